@@ -1,0 +1,3 @@
+"""Skyquilt: drone photos, visible and thermal, to a georeferenced, orthorectified mosaic."""
+
+__version__ = "0.1.0"

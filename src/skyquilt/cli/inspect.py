@@ -1,0 +1,6 @@
+"""`skyquilt inspect`."""
+
+
+def command() -> None:
+    """Not there yet."""
+    raise NotImplementedError

@@ -1,0 +1,6 @@
+"""`skyquilt simulate`."""
+
+
+def command() -> None:
+    """Not there yet."""
+    raise NotImplementedError

@@ -1,0 +1,43 @@
+"""What a user can mend: every error here states what was found, what was expected and the next step."""
+
+
+class SkyquiltError(Exception):
+    """Base of all errors that a user can mend; `exit_code` is what the command line ends with."""
+
+    exit_code = 1
+
+
+class UsageError(SkyquiltError):
+    """The command's words do not fit together or name something that is not there."""
+
+    exit_code = 2
+
+
+class NoPhotosError(SkyquiltError):
+    """There is not one readable photo in the input."""
+
+    exit_code = 3
+
+
+class AlignmentError(SkyquiltError):
+    """The photos cannot be placed by the method asked for."""
+
+    exit_code = 4
+
+
+class OutputError(SkyquiltError):
+    """The output cannot be written: it exists already, is read-only, or the disk is full."""
+
+    exit_code = 5
+
+
+class SideFileError(SkyquiltError):
+    """A side file (geo.txt, gcp_list.txt, boundary, cameras.json ...) is malformed or names unknown photos."""
+
+    exit_code = 6
+
+
+class RefusedError(SkyquiltError):
+    """The job was understood and refused with a reason (no trustworthy registration, say)."""
+
+    exit_code = 7

@@ -1,0 +1,1 @@
+"""The mathematics of frames, cameras and transforms: numpy in, numpy out."""

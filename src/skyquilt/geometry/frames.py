@@ -1,0 +1,83 @@
+"""Frames and angles.
+
+*map*: x east, y north, z up, in m: the output CRS less an origin. *camera*: x right, y down, z forward.
+*ned*: north, east, down. *body*: x nose, y right, z down; the belly camera's image top points along the nose.
+`a_R_b` takes coordinates in b to coordinates in a, so chains cancel visually.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Matrix = NDArray[np.float64]
+
+MAP_R_NED: Matrix = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+CAM_R_BODY: Matrix = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _euler_zyx(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matrix:
+    """Rz(yaw) Ry(pitch) Rx(roll), degrees."""
+    (cy, cp, cr), (sy, sp, sr) = np.cos(a := np.radians([yaw_deg, pitch_deg, roll_deg])), np.sin(a)
+    rz = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    ry = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    rx = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    return np.asarray(rz @ ry @ rx)
+
+
+def _zyx_angles(R: Matrix) -> tuple[float, float, float]:
+    """Yaw, pitch, roll in degrees of Rz Ry Rx; roll 0 at pitch +-90 deg."""
+    pitch = np.arcsin(np.clip(-R[2, 0], -1, 1))
+    if abs(R[2, 0]) > 1 - 1e-12:
+        return float(np.degrees(np.arctan2(-R[0, 1], R[1, 1]))), float(np.degrees(pitch)), 0.0
+    yaw, roll = np.arctan2(R[1, 0], R[0, 0]), np.arctan2(R[2, 1], R[2, 2])
+    return float(np.degrees(yaw)), float(np.degrees(pitch)), float(np.degrees(roll))
+
+
+def cam_R_map_from_angles(yaw_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Matrix:
+    """Rotation (3, 3) from map to camera for belly angles in degrees (see `model.photo.Attitude`).
+
+    The yaw counts from the map's north (+y): subtract the meridian convergence from a true-north yaw first.
+    """
+    ned_R_body = _euler_zyx(yaw_deg, pitch_deg, roll_deg)
+    return np.asarray(CAM_R_BODY @ ned_R_body.T @ MAP_R_NED.T)
+
+
+def angles_from_cam_R_map(cam_R_map: Matrix) -> tuple[float, float, float]:
+    """Belly angles (yaw, pitch, roll) in degrees of a map-to-camera rotation; inverse of the above."""
+    ned_R_body = MAP_R_NED.T @ cam_R_map.T @ CAM_R_BODY
+    return _zyx_angles(ned_R_body)
+
+
+def belly_from_gimbal(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
+    """Belly angles in degrees from gimbal angles of a camera that looks along the body's nose.
+
+    Gimbals (DJI's `GimbalYaw/Pitch/RollDegree`, Rz Ry Rx in NED) report pitch -90 at nadir and roll about the
+    optical axis; the belly camera looks down instead, so the two bodies differ by a quarter turn about y.
+    """
+    gimbal = _euler_zyx(yaw_deg, pitch_deg, roll_deg)
+    quarter = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # belly axes in gimbal axes
+    return _zyx_angles(gimbal @ quarter)
+
+
+def angle_difference_deg(a: float, b: float) -> float:
+    """a - b wrapped to [-180, 180) degrees."""
+    return (a - b + 180.0) % 360.0 - 180.0
+
+
+def rotation_from_vector(w: Matrix) -> Matrix:
+    """Rodrigues: rotation matrices (..., 3, 3) from rotation vectors (..., 3) in rad."""
+    w = np.asarray(w, dtype=np.float64)
+    theta = np.linalg.norm(w, axis=-1)[..., None, None]
+    zero = np.zeros_like(w[..., 0])
+    skew = np.stack(
+        [
+            np.stack([zero, -w[..., 2], w[..., 1]], -1),
+            np.stack([w[..., 2], zero, -w[..., 0]], -1),
+            np.stack([-w[..., 1], w[..., 0], zero], -1),
+        ],
+        -2,
+    )
+    small = theta < 1e-8
+    safe = np.where(small, 1.0, theta)
+    a = np.where(small, 1 - theta**2 / 6, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - theta**2 / 24, (1 - np.cos(safe)) / safe**2)
+    return np.asarray(np.eye(3) + a * skew + b * skew @ skew)

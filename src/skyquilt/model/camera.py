@@ -1,0 +1,55 @@
+"""The interior orientation of a camera."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+PARAMETERS = ("focal", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
+"""Order of the intrinsics in every parameter vector and covariance of the project."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """Pinhole with Brown's distortion in OpenCV's direction (undistorted -> distorted).
+
+    Pixel centres lie at integer coordinates: the image spans [-0.5, width - 0.5] x [-0.5, height - 0.5].
+    """
+
+    width: int
+    """Image width in px."""
+    height: int
+    """Image height in px."""
+    focal: float
+    """Focal length in px; pixels are square."""
+    cx: float
+    """Principal point, x, in px."""
+    cy: float
+    """Principal point, y, in px."""
+    k1: float = 0.0
+    """Radial coefficient of r^2 (r in units of the focal length)."""
+    k2: float = 0.0
+    """Radial coefficient of r^4."""
+    k3: float = 0.0
+    """Radial coefficient of r^6."""
+    p1: float = 0.0
+    """Tangential coefficient, OpenCV's p1."""
+    p2: float = 0.0
+    """Tangential coefficient, OpenCV's p2."""
+    sigmas: tuple[float, ...] | None = field(default=None, compare=False)
+    """Standard deviations of `PARAMETERS` in that order, where an adjustment or a source gives them."""
+
+    @property
+    def vector(self) -> NDArray[np.float64]:
+        """The intrinsics as (8,), in the order of `PARAMETERS`."""
+        return np.array([getattr(self, name) for name in PARAMETERS], dtype=np.float64)
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The (3, 3) matrix K in px."""
+        return np.array([[self.focal, 0, self.cx], [0, self.focal, self.cy], [0, 0, 1]], dtype=np.float64)
+
+    @classmethod
+    def ideal(cls, *, width: int, height: int, focal: float) -> "Camera":
+        """A camera without distortion whose principal point is the image centre."""
+        return cls(width=width, height=height, focal=focal, cx=(width - 1) / 2, cy=(height - 1) / 2)

@@ -1,0 +1,176 @@
+"""One photo as it describes itself: measurements with error models, never facts."""
+
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Literal
+
+from skyquilt.model.camera import Camera
+
+Datum = Literal["takeoff", "sea_level", "ellipsoid", "unknown"]
+"""What a height is counted from."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GeoPosition:
+    """A measured camera position, WGS 84."""
+
+    latitude_deg: float
+    """Degrees, north positive."""
+    longitude_deg: float
+    """Degrees, east positive."""
+    altitude_m: float | None
+    """Height in m above `datum`; None where the photo gives none. The most trustworthy of those found."""
+    datum: Datum
+    """Zero of `altitude_m`."""
+    sigma_xy_m: float = 1.5
+    """Standard deviation of each horizontal axis in m."""
+    sigma_z_m: float = 3.0
+    """Standard deviation of the height in m."""
+    source: str = "exif"
+    """Where it was read: `xmp`, `exif`, `geo.txt`, `csv`, `srt`, `mrk`."""
+    takeoff_m: float | None = None
+    """Height above take-off in m, where given."""
+    sea_level_m: float | None = None
+    """Height above sea level in m, where given."""
+    ellipsoid_m: float | None = None
+    """Height above the WGS 84 ellipsoid in m, where given."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Attitude:
+    """A measured camera attitude: R_ned_body = Rz(yaw) Ry(pitch) Rx(roll) of a body whose belly camera looks down.
+
+    The image top points along the body's nose, so yaw 0 = image top to true north, clockwise positive;
+    pitch 0 = nadir, positive = looking ahead; roll positive = right wing down. Gimbal angles of other
+    conventions are converted where they are read (`geometry.frames.belly_from_gimbal`).
+    """
+
+    yaw_deg: float
+    """Degrees clockwise from true north to the image top."""
+    pitch_deg: float
+    """Degrees from nadir towards the image top."""
+    roll_deg: float
+    """Degrees about the body's nose."""
+    source: str = "xmp-gimbal"
+    """Where it was read: `xmp-gimbal`, `xmp-camera`, `xmp-flight`, `geo.txt`, `csv`."""
+    sigma_yaw_deg: float = 5.0
+    """Standard deviation of the yaw in degrees, when it does not lie altogether."""
+    sigma_tilt_deg: float = 3.0
+    """Standard deviation of pitch and of roll in degrees."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Focal:
+    """A focal length with its standard deviation."""
+
+    px: float
+    """Focal length in px of this file."""
+    sigma_px: float
+    """Standard deviation in px."""
+    source: Literal["calibrated", "sensor", "focal-plane", "35mm", "guess"]
+    """Calibrated value, mm with the sensor database, focal-plane resolution, 35 mm equivalent, guess."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Photo:
+    """One photo: where its pixels are and what its metadata claim."""
+
+    name: str
+    """Unique in the survey: the path below the survey's folder, with forward slashes."""
+    path: Path
+    """The file."""
+    digest: str
+    """Hash of the file's content (hex)."""
+    width: int
+    """Width in px of the decoded sensor image; never rotated by EXIF Orientation."""
+    height: int
+    """Height in px."""
+    channels: int
+    """1 or 3 (or more, multi-band TIFF)."""
+    dtype: Literal["uint8", "uint16", "float32"]
+    """Type of the decoded pixels."""
+    band: Literal["visible", "thermal"]
+    """Spectrum."""
+    unit: Literal["", "celsius", "counts"] = ""
+    """What a single-band pixel value means; empty for pictures."""
+    camera_key: str
+    """Photos with equal keys share their intrinsics: make, model, serial, lens, size."""
+    calibration: Camera | None = None
+    """Intrinsics that metadata or a side file give, distortion included."""
+    focal: Focal
+    """Always present; a guess with a wide deviation where nothing is known."""
+    position: GeoPosition | None
+    """None where the photo has none or it is void, e.g. (0, 0); then a note says so."""
+    attitude: Attitude | None
+    """The camera's attitude as reported."""
+    flight_yaw_deg: float | None = None
+    """Heading of the aircraft as reported, degrees clockwise from true north; a second opinion on the yaw."""
+    time: datetime | None
+    """Capture time with sub-seconds; naive local time unless the photo states an offset."""
+    orientation_tag: int = 1
+    """EXIF Orientation as written; never applied."""
+    rolling_shutter: bool | None = None
+    """True for known electronic (rolling) shutters, False for known global/mechanical ones, None unknown."""
+    editor: str | None = None
+    """Software that rewrote the file after the camera, where the metadata name one."""
+    notes: tuple[str, ...] = ()
+    """Plain sentences: what is missing, void or contradictory."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RejectedPhoto:
+    """A file that takes no part, and why. Never an exception: a bad photo never stops a survey."""
+
+    name: str
+    """As in `Photo.name`."""
+    reason: str
+    """A plain sentence."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Survey:
+    """What lies in a folder."""
+
+    photos: tuple[Photo, ...]
+    """In order of capture (time, then name)."""
+    rejected: tuple[RejectedPhoto, ...] = ()
+    """Image files that could not be used, with reasons."""
+    ignored: tuple[str, ...] = ()
+    """Names of files that are no photos (text, video, archives), left alone."""
+    notes: tuple[str, ...] = ()
+    """Plain sentences about the survey as a whole (two cameras, clocks apart, duplicates ...)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PointObservation:
+    """One sighting of a control point in a photo."""
+
+    photo: str
+    """Photo.name."""
+    x: float
+    """Pixel, centres at integers."""
+    y: float
+    """Pixel, centres at integers."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ControlPoint:
+    """A surveyed point on the ground."""
+
+    name: str
+    """Label."""
+    x: float
+    """Easting or longitude in `crs`."""
+    y: float
+    """Northing or latitude in `crs`."""
+    z: float | None
+    """Height in m; None where the file says NaN."""
+    crs: str
+    """As pyproj reads it, e.g. `EPSG:32615`."""
+    observations: tuple[PointObservation, ...]
+    """Where it was seen."""
+    sigma_m: float = 0.02
+    """Standard deviation of each coordinate in m."""
+    check: bool = False
+    """True: kept out of the adjustment, used to judge it."""
