@@ -1,0 +1,123 @@
+"""Projection with Brown's distortion, its inverse and its derivatives.
+
+One convention inside the project: OpenCV's, from undistorted to distorted coordinates. The thesis prints the
+other direction (Y 2.1); conversions live at the edges (`geometry.camera_formats`).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.model.camera import Camera
+
+Array = NDArray[np.float64]
+
+
+class Projection(NamedTuple):
+    """Pixels and derivatives of N projected points."""
+
+    px: Array
+    """(N, 2) in px."""
+    d_point: Array
+    """(N, 2, 3): by the point in camera coordinates."""
+    d_intrinsics: Array
+    """(N, 2, 8): by the intrinsics in the order of `model.camera.PARAMETERS`."""
+
+
+def distort(xy: Array, k: Array) -> Array:
+    """Distorted image-plane coordinates (N, 2), units of the focal length.
+
+    `k` is (..., 8) in the order of `PARAMETERS`, one row or one row per point.
+    """
+    x, y = xy[..., 0], xy[..., 1]
+    k1, k2, k3, p1, p2 = (k[..., i] for i in range(3, 8))
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        -1,
+    )
+
+
+def project(camera: Camera, xyz_cam: Array) -> Array:
+    """Pixels (N, 2) of points (N, 3) in camera coordinates; NaN behind the camera."""
+    z = xyz_cam[..., 2:3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xy = np.where(z > 0, xyz_cam[..., :2] / z, np.nan)
+    k = camera.vector
+    return np.asarray(distort(xy, k) * k[0] + k[1:3])
+
+
+def project_with_derivatives(k: Array, xyz_cam: Array) -> Projection:
+    """Pixels and derivatives; `k` (N, 8) holds each point's intrinsics, `xyz_cam` is (N, 3) with z > 0."""
+    f, cx, cy, k1, k2, k3, p1, p2 = k.T
+    inv_z = 1.0 / xyz_cam[:, 2]
+    x, y = xyz_cam[:, 0] * inv_z, xyz_cam[:, 1] * inv_z
+    xx, yy, xy = x * x, y * y, x * y
+    r2 = xx + yy
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # d radial / d r2 * 2
+    xd = x * radial + 2 * p1 * xy + p2 * (r2 + 2 * xx)
+    yd = y * radial + p1 * (r2 + 2 * yy) + 2 * p2 * xy
+    dxx = radial + slope * xx + 2 * p1 * y + 6 * p2 * x
+    dxy = slope * xy + 2 * p1 * x + 2 * p2 * y
+    dyy = radial + slope * yy + 6 * p1 * y + 2 * p2 * x
+    d_point = np.empty((len(x), 2, 3))
+    d_point[:, 0, 0], d_point[:, 0, 1] = f * dxx * inv_z, f * dxy * inv_z
+    d_point[:, 1, 0], d_point[:, 1, 1] = f * dxy * inv_z, f * dyy * inv_z
+    d_point[:, 0, 2] = -f * (dxx * x + dxy * y) * inv_z
+    d_point[:, 1, 2] = -f * (dxy * x + dyy * y) * inv_z
+    d_k = np.zeros((len(x), 2, 8))
+    d_k[:, 0, 0], d_k[:, 1, 0] = xd, yd
+    d_k[:, 0, 1] = d_k[:, 1, 2] = 1
+    power = r2.copy()
+    for column in (3, 4, 5):
+        d_k[:, 0, column], d_k[:, 1, column] = f * x * power, f * y * power
+        power = power * r2
+    d_k[:, 0, 6], d_k[:, 1, 6] = 2 * f * xy, f * (r2 + 2 * yy)
+    d_k[:, 0, 7], d_k[:, 1, 7] = f * (r2 + 2 * xx), 2 * f * xy
+    return Projection(np.stack([f * xd + cx, f * yd + cy], -1), d_point, d_k)
+
+
+def undistort(camera: Camera, px: Array, *, iterations: int = 20) -> Array:
+    """Undistorted image-plane coordinates (N, 2), units of the focal length, of pixels (N, 2).
+
+    Newton's method on the distortion; converges to below 1e-10 wherever the model is invertible.
+    """
+    k = camera.vector
+    target = (np.asarray(px, np.float64) - k[1:3]) / k[0]
+    if not k[3:].any():
+        return np.asarray(target)
+    flat = target.reshape(-1, 2)
+    ones = np.ones(len(flat))
+    unit = np.broadcast_to(np.r_[1.0, 0.0, 0.0, k[3:]], (len(flat), 8))
+    guess = flat.copy()
+    for _ in range(iterations):
+        step = project_with_derivatives(unit, np.column_stack([guess, ones]))
+        error = step.px - flat
+        guess -= np.linalg.solve(step.d_point[:, :, :2], error[..., None])[..., 0]
+        if np.abs(error).max(initial=0.0) < 1e-12:
+            break
+    return np.asarray(guess.reshape(target.shape))
+
+
+def rays(camera: Camera, px: Array) -> Array:
+    """Directions (N, 3) in camera coordinates, z = 1, of pixels (N, 2)."""
+    xy = undistort(camera, px)
+    return np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], -1)
+
+
+def monotone_radius(camera: Camera) -> float:
+    """Largest undistorted radius (units of the focal length) up to which distortion is invertible.
+
+    Beyond it a polynomial folds back and points far outside the view would land inside the image.
+    """
+    r = np.linspace(0, 3, 601)[1:]
+    k1, k2, k3 = camera.k1, camera.k2, camera.k3
+    slope = 1 + r**2 * (3 * k1 + r**2 * (5 * k2 + r**2 * 7 * k3))
+    folded = np.flatnonzero(slope <= 0.05)
+    return float(r[folded[0]]) if len(folded) else 3.0

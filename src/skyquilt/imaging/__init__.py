@@ -1,0 +1,1 @@
+"""Pixel mathematics that several stages need: arrays in, arrays out."""

@@ -1,0 +1,1 @@
+"""Stage: Features x 2 -> Matches."""

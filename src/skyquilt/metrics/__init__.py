@@ -1,0 +1,1 @@
+"""Stage: figures that judge a result (part G of the methods)."""

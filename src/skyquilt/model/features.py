@@ -1,0 +1,73 @@
+"""Keypoints of one photo, and what two photos have in common."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Features:
+    """Keypoints and descriptors of one photo."""
+
+    px: NDArray[np.float64]
+    """(N, 2) in px of the full sensor image, centres at integers."""
+    size: NDArray[np.float32]
+    """(N,) diameter in px of the full sensor image."""
+    descriptors: NDArray[np.float32]
+    """(N, D), unit length: the dot product of two is their similarity."""
+    scale: float
+    """Full-resolution px per px of the image the keypoints were found in."""
+
+    def __len__(self) -> int:
+        return len(self.px)
+
+    def __sizeof__(self) -> int:
+        return self.px.nbytes + self.size.nbytes + self.descriptors.nbytes
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Matches:
+    """Putative correspondences of two photos."""
+
+    index_a: NDArray[np.int64]
+    """(M,) keypoints of a."""
+    index_b: NDArray[np.int64]
+    """(M,) keypoints of b."""
+
+    def __len__(self) -> int:
+        return len(self.index_a)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Link:
+    """Two photos that show the same ground, verified."""
+
+    a: int
+    """Index of the first photo."""
+    b: int
+    """Index of the second photo."""
+    index_a: NDArray[np.int64]
+    """(M,) keypoints of a among its features."""
+    index_b: NDArray[np.int64]
+    """(M,) keypoints of b."""
+    b_S_a: complex
+    """Scale and rotation from a to b: p_b = b_S_a * p_a + t for image points as x - iy (y up)."""
+
+    def __len__(self) -> int:
+        return len(self.index_a)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RejectedLink:
+    """A pair that could not be verified: false in `if`, carries its reason."""
+
+    a: int
+    """Index of the first photo."""
+    b: int
+    """Index of the second photo."""
+    reason: str
+    """`too few matches`, `weak inliers`, `implausible scale`, ..."""
+
+    def __bool__(self) -> bool:
+        return False

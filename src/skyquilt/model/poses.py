@@ -1,0 +1,134 @@
+"""Where photos are: the map frame, poses, and the outcome of an alignment."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.model.camera import Camera
+from skyquilt.model.photo import Datum
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapFrame:
+    """The local map frame: x east, y north, z up in m, relative to `origin` in `crs`."""
+
+    crs: str | None
+    """As pyproj reads it; None when nothing says where on Earth the survey is."""
+    origin: tuple[float, float]
+    """Easting and northing in m of the frame's zero; heights are not shifted."""
+    vertical_datum: Datum
+    """What heights count from."""
+    convergence_deg: float = 0.0
+    """Meridian convergence: grid yaw = true yaw - convergence."""
+    metric: bool = True
+    """False when even the scale is unknown (no positions, no height): then 1 m is an arbitrary unit."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prior:
+    """What the metadata say about one photo's pose, in the map frame; NaN where they say nothing."""
+
+    map_C: Array
+    """(3,) camera centre in m."""
+    sigma_C: Array
+    """(3,) standard deviations in m."""
+    yaw_deg: float
+    """Grid yaw of the image top, clockwise from the map's north."""
+    pitch_deg: float
+    """Degrees from nadir; 0 where unknown."""
+    roll_deg: float
+    """Degrees; 0 where unknown."""
+    sigma_yaw_deg: float
+    """Standard deviation of the yaw."""
+    sigma_tilt_deg: float
+    """Standard deviation of pitch and roll."""
+    yaw_source: str = ""
+    """Where the yaw was read."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pose:
+    """Exterior orientation of one photo."""
+
+    cam_R_map: Array
+    """(3, 3) rotation from map to camera."""
+    map_C: Array
+    """(3,) centre of projection in m in the map frame."""
+
+    def to_camera(self, xyz_map: Array) -> Array:
+        """Points (..., 3) in the map frame in camera coordinates."""
+        return np.asarray((xyz_map - self.map_C) @ self.cam_R_map.T)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TiePoints:
+    """Points on the ground and their sightings."""
+
+    xyz: Array
+    """(P, 3) in m in the map frame."""
+    point: NDArray[np.int64]
+    """(N,) index into `xyz` of each sighting, ascending."""
+    photo: NDArray[np.int64]
+    """(N,) index of the photo of each sighting."""
+    px: Array
+    """(N, 2) where it was seen."""
+    residual_px: Array
+    """(N, 2) projected minus seen."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ControlResidual:
+    """How well a control or check point is met."""
+
+    name: str
+    """Label."""
+    check: bool
+    """True: took no part in the adjustment."""
+    error_m: Array
+    """(3,) solution minus survey in m: x, y, z (NaN where the survey gives no height)."""
+    reprojection_px: float
+    """RMS over its sightings in px."""
+    sightings: int
+    """Number of photos that show it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Alignment:
+    """Poses and calibration of a survey, and how they were found."""
+
+    method: str
+    """Name of the method."""
+    why: str
+    """Why it was chosen, one sentence."""
+    frame: MapFrame
+    """Frame of everything below."""
+    poses: dict[int, Pose]
+    """By index of the photo."""
+    cameras: dict[str, Camera]
+    """By `Photo.camera_key`."""
+    blocks: tuple[tuple[int, ...], ...]
+    """Photos that hang together by tie points, largest block first; single photos placed by metadata last."""
+    ties: TiePoints
+    """Tie points; empty for methods without."""
+    rejected: dict[int, str] = field(default_factory=dict)
+    """Photo index -> reason."""
+    control: tuple[ControlResidual, ...] = ()
+    """Control and check points."""
+    loo_rms_m: tuple[float, float, float] | None = None
+    """RMS over photos of the position residual of each photo predicted from all the others."""
+    notes: tuple[str, ...] = ()
+    """Plain sentences worth a reader's attention."""
+
+
+def no_ties() -> TiePoints:
+    """Tie points of a method that has none."""
+    return TiePoints(
+        xyz=np.zeros((0, 3)),
+        point=np.zeros(0, np.int64),
+        photo=np.zeros(0, np.int64),
+        px=np.zeros((0, 2)),
+        residual_px=np.zeros((0, 2)),
+    )

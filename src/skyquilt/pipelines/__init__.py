@@ -1,0 +1,1 @@
+"""Stories: the only place where stages meet."""

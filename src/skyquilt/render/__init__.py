@@ -1,0 +1,1 @@
+"""Stage: poses, surface and photos -> map pixels."""

@@ -1,0 +1,1 @@
+"""Stage: a finished run -> one self-contained page."""

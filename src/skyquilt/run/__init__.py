@@ -1,0 +1,1 @@
+"""How it runs: store, pixel cache, journal, executor."""

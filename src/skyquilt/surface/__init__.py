@@ -1,0 +1,1 @@
+"""Stage: poses and tie points -> heights."""

@@ -1,0 +1,1 @@
+"""Stage: Matches -> Link or RejectedLink."""
