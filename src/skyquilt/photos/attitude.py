@@ -14,9 +14,9 @@ _LOOKS_DOWN_AT_MINUS_90 = -45.0
 def read_attitude(xmp: Xmp) -> tuple[Attitude | None, tuple[str, ...]]:
     """Belly angles, or None, with sentences on what is missing.
 
-    `Gimbal*Degree` (DJI, Autel) and `drone-parrot:Camera*Degree` are gimbal angles (pitch -90 = nadir). Pix4D's
-    `Camera:Yaw/Pitch/Roll` (senseFly, Parrot Sequoia, MicaSense) count as belly angles do: pitch 0 = nadir.
-    Writers that put -90 there for nadir exist; a belly camera looking backwards to the horizon does not map.
+    `Gimbal*Degree` (DJI, Autel) and `drone-parrot:Camera*Degree` are gimbal angles (pitch -90 = nadir).
+    Pix4D's `Camera:Yaw/Pitch/Roll` (senseFly, Parrot Sequoia, MicaSense) count as belly angles do: pitch 0 =
+    nadir. Some write -90 there for nadir, and are taken so: no survey looks backwards to the horizon.
     """
     for names in _GIMBAL:
         yaw, pitch, roll = (xmp.number(name) for name in names)

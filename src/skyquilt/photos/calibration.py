@@ -16,7 +16,7 @@ _SIGMA_RADIAL, _SIGMA_TANGENTIAL, _SIGMA_FREE = 0.02, 0.002, 0.2
 def read_calibration(
     *, exif: Exif, xmp: Xmp, sensor: Sensor | None, width: int, height: int, scale: float
 ) -> Camera | None:
-    """DJI's `DewarpData`, Pix4D's `Camera:Perspective*`, DJI's `CalibratedFocalLength`: the first that is there.
+    """The first of DJI's `DewarpData`, Pix4D's `Camera:Perspective*` and DJI's `CalibratedFocalLength`.
 
     `scale` is this file's px per px as taken (`focal.native_scale`): makers calibrate the latter.
     """
@@ -55,7 +55,7 @@ def _dewarp(xmp: Xmp, size: tuple[int, int]) -> Camera | None:
 
 
 def _perspective(exif: Exif, xmp: Xmp, sensor: Sensor | None, size: tuple[int, int]) -> Camera | None:
-    """Focal length and principal point in mm on the sensor (from its corner); distortion as OpenCV's k1 k2 k3 p1 p2."""
+    """Lengths in mm on the sensor, from its corner; distortion as OpenCV's k1, k2, k3, p1, p2."""
     mm = xmp.number("Camera:PerspectiveFocalLength")
     if not mm or xmp.text("Camera:ModelType").lower() == "fisheye":
         return None

@@ -28,7 +28,7 @@ def modified_time(exif: Exif) -> datetime | None:
 
 
 def parse_moment(text: str, subseconds: str = "", offset: str = "") -> datetime | None:
-    """`2016:06:23 16:31:59` (also ISO 8601), with sub-second digits and `+02:00` apart or inside; else None."""
+    """`2016:06:23 16:31:59` (also ISO 8601) with sub-seconds and `+02:00` inside or apart; else None."""
     found = _MOMENT.match(text.strip())
     if not found:
         return None

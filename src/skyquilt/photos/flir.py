@@ -118,9 +118,11 @@ def _counts(record: bytes) -> NDArray[np.uint16]:
         image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_UNCHANGED)
         if image is None or image.dtype != np.uint16 or image.ndim != 2:
             raise ValueError("its raw PNG is no 16-bit image")
-        return image.byteswap()  # the camera stores little-endian words in a big-endian format
+        return np.asarray(
+            image.byteswap(), dtype=np.uint16
+        )  # the camera stores little-endian words in a big-endian format
     data = np.frombuffer(body, dtype=order + "u2", count=width * height)
-    return data.reshape(height, width).astype(np.uint16)
+    return np.asarray(data.reshape(height, width), dtype=np.uint16)
 
 
 def _camera(record: bytes) -> FlirCamera | None:

@@ -15,7 +15,7 @@ _PLAUSIBLE = (0.2, 60.0)
 
 
 def native_scale(exif: Exif, width: int, height: int) -> tuple[float, str]:
-    """This file's px per px as taken, and a note where EXIF's size fits no reduction of it.
+    """How many px of the file stand for one px as taken, and a note where the sizes disagree in shape.
 
     EXIF keeps the size the camera wrote; a reduced copy still carries it. 1.0 where EXIF says nothing.
     """
@@ -41,7 +41,7 @@ def find_focal(
     height: int,
     thermal: bool = False,
 ) -> Focal:
-    """Calibrated, mm on the sensor, focal-plane resolution, 35 mm equivalent, guess: the first that is there."""
+    """The first of: calibrated, mm on the sensor, focal-plane resolution, 35 mm equivalent, a guess."""
     candidates = (
         _calibrated(calibration),
         _on_sensor(exif, sensor, width, height),

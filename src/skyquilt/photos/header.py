@@ -10,9 +10,9 @@ import numpy as np
 import tifffile
 from PIL import Image
 
+from skyquilt.errors import UnreadablePhotoError
 from skyquilt.photos.exif import Exif, parse_exif, read_tiff_tags
 from skyquilt.photos.jpeg import JpegHeader, has_end, read_jpeg_header
-from skyquilt.photos.unreadable import UnreadablePhoto
 from skyquilt.photos.xmp import Xmp, parse_xmp
 
 Dtype = Literal["uint8", "uint16", "float32"]
@@ -45,17 +45,17 @@ class Header:
 
 
 def read_header(path: Path) -> Header:
-    """Read the head of an image; raises `UnreadablePhoto` with the reason, nothing else."""
+    """Read the head of an image; raises `UnreadablePhotoError` with the reason, nothing else."""
     try:
         with path.open("rb") as file:
             kind = _kind(file)
             return {"jpeg": _jpeg, "tiff": _tiff, "png": _png}[kind](file)
-    except UnreadablePhoto:
+    except UnreadablePhotoError:
         raise
     except OSError as error:
-        raise UnreadablePhoto(f"it cannot be read ({error.strerror or error})") from error
+        raise UnreadablePhotoError(f"it cannot be read ({error.strerror or error})") from error
     except Exception as error:  # tifffile and Pillow raise many kinds on garbage
-        raise UnreadablePhoto(f"its header is broken ({type(error).__name__}: {error})") from error
+        raise UnreadablePhotoError(f"its header is broken ({type(error).__name__}: {error})") from error
 
 
 def content_digest(path: Path) -> str:
@@ -81,20 +81,20 @@ def content_digest(path: Path) -> str:
 def _kind(file: BinaryIO) -> Kind:
     head = file.read(8)
     if not head:
-        raise UnreadablePhoto("it is empty (0 bytes)")
+        raise UnreadablePhotoError("it is empty (0 bytes)")
     if head[:2] == b"\xff\xd8":
         return "jpeg"
     if head[:4] in _TIFF_MAGIC:
         return "tiff"
     if head == b"\x89PNG\r\n\x1a\n":
         return "png"
-    raise UnreadablePhoto("it is neither JPEG, TIFF nor PNG inside, whatever its name says")
+    raise UnreadablePhotoError("it is neither JPEG, TIFF nor PNG inside, whatever its name says")
 
 
 def _jpeg(file: BinaryIO) -> Header:
     head = read_jpeg_header(file)
     if not has_end(file, head.scan_offset):
-        raise UnreadablePhoto("it is cut off: its JPEG data never end")
+        raise UnreadablePhotoError("it is cut off: its JPEG data never end")
     return Header(
         kind="jpeg",
         width=head.width,
@@ -113,7 +113,7 @@ def _tiff(file: BinaryIO) -> Header:
     with tifffile.TiffFile(file) as tiff:
         page = tiff.pages[0]
         if not isinstance(page, tifffile.TiffPage) or page.dtype is None:
-            raise UnreadablePhoto("it is a TIFF of a kind that cannot be decoded")
+            raise UnreadablePhotoError("it is a TIFF of a kind that cannot be decoded")
         _check_extent(page, file)
         packet = page.tags[700].value if 700 in page.tags else b""
         alpha = sum(int(e) in (1, 2) for e in page.extrasamples)
@@ -132,7 +132,7 @@ def _check_extent(page: tifffile.TiffPage, file: BinaryIO) -> None:
     need = max((o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=False)), default=0)
     have = file.seek(0, io.SEEK_END)
     if need > have:
-        raise UnreadablePhoto(f"it is cut off: its pixels need {need} bytes, the file has {have}")
+        raise UnreadablePhotoError(f"it is cut off: its pixels need {need} bytes, the file has {have}")
 
 
 def _stored_as(dtype: "np.dtype[np.generic]") -> Dtype:
@@ -142,13 +142,13 @@ def _stored_as(dtype: "np.dtype[np.generic]") -> Dtype:
         return "uint16"
     if dtype.kind in "iuf":
         return "float32"
-    raise UnreadablePhoto(f"its pixels are of type {dtype}; whole or real numbers are needed")
+    raise UnreadablePhotoError(f"its pixels are of type {dtype}; whole or real numbers are needed")
 
 
 def _png(file: BinaryIO) -> Header:
     file.seek(-12, io.SEEK_END)
     if b"IEND" not in file.read(12):
-        raise UnreadablePhoto("it is cut off: its PNG data never end")
+        raise UnreadablePhotoError("it is cut off: its PNG data never end")
     file.seek(0)
     with Image.open(file) as image:
         packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""

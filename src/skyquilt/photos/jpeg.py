@@ -4,7 +4,7 @@ import io
 from dataclasses import dataclass
 from typing import BinaryIO
 
-from skyquilt.photos.unreadable import UnreadablePhoto
+from skyquilt.errors import UnreadablePhotoError
 
 SOI, EOI, SOS = 0xD8, 0xD9, 0xDA
 APP1, APP3 = 0xE1, 0xE3
@@ -53,11 +53,11 @@ class JpegHeader:
 def _next_marker(file: BinaryIO) -> int:
     byte = file.read(1)
     if byte != b"\xff":
-        raise UnreadablePhoto("its JPEG header is broken or cut off")
+        raise UnreadablePhotoError("its JPEG header is broken or cut off")
     while byte == b"\xff":  # fill bytes may precede a marker
         byte = file.read(1)
     if not byte:
-        raise UnreadablePhoto("its JPEG header is cut off")
+        raise UnreadablePhotoError("its JPEG header is cut off")
     return byte[0]
 
 
@@ -65,14 +65,14 @@ def _payload(file: BinaryIO) -> bytes:
     length = int.from_bytes(file.read(2), "big") - 2
     payload = file.read(max(length, 0))
     if length < 0 or len(payload) < length:
-        raise UnreadablePhoto("its JPEG header is cut off")
+        raise UnreadablePhotoError("its JPEG header is cut off")
     return payload
 
 
 def read_jpeg_header(file: BinaryIO) -> JpegHeader:
     """Walk the segments up to the first scan.
 
-    Raises `UnreadablePhoto` where the header is broken, cut off or declares no image.
+    Raises `UnreadablePhotoError` where the header is broken, cut off or declares no image.
     """
     file.seek(2)
     segments: list[tuple[int, bytes]] = []
@@ -81,14 +81,14 @@ def read_jpeg_header(file: BinaryIO) -> JpegHeader:
         if marker in _BARE:
             continue
         if marker == EOI:
-            raise UnreadablePhoto("it is a JPEG without an image in it")
+            raise UnreadablePhotoError("it is a JPEG without an image in it")
         payload = _payload(file)
         if marker in _FRAMES and len(payload) >= 6:
             frame = (int.from_bytes(payload[3:5], "big"), int.from_bytes(payload[1:3], "big"), payload[5])
         elif 0xE0 <= marker <= 0xEF:
             segments.append((marker, payload))
     if frame is None or 0 in frame:
-        raise UnreadablePhoto("it is a JPEG that declares no image size")
+        raise UnreadablePhotoError("it is a JPEG that declares no image size")
     return JpegHeader(
         width=frame[0],
         height=frame[1],

@@ -15,11 +15,11 @@ import simplejpeg
 import tifffile
 from numpy.typing import NDArray
 
+from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.photo import Photo
 from skyquilt.photos.exif import MAKE
 from skyquilt.photos.header import read_header
 from skyquilt.photos.thermal import thermal_frame_of_jpeg, thermal_frame_of_values
-from skyquilt.photos.unreadable import UnreadablePhoto
 
 Pixels = NDArray[Any]
 Reduction = Literal[1, 2, 4, 8]
@@ -30,7 +30,7 @@ def read_color(photo: Photo, *, reduction: Reduction = 1) -> Pixels:
     """Pixels as recorded: (height, width, 3) uint8 RGB, or (height, width) of a single band, or all bands.
 
     Type and unit are `photo.dtype` and `photo.unit`; thermal frames are float32 with NaN for no measurement.
-    Raises `UnreadablePhoto` where the data are broken.
+    Raises `UnreadablePhotoError` where the data are broken.
     """
     return _read(photo, reduction, gray=False)
 
@@ -38,7 +38,7 @@ def read_color(photo: Photo, *, reduction: Reduction = 1) -> Pixels:
 def read_gray(photo: Photo, *, reduction: Reduction = 1) -> NDArray[np.uint8]:
     """Brightness (height, width) uint8 for finding features; see `to_gray` for other types.
 
-    Raises `UnreadablePhoto` where the data are broken.
+    Raises `UnreadablePhotoError` where the data are broken.
     """
     return to_gray(_read(photo, reduction, gray=True))
 
@@ -74,14 +74,14 @@ def reduce_pixels(pixels: Pixels, reduction: int) -> Pixels:
 def _read(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
     try:
         pixels = _decode(photo, reduction, gray=gray)
-    except UnreadablePhoto:
+    except UnreadablePhotoError:
         raise
     except Exception as error:  # decoders raise many kinds; all mean the same to a survey
-        raise UnreadablePhoto(f"its pixels cannot be decoded ({error})") from error
+        raise UnreadablePhotoError(f"its pixels cannot be decoded ({error})") from error
     want = (-(-photo.height // reduction), -(-photo.width // reduction))
     if pixels.shape[:2] != want:
         found = f"{pixels.shape[1]}x{pixels.shape[0]}"
-        raise UnreadablePhoto(f"its pixels are {found} where its header promised {want[1]}x{want[0]}")
+        raise UnreadablePhotoError(f"its pixels are {found} where its header promised {want[1]}x{want[0]}")
     return pixels
 
 
@@ -101,7 +101,7 @@ def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
 def decode_jpeg(data: bytes, *, gray: bool = False, reduction: Reduction = 1) -> NDArray[np.uint8]:
     """A JPEG file's bytes as (height, width, 3) RGB or (height, width), at full or reduced scale.
 
-    Raises `UnreadablePhoto` where data are missing or corrupt, instead of filling in grey.
+    Raises `UnreadablePhotoError` where data are missing or corrupt, instead of filling in grey.
     """
     height, width, _, _ = simplejpeg.decode_jpeg_header(data)
     wanted = {
@@ -113,7 +113,7 @@ def decode_jpeg(data: bytes, *, gray: bool = False, reduction: Reduction = 1) ->
         pixels = simplejpeg.decode_jpeg(data, **wanted)
     except ValueError as error:
         if not _HARMLESS.search(str(error)):
-            raise UnreadablePhoto(f"its JPEG data are damaged ({error})") from error
+            raise UnreadablePhotoError(f"its JPEG data are damaged ({error})") from error
         pixels = simplejpeg.decode_jpeg(data, strict=False, **wanted)
     return np.asarray(pixels[..., 0] if gray else pixels, dtype=np.uint8)
 
@@ -122,14 +122,14 @@ def _thermal_jpeg(path: Path) -> Pixels:
     header = read_header(path)
     frame = header.jpeg and thermal_frame_of_jpeg(header.jpeg, make=header.exif.text(MAKE))
     if not frame:
-        raise UnreadablePhoto("its radiometric frame is gone")
+        raise UnreadablePhotoError("its radiometric frame is gone")
     return frame.values
 
 
 def _png(data: bytes) -> Pixels:
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
-        raise UnreadablePhoto("its PNG data are damaged")
+        raise UnreadablePhotoError("its PNG data are damaged")
     if image.ndim == 2:
         return np.asarray(image)
     return np.ascontiguousarray(image[..., 2::-1])

@@ -11,7 +11,7 @@ _HEIGHTS = (-500.0, 9500.0)
 _RTK_FLOAT, _RTK_FIXED = 34, 50
 _DRONE_SIGMA = (1.5, 3.0)
 _CAMERA_SIGMA = (5.0, 15.0)
-"""Horizontal and vertical deviation in m where nothing says more: a camera's own receiver is no autopilot's."""
+"""Horizontal and vertical deviation in m where nothing says more; a camera's receiver is no autopilot's."""
 
 
 def read_position(exif: Exif, xmp: Xmp) -> tuple[GeoPosition | None, tuple[str, ...]]:

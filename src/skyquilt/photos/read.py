@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.photos import exif as tag
 from skyquilt.photos.attitude import read_attitude, read_flight_yaw
@@ -17,19 +18,18 @@ from skyquilt.photos.pixels import read_tiff
 from skyquilt.photos.position import read_position
 from skyquilt.photos.sensors import Sensor, find_sensor
 from skyquilt.photos.thermal import ThermalFrame, thermal_frame_of_jpeg, thermal_frame_of_values
-from skyquilt.photos.unreadable import UnreadablePhoto
 
 _SMALLEST = 32
 _LARGEST_THERMAL = 1280
 
 
 def read_photo(path: Path, *, name: str | None = None) -> Photo | RejectedPhoto:
-    """What a file says of itself, without decoding pixels; a bad file is a `RejectedPhoto`, never an exception."""
+    """What a file says of itself, its pixels not decoded; a bad file is a `RejectedPhoto`."""
     name = name or path.name
     try:
         header = read_header(path)
         return _photo(path, name, header)
-    except UnreadablePhoto as error:
+    except UnreadablePhotoError as error:
         return RejectedPhoto(name=name, reason=str(error))
     except OSError as error:
         return RejectedPhoto(name=name, reason=f"it cannot be read ({error.strerror or error})")
@@ -39,7 +39,7 @@ def _photo(path: Path, name: str, header: Header) -> Photo:
     frame = _thermal_frame(path, header)
     height, width = frame.values.shape if frame else (header.height, header.width)
     if min(width, height) < _SMALLEST:
-        raise UnreadablePhoto(f"it has only {width}x{height} px; at least {_SMALLEST} a side are needed")
+        raise UnreadablePhotoError(f"it has only {width}x{height} px; at least {_SMALLEST} a side are needed")
     exif, xmp = header.exif, header.xmp
     scale, size_note = native_scale(exif, width, height)
     sensor = _sensor(header, width, height, scale)
@@ -97,7 +97,7 @@ def _thermal_frame(path: Path, header: Header) -> ThermalFrame | None:
     try:
         frame = thermal_frame_of_values(np.asarray(read_tiff(path)[..., 0]))
     except Exception as error:  # tifffile raises many kinds; all mean that there are no pixels
-        raise UnreadablePhoto(f"its pixels cannot be decoded ({error})") from error
+        raise UnreadablePhotoError(f"its pixels cannot be decoded ({error})") from error
     return frame if known or frame.unit == "celsius" else None
 
 
@@ -112,9 +112,10 @@ def _sensor(header: Header, width: int, height: int, scale: float) -> Sensor | N
 def _camera_key(header: Header, width: int, height: int) -> str:
     exif, xmp = header.exif, header.xmp
     mm = exif.number(tag.FOCAL_MM)
+    make, model = exif.text(tag.MAKE) or "unknown", exif.text(tag.MODEL) or "camera"
     parts = (
-        exif.text(tag.MAKE) or "unknown",
-        exif.text(tag.MODEL) or "camera",
+        "" if model.lower().startswith(make.lower()) else make,
+        model,
         exif.text(tag.SERIAL) or xmp.text("CameraSerialNumber", "drone-dji:DroneSerialNumber"),
         exif.text(tag.LENS),
         xmp.text("Camera:BandName"),
