@@ -41,3 +41,10 @@ class RefusedError(SkyquiltError):
     """The job was understood and refused with a reason (no trustworthy registration, say)."""
 
     exit_code = 7
+
+
+class UnreadablePhotoError(SkyquiltError):
+    """One file cannot be used; the message finishes the sentence 'X was left out: ...'.
+
+    A bad photo never stops a survey: whoever meets this turns it into a `RejectedPhoto`.
+    """

@@ -1,0 +1,62 @@
+"""Cameras in OpenSfM's and OpenDroneMap's form: lengths in units of the longer side, from the image centre.
+
+Both put the origin at ((w - 1) / 2, (h - 1) / 2) with pixel centres at integers, and their distortion runs
+from undistorted to distorted as OpenCV's does, so coefficients carry over with their signs.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from skyquilt.model.camera import Camera
+
+
+def camera_from_opensfm(record: Mapping[str, Any]) -> Camera:
+    """A `brown`, `perspective`, `simple_radial` or `radial` camera.
+
+    Raises `ValueError` for any other projection and for a broken record. `focal_x` and `focal_y`
+    become their mean: pixels are square here.
+    """
+    kind = str(record.get("projection_type", "perspective"))
+    if kind not in ("brown", "perspective", "simple_radial", "radial"):
+        raise ValueError(f"its projection is '{kind}'; expected brown, perspective, simple_radial or radial")
+    width, height = int(_number(record, "width")), int(_number(record, "height"))
+    if width < 1 or height < 1:
+        raise ValueError(f"its size is {width}x{height} px")
+    unit = max(width, height)
+    focals = [_number(record, k) for k in ("focal_x", "focal_y", "focal") if k in record]
+    if not focals or min(focals) <= 0:
+        raise ValueError("it has no positive focal length (focal, or focal_x and focal_y)")
+    return Camera(
+        width=width,
+        height=height,
+        focal=sum(focals) / len(focals) * unit,
+        cx=_number(record, "c_x", 0.0) * unit + (width - 1) / 2,
+        cy=_number(record, "c_y", 0.0) * unit + (height - 1) / 2,
+        k1=_number(record, "k1", 0.0),
+        k2=_number(record, "k2", 0.0),
+        k3=_number(record, "k3", 0.0),
+        p1=_number(record, "p1", 0.0),
+        p2=_number(record, "p2", 0.0),
+    )
+
+
+def camera_to_opensfm(camera: Camera) -> dict[str, Any]:
+    """The camera as a `brown` record, ready for JSON."""
+    unit = max(camera.width, camera.height)
+    return {
+        "projection_type": "brown",
+        "width": camera.width,
+        "height": camera.height,
+        "focal_x": camera.focal / unit,
+        "focal_y": camera.focal / unit,
+        "c_x": (camera.cx - (camera.width - 1) / 2) / unit,
+        "c_y": (camera.cy - (camera.height - 1) / 2) / unit,
+        **{k: getattr(camera, k) for k in ("k1", "k2", "p1", "p2", "k3")},
+    }
+
+
+def _number(record: Mapping[str, Any], key: str, otherwise: float | None = None) -> float:
+    value = record.get(key, otherwise)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ValueError(f"its '{key}' is {value!r}; expected a number")
+    return float(value)

@@ -1,0 +1,108 @@
+"""OpenDroneMap's `gcp_list.txt`: a coordinate system, then `x y z px py image [name] [check]`.
+
+Rows with one name, or without names the same x, y and z, are sightings of one point. z may be NaN. Pixels
+have their centres at integers. A check point, kept out of the adjustment, has a name that starts with `check`
+or the word `check` in the eighth column: both are extensions that OpenDroneMap reads over.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from skyquilt.errors import SideFileError
+from skyquilt.model.photo import ControlPoint, PointObservation
+from skyquilt.photos.side_rows import PhotoNames, sentence_of
+from skyquilt.photos.side_text import finite, number, read_crs, read_lines
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sighting:
+    x: float
+    y: float
+    z: float | None
+    column: float
+    row: float
+    image: str
+    name: str
+    check: bool
+
+    @property
+    def key(self) -> str:
+        return self.name or f"{self.x!r} {self.y!r} {self.z!r}"
+
+
+def read_gcp_list(path: Path, photo_names: Iterable[str]) -> tuple[tuple[ControlPoint, ...], tuple[str, ...]]:
+    """Control points seen in the photos of a survey, and notes on rows of photos that are not in it.
+
+    `photo_names` are `Photo.name`s. Raises `SideFileError` where a line is malformed, one point has two
+    places, or no row names a photo of the survey.
+    """
+    lines = read_lines(path)
+    if len(lines) < 2:
+        raise SideFileError(
+            f"{path.name} has {len(lines)} lines; expected a coordinate system and one line per sighting."
+        )
+    crs = read_crs(lines[0][1], file=path.name)
+    epsg = crs.to_epsg()
+    sightings = [_sighting(text, f"{path.name}, line {i}") for i, text in lines[1:]]
+    names = PhotoNames(photo_names)
+    strangers = sorted({s.image for s in sightings if names.find(s.image) is None})
+    if all(names.find(s.image) is None for s in sightings):
+        raise SideFileError(
+            f"{path.name} names {sentence_of(strangers)}; no photo of the survey is called that. "
+            "Correct the image names in its sixth column."
+        )
+    groups: dict[str, list[_Sighting]] = {}
+    for sighting in sightings:
+        groups.setdefault(sighting.key, []).append(sighting)
+    system = f"EPSG:{epsg}" if epsg else crs.to_string()
+    points = [_point(i, group, system, names, path) for i, group in enumerate(groups.values(), 1)]
+    return tuple(p for p in points if p.observations), _notes(path, strangers, points)
+
+
+def _notes(path: Path, strangers: list[str], points: list[ControlPoint]) -> tuple[str, ...]:
+    unseen = [p.name for p in points if not p.observations]
+    missing = f"{path.name} names photos that are not there: {sentence_of(strangers)}." if strangers else ""
+    lost = f"Control points seen in no photo of the survey: {sentence_of(unseen)}." if unseen else ""
+    return tuple(n for n in (missing, lost) if n)
+
+
+def _sighting(line: str, place: str) -> _Sighting:
+    words = line.split("\t") if line.count("\t") >= 5 else line.split()
+    words = [w.strip() for w in words if w.strip()]
+    numbers = [number(w) for w in words[:5]]
+    x, y, z, column, row = (*numbers, *[None] * 5)[:5]
+    wanted = (finite(v) for v in (x, y, column, row))
+    if len(words) < 6 or z is None or any(v is None for v in wanted):
+        raise SideFileError(
+            f"{place}: expected 'x y z px py image [name] [check]', found '{line}'. Correct that line."
+        )
+    name = words[6] if len(words) > 6 else ""
+    check = name.lower().startswith("check") or (len(words) > 7 and words[7].lower() == "check")
+    return _Sighting(
+        x=x or 0.0,
+        y=y or 0.0,
+        z=finite(z),
+        column=column or 0.0,
+        row=row or 0.0,
+        image=words[5],
+        name=name,
+        check=check,
+    )
+
+
+def _point(i: int, group: list[_Sighting], crs: str, names: PhotoNames, path: Path) -> ControlPoint:
+    first = group[0]
+    label = first.name or f"point {i}"
+    if len({(s.x, s.y, s.z) for s in group}) > 1:
+        raise SideFileError(f"{path.name}: point {label} has two different places. Correct one of its rows.")
+    seen = ((names.find(s.image), s) for s in group)
+    return ControlPoint(
+        name=label,
+        x=first.x,
+        y=first.y,
+        z=first.z,
+        crs=crs,
+        observations=tuple(PointObservation(photo=n, x=s.column, y=s.row) for n, s in seen if n),
+        check=any(s.check for s in group),
+    )

@@ -1,0 +1,148 @@
+"""Pixels of a photo: sensor coordinates everywhere, EXIF Orientation never applied.
+
+At `reduction` r a reduced pixel covers r x r full ones and the size is rounded up: pixel (i, j) of the
+reduced image has its centre at (r * i + (r - 1) / 2, r * j + (r - 1) / 2) of the full one. Reduced JPEGs are
+decoded at that scale (no full decode takes place).
+"""
+
+import re
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+import simplejpeg
+import tifffile
+from numpy.typing import NDArray
+
+from skyquilt.errors import UnreadablePhotoError
+from skyquilt.model.photo import Photo
+from skyquilt.photos.exif import MAKE
+from skyquilt.photos.header import read_header
+from skyquilt.photos.thermal import thermal_frame_of_jpeg, thermal_frame_of_values
+
+Pixels = NDArray[Any]
+Reduction = Literal[1, 2, 4, 8]
+_HARMLESS = re.compile(r"(\d{1,3}) extraneous bytes before marker|JFIF|Inconsistent progression|Invalid SOS")
+
+
+def read_color(photo: Photo, *, reduction: Reduction = 1) -> Pixels:
+    """Pixels as recorded: (height, width, 3) uint8 RGB, or (height, width) of a single band, or all bands.
+
+    Type and unit are `photo.dtype` and `photo.unit`; thermal frames are float32 with NaN for no measurement.
+    Raises `UnreadablePhotoError` where the data are broken.
+    """
+    return _read(photo, reduction, gray=False)
+
+
+def read_gray(photo: Photo, *, reduction: Reduction = 1) -> NDArray[np.uint8]:
+    """Brightness (height, width) uint8 for finding features; see `to_gray` for other types.
+
+    Raises `UnreadablePhotoError` where the data are broken.
+    """
+    return to_gray(_read(photo, reduction, gray=True))
+
+
+def to_gray(pixels: Pixels) -> NDArray[np.uint8]:
+    """Brightness (height, width) uint8 of decoded pixels; other types than uint8 are stretched.
+
+    The stretch maps each frame's own 0.5 to 99.5 percent of finite values to 0-255; NaN becomes 0.
+    """
+    if pixels.ndim == 3 and pixels.dtype == np.uint8 and pixels.shape[2] == 3:
+        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    flat = pixels if pixels.ndim == 2 else pixels.mean(axis=2, dtype=np.float32)
+    if flat.dtype == np.uint8:
+        return flat
+    real = flat.astype(np.float32)
+    finite = real[np.isfinite(real)]
+    low, high = np.percentile(finite, [0.5, 99.5]) if finite.size else (0.0, 1.0)
+    scaled = (real - low) * (255.0 / max(high - low, 1e-6))
+    return np.clip(np.nan_to_num(scaled, nan=0.0), 0, 255).astype(np.uint8)
+
+
+def reduce_pixels(pixels: Pixels, reduction: int) -> Pixels:
+    """Area mean over reduction x reduction px, the size rounded up, type and shape of bands kept."""
+    if reduction == 1:
+        return pixels
+    height, width = pixels.shape[:2]
+    below, right = -height % reduction, -width % reduction
+    padded = cv2.copyMakeBorder(pixels, 0, below, 0, right, cv2.BORDER_REPLICATE)
+    size = (padded.shape[1] // reduction, padded.shape[0] // reduction)
+    return np.asarray(cv2.resize(padded, size, interpolation=cv2.INTER_AREA))
+
+
+def _read(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
+    try:
+        pixels = _decode(photo, reduction, gray=gray)
+    except UnreadablePhotoError:
+        raise
+    except Exception as error:  # decoders raise many kinds; all mean the same to a survey
+        raise UnreadablePhotoError(f"its pixels cannot be decoded ({error})") from error
+    want = (-(-photo.height // reduction), -(-photo.width // reduction))
+    if pixels.shape[:2] != want:
+        found = f"{pixels.shape[1]}x{pixels.shape[0]}"
+        raise UnreadablePhotoError(f"its pixels are {found} where its header promised {want[1]}x{want[0]}")
+    return pixels
+
+
+def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
+    data = photo.path.read_bytes()
+    if data[:2] == b"\xff\xd8" and not photo.unit:
+        return decode_jpeg(data, gray=gray or photo.channels == 1, reduction=reduction)
+    if data[:2] == b"\xff\xd8":
+        return reduce_pixels(_thermal_jpeg(photo.path), reduction)
+    if data[:4] == b"\x89PNG":
+        return reduce_pixels(_png(data), reduction)
+    pixels = read_tiff(photo.path)[..., : photo.channels]
+    pixels = pixels[..., 0] if photo.channels == 1 else pixels
+    return reduce_pixels(thermal_frame_of_values(pixels).values if photo.unit else pixels, reduction)
+
+
+def decode_jpeg(data: bytes, *, gray: bool = False, reduction: Reduction = 1) -> NDArray[np.uint8]:
+    """A JPEG file's bytes as (height, width, 3) RGB or (height, width), at full or reduced scale.
+
+    Raises `UnreadablePhotoError` where data are missing or corrupt, instead of filling in grey.
+    """
+    height, width, _, _ = simplejpeg.decode_jpeg_header(data)
+    wanted = {
+        "colorspace": "GRAY" if gray else "RGB",
+        "min_height": -(-height // reduction) if reduction > 1 else 0,
+        "min_width": -(-width // reduction) if reduction > 1 else 0,
+    }
+    try:
+        pixels = simplejpeg.decode_jpeg(data, **wanted)
+    except ValueError as error:
+        if not _HARMLESS.search(str(error)):
+            raise UnreadablePhotoError(f"its JPEG data are damaged ({error})") from error
+        pixels = simplejpeg.decode_jpeg(data, strict=False, **wanted)
+    return np.asarray(pixels[..., 0] if gray else pixels, dtype=np.uint8)
+
+
+def _thermal_jpeg(path: Path) -> Pixels:
+    header = read_header(path)
+    frame = header.jpeg and thermal_frame_of_jpeg(header.jpeg, make=header.exif.text(MAKE))
+    if not frame:
+        raise UnreadablePhotoError("its radiometric frame is gone")
+    return frame.values
+
+
+def _png(data: bytes) -> Pixels:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise UnreadablePhotoError("its PNG data are damaged")
+    if image.ndim == 2:
+        return np.asarray(image)
+    return np.ascontiguousarray(image[..., 2::-1])
+
+
+def read_tiff(path: Path) -> Pixels:
+    """The first page of a TIFF as (height, width, bands), signed and wide types as float32."""
+    with tifffile.TiffFile(path) as tiff:
+        page = tiff.pages[0]
+        pixels = np.asarray(page.asarray())
+        planar = isinstance(page, tifffile.TiffPage) and page.planarconfig == 2 and pixels.ndim == 3
+    if planar:
+        pixels = np.moveaxis(pixels, 0, -1)
+    if pixels.dtype not in (np.uint8, np.uint16):
+        pixels = pixels.astype(np.float32)
+    return np.ascontiguousarray(pixels if pixels.ndim == 3 else pixels[..., None])

@@ -1,0 +1,155 @@
+"""One file to one `Photo`."""
+
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+
+from skyquilt.errors import UnreadablePhotoError
+from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.photos import exif as tag
+from skyquilt.photos.attitude import read_attitude, read_flight_yaw
+from skyquilt.photos.calibration import read_calibration
+from skyquilt.photos.clock import modified_time, read_time
+from skyquilt.photos.editor import find_editor
+from skyquilt.photos.focal import find_focal, native_scale
+from skyquilt.photos.header import Header, content_digest, read_header
+from skyquilt.photos.pixels import read_tiff
+from skyquilt.photos.position import read_position
+from skyquilt.photos.sensors import Sensor, find_sensor
+from skyquilt.photos.thermal import ThermalFrame, thermal_frame_of_jpeg, thermal_frame_of_values
+
+_SMALLEST = 32
+_LARGEST_THERMAL = 1280
+
+
+def read_photo(path: Path, *, name: str | None = None) -> Photo | RejectedPhoto:
+    """What a file says of itself, its pixels not decoded; a bad file is a `RejectedPhoto`."""
+    name = name or path.name
+    try:
+        header = read_header(path)
+        return _photo(path, name, header)
+    except UnreadablePhotoError as error:
+        return RejectedPhoto(name=name, reason=str(error))
+    except OSError as error:
+        return RejectedPhoto(name=name, reason=f"it cannot be read ({error.strerror or error})")
+
+
+def _photo(path: Path, name: str, header: Header) -> Photo:
+    frame = _thermal_frame(path, header)
+    height, width = frame.values.shape if frame else (header.height, header.width)
+    if min(width, height) < _SMALLEST:
+        raise UnreadablePhotoError(f"it has only {width}x{height} px; at least {_SMALLEST} a side are needed")
+    exif, xmp = header.exif, header.xmp
+    scale, size_note = native_scale(exif, width, height)
+    sensor = _sensor(header, width, height, scale)
+    thermal = frame is not None or (sensor is not None and sensor.band == "thermal") or _is_lwir(header)
+    calibration = read_calibration(exif=exif, xmp=xmp, sensor=sensor, width=width, height=height, scale=scale)
+    focal = find_focal(
+        exif=exif, sensor=sensor, calibration=calibration, width=width, height=height, thermal=thermal
+    )
+    position, place_notes = read_position(exif, xmp)
+    attitude, angle_notes = read_attitude(xmp)
+    time = read_time(exif, xmp)
+    notes = (
+        *_broken_notes(header),
+        size_note,
+        frame.note if frame else "",
+        *place_notes,
+        *angle_notes,
+        "" if time else "It carries no capture time.",
+        _focal_note(focal.source, exif.text(tag.MODEL)),
+        _edit_note(header),
+    )
+    return Photo(
+        name=name,
+        path=path,
+        digest=content_digest(path),
+        width=width,
+        height=height,
+        channels=1 if frame else header.channels,
+        dtype="float32" if frame else header.dtype,
+        band="thermal" if thermal else "visible",
+        unit=frame.unit if frame else "",
+        camera_key=_camera_key(header, width, height),
+        calibration=calibration,
+        focal=focal,
+        position=position,
+        attitude=attitude,
+        flight_yaw_deg=read_flight_yaw(xmp),
+        time=time,
+        orientation_tag=int(exif.number(tag.ORIENTATION) or 1),
+        rolling_shutter=_rolling(header, sensor),
+        editor=find_editor(exif, xmp),
+        notes=tuple(n for n in notes if n),
+    )
+
+
+def _thermal_frame(path: Path, header: Header) -> ThermalFrame | None:
+    if header.jpeg:
+        return thermal_frame_of_jpeg(header.jpeg, make=header.exif.text(tag.MAKE))
+    if header.kind != "tiff" or header.channels != 1 or header.width > _LARGEST_THERMAL:
+        return None
+    sensor = find_sensor(model=header.exif.text(tag.MODEL), long_side=max(header.width, header.height))
+    known = _is_lwir(header) or (sensor is not None and sensor.band == "thermal")
+    if not known and header.dtype != "float32":
+        return None
+    try:
+        frame = thermal_frame_of_values(np.asarray(read_tiff(path)[..., 0]))
+    except Exception as error:  # tifffile raises many kinds; all mean that there are no pixels
+        raise UnreadablePhotoError(f"its pixels cannot be decoded ({error})") from error
+    return frame if known or frame.unit == "celsius" else None
+
+
+def _is_lwir(header: Header) -> bool:
+    return "lwir" in header.xmp.text("Camera:BandName").lower()
+
+
+def _sensor(header: Header, width: int, height: int, scale: float) -> Sensor | None:
+    return find_sensor(model=header.exif.text(tag.MODEL), long_side=round(max(width, height) / scale))
+
+
+def _camera_key(header: Header, width: int, height: int) -> str:
+    exif, xmp = header.exif, header.xmp
+    mm = exif.number(tag.FOCAL_MM)
+    make, model = exif.text(tag.MAKE) or "unknown", exif.text(tag.MODEL) or "camera"
+    parts = (
+        "" if model.lower().startswith(make.lower()) else make,
+        model,
+        exif.text(tag.SERIAL) or xmp.text("CameraSerialNumber", "drone-dji:DroneSerialNumber"),
+        exif.text(tag.LENS),
+        xmp.text("Camera:BandName"),
+        f"{width}x{height}",
+        f"{mm:.1f}mm" if mm else "",
+    )
+    return " ".join(" ".join(p.lower().split()) for p in parts if p)
+
+
+def _rolling(header: Header, sensor: Sensor | None) -> bool | None:
+    written = header.xmp.text("ShutterType").lower()
+    if written:
+        return "mechanical" not in written and "global" not in written
+    return sensor.shutter == "rolling" if sensor and sensor.shutter else None
+
+
+def _broken_notes(header: Header) -> tuple[str, ...]:
+    exif = "Its EXIF block is broken and was read as far as it went." if header.exif.broken else ""
+    xmp = "Its XMP packet is broken XML; values were searched in it as text." if header.xmp.broken else ""
+    return exif, xmp
+
+
+def _focal_note(source: str, model: str) -> str:
+    if source != "guess":
+        return ""
+    camera = f"the camera database does not know '{model}'" if model else "no camera model is named"
+    return f"It gives no usable focal length and {camera}: one is guessed from the format."
+
+
+def _edit_note(header: Header) -> str:
+    editor = find_editor(header.exif, header.xmp)
+    if editor:
+        return f"It was rewritten by '{editor}': rotation, size and metadata may no longer fit the pixels."
+    taken, written = read_time(header.exif, header.xmp), modified_time(header.exif)
+    if taken and written and written.replace(tzinfo=None) - taken.replace(tzinfo=None) > timedelta(minutes=1):
+        return f"It was written again at {written:%Y-%m-%d %H:%M:%S}, after the capture."
+    return ""

@@ -1,0 +1,135 @@
+"""Rows of side files that place photos, and how they override what the photos say."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+from skyquilt.errors import SideFileError
+from skyquilt.geometry.frames import belly_from_gimbal
+from skyquilt.model.photo import Attitude, Datum, GeoPosition, Photo
+from skyquilt.photos.position import why_void
+
+_LOOKS_DOWN_AT_MINUS_90 = -45.0
+_SHOWN = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class SideRow:
+    """What one row says of one photo; None = the row does not say."""
+
+    name: str
+    """File name as written, with or without folder and ending."""
+    latitude_deg: float | None = None
+    """WGS 84."""
+    longitude_deg: float | None = None
+    """WGS 84."""
+    altitude_m: float | None = None
+    """Height above `datum` in m."""
+    datum: Datum = "sea_level"
+    """Zero of the height."""
+    angles_deg: tuple[float, float, float] | None = None
+    """Yaw, pitch, roll of a belly camera; a pitch below -45 is read as a gimbal's (-90 = nadir)."""
+    sigma_xy_m: float | None = None
+    """Horizontal standard deviation in m."""
+    sigma_z_m: float | None = None
+    """Vertical standard deviation in m."""
+
+
+class PhotoNames:
+    """Finds the photo a side file means: by path, by file name, by name without ending, whatever the case."""
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._by_key: dict[str, list[str]] = {}
+        for name in names:
+            path = PurePosixPath(name.lower())
+            for key in {name.lower(), path.name, path.stem}:
+                self._by_key.setdefault(key, []).append(name)
+
+    def find(self, written: str) -> str | None:
+        """The one photo meant; None where there is none or the name fits several."""
+        path = PurePosixPath(written.strip().replace("\\", "/").lower())
+        for key in (str(path), path.name, path.stem):
+            found = self._by_key.get(key, [])
+            if len(found) == 1:
+                return found[0]
+        return None
+
+
+def sentence_of(names: Sequence[str]) -> str:
+    """`a, b, c and 7 more`."""
+    head = ", ".join(names[:_SHOWN])
+    return f"{head} and {len(names) - _SHOWN} more" if len(names) > _SHOWN else head
+
+
+def apply_rows(
+    photos: Sequence[Photo], rows: Sequence[SideRow], *, file: Path, source: str
+) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    """The photos with the rows' positions and angles in place of their own, and notes.
+
+    Raises `SideFileError` where not one row names a photo of the survey, or a row's position is void.
+    """
+    names = PhotoNames(p.name for p in photos)
+    found = {names.find(row.name): row for row in rows}
+    strangers = [row.name for row in rows if names.find(row.name) is None]
+    if rows and len(strangers) == len(rows):
+        raise SideFileError(
+            f"{file.name} names {sentence_of(strangers)}; none of the {len(photos)} photos is called that "
+            f"(they are {sentence_of([p.name for p in photos])}). Correct the names or leave the file away."
+        )
+    _check(rows, file)
+    changed = tuple(_override(p, found, source) for p in photos)
+    without = [p.name for p in photos if p.name not in found]
+    notes = (
+        f"{file.name} placed {len(photos) - len(without)} of {len(photos)} photos.",
+        f"{file.name} names photos that are not there: {sentence_of(strangers)}." if strangers else "",
+        f"{file.name} says nothing of {sentence_of(without)}; their own metadata count." if without else "",
+    )
+    return changed, tuple(n for n in notes if n)
+
+
+def _check(rows: Sequence[SideRow], file: Path) -> None:
+    for row in rows:
+        placed = row.latitude_deg is not None or row.longitude_deg is not None
+        if placed and (reason := why_void(row.latitude_deg, row.longitude_deg)):
+            raise SideFileError(
+                f"{file.name}: the position of {row.name} is void: {reason}. Correct that row."
+            )
+
+
+def _override(photo: Photo, rows: Mapping[str | None, SideRow], source: str) -> Photo:
+    row = rows.get(photo.name)
+    if row is None:
+        return photo
+    position = _position(photo.position, row, source)
+    attitude = _attitude(row, source) or photo.attitude
+    mended = ("GPS position", "no GPS") if position else ()
+    notes = tuple(n for n in photo.notes if not any(m in n for m in mended))
+    return replace(photo, position=position, attitude=attitude, notes=notes)
+
+
+def _position(old: GeoPosition | None, row: SideRow, source: str) -> GeoPosition | None:
+    if row.latitude_deg is None or row.longitude_deg is None:
+        return old
+    base = old or GeoPosition(latitude_deg=0, longitude_deg=0, altitude_m=None, datum="unknown")
+    placed = replace(
+        base,
+        latitude_deg=row.latitude_deg,
+        longitude_deg=row.longitude_deg,
+        sigma_xy_m=row.sigma_xy_m or base.sigma_xy_m,
+        source=source,
+    )
+    if row.altitude_m is None:
+        return placed
+    field = {"takeoff": "takeoff_m", "sea_level": "sea_level_m", "ellipsoid": "ellipsoid_m"}.get(row.datum)
+    placed = replace(placed, altitude_m=row.altitude_m, datum=row.datum)
+    placed = replace(placed, sigma_z_m=row.sigma_z_m or base.sigma_z_m)
+    return replace(placed, **{field: row.altitude_m}) if field else placed  # type: ignore[arg-type]
+
+
+def _attitude(row: SideRow, source: str) -> Attitude | None:
+    if row.angles_deg is None:
+        return None
+    yaw, pitch, roll = row.angles_deg
+    if pitch < _LOOKS_DOWN_AT_MINUS_90:
+        yaw, pitch, roll = belly_from_gimbal(yaw, pitch, roll)
+    return Attitude(yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll, source=source)

@@ -1,0 +1,48 @@
+"""Positions that cannot be: one photo far from all others."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.model.photo import Photo
+
+_FAR_M = 5_000.0
+_FAR_SPREADS = 20.0
+_METRES_PER_DEGREE = 111_320.0
+
+
+def without_outliers(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    """The photos, with positions taken off those that lie absurdly far away, and a note for each.
+
+    Absurd is more than 5 km from the median and more than 20 times the median distance to it; three positions
+    are the least that can tell which one is wrong. The photo stays, and its note keeps the value.
+    """
+    placed = [p for p in photos if p.position]
+    if len(placed) < 3:
+        return tuple(photos), ()
+    distance = dict(zip((p.name for p in placed), distances_to_median(placed), strict=True))
+    limit = max(_FAR_M, _FAR_SPREADS * float(np.median(list(distance.values()))))
+    far = {name: d for name, d in distance.items() if d > limit}
+    notes = tuple(f"{name} claims to lie {d / 1000:.0f} km from the others." for name, d in far.items())
+    return tuple(_unplaced(p, far[p.name]) if p.name in far else p for p in photos), notes
+
+
+def distances_to_median(photos: Sequence[Photo]) -> NDArray[np.float64]:
+    """Horizontal distances (n,) in m of placed photos to the median of their positions."""
+    places = [(p.position.latitude_deg, p.position.longitude_deg) for p in photos if p.position]
+    degrees = np.array(places, dtype=np.float64)
+    middle = np.median(degrees, axis=0)
+    away = degrees - middle
+    away[:, 1] = (away[:, 1] + 180) % 360 - 180
+    away[:, 1] *= np.cos(np.radians(middle[0]))
+    return np.asarray(np.hypot(*away.T) * _METRES_PER_DEGREE)
+
+
+def _unplaced(photo: Photo, distance_m: float) -> Photo:
+    if photo.position is None:
+        return photo
+    place = f"{photo.position.latitude_deg:.6f}, {photo.position.longitude_deg:.6f}"
+    note = f"Its position ({place}) lies {distance_m / 1000:.0f} km from the other photos and was not used."
+    return replace(photo, position=None, notes=(*photo.notes, note))
