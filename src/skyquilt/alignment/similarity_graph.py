@@ -1,0 +1,183 @@
+"""A first solution for all photos: every photo a similarity x = a p + t of the plane, from links alone.
+
+p = (x - cx) - i (y - cy) over the focal length (y up), a = height * exp(-i yaw). A linear least-squares fit of
+points shrinks the map to lower its cost; therefore scales and angles are averaged first and translations come
+after (B/C of the methods). Positions join last, robustly.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import linalg as sparse_linalg
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+
+Complex = NDArray[np.complex128]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlaneLink:
+    """A link in normalised image coordinates."""
+
+    a: int
+    """Index of the first photo."""
+    b: int
+    """Index of the second photo."""
+    b_S_a: complex
+    """p_b = b_S_a p_a + t."""
+    p_a: complex
+    """Mean of the matched points in a."""
+    p_b: complex
+    """Mean of the matched points in b."""
+    weight: float
+    """Trust, e.g. the square root of the number of inliers."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlaneSolution:
+    """Similarities of the photos of one block, in units of the block unless georeferenced."""
+
+    members: NDArray[np.int64]
+    """Indices of the photos."""
+    a: Complex
+    """(k,) factors."""
+    t: Complex
+    """(k,) translations."""
+    link_error: Array
+    """Misfit of each of the block's links in normalised image units."""
+
+
+def components(count: int, links: Sequence[PlaneLink]) -> list[NDArray[np.int64]]:
+    """Connected groups of photos, largest first (single photos included)."""
+    graph = sparse.coo_matrix(
+        (np.ones(len(links)), ([k.a for k in links], [k.b for k in links])), (count, count)
+    )
+    _, label = connected_components(graph, directed=False)
+    groups = [np.flatnonzero(label == g) for g in range(label.max() + 1)]
+    return sorted(groups, key=lambda g: (-len(g), int(g[0])))
+
+
+def _spanning_start(members: NDArray, links: Sequence[PlaneLink], index: dict[int, int]) -> Complex:
+    """log a of each member along the strongest spanning tree; root 0."""
+    k = len(members)
+    cost = sparse.lil_matrix((k, k))
+    step: dict[tuple[int, int], complex] = {}
+    for link in links:
+        i, j = index[link.a], index[link.b]
+        cost[i, j] = 1.0 / (1e-6 + link.weight)
+        step[i, j], step[j, i] = -np.log(link.b_S_a), np.log(link.b_S_a)  # log a_b = log a_a - log S
+    tree = minimum_spanning_tree(cost.tocsr())
+    order, parent = breadth_first_order(tree, 0, directed=False)
+    log_a = np.zeros(k, complex)
+    for node in order[1:]:
+        log_a[node] = log_a[parent[node]] + step[int(parent[node]), int(node)]
+    return log_a
+
+
+def _solve_differences(i: Array, j: Array, d: Complex, w: Array, count: int, anchor: Complex, wa: Array) -> Complex:
+    """Least squares of x_j - x_i = d with weights w and of x = anchor with weights wa (>= 1e-6)."""
+    rows = np.arange(len(i))
+    B = sparse.csr_matrix(
+        (np.r_[w, -w], (np.r_[rows, rows], np.r_[j, i])), (len(i), count)
+    )
+    normal = (B.T @ B + sparse.diags(wa**2)).tocsc()
+    rhs = B.T @ (w * d) + wa**2 * anchor
+    return np.asarray(sparse_linalg.splu(normal.astype(complex)).solve(rhs))
+
+
+def _robust_differences(
+    i: Array, j: Array, d: Complex, weight: Array, start: Complex, anchor: Complex, sigma_anchor: Array,
+    unit: float, *, angular: bool = False,
+) -> Complex:  # fmt: skip
+    """Iteratively reweighted solution; `unit` is the misfit at which a link counts half."""
+    x = start
+    for _ in range(15):
+        misfit = d - (x[j] - x[i])
+        if angular:
+            misfit = misfit.real + 1j * ((misfit.imag + np.pi) % (2 * np.pi) - np.pi)
+        w = weight / unit / np.sqrt(1 + (np.abs(misfit) / unit) ** 2)
+        far = np.abs(x - anchor) / sigma_anchor
+        wa = 1 / sigma_anchor / np.sqrt(1 + (far / 3) ** 2)
+        step = _solve_differences(i, j, misfit, w, len(x), anchor - x, np.maximum(wa, 1e-6))
+        x = x + step
+        if np.abs(step).max() < 1e-7 * max(1.0, float(np.abs(x).max())):
+            break
+    return x
+
+
+def solve_block(members: NDArray[np.int64], links: Sequence[PlaneLink]) -> PlaneSolution:
+    """Similarities of one connected block; its first photo has a = 1, t = 0 (units of that photo's height)."""
+    index = {int(m): k for k, m in enumerate(members)}
+    i = np.array([index[link.a] for link in links], int)
+    j = np.array([index[link.b] for link in links], int)
+    weight = np.sqrt(np.array([link.weight for link in links]))
+    weight /= weight.mean() if len(weight) else 1.0
+    none = np.full(len(members), 1e5)
+    start = _spanning_start(members, links, index)
+    log_s = np.array([-np.log(link.b_S_a) for link in links])
+    log_a = _robust_differences(i, j, log_s, weight, start, start, none, 0.03, angular=True)
+    a = np.exp(log_a - log_a[0])
+    pa, pb = np.array([link.p_a for link in links]), np.array([link.p_b for link in links])
+    d = a[i] * pa - a[j] * pb
+    t = _robust_differences(i, j, d, weight, np.zeros(len(a), complex), np.zeros(len(a), complex), none, 0.03)
+    error = np.abs(a[i] * pa + t[i] - a[j] * pb - t[j])
+    turn = np.abs(np.array([link.b_S_a for link in links]) * a[j] / a[i] - 1)
+    return PlaneSolution(members=members, a=a, t=t - t[0], link_error=np.maximum(error, 0.5 * turn))
+
+
+def fit_similarity(x: Complex, y: Complex, sigma: Array, *, turn: complex | None = None) -> tuple[complex, complex, float]:
+    """g, c and the robust misfit of y = g x + c; `turn` fixes g's direction when points cannot.
+
+    Started from the median of all pairs' ratios, so up to half of the positions may lie.
+    """
+    k, m = np.triu_indices(len(x), 1)
+    far = np.abs(x[k] - x[m]) > 1e-6
+    ratio = (y[k] - y[m])[far] / (x[k] - x[m])[far]
+    reach = np.abs(x[k] - x[m])[far]
+    ratio = ratio[reach >= np.median(reach)]
+    g = np.exp(np.median(np.log(np.abs(ratio) + 1e-12))) * _median_direction(ratio)
+    if turn is not None:
+        g = abs(g) * turn / abs(turn)
+    c = _median(y - g * x)
+    for _ in range(20):
+        e = np.abs(y - g * x - c) / sigma
+        w = 1 / sigma**2 / (1 + (e / 3) ** 2)
+        xm, ym = (w * x).sum() / w.sum(), (w * y).sum() / w.sum()
+        g_new = (w * np.conj(x - xm) * (y - ym)).sum() / (w * np.abs(x - xm) ** 2).sum()
+        g = g_new if turn is None else abs(g_new) * turn / abs(turn)
+        c = ym - g * xm
+    return complex(g), complex(c), float(np.median(np.abs(y - g * x - c)) / 1.18)
+
+
+def _median(z: Complex) -> complex:
+    return complex(np.median(z.real), np.median(z.imag))
+
+
+def _median_direction(z: Complex) -> complex:
+    u = z / np.maximum(np.abs(z), 1e-12)
+    mean = _median(u)
+    return mean / abs(mean) if abs(mean) > 0.1 else u.mean() / max(abs(u.mean()), 1e-12)
+
+
+def tie_to_positions(
+    solution: PlaneSolution, links: Sequence[PlaneLink], position: Complex, sigma: Array
+) -> PlaneSolution:
+    """Moves a georeferenced solution so that links and positions agree: strips stop bending away.
+
+    `position` (k,) in m, NaN where unknown; `sigma` (k,) in m. Links count to about 2 % of the height.
+    """
+    index = {int(m): k for k, m in enumerate(solution.members)}
+    i = np.array([index[link.a] for link in links], int)
+    j = np.array([index[link.b] for link in links], int)
+    a = solution.a
+    d = np.array([a[index[k.a]] * k.p_a - a[index[k.b]] * k.p_b for k in links])
+    height = float(np.median(np.abs(a)))
+    weight = np.ones(len(links))
+    known = np.isfinite(position)
+    anchor = np.where(known, position, solution.t)
+    far = np.where(known, sigma, 1e5)
+    t = _robust_differences(i, j, d, weight, solution.t, anchor, far, 0.02 * height)
+    return PlaneSolution(members=solution.members, a=a, t=t, link_error=solution.link_error)

@@ -1,0 +1,65 @@
+"""SIFT with RootSIFT descriptors, spread over the image."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.imaging.grey import full_px, shrink, to_grey8
+from skyquilt.model.features import Features
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sift:
+    """SIFT (Lowe 2004) on a shrunken image, descriptors as RootSIFT (Arandjelovic and Zisserman 2012)."""
+
+    count: int = 2000
+    """Most keypoints kept per photo."""
+    longest: int = 1000
+    """Longest side in px of the image searched; smaller photos are searched as they are."""
+    contrast: float = 0.015
+    """OpenCV's contrast threshold."""
+    cells: int = 10
+    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare."""
+    version: ClassVar[int] = 1
+
+    def __call__(self, image: NDArray) -> Features:
+        """Features of pixels (H, W[, C]) of a full sensor image."""
+        return self.of_shrunken(shrink(image, self.longest)[0], image.shape[:2])
+
+    def of_shrunken(self, small: NDArray, full: tuple[int, int]) -> Features:
+        """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer to."""
+        grey = to_grey8(small)
+        detector = cv2.SIFT_create(int(1.4 * self.count), contrastThreshold=self.contrast)
+        points, descriptors = detector.detectAndCompute(grey, None)
+        if descriptors is None:
+            points, descriptors = (), np.zeros((0, 128), np.float32)
+        xy = np.array([p.pt for p in points], np.float64).reshape(-1, 2)
+        keep = _spread(xy, np.array([p.response for p in points]), grey.shape, self.count, self.cells)
+        scale = full[1] / grey.shape[1]
+        size = np.array([p.size for p in points], np.float32)[keep] * scale
+        px = full_px(xy[keep], grey.shape, full)
+        return Features(px=px, size=size, descriptors=_root(descriptors[keep]), scale=scale)
+
+
+def _root(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """RootSIFT: L1-normalised, then the square root, which has unit length."""
+    total = np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
+    return np.asarray(np.sqrt(descriptors / total), np.float32)
+
+
+def _spread(
+    xy: NDArray, response: NDArray, shape: tuple[int, int], count: int, cells: int
+) -> NDArray[np.int64]:
+    """Indices of `count` points: round after round the strongest left in every cell of the image."""
+    if len(xy) <= count:
+        return np.arange(len(xy))
+    column, row = (xy / (shape[1], shape[0]) * cells).astype(int).clip(0, cells - 1).T
+    cell = row * cells + column
+    order = np.lexsort((-response, cell))
+    starts = np.flatnonzero(np.r_[True, np.diff(cell[order]) != 0])
+    rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
+    best = np.lexsort((-response[order], rank))[:count]
+    return np.sort(order[best])

@@ -1,0 +1,42 @@
+"""Pictures for feature detection: small, grey, 8 bit, whatever came from the sensor."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+
+def shrink(image: NDArray, longest: int) -> tuple[NDArray, float]:
+    """The image area-averaged so that its longest side is at most `longest` px, and the scale it lost.
+
+    The scale is full-size px per px of the result, exact for both axes to within rounding of the size.
+    """
+    height, width = image.shape[:2]
+    scale = max(1.0, max(width, height) / longest)
+    if scale == 1.0:
+        return image, 1.0
+    size = (round(width / scale), round(height / scale))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA), width / size[0]
+
+
+def to_grey8(image: NDArray) -> NDArray[np.uint8]:
+    """Grey, 8 bit (H, W). Radiometric input is stretched between its 1st and 99th percentile, then
+    equalised locally, because a scene's few degrees fill a small part of a thermal sensor's range.
+    """
+    if image.ndim == 3:
+        image = image[..., 0] if image.shape[2] == 1 else cv2.cvtColor(image[..., :3], cv2.COLOR_RGB2GRAY)
+    if image.dtype == np.uint8:
+        return image
+    values = image.astype(np.float32)
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return np.zeros(values.shape, np.uint8)
+    low, high = np.percentile(finite, [1, 99])
+    stretched = np.nan_to_num((values - low) / max(float(high - low), 1e-6) * 255, nan=0.0)
+    grey = np.clip(stretched, 0, 255).astype(np.uint8)
+    return np.asarray(cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(grey))
+
+
+def full_px(px: NDArray, shape: tuple[int, int], full: tuple[int, int]) -> NDArray[np.float64]:
+    """Pixels (N, 2) of a shrunken image of `shape` (H, W) in the full image's (H, W), centres at integers."""
+    factor = np.array([full[1] / shape[1], full[0] / shape[0]])
+    return np.asarray((np.asarray(px, np.float64) + 0.5) * factor - 0.5)

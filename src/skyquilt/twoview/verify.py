@@ -1,0 +1,63 @@
+"""Verification of a pair: one similarity, loosely, then one epipolar geometry, tightly."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import cv2
+import numpy as np
+
+from skyquilt.model.features import Features, Link, Matches, RejectedLink
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verify:
+    """Near-nadir photos of one ground differ by a similarity up to relief and tilt; relief obeys epipolar geometry."""
+
+    similarity_share: float = 0.03
+    """Tolerance of the similarity as a share of the image width: room for relief and tilt."""
+    epipolar_px: float = 1.0
+    """MAGSAC threshold in px of the image that the features were found in."""
+    minimum: int = 15
+    """Fewest inliers of a link."""
+    scale: float = 1.7
+    """Largest factor between the ground resolutions of two photos."""
+    version: ClassVar[int] = 1
+
+    def __call__(
+        self, a: int, b: int, features_a: Features, features_b: Features, matches: Matches, width: int
+    ) -> Link | RejectedLink:
+        """The link of photos a and b (indices), or why there is none. `width`: image width in px."""
+        if len(matches) < self.minimum:
+            return RejectedLink(a=a, b=b, reason=f"too few matches ({len(matches)} of {self.minimum})")
+        pa = features_a.px[matches.index_a]
+        pb = features_b.px[matches.index_b]
+        tolerance = self.similarity_share * width
+        model, inliers = cv2.estimateAffinePartial2D(
+            pa, pb, ransacReprojThreshold=tolerance, maxIters=2000, confidence=0.999, refineIters=5
+        )
+        if model is None:
+            return RejectedLink(a=a, b=b, reason="no common similarity")
+        keep = np.flatnonzero(inliers.ravel())
+        scale = float(np.hypot(model[0, 0], model[1, 0]))
+        if len(keep) < self.minimum:
+            return RejectedLink(a=a, b=b, reason=f"weak inliers ({len(keep)} of {len(matches)} matches)")
+        if not 1 / self.scale < scale < self.scale:
+            return RejectedLink(a=a, b=b, reason=f"implausible scale ({scale:.2f})")
+        keep = self._epipolar(pa, pb, keep, max(features_a.scale, features_b.scale))
+        if len(keep) < self.minimum:
+            return RejectedLink(a=a, b=b, reason=f"weak inliers after epipolar check ({len(keep)})")
+        # image y runs down: conjugate to get the y-up similarity
+        return Link(
+            a=a, b=b, index_a=matches.index_a[keep], index_b=matches.index_b[keep],
+            b_S_a=complex(model[0, 0], -model[1, 0]),
+        )  # fmt: skip
+
+    def _epipolar(self, pa: np.ndarray, pb: np.ndarray, keep: np.ndarray, scale: float) -> np.ndarray:
+        """Indices of those in `keep` that agree with one epipolar geometry."""
+        try:
+            _, inliers = cv2.findFundamentalMat(
+                pa[keep], pb[keep], cv2.USAC_MAGSAC, self.epipolar_px * scale, 0.999, 1000
+            )
+        except cv2.error:
+            return keep[:0]
+        return keep[:0] if inliers is None else keep[inliers.ravel() > 0]
