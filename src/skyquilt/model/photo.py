@@ -7,8 +7,8 @@ from typing import Literal
 
 from skyquilt.model.camera import Camera
 
-Datum = Literal["takeoff", "sea_level", "ellipsoid", "unknown"]
-"""What a height is counted from."""
+Datum = Literal["takeoff", "sea_level", "ellipsoid", "control", "unknown"]
+"""What a height is counted from; `control`: whatever the heights of the control points are."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

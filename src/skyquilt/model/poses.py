@@ -108,7 +108,9 @@ class Alignment:
     poses: dict[int, Pose]
     """By index of the photo."""
     cameras: dict[str, Camera]
-    """By `Photo.camera_key`."""
+    """Calibrations by name: `Photo.camera_key`, or that plus `/turned` for files rewritten upside down."""
+    camera_of: dict[int, str]
+    """Photo index -> name of its calibration."""
     blocks: tuple[tuple[int, ...], ...]
     """Photos that hang together by tie points, largest block first; single photos placed by metadata last."""
     ties: TiePoints
@@ -121,6 +123,10 @@ class Alignment:
     """RMS over photos of the position residual of each photo predicted from all the others."""
     notes: tuple[str, ...] = ()
     """Plain sentences worth a reader's attention."""
+
+    def camera(self, photo: int) -> Camera:
+        """The calibration of a photo."""
+        return self.cameras[self.camera_of[photo]]
 
 
 def no_ties() -> TiePoints:

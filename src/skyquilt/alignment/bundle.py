@@ -1,0 +1,184 @@
+"""`bundle`: similarity graph -> adjustment with self-calibration and priors -> points of the ground."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.adjust import adjust, covariance
+from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
+from skyquilt.alignment.problem import Problem, State, residuals_px
+from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
+from skyquilt.alignment.start import Start, find_start
+from skyquilt.alignment.tracks import Tracks, build_tracks, thin
+from skyquilt.alignment.triangulate import intersect, polish
+from skyquilt.errors import AlignmentError
+from skyquilt.geometry.camera import undistort
+from skyquilt.model.camera import Camera
+from skyquilt.model.features import Features, Link
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bundle:
+    """Bundle adjustment of all linked photos at once."""
+
+    distortion: str = "4"
+    """Distortion that self-calibration may change: `none`, `2`, `4`, `6` (radial order) or `6t` (and tangential)."""
+    per_photo: int = 400
+    """Sightings per photo in the adjustment; all the others are triangulated afterwards."""
+    repair: bool = True
+    """Treat metadata as measurements that may lie; False believes them to their stated deviations."""
+    version: ClassVar[int] = 1
+
+    def __call__(
+        self, photos: Sequence[Photo], frame: MapFrame, priors: Sequence[Prior], features: Sequence[Features],
+        links: Sequence[Link], control: Sequence[Control] = (),
+    ) -> Alignment:  # fmt: skip
+        """Aligns the photos that hang together by links.
+
+        Raises:
+            AlignmentError: no two photos are linked.
+        """
+        start = find_start(photos, priors, features, links)
+        if not start.blocks:
+            raise AlignmentError(f"none of {len(photos)} photos could be linked to another one")
+        tracks = build_tracks(features, start.links)
+        setup = set_up(photos, priors, start, distortion=self.distortion, repair=self.repair)
+        sizes = [(p.width, p.height) for p in photos]
+        used = setup.sensor_tracks(tracks)
+        problem, state = setup.problem(thin(used, sizes, per_photo=self.per_photo))
+        problem, state = _refine(problem, state)
+        if self.repair:
+            problem, state = _believe_positions_less(problem, state, setup)
+        problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
+        return _outcome(photos, frame, setup, start, used, problem, state, reports)
+
+
+def _refine(problem: Problem, state: State) -> tuple[Problem, State]:
+    """From coarse to fine: intrinsics fixed under a wide loss, then all free under narrower ones, pruning between."""
+    fixed = replace(problem, free=np.zeros_like(problem.free), loss_px=20.0)
+    state = adjust(fixed, state, iterations=10, tolerance=3e-2).state
+    problem, state = prune(problem, state, 40.0)
+    state = adjust(problem.with_loss(6.0), state, iterations=12, tolerance=5e-3).state
+    problem, state = prune(problem, state, 12.0)
+    state = adjust(problem.with_loss(2.5), state, iterations=12, tolerance=1e-3).state
+    problem, state = prune(problem, state, 5.0)
+    return problem, adjust(problem.with_loss(2.0), state, iterations=15, tolerance=1e-4).state
+
+
+def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]:
+    """Without the sightings off by more than `limit` deviations, and points then seen once; control stays."""
+    error = np.linalg.norm(residuals_px(problem, state), axis=1) / problem.sigma_px
+    pinned = np.isfinite(problem.X0).any(1)
+    good = (error < limit) | pinned[problem.point]
+    enough = np.bincount(problem.point[good], minlength=len(state.X)) >= 2
+    good &= enough[problem.point] | pinned[problem.point]
+    points, renumbered = np.unique(problem.point[good], return_inverse=True)
+    thinner = replace(
+        problem, point=renumbered.astype(np.int64), photo=problem.photo[good], px=problem.px[good],
+        sigma_px=problem.sigma_px[good], X0=problem.X0[points], sigma_X=problem.sigma_X[points],
+    )  # fmt: skip
+    return thinner, replace(state, X=state.X[points])
+
+
+def _believe_positions_less(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
+    """Where the block contradicts the stated position accuracy, the block's own estimate takes its place."""
+    for _ in range(2):
+        error = np.abs(state.C - problem.C0)
+        sigma = problem.sigma_C.copy()
+        for axes in ([0, 1], [2]):
+            for block in setup.block_rows:
+                e = error[np.ix_(block, axes)]
+                if np.isfinite(e).sum() >= 6:
+                    measured = 1.48 * float(np.nanmedian(e))
+                    stated = setup.stated_sigma_C[np.ix_(block, axes)]
+                    sigma[np.ix_(block, axes)] = np.maximum(stated, measured)
+        if np.allclose(sigma, problem.sigma_C, rtol=0.15, equal_nan=True):
+            break
+        problem = replace(problem, sigma_C=sigma)
+        state = adjust(problem.with_loss(2.0), state, iterations=10, tolerance=1e-4).state
+    return problem, state
+
+
+def leave_one_out(problem: Problem, state: State, C_covariance: Array | None) -> tuple[float, float, float] | None:
+    """RMS per axis in m of each measured position against the position that everything else predicts.
+
+    From the covariance of the full solution (the usual identity for linear least squares), not by n solutions.
+    """
+    known = np.flatnonzero(np.isfinite(problem.C0[:, :2]).all(1))
+    if C_covariance is None or len(known) < 3:
+        return None
+    out = []
+    for i in known:
+        axes = np.isfinite(problem.C0[i])
+        e = (state.C[i] - problem.C0[i])[axes]
+        white = e / problem.sigma_C[i][axes]
+        precision = np.diag(1 / problem.sigma_C[i][axes] ** 2) / (1 + (white @ white) / problem.loss_C**2)
+        own = C_covariance[6 * i + 3 : 6 * i + 6, 6 * i + 3 : 6 * i + 6][np.ix_(axes, axes)]
+        full = np.full(3, np.nan)
+        full[axes] = np.linalg.solve(np.eye(len(e)) - own @ precision, e)
+        out.append(full)
+    rms = np.sqrt(np.nanmean(np.array(out) ** 2, axis=0)) if out else np.full(3, np.nan)
+    return float(rms[0]), float(rms[1]), float(rms[2])
+
+
+def ground_points(tracks: Tracks, setup: Setup, problem: Problem, state: State) -> TiePoints:
+    """All tracks triangulated with the final poses; bad sightings and unstable points dropped."""
+    everything, _ = setup.problem(tracks)
+    everything = replace(everything, loss_px=2.0)
+    origin = state.C[everything.photo]
+    xy = np.empty((len(everything.px), 2))
+    for row, k in enumerate(state.K):
+        own = setup.camera[everything.photo] == row
+        camera = Camera(width=1, height=1, **dict(zip(("focal", "cx", "cy", "k1", "k2", "k3", "p1", "p2"), k, strict=True)))
+        xy[own] = undistort(camera, everything.px[own])
+    local = np.column_stack([xy, np.ones(len(xy))])
+    direction = np.einsum("nji,nj->ni", state.R[everything.photo], local)
+    X = intersect(everything.point, origin, direction, tracks.count)
+    whole = replace(state, X=X)
+    whole, _ = polish(everything, whole, iterations=3)
+    everything, whole = prune(everything, whole, 5.0)
+    whole, sigma_z = polish(everything, whole, iterations=2)
+    height = float(np.median(state.C[:, 2]) - np.median(whole.X[:, 2]))
+    keep = (sigma_z < 0.05 * abs(height))[everything.point]
+    points, renumbered = np.unique(everything.point[keep], return_inverse=True)
+    photo = setup.members[everything.photo[keep]]
+    return TiePoints(
+        xyz=whole.X[points],
+        point=renumbered.astype(np.int64),
+        photo=photo,
+        px=setup.file_px(photo, everything.px[keep]),
+        residual_px=residuals_px(everything, whole)[keep] * setup.file_sign(photo),
+    )
+
+
+def _outcome(
+    photos: Sequence[Photo], frame: MapFrame, setup: Setup, start: Start, tracks: Tracks,
+    problem: Problem, state: State, control: Sequence[Control],
+) -> Alignment:  # fmt: skip
+    ties = ground_points(tracks, setup, problem, state)
+    seen = np.bincount(ties.photo, minlength=len(photos))
+    weak = {int(i): f"only {seen[i]} tie points hold it" for i in setup.members if seen[i] < 8}
+    full = covariance(problem, state)
+    variance = _variance_factor(problem, state)
+    cameras, camera_of = camera_records(photos, setup, state, None if full is None else full * variance)
+    poses = {i: p for i, p in pose_records(setup, state).items() if i not in weak}
+    blocks = tuple(tuple(i for i in b if i not in weak) for b in start.blocks)
+    return Alignment(
+        method="bundle", why="", frame=replace(frame, metric=frame.metric and start.metric), poses=poses,
+        cameras=cameras, camera_of=camera_of, blocks=tuple(b for b in blocks if b), ties=ties, rejected=weak,
+        control=residuals_of_control(control, frame, setup, problem, state),
+        loo_rms_m=leave_one_out(problem, state, full),
+    )  # fmt: skip
+
+
+def _variance_factor(problem: Problem, state: State) -> float:
+    """Robust variance of the whitened sightings."""
+    e = residuals_px(problem, state) / problem.sigma_px[:, None]
+    return float((1.48 * np.nanmedian(np.abs(e))) ** 2)

@@ -1,0 +1,179 @@
+"""Control points: observations that hold the block to the ground; check points: the judges kept out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import Transformer
+
+from skyquilt.alignment.adjust import adjust
+from skyquilt.alignment.problem import Problem, State, residuals_px
+from skyquilt.alignment.setup import Setup
+from skyquilt.alignment.triangulate import intersect, polish
+from skyquilt.errors import AlignmentError
+from skyquilt.geometry.camera import undistort
+from skyquilt.model.camera import PARAMETERS, Camera
+from skyquilt.model.photo import ControlPoint, Photo
+from skyquilt.model.poses import ControlResidual, MapFrame
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Control:
+    """A control or check point in the map frame."""
+
+    name: str
+    """Label."""
+    check: bool
+    """True: kept out of the adjustment."""
+    xyz: Array
+    """(3,) in m, z NaN where unknown."""
+    sigma_m: float
+    """Deviation of each coordinate in m."""
+    photo: NDArray[np.int64]
+    """(k,) photos that show it."""
+    px: Array
+    """(k, 2) where, in file pixels."""
+
+
+def control_in_frame(
+    points: Sequence[ControlPoint], photos: Sequence[Photo], frame: MapFrame
+) -> tuple[Control, ...]:
+    """Control points in map coordinates; sightings in unknown photos are left out, points never seen too."""
+    index = {p.name: i for i, p in enumerate(photos)} | {p.path.name: i for i, p in enumerate(photos)}
+    found = []
+    for point in points:
+        seen = [(index[o.photo], o.x, o.y) for o in point.observations if o.photo in index]
+        if not seen or frame.crs is None:
+            continue
+        x, y = Transformer.from_crs(point.crs, frame.crs, always_xy=True).transform(point.x, point.y)
+        xyz = np.array([x - frame.origin[0], y - frame.origin[1], np.nan if point.z is None else point.z])
+        photo, px = np.array([s[0] for s in seen]), np.array([s[1:] for s in seen], float)
+        found.append(
+            Control(name=point.name, check=point.check, xyz=xyz, sigma_m=point.sigma_m, photo=photo, px=px)
+        )
+    return tuple(found)
+
+
+def _placed(control: Control, setup: Setup) -> tuple[NDArray[np.int64], Array]:
+    """Rows and sensor pixels of the sightings in placed photos."""
+    mine = np.isin(control.photo, setup.members)
+    photo = control.photo[mine]
+    return np.searchsorted(setup.members, photo), setup.file_px(photo, control.px[mine])
+
+
+def _sightings(control: Sequence[Control], setup: Setup) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Point numbers, rows and sensor pixels of all sightings."""
+    parts = [_placed(c, setup) for c in control]
+    point = np.repeat(np.arange(len(parts)), [len(row) for row, _ in parts])
+    row = np.concatenate([row for row, _ in parts] or [np.zeros(0, int)])
+    return point, row, np.concatenate([px for _, px in parts] or [np.zeros((0, 2))])
+
+
+def _alone(control: Sequence[Control], setup: Setup, problem: Problem, state: State) -> tuple[Problem, State]:
+    """The control points alone, seen by the poses as they are, intersected from their rays."""
+    point, row, px = _sightings(control, setup)
+    xy = np.empty_like(px)
+    for k, values in enumerate(state.K):
+        own = problem.camera[row] == k
+        camera = Camera(width=1, height=1, **dict(zip(PARAMETERS, values, strict=True)))
+        xy[own] = undistort(camera, px[own])
+    direction = np.einsum("nji,nj->ni", state.R[row], np.column_stack([xy, np.ones(len(xy))]))
+    X = intersect(point, state.C[row], direction, len(control))
+    empty = np.full((len(control), 3), np.nan)
+    own_problem = replace(
+        problem, point=point, photo=row, px=px, sigma_px=np.ones(len(px)), X0=empty, sigma_X=np.ones_like(empty)
+    )
+    return own_problem, polish(own_problem, replace(state, X=X))[0]
+
+
+def intersected(control: Sequence[Control], setup: Setup, problem: Problem, state: State) -> tuple[Array, Array]:
+    """Where the poses see the points (k, 3) in m, and the RMS reprojection error of each in px."""
+    own, solved = _alone(control, setup, problem, state)
+    error = (residuals_px(own, solved) ** 2).sum(1)
+    count = np.maximum(np.bincount(own.point, minlength=len(control)), 1)
+    return solved.X, np.sqrt(np.bincount(own.point, error, len(control)) / count)
+
+
+def fit_similarity_3d(x: Array, y: Array) -> tuple[float, Array, Array]:
+    """s, R, t that minimise |y - (s R x + t)|^2 (Umeyama 1991); points (k, 3), k >= 3, not on a line."""
+    xm, ym = x.mean(0), y.mean(0)
+    U, D, Vt = np.linalg.svd((y - ym).T @ (x - xm))
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    R = U @ np.diag(sign) @ Vt
+    s = float((D * sign).sum() / ((x - xm) ** 2).sum())
+    return s, R, ym - s * R @ xm
+
+
+def _moved(problem: Problem, state: State, s: float, R: Array, t: Array) -> tuple[Problem, State]:
+    """State and positions under y = s R x + t."""
+    moved = State(R=state.R @ R.T, C=s * state.C @ R.T + t, K=state.K, X=s * state.X @ R.T + t)
+    C0 = s * problem.C0 @ R.T + t
+    return replace(problem, C0=C0, sigma_C=problem.sigma_C * s, R0=problem.R0 @ R.T), moved
+
+
+def hold_to_control(
+    problem: Problem, state: State, frame: MapFrame, setup: Setup, control: Sequence[Control]
+) -> tuple[Problem, State, MapFrame, Sequence[Control]]:
+    """The adjustment once more with control points as observations.
+
+    GPS positions share an offset (datum of heights, base station); the control points take it out first.
+
+    Raises:
+        AlignmentError: no position and fewer than three usable control points.
+    """
+    usable = [c for c in control if len(_placed(c, setup)[0]) >= 2]
+    fit = [c for c in usable if not c.check]
+    if not setup.georeferenced and frame.crs is not None and len(fit) < 3:
+        raise AlignmentError(
+            f"photos without positions need 3 control points seen in 2 placed photos each, the file gives {len(fit)}"
+        )
+    if not fit:
+        return problem, state, frame, usable
+    surveyed = np.array([c.xyz for c in fit])
+    seen, _ = intersected(fit, setup, problem, state)
+    if not setup.georeferenced:
+        level = np.nan_to_num(surveyed, nan=float(np.nanmean(surveyed[:, 2])) if np.isfinite(surveyed).all(1).any() else 0.0)
+        problem, state = _moved(problem, state, *fit_similarity_3d(seen, level))
+    else:
+        shift = np.nan_to_num(np.nanmedian(surveyed - seen, axis=0))
+        problem, state = _moved(problem, state, 1.0, np.eye(3), shift)
+    problem, state = _with_points(problem, state, setup, fit)
+    if not setup.georeferenced:
+        problem = replace(problem, sigma_C=np.full_like(problem.sigma_C, 1e4))
+    state = adjust(problem, state, iterations=25, tolerance=1e-5).state
+    heights = np.isfinite(surveyed[:, 2]).any()
+    return problem, state, replace(frame, vertical_datum="control", metric=True) if heights else frame, usable
+
+
+def _with_points(problem: Problem, state: State, setup: Setup, fit: Sequence[Control]) -> tuple[Problem, State]:
+    """Tie points and control points together."""
+    point, row, px = _sightings(fit, setup)
+    P = len(state.X)
+    surveyed = np.array([c.xyz for c in fit])
+    X, _ = intersected(fit, setup, problem, state)
+    joined = replace(
+        problem,
+        point=np.concatenate([problem.point, P + point]), photo=np.concatenate([problem.photo, row]),
+        px=np.concatenate([problem.px, px]), sigma_px=np.concatenate([problem.sigma_px, np.full(len(px), 0.7)]),
+        X0=np.concatenate([problem.X0, surveyed]),
+        sigma_X=np.concatenate([problem.sigma_X, np.array([[c.sigma_m] * 3 for c in fit])]),
+    )  # fmt: skip
+    return joined, replace(state, X=np.concatenate([state.X, X]))
+
+
+def residuals_of_control(
+    control: Sequence[Control], frame: MapFrame, setup: Setup, problem: Problem, state: State
+) -> tuple[ControlResidual, ...]:
+    """Errors of all control and check points at the solution, intersected from the final poses alone."""
+    if not control or frame.crs is None:
+        return ()
+    X, rms = intersected(control, setup, problem, state)
+    return tuple(
+        ControlResidual(
+            name=c.name, check=c.check, error_m=x - c.xyz, reprojection_px=float(r), sightings=len(_placed(c, setup)[0])
+        )
+        for c, x, r in zip(control, X, rms, strict=True)
+    )

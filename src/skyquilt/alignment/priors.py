@@ -1,0 +1,101 @@
+"""From what photos report to a map frame and priors in it."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+from pyproj import CRS, Proj, Transformer
+from pyproj.exceptions import CRSError
+
+from skyquilt.errors import UsageError
+from skyquilt.geometry.frames import angle_difference_deg
+from skyquilt.model.photo import ControlPoint, Datum, Photo
+from skyquilt.model.poses import MapFrame, Prior
+
+
+def utm_epsg(latitude_deg: float, longitude_deg: float) -> str:
+    """The UTM zone of a place as `EPSG:326zz` or `EPSG:327zz`."""
+    zone = int((longitude_deg + 180) // 6) % 60 + 1
+    return f"EPSG:{32600 + zone if latitude_deg >= 0 else 32700 + zone}"
+
+
+def choose_frame(photos: Sequence[Photo], crs: str | None, control: Sequence[ControlPoint] = ()) -> MapFrame:
+    """The frame of a survey: `crs` if asked for, else the UTM zone of the median position.
+
+    Without any position it is that of the control points; without those it stays ungeoreferenced.
+
+    Raises:
+        UsageError: `crs` is unknown, or not projected in metres.
+    """
+    places = [(p.position.latitude_deg, p.position.longitude_deg) for p in photos if p.position]
+    if not places and control:
+        to_wgs = Transformer.from_crs(control[0].crs, 4326, always_xy=True)
+        lon, lat = to_wgs.transform([c.x for c in control], [c.y for c in control])
+        places = list(zip(lat, lon, strict=True))
+    if not places:
+        metric = any(p.position and p.position.takeoff_m for p in photos)
+        return MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="unknown", metric=metric)
+    latitude, longitude = np.median(np.array(places), axis=0)
+    name = _checked_crs(crs) if crs else utm_epsg(latitude, longitude)
+    x, y = Transformer.from_crs(4326, name, always_xy=True).transform(longitude, latitude)
+    origin = (float(np.round(x, -2)), float(np.round(y, -2)))
+    convergence = Proj(name).get_factors(longitude, latitude).meridian_convergence
+    return MapFrame(crs=name, origin=origin, vertical_datum=_datum(photos), convergence_deg=float(convergence))
+
+
+def _checked_crs(crs: str) -> str:
+    try:
+        parsed = CRS.from_user_input(crs)
+    except CRSError as error:
+        raise UsageError(f"--crs {crs!r} is no coordinate system that PROJ knows; try e.g. EPSG:32633") from error
+    if not parsed.is_projected or any(axis.unit_name not in ("metre", "meter") for axis in parsed.axis_info[:2]):
+        raise UsageError(f"--crs {crs!r} ({parsed.name}) is not projected in metres; a mosaic needs one that is")
+    return crs
+
+
+def _datum(photos: Sequence[Photo]) -> Datum:
+    """The most trustworthy datum that most positions state."""
+    count = Counter(p.position.datum for p in photos if p.position and p.position.altitude_m is not None)
+    return count.most_common(1)[0][0] if count else "unknown"
+
+
+def _altitude(photo: Photo, datum: Datum) -> float:
+    """The photo's height above the frame's datum in m; NaN where it gives none."""
+    position = photo.position
+    if position is None:
+        return np.nan
+    by_datum = {
+        "takeoff": position.takeoff_m, "sea_level": position.sea_level_m, "ellipsoid": position.ellipsoid_m,
+    }  # fmt: skip
+    height = position.altitude_m if position.datum == datum else by_datum.get(datum)
+    return np.nan if height is None else float(height)
+
+
+def photo_prior(photo: Photo, frame: MapFrame, to_map: Transformer | None) -> Prior:
+    """What one photo says about its pose, in the map frame."""
+    C, sigma = np.full(3, np.nan), np.array([np.inf, np.inf, np.inf])
+    if photo.position and to_map is not None:
+        x, y = to_map.transform(photo.position.longitude_deg, photo.position.latitude_deg)
+        C[:2] = x - frame.origin[0], y - frame.origin[1]
+        sigma[:2] = photo.position.sigma_xy_m
+    if photo.position:
+        C[2] = _altitude(photo, frame.vertical_datum)
+        sigma[2] = photo.position.sigma_z_m
+    attitude = photo.attitude
+    yaw = attitude.yaw_deg if attitude else photo.flight_yaw_deg
+    return Prior(
+        map_C=C,
+        sigma_C=sigma,
+        yaw_deg=np.nan if yaw is None else angle_difference_deg(yaw, frame.convergence_deg),
+        pitch_deg=attitude.pitch_deg if attitude else 0.0,
+        roll_deg=attitude.roll_deg if attitude else 0.0,
+        sigma_yaw_deg=attitude.sigma_yaw_deg if attitude else 15.0,
+        sigma_tilt_deg=attitude.sigma_tilt_deg if attitude else 6.0,
+        yaw_source=attitude.source if attitude else ("xmp-flight" if yaw is not None else ""),
+    )
+
+
+def priors(photos: Sequence[Photo], frame: MapFrame) -> list[Prior]:
+    """Priors of all photos."""
+    to_map = Transformer.from_crs(4326, frame.crs, always_xy=True) if frame.crs else None
+    return [photo_prior(photo, frame, to_map) for photo in photos]

@@ -1,0 +1,232 @@
+"""From photos, priors and a start to the arrays of an adjustment, and back to records."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.problem import Problem, State
+from skyquilt.alignment.start import Start
+from skyquilt.alignment.tracks import Tracks
+from skyquilt.geometry.frames import angle_difference_deg, cam_R_map_from_angles
+from skyquilt.model.camera import Camera
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Pose, Prior
+
+Array = NDArray[np.float64]
+HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+FREE = {
+    "none": (1, 1, 1, 0, 0, 0, 0, 0), "2": (1, 1, 1, 1, 0, 0, 0, 0), "4": (1, 1, 1, 1, 1, 0, 0, 0),
+    "6": (1, 1, 1, 1, 1, 1, 0, 0), "6t": (1, 1, 1, 1, 1, 1, 1, 1),
+}  # fmt: skip
+YAW_LIE_DEG = 20.0
+"""A reported yaw further than this from the pixels' is no measurement of it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Setup:
+    """Rows of the adjustment's arrays and what they mean."""
+
+    members: NDArray[np.int64]
+    """(n,) photo of each row."""
+    camera: NDArray[np.int64]
+    """(n,) camera row of each photo row."""
+    camera_keys: tuple[str, ...]
+    """Name of each camera row."""
+    turned: NDArray[np.bool_]
+    """(photos,) files rewritten upside down: their sensor is the file turned by 180 degrees."""
+    size: Array
+    """(photos, 2) width and height in px."""
+    stated_sigma_C: Array
+    """(n, 3) deviations as stated by the metadata."""
+    block_rows: tuple[NDArray[np.int64], ...]
+    """Rows of each block."""
+    georeferenced: bool
+    """Whether any block was placed by positions."""
+    z_ground: float
+    """Height of the ground plane of the start."""
+    base: Problem
+    """The problem without sightings."""
+    start_R: Array
+    """(n, 3, 3)."""
+    start_C: Array
+    """(n, 3)."""
+    plane_a: NDArray[np.complex128]
+    """(n,) similarity factors of the start, for first points on the ground plane."""
+    plane_t: NDArray[np.complex128]
+    """(n,) translations of the start."""
+
+    def file_px(self, photo: NDArray[np.int64], px: Array) -> Array:
+        """Sensor pixels to file pixels, and back: the two differ by a half turn for turned files."""
+        return np.where(self.turned[photo][:, None], self.size[photo] - 1 - px, px)
+
+    def file_sign(self, photo: NDArray[np.int64]) -> Array:
+        """(N, 1) factor that takes residuals from the sensor to the file."""
+        return np.where(self.turned[photo][:, None], -1.0, 1.0)
+
+    def sensor_tracks(self, tracks: Tracks) -> Tracks:
+        """Tracks of this setup's photos in sensor pixels."""
+        mine = np.isin(tracks.photo, self.members)
+        own = tracks.only(mine)
+        return replace(own, px=self.file_px(own.photo, own.px))
+
+    def problem(self, tracks: Tracks) -> tuple[Problem, State]:
+        """The problem of these tracks (sensor pixels), and where to start: points on the ground plane."""
+        row = np.searchsorted(self.members, tracks.photo)
+        K = self.base.K0[self.camera[row]]
+        p = ((tracks.px[:, 0] - K[:, 1]) - 1j * (tracks.px[:, 1] - K[:, 2])) / K[:, 0]
+        p = np.where(self.turned[tracks.photo], -p, p)
+        ground = self.plane_a[row] * p + self.plane_t[row]
+        X = np.full((tracks.count, 3), self.z_ground)
+        number = np.bincount(tracks.point, minlength=tracks.count)
+        X[:, 0] = np.bincount(tracks.point, ground.real, tracks.count) / number
+        X[:, 1] = np.bincount(tracks.point, ground.imag, tracks.count) / number
+        problem = replace(
+            self.base, point=tracks.point, photo=row, px=tracks.px, sigma_px=tracks.sigma_px,
+            X0=np.full(X.shape, np.nan), sigma_X=np.ones(X.shape),
+        )  # fmt: skip
+        return problem, State(R=self.start_R, C=self.start_C, K=self.base.K0.copy(), X=X)
+
+
+def set_up(
+    photos: Sequence[Photo], priors: Sequence[Prior], start: Start, *, distortion: str, repair: bool
+) -> Setup:
+    """Arrays for all photos that the start placed."""
+    members = np.array(sorted(start.placed), np.int64)
+    a = np.array([start.placed[m][0] for m in members.tolist()])
+    t = np.array([start.placed[m][1] for m in members.tolist()])
+    yaw = -np.degrees(np.angle(a))
+    lies = np.array([_yaw_lie(priors[m], y) for m, y in zip(members.tolist(), yaw, strict=True)])
+    turned = np.zeros(len(photos), bool)
+    for m, lie in zip(members.tolist(), lies, strict=True):
+        turned[m] = abs(abs(lie) - 180) < YAW_LIE_DEG and photos[m].editor is not None
+    keys = tuple(dict.fromkeys(photos[m].camera_key for m in members.tolist()))
+    camera = np.array([keys.index(photos[m].camera_key) for m in members.tolist()])
+    first = [next(m for m in members.tolist() if photos[m].camera_key == key) for key in keys]
+    C0, sigma_C, stated, z_ground = _positions(members, priors, start, np.abs(a), repair)
+    R0, sigma_R = _attitudes(members, priors, yaw, lies, repair, turned)
+    start_C = np.column_stack([t.real, t.imag, z_ground + np.abs(a)])
+    start_R = np.array([_start_R(priors[m], y, bool(turned[m])) for m, y in zip(members.tolist(), yaw, strict=True)])
+    K0, sigma_K, free = _intrinsics([photos[m] for m in first], distortion)
+    base = Problem(
+        point=np.zeros(0, np.int64), photo=np.zeros(0, np.int64), px=np.zeros((0, 2)), sigma_px=np.zeros(0),
+        camera=camera, free=free, K0=K0, sigma_K=sigma_K, C0=C0, sigma_C=sigma_C, R0=R0, sigma_R=sigma_R,
+        X0=np.zeros((0, 3)), sigma_X=np.zeros((0, 3)), loss_px=2.0,
+        loss_C=3.0 if repair else 1e6, loss_R=2.0 if repair else 1e6,
+    )  # fmt: skip
+    return Setup(
+        members=members, camera=camera, camera_keys=keys, turned=turned,
+        size=np.array([(p.width, p.height) for p in photos], float), stated_sigma_C=stated,
+        block_rows=tuple(np.searchsorted(members, b) for b in start.blocks), z_ground=z_ground, base=base,
+        georeferenced=bool(start.georeferenced),
+        start_R=start_R, start_C=start_C, plane_a=a, plane_t=t,
+    )  # fmt: skip
+
+
+def _yaw_lie(prior: Prior, yaw_deg: float) -> float:
+    """Reported less found yaw in degrees; 0 where none was reported."""
+    return angle_difference_deg(prior.yaw_deg, yaw_deg) if np.isfinite(prior.yaw_deg) else 0.0
+
+
+def _start_R(prior: Prior, yaw_deg: float, turned: bool) -> Array:
+    """Nadir with the yaw that links found; of the sensor, for a turned file."""
+    R = cam_R_map_from_angles(yaw_deg)
+    return HALF_TURN @ R if turned else R
+
+
+def _positions(
+    members: NDArray, priors: Sequence[Prior], start: Start, height: Array, repair: bool
+) -> tuple[Array, Array, Array, float]:
+    """Measured centres, deviations used, deviations stated, and the height of the ground plane."""
+    C0 = np.array([priors[m].map_C for m in members])
+    stated = np.array([priors[m].sigma_C for m in members])
+    sigma = stated.copy()
+    ground = C0[:, 2] - height
+    known = np.isfinite(ground)
+    z_ground = float(np.median(ground[known])) if known.any() else 0.0
+    if repair and known.any():
+        scatter = 1.48 * float(np.median(np.abs(ground[known] - z_ground)))
+        sigma[:, 2] = np.maximum(sigma[:, 2], scatter)
+        sigma[:, :2] = np.maximum(sigma[:, :2], [[start.sigma_xy.get(int(m), 0.0)] for m in members])
+    free = ~np.isfinite(C0[:, 0])
+    if free.all():  # nothing holds the block: its own start does, softly
+        a_t = np.array([[start.placed[int(m)][1].real, start.placed[int(m)][1].imag] for m in members])
+        C0 = np.column_stack([a_t, z_ground + height])
+        sigma = stated = np.full(C0.shape, 0.1 * float(np.median(height)))
+    return C0, np.where(np.isfinite(C0), sigma, 1.0), np.where(np.isfinite(C0), stated, 1.0), z_ground
+
+
+def _attitudes(
+    members: NDArray, priors: Sequence[Prior], yaw: Array, lies: Array, repair: bool, turned: NDArray
+) -> tuple[Array, Array]:
+    """Prior attitudes and deviations in rad; a yaw that lies takes its tilt's direction with it."""
+    R0, sigma = [], []
+    for m, y, lie in zip(members.tolist(), yaw, lies, strict=True):
+        prior = priors[m]
+        false = repair and abs(lie) > YAW_LIE_DEG
+        trusted = np.isfinite(prior.yaw_deg) and not false
+        if trusted or turned[m]:
+            R0.append(cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg))
+        else:
+            R0.append(cam_R_map_from_angles(y, prior.pitch_deg, prior.roll_deg))
+        tilt = prior.sigma_tilt_deg
+        sigma.append(np.radians([tilt, tilt, prior.sigma_yaw_deg if trusted or turned[m] else 90.0]))
+    return np.array(R0), np.array(sigma)
+
+
+def _intrinsics(photos: Sequence[Photo], distortion: str) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Priors, deviations and freedom of each camera's intrinsics."""
+    K0, sigma = [], []
+    for photo in photos:
+        wide = max(photo.width, photo.height)
+        if photo.calibration is not None:
+            K0.append(photo.calibration.vector)
+            sigma.append([photo.focal.sigma_px, 0.003 * wide, 0.003 * wide, 0.01, 0.01, 0.01, 1e-3, 1e-3])
+        else:
+            ideal = Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
+            K0.append(ideal.vector)
+            sigma.append([photo.focal.sigma_px, 0.01 * wide, 0.01 * wide, 0.1, 0.1, 0.05, 2e-3, 2e-3])
+    free = np.tile(np.array(FREE[distortion], bool), (len(photos), 1))
+    return np.array(K0), np.array(sigma), free
+
+
+def pose_records(setup: Setup, state: State) -> dict[int, Pose]:
+    """Poses of the files (a turned file's camera is its sensor's, turned)."""
+    return {
+        m: Pose(cam_R_map=HALF_TURN @ R if setup.turned[m] else R, map_C=C)
+        for m, R, C in zip(setup.members.tolist(), state.R, state.C, strict=True)
+    }
+
+
+def mirrored(camera: Camera) -> Camera:
+    """The calibration of the same camera's files turned by 180 degrees."""
+    return replace(
+        camera, cx=camera.width - 1 - camera.cx, cy=camera.height - 1 - camera.cy, p1=-camera.p1, p2=-camera.p2
+    )
+
+
+def camera_records(
+    photos: Sequence[Photo], setup: Setup, state: State, covariance: Array | None
+) -> tuple[dict[str, Camera], dict[int, str]]:
+    """Calibrations with deviations, and the name of each photo's."""
+    n = len(setup.members)
+    cameras: dict[str, Camera] = {}
+    for row, key in enumerate(setup.camera_keys):
+        photo = next(p for p in photos if p.camera_key == key)
+        f, cx, cy, k1, k2, k3, p1, p2 = (float(v) for v in state.K[row])
+        sigmas = None
+        if covariance is not None:
+            at = 6 * n + 8 * row + np.arange(8)
+            spread = np.sqrt(np.abs(covariance[at, at])) * setup.base.free[row]
+            sigmas = tuple(float(s) for s in spread)
+        cameras[key] = Camera(
+            width=photo.width, height=photo.height, focal=f, cx=cx, cy=cy, k1=k1, k2=k2, k3=k3, p1=p1, p2=p2, sigmas=sigmas
+        )
+    camera_of = {}
+    for m in setup.members.tolist():
+        key = photos[m].camera_key
+        camera_of[m] = f"{key}/turned" if setup.turned[m] else key
+        if setup.turned[m]:
+            cameras.setdefault(camera_of[m], mirrored(cameras[key]))
+    return cameras, camera_of

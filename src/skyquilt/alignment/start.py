@@ -1,0 +1,155 @@
+"""The start of an adjustment: every linked photo a similarity of the ground plane, in metres of the map."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.similarity_graph import (
+    PlaneLink,
+    PlaneSolution,
+    components,
+    fit_similarity,
+    solve_block,
+    tie_to_positions,
+)
+from skyquilt.model.features import Features, Link
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Prior
+
+NOMINAL_HEIGHT_M = 50.0
+"""Height above ground assumed where nothing gives a scale; the result is then marked as not metric."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Start:
+    """Where the adjustment starts."""
+
+    placed: dict[int, tuple[complex, complex]]
+    """Photo -> (a, t) of x + iy = a p + t, in m."""
+    blocks: tuple[tuple[int, ...], ...]
+    """Connected groups of two or more photos."""
+    links: tuple[Link, ...]
+    """Links that agree with the blocks."""
+    sigma_xy: dict[int, float]
+    """Photo -> deviation of its measured position in m as its block sees it, where worse than stated."""
+    georeferenced: frozenset[int]
+    """Photos of blocks that positions placed."""
+    metric: bool
+    """False where even the scale had to be assumed."""
+
+
+def plane_link(link: Link, photos: Sequence[Photo], features: Sequence[Features]) -> PlaneLink:
+    """The link in image coordinates over the focal length, y up."""
+
+    def mean(photo: Photo, px: NDArray) -> complex:
+        x, y = px.mean(0)
+        return complex(x - (photo.width - 1) / 2, -(y - (photo.height - 1) / 2)) / photo.focal.px
+
+    a, b = photos[link.a], photos[link.b]
+    return PlaneLink(
+        a=link.a, b=link.b, b_S_a=link.b_S_a * a.focal.px / b.focal.px,
+        p_a=mean(a, features[link.a].px[link.index_a]), p_b=mean(b, features[link.b].px[link.index_b]),
+        weight=min(float(len(link)), 300.0),
+    )  # fmt: skip
+
+
+def find_start(
+    photos: Sequence[Photo], priors: Sequence[Prior], features: Sequence[Features], links: Sequence[Link],
+    *, trust_yaw: bool = False,
+) -> Start:  # fmt: skip
+    """Solves every block, drops links that contradict it, and places it by its own positions."""
+    plane = {(k.a, k.b): plane_link(k, photos, features) for k in links}
+    solutions, kept = _consistent_blocks(len(photos), plane)
+    placed: dict[int, tuple[complex, complex]] = {}
+    sigma_xy: dict[int, float] = {}
+    georeferenced: set[int] = set()
+    metric = True
+    for solution in solutions:
+        inner = [plane[key] for key in kept if key[0] in set(solution.members.tolist())]
+        solution, spread, scaled = georeference(solution, inner, [priors[m] for m in solution.members])
+        metric &= scaled
+        for m, a, t in zip(solution.members.tolist(), solution.a, solution.t, strict=True):
+            placed[m] = (complex(a), complex(t))
+            if np.isfinite(spread):
+                georeferenced.add(m)
+                sigma_xy[m] = spread
+    return Start(
+        placed=placed,
+        blocks=tuple(tuple(s.members.tolist()) for s in solutions),
+        links=tuple(k for k in links if (k.a, k.b) in kept),
+        sigma_xy=sigma_xy,
+        georeferenced=frozenset(georeferenced),
+        metric=metric,
+    )
+
+
+def _consistent_blocks(
+    count: int, plane: dict[tuple[int, int], PlaneLink]
+) -> tuple[list[PlaneSolution], set[tuple[int, int]]]:
+    """Solutions of the blocks, and the links that agree with them within a tenth of the flying height."""
+    kept = set(plane)
+    solutions: list[PlaneSolution] = []
+    for _ in range(4):
+        links = [plane[key] for key in sorted(kept)]
+        groups = [g for g in components(count, links) if len(g) >= 2]
+        solutions, bad = [], set()
+        for members in groups:
+            inside = set(members.tolist())
+            own = [k for k in links if k.a in inside]
+            solution = solve_block(members, own)
+            limit = max(0.1, 4 * float(np.median(solution.link_error)))
+            bad |= {(k.a, k.b) for k, e in zip(own, solution.link_error, strict=True) if e > limit}
+            solutions.append(solution)
+        if not bad:
+            break
+        kept -= bad
+    return solutions, kept
+
+
+def georeference(
+    solution: PlaneSolution, links: Sequence[PlaneLink], priors: Sequence[Prior]
+) -> tuple[PlaneSolution, float, bool]:
+    """The block in map metres, the scatter of its positions in m (NaN without), and whether its scale is known."""
+    position = np.array([complex(p.map_C[0], p.map_C[1]) for p in priors])
+    sigma = np.array([p.sigma_C[0] for p in priors])
+    known = np.isfinite(position)
+    if not known.any():
+        turn = _turn(solution.a, priors)
+        g, metric = _scale_by_height(solution.a, priors)
+        scaled = replace(solution, a=solution.a * g * turn, t=solution.t * g * turn)
+        return scaled, np.nan, metric
+    where = position[known]
+    spread = float(np.abs(where - where.mean()).max()) if known.sum() > 1 else 0.0
+    if known.sum() >= 2 and spread > 3 * float(np.median(sigma[known])):
+        g, c, scatter = fit_similarity(solution.t[known], where, sigma[known])
+        metric = True
+    else:
+        height, metric = _scale_by_height(solution.a, priors)
+        g = height * _turn(solution.a, priors)
+        c, scatter = complex(np.mean(where - g * solution.t[known])), 0.0
+    placed = replace(solution, a=solution.a * g, t=solution.t * g + c)
+    far = np.maximum(np.where(known, sigma, 1e5), scatter)
+    return tie_to_positions(placed, links, position, far), scatter, metric
+
+
+def _turn(a: NDArray[np.complex128], priors: Sequence[Prior]) -> complex:
+    """The direction that brings the block's yaws to the reported ones, by majority; 1 where none is reported."""
+    yaw = np.radians([p.yaw_deg for p in priors])
+    known = np.isfinite(yaw)
+    if not known.any():
+        return 1 + 0j
+    unit = np.exp(-1j * yaw[known]) / (a[known] / np.abs(a[known]))
+    votes = [int((np.abs(unit - u) < 0.35).sum()) for u in unit]
+    chosen = unit[np.abs(unit - unit[int(np.argmax(votes))]) < 0.35].mean()
+    return complex(chosen / abs(chosen))
+
+
+def _scale_by_height(a: NDArray[np.complex128], priors: Sequence[Prior]) -> tuple[float, bool]:
+    """Metres per block unit from heights above take-off, taken as heights above ground; else a nominal height."""
+    height = np.array([p.map_C[2] for p in priors])
+    ratio = (height / np.abs(a))[np.isfinite(height) & (height > 1)]
+    if len(ratio):
+        return float(np.median(ratio)), True
+    return NOMINAL_HEIGHT_M / float(np.median(np.abs(a))), False

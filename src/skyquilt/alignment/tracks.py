@@ -1,0 +1,86 @@
+"""Tracks: one point on the ground, seen in several photos."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from skyquilt.model.features import Features, Link
+
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tracks:
+    """Sightings sorted by track."""
+
+    point: Index
+    """(N,) track of each sighting, 0 .. count-1, ascending."""
+    photo: Index
+    """(N,) photo."""
+    px: NDArray[np.float64]
+    """(N, 2) px."""
+    sigma_px: NDArray[np.float64]
+    """(N,) standard deviation in px."""
+
+    @property
+    def count(self) -> int:
+        """Number of tracks."""
+        return int(self.point[-1]) + 1 if len(self.point) else 0
+
+    def only(self, sighting: NDArray[np.bool_]) -> "Tracks":
+        """The sightings marked, less tracks left with one; renumbered."""
+        point = self.point[sighting]
+        keep = np.flatnonzero(sighting)[np.bincount(point, minlength=self.count)[point] >= 2]
+        _, renumbered = np.unique(self.point[keep], return_inverse=True)
+        return Tracks(
+            point=renumbered.astype(np.int64), photo=self.photo[keep], px=self.px[keep], sigma_px=self.sigma_px[keep]
+        )
+
+
+def build_tracks(features: Sequence[Features], links: Sequence[Link], *, sigma: float = 0.25) -> Tracks:
+    """Chains of matches; one that visits a photo twice is wrong somewhere and dropped.
+
+    `sigma`: standard deviation of a keypoint in px of the image it was found in.
+    """
+    offset = np.r_[0, np.cumsum([len(f) for f in features])]
+    if not links:
+        return Tracks(
+            point=np.zeros(0, np.int64), photo=np.zeros(0, np.int64), px=np.zeros((0, 2)), sigma_px=np.zeros(0)
+        )
+    a = np.concatenate([offset[k.a] + k.index_a for k in links])
+    b = np.concatenate([offset[k.b] + k.index_b for k in links])
+    total = int(offset[-1])
+    _, label = connected_components(sparse.coo_matrix((np.ones(len(a)), (a, b)), (total, total)), directed=False)
+    used = np.unique(np.concatenate([a, b]))
+    photo = np.searchsorted(offset, used, "right") - 1
+    order = np.lexsort((photo, label[used]))
+    used, photo = used[order], photo[order]
+    track = label[used]
+    repeated = np.flatnonzero((np.diff(track) == 0) & (np.diff(photo) == 0))
+    good = ~np.isin(track, track[repeated])
+    used, photo, track = used[good], photo[good], track[good]
+    _, point = np.unique(track, return_inverse=True)
+    px = np.concatenate([f.px for f in features])[used]
+    scale = np.array([f.scale for f in features])[photo]
+    return Tracks(point=point.astype(np.int64), photo=photo, px=px, sigma_px=np.maximum(sigma * scale, 0.3))
+
+
+def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], *, per_photo: int, cells: int = 8) -> Tracks:
+    """The tracks an adjustment needs: long ones first, until every photo has `per_photo` spread over its area.
+
+    `sizes`: (width, height) of each photo.
+    """
+    length = np.bincount(tracks.point, minlength=tracks.count)
+    size = np.array(sizes)[tracks.photo]
+    column, row = ((tracks.px + 0.5) / size * cells).astype(int).clip(0, cells - 1).T
+    slot = (tracks.photo * cells + row) * cells + column
+    order = np.lexsort((tracks.px[:, 0], -length[tracks.point], slot))
+    starts = np.flatnonzero(np.r_[True, np.diff(slot[order]) != 0])
+    rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
+    chosen = np.zeros(tracks.count, bool)
+    chosen[tracks.point[order[rank < max(1, per_photo // cells**2)]]] = True
+    return tracks.only(chosen[tracks.point])

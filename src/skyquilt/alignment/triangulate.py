@@ -1,0 +1,36 @@
+"""Points from sightings with known poses."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.problem import Problem, State, linearise
+
+Array = NDArray[np.float64]
+
+
+def intersect(point: NDArray[np.int64], origin: Array, direction: Array, count: int) -> Array:
+    """Least-squares intersections (count, 3) of rays: origins (N, 3), directions (N, 3), by point (N,)."""
+    d = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    M = np.eye(3) - d[:, :, None] * d[:, None, :]
+    A, b = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    np.add.at(A, point, M)
+    np.add.at(b, point, np.einsum("nij,nj->ni", M, origin))
+    A += np.eye(3) * 1e-9
+    return np.asarray(np.linalg.solve(A, b[..., None])[..., 0])
+
+
+def polish(problem: Problem, state: State, *, iterations: int = 5) -> tuple[State, Array]:
+    """Gauss-Newton on the points alone; returns the state and each point's height deviation (P,) in m."""
+    sigma_z = np.full(len(state.X), np.inf)
+    for _ in range(iterations):
+        lin = linearise(problem, state)
+        w = 1 / (1 + (lin.residual**2).sum(1) / problem.loss_px**2)
+        J = lin.J_point
+        H, g = np.zeros((len(state.X), 3, 3)), np.zeros((len(state.X), 3))
+        np.add.at(H, problem.point, np.einsum("nki,nkj->nij", J, J) * w[:, None, None])
+        np.add.at(g, problem.point, np.einsum("nki,nk->ni", J, lin.residual) * w[:, None])
+        H += np.eye(3) * 1e-9
+        step = -np.linalg.solve(H, g[..., None])[..., 0]
+        state = State(R=state.R, C=state.C, K=state.K, X=state.X + step)
+        sigma_z = np.sqrt(np.abs(np.linalg.inv(H)[:, 2, 2]))
+    return state, sigma_z
