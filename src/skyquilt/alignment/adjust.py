@@ -73,12 +73,8 @@ def _sum_by(index: NDArray[np.int64], values: Array, count: int) -> Array:
 
 
 def _sighting_weights(problem: Problem, residual: Array) -> tuple[Array, float]:
-    squared = (residual**2).sum(1)
-    weight, cost = _cauchy(squared, problem.loss_px)
-    if problem.robust is not None:
-        weight = np.where(problem.robust, weight, 1.0)
-        cost = np.where(problem.robust, cost, squared)
-    return weight, float(cost.sum())
+    weight, cost = _cauchy((residual**2).sum(1), problem.loss_px)
+    return weight * problem.trust, float(cost.sum()) * problem.trust
 
 
 def _prior_terms(problem: Problem, state: State) -> tuple[list[tuple[Array, Array]], float]:

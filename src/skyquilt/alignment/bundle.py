@@ -88,22 +88,31 @@ def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]
 
 
 def _believe_positions_less(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
-    """Where the block contradicts the stated position accuracy, the block's own estimate takes its place."""
+    """Where neighbours contradict the stated horizontal accuracy, their scatter takes its place.
+
+    Only what changes from photo to photo counts: a smooth misfit may as well be the block's own bending, and
+    believing positions less would let it bend. (Heights are judged by image scale, before the adjustment.)
+    """
     for _ in range(2):
-        error = np.abs(state.C - problem.C0)
+        error = state.C - problem.C0
         sigma = problem.sigma_C.copy()
-        for axes in ([0, 1], [2]):
-            for block in setup.block_rows:
-                e = error[np.ix_(block, axes)]
-                if np.isfinite(e).sum() >= 6:
-                    measured = 1.48 * float(np.nanmedian(e))
-                    stated = setup.stated_sigma_C[np.ix_(block, axes)]
-                    sigma[np.ix_(block, axes)] = np.maximum(stated, measured)
+        for block in setup.block_rows:
+            noise = position_noise(error[block][:, :2])
+            sigma[block, :2] = np.maximum(setup.stated_sigma_C[block][:, :2], noise)
         if np.allclose(sigma, problem.sigma_C, rtol=0.15, equal_nan=True):
             break
         problem = replace(problem, sigma_C=sigma)
         state = adjust(problem.with_loss(2.0), state, iterations=10, tolerance=1e-4).state
     return problem, state
+
+
+def position_noise(error: Array) -> float:
+    """Robust deviation in m of each axis of position errors (n, 2), in order of capture, from their neighbours' mean."""
+    known = error[np.isfinite(error).all(1)]
+    if len(known) < 6:
+        return 0.0
+    local = known[1:-1] - (known[:-2] + known[2:]) / 2
+    return float(1.48 * np.median(np.abs(local)) / np.sqrt(1.5))
 
 
 def leave_one_out(problem: Problem, state: State, C_covariance: Array | None) -> tuple[float, float, float] | None:

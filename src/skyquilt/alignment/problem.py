@@ -73,8 +73,9 @@ class Problem:
     """Scale of the Cauchy loss on positions, in units of their deviation: a GPS may lie."""
     loss_R: float = 2.0
     """Scale of the Cauchy loss on attitudes: a gimbal may lie."""
-    robust: NDArray[np.bool_] | None = None
-    """(N,) sightings subject to the loss; None = all. Hand-measured control points are not."""
+    trust: float = 1.0
+    """Factor on the cost of sightings. Errors of neighbouring sightings are correlated (lens model, rolling
+    shutter, features of one kind); a photo's hundreds of sightings weigh like some dozens of independent ones."""
 
     def with_loss(self, loss_px: float) -> "Problem":
         """The same problem with another scale of the loss on sightings."""

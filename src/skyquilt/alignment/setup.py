@@ -20,6 +20,8 @@ FREE = {
     "none": (1, 1, 1, 0, 0, 0, 0, 0), "2": (1, 1, 1, 1, 0, 0, 0, 0), "4": (1, 1, 1, 1, 1, 0, 0, 0),
     "6": (1, 1, 1, 1, 1, 1, 0, 0), "6t": (1, 1, 1, 1, 1, 1, 1, 1),
 }  # fmt: skip
+INDEPENDENT = 40
+"""Independent sightings that a photo's many correlated ones are worth."""
 YAW_LIE_DEG = 20.0
 """A reported yaw further than this from the pixels' is no measurement of it."""
 
@@ -85,6 +87,7 @@ class Setup:
         problem = replace(
             self.base, point=tracks.point, photo=row, px=tracks.px, sigma_px=tracks.sigma_px,
             X0=np.full(X.shape, np.nan), sigma_X=np.ones(X.shape),
+            trust=min(1.0, INDEPENDENT * len(self.members) / max(len(row), 1)),
         )  # fmt: skip
         return problem, State(R=self.start_R, C=self.start_C, K=self.base.K0.copy(), X=X)
 

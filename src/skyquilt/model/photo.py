@@ -56,7 +56,7 @@ class Attitude:
     """Where it was read: `xmp-gimbal`, `xmp-camera`, `xmp-flight`, `geo.txt`, `csv`."""
     sigma_yaw_deg: float = 5.0
     """Standard deviation of the yaw in degrees, when it does not lie altogether."""
-    sigma_tilt_deg: float = 3.0
+    sigma_tilt_deg: float = 1.0
     """Standard deviation of pitch and of roll in degrees."""
 
 
