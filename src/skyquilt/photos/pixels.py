@@ -23,7 +23,7 @@ from skyquilt.photos.thermal import thermal_frame_of_jpeg, thermal_frame_of_valu
 
 Pixels = NDArray[Any]
 Reduction = Literal[1, 2, 4, 8]
-_HARMLESS = re.compile(r"(\d{1,3}) extraneous bytes before marker|JFIF|Inconsistent progression|Invalid SOS")
+_HARMLESS = re.compile(r"\b\d{1,2} extraneous bytes before marker|JFIF|Inconsistent progression|Invalid SOS")
 
 
 def read_color(photo: Photo, *, reduction: Reduction = 1) -> Pixels:
