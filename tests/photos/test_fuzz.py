@@ -36,13 +36,20 @@ def spoil(data, flips, cut):
     return bytes(spoiled)
 
 
+def foreseen(path):
+    """A photo or a reason, and not by the last net, which is for what these tests have not found yet."""
+    photo = read_photo(path)
+    assert isinstance(photo, (Photo, RejectedPhoto))
+    assert isinstance(photo, Photo) or "not foreseen" not in photo.reason, photo.reason
+    return photo
+
+
 @quick
 @given(st.sampled_from([GOOD, FLIR]), flips, st.sampled_from([1.0, 1.0, 0.9, 0.2, 0.02]))
 def test_spoilt_jpegs_are_photos_or_rejected(tmp_path, data, flips, cut):
     path = tmp_path / "x.jpg"
     path.write_bytes(spoil(data, flips, cut))
-    photo = read_photo(path)
-    assert isinstance(photo, (Photo, RejectedPhoto))
+    photo = foreseen(path)
     if isinstance(photo, Photo) and photo.width * photo.height < 1_000_000:
         try:
             assert read_color(photo).shape[:2] == (photo.height, photo.width)
@@ -57,7 +64,7 @@ def test_spoilt_jpegs_are_photos_or_rejected(tmp_path, data, flips, cut):
 def test_any_bytes_are_photos_or_rejected(tmp_path, data, magic):
     path = tmp_path / "x.jpg"
     path.write_bytes(magic + data)
-    assert isinstance(read_photo(path), (Photo, RejectedPhoto))
+    foreseen(path)
 
 
 @quick

@@ -164,7 +164,8 @@ def test_bad_csv(tmp_path, text, words):
 
 
 def test_mrk_moves_the_antenna_to_the_camera(tmp_path):
-    line = "23\t264013.12\t[2120]\t  1000,N\t -2000,E\t 190,V\t46.50000000,Lat\t9.00000000,Lon\t92.345,Ellh\t0.012, 0.011, 0.024\t50,Q\n"
+    shot = "23\t264013.12\t[2120]\t  1000,N\t -2000,E\t 190,V\t46.50000000,Lat\t9.00000000,Lon\t92.345,Ellh"
+    line = shot + "\t0.012, 0.011, 0.024\t50,Q\n"
     names = ["100_0001_0023.JPG", "100_0001_0024.JPG"]
     (row,) = read_mrk(written(tmp_path, line, "t.MRK"), names)
     x, y = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(
@@ -182,7 +183,8 @@ NEW = """1
 00:00:00,000 --> 00:00:00,033
 <font size="28">FrameCnt: 1, DiffTime: 33ms
 2023-05-01 10:11:12.500
-[iso: 100] [focal_len: 24.00] [latitude: 46.50] [longitude: 9.10] [rel_alt: 40.500 abs_alt: 300.100] [gb_yaw: 10.0 gb_pitch: -90.0 gb_roll: 0.0]</font>
+[iso: 100] [latitude: 46.50] [longitude: 9.10] [rel_alt: 40.500 abs_alt: 300.100]
+[gb_yaw: 10.0 gb_pitch: -90.0 gb_roll: 0.0]</font>
 
 2
 00:00:00,033 --> 00:00:00,066

@@ -13,8 +13,8 @@ from skyquilt.photos.survey import read_survey
 from .conftest import dji_exif, dji_xmp, gps_exif, pixels
 
 
-def flight(make_jpeg, n=5, **changes):
-    """n photos ten metres apart towards the north, five seconds between them; `changes[i]` replaces EXIF parts."""
+def flight(make_jpeg, n=5):
+    """n photos ten metres apart towards the north, five seconds between them; names run backwards."""
     for i in range(n):
         exif = dji_exif(Exif={piexif.ExifIFD.DateTimeOriginal: f"2020:06:01 10:00:{5 * i:02d}"})
         exif["GPS"] = gps_exif(46.5 + i * 0.0001, -92.0, 150)
@@ -191,3 +191,23 @@ def test_times_of_different_offsets_sort_by_the_wall_clock(make_jpeg):
     survey = read_survey(folder)
     assert [p.name for p in survey.photos] == ["a.jpg", "b.jpg"]
     assert survey.photos[0].time == datetime(2016, 6, 23, 16, 31, 59)
+
+
+def test_of_two_photos_far_apart_both_stay_and_the_note_says_so(make_jpeg):
+    for i, latitude in enumerate((46.0, 49.0)):
+        exif = dji_exif()
+        exif["GPS"] = gps_exif(latitude, 9.0)
+        folder = make_jpeg(f"{i}.jpg", exif=exif, seed=i).parent
+    survey = read_survey(folder)
+    assert all(p.position for p in survey.photos)
+    assert any("334 km apart" in n for n in survey.notes)
+
+
+def test_a_flight_at_height_zero_counts_from_sea_level_instead(make_jpeg):
+    for i in range(3):
+        folder = make_jpeg(f"{i}.jpg", exif=dji_exif(), xmp=dji_xmp(RelativeAltitude="+0.00"), seed=i).parent
+    survey = read_survey(folder)
+    assert {(p.position.altitude_m, p.position.datum, p.position.takeoff_m) for p in survey.photos} == {
+        (198.3, "sea_level", None)
+    }
+    assert any("were not used" in n for n in survey.notes)

@@ -14,14 +14,14 @@ from skyquilt.photos.thermal import thermal_frame_of_values
 
 from .conftest import jpeg_bytes, pixels, with_segment
 
-R1, B, F, O, R2 = 17096.453, 1428.0, 1.0, -342, 0.046642166
+R1, B, F, OFFSET, R2 = 17096.453, 1428.0, 1.0, -342, 0.046642166
 EMISSIVITY, REFLECTED_K, AIR_K, HUMIDITY, DISTANCE = 0.95, 295.15, 290.15, 0.5, 20.0
 ALPHA1, ALPHA2, BETA1, BETA2, X = 0.006569, 0.01262, -0.002276, -0.00667, 1.9
 
 
 def planck_counts(celsius):
     """Counts of a black body; the published calibration curve."""
-    return R1 / (R2 * (np.exp(B / (np.asarray(celsius) + 273.15)) - F)) - O
+    return R1 / (R2 * (np.exp(B / (np.asarray(celsius) + 273.15)) - F)) - OFFSET
 
 
 def seen_counts(celsius):
@@ -38,11 +38,12 @@ def camera_record():
     record = bytearray(0x400)
     struct.pack_into("<H", record, 0, 2)
     for offset, value in {
-        0x20: EMISSIVITY, 0x24: DISTANCE, 0x28: REFLECTED_K, 0x2C: AIR_K, 0x30: 293.15, 0x34: 1.0, 0x3C: HUMIDITY,
-        0x58: R1, 0x5C: B, 0x60: F, 0x70: ALPHA1, 0x74: ALPHA2, 0x78: BETA1, 0x7C: BETA2, 0x80: X, 0x30C: R2,
+        0x20: EMISSIVITY, 0x24: DISTANCE, 0x28: REFLECTED_K, 0x2C: AIR_K, 0x30: 293.15, 0x34: 1.0,
+        0x3C: HUMIDITY, 0x58: R1, 0x5C: B, 0x60: F, 0x30C: R2,
+        0x70: ALPHA1, 0x74: ALPHA2, 0x78: BETA1, 0x7C: BETA2, 0x80: X,
     }.items():  # fmt: skip
         struct.pack_into("<f", record, offset, value)
-    struct.pack_into("<i", record, 0x308, O)
+    struct.pack_into("<i", record, 0x308, OFFSET)
     return bytes(record)
 
 
@@ -93,7 +94,7 @@ def test_flir_without_constants_keeps_counts(tmp_path):
 
 
 def test_counts_that_are_no_radiance_are_nan():
-    camera = FlirCamera(planck_r1=R1, planck_b=B, planck_f=F, planck_o=O, planck_r2=R2)
+    camera = FlirCamera(planck_r1=R1, planck_b=B, planck_f=F, planck_o=OFFSET, planck_r2=R2)
     celsius = camera.celsius(np.array([[0, 14000]], np.uint16))
     assert np.isnan(celsius[0, 0])
     assert np.isfinite(celsius[0, 1])

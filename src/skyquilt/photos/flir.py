@@ -138,7 +138,7 @@ def _camera(record: bytes) -> FlirCamera | None:
     if not (r1 > 0 and b > 0 and r2 > 0 and math.isfinite(r1 * b * f * r2)):
         return None
     humidity, window, emissivity = real(0x3C), real(0x34), real(0x20)
-    return FlirCamera(
+    camera = FlirCamera(
         planck_r1=r1,
         planck_b=b,
         planck_f=f,
@@ -157,6 +157,16 @@ def _camera(record: bytes) -> FlirCamera | None:
         beta2=_within(real(0x7C), -1, 1, 0.0),
         x=_within(real(0x80), -10, 10, 1.0),
     )
+    return camera if _is_thermometer(camera) else None
+
+
+def _is_thermometer(camera: FlirCamera) -> bool:
+    """Whether hotter means more counts, through air that lets something pass."""
+    try:
+        steps = [camera.signal(kelvin) for kelvin in (150.0, 250.0, 350.0, 1000.0)]
+        return steps == sorted(steps) and math.isfinite(sum(steps)) and 0.05 < camera.transmission < 1.5
+    except ArithmeticError:
+        return False
 
 
 def _within(value: float, low: float, high: float, otherwise: float) -> float:
