@@ -1,4 +1,7 @@
-"""A flight of known truth over procedural terrain. Imports no stage: an oracle shares no code with the judged."""
+"""A flight of known truth over procedural terrain.
+
+Imports no stage: an oracle shares no code with the judged.
+"""
 
 from skyquilt.simulate.flight import Waypoint
 from skyquilt.simulate.presets import PRESETS, preset

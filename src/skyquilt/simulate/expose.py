@@ -1,10 +1,12 @@
 """Form a photo: cast its rays, pick up the colours, and do to them what lenses and sensors do."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.flight import Shot
@@ -12,6 +14,16 @@ from skyquilt.simulate.grid import Doubles, Floats, Grid
 from skyquilt.simulate.raycast import first_hits, rays_of, sample
 from skyquilt.simulate.scene import Scene
 from skyquilt.simulate.settings import Pictures
+
+_TEXTURE_PX = 1024
+
+
+@cache
+def _leaves() -> Floats:
+    """A periodic texture of clumps, about -1 to 1."""
+    white = np.random.default_rng(7).standard_normal((_TEXTURE_PX, _TEXTURE_PX), dtype=np.float32)
+    layers = [gaussian_filter(white, sigma, mode="wrap") * (3.5 * sigma) for sigma in (0.8, 2.0, 5.0)]
+    return np.clip(0.4 * sum(layers), -1.2, 1.2).astype(np.float32)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,13 +37,35 @@ class Exposer:
     directions: Floats
     """(h, w, 2) from `Lens.rays`."""
 
-    def pixels(self, shot: Shot) -> tuple[Floats, Grid]:
-        """Where each pixel's ray first meets the surface: (h, w, 2) pixels of a window of the scene's grid."""
+    def pixels(self, shot: Shot) -> tuple[Floats, Floats, Grid]:
+        """Where each pixel's ray first meets the surface.
+
+        Pixels (h, w, 2) of a window of the scene's grid, heights (h, w) above the base, and that window.
+        """
         window = self.window(shot)
         corner = np.array([window.xs[0], window.ys[0]])
         rays = rays_of(self.directions, shot.rotation, shot.place, corner, window.res)
-        hits, _ = first_hits(np.ascontiguousarray(self.scene.height[window.slices]), rays)
-        return hits, window
+        hits, heights = first_hits(np.ascontiguousarray(self.scene.height[window.slices]), rays)
+        return hits, heights, window
+
+    def _flanks(self, hits: Floats, heights: Floats, window: Grid) -> Floats:
+        """Brightness (h, w) of leaves and plaster on steep flanks, a texture of x, y and z.
+
+        A raster has no texture along the vertical: without this, flanks would be streaks.
+        """
+        surface = self.scene.height[window.slices]
+        slope_x = cv2.Sobel(surface, cv2.CV_32F, 1, 0, scale=1 / (8 * window.res))
+        slope_y = cv2.Sobel(surface, cv2.CV_32F, 0, 1, scale=1 / (8 * window.res))
+        slope = np.hypot(slope_x, slope_y)
+        rough = np.clip(0.6 * (slope - 1.2), 0, 1) * np.clip(1.6 - slope / 25, 0.35, 1)  # walls are smoother
+        steep = sample(rough, hits)
+        offset = np.array([window.col, window.row], dtype=np.float32) % _TEXTURE_PX
+        where = (
+            hits + offset + (heights / np.float32(window.res))[..., None] * np.array([0.83, 0.71], np.float32)
+        )
+        x, y = cv2.split(where)
+        leaves = cv2.remap(_leaves(), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        return np.asarray(1 + 0.30 * steep * leaves, dtype=np.float32)
 
     def window(self, shot: Shot) -> Grid:
         """The part of the scene that a shot can see."""
@@ -50,8 +84,9 @@ class Exposer:
         self, shot: Shot, settings: Pictures, gain: float, rng: np.random.Generator
     ) -> NDArray[np.uint8]:
         """(h, w, 3) as the camera stores it."""
-        hits, window = self.pixels(shot)
+        hits, heights, window = self.pixels(shot)
         seen = sample(np.ascontiguousarray(self.scene.rgb[window.slices]), hits).astype(np.float32)
+        seen *= self._flanks(hits, heights, window)[..., None]
         seen = _blurred(seen, settings)
         seen *= (np.float32(gain) * falloff(self.lens, settings.vignetting))[..., None]
         if settings.noise > 0:
@@ -62,7 +97,7 @@ class Exposer:
         """(h, w) hundredths of a kelvin."""
         if self.scene.thermal is None:
             raise ValueError("the scene was drawn without temperatures")
-        hits, window = self.pixels(shot)
+        hits, _, window = self.pixels(shot)
         kelvin = sample(np.ascontiguousarray(self.scene.thermal[window.slices]).astype(np.float32), hits)
         kelvin = cv2.GaussianBlur(kelvin, (0, 0), 0.7) + np.float32(100 * offset)
         kelvin += rng.standard_normal(kelvin.shape, dtype=np.float32) * np.float32(100 * noise)

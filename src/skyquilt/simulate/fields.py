@@ -1,6 +1,7 @@
 """Painters of the land itself: parcels with their crops, borders, roads, ponds."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -147,7 +148,7 @@ def _marks(canvas: Canvas, road: Road) -> None:
 
 def _dashes(line: Doubles) -> list[Doubles]:
     """Segments of 2 m every 4 m along a line with a vertex every 4 m."""
-    return [np.stack([a, a + 0.5 * (b - a)]) for a, b in zip(line[:-1], line[1:], strict=True)]
+    return [np.stack([a, a + 0.5 * (b - a)]) for a, b in pairwise(line)]
 
 
 def _track(canvas: Canvas, road: Road) -> None:

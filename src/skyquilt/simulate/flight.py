@@ -1,6 +1,7 @@
 """Plan a flight and fly it: where each photo is truly taken."""
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -107,7 +108,7 @@ def _lines(counts: list[int], forward: float, sideways: float, heading: float) -
 
 
 def _around(photos: int, forward: float, heading: float) -> list[Waypoint]:
-    """Once around a rectangle of sides about 3 : 2, the nose along the way; the last photo is beside the first."""
+    """Once around a rectangle of sides about 3 : 2, nose ahead; the last photo is beside the first."""
     length = photos * forward
     long_ = round(0.3 * length / forward) * forward
     sides = [long_, length / 2 - long_, long_, length / 2 - long_]
@@ -175,6 +176,6 @@ def _losses(count: int, lost: int, rng: np.random.Generator) -> set[int]:
         return set()
     edges = np.linspace(1, count - 1, lost + 1)
     chosen: set[int] = set()
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges):
         chosen.add(int(rng.integers(int(np.ceil(low)), max(int(np.ceil(high)) - 1, int(np.ceil(low)) + 1))))
     return chosen

@@ -1,11 +1,13 @@
 """North-up grids in the local map frame, and windows of them."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float32]
+Floats = NDArray[np.floating[Any]]
+"""Mostly float32: rasters and rays."""
 Doubles = NDArray[np.float64]
 
 
@@ -55,12 +57,14 @@ class Grid:
     @property
     def xs(self) -> Doubles:
         """Map x of the columns' centres (width,), m."""
-        return self.left + (self.col + np.arange(self.width) + 0.5) * self.res
+        columns = self.col + 0.5 + np.arange(self.width, dtype=np.float64)
+        return np.asarray(self.left + columns * self.res)
 
     @property
     def ys(self) -> Doubles:
         """Map y of the rows' centres (height,), m, decreasing."""
-        return self.top - (self.row + np.arange(self.height) + 0.5) * self.res
+        rows = self.row + 0.5 + np.arange(self.height, dtype=np.float64)
+        return np.asarray(self.top - rows * self.res)
 
     def pixels(self, xy: Doubles) -> Doubles:
         """Pixel coordinates (..., 2) as (column, row), centres at integers, of map points (..., 2)."""

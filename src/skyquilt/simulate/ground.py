@@ -1,10 +1,12 @@
 """The bare ground: hills, with ponds lying level in them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
+from scipy import sparse
 
 from skyquilt.simulate.grid import Doubles, Floats, Grid
 from skyquilt.simulate.noise import Noise
@@ -96,7 +98,7 @@ def _point(x: float, y: float) -> Grid:
     return Grid(left=x - 0.5, top=y + 0.5, res=1.0, width=1, height=1)
 
 
-def _enlarged(field, grid: Grid, factor: int) -> Floats:  # type: ignore[no-untyped-def]
+def _enlarged(field: Callable[[Grid], Floats], grid: Grid, factor: int) -> Floats:
     """A smooth field computed on cells `factor` times as large, aligned with the endless raster."""
     c0, r0 = grid.col // factor - 1, grid.row // factor - 1
     c1, r1 = (grid.col + grid.width) // factor + 2, (grid.row + grid.height) // factor + 2
@@ -111,10 +113,8 @@ def _enlarged(field, grid: Grid, factor: int) -> Floats:  # type: ignore[no-unty
     return np.ascontiguousarray((across @ (down @ values).T).T)
 
 
-def _linear(positions: Floats, count: int):  # type: ignore[no-untyped-def]
+def _linear(positions: Floats, count: int) -> sparse.csr_matrix:
     """Sparse matrix of linear interpolation."""
-    from scipy import sparse
-
     base = np.clip(np.floor(positions).astype(np.int64), 0, count - 2)
     t = positions - base
     weights = np.stack([1 - t, t], axis=1).ravel()

@@ -1,6 +1,7 @@
 """The plan of the country: parcels, roads, and what stands on them, as vectors."""
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -134,7 +135,7 @@ class Frame:
 def dense(points: Doubles, step: float = 4.0) -> Doubles:
     """A polyline (n, 2) with a vertex every few metres."""
     parts = []
-    for start, end in zip(points[:-1], points[1:], strict=True):
+    for start, end in pairwise(points):
         n = max(int(np.hypot(*(end - start)) / step), 1)
         parts.append(start + (end - start) * (np.arange(n) / n)[:, None])
     return np.concatenate([*parts, points[-1:]])

@@ -31,7 +31,7 @@ def lit(height: Floats, res: float, weather: Weather) -> Floats:
 
 
 def _shadow(height: Floats, res: float, sun: Floats) -> Floats:
-    """1 in shadow: the running maximum of the surface towards the sun, less the rise of the ray, by doubling."""
+    """1 in shadow: the surface's running maximum towards the sun, less the rise of the ray, by doubling."""
     flat = float(np.hypot(sun[0], sun[1]))
     rise = float(sun[2]) / flat * res
     reach = int(np.ceil(_TALLEST_M / rise))

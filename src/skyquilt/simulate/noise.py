@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from skyquilt.simulate.grid import Doubles, Floats, Grid
@@ -19,7 +20,7 @@ def _lattice(seed: int, key: int, size: int) -> Floats:
     return rng.standard_normal((size, size), dtype=np.float32)
 
 
-def _spline(positions: Doubles) -> tuple[sparse.csr_matrix, Doubles]:
+def _spline(positions: Doubles) -> tuple[sparse.csr_matrix, NDArray[np.int64]]:
     """Cubic B-spline weights as a sparse matrix, and the lattice indices of its columns."""
     base = np.floor(positions).astype(np.int64)
     t = positions - base
@@ -31,7 +32,7 @@ def _spline(positions: Doubles) -> tuple[sparse.csr_matrix, Doubles]:
     rows = np.arange(len(t) + 1) * 4
     shape = (len(t), int(base.max()) + 2 - first + 1)
     matrix = sparse.csr_matrix(((weights / 6).astype(np.float32).ravel(), columns.ravel(), rows), shape=shape)
-    return matrix, np.arange(first, first + shape[1])
+    return matrix, np.arange(first, first + shape[1], dtype=np.int64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +43,7 @@ class Noise:
     """Equal seeds give equal fields."""
 
     def smooth(self, grid: Grid, wavelength: float, key: int) -> Floats:
-        """A field (height, width) of zero mean and unit deviation without features below the wavelength (m)."""
+        """A field (height, width), zero mean, unit deviation, no features below the wavelength (m)."""
         down, rows = _spline(grid.ys / wavelength)
         across, cols = _spline(grid.xs / wavelength)
         lattice = _lattice(self.seed, key, _LATTICE)[np.ix_(rows % _LATTICE, cols % _LATTICE)]

@@ -1,6 +1,8 @@
-"""Where the rays of a photo meet a height field: first hits, so that trees and walls hide what lies behind."""
+"""Where rays meet a height field: first hits, so that trees and walls hide what lies behind."""
 
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 import cv2
 import numpy as np
@@ -41,7 +43,9 @@ class Rays:
 
 
 def rays_of(directions: Floats, rotation: Doubles, centre: Doubles, origin: Doubles, res: float) -> Rays:
-    """Rays of ideal image coordinates (h, w, 2) from a camera; `origin` is the map place of raster pixel (0, 0).
+    """Rays of ideal image coordinates (h, w, 2) from a camera.
+
+    `origin` is the map place of raster pixel (0, 0).
 
     Heights count from the same zero as centre[2]. Raises ValueError where a ray does not look down.
     """
@@ -55,22 +59,20 @@ def rays_of(directions: Floats, rotation: Doubles, centre: Doubles, origin: Doub
     return Rays(start=place + np.float32(centre[2]) * slope, slope=slope)
 
 
-def sample(
-    raster: NDArray[np.generic], pixels: Floats, interpolation: int = cv2.INTER_LINEAR
-) -> NDArray[np.generic]:
-    """Values of a raster at pixels (..., 2), edges repeated."""
-    shape = pixels.shape[:-1]
+def sample(raster: NDArray[Any], pixels: Floats, interpolation: int = cv2.INTER_LINEAR) -> NDArray[Any]:
+    """Values of a raster at pixels (h, w, 2) or (n, 2), edges repeated."""
     if pixels.ndim == 3:
-        values = cv2.remap(raster, pixels, None, interpolation, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(values)
-    count = int(np.prod(shape))
-    wide = 1024
-    padded = np.zeros((-(-count // wide) * wide, 2), dtype=np.float32)
-    padded[:count] = pixels.reshape(-1, 2)
-    values = cv2.remap(
-        raster, padded.reshape(-1, wide, 2), None, interpolation, borderMode=cv2.BORDER_REPLICATE
-    )
-    return np.asarray(values.reshape(-1, *values.shape[2:])[:count].reshape(*shape, *values.shape[2:]))
+        return _remap(raster, pixels, interpolation)
+    count, wide = len(pixels), 1024  # lists are folded, since images have at most 32767 rows
+    folded = np.zeros((-(-count // wide), wide, 2), dtype=np.float32)
+    folded.reshape(-1, 2)[:count] = pixels
+    values = _remap(raster, folded, interpolation)
+    return values.reshape(-1, *values.shape[2:])[:count]
+
+
+def _remap(raster: NDArray[Any], pixels: Floats, interpolation: int) -> NDArray[Any]:
+    x, y = cv2.split(pixels)
+    return np.asarray(cv2.remap(raster, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _cells(raster: Floats, reach: int) -> tuple[Floats, Floats]:
@@ -90,7 +92,7 @@ def _bracket(raster: Floats, rays: Rays) -> tuple[Floats, Floats]:
     levels = np.linspace(top, bottom, int(np.ceil((top - bottom) / _LEVEL_M)) + 2, dtype=np.float32)
     above = np.full(rays.start.shape[:2], np.nan, dtype=np.float32)
     below = np.full(rays.start.shape[:2], np.nan, dtype=np.float32)
-    for upper, lower in zip(levels[:-1], levels[1:], strict=True):
+    for upper, lower in pairwise(levels):
         cell = rays.at(np.full_like(above, lower)) / np.float32(_CELL) - np.float32(0.5 - 0.5 / _CELL)
         highest = sample(high, cell, cv2.INTER_NEAREST)
         lowest = sample(low, cell, cv2.INTER_NEAREST)
@@ -148,6 +150,6 @@ def first_hits(raster: Floats, rays: Rays) -> tuple[Floats, Floats]:
     return rays.at(heights), heights
 
 
-def _spread(cells: NDArray[np.generic], height: int, width: int) -> NDArray[np.generic]:
+def _spread(cells: NDArray[Any], height: int, width: int) -> NDArray[Any]:
     """Cell values to pixels."""
     return np.repeat(np.repeat(cells, _CELL, axis=0), _CELL, axis=1)[:height, :width]

@@ -29,7 +29,7 @@ def camera_rotation(yaw: float, pitch: float, roll: float) -> Doubles:
 
 
 def gimbal_angles(yaw: float, pitch: float, roll: float) -> tuple[float, float, float]:
-    """A gimbal's yaw, pitch, roll (nose camera, pitch -90 at nadir) that look the same way as the belly camera."""
+    """Yaw, pitch, roll of a gimbal (nose camera, pitch -90 at nadir) that looks as the belly camera does."""
     belly = _turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll)
     nose = belly @ _NOSE_CAMERA_OF_BELLY.T
     lift = np.degrees(np.arcsin(np.clip(-nose[2, 0], -1, 1)))

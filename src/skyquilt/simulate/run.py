@@ -1,7 +1,7 @@
 """The simulator's story: settings in, a folder of photos with their truth out."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from skyquilt.simulate.flight import Shot, Waypoint, fly, plan, site
 from skyquilt.simulate.ground import Ground
 from skyquilt.simulate.noise import Noise
 from skyquilt.simulate.reported import Place, Report, Start, place_at, report_all
-from skyquilt.simulate.scene import Country, Scene
+from skyquilt.simulate.scene import Country, Scene, empty_scene
 from skyquilt.simulate.settings import FlightSettings, Thermal
 from skyquilt.simulate.truth import Taken, covered, write_rasters, write_thermal, write_truth
 
@@ -68,7 +68,10 @@ class World:
 
 
 def prepare(settings: FlightSettings, waypoints: list[Waypoint] | None = None) -> World:
-    """Plan, fly and report; `waypoints` replaces the planned route. Raises UsageError for settings that do not fit."""
+    """Plan, fly and report; `waypoints` replaces the planned route.
+
+    Raises UsageError for settings that do not fit.
+    """
     settings = settings.checked()
     points = plan(settings.route, settings.lens) if waypoints is None else waypoints
     place = place_at(settings.scene.latitude, settings.scene.longitude)
@@ -180,17 +183,19 @@ def _write(world: World, output: Path) -> Iterator[Progress]:
     yield Progress(stage="truth", done=1, total=1)
 
 
-def _drawn(world: World, output: Path, stage: str, res: float, *, heat: bool) -> Iterator[Progress]:  # type: ignore[misc]
+def _drawn(
+    world: World, output: Path, stage: str, res: float, *, heat: bool
+) -> Generator[Progress, None, Scene]:
     """Draw the country; returns the scene."""
     thermal = world.settings.thermal
     weather = thermal.weather if heat and thermal is not None else world.settings.weather
-    scene: Scene | None = None
-    for done, total, scene in world.country.draw(res, weather, thermal=heat, scratch=output / ".scratch"):
+    scene = empty_scene(world.country.grid(res), thermal=heat, scratch=output / ".scratch" / stage)
+    for done, total in world.country.draw(scene, weather, scratch=output / ".scratch" / stage):
         yield Progress(stage=stage, done=done, total=total)
     return scene
 
 
-def _photograph(world: World, scene: Scene, output: Path) -> Iterator[Progress]:  # type: ignore[misc]
+def _photograph(world: World, scene: Scene, output: Path) -> Generator[Progress, None, list[Taken]]:
     """Take and write the visible photos; returns what was taken."""
     pictures, flight = world.settings.pictures, world.visible
     camera = exposer(scene, flight.lens)
@@ -211,7 +216,9 @@ def _photograph(world: World, scene: Scene, output: Path) -> Iterator[Progress]:
     return taken
 
 
-def _film(world: World, flight: Flight, thermal: Thermal, output: Path) -> Iterator[Progress]:  # type: ignore[misc]
+def _film(
+    world: World, flight: Flight, thermal: Thermal, output: Path
+) -> Generator[Progress, None, list[Taken]]:
     """Take and write the thermal frames; returns what was taken."""
     res = thermal.height / thermal.lens.focal
     scene = yield from _drawn(world, output, "thermal terrain", res, heat=True)

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -112,26 +112,27 @@ class Country:
         paint_targets(canvas, self.targets)
         return canvas
 
-    def draw(
-        self, res: float, weather: Weather, *, thermal: bool, scratch: Path
-    ) -> Iterator[tuple[int, int, Scene]]:
-        """Draw everything block by block; yields (done, total, scene so far)."""
-        grid = self.grid(res)
-        scene = Scene(
-            grid=grid,
-            height=_room(grid, (), np.float32, scratch / "height"),
-            rgb=_room(grid, (3,), np.uint8, scratch / "rgb"),
-            thermal=_room(grid, (), np.uint16, scratch / "thermal") if thermal else None,
-        )
-        looks = _room(grid, (4,), np.float16, scratch / "look")
-        blocks = grid.blocks(_BLOCK)
+    def draw(self, scene: Scene, weather: Weather, *, scratch: Path) -> Iterator[tuple[int, int]]:
+        """Fill a scene, first its surfaces, then their light, block by block; yields (done, total)."""
+        looks = _room(scene.grid, (4,), np.float16, scratch / "look")
+        blocks = scene.grid.blocks(_BLOCK)
         for number, block in enumerate(blocks):
             canvas = self.paint(block, weather)
             scene.height[block.slices], looks[block.slices] = canvas.height, canvas.look
-            yield number + 1, 2 * len(blocks), scene
+            yield number + 1, 2 * len(blocks)
         for number, block in enumerate(blocks):
             _light(scene, looks, block, weather, flat=self.settings.kind == "chessboard")
-            yield len(blocks) + number + 1, 2 * len(blocks), scene
+            yield len(blocks) + number + 1, 2 * len(blocks)
+
+
+def empty_scene(grid: Grid, *, thermal: bool, scratch: Path) -> Scene:
+    """Room for a scene, in memory or in files below `scratch`."""
+    return Scene(
+        grid=grid,
+        height=_room(grid, (), np.float32, scratch / "height"),
+        rgb=_room(grid, (3,), np.uint8, scratch / "rgb"),
+        thermal=_room(grid, (), np.uint16, scratch / "thermal") if thermal else None,
+    )
 
 
 def _light(scene: Scene, looks: NDArray[np.float16], block: Grid, weather: Weather, *, flat: bool) -> None:
@@ -162,7 +163,7 @@ def _paint_squares(canvas: Canvas, square: float) -> None:
     canvas.look[..., 3] = 20 + 6 * odd
 
 
-def _room(grid: Grid, tail: tuple[int, ...], dtype: type, path: Path) -> NDArray:  # type: ignore[type-arg]
+def _room(grid: Grid, tail: tuple[int, ...], dtype: type, path: Path) -> NDArray[Any]:
     """An array for the whole grid, in a file where it is large."""
     shape = (grid.height, grid.width, *tail)
     if grid.height * grid.width <= _IN_MEMORY:

@@ -170,21 +170,46 @@ class FlightSettings:
 
     def checked(self) -> "FlightSettings":
         """Itself; raises UsageError where values do not fit together."""
-        route = self.route
-        rules = [
-            (route.photos >= 1, f"photos must be at least 1, not {route.photos}"),
-            (0 <= route.overlap < 0.98, f"overlap must be 0 to 97 %, not {100 * route.overlap:.0f} %"),
-            (0 <= route.sidelap < 0.98, f"sidelap must be 0 to 97 %, not {100 * route.sidelap:.0f} %"),
-            (route.height >= 25, f"height must be at least 25 m (trees and houses), not {route.height:g} m"),
-            (route.height > 2 * self.scene.relief, f"height {route.height:g} m is too low over a relief of {self.scene.relief:g} m"),
-            (self.scene.relief >= 0, f"relief must not be negative, not {self.scene.relief:g} m"),
-            (route.drones >= 1, f"drones must be at least 1, not {route.drones}"),
-            (0 <= 2 * route.lost < route.photos, f"cannot lose {route.lost} of {route.photos} photos, at most every second one"),
-            (0 <= self.weather.hour < 24, f"hour must be 0 to 24, not {self.weather.hour:g}"),
-            (min(self.lens.width, self.lens.height) >= 64, "photos must be at least 64 px wide and high"),
-            (route.tilt_noise <= 8, f"tilt noise must be at most 8 degrees, not {route.tilt_noise:g}"),
-        ]  # fmt: skip
-        for holds, sentence in rules:
-            if not holds:
-                raise UsageError(sentence)
+        for rules in (_route_rules(self), _other_rules(self)):
+            for holds, sentence in rules:
+                if not holds:
+                    raise UsageError(sentence)
         return self
+
+
+_Rules = list[tuple[bool, str]]
+
+
+def _route_rules(settings: FlightSettings) -> _Rules:
+    route, relief = settings.route, settings.scene.relief
+    low = f"height {route.height:g} m is too low over a relief of {relief:g} m"
+    lost = f"cannot lose {route.lost} of {route.photos} photos, at most every second one"
+    return [
+        (route.photos >= 1, f"photos must be at least 1, not {route.photos}"),
+        (0 <= route.overlap < 0.98, f"overlap must be 0 to 97 %, not {100 * route.overlap:.0f} %"),
+        (0 <= route.sidelap < 0.98, f"sidelap must be 0 to 97 %, not {100 * route.sidelap:.0f} %"),
+        (route.height >= 25, f"height must be at least 25 m (trees, houses), not {route.height:g} m"),
+        (route.height > 2 * relief, low),
+        (route.drones >= 1, f"drones must be at least 1, not {route.drones}"),
+        (0 <= 2 * route.lost < route.photos, lost),
+        (0 <= route.tilt_noise <= 8, f"tilt noise must be 0 to 8 degrees, not {route.tilt_noise:g}"),
+    ]
+
+
+def _other_rules(settings: FlightSettings) -> _Rules:
+    hour, relief, control = settings.weather.hour, settings.scene.relief, settings.control
+    reporting, pictures = settings.reporting, settings.pictures
+    return [
+        (relief >= 0, f"relief must not be negative, not {relief:g} m"),
+        (0 <= hour < 24, f"hour must be 0 to 24, not {hour:g}"),
+        (min(settings.lens.width, settings.lens.height) >= 64, "photos must be at least 64 px wide and high"),
+        (
+            control.points >= 0 and control.checks >= 0,
+            "numbers of control and check points must not be negative",
+        ),
+        (reporting.gps_noise >= 0, f"GPS noise must not be negative, not {reporting.gps_noise:g} m"),
+        (reporting.gps_missing >= 0, "the number of photos without position must not be negative"),
+        (reporting.focal_error > -0.9, "the error of the focal length must be above -90 %"),
+        (pictures.exposure_noise >= 0, "exposure noise must not be negative"),
+        (0 <= pictures.motion_blur <= 100, "motion blur must be 0 to 100 px"),
+    ]

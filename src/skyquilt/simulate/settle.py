@@ -53,7 +53,7 @@ def _estates(bounds: tuple[float, float, float, float]) -> list[tuple[float, flo
 
 
 def _shuffled(lots: list[Lot], rng: np.random.Generator) -> list[Lot]:
-    """Lots in random order, those near the middle of their estate first so that small sites see every kind."""
+    """Lots in random order, but middle ones first, so that small sites see every kind."""
     middle = np.mean([lot.box for lot in lots], axis=0)
     far = [
         float(np.hypot(*(np.mean([lot.box[:2], lot.box[2:]], axis=0) - middle[:2] / 2 - middle[2:] / 2)))

@@ -7,6 +7,7 @@ import numpy as np
 
 from skyquilt.simulate import materials as m
 from skyquilt.simulate.canvas import Canvas
+from skyquilt.simulate.grid import Floats
 
 _TILT = 20.0  # degrees: the quarters of a target are not aligned with the raster
 
@@ -42,5 +43,5 @@ def paint_targets(canvas: Canvas, targets: Sequence[Target]) -> None:
         part.height[...] += (np.hypot(a, b) < 1.3 * target.radius) * (part.ground - part.height)
 
 
-def _step(cells: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+def _step(cells: Floats) -> Floats:
     return np.clip(cells + 0.5, 0, 1)

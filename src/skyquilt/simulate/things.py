@@ -1,6 +1,7 @@
 """Painters of what stands on the land: houses, trees, cars."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.simulate import materials as m
 from skyquilt.simulate.canvas import Canvas
@@ -23,7 +24,7 @@ def _empty(canvas: Canvas) -> bool:
     return canvas.grid.width == 0 or canvas.grid.height == 0
 
 
-def _raise(canvas: Canvas, cover: Floats, height: Floats | float) -> None:
+def _raise(canvas: Canvas, cover: NDArray[np.bool_], height: Floats | float) -> None:
     canvas.height[...] = np.where(cover, np.maximum(canvas.height, height), canvas.height)
 
 
