@@ -13,7 +13,6 @@ from PIL.TiffImagePlugin import IFDRational, ImageFileDirectory_v2
 from skyquilt.simulate.reported import Report
 
 MAKE = "Skyquilt"
-_START = datetime(2024, 7, 15, 9, 0, 0)
 _PITCH_MM = 0.004  # size of a sensor pixel
 _EXIF_IFD, _GPS_IFD, _XMP_TAG = 0x8769, 0x8825, 700
 
@@ -26,6 +25,8 @@ class Body:
     """Camera model."""
     serial: str
     """Camera serial number."""
+    start: datetime
+    """Clock time at which the flight starts."""
 
 
 def write_jpeg(path: Path, pixels: NDArray[np.uint8], report: Report, body: Body, quality: int) -> None:
@@ -55,12 +56,12 @@ def write_tiff(path: Path, counts: NDArray[np.uint16], report: Report, body: Bod
     if xmp is not None:
         tags[_XMP_TAG] = xmp
         tags.tagtype[_XMP_TAG] = 1
-    Image.fromarray(counts).save(path, "TIFF", compression="tiff_lzw", tiffinfo=tags)
+    Image.fromarray(counts).save(path, "TIFF", tiffinfo=tags)  # uncompressed: libtiff drops EXIF
 
 
 def _exif(report: Report, body: Body, width: int) -> Image.Exif:
     exif = Image.Exif()
-    moment = _START + timedelta(seconds=60 + report.clock)
+    moment = body.start + timedelta(seconds=report.clock)
     exif[0x010F], exif[0x0110] = MAKE, body.model
     exif[0x0112] = 1
     exif[0x0132] = moment.strftime("%Y:%m:%d %H:%M:%S")

@@ -209,7 +209,11 @@ def _photograph(world: World, scene: Scene, output: Path) -> Generator[Progress,
         if report.turned:
             pixels = np.ascontiguousarray(pixels[::-1, ::-1])
         name = f"{shot.name}.jpg"
-        body = Body(model="Simulated 4:3", serial=f"SIM{shot.waypoint.drone + 1:03d}")
+        body = Body(
+            model="Simulated 4:3",
+            serial=f"SIM{shot.waypoint.drone + 1:03d}",
+            start=world.settings.weather.moment,
+        )
         write_jpeg(folder / name, pixels, report, body, pictures.quality)
         taken.append(Taken(shot=shot, report=report, band="visible", file=f"photos/{name}", exposure=gain))
         yield Progress(stage="photos", done=number + 1, total=len(flight.shots), name=name)
@@ -223,6 +227,7 @@ def _film(
     res = thermal.height / thermal.lens.focal
     scene = yield from _drawn(world, output, "thermal terrain", res, heat=True)
     camera = exposer(scene, flight.lens)
+    body = Body(model="Simulated thermal", serial="THM001", start=thermal.weather.moment)
     folder = output / "thermal"
     folder.mkdir(exist_ok=True)
     taken = []
@@ -233,7 +238,7 @@ def _film(
         if report.turned:
             counts = np.ascontiguousarray(counts[::-1, ::-1])
         name = f"{shot.name}.tif"
-        write_tiff(folder / name, counts, report, Body(model="Simulated thermal", serial="THM001"))
+        write_tiff(folder / name, counts, report, body)
         taken.append(Taken(shot=shot, report=report, band="thermal", file=f"thermal/{name}", exposure=offset))
         yield Progress(stage="thermal", done=number + 1, total=len(flight.shots), name=name)
     write_thermal(output / "truth", scene, covered(scene.grid, flight.lens, flight.shots, 0.0), world.place)

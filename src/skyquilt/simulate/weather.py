@@ -1,6 +1,7 @@
 """Season and hour: where the sun stands, how strong it is, how warm the air is."""
 
 from dataclasses import dataclass
+from datetime import datetime, timedelta
 from typing import Literal
 
 import numpy as np
@@ -21,6 +22,12 @@ class Weather:
     """Changes the vegetation, the sun's height and the warmth."""
     hour: float = 10.5
     """Local solar time, 0-24."""
+
+    @property
+    def moment(self) -> datetime:
+        """A day of the season at this hour; clocks show solar time."""
+        day = datetime(2024, 7, 15) if self.season == "summer" else datetime(2025, 1, 15)
+        return day + timedelta(hours=self.hour)
 
     @property
     def sun(self) -> Doubles:
