@@ -127,6 +127,7 @@ def test_blocks_make_the_same_country():
     grid = country.grid(0.2)
     whole = country.paint(grid, Weather())
     part = country.paint(grid.window(100, 80, 90, 120), Weather())
-    at = part.grid.slices
-    assert np.abs(whole.height[at] - part.height).max() < 0.01
-    assert np.mean(np.abs(whole.look[at] - part.look).max(axis=-1) > 2) < 0.01
+    inner = grid.window(104, 84, 82, 112)  # smoothing sees a little less at the edge of a block
+    a, b = whole.grid.inside(inner), part.grid.inside(inner)
+    assert np.abs(whole.height[a] - part.height[b]).max() < 0.001
+    assert np.mean(np.abs(whole.look[a] - part.look[b]).max(axis=-1) > 1) < 0.005

@@ -1,4 +1,4 @@
-"""A small survey, written whole: same seed same bytes, metadata as reported, pictures as the orthophoto says."""
+"""A small survey, written whole: same seed same bytes, metadata as reported, pictures as in the orthophoto."""
 
 import json
 from dataclasses import replace
@@ -93,7 +93,8 @@ def test_photo_colours_are_those_of_the_orthophoto(survey, truth):
         rows, cols = (np.array(v) for v in rowcol(transform, xy[:, 0], xy[:, 1]))
         inside = (rows >= 0) & (cols >= 0) & (rows < heights.shape[0]) & (cols < heights.shape[1])
         rows, cols = rows[inside], cols[inside]
-        centres = np.column_stack([*(transform * (cols + 0.5, rows + 0.5)), heights[rows, cols]])
+        x, y = transform.c + (cols + 0.5) * transform.a, transform.f + (rows + 0.5) * transform.e
+        centres = np.column_stack([x, y, heights[rows, cols]])
         at = np.round(project(truth, photo, centres)).astype(int)
         seen = (at[:, 0] >= 0) & (at[:, 1] >= 0) & (at[:, 0] < 400) & (at[:, 1] < 300)
         radius = ((at[seen] - [199.5, 149.5]) ** 2).sum(axis=1) / (199.5**2 + 149.5**2)
@@ -143,8 +144,8 @@ def test_a_used_folder_is_refused(survey, tmp_path):
 
 def test_command_with_every_option(tmp_path):
     words = """--preset demo --photos 6 --overlap 70 --sidelap 50 --height 70 --heading 75 --size 240x180
-    --gps-noise 1 --gps-missing 1 --yaw-lie tag --altitude-drift 20 --focal-error 2 --tilt-noise 0.5 --relief 3
-    --season winter --hour 12 --exposure-noise 0.1 --motion-blur 2 --no-thermal --drones 2 --lose 1
+    --gps-noise 1 --gps-missing 1 --yaw-lie tag --altitude-drift 20 --focal-error 2 --tilt-noise 0.5
+    --relief 3 --season winter --hour 12 --exposure-noise 0.1 --motion-blur 2 --no-thermal --drones 2 --lose 1
     --gcp 2 --checks 1 --seed 4"""
     result = CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *words.split()])
     assert result.exit_code == 0, result.output
