@@ -1,4 +1,4 @@
-"""A small survey, written whole: same seed same bytes, metadata as reported, pictures as in the orthophoto."""
+"""A small survey, written whole: same seed same bytes, metadata as reported, pictures as the orthophoto."""
 
 import json
 from dataclasses import replace
