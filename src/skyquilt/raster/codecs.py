@@ -103,22 +103,29 @@ def split_jpeg(stream: bytes) -> tuple[bytes, bytes]:
 
 
 def smooth_fill(pixels: NDArray, valid: NDArray[np.bool_]) -> NDArray:
-    """Pixels (uint8) with every invalid one set to the mean of the valid ones in and around its JPEG unit.
+    """Pixels (uint8) with every invalid one set to the mean of the valid ones in or around its JPEG unit.
 
     So the rim keeps its colour. Units without valid neighbours become black, for viewers that ignore masks.
     """
-    h, w = valid.shape
-    weight = valid.astype(np.float32)
-    kept = pixels.astype(np.float32) * weight[..., None]
-    small = (w // MCU, h // MCU)
-    total = cv2.resize(kept, small, interpolation=cv2.INTER_AREA).reshape(*small[::-1], -1)
-    count = cv2.resize(weight, small, interpolation=cv2.INTER_AREA)[..., None]
-    around = cv2.blur(total, (3, 3), borderType=cv2.BORDER_CONSTANT).reshape(total.shape)
-    count_around = cv2.blur(count, (3, 3), borderType=cv2.BORDER_CONSTANT)[..., None]
-    own, near = count > 1e-6, count_around > 1e-6
-    mean = np.where(own, total / np.maximum(count, 1e-6), around / np.maximum(count_around, 1e-6)) * near
-    fill = np.repeat(np.repeat((mean + 0.5).astype(np.uint8), MCU, axis=0), MCU, axis=1)
-    return np.where(valid[..., None], pixels, fill)
+    pixels, small = pixels.copy(), (valid.shape[1] // MCU, valid.shape[0] // MCU)
+    units, inside = _units(pixels), _units(valid[..., None])
+    share = cv2.resize(valid.astype(np.uint8) * 255, small, interpolation=cv2.INTER_AREA)
+    mean = cv2.resize(pixels, small, interpolation=cv2.INTER_AREA).reshape((*units.shape[:2], -1))
+    mixed = np.nonzero((share > 0) & (share < 255))
+    colours, kept = units[mixed], inside[mixed]
+    mean[mixed] = (colours * kept).sum((1, 2), dtype=np.uint32) // kept.sum((1, 2), dtype=np.uint32)
+    units[mixed] = np.where(kept, colours, mean[mixed][:, None, None])
+    own, void = (share > 0).astype(np.float32)[..., None], share == 0
+    around = cv2.blur(mean * own, (3, 3), borderType=cv2.BORDER_CONSTANT).reshape(mean.shape)
+    weight = cv2.blur(own, (3, 3), borderType=cv2.BORDER_CONSTANT)[..., None]
+    units[void] = np.where(weight > 0.05, around / np.maximum(weight, 0.05), 0)[void][:, None, None]
+    return pixels
+
+
+def _units(array: NDArray) -> NDArray:
+    """A view (rows, columns, MCU, MCU, bands) of (h, w, bands)."""
+    h, w, bands = array.shape
+    return array.reshape(h // MCU, MCU, w // MCU, MCU, bands).swapaxes(1, 2)
 
 
 def pack_mask(valid: NDArray[np.bool_]) -> bytes:

@@ -39,7 +39,7 @@ class Pyramid:
     def __init__(self, encoder: TileEncoder, spool: Spool, block_level: int) -> None:
         self.spec, self._encoder, self._spool, self._block_level = encoder.spec, encoder, spool, block_level
         self.indices = [np.zeros((*grid, 3), np.uint64) for grid in self.spec.grids]
-        """Per level (rows, columns, 3): offset in the spool, bytes of image, of the mask behind it; 0 = empty."""
+        """Per level (rows, columns, 3): offset in the spool, bytes of image, bytes of mask; 0 = empty."""
         self._open: dict[tuple[int, int, int], _Open] = {}
         self._halves: dict[tuple[int, int], tuple[int, int]] = {}
         self._lock = threading.Lock()
