@@ -43,7 +43,7 @@ def _tags_by_gdal(wkt: str) -> tuple[Tag, ...]:
     from rasterio.io import MemoryFile
     from rasterio.transform import Affine
 
-    place = {"crs": CRS.from_wkt(wkt), "transform": Affine(1, 0, 0, 0, -1, 0)}
+    place = {"crs": CRS.from_wkt(wkt), "transform": Affine(1, 0, 1, 0, -1, 1)}
     with MemoryFile() as memory:
         with memory.open(driver="GTiff", width=1, height=1, count=1, dtype="uint8", **place):
             pass
