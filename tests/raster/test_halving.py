@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from skyquilt.raster.halving import halve
 
-
 TOLERANCE = {"uint8": 0.5, "uint16": 0.5, "int16": 0.5, "float32": 1e-4}
 """OpenCV rounds halves up or to even, depending on type and bands."""
 
