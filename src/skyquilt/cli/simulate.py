@@ -1,6 +1,145 @@
-"""`skyquilt simulate`."""
+"""`skyquilt simulate`: a flight of known truth over procedural terrain."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from skyquilt import simulate as sim
+from skyquilt.errors import UsageError
+from skyquilt.simulate.settings import FlightSettings, Thermal
+from skyquilt.simulate.weather import Weather
+
+PresetName = Literal["default", "demo", "strip", "roundtrip", "thermal", "drones"]
 
 
-def command() -> None:
-    """Not there yet."""
-    raise NotImplementedError
+def command(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="folder for photos/, gcp_list.txt and truth/")],
+    preset: Annotated[
+        PresetName, typer.Option(help="flight to start from; the options change it")
+    ] = "default",
+    photos: Annotated[int | None, typer.Option(help="photos planned")] = None,
+    overlap: Annotated[float | None, typer.Option(help="forward overlap, percent")] = None,
+    sidelap: Annotated[float | None, typer.Option(help="sideways overlap, percent")] = None,
+    height: Annotated[float | None, typer.Option(help="above take-off, m")] = None,
+    heading: Annotated[float | None, typer.Option(help="of the first line, degrees from north")] = None,
+    size: Annotated[str | None, typer.Option(help="photo size in px, such as 1600x1200")] = None,
+    gps_noise: Annotated[float | None, typer.Option(help="standard deviation, m")] = None,
+    gps_missing: Annotated[int | None, typer.Option(help="photos without position")] = None,
+    yaw_lie: Annotated[
+        Literal["none", "turned", "tag"] | None,
+        typer.Option(help="middle line: files turned by 180 degrees, or only the tag wrong"),
+    ] = None,
+    altitude_drift: Annotated[
+        float | None, typer.Option(help="error of reported heights at the end, m")
+    ] = None,
+    focal_error: Annotated[
+        float | None, typer.Option(help="of the focal length in the EXIF, percent")
+    ] = None,
+    no_focal: Annotated[bool, typer.Option("--no-focal", help="leave the focal length out")] = False,
+    tilt_noise: Annotated[float | None, typer.Option(help="standard deviation, degrees")] = None,
+    relief: Annotated[float | None, typer.Option(help="height between low and high ground, m")] = None,
+    terrain: Annotated[
+        Literal["landscape", "chessboard"] | None, typer.Option(help="what is flown over")
+    ] = None,
+    season: Annotated[Literal["summer", "winter"] | None, typer.Option(help="of the photos")] = None,
+    hour: Annotated[float | None, typer.Option(help="solar time of the photos, 0-24")] = None,
+    exposure_noise: Annotated[float | None, typer.Option(help="relative, from photo to photo")] = None,
+    motion_blur: Annotated[float | None, typer.Option(help="length, px")] = None,
+    thermal: Annotated[
+        bool | None, typer.Option("--thermal/--no-thermal", help="a thermal flight as well")
+    ] = None,
+    thermal_season: Annotated[
+        Literal["summer", "winter"] | None, typer.Option(help="of the thermal flight")
+    ] = None,
+    thermal_hour: Annotated[float | None, typer.Option(help="solar time of the thermal flight")] = None,
+    drones: Annotated[int | None, typer.Option(help="flying at once")] = None,
+    lose: Annotated[int | None, typer.Option(help="photos lost on the way")] = None,
+    gcp: Annotated[int | None, typer.Option(help="control points")] = None,
+    checks: Annotated[int | None, typer.Option(help="check points")] = None,
+    seed: Annotated[int | None, typer.Option(help="equal seeds give equal files")] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="replace a former simulation in OUT")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar")] = False,
+) -> None:
+    """Simulate a drone survey: photos with metadata, control points, and beside them the truth."""
+    base = sim.preset(preset)
+    if no_focal:
+        base = _with(base, "reporting", focal_missing=True)
+    base = _with(
+        base,
+        "route",
+        photos=photos,
+        overlap=_share(overlap),
+        sidelap=_share(sidelap),
+        height=height,
+        heading=heading,
+        tilt_noise=tilt_noise,
+        drones=drones,
+        lost=lose,
+    )
+    base = _with(
+        base,
+        "reporting",
+        gps_noise=gps_noise,
+        gps_missing=gps_missing,
+        yaw_lie=yaw_lie,
+        altitude_drift=altitude_drift,
+        focal_error=_share(focal_error),
+    )
+    base = _with(base, "scene", relief=relief, kind=terrain)
+    base = _with(base, "weather", season=season, hour=hour)
+    base = _with(base, "pictures", exposure_noise=exposure_noise, motion_blur=motion_blur)
+    base = _with(base, "control", points=gcp, checks=checks)
+    base = _thermal(base, thermal, Weather(season=thermal_season or "summer", hour=thermal_hour or 13.0))
+    base = replace(base, seed=base.seed if seed is None else seed, lens=_lens(base, size))
+    _show(sim.simulate(base, out, overwrite=overwrite), quiet)
+    if not quiet:
+        typer.echo(f"photos: {out / 'photos'}\ntruth:  {out / 'truth'}")
+
+
+def _share(percent: float | None) -> float | None:
+    return None if percent is None else percent / 100
+
+
+def _with(settings: FlightSettings, part: str, **values: Any) -> FlightSettings:
+    """The settings with those values of one part that are given."""
+    given = {name: value for name, value in values.items() if value is not None}
+    changed: Any = {part: replace(getattr(settings, part), **given)}
+    return replace(settings, **changed)
+
+
+def _thermal(settings: FlightSettings, wanted: bool | None, weather: Weather) -> FlightSettings:
+    flight = settings.thermal
+    if wanted is not None:
+        flight = (flight or Thermal()) if wanted else None
+    return replace(settings, thermal=None if flight is None else replace(flight, weather=weather))
+
+
+def _lens(settings: FlightSettings, size: str | None) -> Any:
+    """The preset's lens on another number of pixels."""
+    if size is None:
+        return settings.lens
+    words = size.lower().split("x")
+    if len(words) != 2 or not all(word.isdigit() and 64 <= int(word) <= 12000 for word in words):
+        raise UsageError(f"--size must look like 1600x1200 (64 to 12000 px each), not '{size}'")
+    return settings.lens.scaled(int(words[0]), int(words[1]))
+
+
+def _show(events: Iterable[sim.Progress], quiet: bool) -> None:
+    """A bar for each stage."""
+    if quiet:
+        for _ in events:
+            pass
+        return
+    columns = (TextColumn("{task.description:16}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns) as bars:
+        tasks: dict[str, TaskID] = {}
+        for event in events:
+            if event.stage not in tasks:
+                tasks[event.stage] = bars.add_task(event.stage)
+            bars.update(tasks[event.stage], completed=event.done, total=event.total)

@@ -4,13 +4,14 @@ Layout and radiometry follow the public descriptions of the format (record direc
 camera record 0x20; radiance budget object, reflection, atmosphere, window).
 """
 
+import io
 import math
 import struct
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from skyquilt.photos.jpeg import APP1, JpegHeader
 
@@ -89,7 +90,7 @@ def read_flir(jpeg: JpegHeader) -> FlirFrame | None:
         records = _records(block)
         counts = _counts(records[_RAW_IMAGE])
         return FlirFrame(counts=counts, camera=_camera(records.get(_CAMERA, b"")))
-    except (struct.error, KeyError, ValueError, IndexError, cv2.error):
+    except Exception:  # struct, Pillow and numpy raise many kinds on garbage; all mean that there is no frame
         return None
 
 
@@ -115,12 +116,11 @@ def _counts(record: bytes) -> NDArray[np.uint16]:
     width, height = struct.unpack_from(order + "HH", record, 2)
     body = record[32:]
     if body.startswith(b"\x89PNG"):
-        image = cv2.imdecode(np.frombuffer(body, np.uint8), cv2.IMREAD_UNCHANGED)
-        if image is None or image.dtype != np.uint16 or image.ndim != 2:
-            raise ValueError("its raw PNG is no 16-bit image")
-        return np.asarray(
-            image.byteswap(), dtype=np.uint16
-        )  # the camera stores little-endian words in a big-endian format
+        with Image.open(io.BytesIO(body)) as image:
+            if image.size != (width, height) or not image.mode.startswith("I"):
+                raise ValueError("its raw PNG is no 16-bit image of the size the record states")
+            swapped = np.asarray(image, dtype=np.uint16)
+        return np.asarray(swapped.byteswap(), dtype=np.uint16)  # little-endian words in a big-endian format
     data = np.frombuffer(body, dtype=order + "u2", count=width * height)
     return np.asarray(data.reshape(height, width), dtype=np.uint16)
 
@@ -138,7 +138,7 @@ def _camera(record: bytes) -> FlirCamera | None:
     if not (r1 > 0 and b > 0 and r2 > 0 and math.isfinite(r1 * b * f * r2)):
         return None
     humidity, window, emissivity = real(0x3C), real(0x34), real(0x20)
-    return FlirCamera(
+    camera = FlirCamera(
         planck_r1=r1,
         planck_b=b,
         planck_f=f,
@@ -157,6 +157,16 @@ def _camera(record: bytes) -> FlirCamera | None:
         beta2=_within(real(0x7C), -1, 1, 0.0),
         x=_within(real(0x80), -10, 10, 1.0),
     )
+    return camera if _is_thermometer(camera) else None
+
+
+def _is_thermometer(camera: FlirCamera) -> bool:
+    """Whether hotter means more counts, through air that lets something pass."""
+    try:
+        steps = [camera.signal(kelvin) for kelvin in (150.0, 250.0, 350.0, 1000.0)]
+        return steps == sorted(steps) and math.isfinite(sum(steps)) and 0.05 < camera.transmission < 1.5
+    except ArithmeticError:
+        return False
 
 
 def _within(value: float, low: float, high: float, otherwise: float) -> float:

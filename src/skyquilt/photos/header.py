@@ -119,9 +119,9 @@ def _tiff(file: BinaryIO) -> Header:
         alpha = sum(int(e) in (1, 2) for e in page.extrasamples)
         return Header(
             kind="tiff",
-            width=page.imagewidth,
-            height=page.imagelength,
-            channels=page.samplesperpixel - alpha,
+            width=int(page.imagewidth),
+            height=int(page.imagelength),
+            channels=int(page.samplesperpixel) - alpha,
             dtype=_stored_as(page.dtype),
             exif=exif,
             xmp=parse_xmp((packet,) if isinstance(packet, bytes) and packet else ()),

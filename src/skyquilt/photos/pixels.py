@@ -5,6 +5,7 @@ reduced image has its centre at (r * i + (r - 1) / 2, r * j + (r - 1) / 2) of th
 decoded at that scale (no full decode takes place).
 """
 
+import io
 import re
 from pathlib import Path
 from typing import Any, Literal
@@ -14,6 +15,7 @@ import numpy as np
 import simplejpeg
 import tifffile
 from numpy.typing import NDArray
+from PIL import Image
 
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.photo import Photo
@@ -23,7 +25,7 @@ from skyquilt.photos.thermal import thermal_frame_of_jpeg, thermal_frame_of_valu
 
 Pixels = NDArray[Any]
 Reduction = Literal[1, 2, 4, 8]
-_HARMLESS = re.compile(r"(\d{1,3}) extraneous bytes before marker|JFIF|Inconsistent progression|Invalid SOS")
+_HARMLESS = re.compile(r"\b\d{1,2} extraneous bytes before marker|JFIF|Inconsistent progression|Invalid SOS")
 
 
 def read_color(photo: Photo, *, reduction: Reduction = 1) -> Pixels:
@@ -92,7 +94,7 @@ def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
     if data[:2] == b"\xff\xd8":
         return reduce_pixels(_thermal_jpeg(photo.path), reduction)
     if data[:4] == b"\x89PNG":
-        return reduce_pixels(_png(data), reduction)
+        return reduce_pixels(_png(data, photo.channels), reduction)
     pixels = read_tiff(photo.path)[..., : photo.channels]
     pixels = pixels[..., 0] if photo.channels == 1 else pixels
     return reduce_pixels(thermal_frame_of_values(pixels).values if photo.unit else pixels, reduction)
@@ -126,13 +128,11 @@ def _thermal_jpeg(path: Path) -> Pixels:
     return frame.values
 
 
-def _png(data: bytes) -> Pixels:
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise UnreadablePhotoError("its PNG data are damaged")
-    if image.ndim == 2:
-        return np.asarray(image)
-    return np.ascontiguousarray(image[..., 2::-1])
+def _png(data: bytes, channels: int) -> Pixels:
+    with Image.open(io.BytesIO(data)) as image:
+        if image.mode.startswith("I"):
+            return np.asarray(image, dtype=np.uint16)
+        return np.asarray(image.convert("L" if channels == 1 else "RGB"))
 
 
 def read_tiff(path: Path) -> Pixels:

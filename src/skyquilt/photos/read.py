@@ -1,12 +1,14 @@
 """One file to one `Photo`."""
 
+from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
 
 from skyquilt.errors import UnreadablePhotoError
-from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.model.camera import Camera
+from skyquilt.model.photo import Focal, Photo, RejectedPhoto
 from skyquilt.photos import exif as tag
 from skyquilt.photos.attitude import read_attitude, read_flight_yaw
 from skyquilt.photos.calibration import read_calibration
@@ -20,6 +22,7 @@ from skyquilt.photos.sensors import Sensor, find_sensor
 from skyquilt.photos.thermal import ThermalFrame, thermal_frame_of_jpeg, thermal_frame_of_values
 
 _SMALLEST = 32
+_STRANGE = "its metadata are of a kind that was not foreseen"
 _LARGEST_THERMAL = 1280
 
 
@@ -33,6 +36,17 @@ def read_photo(path: Path, *, name: str | None = None) -> Photo | RejectedPhoto:
         return RejectedPhoto(name=name, reason=str(error))
     except OSError as error:
         return RejectedPhoto(name=name, reason=f"it cannot be read ({error.strerror or error})")
+    except Exception as error:  # the last net: one strange file must not end a survey of thousands
+        return RejectedPhoto(name=name, reason=f"{_STRANGE} ({type(error).__name__}: {error})")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Lens:
+    sensor: Sensor | None
+    thermal: bool
+    calibration: Camera | None
+    focal: Focal
+    note: str
 
 
 def _photo(path: Path, name: str, header: Header) -> Photo:
@@ -40,27 +54,10 @@ def _photo(path: Path, name: str, header: Header) -> Photo:
     height, width = frame.values.shape if frame else (header.height, header.width)
     if min(width, height) < _SMALLEST:
         raise UnreadablePhotoError(f"it has only {width}x{height} px; at least {_SMALLEST} a side are needed")
-    exif, xmp = header.exif, header.xmp
-    scale, size_note = native_scale(exif, width, height)
-    sensor = _sensor(header, width, height, scale)
-    thermal = frame is not None or (sensor is not None and sensor.band == "thermal") or _is_lwir(header)
-    calibration = read_calibration(exif=exif, xmp=xmp, sensor=sensor, width=width, height=height, scale=scale)
-    focal = find_focal(
-        exif=exif, sensor=sensor, calibration=calibration, width=width, height=height, thermal=thermal
-    )
-    position, place_notes = read_position(exif, xmp)
-    attitude, angle_notes = read_attitude(xmp)
-    time = read_time(exif, xmp)
-    notes = (
-        *_broken_notes(header),
-        size_note,
-        frame.note if frame else "",
-        *place_notes,
-        *angle_notes,
-        "" if time else "It carries no capture time.",
-        _focal_note(focal.source, exif.text(tag.MODEL)),
-        _edit_note(header),
-    )
+    lens = _lens(header, width, height, thermal=frame is not None)
+    position, place_notes = read_position(header.exif, header.xmp)
+    attitude, angle_notes = read_attitude(header.xmp)
+    seen = (lens.note, frame.note if frame else "", *place_notes, *angle_notes)
     return Photo(
         name=name,
         path=path,
@@ -69,20 +66,34 @@ def _photo(path: Path, name: str, header: Header) -> Photo:
         height=height,
         channels=1 if frame else header.channels,
         dtype="float32" if frame else header.dtype,
-        band="thermal" if thermal else "visible",
+        band="thermal" if lens.thermal else "visible",
         unit=frame.unit if frame else "",
         camera_key=_camera_key(header, width, height),
-        calibration=calibration,
-        focal=focal,
+        calibration=lens.calibration,
+        focal=lens.focal,
         position=position,
         attitude=attitude,
-        flight_yaw_deg=read_flight_yaw(xmp),
-        time=time,
-        orientation_tag=int(exif.number(tag.ORIENTATION) or 1),
-        rolling_shutter=_rolling(header, sensor),
-        editor=find_editor(exif, xmp),
-        notes=tuple(n for n in notes if n),
+        flight_yaw_deg=read_flight_yaw(header.xmp),
+        time=read_time(header.exif, header.xmp),
+        orientation_tag=int(header.exif.number(tag.ORIENTATION) or 1),
+        rolling_shutter=_rolling(header, lens.sensor),
+        editor=find_editor(header.exif, header.xmp),
+        notes=tuple(n for n in (*_broken_notes(header), *seen, *_other_notes(header, lens)) if n),
     )
+
+
+def _lens(header: Header, width: int, height: int, *, thermal: bool) -> _Lens:
+    exif = header.exif
+    scale, note = native_scale(exif, width, height)
+    sensor = find_sensor(model=exif.text(tag.MODEL), long_side=round(max(width, height) / scale))
+    thermal = thermal or (sensor is not None and sensor.band == "thermal") or _is_lwir(header)
+    calibration = read_calibration(
+        exif=exif, xmp=header.xmp, sensor=sensor, width=width, height=height, scale=scale
+    )
+    focal = find_focal(
+        exif=exif, sensor=sensor, calibration=calibration, width=width, height=height, thermal=thermal
+    )
+    return _Lens(sensor=sensor, thermal=thermal, calibration=calibration, focal=focal, note=note)
 
 
 def _thermal_frame(path: Path, header: Header) -> ThermalFrame | None:
@@ -103,10 +114,6 @@ def _thermal_frame(path: Path, header: Header) -> ThermalFrame | None:
 
 def _is_lwir(header: Header) -> bool:
     return "lwir" in header.xmp.text("Camera:BandName").lower()
-
-
-def _sensor(header: Header, width: int, height: int, scale: float) -> Sensor | None:
-    return find_sensor(model=header.exif.text(tag.MODEL), long_side=round(max(width, height) / scale))
 
 
 def _camera_key(header: Header, width: int, height: int) -> str:
@@ -136,6 +143,12 @@ def _broken_notes(header: Header) -> tuple[str, ...]:
     exif = "Its EXIF block is broken and was read as far as it went." if header.exif.broken else ""
     xmp = "Its XMP packet is broken XML; values were searched in it as text." if header.xmp.broken else ""
     return exif, xmp
+
+
+def _other_notes(header: Header, lens: _Lens) -> tuple[str, ...]:
+    time = read_time(header.exif, header.xmp)
+    guess = _focal_note(lens.focal.source, header.exif.text(tag.MODEL))
+    return "" if time else "It carries no capture time.", guess, _edit_note(header)
 
 
 def _focal_note(source: str, model: str) -> str:

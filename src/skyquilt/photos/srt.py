@@ -55,8 +55,9 @@ def _samples(path: Path) -> list[_Sample]:
     """Blocks start with their number and a line `00:00:01,000 --> 00:00:02,000`."""
     lines = [line for _, line in read_lines(path)]
     starts = [i for i, line in enumerate(lines) if "-->" in line and i > 0 and lines[i - 1].isdigit()]
+    ends = [*(s - 1 for s in starts[1:]), len(lines)]
     samples = []
-    for start, end in zip(starts, [*(s - 1 for s in starts[1:]), len(lines)], strict=True):
+    for start, end in zip(starts, ends, strict=False):
         text = " ".join(lines[start + 1 : end])
         row = _row(text)
         if row:

@@ -1,4 +1,4 @@
-"""Positions that cannot be: one photo far from all others."""
+"""Positions that cannot be: one photo far from all others, a whole flight at height zero."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.model.photo import Photo
+from skyquilt.model.photo import Datum, Photo
 
 _FAR_M = 5_000.0
 _FAR_SPREADS = 20.0
 _METRES_PER_DEGREE = 111_320.0
+_GROUND_M = 2.0
 
 
 def without_outliers(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
@@ -21,12 +22,43 @@ def without_outliers(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[
     """
     placed = [p for p in photos if p.position]
     if len(placed) < 3:
-        return tuple(photos), ()
+        return tuple(photos), _far_pair(placed)
     distance = dict(zip((p.name for p in placed), distances_to_median(placed), strict=True))
     limit = max(_FAR_M, _FAR_SPREADS * float(np.median(list(distance.values()))))
     far = {name: d for name, d in distance.items() if d > limit}
     notes = tuple(f"{name} claims to lie {d / 1000:.0f} km from the others." for name, d in far.items())
     return tuple(_unplaced(p, far[p.name]) if p.name in far else p for p in photos), notes
+
+
+def without_ground_heights(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    """Heights above sea level in place of heights above take-off that stay at zero through a whole flight.
+
+    Some firmware writes `RelativeAltitude` 0 throughout; nobody maps from below 2 m.
+    """
+    heights = [p.position.takeoff_m for p in photos if p.position and p.position.takeoff_m is not None]
+    if not heights or max(map(abs, heights)) > _GROUND_M:
+        return tuple(photos), ()
+    note = f"The heights above take-off stay within {_GROUND_M:.0f} m of zero and were not used."
+    return tuple(_unraised(p) for p in photos), (note,)
+
+
+def _unraised(photo: Photo) -> Photo:
+    old = photo.position
+    if old is None or old.takeoff_m is None:
+        return photo
+    old = replace(old, takeoff_m=None)
+    if old.datum == "takeoff":
+        datum: Datum = "sea_level" if old.sea_level_m is not None else "unknown"
+        old = replace(old, altitude_m=old.sea_level_m, datum=datum)
+    return replace(photo, position=old)
+
+
+def _far_pair(placed: Sequence[Photo]) -> tuple[str, ...]:
+    """Of two positions nobody can tell which one is wrong, but that one is."""
+    apart = 2 * float(distances_to_median(placed)[0]) if len(placed) == 2 else 0.0
+    if apart <= _FAR_M:
+        return ()
+    return (f"{placed[0].name} and {placed[1].name} claim to lie {apart / 1000:.0f} km apart.",)
 
 
 def distances_to_median(photos: Sequence[Photo]) -> NDArray[np.float64]:

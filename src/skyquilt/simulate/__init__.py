@@ -1,1 +1,11 @@
-"""A flight of known truth over procedural terrain. Imports no stage: an oracle shares no code with the judged."""
+"""A flight of known truth over procedural terrain.
+
+Imports no stage: an oracle shares no code with the judged.
+"""
+
+from skyquilt.simulate.flight import Waypoint
+from skyquilt.simulate.presets import PRESETS, preset
+from skyquilt.simulate.run import Progress, prepare, simulate
+from skyquilt.simulate.settings import FlightSettings
+
+__all__ = ["PRESETS", "FlightSettings", "Progress", "Waypoint", "prepare", "preset", "simulate"]

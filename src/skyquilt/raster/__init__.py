@@ -1,0 +1,7 @@
+"""Pixels to files: Cloud Optimized GeoTIFF, GeoJSON, and the boundary a user hands in."""
+
+from skyquilt.raster.blocks import Block
+from skyquilt.raster.cog import CogWriter, write_array
+from skyquilt.raster.spec import RasterSpec
+
+__all__ = ["Block", "CogWriter", "RasterSpec", "write_array"]

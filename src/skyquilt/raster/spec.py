@@ -1,0 +1,97 @@
+"""What a raster file shall be: size, type, place, compression."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+Compression = Literal["jpeg", "deflate", "zstd", "lzw", "none"]
+Resampling = Literal["average", "mode", "nearest", "max"]
+DTYPES = ("uint8", "uint16", "uint32", "int16", "float32")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RasterSpec:
+    """All that a COG writer must know before the first pixel."""
+
+    width: int
+    """Columns."""
+    height: int
+    """Rows."""
+    bands: int
+    """Samples per pixel."""
+    dtype: str
+    """One of `DTYPES`."""
+    transform: Sequence[float]
+    """(a, b, c, d, e, f), as `affine.Affine`: corner x = a col + b row + c, y = d col + e row + f."""
+    crs: str | None = None
+    """As pyproj reads it (`EPSG:32615`, WKT); None = ungeoreferenced."""
+    nodata: float | None = None
+    """Value of pixels without data; NaN for radiometric rasters."""
+    compress: Compression = "deflate"
+    """`jpeg` takes uint8 with one or three bands; the others are lossless."""
+    quality: int = 85
+    """JPEG quality, 1 to 100."""
+    mask: bool = False
+    """Write an internal 1-bit mask of valid pixels at every level."""
+    overviews: Resampling = "average"
+    """How four pixels become one."""
+    tile: int = 512
+    """Side of a tile in px, a multiple of 16."""
+    tags: dict[str, str] = field(default_factory=dict)
+    """Metadata of the file, as GDAL shows them."""
+    band_names: tuple[str, ...] = ()
+    """Description of each band."""
+    band_units: tuple[str, ...] = ()
+    """Unit of each band, e.g. `m`."""
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1 or self.bands < 1:
+            raise ValueError(
+                f"a raster needs at least 1 x 1 x 1, asked for {self.width} x {self.height} x {self.bands}"
+            )
+        if self.dtype not in DTYPES:
+            raise ValueError(f"dtype is one of {', '.join(DTYPES)}, asked for {self.dtype}")
+        if self.tile < 16 or self.tile % 16:
+            raise ValueError(f"tile is a multiple of 16 px, asked for {self.tile}")
+        if self.compress == "jpeg" and (self.dtype != "uint8" or self.bands not in (1, 3)):
+            raise ValueError(f"JPEG takes 1 or 3 bands of uint8, asked for {self.bands} of {self.dtype}")
+        for what, names in (("band_names", self.band_names), ("band_units", self.band_units)):
+            if names and len(names) != self.bands:
+                raise ValueError(f"{what} has {len(names)} entries, the raster {self.bands} bands")
+
+    @property
+    def numpy_dtype(self) -> np.dtype:
+        """The pixel type, little-endian as in the file."""
+        return np.dtype(self.dtype).newbyteorder("<")
+
+    @property
+    def affine(self) -> tuple[float, float, float, float, float, float]:
+        """The six numbers of the transform (an `affine.Affine` has nine)."""
+        a, b, c, d, e, f = (float(value) for value in tuple(self.transform)[:6])
+        return a, b, c, d, e, f
+
+    @property
+    def levels(self) -> tuple[tuple[int, int], ...]:
+        """(height, width) of each level in px: full size, then halves until one tile holds everything."""
+        sizes = [(self.height, self.width)]
+        while max(sizes[-1]) > self.tile:
+            h, w = sizes[-1]
+            sizes.append(((h + 1) // 2, (w + 1) // 2))
+        return tuple(sizes)
+
+    @property
+    def grids(self) -> tuple[tuple[int, int], ...]:
+        """(rows, columns) of tiles of each level."""
+        return tuple((-(-h // self.tile), -(-w // self.tile)) for h, w in self.levels)
+
+    def tile_size(self, level: int, row: int, col: int) -> tuple[int, int]:
+        """(height, width) in px of the part of a tile that lies inside the raster."""
+        h, w = self.levels[level]
+        return min(self.tile, h - row * self.tile), min(self.tile, w - col * self.tile)
+
+    def digest(self, salt: str = "") -> str:
+        """Hex digest of the specification and of whatever the caller adds."""
+        return hashlib.sha256(f"{self!r}|{salt}".encode()).hexdigest()

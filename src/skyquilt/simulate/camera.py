@@ -1,0 +1,96 @@
+"""The simulated camera: pinhole with Brown's distortion in OpenCV's direction."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from skyquilt.simulate.grid import Doubles, Floats
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """Interior orientation; pixel centres at integers, the image spans [-0.5, width - 0.5]."""
+
+    width: int = 1600
+    """Image width, px."""
+    height: int = 1200
+    """Image height, px."""
+    focal: float = 1333.0
+    """Focal length, px."""
+    offset_x: float = 6.0
+    """Principal point from the image centre, px to the right."""
+    offset_y: float = -4.0
+    """Principal point from the image centre, px downwards."""
+    k1: float = -0.08
+    """Radial, r^2."""
+    k2: float = 0.04
+    """Radial, r^4."""
+    k3: float = 0.0
+    """Radial, r^6."""
+    p1: float = 0.0005
+    """Tangential."""
+    p2: float = -0.0003
+    """Tangential."""
+
+    @property
+    def cx(self) -> float:
+        """Principal point, x, px."""
+        return (self.width - 1) / 2 + self.offset_x
+
+    @property
+    def cy(self) -> float:
+        """Principal point, y, px."""
+        return (self.height - 1) / 2 + self.offset_y
+
+    def distort(self, x: Doubles, y: Doubles) -> tuple[Doubles, Doubles]:
+        """Ideal to real normalised coordinates."""
+        r2 = x * x + y * y
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        xy2 = 2 * x * y
+        return (
+            x * radial + self.p1 * xy2 + self.p2 * (r2 + 2 * x * x),
+            y * radial + self.p1 * (r2 + 2 * y * y) + self.p2 * xy2,
+        )
+
+    def undistort(self, x: Doubles, y: Doubles, rounds: int = 14) -> tuple[Doubles, Doubles]:
+        """Real to ideal normalised coordinates, by fixed-point iteration."""
+        ideal_x, ideal_y = x.copy(), y.copy()
+        for _ in range(rounds):
+            real_x, real_y = self.distort(ideal_x, ideal_y)
+            ideal_x += x - real_x
+            ideal_y += y - real_y
+        return ideal_x, ideal_y
+
+    def project(self, points: Doubles, rotation: Doubles, centre: Doubles) -> Doubles:
+        """Pixels (n, 2) of map points (n, 3); NaN behind the camera."""
+        camera = (np.asarray(points, dtype=np.float64) - centre) @ rotation.T
+        depth = np.where(camera[:, 2] > 1e-6, camera[:, 2], np.nan)
+        x, y = self.distort(camera[:, 0] / depth, camera[:, 1] / depth)
+        return np.stack([self.focal * x + self.cx, self.focal * y + self.cy], axis=1)
+
+    def rays(self) -> Floats:
+        """Ideal normalised coordinates (height, width, 2) of every pixel centre."""
+        out = np.empty((self.height, self.width, 2), dtype=np.float32)
+        x = (np.arange(self.width, dtype=np.float64) - self.cx) / self.focal
+        for row in range(0, self.height, 16):
+            rows = np.arange(row, min(row + 16, self.height))
+            y = (rows - self.cy) / self.focal
+            xx, yy = np.meshgrid(x, y)
+            out[rows, :, 0], out[rows, :, 1] = self.undistort(xx, yy)
+        return out
+
+    def turned(self) -> "Lens":
+        """The lens that describes files whose pixels were turned by 180 degrees."""
+        return replace(self, offset_x=-self.offset_x, offset_y=-self.offset_y, p1=-self.p1, p2=-self.p2)
+
+    def scaled(self, width: int, height: int) -> "Lens":
+        """The same field of view on another number of pixels."""
+        ratio = width / self.width
+        return replace(
+            self,
+            width=width,
+            height=height,
+            focal=self.focal * ratio,
+            offset_x=self.offset_x * ratio,
+            offset_y=self.offset_y * ratio,
+        )

@@ -1,0 +1,118 @@
+"""A block of the country while it is painted."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.simulate.grid import Doubles, Floats, Grid
+from skyquilt.simulate.materials import Material
+from skyquilt.simulate.noise import Noise
+from skyquilt.simulate.weather import Weather
+
+WARM_K = np.float32(1.5)
+"""Kelvin by which a surface twice as bright as its material is warmer."""
+_SHIFT = 4  # fractional bits of polygon vertices
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Canvas:
+    """Arrays that painters write into; the record itself never changes."""
+
+    grid: Grid
+    """Where the block lies."""
+    look: Floats
+    """(h, w, 4) red, green, blue in 0-255 and temperature in degrees Celsius, all before light and shadow."""
+    height: Floats
+    """(h, w) surface above the base, m."""
+    ground: Floats
+    """(h, w) bare ground above the base, m; not written to."""
+    noise: Noise
+    """Of the scene."""
+    weather: Weather
+    """Of the scene."""
+
+    @cached_property
+    def grain(self) -> Floats:
+        """White noise per cell, a little softened."""
+        return np.asarray(cv2.GaussianBlur(self.noise.grain(self.grid, 5), (0, 0), 0.6)) * np.float32(1.9)
+
+    @cached_property
+    def fine(self) -> Floats:
+        """Tufts and clods: a few cells to half a metre."""
+        return self.noise.fractal(self.grid, 0.5, 0.12, 0.8, 6)
+
+    @cached_property
+    def patchy(self) -> Floats:
+        """Patches of one to some metres."""
+        return self.noise.fractal(self.grid, 4.0, 0.9, 0.7, 7)
+
+    @cached_property
+    def broad(self) -> Floats:
+        """Changes over tens of metres."""
+        return self.noise.fractal(self.grid, 45.0, 11.0, 0.7, 8)
+
+    def polygon(self, outline: Doubles) -> Floats:
+        """Coverage (h, w) of a map polygon, 0-1, with soft edges."""
+        mask = np.zeros(self.height.shape, dtype=np.uint8)
+        cv2.fillPoly(mask, [self._fixed(outline)], 255, cv2.LINE_AA, _SHIFT)
+        return mask.astype(np.float32) / np.float32(255)
+
+    def line(self, lines: Doubles | list[Doubles], width: float) -> Floats:
+        """Coverage (h, w) of map polylines of some width in m."""
+        mask = np.zeros(self.height.shape, dtype=np.uint8)
+        thick = max(1, round(width / self.grid.res))
+        fixed = [self._fixed(line) for line in (lines if isinstance(lines, list) else [lines])]
+        cv2.polylines(mask, fixed, False, 255, thick, cv2.LINE_AA, _SHIFT)
+        return mask.astype(np.float32) / np.float32(255)
+
+    def touches(self, points: Doubles, margin: float) -> bool:
+        """Whether the bounding box of map points comes within `margin` m of the block."""
+        if self.grid.width == 0 or self.grid.height == 0:
+            return False
+        low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
+        xs, ys = self.grid.xs, self.grid.ys
+        return bool(low[0] <= xs[-1] and high[0] >= xs[0] and low[1] <= ys[0] and high[1] >= ys[-1])
+
+    def part(self, x: float, y: float, reach: float) -> "Canvas":
+        """Views on the cells within `reach` m of a map point; may be empty."""
+        grid = self.grid.around(x, y, reach)
+        at = self.grid.inside(grid)
+        part = Canvas(
+            grid=grid,
+            look=self.look[at],
+            height=self.height[at],
+            ground=self.ground[at],
+            noise=self.noise,
+            weather=self.weather,
+        )
+        for name in ("grain", "fine", "patchy", "broad"):
+            part.__dict__[name] = getattr(self, name)[at]
+        return part
+
+    def local(self, x: float, y: float, angle_deg: float) -> tuple[Floats, Floats]:
+        """Coordinates (h, w) in m along and across a direction (degrees from map x) about a map point."""
+        c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+        dx = (self.grid.xs - x).astype(np.float32)[None, :]
+        dy = (self.grid.ys - y).astype(np.float32)[:, None]
+        return np.float32(c) * dx + np.float32(s) * dy, np.float32(c) * dy - np.float32(s) * dx
+
+    def lay(
+        self, material: Material, cover: Floats | NDArray[np.bool_], texture: Floats | float = 0.0
+    ) -> None:
+        """Paint a material where `cover` (h, w, 0-1) is; `texture` is a relative change of brightness."""
+        where = cover > 0
+        change = texture[where] if isinstance(texture, np.ndarray) else np.float32(texture)
+        share = cover[where].astype(np.float32)
+        colour = material.look(self.weather)
+        old = self.look[where]
+        for band in range(4):
+            new = colour[band] * (1 + change) if band < 3 else colour[band] + WARM_K * change
+            old[:, band] += share * (new - old[:, band])
+        self.look[where] = old
+
+    def _fixed(self, points: Doubles) -> NDArray[np.int32]:
+        pixels = np.clip(self.grid.pixels(points), -30000, 30000)
+        return np.round(pixels * 2**_SHIFT).astype(np.int32)

@@ -1,0 +1,167 @@
+"""Lay out targets, survey them, and find them in the photos."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.flight import Shot
+from skyquilt.simulate.grid import Doubles
+from skyquilt.simulate.layout import Layout
+from skyquilt.simulate.reported import Place, Report
+from skyquilt.simulate.scene import Country, Scene
+from skyquilt.simulate.settings import Control
+from skyquilt.simulate.targets import Target
+
+_CANDIDATES = 600
+_MARGIN_PX = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sighting:
+    """A target in a photo."""
+
+    point: str
+    """Target name."""
+    photo: str
+    """File name."""
+    x: float
+    """px, centres at integers, with observation noise."""
+    y: float
+    """px."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Surveyed:
+    """A target with its true and its measured coordinates."""
+
+    target: Target
+    """As it lies there."""
+    true: tuple[float, float, float]
+    """Easting, northing, height above the sea, m."""
+    measured: tuple[float, float, float]
+    """The same as surveyed."""
+
+
+def lay_out(
+    settings: Control, country: Country, shots: Sequence[Shot], reach: float, gsd: float
+) -> tuple[Target, ...]:
+    """Targets on open ground, spread as far as can be; `reach` is how far from a nadir they may lie, m."""
+    wanted = settings.points + settings.checks
+    if wanted == 0:
+        return ()
+    rng = np.random.default_rng([country.seed, 41])
+    nadirs = np.array([shot.centre[:2] for shot in shots])
+    places = nadirs[rng.integers(len(nadirs), size=_CANDIDATES)] + rng.uniform(
+        -reach, reach, (_CANDIDATES, 2)
+    )
+    places = np.array([p for p in places if _open(country.layout, p)] or places[:wanted])
+    radius = float(np.clip(7 * gsd, 0.25, 1.0))
+    chosen = _spread(places, wanted)
+    return tuple(
+        Target(
+            name=f"{'gcp' if i < settings.points else 'chk'}{i + 1:02d}",
+            x=float(x),
+            y=float(y),
+            radius=radius,
+            check=i >= settings.points,
+        )
+        for i, (x, y) in enumerate(chosen)
+    )
+
+
+def _open(layout: Layout, place: Doubles) -> bool:
+    """Whether nothing stands over or beside a place."""
+    x, y = place
+    clear = all(np.hypot(t.x - x, t.y - y) > t.radius + 2.5 for t in layout.trees)
+    clear = clear and all(np.hypot(h.x - x, h.y - y) > h.length / 2 + 6.0 for h in layout.houses)
+    clear = clear and all(np.hypot(c.x - x, c.y - y) > 4.5 for c in layout.cars)
+    spot = (float(x), float(y))
+    closed = [p.outline for p in layout.parcels if p.kind in ("maize", "wood")] + list(layout.ponds)
+    return clear and all(
+        cv2.pointPolygonTest(outline.astype(np.float32), spot, True) < -1.5 for outline in closed
+    )
+
+
+def _spread(places: Doubles, count: int) -> Doubles:
+    """The place farthest out, then again and again the one farthest from all chosen."""
+    chosen = [places[int(np.argmax(np.hypot(*(places - places.mean(axis=0)).T)))]]
+    while len(chosen) < min(count, len(places)):
+        nearest = np.min([np.hypot(*(places - c).T) for c in chosen], axis=0)
+        chosen.append(places[int(np.argmax(nearest))])
+    return np.array(chosen)
+
+
+def survey(settings: Control, country: Country, place: Place) -> list[Surveyed]:
+    """Measure the targets' coordinates."""
+    rng = np.random.default_rng([country.seed, 42])
+    out = []
+    for target in country.targets:
+        height = country.settings.base + country.ground.at(target.x, target.y)
+        true = np.array([place.easting + target.x, place.northing + target.y, height])
+        measured = true + rng.normal(0, settings.accuracy, 3)
+        out.append(Surveyed(target=target, true=_three(true), measured=_three(measured)))
+    return out
+
+
+def _three(values: Doubles) -> tuple[float, float, float]:
+    x, y, z = (round(float(v), 4) for v in values)
+    return x, y, z
+
+
+def sightings(
+    settings: Control,
+    country: Country,
+    scene: Scene,
+    lens: Lens,
+    shots: Sequence[Shot],
+    reports: Sequence[Report],
+) -> list[Sighting]:
+    """Where the targets are seen, nothing standing in between."""
+    if not country.targets:
+        return []
+    rng = np.random.default_rng([country.seed, 43])
+    points = np.array([[t.x, t.y, country.ground.at(t.x, t.y)] for t in country.targets])
+    found = []
+    for shot, report in zip(shots, reports, strict=True):
+        pixels = lens.project(points, shot.rotation, shot.place)
+        for target, point, pixel in zip(country.targets, points, pixels, strict=True):
+            if _inside(lens, pixel) and _in_sight(scene, shot.place, point):
+                x, y = pixel if not report.turned else (lens.width - 1 - pixel[0], lens.height - 1 - pixel[1])
+                dx, dy = rng.normal(0, settings.pixel_noise, 2)
+                found.append(Sighting(point=target.name, photo=shot.name, x=float(x + dx), y=float(y + dy)))
+    return found
+
+
+def _inside(lens: Lens, pixel: Doubles) -> bool:
+    x, y = pixel
+    return bool(
+        _MARGIN_PX < x < lens.width - 1 - _MARGIN_PX and _MARGIN_PX < y < lens.height - 1 - _MARGIN_PX
+    )
+
+
+def _in_sight(scene: Scene, eye: Doubles, point: Doubles) -> bool:
+    """Whether the line from a point on the ground to the camera stays above the surface."""
+    share = np.linspace(0, 1, 400)[1:]
+    line = point + share[:, None] * (eye - point)
+    line = line[line[:, 2] < point[2] + 25]
+    cells = np.round(scene.grid.pixels(line[:, :2])).astype(int)
+    rows = np.clip(cells[:, 1], 0, scene.grid.height - 1)
+    cols = np.clip(cells[:, 0], 0, scene.grid.width - 1)
+    return bool((scene.height[rows, cols] < line[:, 2] + 0.05).all())
+
+
+def write_gcp_list(path: Path, crs: str, points: Sequence[Surveyed], seen: Sequence[Sighting]) -> None:
+    """OpenDroneMap's `gcp_list.txt`; a check point says so in the eighth column."""
+    by_name = {point.target.name: point for point in points}
+    lines = [crs]
+    for sighting in sorted(seen, key=lambda s: (s.point, s.photo)):
+        point = by_name[sighting.point]
+        x, y, z = point.measured
+        words = [f"{x:.3f}", f"{y:.3f}", f"{z:.3f}", f"{sighting.x:.2f}", f"{sighting.y:.2f}"]
+        words += [sighting.photo, sighting.point] + ["check"] * point.target.check
+        lines.append("\t".join(words))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -1,0 +1,181 @@
+"""Plan a flight and fly it: where each photo is truly taken."""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.grid import Doubles
+from skyquilt.simulate.rotation import camera_rotation, wrap
+from skyquilt.simulate.settings import Route
+
+_TURN_S = 6.0  # seconds lost between two lines
+
+
+@dataclass(frozen=True, kw_only=True)
+class Waypoint:
+    """A photo as planned."""
+
+    x: float
+    """Map x, m (local)."""
+    y: float
+    """Map y, m (local)."""
+    heading: float
+    """Degrees clockwise from the map's north; the image top points there."""
+    line: int
+    """Which flight line."""
+    drone: int = 0
+    """Which drone."""
+    time: float = 0.0
+    """Seconds since the first photo of the flight."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """A photo as truly taken."""
+
+    name: str
+    """File name."""
+    waypoint: Waypoint
+    """As planned."""
+    centre: tuple[float, float, float]
+    """Map x, y (local) and height above the base, m."""
+    yaw: float
+    """Degrees clockwise from the map's north to the camera's top."""
+    pitch: float
+    """Degrees, positive ahead."""
+    roll: float
+    """Degrees, positive right wing down."""
+
+    @property
+    def rotation(self) -> Doubles:
+        """(3, 3) from map to camera."""
+        return camera_rotation(self.yaw, self.pitch, self.roll)
+
+    @property
+    def place(self) -> Doubles:
+        """The centre as an array (3,)."""
+        return np.array(self.centre)
+
+
+def plan(route: Route, lens: Lens) -> list[Waypoint]:
+    """Waypoints in the order in which they are flown, centred on the map origin; times per drone."""
+    forward = (1 - route.overlap) * route.height * lens.height / lens.focal
+    sideways = (1 - route.sidelap) * route.height * lens.width / lens.focal
+    if route.pattern == "roundtrip":
+        points = _around(route.photos, forward, route.heading)
+    else:
+        counts = [route.photos] if route.pattern == "strip" else _counts(route, forward, sideways)
+        points = _lines(counts, forward, sideways, route.heading)
+    return _timed(_shared(points, route.drones), forward / route.speed)
+
+
+def site(points: list[Waypoint], heading: float) -> tuple[float, float]:
+    """Extent of waypoints along and across a heading, m."""
+    turned = np.array([[p.x, p.y] for p in points]) @ _axes(heading).T
+    along, across = np.ptp(turned, axis=0)
+    return float(along), float(across)
+
+
+def _axes(heading: float) -> Doubles:
+    """Rows: unit vectors along and to the right of a heading."""
+    s, c = np.sin(np.radians(heading)), np.cos(np.radians(heading))
+    return np.array([[s, c], [c, -s]])
+
+
+def _counts(route: Route, forward: float, sideways: float) -> list[int]:
+    """Photos on each line, for a site or for a number of photos on a nearly square one."""
+    if route.site is not None:
+        along, across = route.site
+        return [int(np.ceil(along / forward - 1e-9)) + 1] * (int(np.ceil(across / sideways - 1e-9)) + 1)
+    lines = min(max(1, round(np.sqrt(route.photos * forward / sideways))), route.photos)
+    share, rest = divmod(route.photos, lines)
+    return [share + (i < rest) for i in range(lines)]
+
+
+def _lines(counts: list[int], forward: float, sideways: float, heading: float) -> list[Waypoint]:
+    axes = _axes(heading)
+    points = []
+    for line, count in enumerate(counts):
+        along = (np.arange(count) - (max(counts) - 1) / 2) * forward
+        across = (line - (len(counts) - 1) / 2) * sideways
+        back = line % 2 == 1
+        for a in along[::-1] if back else along:
+            x, y = np.array([a, across]) @ axes
+            points.append(Waypoint(x=x, y=y, heading=wrap(heading + 180 * back), line=line))
+    return points
+
+
+def _around(photos: int, forward: float, heading: float) -> list[Waypoint]:
+    """Once around a rectangle of sides about 3 : 2, nose ahead; the last photo is beside the first."""
+    length = photos * forward
+    long_ = round(0.3 * length / forward) * forward
+    sides = [long_, length / 2 - long_, long_, length / 2 - long_]
+    corners = np.cumsum([0.0, *sides])
+    axes = _axes(heading)
+    ways = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+    starts = np.cumsum(np.vstack([[0, 0], ways * np.array(sides)[:, None]]), axis=0) - [
+        sides[0] / 2,
+        sides[1] / 2,
+    ]
+    points = []
+    for s in np.arange(photos) * forward:
+        side = min(int(np.searchsorted(corners, s + 1e-6) - 1), 3)
+        x, y = (starts[side] + ways[side] * (s - corners[side])) @ axes
+        points.append(Waypoint(x=x, y=y, heading=wrap(heading + 90 * side), line=side))
+    return points
+
+
+def _shared(points: list[Waypoint], drones: int) -> list[Waypoint]:
+    """Each drone gets a run of neighbouring lines (of photos where lines are too few)."""
+    lines = max(p.line for p in points) + 1
+    if lines >= drones:
+        return [replace(p, drone=p.line * drones // lines) for p in points]
+    return [replace(p, drone=i * drones // len(points)) for i, p in enumerate(points)]
+
+
+def _timed(points: list[Waypoint], interval: float) -> list[Waypoint]:
+    """All drones start together; photos in order of time."""
+    clock: dict[int, tuple[float, int]] = {}
+    timed = []
+    for p in points:
+        last = clock.get(p.drone)
+        start = 0.37 * interval * p.drone
+        time = start if last is None else last[0] + interval + (_TURN_S if last[1] != p.line else 0.0)
+        clock[p.drone] = (time, p.line)
+        timed.append(replace(p, time=time))
+    return sorted(timed, key=lambda p: (p.time, p.drone))
+
+
+def fly(points: list[Waypoint], route: Route, takeoff: float, seed: int, prefix: str) -> list[Shot]:
+    """The true shots, lost ones left out; `takeoff` is the height of the take-off point above the base."""
+    rng = np.random.default_rng([seed, 21, len(prefix)])
+    lost = _losses(len(points), route.lost, rng)
+    shots = []
+    for number, point in enumerate(points):
+        dx, dy, dz = rng.normal(0, route.jitter, 3)
+        yaw, pitch, roll = rng.normal(0, [route.yaw_noise, route.tilt_noise, route.tilt_noise])
+        letter = f"{chr(ord('A') + point.drone % 26)}_" if route.drones > 1 else ""
+        shot = Shot(
+            name=f"{prefix}_{letter}{number + 1:04d}",
+            waypoint=point,
+            centre=(point.x + dx, point.y + dy, takeoff + route.height + 0.6 * dz),
+            yaw=wrap(point.heading + yaw),
+            pitch=float(pitch),
+            roll=float(roll),
+        )
+        if number not in lost:
+            shots.append(shot)
+    return shots
+
+
+def _losses(count: int, lost: int, rng: np.random.Generator) -> set[int]:
+    """Numbers of lost photos: spread out, never neighbours, never the first or last where that can be."""
+    if lost == 0:
+        return set()
+    edges = np.linspace(1, count - 1, lost + 1)
+    chosen: set[int] = set()
+    for low, high in pairwise(edges):
+        chosen.add(int(rng.integers(int(np.ceil(low)), max(int(np.ceil(high)) - 1, int(np.ceil(low)) + 1))))
+    return chosen

@@ -1,0 +1,73 @@
+"""Endless seeded noise: the same place gives the same value, whatever window asks."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from skyquilt.simulate.grid import Doubles, Floats, Grid
+
+_LATTICE = 256
+_TILE = 1024
+_SPREAD = 0.48  # standard deviation of cubic B-spline noise over a unit lattice
+
+
+@lru_cache(maxsize=64)
+def _lattice(seed: int, key: int, size: int) -> Floats:
+    rng = np.random.default_rng([seed, key, size])
+    return rng.standard_normal((size, size), dtype=np.float32)
+
+
+def _spline(positions: Doubles) -> tuple[sparse.csr_matrix, NDArray[np.int64]]:
+    """Cubic B-spline weights as a sparse matrix, and the lattice indices of its columns."""
+    base = np.floor(positions).astype(np.int64)
+    t = positions - base
+    weights = np.stack(
+        [(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3], axis=1
+    )
+    first = int(base.min()) - 1
+    columns = base[:, None] - 1 - first + np.arange(4)
+    rows = np.arange(len(t) + 1) * 4
+    shape = (len(t), int(base.max()) + 2 - first + 1)
+    matrix = sparse.csr_matrix(((weights / 6).astype(np.float32).ravel(), columns.ravel(), rows), shape=shape)
+    return matrix, np.arange(first, first + shape[1], dtype=np.int64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """Smooth random fields of a seed."""
+
+    seed: int
+    """Equal seeds give equal fields."""
+
+    def smooth(self, grid: Grid, wavelength: float, key: int) -> Floats:
+        """A field (height, width), zero mean, unit deviation, no features below the wavelength (m)."""
+        down, rows = _spline(grid.ys / wavelength)
+        across, cols = _spline(grid.xs / wavelength)
+        lattice = _lattice(self.seed, key, _LATTICE)[np.ix_(rows % _LATTICE, cols % _LATTICE)]
+        field = across @ (down @ lattice).T
+        return np.ascontiguousarray(field.T) * np.float32(1 / _SPREAD)
+
+    def fractal(self, grid: Grid, longest: float, shortest: float, gain: float, key: int) -> Floats:
+        """Octaves from the longest wavelength down to the shortest (m), each `gain` times the last."""
+        total = np.zeros((grid.height, grid.width), dtype=np.float32)
+        weight, wavelength, power, octave = 1.0, longest, 0.0, 0
+        while wavelength >= shortest:
+            total += np.float32(weight) * self.smooth(grid, wavelength, key * 100 + octave)
+            power += weight**2
+            weight, wavelength, octave = weight * gain, wavelength / 2, octave + 1
+        return total / np.float32(np.sqrt(power))
+
+    def grain(self, grid: Grid, key: int) -> Floats:
+        """White noise per cell of the endless raster, unit deviation."""
+        tile = _lattice(self.seed, key, _TILE)
+        rows = (grid.row + np.arange(grid.height)) % _TILE
+        cols = (grid.col + np.arange(grid.width)) % _TILE
+        return tile[np.ix_(rows, cols)]
+
+    def at(self, x: float, y: float, wavelength: float, key: int) -> float:
+        """The value of `smooth` at one point of the map."""
+        point = Grid(left=x - 0.5, top=y + 0.5, res=1.0, width=1, height=1)
+        return float(self.smooth(point, wavelength, key)[0, 0])

@@ -1,0 +1,155 @@
+"""Where rays meet a height field: first hits, so that trees and walls hide what lies behind."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.simulate.grid import Doubles, Floats
+
+_CELL = 16  # px: side of the cells in which hits are first bracketed, in the photo and in the raster alike
+_LEVEL_M = 0.35  # height between two levels of the bracketing march
+_STEP_PX = 2.0  # raster px between two samples of the exact march
+_MAX_STEPS = 128
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rays:
+    """Straight lines through a raster, parametrised by height: pixel(z) = start - z * slope."""
+
+    start: Floats
+    """(..., 2) raster pixel (column, row) at height 0."""
+    slope: Floats
+    """(..., 2) raster pixels per metre of height."""
+
+    def at(self, z: Floats) -> Floats:
+        """Raster pixels (..., 2) at heights (...)."""
+        return self.start - z[..., None] * self.slope
+
+    def take(self, mask: NDArray[np.bool_]) -> "Rays":
+        """The rays under a mask, flat."""
+        return Rays(start=self.start[mask], slope=self.slope[mask])
+
+    def coarse(self) -> "Rays":
+        """The rays at the centres of cells."""
+        h, w = self.start.shape[:2]
+        rows = np.minimum(np.arange(_CELL // 2, h + _CELL - 1, _CELL), h - 1)
+        cols = np.minimum(np.arange(_CELL // 2, w + _CELL - 1, _CELL), w - 1)
+        at = np.ix_(rows, cols)
+        return Rays(start=self.start[at], slope=self.slope[at])
+
+
+def rays_of(directions: Floats, rotation: Doubles, centre: Doubles, origin: Doubles, res: float) -> Rays:
+    """Rays of ideal image coordinates (h, w, 2) from a camera.
+
+    `origin` is the map place of raster pixel (0, 0).
+
+    Heights count from the same zero as centre[2]. Raises ValueError where a ray does not look down.
+    """
+    to_map = rotation.T.astype(np.float32)
+    x, y = directions[..., 0], directions[..., 1]
+    dx, dy, dz = (to_map[i, 0] * x + to_map[i, 1] * y + to_map[i, 2] for i in range(3))
+    if dz.max() > -0.05:
+        raise ValueError("a ray of the photo does not meet the ground: tilt or field of view too large")
+    slope = np.stack([dx, -dy], axis=-1) / (-dz * np.float32(res))[..., None]
+    place = np.array([(centre[0] - origin[0]) / res, (origin[1] - centre[1]) / res], dtype=np.float32)
+    return Rays(start=place + np.float32(centre[2]) * slope, slope=slope)
+
+
+def sample(raster: NDArray[Any], pixels: Floats, interpolation: int = cv2.INTER_LINEAR) -> NDArray[Any]:
+    """Values of a raster at pixels (h, w, 2) or (n, 2), edges repeated."""
+    if pixels.ndim == 3:
+        return _remap(raster, pixels, interpolation)
+    count, wide = len(pixels), 1024  # lists are folded, since images have at most 32767 rows
+    folded = np.zeros((-(-count // wide), wide, 2), dtype=np.float32)
+    folded.reshape(-1, 2)[:count] = pixels
+    values = _remap(raster, folded, interpolation)
+    return values.reshape(-1, *values.shape[2:])[:count]
+
+
+def _remap(raster: NDArray[Any], pixels: Floats, interpolation: int) -> NDArray[Any]:
+    x, y = cv2.split(pixels)
+    return np.asarray(cv2.remap(raster, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _cells(raster: Floats, reach: int) -> tuple[Floats, Floats]:
+    """Least and greatest height per cell of the raster, spread by `reach` cells to be safe."""
+    h, w = raster.shape
+    padded = np.pad(raster, ((0, -h % _CELL), (0, -w % _CELL)), mode="edge")
+    blocks = padded.reshape(padded.shape[0] // _CELL, _CELL, padded.shape[1] // _CELL, _CELL)
+    kernel = np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)
+    low, high = blocks.min(axis=(1, 3)), blocks.max(axis=(1, 3))
+    return np.asarray(cv2.erode(low, kernel)), np.asarray(cv2.dilate(high, kernel))
+
+
+def _bracket(raster: Floats, rays: Rays) -> tuple[Floats, Floats]:
+    """Heights (cells) above and below every first hit of the cell's rays."""
+    low, high = _cells(raster, 2)
+    top, bottom = float(high.max()) + 0.05, float(low.min()) - 0.05
+    levels = np.linspace(top, bottom, int(np.ceil((top - bottom) / _LEVEL_M)) + 2, dtype=np.float32)
+    above = np.full(rays.start.shape[:2], np.nan, dtype=np.float32)
+    below = np.full(rays.start.shape[:2], np.nan, dtype=np.float32)
+    for upper, lower in pairwise(levels):
+        cell = rays.at(np.full_like(above, lower)) / np.float32(_CELL) - np.float32(0.5 - 0.5 / _CELL)
+        highest = sample(high, cell, cv2.INTER_NEAREST)
+        lowest = sample(low, cell, cv2.INTER_NEAREST)
+        above = np.where(np.isnan(above) & (highest >= lower), upper, above)
+        below = np.where(np.isnan(below) & (lowest >= lower), lower - np.float32(0.02), below)
+    return np.where(np.isnan(above), top, above), np.where(np.isnan(below), bottom, below)
+
+
+def _march(raster: Floats, rays: Rays, above: Floats, below: Floats, steps: int) -> Floats:
+    """Heights (n,) of first hits between two heights (n,) per ray: even steps, then false position."""
+    z_over, z_under = above.copy(), below.copy()
+    f_over = np.full_like(above, -1e-3)
+    f_under = np.full_like(above, 1e-3)
+    step = (above - below) / np.float32(steps)
+    open_ = np.ones(above.shape, dtype=bool)
+    for k in range(1, steps + 1):
+        z = above - np.float32(k) * step
+        f = sample(raster, rays.at(z)) - z
+        hit = open_ & (f >= 0)
+        z_under[hit], f_under[hit] = z[hit], f[hit]
+        open_ &= ~hit
+        z_over[open_], f_over[open_] = z[open_], f[open_]
+        if not open_.any():
+            break
+    return _polish(raster, rays, z_over, z_under, f_over, f_under)
+
+
+def _polish(
+    raster: Floats, rays: Rays, z_over: Floats, z_under: Floats, f_over: Floats, f_under: Floats
+) -> Floats:
+    """Close in on the crossing between heights over and under the surface."""
+    for k in range(5):
+        share = np.float32(0.5) if k in (0, 2) else np.clip(f_over / (f_over - f_under - 1e-9), 0.02, 0.98)
+        z = z_over + (z_under - z_over) * share
+        f = sample(raster, rays.at(z)) - z
+        hit = f >= 0
+        z_under, f_under = np.where(hit, z, z_under), np.where(hit, f, f_under)
+        z_over, f_over = np.where(hit, z_over, z), np.where(hit, f_over, f)
+    share = np.clip(f_over / (f_over - f_under - 1e-9), 0, 1)
+    return np.asarray(z_over + (z_under - z_over) * share)
+
+
+def first_hits(raster: Floats, rays: Rays) -> tuple[Floats, Floats]:
+    """Raster pixels (h, w, 2) and heights (h, w) where the rays of a photo first meet the height raster."""
+    h, w = rays.start.shape[:2]
+    coarse = rays.coarse()
+    above, below = _bracket(raster, coarse)
+    travel = (above - below) * np.linalg.norm(coarse.slope, axis=-1) / _STEP_PX
+    steps = 2 ** np.ceil(np.log2(np.clip(travel, 1, _MAX_STEPS))).astype(np.int32)
+    above, below, steps = (_spread(a, h, w) for a in (above, below, steps))
+    heights = np.empty((h, w), dtype=np.float32)
+    for count in np.unique(steps):
+        mask = steps == count
+        heights[mask] = _march(raster, rays.take(mask), above[mask], below[mask], int(count))
+    return rays.at(heights), heights
+
+
+def _spread(cells: NDArray[Any], height: int, width: int) -> NDArray[Any]:
+    """Cell values to pixels."""
+    return np.repeat(np.repeat(cells, _CELL, axis=0), _CELL, axis=1)[:height, :width]

@@ -1,0 +1,172 @@
+"""What photos say about themselves: the truth, with noise and with lies."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from pyproj import CRS, Proj, Transformer
+
+from skyquilt.simulate.flight import Shot
+from skyquilt.simulate.grid import Doubles
+from skyquilt.simulate.rotation import gimbal_angles, wrap
+from skyquilt.simulate.settings import Reporting
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Where the local map frame lies on Earth."""
+
+    crs: str
+    """UTM zone, e.g. `EPSG:32633`."""
+    easting: float
+    """Of the map origin, m."""
+    northing: float
+    """Of the map origin, m."""
+    convergence: float
+    """Degrees from true north to the map's north at the origin, clockwise positive."""
+
+    def geographic(self, x: float, y: float) -> tuple[float, float]:
+        """Latitude and longitude of a map point (local), degrees."""
+        to = Transformer.from_crs(self.crs, "EPSG:4326", always_xy=True)
+        longitude, latitude = to.transform(self.easting + x, self.northing + y)
+        return float(latitude), float(longitude)
+
+
+def place_at(latitude: float, longitude: float) -> Place:
+    """The map frame whose origin is the whole metre next to a place, in its UTM zone."""
+    zone = int((longitude + 180) // 6) + 1
+    crs = f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
+    to = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
+    easting, northing = to.transform(longitude, latitude)
+    factors = Proj(CRS(crs)).get_factors(longitude, latitude)
+    return Place(
+        crs=crs,
+        easting=round(easting),
+        northing=round(northing),
+        convergence=float(factors.meridian_convergence),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """The metadata of one photo, as written."""
+
+    latitude: float | None
+    """Degrees."""
+    longitude: float | None
+    """Degrees."""
+    sea_level: float | None
+    """Height above the sea, m."""
+    takeoff: float | None
+    """Height above take-off, m."""
+    gimbal: tuple[float, float, float] | None
+    """Yaw from true north, pitch, roll, degrees; pitch -90 looks straight down."""
+    flight_yaw: float | None
+    """Degrees from true north."""
+    clock: float
+    """Seconds since the survey's nominal start, by the drone's clock."""
+    focal: float | None
+    """px."""
+    turned: bool
+    """The file's pixels were turned by 180 degrees after the flight."""
+    lies: tuple[str, ...]
+    """Which fields are grossly wrong: `yaw`, `altitude`, `position`, `focal`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Start:
+    """Heights that reports count from."""
+
+    base: float
+    """Base level above the sea, m."""
+    takeoff: float
+    """Take-off point above the base, m."""
+
+
+def report_all(
+    shots: list[Shot], settings: Reporting, place: Place, start: Start, focal: float, seed: int
+) -> list[Report]:
+    """The metadata of a flight's photos, in order."""
+    rng = np.random.default_rng([seed, 31, len(shots)])
+    errors = _position_errors(shots, settings, rng)
+    silent = set(rng.permutation(len(shots))[: settings.gps_missing].tolist())
+    liars = _liars(shots) if settings.yaw_lie != "none" else set()
+    last = max((shot.waypoint.time for shot in shots), default=0.0) or 1.0
+    return [
+        _report(
+            shot,
+            settings,
+            place,
+            start,
+            focal=focal,
+            error=errors[i],
+            drift=settings.altitude_drift * shot.waypoint.time / last,
+            lying=i in liars,
+            silent=i in silent,
+            rng=rng,
+        )
+        for i, shot in enumerate(shots)
+    ]
+
+
+def _position_errors(shots: list[Shot], settings: Reporting, rng: np.random.Generator) -> Doubles:
+    """(n, 3) errors in m; alike over `gps_correlation` seconds per drone (Gauss-Markov)."""
+    vertical = 1.5 * settings.gps_noise if settings.gps_noise_z is None else settings.gps_noise_z
+    white = rng.normal(0, 1, (len(shots), 3)) * np.array([settings.gps_noise, settings.gps_noise, vertical])
+    if settings.gps_correlation <= 0:
+        return white
+    last: dict[int, int] = {}
+    for i, shot in enumerate(shots):
+        before = last.get(shot.waypoint.drone)
+        last[shot.waypoint.drone] = i
+        if before is not None:
+            gap = shot.waypoint.time - shots[before].waypoint.time
+            keep = float(np.exp(-gap / settings.gps_correlation))
+            white[i] = keep * white[before] + np.sqrt(1 - keep**2) * white[i]
+    return white
+
+
+def _liars(shots: list[Shot]) -> set[int]:
+    """The photos of the middle line; the middle third of a single line."""
+    lines = sorted({shot.waypoint.line for shot in shots})
+    if len(lines) == 1:
+        return set(range(len(shots) // 3, 2 * len(shots) // 3))
+    return {i for i, shot in enumerate(shots) if shot.waypoint.line == lines[len(lines) // 2]}
+
+
+def _report(
+    shot: Shot,
+    settings: Reporting,
+    place: Place,
+    start: Start,
+    *,
+    focal: float,
+    error: Doubles,
+    drift: float,
+    lying: bool,
+    silent: bool,
+    rng: np.random.Generator,
+) -> Report:
+    x, y, z = shot.centre
+    latitude, longitude = place.geographic(x + error[0], y + error[1])
+    angles = np.array([shot.yaw, shot.pitch, shot.roll]) + rng.normal(0, settings.angle_noise, 3)
+    nose = rng.normal(0, settings.angle_noise)
+    barometer = rng.normal(0, settings.barometer_noise)
+    lie = 180.0 if lying and settings.yaw_lie == "tag" else 0.0
+    north = place.convergence
+    gimbal = gimbal_angles(angles[0] + north + lie, angles[1], angles[2])
+    offsets = settings.clock_offsets or (0.0,)
+    altitude_lie = abs(settings.altitude_drift) > 3
+    lies = ["yaw"] * lying + ["altitude"] * altitude_lie
+    with_angles = not settings.attitude_missing
+    return Report(
+        latitude=None if silent else round(latitude, 9),
+        longitude=None if silent else round(longitude, 9),
+        sea_level=None if silent else round(start.base + z + error[2] + drift, 3),
+        takeoff=round(z - start.takeoff + barometer + drift, 3) if with_angles else None,
+        gimbal=(round(gimbal[0], 2), round(gimbal[1], 2), round(gimbal[2], 2)) if with_angles else None,
+        flight_yaw=round(wrap(shot.waypoint.heading + north + lie + nose), 2) if with_angles else None,
+        clock=round(shot.waypoint.time + offsets[shot.waypoint.drone % len(offsets)], 3),
+        focal=None if settings.focal_missing else focal * (1 + settings.focal_error),
+        turned=lying and settings.yaw_lie == "turned",
+        lies=tuple(lies),
+    )

@@ -1,0 +1,245 @@
+"""The simulator's story: settings in, a folder of photos with their truth out."""
+
+import shutil
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from skyquilt.errors import OutputError
+from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.control import lay_out, sightings, survey, write_gcp_list
+from skyquilt.simulate.exif import Body, write_jpeg, write_tiff
+from skyquilt.simulate.expose import exposer, footprint
+from skyquilt.simulate.flight import Shot, Waypoint, fly, plan, site
+from skyquilt.simulate.ground import Ground
+from skyquilt.simulate.noise import Noise
+from skyquilt.simulate.reported import Place, Report, Start, place_at, report_all
+from skyquilt.simulate.scene import Country, Scene, empty_scene
+from skyquilt.simulate.settings import FlightSettings, Thermal
+from skyquilt.simulate.truth import Taken, covered, write_rasters, write_thermal, write_truth
+
+_OURS = ("photos", "thermal", "truth", "gcp_list.txt")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far the simulation is."""
+
+    stage: str
+    """`terrain`, `photos`, `thermal terrain`, `thermal` or `truth`."""
+    done: int
+    """Steps done in this stage."""
+    total: int
+    """Steps of this stage."""
+    name: str = ""
+    """What was finished."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Flight:
+    """One flight of one kind of camera, flown and reported."""
+
+    lens: Lens
+    """True camera."""
+    shots: list[Shot]
+    """True poses."""
+    reports: list[Report]
+    """Metadata."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class World:
+    """Everything that is decided before the first pixel is drawn."""
+
+    settings: FlightSettings
+    """What was asked for."""
+    place: Place
+    """Where on Earth."""
+    start: Start
+    """Heights that reports count from."""
+    country: Country
+    """The terrain."""
+    visible: Flight
+    """The main flight."""
+    thermal: Flight | None
+    """The thermal flight."""
+
+
+def prepare(settings: FlightSettings, waypoints: list[Waypoint] | None = None) -> World:
+    """Plan, fly and report; `waypoints` replaces the planned route.
+
+    Raises UsageError for settings that do not fit.
+    """
+    settings = settings.checked()
+    points = plan(settings.route, settings.lens) if waypoints is None else waypoints
+    place = place_at(settings.scene.latitude, settings.scene.longitude)
+    hills = Ground(noise=Noise(seed=settings.seed), relief=settings.scene.relief)
+    start = Start(base=settings.scene.base, takeoff=hills.at(points[0].x, points[0].y))
+    shots = fly(points, settings.route, start.takeoff, settings.seed, "SIM")
+    reports = report_all(shots, settings.reporting, place, start, settings.lens.focal, settings.seed)
+    visible = Flight(lens=settings.lens, shots=shots, reports=reports)
+    thermal = _thermal_flight(settings, settings.thermal, points, place, start) if settings.thermal else None
+    country = Country(
+        settings=settings.scene, bounds=_bounds(settings, [visible, thermal]), seed=settings.seed
+    )
+    reach = 0.3 * min(settings.lens.width, settings.lens.height) * settings.route.height / settings.lens.focal
+    targets = lay_out(settings.control, country, shots, reach, settings.resolution)
+    return World(
+        settings=settings,
+        place=place,
+        start=start,
+        country=replace(country, targets=targets),
+        visible=visible,
+        thermal=thermal,
+    )
+
+
+def _thermal_flight(
+    settings: FlightSettings, thermal: Thermal, points: list[Waypoint], place: Place, start: Start
+) -> Flight:
+    """Over the same site, with its own lines."""
+    route = replace(
+        settings.route,
+        pattern=settings.route.pattern if settings.route.pattern == "strip" else "block",
+        site=site(points, settings.route.heading),
+        overlap=thermal.overlap,
+        sidelap=thermal.sidelap,
+        height=thermal.height,
+        drones=1,
+        lost=0,
+    )
+    if route.pattern == "strip":
+        forward = (1 - route.overlap) * route.height * thermal.lens.height / thermal.lens.focal
+        route = replace(route, photos=int(np.ceil((route.site or (0, 0))[0] / forward)) + 1)
+    shots = fly(plan(route, thermal.lens), route, start.takeoff, settings.seed, "THM_T")
+    reports = report_all(shots, settings.reporting, place, start, thermal.lens.focal, settings.seed + 1)
+    return Flight(lens=thermal.lens, shots=shots, reports=reports)
+
+
+def _bounds(settings: FlightSettings, flights: list[Flight | None]) -> tuple[float, float, float, float]:
+    """What all photos can see of the lowest ground, with a margin."""
+    lowest = -0.9 * settings.scene.relief - 1.0
+    parts = [footprint(f.lens, shot, lowest) for f in flights if f is not None for shot in f.shots]
+    ground = np.concatenate(parts)
+    (x0, y0), (x1, y1) = ground.min(axis=0) - 3.0, ground.max(axis=0) + 3.0
+    return float(x0), float(y0), float(x1), float(y1)
+
+
+def simulate(
+    settings: FlightSettings,
+    output: Path,
+    *,
+    overwrite: bool = False,
+    waypoints: list[Waypoint] | None = None,
+) -> Iterator[Progress]:
+    """Fly a survey of known truth and write it; yields progress.
+
+    Raises UsageError for settings that do not fit, OutputError where the folder is not free or not writable.
+    """
+    world = prepare(settings, waypoints)
+    try:
+        _make_room(output, overwrite)
+        yield from _write(world, output)
+    except OSError as error:
+        raise OutputError(f"cannot write to {output}: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(output / ".scratch", ignore_errors=True)
+
+
+def _make_room(output: Path, overwrite: bool) -> None:
+    """An empty place, or one that only this simulator's former files leave."""
+    if output.exists() and not output.is_dir():
+        raise OutputError(f"{output} is a file; a folder is needed")
+    if output.is_dir() and any(output.iterdir()):
+        if not overwrite:
+            raise OutputError(f"{output} is not empty; choose another folder or add --overwrite")
+        for name in _OURS:
+            path = output / name
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+    (output / "truth").mkdir(parents=True, exist_ok=True)
+
+
+def _write(world: World, output: Path) -> Iterator[Progress]:
+    settings, country = world.settings, world.country
+    scene = yield from _drawn(world, output, "terrain", settings.resolution, heat=False)
+    taken = yield from _photograph(world, scene, output)
+    points = survey(settings.control, country, world.place)
+    visible = world.visible
+    found = sightings(settings.control, country, scene, visible.lens, visible.shots, visible.reports)
+    seen = [replace(s, photo=s.photo + ".jpg") for s in found]
+    if points:
+        write_gcp_list(output / "gcp_list.txt", world.place.crs, points, seen)
+    part = covered(scene.grid, visible.lens, visible.shots, 0.0)
+    write_rasters(output / "truth", scene, part, world.place, world.start.base)
+    del scene
+    if world.thermal is not None and settings.thermal is not None:
+        taken += yield from _film(world, world.thermal, settings.thermal, output)
+    write_truth(output / "truth" / "truth.json", settings, world.place, world.start, taken, points, seen)
+    yield Progress(stage="truth", done=1, total=1)
+
+
+def _drawn(
+    world: World, output: Path, stage: str, res: float, *, heat: bool
+) -> Generator[Progress, None, Scene]:
+    """Draw the country; returns the scene."""
+    thermal = world.settings.thermal
+    weather = thermal.weather if heat and thermal is not None else world.settings.weather
+    scene = empty_scene(world.country.grid(res), thermal=heat, scratch=output / ".scratch" / stage)
+    for done, total in world.country.draw(scene, weather, scratch=output / ".scratch" / stage):
+        yield Progress(stage=stage, done=done, total=total)
+    return scene
+
+
+def _photograph(world: World, scene: Scene, output: Path) -> Generator[Progress, None, list[Taken]]:
+    """Take and write the visible photos; returns what was taken."""
+    pictures, flight = world.settings.pictures, world.visible
+    camera = exposer(scene, flight.lens)
+    folder = output / "photos"
+    folder.mkdir(exist_ok=True)
+    taken = []
+    for number, (shot, report) in enumerate(zip(flight.shots, flight.reports, strict=True)):
+        rng = np.random.default_rng([world.settings.seed, 51, number])
+        gain = float(np.exp(rng.normal(0, pictures.exposure_noise)))
+        pixels = camera.visible(shot, pictures, gain, rng)
+        if report.turned:
+            pixels = np.ascontiguousarray(pixels[::-1, ::-1])
+        name = f"{shot.name}.jpg"
+        body = Body(
+            model="Simulated 4:3",
+            serial=f"SIM{shot.waypoint.drone + 1:03d}",
+            start=world.settings.weather.moment,
+        )
+        write_jpeg(folder / name, pixels, report, body, pictures.quality)
+        taken.append(Taken(shot=shot, report=report, band="visible", file=f"photos/{name}", exposure=gain))
+        yield Progress(stage="photos", done=number + 1, total=len(flight.shots), name=name)
+    return taken
+
+
+def _film(
+    world: World, flight: Flight, thermal: Thermal, output: Path
+) -> Generator[Progress, None, list[Taken]]:
+    """Take and write the thermal frames; returns what was taken."""
+    res = thermal.height / thermal.lens.focal
+    scene = yield from _drawn(world, output, "thermal terrain", res, heat=True)
+    camera = exposer(scene, flight.lens)
+    body = Body(model="Simulated thermal", serial="THM001", start=thermal.weather.moment)
+    folder = output / "thermal"
+    folder.mkdir(exist_ok=True)
+    taken = []
+    for number, (shot, report) in enumerate(zip(flight.shots, flight.reports, strict=True)):
+        rng = np.random.default_rng([world.settings.seed, 52, number])
+        offset = float(rng.normal(0, thermal.drift))
+        counts = camera.heat(shot, thermal.noise, offset, rng)
+        if report.turned:
+            counts = np.ascontiguousarray(counts[::-1, ::-1])
+        name = f"{shot.name}.tif"
+        write_tiff(folder / name, counts, report, body)
+        taken.append(Taken(shot=shot, report=report, band="thermal", file=f"thermal/{name}", exposure=offset))
+        yield Progress(stage="thermal", done=number + 1, total=len(flight.shots), name=name)
+    write_thermal(output / "truth", scene, covered(scene.grid, flight.lens, flight.shots, 0.0), world.place)
+    return taken

@@ -1,0 +1,172 @@
+"""The whole country as rasters: colours and temperatures under light, and surface heights."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.simulate.canvas import Canvas
+from skyquilt.simulate.fields import paint_borders, paint_parcels, paint_ponds, paint_roads
+from skyquilt.simulate.grid import Floats, Grid
+from skyquilt.simulate.ground import Ground
+from skyquilt.simulate.layout import Layout
+from skyquilt.simulate.light import lit, shadow_reach, shine
+from skyquilt.simulate.noise import Noise
+from skyquilt.simulate.settle import settle
+from skyquilt.simulate.targets import Target, paint_targets
+from skyquilt.simulate.things import paint_things
+from skyquilt.simulate.weather import Weather
+
+_BLOCK = 1536
+_IN_MEMORY = 80_000_000  # cells; larger countries are kept in files
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSettings:
+    """What the country is like."""
+
+    kind: Literal["landscape", "chessboard"] = "landscape"
+    """A farmed landscape, or a level chess-board for distortion tests."""
+    relief: float = 6.0
+    """Height between low and high places of a site, m."""
+    base: float = 440.0
+    """Height of the base level above the sea, m."""
+    latitude: float = 46.6
+    """Of the map origin, degrees."""
+    longitude: float = 14.3
+    """Of the map origin, degrees."""
+    square: float = 2.0
+    """Side of a chess-board square, m."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """Rasters of the country; row 0, column 0 of the arrays is that of the grid."""
+
+    grid: Grid
+    """Where and how fine."""
+    height: Floats
+    """(h, w) surface with houses and trees, m above the base."""
+    rgb: NDArray[np.uint8]
+    """(h, w, 3) the true orthophoto."""
+    thermal: NDArray[np.uint16] | None
+    """(h, w) apparent temperature in hundredths of a kelvin."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Country:
+    """The country before it is drawn: cheap, and exact at any point."""
+
+    settings: SceneSettings
+    """What it is like."""
+    bounds: tuple[float, float, float, float]
+    """x0, y0, x1, y1 in the local map frame, m."""
+    seed: int
+    """Equal seeds give equal countries."""
+    targets: tuple[Target, ...] = field(default=())
+    """Control point targets on the ground."""
+
+    @cached_property
+    def layout(self) -> Layout:
+        """What lies where."""
+        return Layout() if self.settings.kind == "chessboard" else settle(self.bounds, self.seed)
+
+    @cached_property
+    def noise(self) -> Noise:
+        """The country's noise."""
+        return Noise(seed=self.seed)
+
+    @cached_property
+    def ground(self) -> Ground:
+        """The bare ground."""
+        return Ground(noise=self.noise, relief=self.settings.relief, shores=self.layout.ponds)
+
+    def grid(self, res: float) -> Grid:
+        """The raster over the bounds; its corner lies on a multiple of the cell size."""
+        x0, y0, x1, y1 = self.bounds
+        left, top = np.floor(x0 / res) * res, np.ceil(y1 / res) * res
+        width, height = int(np.ceil((x1 - left) / res)), int(np.ceil((top - y0) / res))
+        return Grid(left=float(left), top=float(top), res=res, width=width, height=height)
+
+    def paint(self, grid: Grid, weather: Weather) -> Canvas:
+        """One block without light."""
+        ground = self.ground.heights(grid)
+        look = np.zeros((grid.height, grid.width, 4), dtype=np.float32)
+        canvas = Canvas(
+            grid=grid, look=look, height=ground.copy(), ground=ground, noise=self.noise, weather=weather
+        )
+        if self.settings.kind == "chessboard":
+            _paint_squares(canvas, self.settings.square)
+        else:
+            canvas.height[...] += np.float32(0.035) * canvas.patchy + np.float32(0.012) * canvas.fine
+            paint_parcels(canvas, self.layout)
+            paint_borders(canvas, self.layout)
+            paint_roads(canvas, self.layout)
+            paint_ponds(canvas, self.layout)
+            paint_things(canvas, self.layout, self.ground)
+        paint_targets(canvas, self.targets)
+        return canvas
+
+    def draw(self, scene: Scene, weather: Weather, *, scratch: Path) -> Iterator[tuple[int, int]]:
+        """Fill a scene, first its surfaces, then their light, block by block; yields (done, total)."""
+        looks = _room(scene.grid, (4,), np.float16, scratch / "look")
+        blocks = scene.grid.blocks(_BLOCK)
+        for number, block in enumerate(blocks):
+            canvas = self.paint(block, weather)
+            scene.height[block.slices], looks[block.slices] = canvas.height, canvas.look
+            yield number + 1, 2 * len(blocks)
+        for number, block in enumerate(blocks):
+            _light(scene, looks, block, weather, flat=self.settings.kind == "chessboard")
+            yield len(blocks) + number + 1, 2 * len(blocks)
+
+
+def empty_scene(grid: Grid, *, thermal: bool, scratch: Path) -> Scene:
+    """Room for a scene, in memory or in files below `scratch`."""
+    return Scene(
+        grid=grid,
+        height=_room(grid, (), np.float32, scratch / "height"),
+        rgb=_room(grid, (3,), np.uint8, scratch / "rgb"),
+        thermal=_room(grid, (), np.uint16, scratch / "thermal") if thermal else None,
+    )
+
+
+def _light(scene: Scene, looks: NDArray[np.float16], block: Grid, weather: Weather, *, flat: bool) -> None:
+    """Light one block, seeing its neighbours' shadows."""
+    margin = int(np.ceil(shadow_reach(weather) / scene.grid.res)) + 4
+    wide = scene.grid.window(
+        block.row - margin, block.col - margin, block.height + 2 * margin, block.width + 2 * margin
+    )
+    look = looks[block.slices].astype(np.float32)
+    if flat:
+        direct = np.ones(look.shape[:2], dtype=np.float32)
+    else:
+        direct = lit(scene.height[wide.slices], scene.grid.res, weather)[wide.inside(block)]
+    out = shine(look, direct, weather)
+    scene.rgb[block.slices] = np.clip(out[..., :3] + 0.5, 0, 255).astype(np.uint8)
+    if scene.thermal is not None:
+        kelvin = cv2.GaussianBlur(out[..., 3], (0, 0), 0.12 / scene.grid.res) + 273.15
+        scene.thermal[block.slices] = np.clip(kelvin * 100 + 0.5, 0, 65535).astype(np.uint16)
+
+
+def _paint_squares(canvas: Canvas, square: float) -> None:
+    """A chess-board with a little grain."""
+    x, y = canvas.grid.xs, canvas.grid.ys
+    odd = (np.floor(x / square)[None, :] + np.floor(y / square)[:, None]) % 2
+    canvas.look[..., :3] = (70 + 120 * odd[..., None]) * (1 + 0.03 * canvas.fine + 0.02 * canvas.grain)[
+        ..., None
+    ]
+    canvas.look[..., 3] = 20 + 6 * odd
+
+
+def _room(grid: Grid, tail: tuple[int, ...], dtype: type, path: Path) -> NDArray[Any]:
+    """An array for the whole grid, in a file where it is large."""
+    shape = (grid.height, grid.width, *tail)
+    if grid.height * grid.width <= _IN_MEMORY:
+        return np.zeros(shape, dtype=dtype)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return np.lib.format.open_memmap(path.with_suffix(".npy"), mode="w+", dtype=dtype, shape=shape)

@@ -1,0 +1,215 @@
+"""What a simulated flight is like: one record of records, and presets by name."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from skyquilt.errors import UsageError
+from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.scene import SceneSettings
+from skyquilt.simulate.weather import Weather
+
+YawLie = Literal["none", "turned", "tag"]
+Pattern = Literal["block", "strip", "roundtrip"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Route:
+    """Where photos are taken."""
+
+    pattern: Pattern = "block"
+    """Parallel lines, one line, or a rectangle flown once around."""
+    photos: int = 40
+    """Photos planned, before losses."""
+    site: tuple[float, float] | None = None
+    """Extent along and across the lines in m that the camera centres cover; replaces `photos` for a block."""
+    overlap: float = 0.75
+    """Forward overlap, share of the footprint."""
+    sidelap: float = 0.60
+    """Sideways overlap between lines."""
+    height: float = 60.0
+    """Above the take-off point, m."""
+    heading: float = 20.0
+    """Direction of the first line, degrees from the map's north."""
+    speed: float = 6.0
+    """Ground speed, m/s."""
+    jitter: float = 0.5
+    """Standard deviation of the true place around the plan, each axis, m."""
+    yaw_noise: float = 2.0
+    """Standard deviation of the true yaw around the heading, degrees."""
+    tilt_noise: float = 1.0
+    """Standard deviation of the true pitch and of the true roll, degrees."""
+    drones: int = 1
+    """Flying at once, each on its share of the lines."""
+    lost: int = 0
+    """Photos planned but not delivered, never two neighbours."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pictures:
+    """How pixels are formed."""
+
+    exposure_noise: float = 0.05
+    """Standard deviation of the logarithm of each photo's exposure."""
+    vignetting: float = 0.15
+    """Loss of light in the corners, share."""
+    blur: float = 0.45
+    """Standard deviation of the lens's blur, px."""
+    motion_blur: float = 0.0
+    """Length of the blur along the flight, px."""
+    noise: float = 1.5
+    """Standard deviation of the sensor noise, levels of 255."""
+    quality: int = 92
+    """Of the JPEG."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reporting:
+    """How the metadata differ from the truth."""
+
+    gps_noise: float = 2.0
+    """Standard deviation of the position, each horizontal axis, m."""
+    gps_noise_z: float | None = None
+    """Standard deviation of the height above sea level, m; 1.5 times the horizontal one where None."""
+    gps_correlation: float = 0.0
+    """Time in s over which position errors stay alike; 0 is independent errors."""
+    barometer_noise: float = 0.3
+    """Standard deviation of the height above take-off, m."""
+    altitude_drift: float = 0.0
+    """Error of all reported heights that grows evenly to this value over the flight, m."""
+    angle_noise: float = 0.5
+    """Standard deviation of each reported angle, degrees."""
+    yaw_lie: YawLie = "none"
+    """One whole line: files turned by 180 degrees in a viewer, or only the yaw tag 180 degrees off."""
+    focal_error: float = 0.01
+    """Relative error of the focal length in the EXIF."""
+    focal_missing: bool = False
+    """No focal length at all."""
+    attitude_missing: bool = False
+    """No gimbal or flight angles (no XMP at all)."""
+    gps_missing: int = 0
+    """Photos without position."""
+    clock_offsets: tuple[float, ...] = (0.0, 40.0, -25.0)
+    """Clock error of each drone, s, repeated as needed."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Control:
+    """Surveyed targets."""
+
+    points: int = 5
+    """Control points."""
+    checks: int = 4
+    """Check points."""
+    accuracy: float = 0.02
+    """Standard deviation of each surveyed coordinate, m."""
+    pixel_noise: float = 0.3
+    """Standard deviation of each sighting, px."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thermal:
+    """A second drone with a thermal camera over the same site."""
+
+    lens: Lens = field(
+        default_factory=lambda: Lens(
+            width=640,
+            height=512,
+            focal=772.0,
+            offset_x=3.0,
+            offset_y=2.0,
+            k1=-0.22,
+            k2=0.08,
+            p1=0.001,
+            p2=0.0005,
+        )
+    )
+    """Its camera."""
+    overlap: float = 0.80
+    """Forward overlap."""
+    sidelap: float = 0.65
+    """Sideways overlap."""
+    height: float = 75.0
+    """Above take-off, m."""
+    weather: Weather = field(default_factory=lambda: Weather(hour=13.0))
+    """Its own time of day and season."""
+    drift: float = 0.2
+    """Standard deviation of the offset between frames, K."""
+    noise: float = 0.05
+    """Standard deviation per pixel, K."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightSettings:
+    """A whole simulated survey; equal settings give equal bytes."""
+
+    seed: int = 1
+    """Of everything random."""
+    lens: Lens = field(default_factory=Lens)
+    """The true camera."""
+    scene: SceneSettings = field(default_factory=SceneSettings)
+    """The country."""
+    weather: Weather = field(default_factory=Weather)
+    """Season and hour of the visible flight."""
+    route: Route = field(default_factory=Route)
+    """Where photos are taken."""
+    pictures: Pictures = field(default_factory=Pictures)
+    """How they look."""
+    reporting: Reporting = field(default_factory=Reporting)
+    """What they say about themselves."""
+    control: Control = field(default_factory=Control)
+    """Targets on the ground."""
+    thermal: Thermal | None = None
+    """A thermal flight as well."""
+    gsd: float | None = None
+    """Cell size of the country's raster, m; the nominal ground resolution of the photos where None."""
+
+    @property
+    def resolution(self) -> float:
+        """Cell size of the country's raster and of the true orthophoto, m."""
+        return self.gsd if self.gsd is not None else self.route.height / self.lens.focal
+
+    def checked(self) -> "FlightSettings":
+        """Itself; raises UsageError where values do not fit together."""
+        for rules in (_route_rules(self), _other_rules(self)):
+            for holds, sentence in rules:
+                if not holds:
+                    raise UsageError(sentence)
+        return self
+
+
+_Rules = list[tuple[bool, str]]
+
+
+def _route_rules(settings: FlightSettings) -> _Rules:
+    route, relief = settings.route, settings.scene.relief
+    low = f"height {route.height:g} m is too low over a relief of {relief:g} m"
+    lost = f"cannot lose {route.lost} of {route.photos} photos, at most every second one"
+    return [
+        (route.photos >= 1, f"photos must be at least 1, not {route.photos}"),
+        (0 <= route.overlap < 0.98, f"overlap must be 0 to 97 %, not {100 * route.overlap:.0f} %"),
+        (0 <= route.sidelap < 0.98, f"sidelap must be 0 to 97 %, not {100 * route.sidelap:.0f} %"),
+        (route.height >= 25, f"height must be at least 25 m (trees, houses), not {route.height:g} m"),
+        (route.height > 2 * relief, low),
+        (route.drones >= 1, f"drones must be at least 1, not {route.drones}"),
+        (0 <= 2 * route.lost < route.photos, lost),
+        (0 <= route.tilt_noise <= 8, f"tilt noise must be 0 to 8 degrees, not {route.tilt_noise:g}"),
+    ]
+
+
+def _other_rules(settings: FlightSettings) -> _Rules:
+    hour, relief, control = settings.weather.hour, settings.scene.relief, settings.control
+    reporting, pictures = settings.reporting, settings.pictures
+    return [
+        (relief >= 0, f"relief must not be negative, not {relief:g} m"),
+        (0 <= hour < 24, f"hour must be 0 to 24, not {hour:g}"),
+        (min(settings.lens.width, settings.lens.height) >= 64, "photos must be at least 64 px wide and high"),
+        (
+            control.points >= 0 and control.checks >= 0,
+            "numbers of control and check points must not be negative",
+        ),
+        (reporting.gps_noise >= 0, f"GPS noise must not be negative, not {reporting.gps_noise:g} m"),
+        (reporting.gps_missing >= 0, "the number of photos without position must not be negative"),
+        (reporting.focal_error > -0.9, "the error of the focal length must be above -90 %"),
+        (pictures.exposure_noise >= 0, "exposure noise must not be negative"),
+        (0 <= pictures.motion_blur <= 100, "motion blur must be 0 to 100 px"),
+    ]

@@ -1,0 +1,49 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyquilt.geometry.camera_formats import camera_from_opensfm, camera_to_opensfm
+from skyquilt.model.camera import Camera
+
+small = st.floats(-0.3, 0.3)
+
+
+@given(st.integers(100, 9000), st.integers(100, 9000), st.floats(0.3, 5), small, small, small, small)
+def test_round_trip(width, height, focal, k1, k2, p1, cx):
+    unit = max(width, height)
+    camera = Camera(
+        width=width,
+        height=height,
+        focal=focal * unit,
+        cx=cx * unit,
+        cy=height / 2,
+        k1=k1,
+        k2=k2,
+        k3=-k1,
+        p1=p1,
+    )
+    back = camera_from_opensfm(camera_to_opensfm(camera))
+    assert back.vector == pytest.approx(camera.vector, rel=1e-9, abs=1e-6)
+
+
+def test_a_centred_principal_point_is_the_middle_of_integer_centres():
+    camera = camera_from_opensfm(
+        {"projection_type": "perspective", "width": 4000, "height": 3000, "focal": 0.85}
+    )
+    assert (camera.focal, camera.cx, camera.cy) == (3400, 1999.5, 1499.5)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"projection_type": "fisheye"}, "fisheye"),
+        ({"width": "wide"}, "width"),
+        ({"width": 0}, "size"),
+        ({"focal": None}, "focal"),
+        ({"focal": -1.0}, "positive focal"),
+    ],
+)
+def test_a_broken_record_says_what_is_wrong(change, words):
+    record = {"projection_type": "perspective", "width": 40, "height": 30, "focal": 1.0, **change}
+    with pytest.raises(ValueError, match=words):
+        camera_from_opensfm(record)

@@ -1,0 +1,111 @@
+import math
+
+import piexif
+import pytest
+
+from skyquilt.photos.read import read_photo
+from skyquilt.photos.sensors import _table, find_sensor
+
+from .conftest import dji_exif, dji_xmp, pixels
+
+
+def exif_of(model, **tags):
+    numbers = {getattr(piexif.ExifIFD, name): value for name, value in tags.items()}
+    return {"0th": {piexif.ImageIFD.Make: "X", piexif.ImageIFD.Model: model}, "Exif": numbers}
+
+
+def focal(make_jpeg, exif=None, xmp=None):
+    return read_photo(make_jpeg(exif=exif, xmp=xmp, image=pixels(120, 90))).focal
+
+
+def test_reduced_copy_scales_the_focal_length(make_jpeg):
+    exif = exif_of(
+        "Canon PowerShot SX260 HS",
+        FocalLength=(45, 10),
+        PixelXDimension=4000,
+        PixelYDimension=3000,
+        FocalPlaneXResolution=(4_000_000, 244),
+        FocalPlaneResolutionUnit=2,
+    )
+    found = focal(make_jpeg, exif)
+    assert (found.source, found.px) == ("sensor", pytest.approx(4.5 / 6.17 * 120))
+    exif["0th"][piexif.ImageIFD.Model] = "Some other camera"
+    found = focal(make_jpeg, exif)
+    assert (found.source, found.px) == (
+        "focal-plane",
+        pytest.approx(4.5 * 4_000_000 / 244 / 25.4 * 120 / 4000),
+    )
+    assert found.sigma_px == pytest.approx(0.03 * found.px)
+
+
+def test_35mm_equivalent_counts_for_the_diagonal(make_jpeg):
+    found = focal(make_jpeg, exif_of("Unknown", FocalLengthIn35mmFilm=24))
+    assert (found.source, found.px) == ("35mm", pytest.approx(24 / math.hypot(36, 24) * 150))
+
+
+@pytest.mark.parametrize(
+    "exif", [None, exif_of("Unknown", FocalLength=(5, 1)), exif_of("FC300S", FocalLength=(0, 0))]
+)
+def test_otherwise_it_is_native_or_guessed(make_jpeg, exif):
+    found = focal(make_jpeg, exif)
+    if exif and exif["0th"][piexif.ImageIFD.Model] == "FC300S":
+        assert (found.source, found.px) == ("sensor", pytest.approx(3.61 / 6.25 * 120))
+    else:
+        assert (found.source, found.px, found.sigma_px) == ("guess", pytest.approx(102), pytest.approx(25.5))
+
+
+def test_an_absurd_focal_length_is_passed_over(make_jpeg):
+    assert focal(make_jpeg, exif_of("FC300S", FocalLength=(361_000, 1))).source == "guess"
+
+
+def test_dewarp_data(make_jpeg):
+    data = "2018-09-04;100.0,100.4,2.0,-1.0,-0.26,0.11,0.0002,-0.0001,-0.05"
+    photo = read_photo(
+        make_jpeg(image=pixels(120, 90), exif=dji_exif(), xmp=dji_xmp(DewarpData=data, DewarpFlag="0"))
+    )
+    camera = photo.calibration
+    assert camera.focal == pytest.approx(100.2)
+    assert (camera.cx, camera.cy) == (pytest.approx(61.5), pytest.approx(43.5))
+    assert (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2) == (-0.26, 0.11, -0.05, 0.0002, -0.0001)
+    assert (photo.focal.source, photo.focal.px) == ("calibrated", camera.focal)
+    flagged = dji_xmp(DewarpData=data, DewarpFlag="1")
+    assert read_photo(make_jpeg(image=pixels(120, 90), xmp=flagged)).calibration.k1 == 0
+
+
+def test_calibrated_focal_length_of_a_reduced_copy(make_jpeg):
+    size = {piexif.ExifIFD.PixelXDimension: 4000, piexif.ExifIFD.PixelYDimension: 3000}
+    xmp = dji_xmp(
+        CalibratedFocalLength="3666.67", CalibratedOpticalCenterX="2000.0", CalibratedOpticalCenterY="1500.0"
+    )
+    photo = read_photo(make_jpeg(image=pixels(120, 90), exif=dji_exif(Exif=size), xmp=xmp))
+    assert photo.calibration.focal == pytest.approx(3666.67 * 0.03)
+    assert (photo.calibration.cx, photo.calibration.cy) == (pytest.approx(59.5), pytest.approx(44.5))
+
+
+def test_pix4d_lens_model_in_mm(make_jpeg):
+    model = (
+        'xmlns:Camera="http://pix4d.com/camera/1.0/" Camera:ModelType="perspective" '
+        'Camera:PerspectiveFocalLength="5.5" Camera:PrincipalPoint="2.4,1.8" '
+        'Camera:PerspectiveDistortion="-0.1,0.15,-0.03,0.001,0.002"'
+    )
+    xmp = dji_xmp().replace("xmlns:drone-dji", model + " xmlns:drone-dji")
+    exif = exif_of("RedEdge", FocalPlaneXResolution=(25, 1), FocalPlaneResolutionUnit=4)
+    camera = read_photo(make_jpeg(image=pixels(120, 90), exif=exif, xmp=xmp)).calibration
+    assert camera.focal == pytest.approx(5.5 * 25)
+    assert (camera.cx, camera.cy, camera.p2) == (pytest.approx(59.5), pytest.approx(44.5), 0.002)
+
+
+def test_sensor_table_is_sane():
+    rows = [row for group in _table().values() for row in group]
+    assert len(rows) >= 60
+    assert all(1.5 < row.width_mm < 60 for row in rows)
+    assert all(
+        row.shutter in ("rolling", "global", "") and row.band in ("visible", "thermal") for row in rows
+    )
+
+
+def test_two_eyes_of_one_model_are_told_apart_by_size():
+    model = "MAVIC2-ENTERPRISE-ADVANCED"
+    assert find_sensor(model=model, long_side=640).band == "thermal"
+    assert find_sensor(model=model, long_side=8000).band == "visible"
+    assert find_sensor(model=model, long_side=1234) is None

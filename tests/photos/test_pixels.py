@@ -1,0 +1,146 @@
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image
+
+from skyquilt.errors import UnreadablePhotoError
+from skyquilt.model.photo import RejectedPhoto
+from skyquilt.photos.pixels import decode_jpeg, read_color, read_gray, reduce_pixels, to_gray
+from skyquilt.photos.read import read_photo
+
+from .conftest import dji_exif, jpeg_bytes, pixels
+
+
+def test_full_jpeg_equals_pillows_and_ignores_orientation(make_jpeg):
+    path = make_jpeg(exif=dji_exif(**{"0th": {274: 6}}))
+    ours = read_color(read_photo(path)).astype(int)
+    assert ours.shape == (64, 96, 3)
+    assert np.abs(ours - np.asarray(Image.open(path)).astype(int)).max() <= 2
+
+
+@pytest.mark.parametrize("reduction", [2, 4, 8])
+@pytest.mark.parametrize("size", [(96, 64), (101, 75)])
+def test_reduced_jpeg_is_the_area_mean(make_jpeg, reduction, size):
+    photo = read_photo(make_jpeg(image=pixels(*size)))
+    small = read_color(photo, reduction=reduction)
+    mean = reduce_pixels(read_color(photo), reduction)
+    assert small.shape == mean.shape == (-(-size[1] // reduction), -(-size[0] // reduction), 3)
+    assert np.abs(small.astype(int) - mean)[:-1, :-1].mean() < 3
+    gray = read_gray(photo, reduction=reduction)
+    assert np.abs(gray.astype(int) - to_gray(small))[:-1, :-1].mean() < 3
+
+
+def test_reduced_pixel_centres_are_where_they_are_said_to_be(make_jpeg):
+    """A blob at x of the full image lies at (x - (r - 1) / 2) / r of the reduced one."""
+    rows, columns = np.mgrid[0:128, 0:192]
+    blob = 250 * np.exp(-((columns - 100.0) ** 2 + (rows - 61.0) ** 2) / (2 * 9.0**2))
+    photo = read_photo(make_jpeg(image=np.repeat(blob[..., None], 3, 2).astype(np.uint8)))
+    for r in (1, 2, 4):
+        small = read_gray(photo, reduction=r).astype(float)
+        small[small < 20] = 0
+        v, u = np.mgrid[0 : small.shape[0], 0 : small.shape[1]]
+        where = np.array([(u * small).sum(), (v * small).sum()]) / small.sum()
+        assert where == pytest.approx([(100 - (r - 1) / 2) / r, (61 - (r - 1) / 2) / r], abs=0.03)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95, 0.999])
+def test_truncated_jpeg_is_left_out(make_jpeg, share):
+    path = make_jpeg(
+        exif=dji_exif(), image=np.random.default_rng(1).integers(0, 255, (200, 300, 3), np.uint8)
+    )
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    rejected = read_photo(path)
+    assert isinstance(rejected, RejectedPhoto)
+    assert "cut off" in rejected.reason
+
+
+def test_zero_padding_does_not_hide_a_truncation(make_jpeg):
+    path = make_jpeg(image=np.random.default_rng(1).integers(0, 255, (200, 300, 3), np.uint8))
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2] + bytes(len(data) // 2))
+    assert "cut off" in read_photo(path).reason
+
+
+def test_trailers_behind_the_image_do_no_harm(make_jpeg):
+    """Previews, padding, maker's blocks: all stand behind the end of the image proper."""
+    path = make_jpeg()
+    path.write_bytes(path.read_bytes() + jpeg_bytes(pixels(40, 30)) + bytes(5000))
+    assert read_color(read_photo(path)).shape == (64, 96, 3)
+
+
+def test_damage_inside_raises_instead_of_yielding_grey(make_jpeg):
+    path = make_jpeg(image=np.random.default_rng(1).integers(0, 255, (200, 300, 3), np.uint8))
+    photo = read_photo(path)
+    data = path.read_bytes()
+    middle = len(data) // 2
+    path.write_bytes(data[:middle] + bytes(3000) + data[middle + 3000 :])
+    with pytest.raises(UnreadablePhotoError, match="damaged"):
+        read_color(photo)
+
+
+def test_a_file_that_changed_its_size_is_no_longer_that_photo(make_jpeg):
+    photo = read_photo(make_jpeg())
+    make_jpeg(image=pixels(60, 60))
+    with pytest.raises(UnreadablePhotoError, match="60x60"):
+        read_color(photo)
+
+
+def test_gone_file_is_a_reason(make_jpeg):
+    photo = read_photo(make_jpeg())
+    photo.path.unlink()
+    with pytest.raises(UnreadablePhotoError):
+        read_gray(photo)
+
+
+def test_gray_jpeg(tmp_path):
+    Image.fromarray(pixels()[..., 0]).save(tmp_path / "g.jpg")
+    photo = read_photo(tmp_path / "g.jpg")
+    assert (photo.channels, read_color(photo).shape) == (1, (64, 96))
+
+
+@pytest.mark.parametrize("planar", ["contig", "separate"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
+def test_multiband_tiff(tmp_path, planar, dtype):
+    bands = np.random.default_rng(0).integers(0, 255, (64, 96, 5)).astype(dtype)
+    stored = bands if planar == "contig" else np.moveaxis(bands, -1, 0)
+    tifffile.imwrite(tmp_path / "m.tif", stored, photometric="minisblack", planarconfig=planar)
+    photo = read_photo(tmp_path / "m.tif")
+    assert (photo.width, photo.height, photo.channels, photo.dtype) == (96, 64, 5, np.dtype(dtype).name)
+    assert np.array_equal(read_color(photo), bands)
+    assert read_color(photo, reduction=2).shape == (32, 48, 5)
+    assert read_gray(photo).shape == (64, 96)
+
+
+def test_truncated_tiff(tmp_path):
+    tifffile.imwrite(tmp_path / "m.tif", pixels(), photometric="rgb")
+    data = (tmp_path / "m.tif").read_bytes()
+    (tmp_path / "m.tif").write_bytes(data[:-4000])
+    assert "cut off" in read_photo(tmp_path / "m.tif").reason
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "P", "I;16"])
+def test_png(tmp_path, mode):
+    image = Image.fromarray(pixels())
+    if mode == "I;16":
+        cv2.imwrite(str(tmp_path / "p.png"), pixels()[..., 0].astype(np.uint16) * 200)
+    else:
+        image.convert(mode).save(tmp_path / "p.png")
+    photo = read_photo(tmp_path / "p.png")
+    values = read_color(photo)
+    assert values.dtype == photo.dtype
+    assert values.shape == ((64, 96) if mode in ("L", "I;16") else (64, 96, 3))
+    if mode.startswith("RGB"):
+        assert np.array_equal(values, pixels())
+
+
+def test_sixteen_bit_gray_is_stretched(tmp_path):
+    ramp = np.tile(np.linspace(1000, 3000, 96).astype(np.uint16), (64, 1))
+    tifffile.imwrite(tmp_path / "r.tif", ramp)
+    gray = read_gray(read_photo(tmp_path / "r.tif"))
+    assert (gray.min(), gray.max()) == (0, 255)
+
+
+def test_decode_jpeg_of_bytes():
+    assert decode_jpeg(jpeg_bytes(pixels()), gray=True, reduction=2).shape == (32, 48)

@@ -1,0 +1,273 @@
+import json
+from dataclasses import replace
+from datetime import datetime
+
+import pyproj
+import pytest
+
+from skyquilt.errors import SideFileError
+from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
+from skyquilt.photos.gcp import read_gcp_list
+from skyquilt.photos.geo_txt import read_geo_txt
+from skyquilt.photos.mrk import read_mrk
+from skyquilt.photos.positions_csv import read_positions_csv
+from skyquilt.photos.read import read_photo
+from skyquilt.photos.side_files import apply_positions
+from skyquilt.photos.side_rows import PhotoNames, SideRow, apply_rows
+from skyquilt.photos.srt import read_srt
+
+from .conftest import dji_exif, dji_xmp
+
+
+def written(tmp_path, text, name="side.txt"):
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture
+def photo(make_jpeg):
+    return read_photo(make_jpeg("DJI_0001.JPG", exif=dji_exif(), xmp=dji_xmp(RelativeAltitude="40")))
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32615", "WGS84 UTM 15N", "+proj=utm +zone=15 +datum=WGS84 +units=m"])
+def test_geo_txt_in_utm(tmp_path, crs):
+    x, y = pyproj.Transformer.from_crs(4326, 32615, always_xy=True).transform(-92.0, 46.5)
+    rows = read_geo_txt(
+        written(tmp_path, f"{crs}\n# words\n\nmy photo 1.JPG {x} {y} 210.5 45 2 -1 0.03 0.05\n")
+    )
+    (row,) = rows
+    assert (row.name, row.altitude_m, row.datum) == ("my photo 1.JPG", 210.5, "sea_level")
+    assert (row.longitude_deg, row.latitude_deg) == (
+        pytest.approx(-92, abs=1e-8),
+        pytest.approx(46.5, abs=1e-8),
+    )
+    assert (row.angles_deg, row.sigma_xy_m, row.sigma_z_m) == ((45, 2, -1), 0.03, 0.05)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("EPSG:4326\n", "1 lines"),
+        ("not a system\na.jpg 1 2\n", "coordinate system"),
+        ("EPSG:4326\na.jpg 9\n", "line 2"),
+        ("EPSG:4326\na.jpg 9 46 1 2\n", "line 2"),
+    ],
+)
+def test_bad_geo_txt_names_the_line(tmp_path, text, words):
+    with pytest.raises(SideFileError, match=words):
+        read_geo_txt(written(tmp_path, text))
+
+
+def test_void_row_is_an_error_and_missing_height_keeps_the_old_one(tmp_path, photo):
+    with pytest.raises(SideFileError, match="outside the globe"):
+        apply_positions([photo], written(tmp_path, "EPSG:4326\nDJI_0001 9 146\n"))
+    ((after,), _) = apply_positions([photo], written(tmp_path, "EPSG:4326\nDJI_0001 9 46\n"))
+    assert (after.position.latitude_deg, after.position.altitude_m, after.position.datum) == (
+        46,
+        40,
+        "takeoff",
+    )
+    assert after.attitude is photo.attitude
+
+
+def test_rows_override_position_and_angles(photo):
+    row = SideRow(name="dji_0001", latitude_deg=46, longitude_deg=9, altitude_m=77, angles_deg=(10, -90, 0))
+    ((after,), notes) = apply_rows([photo], [row, SideRow(name="other")], file=photo.path, source="csv")
+    assert (after.position.altitude_m, after.position.datum, after.position.takeoff_m) == (
+        77,
+        "sea_level",
+        40,
+    )
+    assert (after.attitude.yaw_deg, after.attitude.pitch_deg) == (
+        pytest.approx(10),
+        pytest.approx(0, abs=1e-9),
+    )
+    assert any("other" in n for n in notes)
+
+
+def test_names_are_found_by_path_name_or_stem_but_never_guessed():
+    names = PhotoNames(["a/x1.JPG", "b/x1.JPG", "b/x2.JPG"])
+    assert names.find("A/X1.jpg") == "a/x1.JPG"
+    assert names.find("x2") == "b/x2.JPG"
+    assert names.find("x1.JPG") is None
+    assert names.find("C:\\flights\\x2.jpg") == "b/x2.JPG"
+
+
+GCP = """WGS84 UTM 15N
+544256.7 5320919.9 5 3044 2622 DJI_0001.JPG gcp1
+544256.7 5320919.9 5 4193.5 1552 DJI_0002.JPG gcp1
+544157.7 5320899.2 NaN 2860 2621 DJI_0001.JPG
+544157.7 5320899.2 NaN 3385 1100 DJI_0002.JPG
+544033.4 5320876.0 7 100 200 DJI_0001.JPG check-a
+544000.0 5320000.0 7 100 200 DJI_0002.JPG plain check
+544000.0 5320500.0 7 100 200 DJI_0099.JPG lost
+"""
+
+
+def test_gcp_list(tmp_path):
+    points, notes = read_gcp_list(written(tmp_path, GCP), ["DJI_0001.JPG", "DJI_0002.JPG"])
+    by_name = {p.name: p for p in points}
+    assert list(by_name) == ["gcp1", "point 2", "check-a", "plain"]
+    assert by_name["gcp1"].crs == "EPSG:32615"
+    assert [(o.photo, o.x, o.y) for o in by_name["gcp1"].observations] == [
+        ("DJI_0001.JPG", 3044, 2622),
+        ("DJI_0002.JPG", 4193.5, 1552),
+    ]
+    assert by_name["point 2"].z is None and len(by_name["point 2"].observations) == 2
+    assert [p.check for p in points] == [False, False, True, True]
+    assert any("DJI_0099.JPG" in n for n in notes) and any("lost" in n for n in notes)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("EPSG:32615\n1 2 3 4 5\n", "line 2"),
+        ("EPSG:32615\n1 2 3 4 x a.jpg\n", "line 2"),
+        ("EPSG:32615\n1 2 3 4 5 b.jpg\n", "no photo of the survey"),
+        ("EPSG:32615\n1 2 3 4 5 a.jpg p\n1 3 3 4 5 a.jpg p\n", "two different places"),
+        ("EPSG:999999\n1 2 3 4 5 a.jpg\n", "coordinate system"),
+    ],
+)
+def test_bad_gcp_list(tmp_path, text, words):
+    with pytest.raises(SideFileError, match=words):
+        read_gcp_list(written(tmp_path, text), ["a.jpg"])
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_csv(tmp_path, mark):
+    lines = [
+        "File Name,Latitude [deg],LON,Rel_Alt,Yaw,Pitch,Roll,Accuracy",
+        "a.jpg,46.5,9.1,40.5,359,1,2,0.5",
+        "b.jpg,,,,10,,,",
+    ]
+    rows = read_positions_csv(written(tmp_path, "\n".join(lines).replace(",", mark), "p.csv"))
+    first, second = rows
+    assert (first.name, first.latitude_deg, first.longitude_deg) == ("a.jpg", 46.5, 9.1)
+    assert (first.altitude_m, first.datum, first.angles_deg) == (40.5, "takeoff", (359, 1, 2))
+    assert (first.sigma_xy_m, first.sigma_z_m) == (0.5, 0.5)
+    assert (second.latitude_deg, second.angles_deg) == (None, (10, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "empty"),
+        ("a,b\n1,2\n", "header"),
+        ("name,lat,lon\na.jpg,north,3\n", "row 1"),
+        ("name,lat\na,1\n", "header"),
+    ],
+)
+def test_bad_csv(tmp_path, text, words):
+    with pytest.raises(SideFileError, match=words):
+        read_positions_csv(written(tmp_path, text, "p.csv"))
+
+
+def test_mrk_moves_the_antenna_to_the_camera(tmp_path):
+    shot = "23\t264013.12\t[2120]\t  1000,N\t -2000,E\t 190,V\t46.50000000,Lat\t9.00000000,Lon\t92.345,Ellh"
+    line = shot + "\t0.012, 0.011, 0.024\t50,Q\n"
+    names = ["100_0001_0023.JPG", "100_0001_0024.JPG"]
+    (row,) = read_mrk(written(tmp_path, line, "t.MRK"), names)
+    x, y = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(
+        row.longitude_deg, row.latitude_deg
+    )
+    x0, y0 = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(9, 46.5)
+    assert (x - x0, y - y0) == (pytest.approx(-2, abs=0.01), pytest.approx(1, abs=0.01))
+    assert (row.altitude_m, row.datum) == (pytest.approx(92.155), "ellipsoid")
+    assert (row.sigma_xy_m, row.sigma_z_m) == (0.012, 0.024)
+    with pytest.raises(SideFileError, match="shots 23 to 23"):
+        read_mrk(tmp_path / "t.MRK", ["IMG_1.JPG"])
+
+
+NEW = """1
+00:00:00,000 --> 00:00:00,033
+<font size="28">FrameCnt: 1, DiffTime: 33ms
+2023-05-01 10:11:12.500
+[iso: 100] [latitude: 46.50] [longitude: 9.10] [rel_alt: 40.500 abs_alt: 300.100]
+[gb_yaw: 10.0 gb_pitch: -90.0 gb_roll: 0.0]</font>
+
+2
+00:00:00,033 --> 00:00:00,066
+<font size="28">FrameCnt: 2, DiffTime: 33ms
+2023-05-01 10:11:13.500
+[latitude: 46.60] [longtitude: 9.20] [altitude: 301.0]</font>
+"""
+OLD = """1
+00:00:01,000 --> 00:00:02,000
+HOME(9.0000,46.0000) 2017.05.01 10:11:12
+GPS(9.1000,46.5000,15) BAROMETER:64.3
+ISO:100 Shutter:320
+
+2
+00:00:02,000 --> 00:00:03,000
+F/2.8, SS 206.14, ISO 150, EV 0, GPS (9.2000, 46.6000, 17), D 24.26m, H 6.00m, H.S 0.00m/s
+"""
+
+
+def test_srt_by_frame_number(tmp_path, photo):
+    frames = [replace(photo, name=f"frame_{i:06d}.jpg", time=None) for i in (1, 2)]
+    first, second = read_srt(written(tmp_path, NEW, "a.SRT"), frames)
+    assert (first.latitude_deg, first.longitude_deg, first.altitude_m, first.datum) == (
+        46.5,
+        9.1,
+        40.5,
+        "takeoff",
+    )
+    assert first.angles_deg == (10, -90, 0)
+    assert (second.latitude_deg, second.longitude_deg, second.altitude_m, second.datum) == (
+        46.6,
+        9.2,
+        301,
+        "sea_level",
+    )
+    first, second = read_srt(written(tmp_path, OLD, "b.SRT"), frames)
+    assert (first.latitude_deg, first.longitude_deg, first.altitude_m) == (46.5, 9.1, 64.3)
+    assert (second.latitude_deg, second.altitude_m, second.datum) == (46.6, 6.0, "takeoff")
+
+
+def test_srt_by_time_or_not_at_all(tmp_path, photo):
+    path = written(tmp_path, NEW, "a.SRT")
+    timed = replace(photo, name="x.jpg", time=datetime(2023, 5, 1, 10, 11, 13, 300_000))
+    (row,) = read_srt(path, [timed])
+    assert (row.name, row.latitude_deg) == ("x.jpg", 46.6)
+    with pytest.raises(SideFileError, match="Name the frames"):
+        read_srt(path, [replace(photo, name="x.jpg", time=None)])
+
+
+def test_positions_by_the_files_ending(tmp_path, photo):
+    ((after,), _) = apply_positions([photo], written(tmp_path, "name,lat,lon\nDJI_0001,46,9\n", "p.CSV"))
+    assert after.position.source == "csv"
+
+
+CAMERAS = {
+    "v2 dji fc300s 96 64 brown 0.58": {
+        "projection_type": "brown", "width": 192, "height": 128, "focal_x": 0.58, "focal_y": 0.58,
+        "c_x": 0.01, "c_y": 0.0, "k1": -0.01, "k2": 0.02, "p1": 0.0, "p2": 0.0, "k3": 0.0,
+    }
+}  # fmt: skip
+
+
+def test_cameras_json_is_scaled_to_the_photo(tmp_path, photo):
+    path = written(tmp_path, json.dumps(CAMERAS), "cameras.json")
+    ((after,), notes) = apply_cameras([photo], read_cameras_json(path), file=path)
+    assert notes == ()
+    assert (after.calibration.width, after.calibration.focal) == (96, pytest.approx(0.58 * 96))
+    assert after.calibration.cx == pytest.approx(47.5 + 0.96)
+    assert (after.focal.source, after.focal.px) == ("calibrated", pytest.approx(0.58 * 96))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [("{", "no JSON"), ("[]", "cameras by name"), ('{"a": {"width": 3}}', "height"), ("{}", "by name")],
+)
+def test_bad_cameras_json(tmp_path, text, words):
+    with pytest.raises(SideFileError, match=words):
+        read_cameras_json(written(tmp_path, text, "cameras.json"))
+
+
+def test_cameras_of_another_shape_do_not_fit(tmp_path, photo):
+    path = written(
+        tmp_path, json.dumps({"all": {**CAMERAS["v2 dji fc300s 96 64 brown 0.58"], "height": 190}})
+    )
+    with pytest.raises(SideFileError, match="dji fc300s"):
+        apply_cameras([photo], read_cameras_json(path), file=path)

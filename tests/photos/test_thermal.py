@@ -1,0 +1,162 @@
+import math
+import struct
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+
+from skyquilt.model.photo import Photo
+from skyquilt.photos.flir import FlirCamera
+from skyquilt.photos.pixels import read_color, read_gray
+from skyquilt.photos.read import read_photo
+from skyquilt.photos.thermal import thermal_frame_of_values
+
+from .conftest import jpeg_bytes, pixels, with_segment
+
+R1, B, F, OFFSET, R2 = 17096.453, 1428.0, 1.0, -342, 0.046642166
+EMISSIVITY, REFLECTED_K, AIR_K, HUMIDITY, DISTANCE = 0.95, 295.15, 290.15, 0.5, 20.0
+ALPHA1, ALPHA2, BETA1, BETA2, X = 0.006569, 0.01262, -0.002276, -0.00667, 1.9
+
+
+def planck_counts(celsius):
+    """Counts of a black body; the published calibration curve."""
+    return R1 / (R2 * (np.exp(B / (np.asarray(celsius) + 273.15)) - F)) - OFFSET
+
+
+def seen_counts(celsius):
+    """Counts of a grey body behind air, with what it reflects: the forward radiance budget."""
+    t = AIR_K - 273.15
+    water = math.sqrt(HUMIDITY * math.exp(1.5587 + 6.939e-2 * t - 2.7816e-4 * t * t + 6.8455e-7 * t**3))
+    d = math.sqrt(DISTANCE)
+    tau = X * math.exp(-d * (ALPHA1 + BETA1 * water)) + (1 - X) * math.exp(-d * (ALPHA2 + BETA2 * water))
+    own = EMISSIVITY * tau * planck_counts(celsius)
+    return own + (1 - EMISSIVITY) * tau * planck_counts(REFLECTED_K - 273.15) + (1 - tau) * planck_counts(t)
+
+
+def camera_record():
+    record = bytearray(0x400)
+    struct.pack_into("<H", record, 0, 2)
+    for offset, value in {
+        0x20: EMISSIVITY, 0x24: DISTANCE, 0x28: REFLECTED_K, 0x2C: AIR_K, 0x30: 293.15, 0x34: 1.0,
+        0x3C: HUMIDITY, 0x58: R1, 0x5C: B, 0x60: F, 0x30C: R2,
+        0x70: ALPHA1, 0x74: ALPHA2, 0x78: BETA1, 0x7C: BETA2, 0x80: X,
+    }.items():  # fmt: skip
+        struct.pack_into("<f", record, offset, value)
+    struct.pack_into("<i", record, 0x308, OFFSET)
+    return bytes(record)
+
+
+def flir_jpeg(counts, *, as_png=True, camera=True, chunk=3000):
+    """A FLIR radiometric JPEG by the published layout, its FFF block split over several segments."""
+    height, width = counts.shape
+    body = cv2.imencode(".png", counts.byteswap())[1].tobytes() if as_png else counts.astype("<u2").tobytes()
+    raw = struct.pack("<HHH", 2, width, height).ljust(32, b"\0") + body
+    records = [(1, raw)] + ([(0x20, camera_record())] if camera else [])
+    offset = 64 + 32 * len(records)
+    directory, bodies = b"", b""
+    for kind, record in records:
+        directory += struct.pack(">HHIIIIIII", kind, 0, 0, 0, offset + len(bodies), len(record), 0, 0, 0)
+        bodies += record
+    head = b"FFF\0" + b"test".ljust(16, b"\0") + struct.pack(">III", 101, 64, len(records))
+    block = head.ljust(64, b"\0") + directory + bodies
+    chunks = [block[i : i + chunk] for i in range(0, len(block), chunk)]
+    data = jpeg_bytes(pixels(80, 60))
+    for i, part in reversed(list(enumerate(chunks))):
+        data = with_segment(data, 0xE1, b"FLIR\0\x01" + bytes([i, len(chunks) - 1]) + part)
+    return data
+
+
+def scene(height=60, width=80):
+    return np.linspace(-20, 60, height * width).reshape(height, width)
+
+
+@pytest.mark.parametrize("as_png", [True, False])
+def test_flir_counts_become_the_temperatures_they_came_from(tmp_path, as_png):
+    celsius = scene()
+    counts = np.round(seen_counts(celsius)).astype(np.uint16)
+    (tmp_path / "a.jpg").write_bytes(flir_jpeg(counts, as_png=as_png))
+    photo = read_photo(tmp_path / "a.jpg")
+    assert (photo.band, photo.unit, photo.dtype, photo.channels) == ("thermal", "celsius", "float32", 1)
+    assert (photo.width, photo.height) == (80, 60)
+    values = read_color(photo)
+    assert values.dtype == np.float32
+    assert np.abs(values - celsius).max() < 0.06  # one count is 0.02 to 0.05 K here
+    assert read_gray(photo).dtype == np.uint8
+
+
+def test_flir_without_constants_keeps_counts(tmp_path):
+    counts = np.round(planck_counts(scene())).astype(np.uint16)
+    (tmp_path / "a.jpg").write_bytes(flir_jpeg(counts, camera=False))
+    photo = read_photo(tmp_path / "a.jpg")
+    assert photo.unit == "counts"
+    assert np.array_equal(read_color(photo), counts)
+
+
+def test_counts_that_are_no_radiance_are_nan():
+    camera = FlirCamera(planck_r1=R1, planck_b=B, planck_f=F, planck_o=OFFSET, planck_r2=R2)
+    celsius = camera.celsius(np.array([[0, 14000]], np.uint16))
+    assert np.isnan(celsius[0, 0])
+    assert np.isfinite(celsius[0, 1])
+
+
+def dji_jpeg(tmp_path, counts, short=0):
+    exif = {"0th": {0x010F: "DJI", 0x0110: "MAVIC2-ENTERPRISE-ADVANCED"}}
+    data = jpeg_bytes(pixels(counts.shape[1], counts.shape[0]), exif)
+    raw = counts.astype("<u2").tobytes()[: -short or None]
+    for i in reversed(range(0, len(raw), 65532)):
+        data = with_segment(data, 0xE3, raw[i : i + 65532])
+    (tmp_path / "t.jpg").write_bytes(data)
+    return read_photo(tmp_path / "t.jpg")
+
+
+def test_dji_counts_come_back_and_the_palette_does_not(tmp_path):
+    counts = np.arange(640 * 512, dtype=np.uint32).reshape(512, 640).astype(np.uint16)
+    photo = dji_jpeg(tmp_path, counts)
+    assert (photo.band, photo.unit, photo.focal.source, photo.focal.px) == (
+        "thermal",
+        "counts",
+        "sensor",
+        750,
+    )
+    assert np.array_equal(read_color(photo), counts)
+    assert read_color(photo, reduction=4).shape == (128, 160)
+
+
+def test_dji_frame_of_a_wrong_size_is_no_frame(tmp_path):
+    photo = dji_jpeg(tmp_path, np.zeros((512, 640), np.uint16), short=2)
+    assert isinstance(photo, Photo)
+    assert (photo.band, photo.unit, photo.dtype) == (
+        "thermal",
+        "",
+        "uint8",
+    )  # the model is known to be thermal
+
+
+@pytest.mark.parametrize(
+    ("values", "unit", "first"),
+    [
+        (np.full((9, 9), 29515, np.uint16), "celsius", 22.0),
+        (np.full((9, 9), 2951, np.uint16), "celsius", 21.95),
+        (np.full((9, 9), 300.15, np.float32), "celsius", 27.0),
+        (np.full((9, 9), 21.5, np.float32), "celsius", 21.5),
+        (np.full((9, 9), 7000, np.uint16), "counts", 7000.0),
+    ],
+)
+def test_units_of_thermal_tiffs(values, unit, first):
+    frame = thermal_frame_of_values(values)
+    assert (frame.unit, float(frame.values[0, 0])) == (unit, pytest.approx(first, abs=1e-3))
+    assert f"{np.median(values):g}" in frame.note
+
+
+def test_thermal_tiff_from_file(tmp_path):
+    values = np.full((60, 80), 29515, np.uint16)
+    values[0, 0] = 0
+    tifffile.imwrite(tmp_path / "t.tif", values, extratags=[(272, "s", 0, "Vue Pro R", True)])
+    assert (
+        read_photo(tmp_path / "t.tif").unit == ""
+    )  # a camera of that name has no 80 px mode: not known as thermal
+    tifffile.imwrite(tmp_path / "u.tif", values.astype(np.float32) / 100)
+    photo = read_photo(tmp_path / "u.tif")
+    assert (photo.band, photo.unit) == ("thermal", "celsius")
+    assert read_color(photo)[1, 1] == pytest.approx(22.0, abs=1e-3)

@@ -1,0 +1,42 @@
+"""Small rasters, and rasterio and rio-cogeo to look at what became of them."""
+
+import numpy as np
+import pytest
+import rasterio
+
+from skyquilt.raster import RasterSpec
+
+PLACE = (0.02, 0.0, 500_000.0, 0.0, -0.02, 4_500_000.0)
+
+
+def spec_for(array, **options):
+    array = array[..., None] if array.ndim == 2 else array
+    height, width, bands = array.shape
+    known = {"transform": PLACE, "crs": "EPSG:32615"} | options
+    return RasterSpec(width=width, height=height, bands=bands, dtype=str(array.dtype), **known)
+
+
+def picture(height, width, bands=3):
+    y, x = np.mgrid[:height, :width]
+    waves = [120 + 90 * np.sin(x / (17 + 9 * b)) * np.cos(y / (23 + 5 * b)) for b in range(bands)]
+    return np.stack(waves, -1).astype(np.uint8)
+
+
+def disc(height, width):
+    y, x = np.mgrid[:height, :width]
+    return ((y - height / 2) / height) ** 2 + ((x - width / 2) / width) ** 2 < 0.2
+
+
+def assert_valid_cog(path):
+    cogeo = pytest.importorskip("rio_cogeo")
+    assert cogeo.cog_validate(path, strict=True) == (True, [], [])
+
+
+def read(path, level=None):
+    options = {} if level is None else {"overview_level": level}
+    with rasterio.open(path, **options) as source:
+        return np.moveaxis(source.read(), 0, 2), source.dataset_mask() > 0
+
+
+def psnr(a, b):
+    return 10 * np.log10(255**2 / np.mean((a.astype(float) - b) ** 2))

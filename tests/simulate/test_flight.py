@@ -1,0 +1,112 @@
+"""Plans have the overlap asked for; what is reported has the errors asked for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pyproj import Transformer
+
+from skyquilt.errors import UsageError
+from skyquilt.simulate import prepare, preset
+from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.flight import fly, plan
+from skyquilt.simulate.reported import Start, place_at, report_all
+from skyquilt.simulate.settings import Reporting, Route
+
+LENS = Lens()
+START = Start(base=440.0, takeoff=1.5)
+
+
+def shots(route: Route):
+    return fly(plan(route, LENS), route, START.takeoff, 1, "SIM")
+
+
+def places(points):
+    return np.array([[p.x, p.y] for p in points])
+
+
+def test_overlaps_of_a_block():
+    points = plan(Route(photos=40, overlap=0.75, sidelap=0.60), LENS)
+    along = 60 * LENS.height / LENS.focal
+    across = 60 * LENS.width / LENS.focal
+    first = [p for p in points if p.line == 0]
+    step = np.hypot(*np.diff(places(first), axis=0).T)
+    assert len(points) == 40
+    assert np.allclose(1 - step / along, 0.75)
+    normal = np.array([np.cos(np.radians(20)), -np.sin(np.radians(20))])
+    offsets = np.unique(np.round(places(points) @ normal, 6))
+    assert np.allclose(1 - np.diff(offsets) / across, 0.60)
+    assert {round(p.heading) for p in points} == {20, -160}
+
+
+def test_strip_and_site():
+    strip = plan(Route(pattern="strip", photos=20), LENS)
+    assert len(strip) == 20
+    assert len({p.heading for p in strip}) == 1
+    block = plan(Route(site=(100.0, 80.0)), LENS)
+    assert np.ptp(places(block) @ [np.sin(np.radians(20)), np.cos(np.radians(20))]) >= 100
+
+
+def test_round_trip_closes_and_gaps_have_twenty_percent():
+    route = Route(pattern="roundtrip", photos=40, overlap=0.60, lost=3, jitter=0.0)
+    points = places(plan(route, LENS))
+    step = 0.4 * 60 * LENS.height / LENS.focal
+    assert np.isclose(np.hypot(*(points[-1] - points[0])), step)
+    flown = shots(route)
+    numbers = [int(s.name[-4:]) for s in flown]
+    assert len(flown) == 37
+    assert max(np.diff(numbers)) == 2
+    assert {1, 40} <= set(numbers)
+
+
+def test_drones_fly_at_once():
+    points = plan(Route(photos=48, drones=3), LENS)
+    assert [p.drone for p in points[:6]] == [0, 1, 2, 0, 1, 2]
+    assert np.all(np.diff([p.time for p in points]) >= 0)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 60.0])
+def test_position_noise(correlation):
+    flown = shots(Route(photos=900))
+    place = place_at(46.6, 14.3)
+    reports = report_all(
+        flown, Reporting(gps_noise=2.0, gps_correlation=correlation), place, START, 1333.0, 7
+    )
+    to = Transformer.from_crs("EPSG:4326", place.crs, always_xy=True)
+    east, north = to.transform([r.longitude for r in reports], [r.latitude for r in reports])
+    true = np.array([s.centre for s in flown])
+    errors = np.column_stack([east, north]) - [place.easting, place.northing] - true[:, :2]
+    assert np.allclose(errors.std(axis=0), 2.0, rtol=0.35 if correlation else 0.1)
+    neighbours = np.mean(errors[1:] * errors[:-1]) / 4
+    assert (neighbours > 0.7) if correlation else (abs(neighbours) < 0.12)
+    heights = np.array([r.sea_level for r in reports]) - 440 - true[:, 2]
+    assert abs(heights.std() - 3.0) < (1.2 if correlation else 0.3)
+    assert abs(np.std([r.takeoff - z + 1.5 for r, z in zip(reports, true[:, 2], strict=True)]) - 0.3) < 0.05
+
+
+def test_lies():
+    flown = shots(Route(photos=40))
+    place = place_at(46.6, 14.3)
+    noise = Reporting(angle_noise=0.0)
+    honest = report_all(flown, noise, place, START, 1333.0, 7)
+    lying = report_all(flown, replace(noise, yaw_lie="tag"), place, START, 1333.0, 7)
+    turned = report_all(flown, replace(noise, yaw_lie="turned"), place, START, 1333.0, 7)
+    liars = [r for r in lying if "yaw" in r.lies]
+    assert len(liars) == 10 == sum(r.turned for r in turned)
+    for a, b, c in zip(honest, lying, turned, strict=True):
+        assert a.flight_yaw == c.flight_yaw
+        apart = abs((a.flight_yaw - b.flight_yaw + 180) % 360 - 180)
+        assert apart == pytest.approx(180 if b.lies else 0, abs=0.02)
+    drift = report_all(flown, replace(noise, altitude_drift=100.0), place, START, 1333.0, 7)
+    assert drift[-1].sea_level - honest[-1].sea_level == pytest.approx(100, abs=0.01)
+    assert drift[0].lies == ("altitude",)
+    silent = report_all(flown, replace(noise, gps_missing=4, focal_missing=True), place, START, 1333.0, 7)
+    assert sum(r.latitude is None for r in silent) == 4
+    assert silent[0].focal is None
+
+
+def test_settings_that_do_not_fit():
+    with pytest.raises(UsageError, match="overlap"):
+        prepare(replace(preset("demo"), route=Route(overlap=1.2)))
+    with pytest.raises(UsageError, match="no preset 'x'"):
+        preset("x")
