@@ -188,6 +188,11 @@ def test_mistakes_state_both_sides(tmp_path):
     array = picture(100, 100)
     with pytest.raises(ValueError, match="JPEG takes 1 or 3 bands of uint8, asked for 3 of uint16"):
         spec_for(array.astype(np.uint16), compress="jpeg")
+    with pytest.raises(ValueError, match="JPEG does not keep a nodata value"):
+        spec_for(array, compress="jpeg", nodata=0)
+    for nodata in (np.nan, -1, 256, 0.5):
+        with pytest.raises(ValueError, match="uint8 cannot hold the nodata value"):
+            spec_for(array, nodata=nodata)
     with pytest.raises(ValueError, match=r"is \(100, 100, 3\) of uint8, got \(99, 100, 3\) of uint8"):
         write_array(tmp_path / "a.tif", array[1:], spec_for(array))
     with CogWriter(tmp_path / "b.tif", spec_for(array)) as writer:

@@ -184,6 +184,23 @@ def test_disk_fills_while_assembling(tmp_path, monkeypatch, whole):
     assert (tmp_path / "a.tif").read_bytes() == b"the last good one"
 
 
+def test_room_made_after_a_full_disk_costs_no_pixels(tmp_path, monkeypatch, whole):
+    with monkeypatch.context() as patch:
+        patch.setattr("skyquilt.raster.assemble._framed", refuse)
+        with pytest.raises(OutputError), CogWriter(tmp_path / "a.tif", SPEC, digest="x") as writer:
+            write_some(writer, 100)
+    with CogWriter(tmp_path / "a.tif", SPEC, digest="x") as writer:
+        assert list(writer.blocks()) == []
+    assert (tmp_path / "a.tif").read_bytes() == whole
+
+
+def test_few_overview_tiles_are_open_at_a_time(tmp_path):
+    with CogWriter(tmp_path / "a.tif", SPEC) as writer:
+        for block in writer.blocks():
+            writer.write_block(block, ARRAY[cut(block)], VALID[cut(block)])
+            assert len(writer._pyramid._open) < len(SPEC.levels)
+
+
 def refuse(*_):
     raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -16,7 +16,7 @@ MCU = 16
 """Side in px of what 4:2:0 JPEG codes together: ringing never leaves it."""
 
 DEFLATE_LEVEL = 6
-ZSTD_LEVEL = 9
+ZSTD_LEVEL = 3
 
 
 class TileEncoder:

@@ -67,7 +67,8 @@ class CogWriter:
         """Encode and spool one tile of the full size; may be called by several threads at once.
 
         Pixels are (h, w, bands), or (h, w) for one band, cut at the raster's edge; `valid` is (h, w), None =
-        all (or, with a nodata value, what differs from it). Each tile is written once.
+        all (or, with a nodata value, what differs from it). Each tile is written once. What is not
+        valid becomes nodata, or masked, or 0.
         """
         part = self._checked(tile_row, tile_col, pixels, valid)
         self._claim(tile_row, tile_col)

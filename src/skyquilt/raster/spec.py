@@ -58,6 +58,10 @@ class RasterSpec:
             raise ValueError(f"tile is a multiple of 16 px, asked for {self.tile}")
         if self.compress == "jpeg" and (self.dtype != "uint8" or self.bands not in (1, 3)):
             raise ValueError(f"JPEG takes 1 or 3 bands of uint8, asked for {self.bands} of {self.dtype}")
+        if self.nodata is not None and self.compress == "jpeg":
+            raise ValueError("JPEG does not keep a nodata value; ask for a mask instead")
+        if self.nodata is not None and not _holds(np.dtype(self.dtype), self.nodata):
+            raise ValueError(f"{self.dtype} cannot hold the nodata value {self.nodata}")
         for what, names in (("band_names", self.band_names), ("band_units", self.band_units)):
             if names and len(names) != self.bands:
                 raise ValueError(f"{what} has {len(names)} entries, the raster {self.bands} bands")
@@ -95,3 +99,10 @@ class RasterSpec:
     def digest(self, salt: str = "") -> str:
         """Hex digest of the specification and of whatever the caller adds."""
         return hashlib.sha256(f"{self!r}|{salt}".encode()).hexdigest()
+
+
+def _holds(dtype: np.dtype, value: float) -> bool:
+    if dtype.kind == "f":
+        return True
+    limits = np.iinfo(dtype)
+    return value == value // 1 and limits.min <= value <= limits.max

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.flight import Shot
@@ -47,18 +48,27 @@ class Surveyed:
 
 
 def lay_out(
-    settings: Control, country: Country, shots: Sequence[Shot], reach: float, gsd: float
+    settings: Control, country: Country, lens: Lens, shots: Sequence[Shot], reach: float, gsd: float
 ) -> tuple[Target, ...]:
-    """Targets on open ground, spread as far as can be; `reach` is how far from a nadir they may lie, m."""
+    """Targets on open ground that several photos see, spread as far as can be.
+
+    `reach` is how far from the next nadir they may lie, m.
+    """
     wanted = settings.points + settings.checks
     if wanted == 0:
         return ()
     rng = np.random.default_rng([country.seed, 41])
     nadirs = np.array([shot.centre[:2] for shot in shots])
-    places = nadirs[rng.integers(len(nadirs), size=_CANDIDATES)] + rng.uniform(
+    anywhere = nadirs[rng.integers(len(nadirs), size=_CANDIDATES)] + rng.uniform(
         -reach, reach, (_CANDIDATES, 2)
     )
-    places = np.array([p for p in places if _open(country.layout, p)] or places[:wanted])
+    clear = np.array([_open(country.layout, place) for place in anywhere])
+    views = _views(lens, shots, anywhere)
+    places = anywhere[:wanted]
+    for least in (1, 2, 3, 4):  # as many views as enough places have
+        good = clear & (views >= least)
+        if good.sum() >= 3 * wanted:
+            places = anywhere[good]
     radius = float(np.clip(7 * gsd, 0.25, 1.0))
     chosen = _spread(places, wanted)
     return tuple(
@@ -71,6 +81,17 @@ def lay_out(
         )
         for i, (x, y) in enumerate(chosen)
     )
+
+
+def _views(lens: Lens, shots: Sequence[Shot], places: Doubles) -> NDArray[np.int64]:
+    """How many photos see each place (n, 2), were the ground level."""
+    points = np.column_stack([places, np.zeros(len(places))])
+    size = np.array([lens.width, lens.height])
+    count = np.zeros(len(places), dtype=np.int64)
+    for shot in shots:
+        pixels = lens.project(points, shot.rotation, shot.place)
+        count += ((pixels > 0.04 * size) & (pixels < 0.96 * size)).all(axis=1)
+    return count
 
 
 def _open(layout: Layout, place: Doubles) -> bool:

@@ -85,7 +85,7 @@ def prepare(settings: FlightSettings, waypoints: list[Waypoint] | None = None) -
         settings=settings.scene, bounds=_bounds(settings, [visible, thermal]), seed=settings.seed
     )
     reach = 0.3 * min(settings.lens.width, settings.lens.height) * settings.route.height / settings.lens.focal
-    targets = lay_out(settings.control, country, shots, reach, settings.resolution)
+    targets = lay_out(settings.control, country, settings.lens, shots, reach, settings.resolution)
     return World(
         settings=settings,
         place=place,

@@ -23,7 +23,7 @@ from skyquilt.simulate.things import paint_things
 from skyquilt.simulate.weather import Weather
 
 _BLOCK = 1536
-_IN_MEMORY = 80_000_000  # cells; larger countries are kept in files
+_IN_MEMORY = 60_000_000  # cells; larger countries are kept in files
 
 
 @dataclass(frozen=True, kw_only=True)
