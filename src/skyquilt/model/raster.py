@@ -1,0 +1,67 @@
+"""The pixel grid of a map, and pixels with their place."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Grid:
+    """A north-up pixel grid in the map frame; row 0 is the northernmost."""
+
+    west: float
+    """Easting of the left edge in m (map frame)."""
+    north: float
+    """Northing of the top edge in m (map frame)."""
+    gsd: float
+    """Ground size of a pixel in m."""
+    width: int
+    """Columns."""
+    height: int
+    """Rows."""
+
+    def x(self, columns: NDArray) -> NDArray[np.float64]:
+        """Eastings in m of pixel centres."""
+        return self.west + (np.asarray(columns, np.float64) + 0.5) * self.gsd
+
+    def y(self, rows: NDArray) -> NDArray[np.float64]:
+        """Northings in m of pixel centres."""
+        return self.north - (np.asarray(rows, np.float64) + 0.5) * self.gsd
+
+    def pixel(self, x: NDArray, y: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Columns and rows (centres at integers) of map coordinates."""
+        return (np.asarray(x) - self.west) / self.gsd - 0.5, (self.north - np.asarray(y)) / self.gsd - 0.5
+
+    def coarser(self, factor: int) -> "Grid":
+        """The same area in pixels `factor` times as large; the last row and column may reach beyond it."""
+        return Grid(
+            west=self.west, north=self.north, gsd=self.gsd * factor,
+            width=-(-self.width // factor), height=-(-self.height // factor),
+        )  # fmt: skip
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """West, south, east, north in m (map frame)."""
+        return self.west, self.north - self.height * self.gsd, self.west + self.width * self.gsd, self.north
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """A rectangle of a grid."""
+
+    row: int
+    """First row."""
+    column: int
+    """First column."""
+    height: int
+    """Rows."""
+    width: int
+    """Columns."""
+
+    def grown(self, margin: int) -> "Window":
+        """With `margin` px more on each side; may reach beyond the grid."""
+        return Window(
+            row=self.row - margin, column=self.column - margin,
+            height=self.height + 2 * margin, width=self.width + 2 * margin,
+        )  # fmt: skip

@@ -1,0 +1,157 @@
+"""What each photo sees of the map: footprints and coarse grids of where a map pixel lies in a photo."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.geometry.camera import distort, monotone_radius, rays
+from skyquilt.model.camera import Camera
+from skyquilt.model.poses import Alignment, Pose
+from skyquilt.model.raster import Grid, Window
+from skyquilt.model.surface import Surface
+
+STEP = 16
+"""Map pixels between the nodes at which photos are projected; in between, positions are interpolated."""
+BORDER_PX = 2.0
+"""Photo pixels at the border that are not used."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class View:
+    """One placed photo."""
+
+    photo: int
+    """Index of the photo."""
+    camera: Camera
+    """Its calibration."""
+    pose: Pose
+    """Where it was."""
+    footprint: NDArray[np.float64]
+    """(k, 2) outline on the ground in m (map frame)."""
+
+    def overlaps(self, bounds: tuple[float, float, float, float]) -> bool:
+        """Whether the footprint's box meets bounds (west, south, east, north)."""
+        low, high = self.footprint.min(0), self.footprint.max(0)
+        return bool(low[0] < bounds[2] and high[0] > bounds[0] and low[1] < bounds[3] and high[1] > bounds[1])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Nodes:
+    """Where the nodes of a window lie in one photo."""
+
+    view: View
+    """The photo."""
+    u: NDArray[np.float32]
+    """(r, c) photo columns in px."""
+    v: NDArray[np.float32]
+    """(r, c) photo rows in px."""
+    score: NDArray[np.float32]
+    """(r, c) squared tangent of the angle off the vertical: small is better, infinite where not seen."""
+    height: float
+    """Median height of the camera above the window's ground in m."""
+
+
+def footprint(camera: Camera, pose: Pose, surface: Surface, *, per_side: int = 8) -> NDArray[np.float64]:
+    """Outline (4 * per_side, 2) in m of the image's rim on the surface; empty if the rim sees the horizon."""
+    s = np.linspace(0, 1, per_side, endpoint=False)
+    w, h = camera.width - 1.0, camera.height - 1.0
+    rim = np.concatenate(
+        [np.c_[s * w, 0 * s], np.c_[0 * s + w, s * h], np.c_[w - s * w, 0 * s + h], np.c_[0 * s, h - s * h]]
+    )
+    direction = rays(camera, rim) @ pose.cam_R_map
+    if (direction[:, 2] > -0.1).any():
+        return np.zeros((0, 2))
+    xy = np.repeat(pose.map_C[None, :2], len(rim), 0)
+    for _ in range(6):
+        drop = (surface.at(xy[:, 0], xy[:, 1]) - pose.map_C[2]) / direction[:, 2]
+        xy = pose.map_C[:2] + direction[:, :2] * drop[:, None]
+    return np.asarray(xy)
+
+
+def make_views(alignment: Alignment, surface: Surface) -> list[View]:
+    """Views of all placed photos, in order of the photos."""
+    views = []
+    for photo, pose in sorted(alignment.poses.items()):
+        outline = footprint(alignment.camera(photo), pose, surface)
+        if len(outline):
+            views.append(View(photo=photo, camera=alignment.camera(photo), pose=pose, footprint=outline))
+    return views
+
+
+def project_nodes(view: View, x: NDArray, y: NDArray, z: NDArray) -> Nodes:
+    """Nodes at map coordinates (r, c): photo pixels and scores."""
+    d = np.stack([x, y, z], -1) - view.pose.map_C
+    local = d @ view.pose.cam_R_map.T
+    depth = np.maximum(local[..., 2], 1e-3)
+    plane = local[..., :2] / depth[..., None]
+    limit = monotone_radius(view.camera)
+    radius2 = (plane**2).sum(-1)
+    k = view.camera.vector
+    px = distort(plane, k) * k[0] + k[1:3]
+    u, v = px[..., 0], px[..., 1]
+    inside = (local[..., 2] > 0.1) & (radius2 < limit**2)
+    inside &= (u > BORDER_PX) & (v > BORDER_PX)
+    inside &= (u < view.camera.width - 1 - BORDER_PX) & (v < view.camera.height - 1 - BORDER_PX)
+    drop2 = np.maximum(d[..., 2] ** 2, 1e-6)
+    score = np.where(inside, (d[..., 0] ** 2 + d[..., 1] ** 2) / drop2, np.inf).astype(np.float32)
+    return Nodes(
+        view=view, u=u.astype(np.float32), v=v.astype(np.float32), score=score, height=float(np.median(-d[..., 2]))
+    )
+
+
+def window_nodes(views: Sequence[View], grid: Grid, surface: Surface, window: Window) -> list[Nodes]:
+    """Nodes of every view that sees something of a window, at every STEP-th pixel centre, both ends included."""
+    columns = window.column + STEP * np.arange(-(-(window.width - 1) // STEP) + 1)
+    rows = window.row + STEP * np.arange(-(-(window.height - 1) // STEP) + 1)
+    x, y = np.meshgrid(grid.x(columns), grid.y(rows))
+    z = surface.at(x, y)
+    bounds = (float(x[0, 0]), float(y[-1, 0]), float(x[0, -1]), float(y[0, 0]))
+    nodes = [project_nodes(view, x, y, z) for view in views if view.overlaps(bounds)]
+    return [n for n in nodes if np.isfinite(n.score).any()]
+
+
+def cut(nodes: Nodes, row: int, column: int, height: int, width: int) -> Nodes:
+    """The nodes of a sub-window that starts at a multiple of STEP px from the window's corner."""
+    rows = slice(row // STEP, row // STEP + -(-(height - 1) // STEP) + 1)
+    columns = slice(column // STEP, column // STEP + -(-(width - 1) // STEP) + 1)
+    return Nodes(
+        view=nodes.view, u=nodes.u[rows, columns], v=nodes.v[rows, columns],
+        score=nodes.score[rows, columns], height=nodes.height,
+    )  # fmt: skip
+
+
+def densify(values: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
+    """Node values (r, c) interpolated linearly at every pixel (height, width)."""
+    M = np.array([[1 / STEP, 0, 0], [0, 1 / STEP, 0]])
+    return np.asarray(
+        cv2.warpAffine(
+            values, M, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE
+        )
+    )
+
+
+def native_gsd(views: Sequence[View], surface: Surface) -> float:
+    """Median ground size in m of a photo pixel at the photos' centres."""
+    C = np.array([v.pose.map_C for v in views])
+    drop = C[:, 2] - surface.at(C[:, 0], C[:, 1])
+    return float(np.median(drop / np.array([v.camera.focal for v in views])))
+
+
+def grid_of(views: Sequence[View], gsd: float, bounds: tuple[float, float, float, float] | None = None) -> Grid:
+    """The grid that covers all footprints, or the bounds (west, south, east, north) given, on multiples of gsd."""
+    if bounds is None:
+        low = np.min([v.footprint.min(0) for v in views], axis=0)
+        high = np.max([v.footprint.max(0) for v in views], axis=0)
+        bounds = (low[0], low[1], high[0], high[1])
+    west, north = np.floor(bounds[0] / gsd) * gsd, np.ceil(bounds[3] / gsd) * gsd
+    width = max(1, int(np.ceil((bounds[2] - west) / gsd)))
+    height = max(1, int(np.ceil((north - bounds[1]) / gsd)))
+    return Grid(west=float(west), north=float(north), gsd=gsd, width=width, height=height)
+
+
+def gains_at(gains: Mapping[int, NDArray[np.float32]], photo: int, bands: int) -> NDArray[np.float32]:
+    """The gain per band of a photo; ones where none was estimated."""
+    return gains.get(photo, np.ones(bands, np.float32))
