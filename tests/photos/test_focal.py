@@ -109,3 +109,15 @@ def test_two_eyes_of_one_model_are_told_apart_by_size():
     assert find_sensor(model=model, long_side=640).band == "thermal"
     assert find_sensor(model=model, long_side=8000).band == "visible"
     assert find_sensor(model=model, long_side=1234) is None
+
+
+def test_digital_zoom_lengthens_the_lens(make_jpeg):
+    photo = read_photo(make_jpeg(exif=exif_of("FC300S", FocalLength=(361, 100), DigitalZoomRatio=(2, 1))))
+    assert photo.focal.px == pytest.approx(2 * 3.61 / 6.25 * 96)
+    assert any("digital zoom of 2" in n for n in photo.notes)
+
+
+def test_contradicting_focal_lengths_are_named_with_both_values(make_jpeg):
+    exif = exif_of("FC300S", FocalLength=(361, 100), FocalLengthIn35mmFilm=35)
+    notes = read_photo(make_jpeg(exif=exif, image=pixels(120, 90))).notes
+    assert any("means 69 px, its 35 mm equivalent 121 px" in n for n in notes)

@@ -1,9 +1,13 @@
 """Garbage never raises out of the stage."""
 
+import io
+
 import numpy as np
 import piexif
+import tifffile
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from skyquilt.errors import SkyquiltError, UnreadablePhotoError
 from skyquilt.model.photo import Photo, RejectedPhoto
@@ -25,6 +29,16 @@ XMP = dji_xmp(
 )
 GOOD = jpeg_bytes(pixels(), dji_exif(), XMP)
 FLIR = flir_jpeg(np.round(planck_counts(scene())).astype(np.uint16))
+
+
+def encoded(write):
+    buffer = io.BytesIO()
+    write(buffer)
+    return buffer.getvalue()
+
+
+TIFF = encoded(lambda b: tifffile.imwrite(b, pixels(), photometric="rgb", compression="deflate"))
+PNG = encoded(lambda b: Image.fromarray(pixels()).save(b, "PNG"))
 quick = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 flips = st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=30)
 
@@ -45,8 +59,8 @@ def foreseen(path):
 
 
 @quick
-@given(st.sampled_from([GOOD, FLIR]), flips, st.sampled_from([1.0, 1.0, 0.9, 0.2, 0.02]))
-def test_spoilt_jpegs_are_photos_or_rejected(tmp_path, data, flips, cut):
+@given(st.sampled_from([GOOD, FLIR, TIFF, PNG]), flips, st.sampled_from([1.0, 1.0, 0.9, 0.2, 0.02]))
+def test_spoilt_images_are_photos_or_rejected(tmp_path, data, flips, cut):
     path = tmp_path / "x.jpg"
     path.write_bytes(spoil(data, flips, cut))
     photo = foreseen(path)

@@ -12,6 +12,9 @@ _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _PLAUSIBLE = (0.2, 60.0)
 """A focal length outside these multiples of the long side is a slip of the pen, not a lens."""
+_MOST_ZOOM = 16.0
+_APART = 1.2
+"""Focal lengths that differ by more than this factor contradict each other; 35 mm values are rounded."""
 
 
 def native_scale(exif: Exif, width: int, height: int) -> tuple[float, str]:
@@ -56,6 +59,28 @@ def find_focal(
     return Focal(px=px, sigma_px=share * px, source="guess")
 
 
+def digital_zoom(exif: Exif) -> float:
+    """By how much the camera enlarged the middle of its image; 1.0 where EXIF says nothing."""
+    zoom = exif.number(tag.ZOOM) or 1.0
+    return zoom if 1.0 < zoom <= _MOST_ZOOM else 1.0
+
+
+def focal_notes(exif: Exif, sensor: Sensor | None, width: int, height: int) -> tuple[str, ...]:
+    """Where EXIF's ways to the focal length disagree, and a digital zoom."""
+    zoom = digital_zoom(exif)
+    zoomed = (
+        f"It was taken with a digital zoom of {zoom:g}; the focal length counts it in." if zoom > 1 else ""
+    )
+    direct = _on_sensor(exif, sensor, width, height) or _on_plane(exif, width, height)
+    rounded = _from_35mm(exif, width, height)
+    if direct and rounded and not 1 / _APART < direct.px / rounded.px < _APART:
+        return zoomed, (
+            f"Its focal length in mm means {direct.px:.0f} px, its 35 mm equivalent {rounded.px:.0f} px; "
+            "one of them is wrong."
+        )
+    return (zoomed,)
+
+
 def _calibrated(camera: Camera | None) -> Focal | None:
     if camera is None:
         return None
@@ -70,7 +95,7 @@ def _on_sensor(exif: Exif, sensor: Sensor | None, width: int, height: int) -> Fo
     mm = written or sensor.focal_mm
     if not mm or mm < 0:
         return None
-    px = mm / sensor.width_mm * max(width, height)
+    px = mm / sensor.width_mm * max(width, height) * digital_zoom(exif)
     return Focal(px=px, sigma_px=(0.02 if written else 0.05) * px, source="sensor")
 
 
@@ -79,7 +104,7 @@ def _on_plane(exif: Exif, width: int, height: int) -> Focal | None:
     unit = _MM_PER_UNIT.get(int(exif.number(tag.PLANE_UNIT) or 2))
     if not mm or not resolution or unit is None or mm < 0 or resolution < 0:
         return None
-    px = mm * resolution / unit * native_scale(exif, width, height)[0]
+    px = mm * resolution / unit * native_scale(exif, width, height)[0] * digital_zoom(exif)
     return Focal(px=px, sigma_px=0.03 * px, source="focal-plane")
 
 

@@ -14,7 +14,7 @@ from skyquilt.photos.attitude import read_attitude, read_flight_yaw
 from skyquilt.photos.calibration import read_calibration
 from skyquilt.photos.clock import modified_time, read_time
 from skyquilt.photos.editor import find_editor
-from skyquilt.photos.focal import find_focal, native_scale
+from skyquilt.photos.focal import find_focal, focal_notes, native_scale
 from skyquilt.photos.header import Header, content_digest, read_header
 from skyquilt.photos.pixels import read_tiff
 from skyquilt.photos.position import read_position
@@ -46,7 +46,7 @@ class _Lens:
     thermal: bool
     calibration: Camera | None
     focal: Focal
-    note: str
+    notes: tuple[str, ...]
 
 
 def _photo(path: Path, name: str, header: Header) -> Photo:
@@ -57,7 +57,7 @@ def _photo(path: Path, name: str, header: Header) -> Photo:
     lens = _lens(header, width, height, thermal=frame is not None)
     position, place_notes = read_position(header.exif, header.xmp)
     attitude, angle_notes = read_attitude(header.xmp)
-    seen = (lens.note, frame.note if frame else "", *place_notes, *angle_notes)
+    seen = (*lens.notes, frame.note if frame else "", *place_notes, *angle_notes)
     return Photo(
         name=name,
         path=path,
@@ -93,7 +93,8 @@ def _lens(header: Header, width: int, height: int, *, thermal: bool) -> _Lens:
     focal = find_focal(
         exif=exif, sensor=sensor, calibration=calibration, width=width, height=height, thermal=thermal
     )
-    return _Lens(sensor=sensor, thermal=thermal, calibration=calibration, focal=focal, note=note)
+    notes = (note, *focal_notes(exif, sensor, width, height))
+    return _Lens(sensor=sensor, thermal=thermal, calibration=calibration, focal=focal, notes=notes)
 
 
 def _thermal_frame(path: Path, header: Header) -> ThermalFrame | None:
