@@ -1,0 +1,101 @@
+"""Where metadata and pixels disagree."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
+from skyquilt.model.event import MetadataConflict
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Alignment, Prior
+
+YAW_DEG = 15.0
+"""Yaws further apart than this contradict each other."""
+
+
+def conflicts(photos: Sequence[Photo], priors: Sequence[Prior], alignment: Alignment) -> list[MetadataConflict]:
+    """All contradictions of photos that tie points hold, in order of capture."""
+    held = [i for block in alignment.blocks if len(block) > 1 for i in block if i in alignment.poses]
+    found = [c for i in sorted(held) for c in _yaw(photos[i], priors[i], alignment, i)]
+    if alignment.frame.crs is not None:
+        found += _altitudes(photos, priors, alignment, sorted(held)) + _positions(photos, priors, alignment, sorted(held))
+    return found + _focals(photos, alignment, sorted(held))
+
+
+def _yaw(photo: Photo, prior: Prior, alignment: Alignment, i: int) -> list[MetadataConflict]:
+    if not np.isfinite(prior.yaw_deg):
+        return []
+    grid_yaw, _, _ = angles_from_cam_R_map(alignment.poses[i].cam_R_map)
+    off = angle_difference_deg(prior.yaw_deg, grid_yaw)
+    if abs(off) < max(YAW_DEG, 3 * prior.sigma_yaw_deg):
+        return []
+    convergence = alignment.frame.convergence_deg
+    why = "the file was turned upside down by another program" if abs(abs(off) - 180) < 20 and photo.editor else (
+        f"the heading reported ({prior.yaw_source}) is off by {off:+.0f} degrees"
+    )  # fmt: skip
+    return [
+        MetadataConflict(
+            photo=photo.name, field="yaw", reported=round(angle_difference_deg(prior.yaw_deg + convergence, 0), 1),
+            estimated=round(angle_difference_deg(grid_yaw + convergence, 0), 1), meaning=why,
+        )  # fmt: skip
+    ]
+
+
+def _altitudes(
+    photos: Sequence[Photo], priors: Sequence[Prior], alignment: Alignment, held: Sequence[int]
+) -> list[MetadataConflict]:
+    """Altitudes that differ from the solution by more than three deviations and 5 % of the flying height.
+
+    The common offset of a survey is its datum's, not a contradiction.
+    """
+    z = np.array([alignment.poses[i].map_C[2] for i in held])
+    off = np.array([priors[i].map_C[2] for i in held]) - z
+    if not np.isfinite(off).any():
+        return []
+    off = off - np.nanmedian(off)
+    ground = float(np.median(alignment.ties.xyz[:, 2])) if len(alignment.ties.xyz) else 0.0
+    out = []
+    for i, e, height in zip(held, off, z - ground, strict=True):
+        if np.isfinite(e) and abs(e) > max(2 * priors[i].sigma_C[2], 0.05 * height):
+            reported = float(priors[i].map_C[2])
+            out.append(
+                MetadataConflict(
+                    photo=photos[i].name, field="altitude", reported=round(reported, 1),
+                    estimated=round(reported - float(e), 1),
+                    meaning=f"image scale and neighbours put it {abs(e):.0f} m {'lower' if e > 0 else 'higher'}",
+                )  # fmt: skip
+            )
+    return out
+
+
+def _positions(
+    photos: Sequence[Photo], priors: Sequence[Prior], alignment: Alignment, held: Sequence[int]
+) -> list[MetadataConflict]:
+    out = []
+    for i in held:
+        off = float(np.hypot(*(alignment.poses[i].map_C - priors[i].map_C)[:2]))
+        if np.isfinite(off) and off > 5 * priors[i].sigma_C[0]:
+            out.append(
+                MetadataConflict(
+                    photo=photos[i].name, field="position", reported=round(off, 1), estimated=0.0,
+                    meaning=f"the reported position lies {off:.1f} m from where the photo fits",
+                )  # fmt: skip
+            )
+    return out
+
+
+def _focals(photos: Sequence[Photo], alignment: Alignment, held: Sequence[int]) -> list[MetadataConflict]:
+    out, seen = [], set()
+    for i in held:
+        photo, camera = photos[i], alignment.camera(i)
+        off = abs(camera.focal - photo.focal.px)
+        if photo.camera_key not in seen and off > max(3 * photo.focal.sigma_px, 0.05 * photo.focal.px):
+            seen.add(photo.camera_key)
+            out.append(
+                MetadataConflict(
+                    photo=photo.name, field="focal", reported=round(photo.focal.px, 1),
+                    estimated=round(camera.focal, 1),
+                    meaning=f"self-calibration of {photo.camera_key} finds another focal length (in px)",
+                )  # fmt: skip
+            )
+    return out

@@ -1,0 +1,113 @@
+"""`position` and `pose`: every photo where its metadata say (Y 4.1.2)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from skyquilt.errors import AlignmentError
+from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.model.camera import Camera
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior, no_ties
+
+
+def reported_camera(photo: Photo) -> Camera:
+    """The calibration that metadata or a side file give, else an ideal camera of the reported focal length."""
+    if photo.calibration is not None:
+        return photo.calibration
+    return Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ByMetadata:
+    """Photos placed by metadata alone; subclasses differ in what they believe."""
+
+    height_m: float | None = None
+    """Height above ground in m where altitudes do not tell it; None = heights above take-off."""
+    version: ClassVar[int] = 1
+    name: ClassVar[str] = "pose"
+
+    def __call__(self, photos: Sequence[Photo], frame: MapFrame, priors: Sequence[Prior]) -> Alignment:
+        """Places all photos that have a position; one without any survives alone in a frame of its own.
+
+        Raises:
+            AlignmentError: positions or the height above ground are missing.
+        """
+        rejected: dict[int, str] = {}
+        poses: dict[int, Pose] = {}
+        if len(photos) == 1 and frame.crs is None:
+            poses[0] = Pose(
+                cam_R_map=cam_R_map_from_angles(0.0), map_C=np.array([0.0, 0.0, self.height_m or 50.0])
+            )
+        else:
+            heights = self._heights(frame, priors)
+            poses, rejected = self._placed(photos, priors, heights)
+        if not poses:
+            raise AlignmentError(f"method {self.name} places photos by position, and none of {len(photos)} has one")
+        return Alignment(
+            method=self.name, why="", frame=replace(frame, metric=frame.crs is not None or self.height_m is not None),
+            poses=poses, cameras={p.camera_key: reported_camera(p) for p in photos},
+            camera_of={i: p.camera_key for i, p in enumerate(photos)}, blocks=tuple((i,) for i in sorted(poses)),
+            ties=no_ties(), rejected=rejected,
+        )  # fmt: skip
+
+    def _heights(self, frame: MapFrame, priors: Sequence[Prior]) -> np.ndarray:
+        """Camera heights (n,) in m above the ground, which is level at z = 0."""
+        z = np.array([p.map_C[2] for p in priors])
+        if self.height_m is not None:
+            return np.where(np.isfinite(z), self.height_m + z - np.nanmedian(z), self.height_m) if np.isfinite(z).any() else np.full(len(z), self.height_m)
+        if frame.vertical_datum != "takeoff":
+            raise AlignmentError(
+                f"method {self.name} needs heights above ground, and the photos give heights above"
+                f" {frame.vertical_datum.replace('_', ' ')}; add --height METRES"
+            )
+        return np.where(np.isfinite(z), z, np.nanmedian(z))
+
+    def _placed(
+        self, photos: Sequence[Photo], priors: Sequence[Prior], heights: np.ndarray
+    ) -> tuple[dict[int, Pose], dict[int, str]]:
+        poses, rejected = {}, {}
+        for i, prior in enumerate(priors):
+            if not np.isfinite(prior.map_C[:2]).all():
+                rejected[i] = "it has no position"
+            elif not np.isfinite(prior.yaw_deg):
+                rejected[i] = "it has a position but no heading"
+            elif heights[i] <= 0:
+                rejected[i] = f"its height above ground would be {heights[i]:.1f} m"
+            else:
+                poses[i] = self._pose(prior, heights, i)
+        return poses, rejected
+
+    def _pose(self, prior: Prior, heights: np.ndarray, i: int) -> Pose:
+        R = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
+        return Pose(cam_R_map=R, map_C=np.array([prior.map_C[0], prior.map_C[1], heights[i]]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ByPose(ByMetadata):
+    """`pose`: position plus roll, pitch, yaw: an 8-dof projective transform (Y 4.3, 4.4)."""
+
+    name: ClassVar[str] = "pose"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ByPosition(ByMetadata):
+    """`position`: translations only, one common scale and one survey heading (Y 4.2)."""
+
+    heading_deg: float = 0.0
+    """Grid heading of every photo's image top in degrees clockwise from north."""
+    name: ClassVar[str] = "position"
+
+    def _placed(
+        self, photos: Sequence[Photo], priors: Sequence[Prior], heights: np.ndarray
+    ) -> tuple[dict[int, Pose], dict[int, str]]:
+        common = float(np.median(heights))
+        R = cam_R_map_from_angles(self.heading_deg)
+        poses = {
+            i: Pose(cam_R_map=R, map_C=np.array([p.map_C[0], p.map_C[1], common]))
+            for i, p in enumerate(priors)
+            if np.isfinite(p.map_C[:2]).all()
+        }
+        return poses, {i: "it has no position" for i in range(len(photos)) if i not in poses}

@@ -1,0 +1,133 @@
+"""Names and numbers -> methods: the one place where words on a command line become parts of a story."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from skyquilt.alignment.bundle import Bundle
+from skyquilt.alignment.pose import ByPose, ByPosition
+from skyquilt.errors import UsageError
+from skyquilt.features.sift import Sift
+from skyquilt.matching.mutual import Mutual
+from skyquilt.pairs.nearest import Nearest
+from skyquilt.pairs.retrieval import Retrieval
+from skyquilt.render.blend import Average, Blend, Feather, First, Multiband
+from skyquilt.render.exposure import Balance
+from skyquilt.surface.tiepoints import FromTiePoints
+from skyquilt.twoview.verify import Verify
+
+METHODS = ("auto", "bundle", "pose", "position")
+BLENDS = {"feather": Feather, "first": First, "average": Average, "multiband": Multiband}
+COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
+DISTORTIONS = ("none", "2", "4", "6", "6t")
+
+
+@dataclass(frozen=True, kw_only=True)
+class MosaicSettings:
+    """Everything a mosaic can be asked for; the defaults are meant to be right."""
+
+    method: str = "auto"
+    """One of `METHODS`."""
+    gsd_cm: float | None = None
+    """Ground size of a map pixel in cm; None = the photos' own."""
+    crs: str | None = None
+    """Output CRS as PROJ knows it; None = the local UTM zone."""
+    gcp: Path | None = None
+    """Control points (gcp_list.txt); None = the one in the folder of photos, if any."""
+    geo: Path | None = None
+    """Positions (geo.txt, CSV, MRK, SRT); None = the geo.txt in the folder of photos, if any."""
+    cameras: Path | None = None
+    """Calibrations (cameras.json)."""
+    bounds: tuple[float, float, float, float] | None = None
+    """West, south, east, north in the output CRS."""
+    boundary: Path | None = None
+    """Polygon that the map is cut to."""
+    blend: str = "feather"
+    """One of `BLENDS`."""
+    feather_px: float = 6.0
+    """Width of feathered seams in map pixels."""
+    balance: bool = True
+    """Bring photos to one brightness (8-bit pictures only; measured values are never changed)."""
+    compress: str = "auto"
+    """One of `COMPRESSIONS`; auto = JPEG for 8-bit pictures, zstd for measured values."""
+    quality: int = 85
+    """JPEG quality."""
+    distortion: str = "4"
+    """One of `DISTORTIONS`: what self-calibration may change of the lens model."""
+    height_m: float | None = None
+    """Height above ground for methods without tie points, where altitudes do not tell it."""
+    heading_deg: float = 0.0
+    """Common heading for method `position`."""
+    repair: bool = True
+    """Treat metadata as measurements that may lie."""
+    features: int = 2000
+    """Features per photo."""
+    jobs: int = 0
+    """Threads; 0 = all processors."""
+    memory_gb: float | None = None
+    """Memory to stay within; None = 1.2."""
+
+    def __post_init__(self) -> None:
+        _one_of("--method", self.method, METHODS)
+        _one_of("--blend", self.blend, BLENDS)
+        _one_of("--compress", self.compress, COMPRESSIONS)
+        _one_of("--distortion", self.distortion, DISTORTIONS)
+        for name, value, low, high in (
+            ("--gsd", self.gsd_cm, 0.05, 10000), ("--quality", self.quality, 1, 100),
+            ("--height", self.height_m, 0.5, 1e5), ("--memory", self.memory_gb, 0.5, 4096),
+            ("--jobs", self.jobs, 0, 1024), ("--features", self.features, 100, 50000),
+        ):  # fmt: skip
+            if value is not None and not low <= value <= high:
+                raise UsageError(f"{name} {value} lies outside {low} to {high}")
+        if self.bounds and not (self.bounds[0] < self.bounds[2] and self.bounds[1] < self.bounds[3]):
+            raise UsageError(f"--bounds is west,south,east,north with west < east and south < north, got {self.bounds}")
+
+    def as_table(self) -> dict[str, Any]:
+        """Names and values as written to run.toml; unset ones left out."""
+        table = {f.name: getattr(self, f.name) for f in fields(self)}
+        return {k: str(v) if isinstance(v, Path) else v for k, v in table.items() if v is not None}
+
+
+def _one_of(option: str, value: str, allowed: Any) -> None:
+    if value not in allowed:
+        raise UsageError(f"{option} {value!r} is not one of {', '.join(allowed)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Methods:
+    """The parts of the mosaic story."""
+
+    sift: Sift
+    """Features."""
+    nearest: Nearest
+    """Pairs by position."""
+    retrieval: Retrieval
+    """Pairs by picture."""
+    mutual: Mutual
+    """Matching."""
+    verify: Verify
+    """Two-view verification."""
+    bundle: Bundle
+    """Alignment from links."""
+    by_pose: ByPose
+    """Alignment from metadata."""
+    by_position: ByPosition
+    """Alignment from positions."""
+    surface: FromTiePoints
+    """Heights."""
+    balance: Balance
+    """Exposure."""
+    blend: Blend
+    """Merge rule."""
+
+
+def methods(settings: MosaicSettings) -> Methods:
+    """The methods that settings name."""
+    blend: Blend = Feather(width_px=settings.feather_px) if settings.blend == "feather" else BLENDS[settings.blend]()
+    return Methods(
+        sift=Sift(count=settings.features), nearest=Nearest(), retrieval=Retrieval(), mutual=Mutual(), verify=Verify(),
+        bundle=Bundle(distortion=settings.distortion, repair=settings.repair),
+        by_pose=ByPose(height_m=settings.height_m),
+        by_position=ByPosition(height_m=settings.height_m, heading_deg=settings.heading_deg),
+        surface=FromTiePoints(), balance=Balance(), blend=blend,
+    )  # fmt: skip

@@ -1,0 +1,81 @@
+"""What a story says while it runs: progress bars, journals, viewers and tests read the same events."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageStarted:
+    """A stage begins."""
+
+    stage: str
+    """Its name."""
+    total: int
+    """Steps it will take; 0 where unknown."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageProgress:
+    """A stage has come further."""
+
+    stage: str
+    """Its name."""
+    done: int
+    """Steps done."""
+    total: int
+    """Steps in all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageFinished:
+    """A stage has ended."""
+
+    stage: str
+    """Its name."""
+    seconds: float
+    """Wall-clock time in s."""
+    cpu_seconds: float
+    """CPU time of the process in s."""
+    reused: bool
+    """True when everything came from the store."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Note:
+    """Something worth saying."""
+
+    text: str
+    """A plain sentence."""
+    warning: bool = False
+    """True when a user should look."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Result:
+    """The end of a run."""
+
+    output: Path
+    """The run's folder."""
+    metrics: Mapping[str, Any]
+    """The content of metrics.json."""
+
+
+Event = StageStarted | StageProgress | StageFinished | Note | Result
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetadataConflict:
+    """A photo whose metadata the pixels contradict."""
+
+    photo: str
+    """Photo.name."""
+    field: str
+    """`yaw`, `altitude`, `position` or `focal`."""
+    reported: float
+    """What the metadata say: degrees, m above the datum, m off, px."""
+    estimated: float
+    """What the photos together say, same unit."""
+    meaning: str
+    """A plain sentence."""

@@ -1,0 +1,302 @@
+"""The map drawn: surface, exposure, and the rasters, block by block in bounded memory."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.config import Methods, MosaicSettings
+from skyquilt.errors import UsageError
+from skyquilt.model.poses import Alignment
+from skyquilt.model.raster import Grid, Window
+from skyquilt.model.surface import Surface
+from skyquilt.pipelines.intake import Intake
+from skyquilt.raster import Block, CogWriter, RasterSpec, write_array
+from skyquilt.raster.boundary import inside as inside_polygon
+from skyquilt.raster.boundary import read_boundary
+from skyquilt.render.compose import Composed, Composer, PhotoPixels
+from skyquilt.render.exposure import NEUTRAL, Exposure
+from skyquilt.render.views import STEP, View, grid_of, make_views, native_gsd
+from skyquilt.run.clock import Steps
+from skyquilt.run.executor import in_order
+from skyquilt.run.store import Store, digest
+from skyquilt.surface.plane import level
+
+PROVENANCE = 4
+"""Map pixels per provenance pixel."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ground:
+    """What the map is drawn on."""
+
+    surface: Surface
+    """Heights."""
+    views: tuple[View, ...]
+    """What each photo sees."""
+    grid: Grid
+    """The map's pixels."""
+    native_gsd: float
+    """Median ground size of a photo pixel in m."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BlockExtras:
+    """What a block of the map leaves beside its pixels."""
+
+    provenance: NDArray[np.uint32]
+    """Shot numbers from 1, 0 = none, every PROVENANCE-th pixel."""
+    views: NDArray[np.uint16]
+    """Photos that see each STEP-pixel cell."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drawn:
+    """The finished rasters' small companions."""
+
+    provenance: NDArray[np.uint32]
+    """As in provenance.tif."""
+    provenance_grid: Grid
+    """Its grid."""
+    views: NDArray[np.uint16]
+    """As in views.tif."""
+    views_grid: Grid
+    """Its grid."""
+
+
+def survey_ground(alignment: Alignment, methods: Methods, settings: MosaicSettings, store: Store) -> Steps[Ground]:
+    """Heights from the tie points (level ground where there are none), and the grid of the map.
+
+    Raises:
+        UsageError: the map would have no pixels, or absurdly many.
+    """
+    yield 0, 1
+    z = float(np.median(alignment.ties.xyz[:, 2])) if len(alignment.ties.xyz) else 0.0
+    rough = make_views(alignment, level(z))
+    if not rough:
+        raise UsageError("no photo looks down at the ground: all see the horizon")
+    native = native_gsd(rough, level(z))
+    gsd = settings.gsd_cm / 100 if settings.gsd_cm else round_gsd(native)
+    bounds = _local_bounds(settings, alignment)
+    wide = grid_of(rough, gsd, bounds)
+    margin = 0.05 * max(wide.width, wide.height) * gsd
+    w, s, e, n = wide.bounds
+    area = (w - margin, s - margin, e + margin, n + margin)
+    key = digest(alignment.ties.xyz, area, methods.surface)
+    surface = store.get_or(
+        "surface", key, lambda: methods.surface(alignment.ties.xyz, area) if len(alignment.ties.xyz) > 3 else level(z)
+    )
+    views = tuple(make_views(alignment, surface))
+    grid = grid_of(views, gsd, bounds)
+    if grid.width * grid.height > 4e11:
+        raise UsageError(
+            f"at {gsd * 100:g} cm the map would have {grid.width} x {grid.height} px; check --gsd and the positions"
+        )
+    yield 1, 1
+    return Ground(surface=surface, views=views, grid=grid, native_gsd=native)
+
+
+def round_gsd(gsd: float) -> float:
+    """A ground resolution in m rounded to two digits."""
+    digits = 1 - int(np.floor(np.log10(gsd)))
+    return float(round(gsd, digits))
+
+
+def _local_bounds(settings: MosaicSettings, alignment: Alignment) -> tuple[float, float, float, float] | None:
+    """Bounds asked for, or those of the boundary, in the map frame."""
+    frame = alignment.frame
+    bounds = settings.bounds
+    if settings.boundary is not None and bounds is None:
+        if frame.crs is None:
+            raise UsageError("--boundary needs a georeferenced survey, and these photos have no positions")
+        bounds = read_boundary(settings.boundary, frame.crs).bounds
+    if bounds is None:
+        return None
+    x, y = frame.origin
+    return bounds[0] - x, bounds[1] - y, bounds[2] - x, bounds[3] - y
+
+
+def balance(intake: Intake, ground: Ground, alignment: Alignment, methods: Methods, settings: MosaicSettings) -> Exposure:
+    """Exposure of the placed 8-bit photos; neutral for measured values."""
+    if not settings.balance or intake.photos[0].dtype != "uint8":
+        return NEUTRAL
+    thumbnails = {v.photo: _three(intake.looked[v.photo].thumbnail) for v in ground.views}
+    return methods.balance(ground.views, thumbnails, alignment.camera_of, ground.surface, ground.grid.bounds)
+
+
+def _three(thumbnail: NDArray) -> NDArray:
+    return thumbnail[..., None] if thumbnail.ndim == 2 else thumbnail
+
+
+def composer(
+    intake: Intake, ground: Ground, alignment: Alignment, exposure: Exposure, methods: Methods, pixels: PhotoPixels
+) -> Composer:
+    """The composer of the survey's map."""
+    first = intake.photos[ground.views[0].photo]
+    return Composer(
+        grid=ground.grid, views=ground.views, surface=ground.surface, blend=methods.blend, pixels=pixels,
+        bands=first.channels, dtype=np.dtype(first.dtype), exposure=exposure,
+    )  # fmt: skip
+
+
+def geotransform(grid: Grid, alignment: Alignment) -> tuple[float, float, float, float, float, float]:
+    """The six numbers of a north-up raster in the output CRS."""
+    x, y = alignment.frame.origin
+    return grid.gsd, 0.0, grid.west + x, 0.0, -grid.gsd, grid.north + y
+
+
+def mosaic_spec(compose: Composer, alignment: Alignment, settings: MosaicSettings, unit: str) -> RasterSpec:
+    """How mosaic.tif is written."""
+    picture = compose.dtype == np.uint8
+    compress = settings.compress
+    if compress == "auto":
+        compress = "jpeg" if picture and compose.bands in (1, 3) else "zstd"
+    if compress == "jpeg" and not (picture and compose.bands in (1, 3)):
+        raise UsageError(f"--compress jpeg is for 8-bit pictures; these photos are {compose.dtype}, {compose.bands} bands")
+    real = compose.dtype.kind == "f"
+    return RasterSpec(
+        width=compose.grid.width, height=compose.grid.height, bands=compose.bands, dtype=str(compose.dtype),
+        transform=geotransform(compose.grid, alignment), crs=alignment.frame.crs, compress=compress,
+        quality=settings.quality, mask=not real, nodata=float("nan") if real else None,
+        tags={"SOFTWARE": "Skyquilt", "METHOD": alignment.method} | ({"UNIT": unit} if unit else {}),
+    )  # fmt: skip
+
+
+def draw(
+    output: Path, compose: Composer, alignment: Alignment, settings: MosaicSettings, store: Store, key: str,
+    unit: str, jobs: int,
+) -> Steps[Drawn]:  # fmt: skip
+    """Writes mosaic.tif, provenance.tif and views.tif; a killed run goes on at the block where it stopped."""
+    keep = _keeper(compose, alignment, settings)
+    number = {v.photo: k + 1 for k, v in enumerate(sorted(compose.views, key=lambda v: v.photo))}
+    table = np.zeros(max(number) + 2, np.uint32)
+    table[list(number)] = list(number.values())  # index -1 (no photo) is the last entry: 0
+    whole = _Companions(compose.grid)
+    spec = mosaic_spec(compose, alignment, settings, unit)
+    spool = output / ".skyquilt" / "mosaic.spool"
+    with CogWriter(output / "mosaic.tif", spec, spool=spool, digest=key) as writer:
+        todo = list(writer.blocks())
+        total = -(-spec.height // 2048) * -(-spec.width // 2048)
+
+        def one(block: Block) -> tuple[Block, Composed]:
+            return block, compose(_window(block))
+
+        for done, (block, composed) in enumerate(in_order(one, todo, jobs=jobs)):
+            valid = composed.photo >= 0
+            if keep is not None:
+                valid &= keep(block)
+            extras = BlockExtras(provenance=_thinned(table[np.where(valid, composed.photo, -1)]), views=composed.views)
+            store.put("blocks", digest(key, block.row0, block.col0), extras)
+            writer.write_block(block, _blanked(composed.pixels, valid), valid)
+            yield total - len(todo) + done + 1, total
+    for row in range(0, spec.height, 2048):
+        for column in range(0, spec.width, 2048):
+            whole.add(row, column, store.get("blocks", digest(key, row, column)))
+    _write_companions(output, whole, alignment)
+    return Drawn(
+        provenance=whole.provenance, provenance_grid=whole.fine, views=whole.views, views_grid=whole.coarse
+    )
+
+
+def _thinned(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
+    half = PROVENANCE // 2
+    thin = numbers[half::PROVENANCE, half::PROVENANCE]
+    rows, columns = -(-numbers.shape[0] // PROVENANCE), -(-numbers.shape[1] // PROVENANCE)
+    return np.pad(thin, ((0, rows - thin.shape[0]), (0, columns - thin.shape[1])), mode="edge") if thin.size else numbers[:1, :1]
+
+
+def _blanked(pixels: NDArray, valid: NDArray[np.bool_]) -> NDArray:
+    if pixels.dtype.kind == "f":
+        pixels[~valid] = np.nan
+    return pixels
+
+
+def _window(block: Block) -> Window:
+    return Window(row=block.row0, column=block.col0, height=block.height, width=block.width)
+
+
+def _keeper(
+    compose: Composer, alignment: Alignment, settings: MosaicSettings
+) -> Callable[[Block], NDArray[np.bool_]] | None:
+    if settings.boundary is None or alignment.frame.crs is None:
+        return None
+    polygon = read_boundary(settings.boundary, alignment.frame.crs)
+    transform = geotransform(compose.grid, alignment)
+    return lambda b: inside_polygon(polygon, transform, row0=b.row0, col0=b.col0, height=b.height, width=b.width)
+
+
+class _Companions:
+    """Provenance and views, assembled from blocks."""
+
+    def __init__(self, grid: Grid) -> None:
+        self.fine, self.coarse = grid.coarser(PROVENANCE), grid.coarser(STEP)
+        self.provenance = np.zeros((self.fine.height, self.fine.width), np.uint32)
+        self.views = np.zeros((self.coarse.height, self.coarse.width), np.uint16)
+
+    def add(self, row: int, column: int, extras: BlockExtras) -> None:
+        for target, part, step in ((self.provenance, extras.provenance, PROVENANCE), (self.views, extras.views, STEP)):
+            r, c = row // step, column // step
+            target[r : r + part.shape[0], c : c + part.shape[1]] = part
+
+
+def _write_companions(output: Path, whole: _Companions, alignment: Alignment) -> None:
+    top = int(whole.provenance.max(initial=0))
+    for name, array, grid, kind in (
+        ("provenance.tif", whole.provenance, whole.fine, "uint8" if top < 256 else "uint16" if top < 65536 else "uint32"),
+        ("views.tif", whole.views, whole.coarse, "uint8" if whole.views.max(initial=0) < 256 else "uint16"),
+    ):
+        write_array(
+            output / name, array.astype(kind),
+            RasterSpec(
+                width=grid.width, height=grid.height, bands=1, dtype=kind, transform=geotransform(grid, alignment),
+                crs=alignment.frame.crs, compress="deflate", nodata=0.0, overviews="mode" if name.startswith("p") else "max",
+                tags={"SOFTWARE": "Skyquilt"},
+            ),
+        )  # fmt: skip
+
+
+def write_surface(output: Path, ground: Ground, alignment: Alignment) -> None:
+    """surface.tif: heights over the map's area, and what they count from in its tags."""
+    grid = ground.grid
+    factor = max(1, int(ground.surface.cell / grid.gsd)) if ground.surface.source == "tie points" else max(grid.width, grid.height)
+    coarse = grid.coarser(factor)
+    x, y = np.meshgrid(coarse.x(np.arange(coarse.width)), coarse.y(np.arange(coarse.height)))
+    spec = RasterSpec(
+        width=coarse.width, height=coarse.height, bands=1, dtype="float32", transform=geotransform(coarse, alignment),
+        crs=alignment.frame.crs, compress="zstd", nodata=float("nan"),
+        tags={"SOFTWARE": "Skyquilt", "VERTICAL_DATUM": alignment.frame.vertical_datum, "SOURCE": ground.surface.source},
+    )  # fmt: skip
+    write_array(output / "surface.tif", ground.surface.at(x, y).astype(np.float32), spec)
+
+
+def used_photos(views: Sequence[View]) -> list[int]:
+    """Photos that are in the map, in the order of shots.geojson."""
+    return sorted(v.photo for v in views)
+
+
+def unit_of(intake: Intake) -> str:
+    """Unit of the map's values; empty for pictures."""
+    return intake.photos[0].unit
+
+
+def single_kind(intake: Intake) -> Intake:
+    """The photos whose pixels are of the most frequent kind: a map has one type of pixel."""
+    kinds = [(p.channels, p.dtype, p.band) for p in intake.photos]
+    common = max(set(kinds), key=lambda k: (kinds.count(k), k))
+    keep = [i for i, k in enumerate(kinds) if k == common]
+    from skyquilt.model.photo import RejectedPhoto
+
+    odd = tuple(
+        RejectedPhoto(
+            name=p.name,
+            reason=f"its pixels ({p.channels} x {p.dtype}, {p.band}) differ from the survey's ({common[0]} x {common[1]}, {common[2]})",
+        )
+        for i, p in enumerate(intake.photos)
+        if i not in keep
+    )
+    return replace(
+        intake, photos=tuple(intake.photos[i] for i in keep), looked=tuple(intake.looked[i] for i in keep),
+        rejected=(*intake.rejected, *odd),
+    )  # fmt: skip

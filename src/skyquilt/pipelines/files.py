@@ -1,0 +1,156 @@
+"""The small files of a run, in the forms that users of OpenDroneMap and OpenSfM know."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import Transformer
+
+from skyquilt import __version__
+from skyquilt.geometry.camera_formats import camera_to_opensfm
+from skyquilt.geometry.frames import angles_from_cam_R_map, rotation_from_vector
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Alignment
+from skyquilt.raster import vector
+from skyquilt.raster.atomic import write_text
+from skyquilt.render.views import View
+
+MOST_POINTS = 20000
+"""Tie points written to reconstruction.json."""
+
+
+def rotation_vector(R: NDArray) -> list[float]:
+    """Axis times angle in rad."""
+    return [float(v) for v in cv2.Rodrigues(R)[0].ravel()]
+
+
+def in_crs(alignment: Alignment, xyz: NDArray) -> NDArray[np.float64]:
+    """Map coordinates (..., 3) in the output CRS."""
+    return np.asarray(xyz) + np.array([*alignment.frame.origin, 0.0])
+
+
+def write_cameras(path: Path, alignment: Alignment) -> None:
+    """cameras.json: calibrations by camera."""
+    used = {alignment.camera_of[i] for i in alignment.poses}
+    records = {key: camera_to_opensfm(alignment.cameras[key]) for key in sorted(used)}
+    write_text(path, json.dumps(records, indent=1))
+
+
+def shot_properties(photo: Photo, alignment: Alignment, i: int) -> dict[str, Any]:
+    """What shots.geojson says of a photo."""
+    pose, camera = alignment.poses[i], alignment.camera(i)
+    yaw, pitch, roll = angles_from_cam_R_map(pose.cam_R_map)
+    block = next((k for k, b in enumerate(alignment.blocks) if i in b), -1)
+    return {
+        "filename": photo.name, "camera": alignment.camera_of[i], "focal": camera.focal / max(photo.width, photo.height),
+        "width": photo.width, "height": photo.height, "capture_time": photo.time.timestamp() if photo.time else None,
+        "translation": [float(v) for v in in_crs(alignment, pose.map_C)],
+        "rotation": rotation_vector(pose.cam_R_map),
+        "yaw": round((yaw + alignment.frame.convergence_deg) % 360, 3), "pitch": round(pitch, 3), "roll": round(roll, 3),
+        "block": block, "tie_points": int((alignment.ties.photo == i).sum()),
+    }  # fmt: skip
+
+
+def write_shots(path: Path, photos: Sequence[Photo], alignment: Alignment, order: Sequence[int]) -> None:
+    """shots.geojson: a point per photo; the k-th feature is number k in provenance.tif."""
+    features = [
+        (in_crs(alignment, alignment.poses[i].map_C), shot_properties(photos[i], alignment, i)) for i in order
+    ]
+    vector.points(path, features, crs=alignment.frame.crs)
+
+
+def write_footprints(path: Path, photos: Sequence[Photo], alignment: Alignment, views: Sequence[View]) -> None:
+    """footprints.geojson: the ground that each photo shows."""
+    x, y = alignment.frame.origin
+    features = [([v.footprint + (x, y)], {"filename": photos[v.photo].name}) for v in views]
+    vector.polygons(path, features, crs=alignment.frame.crs)
+
+
+def write_reconstruction(path: Path, photos: Sequence[Photo], alignment: Alignment, colours: NDArray | None) -> None:
+    """reconstruction.json in OpenSfM's form: topocentric east-north-up about `reference_lla`."""
+    enu = Topocentric(alignment)
+    shots = {}
+    for i, pose in sorted(alignment.poses.items()):
+        R = pose.cam_R_map @ enu.map_R_enu
+        C = enu(pose.map_C[None])[0]
+        shots[photos[i].name] = {
+            "camera": alignment.camera_of[i], "rotation": rotation_vector(R),
+            "translation": [float(v) for v in -R @ C], "orientation": 1, "capture_time": 0.0,
+            "gps_position": [float(v) for v in C], "gps_dop": 15.0,
+        }  # fmt: skip
+    chosen = np.linspace(0, len(alignment.ties.xyz) - 1, min(MOST_POINTS, len(alignment.ties.xyz))).astype(int)
+    coordinates = enu(alignment.ties.xyz[chosen]) if len(chosen) else np.zeros((0, 3))
+    points = {
+        str(k): {"coordinates": [round(float(v), 4) for v in c], "color": [128.0, 128.0, 128.0] if colours is None else [float(v) for v in colours[k]]}
+        for k, c in zip(chosen.tolist(), coordinates, strict=True)
+    }
+    used = {alignment.camera_of[i] for i in alignment.poses}
+    record = {
+        "cameras": {key: camera_to_opensfm(alignment.cameras[key]) for key in sorted(used)},
+        "shots": shots, "points": points, "reference_lla": enu.reference, "biases": {}, "rig_cameras": {}, "rig_instances": {},
+    }  # fmt: skip
+    write_text(path, json.dumps([record]))
+
+
+class Topocentric:
+    """From the map frame to east-north-up about the frame's origin."""
+
+    def __init__(self, alignment: Alignment) -> None:
+        frame = alignment.frame
+        self.alignment, self.reference = alignment, {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}
+        self.map_R_enu = np.eye(3)
+        self._to_ecef: Transformer | None = None
+        if frame.crs is None:
+            return
+        self._to_wgs = Transformer.from_crs(frame.crs, 4326, always_xy=True)
+        self._to_ecef = Transformer.from_crs(4979, 4978, always_xy=True)
+        lon, lat = self._to_wgs.transform(*frame.origin)
+        self.reference = {"latitude": lat, "longitude": lon, "altitude": 0.0}
+        a, b = np.radians([lon, lat])
+        self._east_north_up = np.array(
+            [
+                [-np.sin(a), np.cos(a), 0],
+                [-np.sin(b) * np.cos(a), -np.sin(b) * np.sin(a), np.cos(b)],
+                [np.cos(b) * np.cos(a), np.cos(b) * np.sin(a), np.sin(b)],
+            ]
+        )
+        self._origin = np.array(self._to_ecef.transform(lon, lat, 0.0))
+        # grid north lies `convergence` clockwise of true north
+        self.map_R_enu = rotation_from_vector(np.array([0.0, 0.0, np.radians(frame.convergence_deg)]))
+
+    def __call__(self, xyz: NDArray) -> NDArray[np.float64]:
+        """East, north, up (N, 3) in m of map coordinates (N, 3)."""
+        if self._to_ecef is None:
+            return np.asarray(xyz)
+        place = in_crs(self.alignment, xyz)
+        lon, lat = self._to_wgs.transform(place[:, 0], place[:, 1])
+        ecef = np.column_stack(self._to_ecef.transform(lon, lat, place[:, 2]))
+        return np.asarray((ecef - self._origin) @ self._east_north_up.T)
+
+
+def write_run(path: Path, settings: Mapping[str, Any], photos: str, commit: str | None, method: str) -> None:
+    """run.toml: what was asked for, by which version."""
+    lines = [f"version = {json.dumps(__version__)}", f"commit = {json.dumps(commit or 'unknown')}",
+             f"photos = {json.dumps(photos)}", f"method_used = {json.dumps(method)}", "", "[settings]"]  # fmt: skip
+    lines += [f"{key} = {json.dumps(value)}" for key, value in settings.items()]
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def source_commit() -> str | None:
+    """The commit of the source this runs from, read from git's files; None for an installed package."""
+    for folder in Path(__file__).resolve().parents:
+        head = folder / ".git" / "HEAD"
+        if head.is_file():
+            try:
+                text = head.read_text().strip()
+                if not text.startswith("ref: "):
+                    return text
+                ref = folder / ".git" / text.removeprefix("ref: ")
+                return ref.read_text().strip() if ref.is_file() else None
+            except OSError:
+                return None
+    return None

@@ -1,0 +1,197 @@
+"""The main story: a folder of photos becomes a georeferenced orthomosaic.
+
+    read -> features -> links -> align -> surface -> balance -> mosaic -> measure -> report
+
+Read `iter_mosaic`: it is the product. Each stage's result is looked up in the run's store before it is made,
+so a second run recomputes nothing and a killed one goes on where it stopped.
+"""
+
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from skyquilt.alignment.conflicts import conflicts
+from skyquilt.alignment.priors import choose_frame, priors
+from skyquilt.config import Methods, MosaicSettings, methods
+from skyquilt.model import camera, event, features, poses, raster, surface
+from skyquilt.model.event import Event, Note, Result
+from skyquilt.model.photo import ControlPoint, Photo, RejectedPhoto, Survey
+from skyquilt.pipelines import drawing, files, intake, judging, linking, placing, reporting
+from skyquilt.photos.gcp import read_gcp_list
+from skyquilt.photos.pixels import read_color
+from skyquilt.photos.survey import read_survey
+from skyquilt.raster.atomic import write_text
+from skyquilt.run.clock import Clock, Steps, cpu_seconds, peak_memory_mb
+from skyquilt.run.folder import RunFolder, open_run
+from skyquilt.run.pixel_cache import PixelCache
+from skyquilt.run.store import Store, digest
+
+STAGES = ("read", "features", "links", "align", "surface", "balance", "mosaic", "measure", "report")
+"""Stages in order."""
+ARTEFACTS = {"features": "features", "links": "links", "align": "alignment", "surface": "surface", "mosaic": "blocks"}
+"""Stage -> folder in the store."""
+REGISTRY = {
+    c.__name__: c
+    for c in (
+        intake.Looked, features.Features, features.Link, features.RejectedLink, features.Matches, camera.Camera,
+        poses.Alignment, poses.MapFrame, poses.Pose, poses.TiePoints, poses.ControlResidual, surface.Surface,
+        RejectedPhoto, drawing.BlockExtras, raster.Grid,
+    )
+}  # fmt: skip
+"""Records that the store may hold."""
+
+
+def iter_mosaic(
+    folder: Path | Sequence[Path], output: Path, settings: MosaicSettings | None = None, *,
+    overwrite: bool = False, rerun_from: str | None = None,
+) -> Iterator[Event]:  # fmt: skip
+    """Makes a mosaic, telling its progress; the last event is the `Result`.
+
+    Raises:
+        SkyquiltError: anything a user can mend: no photos, an output that is taken, a malformed side file ...
+    """
+    settings = settings or MosaicSettings()
+    parts, jobs = methods(settings), settings.jobs or os.cpu_count() or 1
+    survey, control = _read(folder, settings)
+    run = open_run(Path(output), run_key(survey, control, settings), overwrite=overwrite or rerun_from is not None)
+    store = Store(folder=run.store, registry=REGISTRY)
+    _forget(run, store, rerun_from)
+    if run.done:
+        yield Note(text=f"{run.path} holds this very mosaic already; nothing to do")
+        yield Result(output=run.path, metrics=json.loads((run.path / "metrics.json").read_text()))
+        return
+    run.mark("running")
+    clock = Clock(store=store)
+    yield from (Note(text=n) for n in survey.notes)
+    cache = PixelCache(read=lambda i: read_color(survey.photos[i]), budget_bytes=pixel_budget(settings))
+    taken = yield from clock.stage("features", intake.take_in(survey.photos, cache, parts, store, jobs))
+    taken, cache = _one_kind(taken, survey, cache, settings)
+    frame = choose_frame(taken.photos, settings.crs, control)
+    prior = priors(taken.photos, frame)
+    links = yield from clock.stage("links", _links(taken, prior, parts, settings, store, jobs))
+    alignment = yield from clock.stage(
+        "align", placing.place(taken, frame, prior, links, control, parts, settings, store)
+    )
+    yield from (Note(text=n, warning=True) for n in alignment.notes)
+    ground = yield from clock.stage("surface", drawing.survey_ground(alignment, parts, settings, store))
+    exposure = yield from clock.stage("balance", _at_once(lambda: drawing.balance(taken, ground, alignment, parts, settings)))
+    compose = drawing.composer(taken, ground, alignment, exposure, parts, cache)
+    key = digest(run.key, poses_digest(alignment), ground.surface.z, dict(exposure.gains))
+    unit = drawing.unit_of(taken)
+    drawn = yield from clock.stage(
+        "mosaic", drawing.draw(run.path, compose, alignment, settings, store, key, unit, jobs)
+    )
+    seams = yield from clock.stage("measure", reporting.seams(compose, drawn, ground))
+    rejected = [*survey.rejected, *taken.rejected, *_unplaced(taken, alignment)]
+    figures = judging.figures(
+        photos=taken.photos, total=len(survey.photos) + len(survey.rejected), rejected=rejected, priors=prior,
+        links=links, alignment=alignment, ground=ground, drawn=drawn, seams=seams.figures,
+        conflicts=conflicts(taken.photos, prior, alignment), notes=[*survey.notes, *alignment.notes],
+    )  # fmt: skip
+    finish = reporting.finish(run.path, taken, prior, alignment, ground, drawn, seams, figures, settings, clock, folder)
+    metrics = yield from clock.stage("report", finish)
+    run.mark("done")
+    yield Result(output=run.path, metrics=metrics)
+
+
+def mosaic(
+    folder: Path | str | Sequence[Path], output: Path | str, settings: MosaicSettings | None = None, *,
+    overwrite: bool = False,
+) -> Result:  # fmt: skip
+    """Makes a mosaic of the photos in a folder and returns when it is finished.
+
+    Raises:
+        SkyquiltError: anything a user can mend.
+    """
+    source = Path(folder) if isinstance(folder, str) else folder
+    for happened in iter_mosaic(source, Path(output), settings, overwrite=overwrite):
+        if isinstance(happened, Result):
+            return happened
+    raise RuntimeError("the story ended without a result")
+
+
+def _read(folder: Path | Sequence[Path], settings: MosaicSettings) -> tuple[Survey, tuple[ControlPoint, ...]]:
+    """Metadata and side files; a gcp_list.txt beside the photos is used unasked."""
+    survey = read_survey(folder, geo=settings.geo, cameras=settings.cameras)
+    gcp = settings.gcp
+    if gcp is None and isinstance(folder, Path) and (folder / "gcp_list.txt").is_file():
+        gcp = folder / "gcp_list.txt"
+    if gcp is None:
+        return survey, ()
+    control, notes = read_gcp_list(gcp, [p.name for p in survey.photos])
+    return replace(survey, notes=(*survey.notes, *notes)), control
+
+
+def run_key(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSettings) -> str:
+    """What a run depends on: content and metadata of its photos, side files, and the settings that shape results."""
+    shaping = {k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb")}
+    side = [p.read_bytes().hex() for p in (settings.boundary,) if p is not None and p.is_file()]
+    photos = [(p.name, p.digest, p.position, p.attitude, p.focal, p.calibration) for p in survey.photos]
+    return digest(photos, list(control), shaping, side)
+
+
+def poses_digest(alignment: poses.Alignment) -> str:
+    """What of an alignment shapes the map."""
+    order = sorted(alignment.poses)
+    stack = [np.concatenate([alignment.poses[i].cam_R_map.ravel(), alignment.poses[i].map_C, alignment.camera(i).vector]) for i in order]
+    return digest(order, np.array(stack), alignment.frame)
+
+
+def pixel_budget(settings: MosaicSettings) -> int:
+    """Bytes for decoded photos: what the memory allowed leaves after code, features and tiles."""
+    return int(max(0.15, (settings.memory_gb or 1.2) - 0.6) * 1e9)
+
+
+def _forget(run: RunFolder, store: Store, rerun_from: str | None) -> None:
+    if rerun_from is not None:
+        later = STAGES[STAGES.index(rerun_from) :]
+        store.forget([ARTEFACTS[s] for s in later if s in ARTEFACTS])
+        run.mark("running")
+
+
+def _one_kind(
+    taken: intake.Intake, survey: Survey, cache: PixelCache, settings: MosaicSettings
+) -> tuple[intake.Intake, PixelCache]:
+    """The photos that fit one map, and the cache under their new indices."""
+    fitting = drawing.single_kind(taken)
+    if len(fitting.photos) == len(survey.photos):
+        return fitting, cache
+    where = {p.name: i for i, p in enumerate(survey.photos)}
+    return fitting, replace_read(cache, [where[p.name] for p in fitting.photos])
+
+
+def replace_read(cache: PixelCache, old: Sequence[int]) -> PixelCache:
+    """A cache over a cache: photo k of the new is photo old[k] of the old."""
+    return PixelCache(read=lambda i: cache(old[i]), budget_bytes=0)
+
+
+def _links(
+    taken: intake.Intake, prior: Sequence[poses.Prior], parts: Methods, settings: MosaicSettings, store: Store, jobs: int
+) -> Steps[linking.Links]:
+    """Links, unless the method asked for does without."""
+    if settings.method in ("pose", "position") or len(taken.photos) < 2:
+        return linking.Links(links=(), rejected=())
+    return (yield from linking.link_up(taken, prior, parts, store, jobs))
+
+
+def _at_once(work) -> Steps:  # type: ignore[no-untyped-def]
+    """A stage of one step."""
+    yield 0, 1
+    result = work()
+    yield 1, 1
+    return result
+
+
+def _unplaced(taken: intake.Intake, alignment: poses.Alignment) -> list[RejectedPhoto]:
+    return [
+        RejectedPhoto(name=p.name, reason=alignment.rejected.get(i, "it could not be placed"))
+        for i, p in enumerate(taken.photos)
+        if i not in alignment.poses
+    ]
+
+
+__all__ = ["STAGES", "MosaicSettings", "Photo", "cpu_seconds", "event", "iter_mosaic", "mosaic", "peak_memory_mb", "write_text"]

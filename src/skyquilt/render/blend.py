@@ -1,0 +1,248 @@
+"""Merge rules: what a map pixel shows where several photos see it. No ghost removal: every pixel is some photo's."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Layer:
+    """One photo orthorectified over a window."""
+
+    photo: int
+    """Index of the photo."""
+    pixels: NDArray
+    """(h, w, bands)."""
+    score: Float
+    """(h, w) squared tangent of the angle off the vertical; infinite where the photo sees nothing."""
+    centre: tuple[float, float]
+    """Camera's plan position in m."""
+    height: float
+    """Camera above ground in m."""
+
+
+class Blend(Protocol):
+    """A merge rule."""
+
+    margin: int
+    """Pixels beyond the window that the rule must see."""
+
+    def rank(self, order: int, score: Float) -> Float:
+        """What decides between photos: the lowest wins. `order`: position in order of capture."""
+
+    def reach(self, gsd: float) -> float:
+        """How far, in rank, a photo behind the winner still matters; infinite = all photos do."""
+
+    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray, NDArray[np.int32]]:
+        """Pixels (h, w, bands) and which photo leads each (h, w), -1 = none."""
+
+
+def leader(layers: Sequence[Layer], ranks: Sequence[Float]) -> NDArray[np.int32]:
+    """Position in `layers` of the lowest finite rank per pixel, -1 where none is."""
+    best = np.full(ranks[0].shape, np.inf, np.float32)
+    lead = np.full(ranks[0].shape, -1, np.int32)
+    for position, rank in enumerate(ranks):
+        better = rank < best
+        np.copyto(best, rank, where=better)
+        lead[better] = position
+    return lead
+
+
+def _photos(lead: NDArray[np.int32], layers: Sequence[Layer]) -> NDArray[np.int32]:
+    table = np.array([*(layer.photo for layer in layers), -1], np.int32)
+    return table[lead]
+
+
+def _weighted(layers: Sequence[Layer], weights: Sequence[Float]) -> NDArray:
+    """Sum of pixels by weights that add up to one (zero where no photo sees)."""
+    kind = layers[0].pixels.dtype
+    total = np.zeros(layers[0].pixels.shape, np.float32)
+    for layer, weight in zip(layers, weights, strict=True):
+        part = np.where(weight[..., None] > 0, layer.pixels, 0) if kind.kind == "f" else layer.pixels
+        total += part * weight[..., None]
+    return np.clip(np.rint(total), 0, np.iinfo(kind).max).astype(kind) if kind.kind == "u" else total.astype(kind)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Feather:
+    """The most vertical view wins; seams are blended over a few pixels."""
+
+    width_px: float = 6.0
+    """Width of the blend in map pixels; 0 = hard seams."""
+    margin: ClassVar[int] = 0
+    version: ClassVar[int] = 2
+
+    def rank(self, order: int, score: Float) -> Float:
+        """The angle off the vertical."""
+        return score
+
+    def reach(self, gsd: float) -> float:
+        """A seam moves by its width when ranks differ by this much, for cameras half a height apart."""
+        return 2.0 * (self.width_px + 20) * gsd
+
+    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray, NDArray[np.int32]]:
+        """Ramps across seams, whose distance follows from the ranks: they differ linearly in the plane."""
+        lead = leader(layers, [layer.score for layer in layers])
+        if self.width_px <= 0:
+            return _picked(layers, lead), _photos(lead, layers)
+        near = [self._margin(layers, position, gsd) for position in range(len(layers))]
+        ramps = [np.clip(0.5 + m / self.width_px, 0, 1) for m in near]
+        total = np.maximum(np.sum(ramps, axis=0, dtype=np.float32), 1e-6)
+        if all((ramp == (lead == k)).all() for k, ramp in enumerate(ramps)):
+            return _picked(layers, lead), _photos(lead, layers)
+        return _weighted(layers, [ramp / total for ramp in ramps]), _photos(lead, layers)
+
+    def _margin(self, layers: Sequence[Layer], position: int, gsd: float) -> Float:
+        """Signed distance in px to the nearest seam: positive where this layer wins (h, w)."""
+        own = layers[position]
+        closest = np.full(own.score.shape, np.float32(1e6))
+        with np.errstate(invalid="ignore"):
+            for k, other in enumerate(layers):
+                if k != position:
+                    apart = np.hypot(own.centre[0] - other.centre[0], own.centre[1] - other.centre[1])
+                    h2 = own.height * other.height
+                    slope = np.float32(2 * max(apart, 0.05 * own.height) * gsd / h2)  # rank per px across the seam
+                    np.minimum(closest, (other.score - own.score) / slope, out=closest)
+        return np.where(np.isfinite(own.score), np.nan_to_num(closest, nan=-1e6), np.float32(-1e6))
+
+
+def _picked(layers: Sequence[Layer], lead: NDArray[np.int32]) -> NDArray:
+    """Each pixel from its leading layer; zero or NaN where there is none."""
+    kind = layers[0].pixels.dtype
+    out = np.full(layers[0].pixels.shape, np.nan if kind.kind == "f" else 0, kind)
+    for position, layer in enumerate(layers):
+        cv2.copyTo(layer.pixels, (lead == position).view(np.uint8), out) if kind == np.uint8 else np.copyto(
+            out, layer.pixels, where=(lead == position)[..., None]
+        )
+    return out
+
+
+@dataclass(frozen=True, kw_only=True)
+class First:
+    """The photo taken first wins, hard seams: earlier photos stay, as in the thesis."""
+
+    margin: ClassVar[int] = 0
+    version: ClassVar[int] = 1
+
+    def rank(self, order: int, score: Float) -> Float:
+        """Order of capture."""
+        return np.where(np.isfinite(score), np.float32(order), np.float32(np.inf))
+
+    def reach(self, gsd: float) -> float:
+        """Only the winner matters."""
+        return 0.0
+
+    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray, NDArray[np.int32]]:
+        """The first layer that sees the pixel; layers come in order of capture."""
+        ranks = [self.rank(k, layer.score) for k, layer in enumerate(layers)]
+        lead = leader(layers, ranks)
+        return _picked(layers, lead), _photos(lead, layers)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Average:
+    """The mean of all photos that see the pixel, as in Arteaga et al. 2019."""
+
+    margin: ClassVar[int] = 0
+    version: ClassVar[int] = 1
+
+    def rank(self, order: int, score: Float) -> Float:
+        """The angle off the vertical decides which photo is named as the source."""
+        return score
+
+    def reach(self, gsd: float) -> float:
+        """All photos matter."""
+        return float(np.inf)
+
+    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray, NDArray[np.int32]]:
+        """Equal weights."""
+        seen = [np.isfinite(layer.score).astype(np.float32) for layer in layers]
+        number = np.maximum(np.sum(seen, axis=0, dtype=np.float32), 1e-6)
+        lead = leader(layers, [layer.score for layer in layers])
+        merged = _weighted(layers, [s / number for s in seen])
+        if merged.dtype.kind == "f":
+            merged[lead < 0] = np.nan
+        return merged, _photos(lead, layers)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Multiband:
+    """The most vertical view wins; each band of detail is blended over its own width (Burt and Adelson 1983)."""
+
+    levels: int = 5
+    """Halvings of the Laplacian pyramid; the widest blend is about 2 ** levels px."""
+    version: ClassVar[int] = 1
+
+    @property
+    def margin(self) -> int:
+        """Tiles see each other's rim, so that they meet without a step."""
+        return 4 * 2**self.levels
+
+    def rank(self, order: int, score: Float) -> Float:
+        """The angle off the vertical."""
+        return score
+
+    def reach(self, gsd: float) -> float:
+        """As wide as the coarsest blend."""
+        return 4.0 * self.margin * gsd
+
+    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray, NDArray[np.int32]]:
+        """Laplacian pyramids of the layers, weighted by Gaussian pyramids of their territories."""
+        lead = leader(layers, [layer.score for layer in layers])
+        hard = _picked(layers, lead)
+        if len(layers) == 1:
+            return hard, _photos(lead, layers)
+        total: list[NDArray] = []
+        mass: list[NDArray] = []
+        for position, layer in enumerate(layers):
+            bands = _laplacian(_filled(layer, hard), self.levels)
+            weights = _gaussian((lead == position).astype(np.float32), self.levels)
+            for level, (band, weight) in enumerate(zip(bands, weights, strict=True)):
+                if position == 0:
+                    total.append(np.zeros_like(band))
+                    mass.append(np.zeros_like(weight))
+                total[level] += band * weight[..., None]
+                mass[level] += weight
+        out = _collapse([t / np.maximum(m, 1e-6)[..., None] for t, m in zip(total, mass, strict=True)])
+        kind = layers[0].pixels.dtype
+        if kind.kind == "u":
+            out = np.clip(np.rint(out), 0, np.iinfo(kind).max)
+        blended = out.astype(kind)
+        blended[lead < 0] = hard[lead < 0]
+        return blended, _photos(lead, layers)
+
+
+def _filled(layer: Layer, hard: NDArray) -> Float:
+    """The layer, continued by the hard composite where it sees nothing, so that no black bleeds in."""
+    seen = np.isfinite(layer.score)[..., None]
+    return np.nan_to_num(np.where(seen, layer.pixels, hard).astype(np.float32))
+
+
+def _gaussian(image: Float, levels: int) -> list[Float]:
+    out = [image]
+    for _ in range(levels):
+        out.append(cv2.pyrDown(out[-1]))
+    return out
+
+
+def _laplacian(image: Float, levels: int) -> list[Float]:
+    gaussian = _gaussian(image, levels)
+    gaussian = [g[..., None] if g.ndim == 2 else g for g in gaussian]
+    return [a - _up(b, a) for a, b in zip(gaussian[:-1], gaussian[1:], strict=True)] + [gaussian[-1]]
+
+
+def _up(small: Float, like: Float) -> Float:
+    return np.asarray(cv2.pyrUp(small, dstsize=(like.shape[1], like.shape[0]))).reshape(like.shape)
+
+
+def _collapse(bands: list[Float]) -> Float:
+    image = bands[-1]
+    for band in reversed(bands[:-1]):
+        image = band + _up(image, band)
+    return image

@@ -1,0 +1,66 @@
+"""Time per stage, told as events."""
+
+import sys
+import time
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from skyquilt.model.event import Event, StageFinished, StageProgress, StageStarted
+from skyquilt.run.store import Store
+
+T = TypeVar("T")
+Steps = Generator[tuple[int, int] | Event, None, T]
+"""A stage's work: yields (done, total) or events, returns its result."""
+
+
+def cpu_seconds() -> float:
+    """CPU time of this process in s."""
+    return time.process_time()
+
+
+def peak_memory_mb() -> float | None:
+    """Largest resident memory of this process in MB; None on systems that do not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    unit = 1e6 if sys.platform == "darwin" else 1e6 / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+@dataclass(kw_only=True)
+class Clock:
+    """Stage times of a run."""
+
+    store: Store
+    """Watched to tell reused stages."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Wall-clock time per stage in s."""
+    started: float = field(default_factory=time.perf_counter)
+    """When the run began."""
+    cpu_started: float = field(default_factory=cpu_seconds)
+    """CPU time spent before the run."""
+
+    def stage(self, name: str, work: Steps[T]) -> Generator[Event, None, T]:
+        """Runs a stage's steps as events and returns its result."""
+        begun, cpu, misses = time.perf_counter(), cpu_seconds(), self.store.misses
+        yield StageStarted(stage=name, total=0)
+        try:
+            while True:
+                step = next(work)
+                yield StageProgress(stage=name, done=step[0], total=step[1]) if isinstance(step, tuple) else step
+        except StopIteration as stop:
+            result: T = stop.value
+        finally:
+            work.close()
+        self.seconds[name] = round(time.perf_counter() - begun, 3)
+        yield StageFinished(
+            stage=name, seconds=self.seconds[name], cpu_seconds=round(cpu_seconds() - cpu, 3),
+            reused=self.store.misses == misses and self.store.hits > 0,
+        )  # fmt: skip
+        return result
+
+    def total(self) -> float:
+        """Wall-clock time so far in s."""
+        return time.perf_counter() - self.started

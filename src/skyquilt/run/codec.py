@@ -1,0 +1,80 @@
+"""Records to files and back, without executing anything on the way: JSON for structure, npz for arrays."""
+
+import dataclasses
+import io
+import json
+import math
+import zipfile
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+Registry = Mapping[str, type]
+
+
+def encode(value: Any) -> bytes:
+    """Bytes of dataclasses, tuples, lists, dicts, sets, arrays and scalars."""
+    arrays: dict[str, np.ndarray] = {}
+    tree = _down(value, arrays)
+    buffer = io.BytesIO()
+    np.savez(buffer, __tree__=np.frombuffer(json.dumps(tree).encode(), np.uint8), **arrays)
+    return buffer.getvalue()
+
+
+def decode(data: bytes, registry: Registry) -> Any:
+    """The value; `registry` names the dataclasses that may occur.
+
+    Raises:
+        ValueError: the bytes are torn, or name an unknown record.
+    """
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            tree = json.loads(bytes(arrays["__tree__"]).decode())
+            return _up(tree, arrays, registry)
+    except (zipfile.BadZipFile, KeyError, EOFError, OSError, json.JSONDecodeError, TypeError) as error:
+        raise ValueError(f"not a stored record: {error}") from error
+
+
+def _down(value: Any, arrays: dict[str, np.ndarray]) -> Any:
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else {"!": "float", "v": repr(value)}
+    if isinstance(value, complex):
+        return {"!": "complex", "v": [repr(value.real), repr(value.imag)]}
+    if isinstance(value, np.generic):
+        return _down(value.item(), arrays)
+    if isinstance(value, np.ndarray):
+        name = f"a{len(arrays)}"
+        arrays[name] = value
+        return {"!": "array", "v": name}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: _down(getattr(value, f.name), arrays) for f in dataclasses.fields(value)}
+        return {"!": "record", "c": type(value).__name__, "v": fields}
+    if isinstance(value, Mapping):
+        return {"!": "dict", "v": [[_down(k, arrays), _down(v, arrays)] for k, v in value.items()]}
+    if isinstance(value, tuple | list | frozenset | set):
+        kind = "list" if isinstance(value, list) else "tuple" if isinstance(value, tuple) else "set"
+        return {"!": kind, "v": [_down(v, arrays) for v in value]}
+    raise TypeError(f"cannot store {type(value).__name__}")
+
+
+def _up(tree: Any, arrays: Mapping[str, np.ndarray], registry: Registry) -> Any:
+    if not isinstance(tree, dict):
+        return tree
+    kind, v = tree["!"], tree["v"]
+    if kind == "float":
+        return float(v)
+    if kind == "complex":
+        return complex(float(v[0]), float(v[1]))
+    if kind == "array":
+        return arrays[v]
+    if kind == "record":
+        if tree["c"] not in registry:
+            raise ValueError(f"unknown record {tree['c']}")
+        return registry[tree["c"]](**{k: _up(x, arrays, registry) for k, x in v.items()})
+    if kind == "dict":
+        return {_up(k, arrays, registry): _up(x, arrays, registry) for k, x in v}
+    items = [_up(x, arrays, registry) for x in v]
+    return items if kind == "list" else tuple(items) if kind == "tuple" else frozenset(items)

@@ -1,0 +1,86 @@
+"""The run's folder: who may write there, and what may be taken up again."""
+
+import json
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from skyquilt.errors import OutputError
+
+CONTRACT = (
+    "mosaic.tif", "provenance.tif", "views.tif", "surface.tif", "cameras.json", "shots.geojson",
+    "reconstruction.json", "footprints.geojson", "metrics.json", "report.html", "run.toml",
+)  # fmt: skip
+"""Files of a finished run."""
+STATE = ".skyquilt"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFolder:
+    """An opened output folder."""
+
+    path: Path
+    """The folder."""
+    key: str
+    """What the run is made from: inputs and settings."""
+
+    @property
+    def store(self) -> Path:
+        """Where intermediate results lie."""
+        return self.path / STATE / "store"
+
+    def mark(self, state: str) -> None:
+        """Writes down how far the run is: `running` or `done`."""
+        target = self.path / STATE / "run.json"
+        partial = target.with_suffix(".partial")
+        try:
+            partial.write_text(json.dumps({"key": self.key, "state": state}))
+            os.replace(partial, target)
+        except OSError as error:
+            raise OutputError(f"cannot write to {self.path}: {error.strerror}") from error
+
+    @property
+    def done(self) -> bool:
+        """Whether this very run was finished before."""
+        return _state(self.path) == (self.key, "done") and all((self.path / name).is_file() for name in CONTRACT)
+
+
+def _state(path: Path) -> tuple[str, str]:
+    try:
+        found = json.loads((path / STATE / "run.json").read_text())
+        return str(found["key"]), str(found["state"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "", ""
+
+
+def open_run(path: Path, key: str, *, overwrite: bool) -> RunFolder:
+    """Opens a folder for a run: new, empty, the same run again (resumed), or overwritten.
+
+    Raises:
+        OutputError: it holds something else, or cannot be written.
+    """
+    if path.exists() and not path.is_dir():
+        raise OutputError(f"{path} is a file; the output is a folder")
+    known, state = _state(path)
+    if path.is_dir() and any(path.iterdir()) and known != key:
+        if not overwrite:
+            what = "another run" if known else "other files"
+            raise OutputError(
+                f"{path} already holds {what}; add --overwrite to replace its results, or choose another folder"
+            )
+        for name in CONTRACT:
+            (path / name).unlink(missing_ok=True)
+        for left in path.glob("*.spool"):
+            shutil.rmtree(left, ignore_errors=True)
+    try:
+        (path / STATE).mkdir(parents=True, exist_ok=True)
+        probe = path / STATE / "probe"
+        probe.write_bytes(b"x")
+        probe.unlink()
+    except OSError as error:
+        raise OutputError(f"cannot write to {path}: {error.strerror}; choose another folder") from error
+    folder = RunFolder(path=path, key=key)
+    if state != "done" or known != key:
+        folder.mark("running")
+    return folder

@@ -1,0 +1,53 @@
+"""Decoded photos, kept as long as memory allows."""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from numpy.typing import NDArray
+
+
+@dataclass(kw_only=True)
+class PixelCache:
+    """Least recently used photos make room when the budget is exceeded; safe to share between threads."""
+
+    read: Callable[[int], NDArray]
+    """Decodes a photo by its index."""
+    budget_bytes: int
+    """Most bytes kept; one photo larger than that is still handed out, but not kept."""
+    decoded: int = 0
+    """How many times a photo was decoded."""
+    _kept: OrderedDict[int, NDArray] = field(default_factory=OrderedDict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _busy: dict[int, threading.Lock] = field(default_factory=dict)
+
+    def __call__(self, photo: int) -> NDArray:
+        """Pixels of a photo, read-only."""
+        with self._lock:
+            own = self._busy.setdefault(photo, threading.Lock())
+        with own:  # two threads that want one photo decode it once
+            with self._lock:
+                if photo in self._kept:
+                    self._kept.move_to_end(photo)
+                    return self._kept[photo]
+            pixels = self.read(photo)
+            pixels.setflags(write=False)
+            self.put(photo, pixels)
+            return pixels
+
+    def put(self, photo: int, pixels: NDArray) -> None:
+        """Keeps pixels decoded by a call, if they fit."""
+        with self._lock:
+            self.decoded += 1
+            if pixels.nbytes > self.budget_bytes:
+                return
+            self._kept[photo] = pixels
+            self._kept.move_to_end(photo)
+            while sum(p.nbytes for p in self._kept.values()) > self.budget_bytes:
+                self._kept.popitem(last=False)
+
+    def clear(self) -> None:
+        """Forgets everything."""
+        with self._lock:
+            self._kept.clear()
