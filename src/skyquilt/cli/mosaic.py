@@ -1,0 +1,78 @@
+"""`skyquilt mosaic`: a folder of photos to a georeferenced orthomosaic."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from skyquilt.errors import UsageError
+
+METHOD_HELP = "How photos are aligned: auto, bundle, pose, position."
+
+
+def command(
+    photos: Annotated[Path, typer.Argument(help="Folder of photos (subfolders included).")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
+    method: Annotated[str, typer.Option(help=METHOD_HELP)] = "auto",
+    gsd: Annotated[float | None, typer.Option(help="Ground size of a map pixel in cm. [default: the photos' own]")] = None,
+    crs: Annotated[str | None, typer.Option(help="Output CRS, e.g. EPSG:32633. [default: local UTM]")] = None,
+    gcp: Annotated[Path | None, typer.Option(help="Control points (gcp_list.txt). [default: the one beside the photos]")] = None,
+    geo: Annotated[Path | None, typer.Option(help="Positions: geo.txt, CSV, .MRK or .SRT. [default: geo.txt beside the photos]")] = None,
+    cameras: Annotated[Path | None, typer.Option(help="Calibrations (cameras.json).")] = None,
+    bounds: Annotated[str | None, typer.Option(help="west,south,east,north in the output CRS.")] = None,
+    boundary: Annotated[Path | None, typer.Option(help="Polygon to cut the map to: GeoJSON, KML, GeoPackage, Shapefile.")] = None,
+    blend: Annotated[str, typer.Option(help="Where photos meet: feather, first, average, multiband.")] = "feather",
+    feather: Annotated[float, typer.Option(help="Width of feathered seams in map pixels.")] = 6.0,
+    balance: Annotated[bool, typer.Option("--balance/--no-balance", help="Bring photos to one brightness.")] = True,
+    compress: Annotated[str, typer.Option(help="auto, jpeg, or lossless: deflate, zstd, lzw, none.")] = "auto",
+    quality: Annotated[int, typer.Option(help="JPEG quality.")] = 85,
+    distortion: Annotated[str, typer.Option(help="Lens terms to calibrate: none, 2, 4, 6 (radial order), 6t (and tangential).")] = "4",
+    height: Annotated[float | None, typer.Option(help="Height above ground in m, for methods pose and position where altitudes do not tell it.")] = None,
+    heading: Annotated[float, typer.Option(help="Heading of all photos in degrees, for method position.")] = 0.0,
+    repair: Annotated[bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")] = True,
+    features: Annotated[int, typer.Option(help="Features per photo.")] = 2000,
+    jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.")] = 0,
+    memory: Annotated[float | None, typer.Option(help="Memory to stay within, in GB. [default: 1.2]")] = None,
+    rerun_from: Annotated[str | None, typer.Option(help="Make everything anew from this stage on: features, links, align, surface, balance, mosaic, measure, report.")] = None,
+    overwrite: Annotated[bool, typer.Option(help="Replace the results of another run in OUTPUT.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Say more: every stage's time.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
+) -> None:  # fmt: skip
+    """Turn a folder of drone photos into a georeferenced, orthorectified mosaic.
+
+    Sensible without any option. The same command again resumes a run that was killed. Exit codes: 0 done,
+    1 other errors, 2 wrong options, 3 no readable photo, 4 photos cannot be aligned, 5 output cannot be
+    written, 6 malformed side file, 130 interrupted.
+    """
+    from skyquilt.cli.progress import show
+    from skyquilt.config import MosaicSettings
+    from skyquilt.pipelines.mosaic import STAGES, iter_mosaic
+
+    if rerun_from is not None and rerun_from not in STAGES[1:]:
+        raise UsageError(f"--rerun-from {rerun_from!r} is not one of {', '.join(STAGES[1:])}")
+    if quiet + verbose + json > 1:
+        raise UsageError("--quiet, --verbose and --json exclude one another")
+    settings = MosaicSettings(
+        method=method, gsd_cm=gsd, crs=crs, gcp=gcp, geo=geo, cameras=cameras, bounds=parse_bounds(bounds),
+        boundary=boundary, blend=blend, feather_px=feather, balance=balance, compress=compress, quality=quality,
+        distortion=distortion, height_m=height, heading_deg=heading, repair=repair, features=features, jobs=jobs,
+        memory_gb=memory,
+    )  # fmt: skip
+    events = iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
+    show(events, mode="quiet" if quiet else "json" if json else "verbose" if verbose else "normal")
+
+
+def parse_bounds(text: str | None) -> tuple[float, float, float, float] | None:
+    """Four numbers separated by commas.
+
+    Raises:
+        UsageError: they are not.
+    """
+    if text is None:
+        return None
+    try:
+        west, south, east, north = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UsageError(f"--bounds is west,south,east,north, four numbers; got {text!r}") from error
+    return west, south, east, north

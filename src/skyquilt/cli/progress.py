@@ -1,0 +1,78 @@
+"""Events on a terminal: a bar per stage with the time left, JSON lines, or silence."""
+
+import json
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict
+from typing import Any
+
+from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
+
+
+def show(events: Iterable[Event], *, mode: str) -> None:
+    """Consumes a story and tells it: mode `normal`, `verbose`, `quiet` or `json`."""
+    if mode == "json":
+        for happened in events:
+            sys.stdout.write(json.dumps(as_record(happened), default=str) + "\n")
+            sys.stdout.flush()
+    elif mode == "quiet":
+        for _ in events:
+            pass
+    else:
+        _bars(events, verbose=mode == "verbose")
+
+
+def as_record(happened: Event) -> dict[str, Any]:
+    """The event with its name, ready for JSON."""
+    if isinstance(happened, Result):
+        return {"event": "Result", "output": str(happened.output), "metrics": dict(happened.metrics)}
+    return {"event": type(happened).__name__, **asdict(happened)}
+
+
+def _bars(events: Iterable[Event], *, verbose: bool) -> None:
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description:<9}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        tasks: dict[str, Any] = {}
+        for happened in events:
+            if isinstance(happened, StageStarted):
+                tasks[happened.stage] = progress.add_task(happened.stage, total=None)
+            elif isinstance(happened, StageProgress):
+                progress.update(tasks[happened.stage], completed=happened.done, total=happened.total)
+            elif isinstance(happened, StageFinished):
+                progress.update(tasks[happened.stage], completed=1, total=1)
+                if verbose:
+                    how = " (from an earlier run)" if happened.reused else ""
+                    progress.console.print(f"{happened.stage}: {happened.seconds:.2f} s, {happened.cpu_seconds:.2f} s of CPU{how}")
+            elif isinstance(happened, Note):
+                progress.console.print(happened.text, style="yellow" if happened.warning else None, markup=False, highlight=False)
+            elif isinstance(happened, Result):
+                result = happened
+    Console().print(summary(result), markup=False, highlight=False)
+
+
+def summary(result: Result) -> str:
+    """The result in a few lines."""
+    m = result.metrics
+    lines = [
+        f"{m['photos_used']} of {m['photos_total']} photos in {len(m['blocks'])} block(s), method {m['method']}: {m['why']}",
+        f"map: {m['size_px'][0]} x {m['size_px'][1]} px at {m['gsd_m'] * 100:g} cm, {m['crs'] or 'not georeferenced'}",
+    ]
+    if m["reprojection_error_px"]:
+        seam = m["seam_disparity_px"]
+        lines.append(
+            f"reprojection error {m['reprojection_error_px']['mean']:.2f} px, seams {seam['median']} px (median;"
+            f" {seam['measured']} of {seam['attempted']} measured)"
+        )
+    lines += [f"left out: {name}: {reason}" for name, reason in list(m["photos_rejected"].items())[:10]]
+    if m["metadata_conflicts"]:
+        lines.append(f"{len(m['metadata_conflicts'])} contradictions between metadata and pixels: see the report")
+    lines.append(f"{m['seconds']['total']:.1f} s, {m['cpu_seconds']:.1f} s of CPU, {m['peak_memory_mb']} MB")
+    lines += [f"map:    {result.output / 'mosaic.tif'}", f"report: {result.output / 'report.html'}"]
+    return "\n".join(lines)

@@ -1,0 +1,100 @@
+"""The end of the story: seams measured, files written, the report."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skyquilt.config import MosaicSettings
+from skyquilt.metrics.seam_points import SeamPoint, seam_points
+from skyquilt.metrics.seams import PatchPairs, SeamReport, seam_disparity
+from skyquilt.model.event import Note
+from skyquilt.model.poses import Alignment, Prior
+from skyquilt.pipelines import drawing, files
+from skyquilt.pipelines.drawing import Drawn, Ground
+from skyquilt.pipelines.intake import Intake
+from skyquilt.raster.atomic import write_text
+from skyquilt.render.compose import Composer
+from skyquilt.render.patches import grey_pairs
+from skyquilt.run.clock import Clock, Steps, cpu_seconds, peak_memory_mb
+
+SEAM_POINTS = 300
+"""Points at which seams are measured."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Seams:
+    """Seam disparity: the figures, and where they were taken."""
+
+    report: SeamReport
+    """All samples."""
+    figures: Mapping[str, Any]
+    """What metrics.json says."""
+
+
+def seams(compose: Composer, drawn: Drawn, ground: Ground) -> Steps[Seams]:
+    """Measures the disparity along all seams of the finished map."""
+    yield 0, 1
+    shown = drawing.used_photos(ground.views)
+    views = {k + 1: next(v for v in ground.views if v.photo == photo) for k, photo in enumerate(shown)}
+    points = seam_points(drawn.provenance, limit=SEAM_POINTS)
+    grid = drawn.provenance_grid
+
+    def patches(at: Sequence[SeamPoint]) -> PatchPairs:
+        xy = np.array([(grid.x(np.array(p.column)), grid.y(np.array(p.row))) for p in at])
+        a, b, seen = grey_pairs(
+            [views[p.a] for p in at], [views[p.b] for p in at], xy, ground.surface, compose.pixels, ground.native_gsd
+        )
+        return PatchPairs(a=a, b=b, seen=seen)
+
+    report = seam_disparity(points, patches, gsd_m=ground.native_gsd)
+    yield 1, 1
+    return Seams(report=report, figures=_figures(report))
+
+
+def _figures(report: SeamReport) -> dict[str, Any]:
+    def short(value: float | None) -> float | None:
+        return None if value is None else round(value, 3)
+
+    return {
+        "median": short(report.median_px), "p95": short(report.p95_px), "median_cm": short(report.median_cm),
+        "p95_cm": short(report.p95_cm), "measured": report.measured, "attempted": report.attempted,
+    }  # fmt: skip
+
+
+def finish(
+    output: Path, taken: Intake, priors: Sequence[Prior], alignment: Alignment, ground: Ground, drawn: Drawn,
+    seen: Seams, figures: dict[str, Any], settings: MosaicSettings, clock: Clock, folder: Path | Sequence[Path],
+) -> Steps[dict[str, Any]]:  # fmt: skip
+    """Writes every file of the run but the rasters already there; metrics.json comes last."""
+    yield 0, 3
+    order = drawing.used_photos(ground.views)
+    drawing.write_surface(output, ground, alignment)
+    files.write_cameras(output / "cameras.json", alignment)
+    files.write_shots(output / "shots.geojson", taken.photos, alignment, order)
+    files.write_footprints(output / "footprints.geojson", taken.photos, alignment, ground.views)
+    files.write_reconstruction(output / "reconstruction.json", taken.photos, alignment, None)
+    source = str(folder) if isinstance(folder, Path) else f"{len(folder)} files"
+    files.write_run(output / "run.toml", settings.as_table(), source, files.source_commit(), alignment.method)
+    yield 1, 3
+    metrics = figures | _times(clock)
+    write_text(output / "report.html", "")
+    yield 2, 3
+    metrics |= _times(clock)
+    write_text(output / "metrics.json", json.dumps(metrics, indent=1, allow_nan=False))
+    if not alignment.frame.crs:
+        yield Note(text="the map is not georeferenced: the photos carry no usable positions", warning=True)
+    yield 3, 3
+    return metrics
+
+
+def _times(clock: Clock) -> dict[str, Any]:
+    memory = peak_memory_mb()
+    return {
+        "seconds": {**clock.seconds, "total": round(clock.total(), 3)},
+        "cpu_seconds": round(cpu_seconds(), 3),
+        "peak_memory_mb": None if memory is None else round(memory, 1),
+    }
