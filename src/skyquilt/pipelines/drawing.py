@@ -18,7 +18,7 @@ from skyquilt.raster.boundary import inside as inside_polygon
 from skyquilt.raster.boundary import read_boundary
 from skyquilt.render.compose import Composed, Composer, PhotoPixels
 from skyquilt.render.exposure import NEUTRAL, Exposure
-from skyquilt.render.views import STEP, View, grid_of, make_views, native_gsd
+from skyquilt.imaging.views import STEP, View, grid_of, make_views, native_gsd
 from skyquilt.run.clock import Steps
 from skyquilt.run.executor import in_order
 from skyquilt.run.store import Store, digest

@@ -17,7 +17,7 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment
 from skyquilt.raster import vector
 from skyquilt.raster.atomic import write_text
-from skyquilt.render.views import View
+from skyquilt.imaging.views import View
 
 MOST_POINTS = 20000
 """Tie points written to reconstruction.json."""

@@ -11,7 +11,7 @@ from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.render.blend import Blend, Layer
 from skyquilt.render.exposure import NEUTRAL, Exposure, corner_radius2
-from skyquilt.render.views import STEP, Nodes, View, cut, densify, inside, window_nodes
+from skyquilt.imaging.views import STEP, Nodes, View, cut, densify, inside, window_nodes
 
 PhotoPixels = Callable[[int], NDArray]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""

@@ -15,7 +15,7 @@ from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
 from skyquilt.model.surface import Surface
-from skyquilt.render.views import View, project_nodes
+from skyquilt.imaging.views import View, project_nodes
 
 Float = NDArray[np.float32]
 

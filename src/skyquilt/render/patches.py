@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from skyquilt.model.surface import Surface
 from skyquilt.render.compose import PhotoPixels
-from skyquilt.render.views import View, inside, project_nodes
+from skyquilt.imaging.views import View, inside, project_nodes
 
 SIDE = 64
 """Pixels of a patch's side."""

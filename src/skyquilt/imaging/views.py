@@ -1,6 +1,6 @@
 """What each photo sees of the map: footprints and coarse grids of where a map pixel lies in a photo."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -156,8 +156,3 @@ def grid_of(views: Sequence[View], gsd: float, bounds: tuple[float, float, float
     width = max(1, int(np.ceil((bounds[2] - west) / gsd)))
     height = max(1, int(np.ceil((north - bounds[1]) / gsd)))
     return Grid(west=float(west), north=float(north), gsd=gsd, width=width, height=height)
-
-
-def gains_at(gains: Mapping[int, NDArray[np.float32]], photo: int, bands: int) -> NDArray[np.float32]:
-    """The gain per band of a photo; ones where none was estimated."""
-    return gains.get(photo, np.ones(bands, np.float32))

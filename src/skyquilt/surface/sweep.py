@@ -1,0 +1,212 @@
+"""Heights where tie points are few: a plane sweep over the ground, from the two best views of every place.
+
+The ground is shown twice, by its most vertical view and by the next one that sees it from elsewhere, at many
+heights about the surface known so far; the height at which the two pictures agree is kept. Coarse pictures find
+canopies and roofs, finer ones polish. In the manner of Collins (1996), on a map grid instead of an image.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.imaging.views import STEP, Nodes, View, densify, inside, project_nodes
+from skyquilt.model.raster import Grid
+from skyquilt.model.surface import Surface
+
+Float = NDArray[np.float32]
+GreyPicture = Callable[[int, int], NDArray[np.uint8]]
+"""Grey picture (h, w) of a photo (index), shrunken so that its longest side is the px given."""
+TILE = 256
+"""Pixels of a piece swept at a time."""
+MARGIN = 16
+"""Pixels that neighbouring pieces share."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sweep:
+    """Coarse-to-fine plane sweep."""
+
+    sides: tuple[int, ...] = (250, 500)
+    """Longest side in px of the pictures of each pass."""
+    below: float = 0.08
+    """Depth searched below the known surface in the first pass, as a share of the flying height."""
+    above: float = 0.35
+    """Height searched above it: trees and buildings that gave no tie points."""
+    window: int = 9
+    """Side in px of the window that must agree."""
+    agree: float = 0.55
+    """Correlation from which a height is believed."""
+    smoothing_cells: float = 1.0
+    """Standard deviation of the final Gaussian in cells."""
+    version: ClassVar[int] = 1
+
+    def __call__(self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture) -> Surface:
+        """The surface with the heights found; where pictures do not agree it stays as it was."""
+        height = float(np.median([v.pose.map_C[2] for v in views]) - np.median(surface.z))
+        if len(views) < 2 or height <= 0:
+            return surface
+        for number, side in enumerate(self.sides):
+            gsd = float(np.median([height / v.camera.focal * max(v.camera.width, v.camera.height) for v in views])) / side
+            low, high = (-self.below * height, self.above * height) if number == 0 else (-3.0, 3.0)
+            surface = self._pass(surface, views, grid, grey, side, gsd, height, (low, high), relative=number > 0)
+        return surface
+
+    def _pass(
+        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, side: int, gsd: float,
+        height: float, span: tuple[float, float], *, relative: bool,
+    ) -> Surface:  # fmt: skip
+        """One pass; `span` in m, or in steps of about one pixel of disparity when `relative`."""
+        w, s, e, n = grid.bounds
+        work = Grid(west=w, north=n, gsd=gsd, width=int((e - w) / gsd) + 1, height=int((n - s) / gsd) + 1)
+        z = np.zeros((work.height, work.width), np.float32)
+        trust = np.zeros_like(z)
+        for row in range(0, work.height, TILE):
+            for column in range(0, work.width, TILE):
+                piece = self._piece(surface, views, work, grey, side, height, span, relative, row, column)
+                h, c = min(TILE, work.height - row), min(TILE, work.width - column)
+                inner = (slice(row, row + h), slice(column, column + c))
+                z[inner], trust[inner] = piece[0][:h, :c], piece[1][:h, :c]
+        return self._fused(surface, work, z, trust)
+
+    def _piece(
+        self, surface: Surface, views: Sequence[View], work: Grid, grey: GreyPicture, side: int, height: float,
+        span: tuple[float, float], relative: bool, row: int, column: int,
+    ) -> tuple[Float, Float]:  # fmt: skip
+        """Heights and trust (TILE, TILE) of a piece."""
+        full = TILE + 2 * MARGIN
+        cells = np.arange(-1, full // STEP + 1) + 0.5
+        x, y = np.meshgrid(
+            work.x(column - MARGIN + STEP * cells - 0.5), work.y(row - MARGIN + STEP * cells - 0.5)
+        )
+        ground = surface.at(x, y)
+        box = (float(x[0, 0]), float(y[-1, 0]), float(x[0, -1]), float(y[0, 0]))
+        nodes = [project_nodes(v, x, y, ground) for v in views if v.overlaps(box)]
+        first, second, step = pair_labels([n for n in nodes if n.seen.any()], work.gsd)
+        inner = slice(MARGIN, MARGIN + TILE)
+        start = densify(ground, full, full)
+        if first is None or second is None:
+            return start[inner, inner], np.zeros((TILE, TILE), np.float32)
+        low, high = (span[0] * step, span[1] * step) if relative else span
+        offsets = np.arange(low, high + 0.5 * step, step).astype(np.float32)
+        scores = np.stack(
+            [
+                _agreement(
+                    _shown(first, views, x, y, ground + dz, grey, side, full),
+                    _shown(second, views, x, y, ground + dz, grey, side, full),
+                    self.window,
+                )[inner, inner]
+                for dz in offsets
+            ]
+        )
+        best, trust = _summit(scores, offsets)
+        return start[inner, inner] + best, np.where(trust > self.agree, trust, 0).astype(np.float32)
+
+    def _fused(self, surface: Surface, work: Grid, z: Float, trust: Float) -> Surface:
+        """Medians of believed heights in cells of four pixels; gaps keep the surface known so far."""
+        cell = 4
+        rows, columns = -(-work.height // cell), -(-work.width // cell)
+        coarse = work.coarser(cell)
+        gx, gy = np.meshgrid(coarse.x(np.arange(columns)), coarse.y(np.arange(rows)))
+        known = surface.at(gx, gy)
+        pad = ((0, rows * cell - work.height), (0, columns * cell - work.width))
+        blocks = [
+            np.pad(a, pad).reshape(rows, cell, columns, cell).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
+            for a in (z, trust)
+        ]
+        believed = np.where(blocks[1] > 0, blocks[0], np.nan)
+        number = (blocks[1] > 0).sum(2)
+        with np.errstate(all="ignore"):
+            middle = np.where(number >= cell * cell // 3, _nanmedian(believed), np.nan)
+        weight = np.where(np.isfinite(middle), 1.0, 0.05).astype(np.float32)
+        value = np.where(np.isfinite(middle), middle, known).astype(np.float32)
+        value = cv2.medianBlur(value, 5)
+        spread = self.smoothing_cells
+        total = cv2.GaussianBlur(weight, (0, 0), spread)
+        smooth = cv2.GaussianBlur(value * weight, (0, 0), spread) / total
+        x0, y0 = float(coarse.x(np.array(0))), float(coarse.y(np.array(rows - 1)))
+        return Surface(z=np.ascontiguousarray(smooth[::-1]), x0=x0, y0=y0, cell=coarse.gsd, source="tie points and sweep")
+
+
+def _nanmedian(values: Float) -> Float:
+    """Median over the last axis, NaN ignored; sorting puts NaN last."""
+    ordered = np.sort(values, axis=-1)
+    number = np.isfinite(values).sum(-1)
+    index = np.maximum(number - 1, 0) // 2
+    return np.asarray(np.take_along_axis(ordered, index[..., None], -1)[..., 0])
+
+
+def pair_labels(
+    nodes: Sequence[Nodes], gsd: float
+) -> tuple[NDArray[np.int32] | None, NDArray[np.int32] | None, float]:
+    """Per node the most vertical photo and the most vertical one seen from elsewhere (-1 = none), and the step
+    in m of height that moves one picture against the other by about one pixel of gsd.
+    """
+    if len(nodes) < 2:
+        return None, None, 0.0
+    scores = np.stack([np.where(n.seen, n.score, np.float32(np.inf)) for n in nodes])
+    best = scores.argmin(0)
+    number = np.array([n.view.photo for n in nodes], np.int32)
+    centre = np.array([n.view.pose.map_C[:2] for n in nodes])
+    height = np.array([n.height for n in nodes])
+    apart = np.hypot(*(centre[:, None] - centre[None]).transpose(2, 0, 1)) / height[:, None]
+    other = np.where(apart[best].transpose(2, 0, 1) > 0.15, scores, np.float32(np.inf))
+    second = other.argmin(0)
+    have = np.isfinite(np.take_along_axis(other, second[None], 0)[0])
+    if not have.any():
+        return None, None, 0.0
+    base = float(np.median(apart[best[have], second[have]]))
+    first = np.where(have, number[best], -1)
+    return first, np.where(have, number[second], -1), gsd / max(base, 0.05)
+
+
+def _shown(
+    labels: NDArray[np.int32], views: Sequence[View], x: NDArray, y: NDArray, z: NDArray, grey: GreyPicture,
+    side: int, full: int,
+) -> Float:  # fmt: skip
+    """The ground at heights z as the labelled photos show it (full, full); NaN where none does."""
+    out = np.full((full, full), np.nan, np.float32)
+    dense = cv2.resize(labels.astype(np.float32), None, fx=STEP, fy=STEP, interpolation=cv2.INTER_NEAREST)
+    dense = dense[STEP : STEP + full, STEP : STEP + full]
+    for photo in np.unique(labels[labels >= 0]).tolist():
+        view = next(v for v in views if v.photo == photo)
+        n = project_nodes(view, x, y, z)
+        picture = grey(photo, side)
+        scale = picture.shape[1] / view.camera.width
+        u, v = densify(n.u, full, full), densify(n.v, full, full)
+        warped = cv2.remap(
+            picture, (u + 0.5) * scale - 0.5, (v + 0.5) * scale - 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        mine = (dense == photo) & inside(view.camera, u, v)
+        np.copyto(out, warped, where=mine, casting="unsafe")
+    return out
+
+
+def _agreement(a: Float, b: Float, window: int) -> Float:
+    """Normalised cross-correlation of two pictures in a sliding window; -1 where either is missing."""
+    missing = np.isnan(a) | np.isnan(b)
+    a, b = np.where(missing, 0, a), np.where(missing, 0, b)
+    size = (window, window)
+    stack = cv2.boxFilter(np.dstack([a, b, a * a, b * b]), cv2.CV_32F, size)
+    ab = cv2.boxFilter(a * b, cv2.CV_32F, size)
+    ma, mb = stack[..., 0], stack[..., 1]
+    va, vb = stack[..., 2] - ma * ma, stack[..., 3] - mb * mb
+    score = (ab - ma * mb) / np.sqrt(np.maximum(va, 4.0) * np.maximum(vb, 4.0))
+    near = cv2.dilate(missing.astype(np.uint8), np.ones(size, np.uint8)) > 0
+    return np.where(near, np.float32(-1), score)
+
+
+def _summit(scores: Float, offsets: Float) -> tuple[Float, Float]:
+    """Offset of the best score per pixel, refined by a parabola, and that score; 0 at the ends of the search."""
+    best = scores.argmax(0)
+    top = np.take_along_axis(scores, best[None], 0)[0]
+    inner = np.clip(best, 1, len(offsets) - 2)
+    left, mid, right = (np.take_along_axis(scores, (inner + k)[None], 0)[0] for k in (-1, 0, 1))
+    curve = left - 2 * mid + right
+    shift = np.where(curve < -1e-4, np.clip(0.5 * (left - right) / np.minimum(curve, -1e-4), -0.5, 0.5), 0)
+    step = offsets[1] - offsets[0] if len(offsets) > 1 else np.float32(0)
+    at_end = (best == 0) | (best == len(offsets) - 1)
+    return (offsets[best] + shift * step).astype(np.float32), np.where(at_end, 0, top).astype(np.float32)
