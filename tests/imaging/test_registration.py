@@ -40,7 +40,7 @@ def test_subpixel_shifts_are_found_without_bias(roughness):
     shifts = shifts_between(a, b)
     error = found(shifts) - truth
     assert all(shifts), {s.reason for s in shifts if not s}
-    assert np.median(np.hypot(*error.T)) < 0.03
+    assert np.median(np.hypot(*error.T)) < 0.04
     assert np.percentile(np.hypot(*error.T), 95) < 0.1
     assert (abs(error.mean(0)) < 0.01).all()
     for axis in (0, 1):  # neither drawn towards zero nor towards whole pixels
@@ -130,7 +130,7 @@ def test_weakest_gradient_of_a_known_pattern():
 def test_wrong_shapes_are_named():
     with pytest.raises(ValueError, match="two equal stacks"):
         shifts_between(np.zeros((2, 64, 64)), np.zeros((2, 64, 60)))
-    with pytest.raises(ValueError, match="radius 20 needs"):
+    with pytest.raises(ValueError, match="at least 80 px expected"):
         shift_between(np.zeros((64, 64)), np.zeros((64, 64)), radius=20)
     assert shifts_between(np.zeros((0, 64, 64)), np.zeros((0, 64, 64))) == []
 

@@ -21,7 +21,9 @@ def write(path, grey, *, gsd=GSD, west=WEST, north=NORTH, known=None, crs="EPSG:
     height, width = grey.shape
     profile = {"driver": "GTiff", "width": width, "height": height, "count": len(bands), "dtype": "uint8"}
     place = {"crs": crs, "transform": from_origin(west, north, gsd, gsd)}
-    with rasterio.open(path, "w", **profile, **place, photometric="RGB", tiled=True) as out:
+    with rasterio.open(
+        path, "w", **profile, **place, photometric="RGB", alpha="YES" if known is not None else "NO"
+    ) as out:
         out.write(np.array(bands))
     return path
 

@@ -26,9 +26,8 @@ TABLE = {
 @pytest.mark.parametrize("method", TABLE)
 def test_table_6_1_comes_out(method):
     found, spat, corr, total = TABLE[method]
-    assert 100 * lambda_spat_of_table(REFERENCE, found) == pytest.approx(
-        spat, abs=0.12
-    )  # it prints 97.01 as 96.9
+    # the table prints 97.01 as 96.9
+    assert 100 * lambda_spat_of_table(REFERENCE, found) == pytest.approx(spat, abs=0.12)
     assert lambda_quality(spat, corr) == pytest.approx(total, abs=0.06)
     assert 0.98 < lambda_spat(REFERENCE, found) < 1  # (6.1) itself is another figure
 
