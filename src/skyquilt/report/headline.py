@@ -92,7 +92,7 @@ def area(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
     value = number(m.get("area_m2"))
     if value is None and data.preview is not None and data.bounds is not None and data.preview.size:
         west, south, east, north = data.bounds
-        value = float((data.preview[::2, ::2, 3] > 127).mean()) * (east - west) * (north - south)
+        value = float((data.preview[::4, ::4, 3] > 127).mean()) * (east - west) * (north - south)
     if value is None:
         return None
     if not data.metric:

@@ -1,5 +1,7 @@
 """Rasters as data URIs, colour scales, and the outline of what is not transparent."""
 
+import struct
+import zlib
 from base64 import b64encode
 
 import cv2
@@ -20,18 +22,37 @@ def shrunk(image: NDArray, longest: int, interpolation: int = cv2.INTER_AREA) ->
     return cv2.resize(image, size, interpolation=interpolation)
 
 
-def jpeg_uri(rgb: NDArray, quality: int = 82) -> str:
-    """A JPEG of (H, W, 3) uint8."""
-    data = simplejpeg.encode_jpeg(np.ascontiguousarray(rgb), quality=quality, colorspace="RGB")
+def jpeg_uri(rgba: NDArray, quality: int = 80) -> str:
+    """A JPEG of (H, W, 4) uint8, its alpha left out."""
+    data = simplejpeg.encode_jpeg(
+        np.ascontiguousarray(rgba), quality=quality, colorspace="RGBX", colorsubsampling="420", fastdct=True
+    )
     return "data:image/jpeg;base64," + b64encode(data).decode()
 
 
-def png_uri(rgba: NDArray) -> str:
-    """A PNG of (H, W, 4) uint8 RGBA."""
-    ok, data = cv2.imencode(".png", cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA), (cv2.IMWRITE_PNG_COMPRESSION, 4))
-    if not ok:
-        raise ValueError(f"cannot encode a raster of shape {rgba.shape}")
-    return "data:image/png;base64," + b64encode(data.tobytes()).decode()
+def png_uri(index: NDArray[np.uint8], colours: NDArray[np.uint8]) -> str:
+    """A PNG of (H, W) indices into colours (n <= 256, 4) RGBA."""
+    height, width = index.shape
+    rows = np.zeros((height, width + 1), np.uint8)  # each row starts with its filter: none
+    rows[:, 1:] = index
+    chunks = (
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)),
+        (b"PLTE", np.ascontiguousarray(colours[:, :3]).tobytes()),
+        (b"tRNS", np.ascontiguousarray(colours[:, 3]).tobytes()),
+        (b"IDAT", zlib.compress(rows.tobytes(), 5)),
+        (b"IEND", b""),
+    )
+    data = b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        for name, body in chunks
+    )
+    return "data:image/png;base64," + b64encode(data).decode()
+
+
+def thinned(values: NDArray, most: int) -> NDArray:
+    """Every n-th row and column, so that neither side has more than about so many."""
+    step = max(1, -(-max(values.shape[:2]) // most))
+    return values[::step, ::step]
 
 
 def scale(values: NDArray) -> NDArray[np.uint8]:
@@ -57,15 +78,19 @@ def outline(alpha: NDArray[np.uint8], *, tolerance: float = 0.7, limit: int = 20
     return [cv2.approxPolyDP(r, tolerance, True)[:, 0, :] - 0.5 for r in rings]
 
 
-def shaded(z: NDArray, cell: float) -> tuple[NDArray[np.uint8], float, float]:
-    """RGBA of heights, lit from the north-west, and the heights at both ends of the colour scale."""
+def shaded(z: NDArray, cell: float) -> NDArray[np.uint8]:
+    """RGBA (h, w, 4) of heights in m, lit from the north-west; transparent where not finite."""
     valid = np.isfinite(z)
-    low, high = (float(v) for v in np.percentile(z[valid], [1, 99]))
-    if high - low < 1e-6:
-        low, high = low - 0.5, high + 0.5
+    low, high = height_range(z)
     filled = np.where(valid, z, low).astype(np.float32)
     east = cv2.Sobel(filled, cv2.CV_32F, 1, 0, scale=0.125 / cell)
     south = cv2.Sobel(filled, cv2.CV_32F, 0, 1, scale=0.125 / cell)
     light = np.clip(1 + 0.45 * (east + south) / np.sqrt(1 + east**2 + south**2), 0.45, 1.25)
     rgb = np.clip(scale((filled - low) / (high - low)) * light[..., None], 0, 255).astype(np.uint8)
-    return np.dstack([rgb, np.where(valid, 255, 0).astype(np.uint8)]), low, high
+    return np.dstack([rgb, np.where(valid, 255, 0).astype(np.uint8)])
+
+
+def height_range(z: NDArray) -> tuple[float, float]:
+    """Both ends of the colour scale for heights of which some are finite."""
+    low, high = (float(v) for v in np.percentile(z[np.isfinite(z)], [1, 99]))
+    return (low, high) if high - low > 1e-6 else (low - 0.5, high + 0.5)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skyquilt.report import images
 from skyquilt.report.ground import Ground
-from skyquilt.report.input import ReportInput, SeamMark, Shot
+from skyquilt.report.input import Bounds, ReportInput, SeamMark, Shot
 from skyquilt.report.numbers import nice
 from skyquilt.report.parts import LegendItem
 from skyquilt.report.svg import arrows, dots, path, polyline
@@ -52,24 +52,30 @@ def layers_of(data: ReportInput, ground: Ground) -> tuple[Layer, ...]:
 
 
 def mosaic(data: ReportInput, ground: Ground) -> Layer | None:
-    """The map's pixels as JPEG, clipped to where there are any."""
+    """The map's pixels."""
     if data.preview is None or data.bounds is None or not data.preview.size:
         return None
     small = images.shrunk(data.preview, PREVIEW_PX)
-    height, width = small.shape[:2]
-    west, south, east, north = data.bounds
+    return Layer(id="mosaic", label="Mosaic", shape=clipped("mosaic", small, data.bounds, ground), on=True)
+
+
+def clipped(name: str, rgba: NDArray, bounds: Bounds, ground: Ground, *, within: str = "") -> Markup:
+    """A raster as JPEG, cut along the outline of its alpha and along another clip path."""
+    height, width = rgba.shape[:2]
+    west, south, east, north = bounds
     metres = np.array([(east - west) / width, (north - south) / height])
     corner = ground.xy([[west, north]])
-    rings = [ring * metres + corner for ring in images.outline(small[..., 3])]
-    shape = Markup(
-        '<clipPath id="mapped"><path clip-rule="evenodd" d="{}"/></clipPath>'
-        '<g id="mosaic" clip-path="url(#mapped)"><image {} href="{}"/></g>'
+    rings = [ring * metres + corner for ring in images.outline(rgba[..., 3])]
+    return Markup(
+        '<clipPath id="{0}-rim"><path clip-rule="evenodd" d="{1}"/></clipPath>'
+        '<g id="{0}" clip-path="url(#{0}-rim)"><g{4}><image {2} href="{3}"/></g></g>'
     ).format(
+        name,
         "".join(polyline(ring, ground.decimals, close=True) for ring in rings),
-        ground.box(data.bounds),
-        images.jpeg_uri(small[..., :3]),
+        ground.box(bounds),
+        Markup(images.jpeg_uri(rgba)),
+        Markup(' clip-path="url(#{})"').format(within) if within else "",
     )
-    return Layer(id="mosaic", label="Mosaic", shape=shape, on=True)
 
 
 def overlap(data: ReportInput, ground: Ground) -> Layer | None:
@@ -79,9 +85,9 @@ def overlap(data: ReportInput, ground: Ground) -> Layer | None:
     colours = view_colours()
     table = np.zeros((MOST_VIEWS + 1, 4), np.uint8)
     table[1:, :3], table[1:, 3] = colours, 255
-    small = images.shrunk(np.clip(data.views, 0, MOST_VIEWS).astype(np.uint8), VIEWS_PX, cv2.INTER_NEAREST)
+    index = np.clip(images.thinned(np.asarray(data.views), VIEWS_PX), 0, MOST_VIEWS).astype(np.uint8)
     shape = Markup('<image id="overlap" {} href="{}"/>').format(
-        ground.box(data.views_bounds), images.png_uri(table[small])
+        ground.box(data.views_bounds), Markup(images.png_uri(index, table))
     )
     legend = tuple(
         LegendItem(colour=images.css(colours[k]), text=f"{k + 1}" if k + 1 < MOST_VIEWS else f"{MOST_VIEWS} or more")
@@ -101,8 +107,8 @@ def surface(data: ReportInput, ground: Ground) -> Layer | None:
     if z is None or bounds is None or not np.isfinite(z).any():
         return None
     small = images.shrunk(np.asarray(z, np.float32), SURFACE_PX, cv2.INTER_NEAREST)
-    rgba, _, _ = images.shaded(small, (bounds[2] - bounds[0]) / small.shape[1])
-    shape = Markup('<image id="heights" {} href="{}"/>').format(ground.box(bounds), images.png_uri(rgba))
+    rgba = images.shaded(small, (bounds[2] - bounds[0]) / small.shape[1])
+    shape = clipped("heights", rgba, bounds, ground, within="" if data.preview is None else "mosaic-rim")
     return Layer(id="heights", label="Heights", shape=shape)
 
 

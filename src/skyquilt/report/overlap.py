@@ -6,9 +6,9 @@ from skyquilt.report import images
 from skyquilt.report.ground import Ground, picture, use
 from skyquilt.report.input import ReportInput
 from skyquilt.report.layers import MOST_VIEWS, Layer, view_colours
-from skyquilt.report.numbers import fixed
+from skyquilt.report.numbers import fixed, nice
 from skyquilt.report.parts import Block, Figure, Missing, Section
-from skyquilt.report.svg import colour_bar, columns
+from skyquilt.report.svg import bars, colour_bar, columns
 
 DATUMS = {
     "takeoff": "above the take-off point",
@@ -26,14 +26,29 @@ def overlap_section(data: ReportInput, ground: Ground | None, layers: dict[str, 
         blocks = (_histogram(data.views),)
         if ground and "overlap" in layers:
             title = "Photos that see each place"
-            caption = "Single coverage is flat and unchecked; from three photos on, heights and mistakes can be controlled."
+            caption = "Single coverage is flat and unchecked; from three photos on, heights can be measured and mistakes found."
             svg = picture(ground, [use("mosaic", "faded") if "mosaic" in layers else use("overlap"), use("overlap", "haze")], title)
             blocks = (Figure(svg=svg, title=title, caption=caption, legend=layers["overlap"].legend), *blocks)
     return Section(id="overlap", title="Overlap", blocks=blocks)
 
 
+def _heights(z: np.ndarray, low: float, high: float, unit: str) -> Figure:
+    title = "Share of the cells by height"
+    step = nice(high - low, 24)
+    edges = np.arange(np.floor(low / step), np.ceil(high / step) + 1) * step
+    counts = np.histogram(z, edges)[0]
+    median = float(np.median(z))
+    svg = bars(
+        edges, counts / max(len(z), 1) * 100, title=title, x_label=f"height, {unit}", y_label="share of the cells",
+        unit="\u202f%", marks=((median, f"median {fixed(median, 1)}"),),
+    )  # fmt: skip
+    caption = "A few cells far from all others would be outliers that passed; they tear the map where they lie."
+    return Figure(svg=svg, title=title, caption=caption)
+
+
 def _histogram(views: np.ndarray) -> Figure:
-    seen = np.clip(np.asarray(views)[np.asarray(views) > 0].astype(np.int64), 1, MOST_VIEWS)
+    views = images.thinned(np.asarray(views), 1000)
+    seen = np.clip(views[views > 0].astype(np.int64), 1, MOST_VIEWS)
     shares = np.bincount(seen, minlength=MOST_VIEWS + 1)[1:] / len(seen) * 100
     enough = float(shares[2:].sum())
     title = "Share of the mapped ground by number of photos"
@@ -42,7 +57,7 @@ def _histogram(views: np.ndarray) -> Figure:
         labels, shares, [images.css(c) for c in view_colours()], title=title,
         x_label="photos that see a place", y_label="share of the ground",
     )  # fmt: skip
-    judged = "good" if enough >= 90 else "fair" if enough >= 70 else "thin"
+    judged = "good" if enough >= 90 else "fair" if enough >= 70 else "poor"
     caption = (
         f"{fixed(enough, 0)}\u202f% of the ground is seen by three photos or more: {judged} "
         "(good from 90\u202f%, fair from 70\u202f%)."
@@ -55,7 +70,7 @@ def surface_section(data: ReportInput, ground: Ground | None, layers: dict[str, 
     blocks: tuple[Block, ...] = (Missing(why="The photos were placed on a plane: there is no height surface to show."),)
     if ground and "heights" in layers and data.surface is not None and data.surface_bounds is not None:
         z = np.asarray(data.surface)[np.isfinite(data.surface)]
-        low, high = (float(v) for v in np.percentile(z, [1, 99]))
+        low, high = images.height_range(z)
         datum = DATUMS.get(data.vertical_datum, data.vertical_datum)
         stops = [images.css(c) for c in images.scale(np.linspace(0, 1, 24)[None])[0]]
         unit = ground.unit
@@ -66,7 +81,7 @@ def surface_section(data: ReportInput, ground: Ground | None, layers: dict[str, 
             f"Heights {datum}, lit from the north-west, from {fixed(z.min(), 1)} to {fixed(z.max(), 1)} {unit}. "
             "Errors here shift the map sideways, most at the photos\u2019 rims."
         )
-        blocks = (Figure(svg=svg + bar, title=title, caption=caption),)
+        blocks = (Figure(svg=svg + bar, title=title, caption=caption), _heights(z, low, high, unit))
         if z.max() - z.min() < 1e-3:
             blocks = (Missing(why=f"The surface is level at {fixed(low, 1)} {unit} {datum}: there is no relief to show."),)
     return Section(id="surface", title="Height surface", blocks=blocks)

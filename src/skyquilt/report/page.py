@@ -1,6 +1,7 @@
 """The page: sections in order, one template, one file."""
 
 import os
+import re
 from functools import cache
 from pathlib import Path
 
@@ -89,11 +90,17 @@ def attention(data: ReportInput) -> tuple[tuple[str, str], ...]:
     return tuple(found)
 
 
+def tied(words: str) -> str:
+    """Figures and their units kept on one line."""
+    return re.sub(r"(\d) (px|m|cm|s|GB|MB)\b", "\\1\u00a0\\2", words)
+
+
 @cache
 def _template() -> Template:
     environment = Environment(
         loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
+    environment.filters["tied"] = tied
     return environment.get_template("page.html.j2")
 
 

@@ -53,7 +53,7 @@ def _series(off: NDArray, unit: str) -> Figure:
     """East, north and up in order of capture, in three strips."""
     title = "Residuals in order of capture"
     stride = -(-len(off) // 1500)
-    strip = (HEIGHT + 60) / 3
+    strip = (HEIGHT + 50) / 3
     parts = []
     for k, (name, cls) in enumerate(SERIES):
         value = off[::stride, k]
@@ -68,7 +68,7 @@ def _series(off: NDArray, unit: str) -> Figure:
         xy = axes.points(np.stack([index * stride + 1.0, value[index]], 1))
         runs = np.split(xy, np.flatnonzero(np.diff(index) > 1) + 1)
         lines = path("".join(polyline(r) for r in runs), f"series {cls}") + path(dots(xy), f"points {cls}")
-        grid = axes.grid("photo" if k == 2 else "", f"{name}, {unit}", x_ticks=k == 2)
+        grid = axes.grid("photo" if k == 2 else "", f"{name}, {unit}", x_ticks=k == 2, y_parts=5)
         parts.append(Markup('<g transform="translate(0 {})">{}</g>').format(coordinate(k * strip), grid + lines))
     svg = drawing(parts, title, WIDTH, strip * 3 + 32)
     caption = "A step or a slope that lasts for many photos is a fault of the receiver or the barometer, not noise."

@@ -8,10 +8,10 @@ from skyquilt.report import images
 from skyquilt.report.input import CameraResiduals, ReportInput
 from skyquilt.report.numbers import count, decimals_of, fixed, nice
 from skyquilt.report.parts import Block, Figure, Missing, Section
-from skyquilt.report.svg import RIGHT, TOP, WIDTH, Axes, arrows, bars, coordinate, dots, drawing, path, rect, text
+from skyquilt.report.svg import BOTTOM, LEFT, RIGHT, TOP, WIDTH, Axes, arrows, bars, coordinate, dots, drawing, path, rect, text
 
 COLUMNS, ROWS = 8, 6
-FEWEST = 5
+FEWEST = 10
 """Sightings a cell of the image needs for its mean."""
 MOST_CAMERAS = 6
 CELLS = 61
@@ -48,8 +48,8 @@ def _density(residual: NDArray) -> Figure:
     title = "Residual vectors"
     rms = float(np.sqrt((residual**2).sum(1).mean()))
     reach = max(nice(3 * float(np.percentile(np.abs(residual), 95)) / 2, 1), 1e-3)
-    size = 400.0
-    axes = Axes(x=(-reach, reach), y=(reach, -reach), width=size + 56 + RIGHT, height=size + TOP + 46)
+    size = 320.0
+    axes = Axes(x=(-reach, reach), y=(reach, -reach), width=size + LEFT + RIGHT, height=size + TOP + BOTTOM)
     inside = (np.abs(residual) < reach).all(1)
     body = _points(residual[inside], axes) if inside.sum() <= 1500 else _cells(residual[inside], reach, axes, size)
     circle = Markup('<ellipse class="marker" cx="{}" cy="{}" rx="{}" ry="{}"/>').format(
@@ -57,8 +57,8 @@ def _density(residual: NDArray) -> Figure:
     )
     words = text(float(axes.px(0)), float(axes.py(-rms)) - 5, f"RMS {fixed(rms, 2)} px", "mark mid")
     svg = drawing(
-        [axes.grid("residual along the rows, px", "along the columns, px"), body, circle, words], title,
-        axes.width, axes.height,
+        [axes.grid("to the right, px", "downwards, px"), body, circle, words], title,
+        WIDTH, axes.height, (WIDTH - axes.width) / 2,
     )  # fmt: skip
     beyond = int((~inside).sum())
     outside = f" {count(beyond, 'sighting')} further out not drawn." if beyond else ""
@@ -73,11 +73,10 @@ def _points(residual: NDArray, axes: Axes) -> Markup:
 def _cells(residual: NDArray, reach: float, axes: Axes, size: float) -> Markup:
     index = np.clip(((residual + reach) / (2 * reach) * CELLS).astype(np.int64), 0, CELLS - 1)
     counts = np.bincount(index[:, 1] * CELLS + index[:, 0], minlength=CELLS * CELLS).reshape(CELLS, CELLS)
-    rgba = np.empty((CELLS, CELLS, 4), np.uint8)
-    rgba[..., :3] = images.ACCENT
-    rgba[..., 3] = 255 * np.log1p(counts) / np.log1p(counts.max())
+    index = (255 * np.log1p(counts) / np.log1p(counts.max())).astype(np.uint8)
+    colours = np.array([(*images.ACCENT, alpha) for alpha in range(256)], np.uint8)
     return Markup('<image class="cells" x="{}" y="{}" width="{}" height="{}" href="{}"/>').format(
-        coordinate(axes.left), TOP, coordinate(size), coordinate(size), images.png_uri(rgba)
+        coordinate(axes.left), TOP, coordinate(size), coordinate(size), Markup(images.png_uri(index, colours))
     )
 
 
@@ -114,15 +113,17 @@ def _field(r: CameraResiduals) -> Figure:
     length = np.linalg.norm(mean, axis=1)
     longest = float(length.max())
     step = nice(max(longest, 1e-6) / 2, 1)
-    px_per_px = 0.85 * body / COLUMNS / max(longest, 1e-6)
+    px_per_px = 0.9 * min(body / COLUMNS, height / ROWS) / max(longest, 1e-6)
     middle = at * scale + 1
     shape = arrows(middle - mean * px_per_px / 2, middle + mean * px_per_px / 2, longest=12)
     key = _key(step, step * px_per_px, height)
     svg = drawing([*frame, path(shape, "vectors"), key], title, WIDTH, height + 36)
-    left = "no distortion is left" if longest < 0.3 else "a little distortion is left" if longest < 1 else "distortion is left"
+    left = systematic(r, mean, n)
+    judged = "good" if left <= 0.15 else "fair" if left <= 0.5 else "poor"
     caption = (
-        f"{count(int(n.sum()), 'sighting')} in cells of {FEWEST} or more; the longest mean is {fixed(longest, 2)} px: "
-        f"{left} (good below 0.3 px, fair below 1). Arrows pointing in or out all round are a wrong radial distortion."
+        f"{count(int(n.sum()), 'sighting')} in cells of {FEWEST} or more. With the share of chance taken off, "
+        f"{fixed(left, 2)} px RMS are systematic: {judged} (good up to 0.15 px, fair up to 0.5). "
+        "Arrows that point in or out all round would be a wrong radial distortion."
     )
     return Figure(svg=svg, title=title, caption=caption)
 
@@ -131,6 +132,12 @@ def _key(step: float, length: float, height: float) -> Markup:
     y = height + 22
     arrow = arrows(np.array([[2.0, y]]), np.array([[2.0 + length, y]]), longest=12)
     return path(arrow, "vectors") + text(length + 12, y + 4, f"{fixed(step, decimals_of(step))} px", "tick")
+
+
+def systematic(r: CameraResiduals, mean: NDArray, n: NDArray) -> float:
+    """RMS in px of the cells' means (k, 2) beyond what residuals of this spread give by chance."""
+    chance = (r.residual_px**2).sum(1).mean() / n
+    return float(np.sqrt(max(0.0, np.average((mean**2).sum(1) - chance, weights=n))))
 
 
 def mean_field(r: CameraResiduals) -> tuple[NDArray, NDArray, NDArray]:

@@ -32,7 +32,7 @@ def seams_section(data: ReportInput, ground: Ground | None, layers: dict[str, La
 def _picture(ground: Ground, layers: dict[str, Layer], attempted: int, measured: int) -> Figure:
     title = "Displacement along the seams"
     under = [use("mosaic", "faded")] if "mosaic" in layers else []
-    svg = picture(ground, [*under, *(use("seams", c) for c in layers["seams"].styles)], title)
+    svg = picture(ground, [*under, *(use("seams", f"small {c}") for c in layers["seams"].styles)], title)
     share = measured / attempted
     stands = "enough for the figures to stand" if share >= SEAMS_MEASURED else "too few for the figures to stand"
     caption = f"{fixed(measured, 0)} of {count(attempted, 'sample')} measured ({share:.0%}): {stands} ({SEAMS_MEASURED:.0%} needed)."

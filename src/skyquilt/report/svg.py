@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from skyquilt.report.numbers import decimals_of, fixed, nice
 
 WIDTH = 520
-HEIGHT = 300
-LEFT, RIGHT, TOP, BOTTOM = 56, 14, 12, 46
+HEIGHT = 340
+LEFT, RIGHT, TOP, BOTTOM = 64, 14, 12, 46
 
 
 def coordinate(value: float, decimals: int = 1) -> str:
@@ -71,11 +71,11 @@ def rect(x: float, y: float, width: float, height: float, cls: str, fill: str = 
     )
 
 
-def drawing(content: Iterable[Markup | str], title: str, width: float = WIDTH, height: float = HEIGHT) -> Markup:
-    """An SVG element of its own."""
+def drawing(content: Iterable[Markup | str], title: str, width: float = WIDTH, height: float = HEIGHT, left: float = 0) -> Markup:
+    """An SVG element of its own; `left` px of it lie left of x = 0."""
     inner = Markup().join(content)
-    return Markup('<svg viewBox="0 0 {} {}" role="img" aria-label="{}">{}</svg>').format(
-        coordinate(width), coordinate(height), title, inner
+    return Markup('<svg viewBox="{} 0 {} {}" role="img" aria-label="{}">{}</svg>').format(
+        coordinate(-left), coordinate(width), coordinate(height), title, inner
     )
 
 
@@ -111,11 +111,11 @@ class Axes:
         pairs = np.asarray(xy, np.float64)
         return np.stack([self.px(pairs[:, 0]), self.py(pairs[:, 1])], 1)
 
-    def grid(self, x_label: str = "", y_label: str = "", *, x_ticks: bool = True, unit: str = "") -> Markup:
+    def grid(self, x_label: str = "", y_label: str = "", *, x_ticks: bool = True, unit: str = "", y_parts: float = 0) -> Markup:
         """Lines, numbers and names of both axes."""
         floor, right = self.height - self.bottom, self.width - RIGHT
         parts = []
-        for value, label in ticks(*self.y, (floor - TOP) / 42):
+        for value, label in ticks(*self.y, y_parts or (floor - TOP) / 42):
             y = float(self.py(value))
             parts += [line(self.left, y, right, y, "grid"), text(self.left - 7, y + 4, label + unit, "tick end")]
         if x_ticks:
@@ -138,6 +138,7 @@ class Axes:
 
 def ticks(low: float, high: float, parts: float) -> list[tuple[float, str]]:
     """Round values between two bounds with their labels."""
+    low, high = min(low, high), max(low, high)
     step = nice(high - low, max(2.0, parts))
     first, last = int(np.ceil(low / step - 1e-6)), int(np.floor(high / step + 1e-6))
     return [(k * step, fixed(k * step, decimals_of(step))) for k in range(first, min(last, first + 40) + 1)]
