@@ -20,11 +20,16 @@ def time_section(data: ReportInput) -> Section:
     for k, (name, value) in enumerate(stages.items()):
         y, width = k * ROW, max(0.0, value / longest * (WIDE - LEFT - 150))
         parts += [
-            text(LEFT - 10, y + 18, name, "label end"), rect(LEFT, y + 5, max(width, 1), ROW - 10, "bar"),
+            text(LEFT - 10, y + 18, name, "label end"),
+            rect(LEFT, y + 5, max(width, 1), ROW - 10, "bar"),
             text(LEFT + max(width, 1) + 8, y + 18, f"{seconds(value)}  ({value / whole:.0%})", "tick"),
-        ]  # fmt: skip
+        ]
     title = "Time per stage"
     rest = whole - sum(stages.values())
-    caption = f"{seconds(whole)} in all." + (f" {seconds(rest)} between the stages." if rest > 0.05 * whole else "")
-    figure = Figure(svg=drawing(parts, title, WIDE, len(stages) * ROW), title=title, caption=caption, wide=True)
+    caption = f"{seconds(whole)} in all." + (
+        f" {seconds(rest)} between the stages." if rest > 0.05 * whole else ""
+    )
+    figure = Figure(
+        svg=drawing(parts, title, WIDE, len(stages) * ROW), title=title, caption=caption, wide=True
+    )
     return Section(id="time", title=title, blocks=(figure,))

@@ -62,7 +62,11 @@ def ground_of(data: ReportInput) -> Ground | None:
     corners = [np.reshape(b, (2, 2)) for b in (data.bounds, data.views_bounds, data.surface_bounds) if b][:1]
     centres = [np.reshape(s.xyz, (1, 3))[:, :2] for s in data.shots]
     marks = [np.array([[m.x, m.y]]) for m in data.seams] if not corners else []
-    points = np.concatenate([*corners, *centres, *marks], dtype=np.float64) if corners or centres or marks else None
+    points = (
+        np.concatenate([*corners, *centres, *marks], dtype=np.float64)
+        if corners or centres or marks
+        else None
+    )
     points = points[np.isfinite(points).all(1)] if points is not None else np.zeros((0, 2))
     if not len(points):
         return None
@@ -75,7 +79,7 @@ def ground_of(data: ReportInput) -> Ground | None:
 
 def use(layer: str, cls: str = "") -> Markup:
     """A layer of the page's definitions, drawn in the style of a class."""
-    return Markup('<use href="#{}" class="{}"/>').format(layer, cls)
+    return Markup('<use href="#layer-{}" class="{}"/>').format(layer, cls)
 
 
 def fit(ground: Ground, width: float, shortest: float, tallest: float) -> tuple[float, str]:

@@ -24,7 +24,20 @@ def tiles(data: ReportInput) -> tuple[Tile, ...]:
 
 def _tiles(data: ReportInput) -> Iterator[Tile]:
     m = data.metrics
-    makers = (photos, georeference, blocks, gsd, area, reprojection, gps, leave_one_out, seam, checks, time, memory)
+    makers = (
+        photos,
+        georeference,
+        blocks,
+        gsd,
+        area,
+        reprojection,
+        gps,
+        leave_one_out,
+        seam,
+        checks,
+        time,
+        memory,
+    )
     for make in makers:
         if tile := make(m, data):
             yield tile
@@ -37,23 +50,31 @@ def photos(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         return None
     share = used / total
     return Tile(
-        label="Photos used", value=f"{fixed(used, 0)} of {fixed(total, 0)}", anchor="rejected",
+        label="Photos used",
+        value=f"{fixed(used, 0)} of {fixed(total, 0)}",
+        anchor="rejected",
         verdict="good" if share >= 0.95 else "fair" if share >= 0.8 else "poor",
         says="Every photo left out may leave a gap. Good from 95\u202f%, fair from 80\u202f%.",
-    )  # fmt: skip
+    )
 
 
 def georeference(m: Mapping[str, Any], data: ReportInput) -> Tile:
     """Where on Earth."""
     if not data.crs:
         return Tile(
-            label="Coordinates", value="not georeferenced", verdict="poor", anchor="map",
+            label="Coordinates",
+            value="not georeferenced",
+            verdict="poor",
+            anchor="map",
             says="Nothing says where on Earth this is. Photos with GPS, geo.txt or control points would.",
-        )  # fmt: skip
+        )
     return Tile(
-        label="Coordinates", value=data.crs, verdict="good", anchor="map",
+        label="Coordinates",
+        value=data.crs,
+        verdict="good",
+        anchor="map",
         says=f"{crs_name(data.crs)}The map lies where a GIS expects it.",
-    )  # fmt: skip
+    )
 
 
 def crs_name(crs: str) -> str:
@@ -72,8 +93,12 @@ def blocks(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
     says = "All photos hang together by what they show. One block is good."
     if len(sizes) > 1:
         listed = ", ".join(fixed(n, 0) for n in sizes[:6]) + (" \u2026" if len(sizes) > 6 else "")
-        says = f"Pieces of {listed} photos, each placed by its own GPS: expect steps between them. One is good."
-    return Tile(label="Blocks", value=fixed(len(sizes), 0), verdict="good" if len(sizes) == 1 else "fair", says=says)
+        says = (
+            f"Pieces of {listed} photos, each placed by its own GPS: expect steps between them. One is good."
+        )
+    return Tile(
+        label="Blocks", value=fixed(len(sizes), 0), verdict="good" if len(sizes) == 1 else "fair", says=says
+    )
 
 
 def gsd(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
@@ -83,7 +108,9 @@ def gsd(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         return None
     if not data.metric:
         return Tile(label="Pixel size", value=significant(value), unit="units", says="The scale is unknown.")
-    says = f"Side of one map pixel on the ground; things of about {fixed(value * 300, 0)} cm can be told apart."
+    says = (
+        f"Side of one map pixel on the ground; things of about {fixed(value * 300, 0)} cm can be told apart."
+    )
     return Tile(label="Ground sampling distance", value=significant(value * 100), unit="cm", says=says)
 
 
@@ -99,9 +126,11 @@ def area(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         return Tile(label="Area", value=significant(value), unit="square units", says="The scale is unknown.")
     large = value >= 1e4
     return Tile(
-        label="Area", value=fixed(value / 1e4, 2) if large else fixed(value, 0), unit="ha" if large else "m\u00b2",
+        label="Area",
+        value=fixed(value / 1e4, 2) if large else fixed(value, 0),
+        unit="ha" if large else "m\u00b2",
         says="Ground the map covers, holes left out.",
-    )  # fmt: skip
+    )
 
 
 def reprojection(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
@@ -115,9 +144,14 @@ def reprojection(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
     behind = f" over {count(points, 'tie point')}" if points else ""
     also = f", RMS {fixed(rms, 2)}" if mean is not None and rms is not None else ""
     return Tile(
-        label="Reprojection error", value=fixed(shown, 2), unit="px", anchor="residuals", verdict=verdict(shown, 1, 2),
-        says=f"Mean distance between a point as seen and as computed{behind}{also}. Good up to 1 px, fair up to 2.",
-    )  # fmt: skip
+        label="Reprojection error",
+        value=fixed(shown, 2),
+        unit="px",
+        anchor="residuals",
+        verdict=verdict(shown, 1, 2),
+        says=f"Mean distance between a point as seen and as computed{behind}{also}. Good up to 1 px, "
+        "fair up to 2.",
+    )
 
 
 def gps(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
@@ -128,10 +162,15 @@ def gps(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
     flat = float(np.hypot(x, y))
     height = f"; height {fixed(z, 2)} m" if z is not None else ""
     return Tile(
-        label="GPS residual", value=fixed(flat, 2), unit="m", anchor="positions", verdict=verdict(flat, 3, 10),
-        says=f"RMS horizontal distance of the photos from their GPS{height}. It judges the GPS more than the map: "
+        label="GPS residual",
+        value=fixed(flat, 2),
+        unit="m",
+        anchor="positions",
+        verdict=verdict(flat, 3, 10),
+        says=f"RMS horizontal distance of the photos from their GPS{height}. It judges the GPS more "
+        "than the map: "
         "up to 3 m is normal, up to 10 m poor but usable.",
-    )  # fmt: skip
+    )
 
 
 def leave_one_out(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
@@ -142,10 +181,15 @@ def leave_one_out(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
     if shown is None:
         return None
     return Tile(
-        label="GPS, leave one out", value=fixed(shown, 2), unit="m", anchor="positions", verdict=verdict(shown, 3, 10),
-        says="Each photo\u2019s GPS predicted from all the others. Close to the GPS residual means no photo bends the map "
+        label="GPS, leave one out",
+        value=fixed(shown, 2),
+        unit="m",
+        anchor="positions",
+        verdict=verdict(shown, 3, 10),
+        says="Each photo\u2019s GPS predicted from all the others. Close to the GPS residual means "
+        "no photo bends the map "
         "to itself. Good up to 3 m, fair up to 10.",
-    )  # fmt: skip
+    )
 
 
 def seam(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
@@ -161,8 +205,13 @@ def seam(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
     says = f"Typical step where two photos meet.{also} Good up to 2 px, fair up to 5."
     if share is not None and share < SEAMS_MEASURED:
         judged = "poor" if judged == "poor" else "fair"
-        says = f"Only {share:.0%} of the samples could be measured; below {SEAMS_MEASURED:.0%} the figure does not stand."
-    return Tile(label="Seam disparity", value=fixed(median, 2), unit="px", verdict=judged, anchor="seams", says=says)
+        says = (
+            f"Only {share:.0%} of the samples could be measured; below {SEAMS_MEASURED:.0%} the "
+            "figure does not stand."
+        )
+    return Tile(
+        label="Seam disparity", value=fixed(median, 2), unit="px", verdict=judged, anchor="seams", says=says
+    )
 
 
 def checks(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
@@ -175,10 +224,15 @@ def checks(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         return None
     rms = float(np.sqrt(np.mean(np.square(flat))))
     return Tile(
-        label="Check points", value=fixed(rms, 3), unit="m", anchor="control", verdict=verdict(rms, 2 * pixel, 5 * pixel),
-        says=f"RMS horizontal error at {count(len(flat), 'surveyed point')} kept out of the adjustment: the most honest "
+        label="Check points",
+        value=fixed(rms, 3),
+        unit="m",
+        anchor="control",
+        verdict=verdict(rms, 2 * pixel, 5 * pixel),
+        says=f"RMS horizontal error at {count(len(flat), 'surveyed point')} kept out of the "
+        "adjustment: the most honest "
         f"figure here. Good up to 2 pixels ({fixed(2 * pixel, 3)} m), fair up to 5.",
-    )  # fmt: skip
+    )
 
 
 def time(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
@@ -199,16 +253,20 @@ def memory(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         return None
     large = peak >= 1000
     return Tile(
-        label="Memory", value=fixed(peak / 1000 if large else peak, 2 if large else 0), unit="GB" if large else "MB",
+        label="Memory",
+        value=fixed(peak / 1000 if large else peak, 2 if large else 0),
+        unit="GB" if large else "MB",
         says="The most the run needed at any moment.",
-    )  # fmt: skip
+    )
 
 
 def summary(data: ReportInput) -> str:
     """The run in one sentence."""
     m = data.metrics
     used, total = number(m.get("photos_used")), number(m.get("photos_total"))
-    words = [f"{fixed(used, 0)} of {count(total, 'photo')}" if used is not None and total is not None else "Photos"]
+    words = [
+        f"{fixed(used, 0)} of {count(total, 'photo')}" if used is not None and total is not None else "Photos"
+    ]
     if n := len(items(m.get("blocks"))):
         words.append(f"in {'one block' if n == 1 else count(n, 'block')}")
     if method := m.get("method"):
@@ -218,5 +276,3 @@ def summary(data: ReportInput) -> str:
         words.append(f"at {significant(pixel * 100)} cm per pixel")
     place = f"georeferenced in {data.crs}" if data.crs else "not georeferenced"
     return " ".join(words) + f", {place}."
-
-

@@ -59,7 +59,7 @@ def scale(values: NDArray) -> NDArray[np.uint8]:
     """Colours (..., 3) RGB of values in [0, 1] on the sequential scale."""
     index = np.clip(np.nan_to_num(values) * 255, 0, 255).astype(np.uint8)
     bgr = cv2.applyColorMap(np.atleast_2d(index), SEQUENTIAL)
-    return np.ascontiguousarray(bgr[..., ::-1]).reshape(*index.shape, 3)
+    return np.ascontiguousarray(bgr[..., ::-1], np.uint8).reshape(*index.shape, 3)
 
 
 def css(rgb: NDArray) -> str:
@@ -67,15 +67,17 @@ def css(rgb: NDArray) -> str:
     return "#" + "".join(f"{int(c):02x}" for c in rgb)
 
 
-def outline(alpha: NDArray[np.uint8], *, tolerance: float = 0.7, limit: int = 200) -> list[NDArray[np.float64]]:
-    """Rings (k, 2) in px (corners of the image at 0 and its size) around all that is not transparent, holes too.
+def outline(
+    alpha: NDArray[np.uint8], *, tolerance: float = 0.7, limit: int = 200
+) -> list[NDArray[np.float64]]:
+    """Rings (k, 2) in px (the image spans 0 to its size) around all that is not transparent, and around holes.
 
     At most `limit` rings, the largest ones.
     """
     solid = cv2.copyMakeBorder((alpha > 127).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT)
     rings = cv2.findContours(solid, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)[0]
     rings = sorted((r for r in rings if len(r) > 2), key=cv2.contourArea, reverse=True)[:limit]
-    return [cv2.approxPolyDP(r, tolerance, True)[:, 0, :] - 0.5 for r in rings]
+    return [np.float64(1) * cv2.approxPolyDP(r, tolerance, True)[:, 0, :] - 0.5 for r in rings]
 
 
 def shaded(z: NDArray, cell: float) -> NDArray[np.uint8]:

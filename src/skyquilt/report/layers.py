@@ -29,7 +29,7 @@ class Layer:
     """What can be switched on and off over the map."""
 
     id: str
-    """Id of its definition."""
+    """Its definition carries the id `layer-...`."""
     label: str
     """Words on its switch."""
     shape: Markup
@@ -45,9 +45,15 @@ class Layer:
 def layers_of(data: ReportInput, ground: Ground) -> tuple[Layer, ...]:
     """All layers there are data for, from below to above."""
     found = (
-        mosaic(data, ground), surface(data, ground), overlap(data, ground), footprints(data.shots, ground),
-        flight(data.shots, ground), gps(data.shots, ground), centres(data.shots, ground), seams(data.seams, ground),
-    )  # fmt: skip
+        mosaic(data, ground),
+        surface(data, ground),
+        overlap(data, ground),
+        footprints(data.shots, ground),
+        flight(data.shots, ground),
+        gps(data.shots, ground),
+        centres(data.shots, ground),
+        seams(data.seams, ground),
+    )
     return tuple(layer for layer in found if layer)
 
 
@@ -68,7 +74,7 @@ def clipped(name: str, rgba: NDArray, bounds: Bounds, ground: Ground, *, within:
     rings = [ring * metres + corner for ring in images.outline(rgba[..., 3])]
     return Markup(
         '<clipPath id="{0}-rim"><path clip-rule="evenodd" d="{1}"/></clipPath>'
-        '<g id="{0}" clip-path="url(#{0}-rim)"><g{4}><image {2} href="{3}"/></g></g>'
+        '<g id="layer-{0}" clip-path="url(#{0}-rim)"><g{4}><image {2} href="{3}"/></g></g>'
     ).format(
         name,
         "".join(polyline(ring, ground.decimals, close=True) for ring in rings),
@@ -86,11 +92,13 @@ def overlap(data: ReportInput, ground: Ground) -> Layer | None:
     table = np.zeros((MOST_VIEWS + 1, 4), np.uint8)
     table[1:, :3], table[1:, 3] = colours, 255
     index = np.clip(images.thinned(np.asarray(data.views), VIEWS_PX), 0, MOST_VIEWS).astype(np.uint8)
-    shape = Markup('<image id="overlap" {} href="{}"/>').format(
+    shape = Markup('<image id="layer-overlap" {} href="{}"/>').format(
         ground.box(data.views_bounds), Markup(images.png_uri(index, table))
     )
     legend = tuple(
-        LegendItem(colour=images.css(colours[k]), text=f"{k + 1}" if k + 1 < MOST_VIEWS else f"{MOST_VIEWS} or more")
+        LegendItem(
+            colour=images.css(colours[k]), text=f"{k + 1}" if k + 1 < MOST_VIEWS else f"{MOST_VIEWS} or more"
+        )
         for k in range(MOST_VIEWS)
     )
     return Layer(id="overlap", label="Overlap", shape=shape, styles=("haze",), legend=legend)
@@ -117,16 +125,15 @@ def footprints(shots: Sequence[Shot], ground: Ground) -> Layer | None:
     if not any(len(s.footprint) > 2 for s in shots):
         return None
     outlines = "".join(f'<path d="{_outline(s.footprint, ground)}"/>' for s in shots[:MOST_SHOTS])
-    shape = Markup('<g id="footprints">{}</g>').format(Markup(outlines))
+    shape = Markup('<g id="layer-footprints">{}</g>').format(Markup(outlines))
     return Layer(id="footprints", label="Footprints", shape=shape, styles=("footprints",))
 
 
 def _outline(footprint: NDArray, ground: Ground) -> str:
     if len(footprint) < 3 or not np.isfinite(footprint).all():
         return ""
-    ring = ground.xy(footprint).astype(np.float32)
-    ring = cv2.approxPolyDP(ring[:, None], ground.diagonal / 1500, True)[:, 0]
-    return polyline(ring, ground.decimals, close=True)
+    ring = ground.xy(footprint).astype(np.float32)[:, None]
+    return polyline(cv2.approxPolyDP(ring, ground.diagonal / 1500, True)[:, 0], ground.decimals, close=True)
 
 
 def placed(shots: Sequence[Shot]) -> NDArray[np.float64]:
@@ -145,7 +152,7 @@ def flight(shots: Sequence[Shot], ground: Ground) -> Layer | None:
     xyz = xyz[np.isfinite(xyz).all(1)]
     if len(xyz) < 2:
         return None
-    shape = Markup('<path id="flight" d="{}"/>').format(polyline(ground.xy(xyz), ground.decimals))
+    shape = Markup('<path id="layer-flight" d="{}"/>').format(polyline(ground.xy(xyz), ground.decimals))
     return Layer(id="flight", label="Flight path", shape=shape, styles=("casing", "flight"), on=True)
 
 
@@ -161,12 +168,18 @@ def centres(shots: Sequence[Shot], ground: Ground) -> Layer | None:
     for k, block in enumerate(kinds[: last + 1].tolist()):
         member = known & ((blocks == block) if k < last else np.isin(blocks, kinds[last:]))
         shapes.append(path(dots(ground.xy(xyz[member]), ground.decimals), f"b{k}"))
-        legend.append(LegendItem(colour=BLOCK_COLOURS[k], text=f"block {block + 1}" if k < last else "other blocks"))
-    shape = Markup('<g id="centres">{}</g>').format(Markup().join(shapes))
+        legend.append(
+            LegendItem(colour=BLOCK_COLOURS[k], text=f"block {block + 1}" if k < last else "other blocks")
+        )
+    shape = Markup('<g id="layer-centres">{}</g>').format(Markup().join(shapes))
     return Layer(
-        id="centres", label="Photo centres", shape=shape, styles=("dot-casing", "dots"), on=True,
+        id="centres",
+        label="Photo centres",
+        shape=shape,
+        styles=("dot-casing", "dots"),
+        on=True,
         legend=tuple(legend) if len(kinds) > 1 else (),
-    )  # fmt: skip
+    )
 
 
 def exaggeration(shots: Sequence[Shot], ground: Ground) -> float:
@@ -188,8 +201,10 @@ def gps(shots: Sequence[Shot], ground: Ground) -> Layer | None:
         return None
     factor = exaggeration(shots, ground)
     tails, off = tails[near][:MOST_SHOTS], off[near][:MOST_SHOTS]
-    shape = Markup('<path id="gps" d="{}"/>').format(
-        arrows(ground.xy(tails), ground.xy(tails + factor * off), ground.decimals, longest=ground.diagonal / 60)
+    shape = Markup('<path id="layer-gps" d="{}"/>').format(
+        arrows(
+            ground.xy(tails), ground.xy(tails + factor * off), ground.decimals, longest=ground.diagonal / 90
+        )
     )
     return Layer(id="gps", label=f"GPS to solution \u00d7{factor:g}", shape=shape, styles=("casing", "gps"))
 
@@ -203,9 +218,11 @@ def seams(marks: Sequence[SeamMark], ground: Ground) -> Layer | None:
     kind = seam_kinds(marks[::stride])
     order = (5, 0, 1, 2, 3, 4)  # the worst on top
     shapes = [path(dots(xy[kind == k], ground.decimals), f"s{k}") for k in order if (kind == k).any()]
-    shape = Markup('<g id="seams">{}</g>').format(Markup().join(shapes))
+    shape = Markup('<g id="layer-seams">{}</g>').format(Markup().join(shapes))
     legend = tuple(LegendItem(colour=c, text=t) for c, t in zip(SEAM_COLOURS, SEAM_LABELS, strict=True))
-    return Layer(id="seams", label="Seam samples", shape=shape, styles=("dot-casing", "dots"), legend=legend)
+    return Layer(
+        id="seams", label="Seam samples", shape=shape, styles=("fine dot-casing", "fine dots"), legend=legend
+    )
 
 
 def disparities(marks: Sequence[SeamMark]) -> NDArray[np.float64]:

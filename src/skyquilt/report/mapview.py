@@ -42,7 +42,9 @@ def map_view(data: ReportInput, ground: Ground, layers: Sequence[Layer]) -> MapV
     height, transform = fit(ground, MAP_WIDTH, 400, 720)
     scale = min(MAP_WIDTH / ground.width, height / ground.height)
     world = [
-        Markup('<g class="layer" id="on-{}">{}</g>').format(y.id, Markup().join(use(y.id, c) for c in y.styles))
+        Markup('<g class="layer" id="on-{}">{}</g>').format(
+            y.id, Markup().join(use(y.id, c) for c in y.styles)
+        )
         for y in layers
     ]
     return MapView(
@@ -62,7 +64,12 @@ def facts(data: ReportInput, ground: Ground) -> str:
     """What the script needs, safe inside a script element."""
     west, _, _, north = ground.bounds
     shots = [
-        [k, s.name, *ground.xy(np.reshape(s.xyz, (1, 3)))[0].round(ground.decimals).tolist(), about(data, k, ground)]
+        [
+            k,
+            s.name,
+            *ground.xy(np.reshape(s.xyz, (1, 3)))[0].round(ground.decimals).tolist(),
+            about(data, k, ground),
+        ]
         for k, s in enumerate(data.shots[:MOST_SHOTS])
         if np.isfinite(s.xyz).all()
     ]

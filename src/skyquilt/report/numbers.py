@@ -41,7 +41,7 @@ def items(value: Any) -> tuple[Any, ...]:
 
 
 def fixed(value: Any, decimals: int = 2, *, sign: bool = False) -> str:
-    """`1 234.50` with a true minus sign and thin spaces between thousands; a dash where there is no figure."""
+    """`1 234.50` with a true minus sign and thin spaces between thousands; a dash for no figure."""
     figure = number(value)
     if figure is None:
         return DASH

@@ -26,8 +26,15 @@ def overlap_section(data: ReportInput, ground: Ground | None, layers: dict[str, 
         blocks = (_histogram(data.views),)
         if ground and "overlap" in layers:
             title = "Photos that see each place"
-            caption = "Single coverage is flat and unchecked; from three photos on, heights can be measured and mistakes found."
-            svg = picture(ground, [use("mosaic", "faded") if "mosaic" in layers else use("overlap"), use("overlap", "haze")], title)
+            caption = (
+                "Single coverage is flat and unchecked; from three photos on, heights can be "
+                "measured and mistakes found."
+            )
+            svg = picture(
+                ground,
+                [use("mosaic", "faded") if "mosaic" in layers else use("overlap"), use("overlap", "haze")],
+                title,
+            )
             blocks = (Figure(svg=svg, title=title, caption=caption, legend=layers["overlap"].legend), *blocks)
     return Section(id="overlap", title="Overlap", blocks=blocks)
 
@@ -39,10 +46,17 @@ def _heights(z: np.ndarray, low: float, high: float, unit: str) -> Figure:
     counts = np.histogram(z, edges)[0]
     median = float(np.median(z))
     svg = bars(
-        edges, counts / max(len(z), 1) * 100, title=title, x_label=f"height, {unit}", y_label="share of the cells",
-        unit="\u202f%", marks=((median, f"median {fixed(median, 1)}"),),
-    )  # fmt: skip
-    caption = "A few cells far from all others would be outliers that passed; they tear the map where they lie."
+        edges,
+        counts / max(len(z), 1) * 100,
+        title=title,
+        x_label=f"height, {unit}",
+        y_label="share of the cells",
+        unit="\u202f%",
+        marks=((median, f"median {fixed(median, 1)}"),),
+    )
+    caption = (
+        "A few cells far from all others would be outliers that passed; they tear the map where they lie."
+    )
     return Figure(svg=svg, title=title, caption=caption)
 
 
@@ -54,9 +68,13 @@ def _histogram(views: np.ndarray) -> Figure:
     title = "Share of the mapped ground by number of photos"
     labels = [str(k + 1) for k in range(MOST_VIEWS - 1)] + [f"{MOST_VIEWS}+"]
     svg = columns(
-        labels, shares, [images.css(c) for c in view_colours()], title=title,
-        x_label="photos that see a place", y_label="share of the ground",
-    )  # fmt: skip
+        labels,
+        shares,
+        [images.css(c) for c in view_colours()],
+        title=title,
+        x_label="photos that see a place",
+        y_label="share of the ground",
+    )
     judged = "good" if enough >= 90 else "fair" if enough >= 70 else "poor"
     caption = (
         f"{fixed(enough, 0)}\u202f% of the ground is seen by three photos or more: {judged} "
@@ -67,21 +85,27 @@ def _histogram(views: np.ndarray) -> Figure:
 
 def surface_section(data: ReportInput, ground: Ground | None, layers: dict[str, Layer]) -> Section:
     """The heights the photos were rectified over."""
-    blocks: tuple[Block, ...] = (Missing(why="The photos were placed on a plane: there is no height surface to show."),)
+    blocks: tuple[Block, ...] = (
+        Missing(why="The photos were placed on a plane: there is no height surface to show."),
+    )
     if ground and "heights" in layers and data.surface is not None and data.surface_bounds is not None:
         z = np.asarray(data.surface)[np.isfinite(data.surface)]
         low, high = images.height_range(z)
         datum = DATUMS.get(data.vertical_datum, data.vertical_datum)
         stops = [images.css(c) for c in images.scale(np.linspace(0, 1, 24)[None])[0]]
         unit = ground.unit
-        title = "Height surface"
+        title = f"Heights {datum}"
         svg = picture(ground, [use("heights")], title)
         bar = colour_bar(stops, f"{fixed(low, 1)} {unit}", f"{fixed(high, 1)} {unit}", "height")
         caption = (
-            f"Heights {datum}, lit from the north-west, from {fixed(z.min(), 1)} to {fixed(z.max(), 1)} {unit}. "
+            f"Lit from the north-west, from {fixed(z.min(), 1)} to {fixed(z.max(), 1)} {unit}. "
             "Errors here shift the map sideways, most at the photos\u2019 rims."
         )
         blocks = (Figure(svg=svg + bar, title=title, caption=caption), _heights(z, low, high, unit))
         if z.max() - z.min() < 1e-3:
-            blocks = (Missing(why=f"The surface is level at {fixed(low, 1)} {unit} {datum}: there is no relief to show."),)
+            blocks = (
+                Missing(
+                    why=f"The surface is level at {fixed(low, 1)} {unit} {datum}: there is no relief to show."
+                ),
+            )
     return Section(id="surface", title="Height surface", blocks=blocks)

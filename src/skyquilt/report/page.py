@@ -2,6 +2,7 @@
 
 import os
 import re
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -64,14 +65,15 @@ def build_report(data: ReportInput) -> str:
 
 
 def write_report(path: Path, data: ReportInput) -> None:
-    """Build the page and put it at `path`, whole or not at all; raises `OutputError` if it cannot be written."""
+    """Build the page and put it at `path`, whole or not at all; `OutputError` if it cannot be written."""
     path, page = Path(path), build_report(data)
     partial = path.with_name(path.name + ".partial")
     try:
         partial.write_text(page, encoding="utf-8")
         os.replace(partial, path)  # noqa: PTH105
     except OSError as error:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink()
         raise OutputError(
             f"the report cannot be written to {path}: {error.strerror or error}. "
             "Make room or choose another output folder."
@@ -82,7 +84,11 @@ def attention(data: ReportInput) -> tuple[tuple[str, str], ...]:
     """What deserves a look first: sentences with the section that shows more."""
     m = data.metrics
     found = [(plain(w), "") for w in items(m.get("warnings"))[:20]]
-    found += [(f"{t.label}: {t.value} {t.unit}".rstrip() + ".", t.anchor) for t in tiles(data) if t.verdict == "poor"]
+    found += [
+        (f"{t.label}: {t.value} {t.unit}".rstrip() + ".", t.anchor)
+        for t in tiles(data)
+        if t.verdict == "poor"
+    ]
     if n := len(items(m.get("metadata_conflicts"))):
         found.append((f"{count(n, 'metadata conflict')}.", "conflicts"))
     if n := len(mapping(m.get("photos_rejected"))):
@@ -98,7 +104,11 @@ def tied(words: str) -> str:
 @cache
 def _template() -> Template:
     environment = Environment(
-        loader=FileSystemLoader(HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=FileSystemLoader(HERE),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
     environment.filters["tied"] = tied
     return environment.get_template("page.html.j2")

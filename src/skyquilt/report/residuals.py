@@ -8,7 +8,22 @@ from skyquilt.report import images
 from skyquilt.report.input import CameraResiduals, ReportInput
 from skyquilt.report.numbers import count, decimals_of, fixed, nice
 from skyquilt.report.parts import Block, Figure, Missing, Section
-from skyquilt.report.svg import BOTTOM, LEFT, RIGHT, TOP, WIDTH, Axes, arrows, bars, coordinate, dots, drawing, path, rect, text
+from skyquilt.report.svg import (
+    BOTTOM,
+    LEFT,
+    RIGHT,
+    TOP,
+    WIDTH,
+    Axes,
+    arrows,
+    bars,
+    coordinate,
+    dots,
+    drawing,
+    path,
+    rect,
+    text,
+)
 
 COLUMNS, ROWS = 8, 6
 FEWEST = 10
@@ -30,9 +45,11 @@ def residuals_section(data: ReportInput) -> Section:
     if (more := len(cameras) - MOST_CAMERAS) > 0:
         blocks.append(Missing(why=f"{count(more, 'camera')} with fewer sightings not drawn."))
     return Section(
-        id="residuals", title="Reprojection residuals",
-        lead="Computed minus observed place of every tie point in every photo that shows it.", blocks=tuple(blocks),
-    )  # fmt: skip
+        id="residuals",
+        title="Reprojection residuals",
+        lead="Computed minus observed place of every tie point in every photo that shows it.",
+        blocks=tuple(blocks),
+    )
 
 
 def _finite(r: CameraResiduals) -> CameraResiduals:
@@ -40,7 +57,7 @@ def _finite(r: CameraResiduals) -> CameraResiduals:
     keep = np.isfinite(px).all(1) & np.isfinite(residual).all(1)
     return CameraResiduals(
         camera=r.camera, width=r.width, height=r.height, px=px[keep], residual_px=residual[keep]
-    )  # fmt: skip
+    )
 
 
 def _density(residual: NDArray) -> Figure:
@@ -51,18 +68,31 @@ def _density(residual: NDArray) -> Figure:
     size = 320.0
     axes = Axes(x=(-reach, reach), y=(reach, -reach), width=size + LEFT + RIGHT, height=size + TOP + BOTTOM)
     inside = (np.abs(residual) < reach).all(1)
-    body = _points(residual[inside], axes) if inside.sum() <= 1500 else _cells(residual[inside], reach, axes, size)
+    body = (
+        _points(residual[inside], axes)
+        if inside.sum() <= 1500
+        else _cells(residual[inside], reach, axes, size)
+    )
     circle = Markup('<ellipse class="marker" cx="{}" cy="{}" rx="{}" ry="{}"/>').format(
-        *(coordinate(float(v)) for v in (axes.px(0), axes.py(0), rms / reach * size / 2, rms / reach * size / 2))
+        *(
+            coordinate(float(v))
+            for v in (axes.px(0), axes.py(0), rms / reach * size / 2, rms / reach * size / 2)
+        )
     )
     words = text(float(axes.px(0)), float(axes.py(-rms)) - 5, f"RMS {fixed(rms, 2)} px", "mark mid")
     svg = drawing(
-        [axes.grid("to the right, px", "downwards, px"), body, circle, words], title,
-        WIDTH, axes.height, (WIDTH - axes.width) / 2,
-    )  # fmt: skip
+        [axes.grid("to the right, px", "downwards, px"), body, circle, words],
+        title,
+        WIDTH,
+        axes.height,
+        (WIDTH - axes.width) / 2,
+    )
     beyond = int((~inside).sum())
     outside = f" {count(beyond, 'sighting')} further out not drawn." if beyond else ""
-    caption = f"{count(len(residual), 'sighting')}. A round, centred cloud is noise; a shifted or long one is a fault.{outside}"
+    caption = (
+        f"{count(len(residual), 'sighting')}. A round, centred cloud is noise; a shifted or "
+        f"long one is a fault.{outside}"
+    )
     return Figure(svg=svg, title=title, caption=caption)
 
 
@@ -89,12 +119,18 @@ def _lengths(residual: NDArray) -> Figure:
     counts = np.histogram(length, edges)[0]
     median, p95 = (float(v) for v in np.percentile(length, [50, 95]))
     svg = bars(
-        edges, counts, title=title, x_label="length, px", y_label="sightings",
+        edges,
+        counts,
+        title=title,
+        x_label="length, px",
+        y_label="sightings",
         marks=((median, f"median {fixed(median, 2)}"), (p95, f"95\u202f% below {fixed(p95, 2)}")),
-    )  # fmt: skip
+    )
     beyond = int((length > edges[-1]).sum())
     caption = "Many short ones and a thin tail are good; a hump far out would be wrong matches."
-    return Figure(svg=svg, title=title, caption=caption + (f" {count(beyond, 'sighting')} beyond." if beyond else ""))
+    return Figure(
+        svg=svg, title=title, caption=caption + (f" {count(beyond, 'sighting')} beyond." if beyond else "")
+    )
 
 
 def _field(r: CameraResiduals) -> Figure:
@@ -121,7 +157,8 @@ def _field(r: CameraResiduals) -> Figure:
     left = systematic(r, mean, n)
     judged = "good" if left <= 0.15 else "fair" if left <= 0.5 else "poor"
     caption = (
-        f"{count(int(n.sum()), 'sighting')} in cells of {FEWEST} or more. With the share of chance taken off, "
+        f"{count(int(n.sum()), 'sighting')} in cells of {FEWEST} or more. With the share of chance "
+        "taken off, "
         f"{fixed(left, 2)} px RMS are systematic: {judged} (good up to 0.15 px, fair up to 0.5). "
         "Arrows that point in or out all round would be a wrong radial distortion."
     )
@@ -141,12 +178,14 @@ def systematic(r: CameraResiduals, mean: NDArray, n: NDArray) -> float:
 
 
 def mean_field(r: CameraResiduals) -> tuple[NDArray, NDArray, NDArray]:
-    """Centres (k, 2) in px, mean residuals (k, 2) in px and counts (k,) of the cells with enough sightings."""
+    """Centres (k, 2) in px, mean residuals (k, 2) in px and counts (k,) of cells with enough sightings."""
     column = np.clip((r.px[:, 0] + 0.5) / r.width * COLUMNS, 0, COLUMNS - 1).astype(np.int64)
     row = np.clip((r.px[:, 1] + 0.5) / r.height * ROWS, 0, ROWS - 1).astype(np.int64)
     cell, size = row * COLUMNS + column, COLUMNS * ROWS
     n = np.bincount(cell, minlength=size)
     total = np.stack([np.bincount(cell, r.residual_px[:, k], minlength=size) for k in (0, 1)], 1)
     enough = np.flatnonzero(n >= FEWEST)
-    centre = np.stack([(enough % COLUMNS + 0.5) * r.width / COLUMNS, (enough // COLUMNS + 0.5) * r.height / ROWS], 1)
+    centre = np.stack(
+        [(enough % COLUMNS + 0.5) * r.width / COLUMNS, (enough // COLUMNS + 0.5) * r.height / ROWS], 1
+    )
     return centre, total[enough] / n[enough, None], n[enough]

@@ -3,7 +3,7 @@
   const overlay = svg.querySelector(".overlay"), tip = map.querySelector(".tip"), place = map.querySelector(".place");
   const facts = JSON.parse(document.getElementById("facts").textContent), [W0, H0] = [svg.viewBox.baseVal.width, svg.viewBox.baseVal.height];
   const start = world.transform.baseVal[0].matrix, first = [start.a, start.e, start.f];
-  const outlines = document.getElementById("footprints")?.children, touches = new Map();
+  const outlines = document.getElementById("layer-footprints")?.children, touches = new Map();
   let W, H, k, x, y, home = true;  // a point (e, s) in m lies at (x + k e, y + k s) px
 
   const nice = raw => { const b = 10 ** Math.floor(Math.log10(raw)); return [5, 2, 1].map(f => f * b).find(v => v <= raw * 1.0001); };

@@ -28,10 +28,14 @@ def polyline(points: ArrayLike, decimals: int = 1, *, close: bool = False) -> st
 
 def dots(points: ArrayLike, decimals: int = 1) -> str:
     """Path data of one point each; round line caps make them discs of a constant size on the screen."""
-    return "".join(f"M{x:.{decimals}f} {y:.{decimals}f}h0" for x, y in np.asarray(points, np.float64).tolist())
+    return "".join(
+        f"M{x:.{decimals}f} {y:.{decimals}f}h0" for x, y in np.asarray(points, np.float64).tolist()
+    )
 
 
-def arrows(tails: NDArray, tips: NDArray, decimals: int = 1, head: float = 0.28, longest: float = np.inf) -> str:
+def arrows(
+    tails: NDArray, tips: NDArray, decimals: int = 1, head: float = 0.28, longest: float = np.inf
+) -> str:
     """Path data of arrows (k, 2) -> (k, 2); heads grow with the arrow up to `longest`."""
     along = tips - tails
     length = np.linalg.norm(along, axis=1, keepdims=True)
@@ -52,7 +56,9 @@ def path(d: str, cls: str) -> Markup:
 
 def text(x: float, y: float, words: str, cls: str = "", *, turn: int = 0) -> Markup:
     """Words at a place; classes `mid` and `end` align them."""
-    turned = Markup(' transform="rotate({} {} {})"').format(turn, coordinate(x), coordinate(y)) if turn else ""
+    turned = (
+        Markup(' transform="rotate({} {} {})"').format(turn, coordinate(x), coordinate(y)) if turn else ""
+    )
     return Markup('<text x="{}" y="{}" class="{}"{}>{}</text>').format(
         coordinate(x), coordinate(y), cls, turned, words
     )
@@ -60,7 +66,9 @@ def text(x: float, y: float, words: str, cls: str = "", *, turn: int = 0) -> Mar
 
 def line(x1: float, y1: float, x2: float, y2: float, cls: str) -> Markup:
     """A straight line."""
-    return Markup('<path class="{}" d="M{} {}L{} {}"/>').format(cls, *(coordinate(v) for v in (x1, y1, x2, y2)))
+    return Markup('<path class="{}" d="M{} {}L{} {}"/>').format(
+        cls, *(coordinate(v) for v in (x1, y1, x2, y2))
+    )
 
 
 def rect(x: float, y: float, width: float, height: float, cls: str, fill: str = "") -> Markup:
@@ -71,7 +79,9 @@ def rect(x: float, y: float, width: float, height: float, cls: str, fill: str = 
     )
 
 
-def drawing(content: Iterable[Markup | str], title: str, width: float = WIDTH, height: float = HEIGHT, left: float = 0) -> Markup:
+def drawing(
+    content: Iterable[Markup | str], title: str, width: float = WIDTH, height: float = HEIGHT, left: float = 0
+) -> Markup:
     """An SVG element of its own; `left` px of it lie left of x = 0."""
     inner = Markup().join(content)
     return Markup('<svg viewBox="{} 0 {} {}" role="img" aria-label="{}">{}</svg>').format(
@@ -111,13 +121,24 @@ class Axes:
         pairs = np.asarray(xy, np.float64)
         return np.stack([self.px(pairs[:, 0]), self.py(pairs[:, 1])], 1)
 
-    def grid(self, x_label: str = "", y_label: str = "", *, x_ticks: bool = True, unit: str = "", y_parts: float = 0) -> Markup:
+    def grid(
+        self,
+        x_label: str = "",
+        y_label: str = "",
+        *,
+        x_ticks: bool = True,
+        unit: str = "",
+        y_parts: float = 0,
+    ) -> Markup:
         """Lines, numbers and names of both axes."""
         floor, right = self.height - self.bottom, self.width - RIGHT
         parts = []
         for value, label in ticks(*self.y, y_parts or (floor - TOP) / 42):
             y = float(self.py(value))
-            parts += [line(self.left, y, right, y, "grid"), text(self.left - 7, y + 4, label + unit, "tick end")]
+            parts += [
+                line(self.left, y, right, y, "grid"),
+                text(self.left - 7, y + 4, label + unit, "tick end"),
+            ]
         if x_ticks:
             for value, label in ticks(*self.x, (right - self.left) / 62):
                 x = float(self.px(value))
@@ -132,7 +153,12 @@ class Axes:
     def marker(self, x: float, label: str, level: int = 0) -> Markup:
         """A vertical line with words beside it; `level` moves them down a line."""
         at, middle = float(self.px(x)), (self.left + self.width - RIGHT) / 2
-        words = text(at + (6 if at < middle else -6), TOP + 11 + 16 * level, label, "mark" if at < middle else "mark end")
+        words = text(
+            at + (6 if at < middle else -6),
+            TOP + 11 + 16 * level,
+            label,
+            "mark" if at < middle else "mark end",
+        )
         return line(at, TOP, at, self.height - self.bottom, "marker") + words
 
 
@@ -145,9 +171,15 @@ def ticks(low: float, high: float, parts: float) -> list[tuple[float, str]]:
 
 
 def bars(
-    edges: Sequence[float] | NDArray, counts: ArrayLike, *, title: str, x_label: str, y_label: str,
-    marks: Sequence[tuple[float, str]] = (), unit: str = "",
-) -> Markup:  # fmt: skip
+    edges: Sequence[float] | NDArray,
+    counts: ArrayLike,
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
+    marks: Sequence[tuple[float, str]] = (),
+    unit: str = "",
+) -> Markup:
     """A histogram: counts (n,) between edges (n + 1,)."""
     counts = np.asarray(counts, np.float64)
     axes = Axes(x=(float(edges[0]), float(edges[-1])), y=(0.0, float(counts.max(initial=0)) * 1.12 or 1.0))
@@ -160,7 +192,15 @@ def bars(
     return drawing([axes.grid(x_label, y_label, unit=unit), *boxes, *lines], title)
 
 
-def columns(labels: Sequence[str], shares: ArrayLike, colours: Sequence[str], *, title: str, x_label: str, y_label: str) -> Markup:
+def columns(
+    labels: Sequence[str],
+    shares: ArrayLike,
+    colours: Sequence[str],
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
+) -> Markup:
     """One column per label, its share in percent written above."""
     shares = np.asarray(shares, np.float64)
     axes = Axes(x=(0.0, float(len(labels))), y=(0.0, max(float(shares.max(initial=0)) * 1.18, 1e-9)))
@@ -178,10 +218,16 @@ def columns(labels: Sequence[str], shares: ArrayLike, colours: Sequence[str], *,
 def colour_bar(stops: Sequence[str], low: str, high: str, name: str) -> Markup:
     """A horizontal colour scale with its ends and its meaning."""
     n = len(stops)
-    boxes = "".join(f'<rect x="{k * 240 / n:.1f}" width="{240 / n + 0.5:.1f}" height="12" fill="{c}"/>' for k, c in enumerate(stops))
+    boxes = "".join(
+        f'<rect x="{k * 240 / n:.1f}" width="{240 / n + 0.5:.1f}" height="12" fill="{c}"/>'
+        for k, c in enumerate(stops)
+    )
     words = text(0, 28, low, "tick") + text(240, 28, high, "tick end") + text(120, 28, name, "name mid")
-    return Markup('<svg class="scale" viewBox="0 0 240 34" role="img" aria-label="{}">').format(
-        f"{name}: {low} to {high}"
-    ) + Markup(boxes) + words + Markup("</svg>")
-
-
+    return (
+        Markup('<svg class="scale" viewBox="0 0 240 34" role="img" aria-label="{}">').format(
+            f"{name}: {low} to {high}"
+        )
+        + Markup(boxes)
+        + words
+        + Markup("</svg>")
+    )

@@ -23,10 +23,17 @@ MEANINGS = {
 FAR = 3.0
 """Deviations of the prior at which a parameter is called far from it."""
 CONFLICTS = {
-    "yaw": "The image top does not point where the metadata say: the file was turned afterwards, or the compass is off.",
-    "altitude": "The reported height does not fit the image scale: a drifting barometer or another zero of heights.",
+    "yaw": (
+        "The image top does not point where the metadata say: the file was turned afterwards, or "
+        "the compass is off."
+    ),
+    "altitude": (
+        "The reported height does not fit the image scale: a drifting barometer or another zero of heights."
+    ),
     "position": "The GPS position lies far from where the pixels put the photo; it was given little weight.",
-    "focal": "The focal length found differs from the reported one: check the camera, a zoom or a resized file.",
+    "focal": (
+        "The focal length found differs from the reported one: check the camera, a zoom or a resized file."
+    ),
 }
 UNITS = {"yaw": "\u00b0", "altitude": " m", "position": " m", "focal": " px"}
 
@@ -36,7 +43,12 @@ def calibration_section(data: ReportInput) -> Section:
     cameras = mapping(data.metrics.get("cameras"))
     blocks: list[Block] = [_camera(str(k), v) for k, v in list(cameras.items())[:12] if mapping(v)]
     if not blocks:
-        blocks = [Missing(why="No calibration was estimated: the values in the photos\u2019 metadata were taken as they are.")]
+        blocks = [
+            Missing(
+                why="No calibration was estimated: the values in the photos\u2019 metadata were "
+                "taken as they are."
+            )
+        ]
     if len(cameras) > 12:
         blocks.append(Missing(why=f"{count(len(cameras) - 12, 'camera')} more in metrics.json."))
     return Section(id="cameras", title="Camera calibration", blocks=tuple(blocks))
@@ -46,23 +58,41 @@ def _camera(name: str, parameters: Mapping[str, Any]) -> Table:
     rows, far = [], []
     for key, entry in parameters.items():
         entry = mapping(entry) or {"value": entry}
-        value, sigma, prior, prior_sigma = (number(entry.get(k)) for k in ("value", "sigma", "prior", "prior_sigma"))
+        value, sigma, prior, prior_sigma = (
+            number(entry.get(k)) for k in ("value", "sigma", "prior", "prior_sigma")
+        )
         pixels = key in ("focal", "cx", "cy")
         shown = [fixed(v, 1) if pixels else significant(v) for v in (value, sigma, prior, prior_sigma)]
         held = sigma == 0 or (sigma is None and value == 0)
-        moved = (value - prior) / prior_sigma if value is not None and prior is not None and prior_sigma else None
+        moved = (
+            (value - prior) / prior_sigma if value is not None and prior is not None and prior_sigma else None
+        )
         if moved is not None and abs(moved) > FAR:
             far.append(key)
         rows.append(
-            (key, MEANINGS.get(key, ""), shown[0], "held" if held else shown[1], shown[2], shown[3], fixed(moved, 1, sign=True))
+            (
+                key,
+                MEANINGS.get(key, ""),
+                shown[0],
+                "held" if held else shown[1],
+                shown[2],
+                shown[3],
+                fixed(moved, 1, sign=True),
+            )
         )
     note = "The last column is the change from the prior in units of its deviation."
     if far:
-        note += f" More than {FAR:.0f} for {', '.join(far)}: the prior was wrong or the flight cannot determine it."
+        note += (
+            f" More than {FAR:.0f} for {', '.join(far)}: the prior was wrong or the flight cannot "
+            "determine it."
+        )
     return Table(
-        title=name, head=("Parameter", "Meaning", "Value", "\u00b1", "Prior", "\u00b1", "Change, \u03c3"), rows=tuple(rows),
-        numeric="ctnnnnn", note=note,
-    )  # fmt: skip
+        title=name,
+        head=("Parameter", "Meaning", "Value", "\u00b1", "Prior", "\u00b1", "Change, \u03c3"),
+        rows=tuple(rows),
+        numeric="ctnnnnn",
+        note=note,
+    )
 
 
 def control_section(data: ReportInput) -> Section:
@@ -73,23 +103,30 @@ def control_section(data: ReportInput) -> Section:
         return Section(id="control", title="Control and check points", blocks=(Missing(why=why),))
     rows = tuple(
         (
-            plain(p.get("name")), "check" if p.get("check") else "control",
+            plain(p.get("name")),
+            "check" if p.get("check") else "control",
             *(fixed(p.get(k), 3, sign=True) for k in ("dx_m", "dy_m", "dz_m")),
-            fixed(p.get("reprojection_px"), 2), fixed(p.get("sightings"), 0),
+            fixed(p.get("reprojection_px"), 2),
+            fixed(p.get("sightings"), 0),
         )
         for p in sorted(points, key=lambda p: bool(p.get("check")))[:MOST_ROWS]
-    )  # fmt: skip
+    )
     sums = [_rms(points, check, name) for check, name in ((False, "control"), (True, "check"))]
     return Section(
-        id="control", title="Control and check points",
-        lead="Solution minus survey. Control points pulled the solution; check points took no part and are the honest test.",
+        id="control",
+        title="Control and check points",
+        lead="Solution minus survey. Control points pulled the solution; check points took no part "
+        "and are the honest test.",
         blocks=(
             Table(
-                title="Residuals", head=("Point", "Role", "East, m", "North, m", "Up, m", "Reprojection, px", "Photos"),
-                rows=rows, numeric="ctnnnnn", note=" ".join(s for s in sums if s),
+                title="Residuals",
+                head=("Point", "Role", "East, m", "North, m", "Up, m", "Reprojection, px", "Photos"),
+                rows=rows,
+                numeric="ctnnnnn",
+                note=" ".join(s for s in sums if s),
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def _rms(points: list[Mapping[str, Any]], check: bool, name: str) -> str:
@@ -111,20 +148,27 @@ def conflicts_section(data: ReportInput) -> Section:
         return Section(id="conflicts", title="Metadata conflicts", blocks=(none,))
     rows = tuple(
         (
-            plain(c.get("photo")), plain(c.get("field")), _figure(c, "reported"), _figure(c, "estimated"),
+            plain(c.get("photo")),
+            plain(c.get("field")),
+            _figure(c, "reported"),
+            _figure(c, "estimated"),
             CONFLICTS.get(str(c.get("field")), "The metadata and the pixels disagree."),
         )
         for c in found[:MOST_ROWS]
-    )  # fmt: skip
+    )
     kinds = sorted({str(c.get("field")) for c in found})
     told = ", ".join(f"{sum(str(c.get('field')) == k for c in found)} \u00d7 {k}" for k in kinds)
     head = ("Photo", "Field", "Reported", "Estimated", "What it means")
-    table = Table(title=f"Contradictions: {told}", head=head, rows=rows, numeric="ctnnt", note=_cut(len(found)))
+    table = Table(
+        title=f"Contradictions: {told}", head=head, rows=rows, numeric="ctnnt", note=_cut(len(found))
+    )
     return Section(
-        id="conflicts", title="Metadata conflicts",
-        lead="Metadata are measurements, not facts. These were contradicted by the photos themselves and not relied on.",
+        id="conflicts",
+        title="Metadata conflicts",
+        lead="Metadata are measurements, not facts. These were contradicted by the photos themselves "
+        "and not relied on.",
         blocks=(table,),
-    )  # fmt: skip
+    )
 
 
 def _figure(conflict: Mapping[str, Any], key: str) -> str:
@@ -141,9 +185,17 @@ def rejected_section(data: ReportInput) -> Section:
     """Photos that take no part."""
     rejected = mapping(data.metrics.get("photos_rejected"))
     if not rejected:
-        return Section(id="rejected", title="Rejected photos", blocks=(Missing(why="No photo was rejected."),))
+        return Section(
+            id="rejected", title="Rejected photos", blocks=(Missing(why="No photo was rejected."),)
+        )
     rows = tuple((str(k), plain(v)) for k, v in list(rejected.items())[:MOST_ROWS])
-    table = Table(title=count(len(rejected), "photo"), head=("Photo", "Reason"), rows=rows, numeric="ct", note=_cut(len(rejected)))
+    table = Table(
+        title=count(len(rejected), "photo"),
+        head=("Photo", "Reason"),
+        rows=rows,
+        numeric="ct",
+        note=_cut(len(rejected)),
+    )
     return Section(id="rejected", title="Rejected photos", blocks=(table,))
 
 
@@ -154,7 +206,9 @@ def _cut(n: int) -> str:
 def notes_section(data: ReportInput) -> Section:
     """Sentences the stages left."""
     notes = tuple(plain(v) for v in items(data.metrics.get("notes")))[:MOST_ROWS]
-    blocks: tuple[Block, ...] = (Sentences(items=notes),) if notes else (Missing(why="No stage left a note."),)
+    blocks: tuple[Block, ...] = (
+        (Sentences(items=notes),) if notes else (Missing(why="No stage left a note."),)
+    )
     return Section(id="notes", title="Notes", blocks=blocks)
 
 
