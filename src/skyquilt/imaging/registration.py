@@ -87,6 +87,8 @@ def shifts_between(a: NDArray, b: NDArray, *, radius: int = RADIUS) -> list[Shif
 def gradients(patches: NDArray) -> Spectra:
     """Complex gradients (n, S, S), gx + i gy per px, of patches (n, S, S), lightly smoothed; rim 0."""
     n, size, _ = patches.shape
+    if not n:
+        return np.zeros(patches.shape, np.complex64)
     tall = np.ascontiguousarray(patches, np.float32).reshape(n * size, size)
     g = np.zeros((n, size, size), np.complex64)
     inner = (slice(None), slice(RIM, -RIM), slice(RIM, -RIM))

@@ -1,0 +1,62 @@
+"""Geolocation errors per axis [Arteaga 2019, Table 2]."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.model.poses import Alignment, Prior
+
+Array = NDArray[np.float64]
+Axes = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AxisErrors:
+    """Errors of positions, axis by axis; NaN for an axis without a reference."""
+
+    mae_m: Axes
+    """Mean absolute error along x, y, z in m."""
+    rms_m: Axes
+    """Root mean square error along x, y, z in m."""
+    mean_m: Axes
+    """Mean error along x, y, z in m: what a shift of the whole map would take away."""
+    count: int
+    """Positions compared."""
+
+
+def geolocation_errors(estimated: NDArray, reference: NDArray) -> AxisErrors:
+    """Errors of positions (n, 3) in m against a reference (n, 3); NaN where either says nothing."""
+    if np.shape(estimated) != np.shape(reference) or np.shape(estimated)[1:] != (3,):
+        raise ValueError(f"two (n, 3) arrays expected, got {np.shape(estimated)} and {np.shape(reference)}")
+    error = np.asarray(estimated, np.float64) - np.asarray(reference, np.float64)
+    return AxisErrors(
+        mae_m=_axes(np.abs(error)),
+        rms_m=_root(_axes(error**2)),
+        mean_m=_axes(error),
+        count=len(error),
+    )
+
+
+def gps_residuals(alignment: Alignment, priors: Mapping[int, Prior]) -> Array:
+    """(n, 3) solution minus reported position in m (map frame) of the placed photos that reported one, in
+    order of their index.
+    """
+    rows = [
+        pose.map_C - priors[photo].map_C
+        for photo, pose in sorted(alignment.poses.items())
+        if photo in priors and np.isfinite(priors[photo].map_C).any()
+    ]
+    return np.array(rows, np.float64).reshape(-1, 3)
+
+
+def _axes(values: Array) -> Axes:
+    """Mean of each column, leaving out NaN."""
+    means = [float(v[np.isfinite(v)].mean()) if np.isfinite(v).any() else float("nan") for v in values.T]
+    return means[0], means[1], means[2]
+
+
+def _root(axes: Axes) -> Axes:
+    """Square root of each."""
+    return axes[0] ** 0.5, axes[1] ** 0.5, axes[2] ** 0.5

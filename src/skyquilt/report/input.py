@@ -1,0 +1,96 @@
+"""What a finished run hands to its report: plain arrays and numbers, nothing that needs another stage."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from numpy.typing import NDArray
+
+Bounds = tuple[float, float, float, float]
+"""West, south, east, north in m (map frame)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shot:
+    """One placed photo."""
+
+    name: str
+    """Photo.name."""
+    xyz: NDArray
+    """(3,) solved camera centre in m (map frame)."""
+    reported_xyz: NDArray
+    """(3,) position its metadata report in m (map frame); NaN where they say nothing."""
+    block: int = 0
+    """Number of its block, the largest is 0."""
+    method: str = ""
+    """How it was placed."""
+    footprint: NDArray
+    """(k, 2) outline on the ground in m (map frame); empty if unknown."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraResiduals:
+    """Sightings of tie points in all photos of one camera."""
+
+    camera: str
+    """Name of its calibration."""
+    width: int
+    """Image width in px."""
+    height: int
+    """Image height in px."""
+    px: NDArray
+    """(N, 2) where the points were seen."""
+    residual_px: NDArray
+    """(N, 2) projected minus seen."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeamMark:
+    """One place on a seam where the two photos were compared."""
+
+    x: float
+    """Easting in m (map frame)."""
+    y: float
+    """Northing in m (map frame)."""
+    disparity_px: float | None
+    """Displacement between the two photos in map px; None where it could not be measured."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReportInput:
+    """Everything the page shows. What is absent is left out, with a sentence why."""
+
+    metrics: Mapping[str, Any]
+    """The content of metrics.json, with `control`, `cameras`, `notes`, `warnings` where there are any."""
+    preview: NDArray | None = None
+    """(H, W, 4) uint8 RGBA, north up: the mosaic, reduced."""
+    bounds: Bounds | None = None
+    """Of the preview."""
+    origin: tuple[float, float] = (0.0, 0.0)
+    """Added to map coordinates this gives coordinates in `crs`."""
+    crs: str | None = None
+    """As pyproj reads it; None when nothing says where on Earth the survey is."""
+    metric: bool = True
+    """False when even the scale is unknown: then 1 m is an arbitrary unit."""
+    views: NDArray | None = None
+    """(h, w) integers: number of photos that see each cell, row 0 is the northernmost."""
+    views_bounds: Bounds | None = None
+    """Of the views."""
+    surface: NDArray | None = None
+    """(h, w) float heights in m, NaN where unknown, row 0 is the northernmost."""
+    surface_bounds: Bounds | None = None
+    """Of the surface."""
+    vertical_datum: str = "unknown"
+    """What heights count from: `takeoff`, `sea_level`, `ellipsoid`, `control`, `unknown`, or any phrase."""
+    shots: Sequence[Shot] = ()
+    """Placed photos in order of capture."""
+    residuals: Sequence[CameraResiduals] = ()
+    """Reprojection residuals by camera."""
+    seams: Sequence[SeamMark] = ()
+    """Samples along the seams."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """The resolved settings, nested as they are."""
+    title: str = "Survey"
+    """Heading of the page."""
+    version: str = ""
+    """Version of Skyquilt."""

@@ -1,0 +1,119 @@
+"""The page: sections in order, one template, one file."""
+
+import os
+import re
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
+from markupsafe import Markup
+
+from skyquilt.errors import OutputError
+from skyquilt.report.effort import time_section
+from skyquilt.report.ground import ground_of
+from skyquilt.report.headline import summary, tiles
+from skyquilt.report.input import ReportInput
+from skyquilt.report.layers import layers_of
+from skyquilt.report.mapview import map_view
+from skyquilt.report.numbers import count, items, mapping, plain
+from skyquilt.report.overlap import overlap_section, surface_section
+from skyquilt.report.positions import positions_section
+from skyquilt.report.residuals import residuals_section
+from skyquilt.report.seams import seams_section
+from skyquilt.report.tables import (
+    calibration_section,
+    conflicts_section,
+    control_section,
+    notes_section,
+    rejected_section,
+    settings_section,
+)
+
+HERE = Path(__file__).parent
+
+
+def build_report(data: ReportInput) -> str:
+    """The whole page as text: no other file and no network is needed to read it."""
+    ground = ground_of(data)
+    layers = layers_of(data, ground) if ground else ()
+    named = {layer.id: layer for layer in layers}
+    sections = (
+        overlap_section(data, ground, named),
+        positions_section(data, ground, named),
+        residuals_section(data),
+        seams_section(data, ground, named),
+        surface_section(data, ground, named),
+        calibration_section(data),
+        control_section(data),
+        conflicts_section(data),
+        rejected_section(data),
+        notes_section(data),
+        time_section(data),
+        settings_section(data),
+    )
+    return _template().render(
+        data=data,
+        summary=summary(data),
+        tiles=tiles(data),
+        attention=attention(data),
+        map=map_view(data, ground, layers) if ground and layers else None,
+        sections=sections,
+        style=_asset("style.css"),
+        script=_asset("script.js"),
+    )
+
+
+def write_report(path: Path, data: ReportInput) -> None:
+    """Build the page and put it at `path`, whole or not at all; `OutputError` if it cannot be written."""
+    path, page = Path(path), build_report(data)
+    partial = path.with_name(path.name + ".partial")
+    try:
+        partial.write_text(page, encoding="utf-8")
+        os.replace(partial, path)  # noqa: PTH105
+    except OSError as error:
+        with suppress(OSError):
+            partial.unlink()
+        raise OutputError(
+            f"the report cannot be written to {path}: {error.strerror or error}. "
+            "Make room or choose another output folder."
+        ) from error
+
+
+def attention(data: ReportInput) -> tuple[tuple[str, str], ...]:
+    """What deserves a look first: sentences with the section that shows more."""
+    m = data.metrics
+    found = [(plain(w), "") for w in items(m.get("warnings"))[:20]]
+    found += [
+        (f"{t.label}: {t.value} {t.unit}".rstrip() + ".", t.anchor)
+        for t in tiles(data)
+        if t.verdict == "poor"
+    ]
+    if n := len(items(m.get("metadata_conflicts"))):
+        found.append((f"{count(n, 'metadata conflict')}.", "conflicts"))
+    if n := len(mapping(m.get("photos_rejected"))):
+        found.append((f"{count(n, 'photo')} rejected.", "rejected"))
+    return tuple(found)
+
+
+def tied(words: str) -> str:
+    """Figures and their units kept on one line."""
+    return re.sub(r"(\d) (px|m|cm|s|GB|MB)\b", "\\1\u00a0\\2", words)
+
+
+@cache
+def _template() -> Template:
+    environment = Environment(
+        loader=FileSystemLoader(HERE),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["tied"] = tied
+    return environment.get_template("page.html.j2")
+
+
+@cache
+def _asset(name: str) -> Markup:
+    return Markup((HERE / name).read_text(encoding="utf-8"))  # ours, not the user's
