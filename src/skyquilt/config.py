@@ -13,12 +13,14 @@ from skyquilt.pairs.nearest import Nearest
 from skyquilt.pairs.retrieval import Retrieval
 from skyquilt.render.blend import Average, Blend, Feather, First, Multiband
 from skyquilt.render.exposure import Balance
+from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints
 from skyquilt.twoview.verify import Verify
 
 METHODS = ("auto", "bundle", "pose", "position")
 BLENDS = {"feather": Feather, "first": First, "average": Average, "multiband": Multiband}
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
+SURFACES = ("sweep", "ties")
 DISTORTIONS = ("none", "2", "4", "6", "6t")
 
 
@@ -42,6 +44,8 @@ class MosaicSettings:
     """West, south, east, north in the output CRS."""
     boundary: Path | None = None
     """Polygon that the map is cut to."""
+    surface: str = "sweep"
+    """One of `SURFACES`: heights from tie points alone, or refined by a plane sweep."""
     blend: str = "feather"
     """One of `BLENDS`."""
     feather_px: float = 6.0
@@ -69,6 +73,7 @@ class MosaicSettings:
 
     def __post_init__(self) -> None:
         _one_of("--method", self.method, METHODS)
+        _one_of("--surface", self.surface, SURFACES)
         _one_of("--blend", self.blend, BLENDS)
         _one_of("--compress", self.compress, COMPRESSIONS)
         _one_of("--distortion", self.distortion, DISTORTIONS)
@@ -115,6 +120,8 @@ class Methods:
     """Alignment from positions."""
     surface: FromTiePoints
     """Heights."""
+    sweep: Sweep | None
+    """Refinement of the heights from the pictures."""
     balance: Balance
     """Exposure."""
     blend: Blend
@@ -129,5 +136,5 @@ def methods(settings: MosaicSettings) -> Methods:
         bundle=Bundle(distortion=settings.distortion, repair=settings.repair),
         by_pose=ByPose(height_m=settings.height_m),
         by_position=ByPosition(height_m=settings.height_m, heading_deg=settings.heading_deg),
-        surface=FromTiePoints(), balance=Balance(), blend=blend,
+        surface=FromTiePoints(), sweep=Sweep() if settings.surface == "sweep" else None, balance=Balance(), blend=blend,
     )  # fmt: skip

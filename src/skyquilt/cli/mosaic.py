@@ -21,6 +21,7 @@ def command(
     cameras: Annotated[Path | None, typer.Option(help="Calibrations (cameras.json).")] = None,
     bounds: Annotated[str | None, typer.Option(help="west,south,east,north in the output CRS.")] = None,
     boundary: Annotated[Path | None, typer.Option(help="Polygon to cut the map to: GeoJSON, KML, GeoPackage, Shapefile.")] = None,
+    surface: Annotated[str, typer.Option(help="Heights: ties (tie points alone) or sweep (refined from the pictures).")] = "sweep",
     blend: Annotated[str, typer.Option(help="Where photos meet: feather, first, average, multiband.")] = "feather",
     feather: Annotated[float, typer.Option(help="Width of feathered seams in map pixels.")] = 6.0,
     balance: Annotated[bool, typer.Option("--balance/--no-balance", help="Bring photos to one brightness.")] = True,
@@ -55,7 +56,7 @@ def command(
         raise UsageError("--quiet, --verbose and --json exclude one another")
     settings = MosaicSettings(
         method=method, gsd_cm=gsd, crs=crs, gcp=gcp, geo=geo, cameras=cameras, bounds=parse_bounds(bounds),
-        boundary=boundary, blend=blend, feather_px=feather, balance=balance, compress=compress, quality=quality,
+        boundary=boundary, surface=surface, blend=blend, feather_px=feather, balance=balance, compress=compress, quality=quality,
         distortion=distortion, height_m=height, heading_deg=heading, repair=repair, features=features, jobs=jobs,
         memory_gb=memory,
     )  # fmt: skip

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -50,6 +51,10 @@ class BlockExtras:
     """Shot numbers from 1, 0 = none, every PROVENANCE-th pixel."""
     views: NDArray[np.uint16]
     """Photos that see each STEP-pixel cell."""
+    preview: NDArray
+    """(h, w, bands) the block, area-averaged to every `preview_factor`-th pixel."""
+    shown: NDArray[np.uint8]
+    """(h, w) opacity of the preview, 0 to 255."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,9 +69,15 @@ class Drawn:
     """As in views.tif."""
     views_grid: Grid
     """Its grid."""
+    preview: NDArray[np.uint8]
+    """(h, w, 4) the map, reduced, RGBA."""
+    preview_grid: Grid
+    """Its grid."""
 
 
-def survey_ground(alignment: Alignment, methods: Methods, settings: MosaicSettings, store: Store) -> Steps[Ground]:
+def survey_ground(
+    alignment: Alignment, intake: Intake, methods: Methods, settings: MosaicSettings, store: Store
+) -> Steps[Ground]:
     """Heights from the tie points (level ground where there are none), and the grid of the map.
 
     Raises:
@@ -90,12 +101,33 @@ def survey_ground(alignment: Alignment, methods: Methods, settings: MosaicSettin
     )
     views = tuple(make_views(alignment, surface))
     grid = grid_of(views, gsd, bounds)
+    if methods.sweep is not None and len(alignment.ties.xyz) > 3:
+        sweep, known = methods.sweep, surface
+        surface = store.get_or(
+            "surface", digest(key, poses_digest(alignment), grid, sweep),
+            lambda: sweep(known, [v for v in views if held(alignment, v.photo)], grid, intake.grey),
+        )  # fmt: skip
     if grid.width * grid.height > 4e11:
         raise UsageError(
             f"at {gsd * 100:g} cm the map would have {grid.width} x {grid.height} px; check --gsd and the positions"
         )
     yield 1, 1
     return Ground(surface=surface, views=views, grid=grid, native_gsd=native)
+
+
+def poses_digest(alignment: Alignment) -> str:
+    """What of an alignment shapes the map."""
+    order = sorted(alignment.poses)
+    stack = [
+        np.concatenate([alignment.poses[i].cam_R_map.ravel(), alignment.poses[i].map_C, alignment.camera(i).vector])
+        for i in order
+    ]
+    return digest(order, np.array(stack), alignment.frame)
+
+
+def held(alignment: Alignment, photo: int) -> bool:
+    """Whether tie points hold the photo."""
+    return any(photo in block for block in alignment.blocks if len(block) > 1)
 
 
 def round_gsd(gsd: float) -> float:
@@ -173,7 +205,7 @@ def draw(
     number = {v.photo: k + 1 for k, v in enumerate(sorted(compose.views, key=lambda v: v.photo))}
     table = np.zeros(max(number) + 2, np.uint32)
     table[list(number)] = list(number.values())  # index -1 (no photo) is the last entry: 0
-    whole = _Companions(compose.grid)
+    whole = _Companions(compose.grid, compose.bands, compose.dtype)
     spec = mosaic_spec(compose, alignment, settings, unit)
     spool = output / ".skyquilt" / "mosaic.spool"
     with CogWriter(output / "mosaic.tif", spec, spool=spool, digest=key) as writer:
@@ -187,17 +219,21 @@ def draw(
             valid = composed.photo >= 0
             if keep is not None:
                 valid &= keep(block)
-            extras = BlockExtras(provenance=_thinned(table[np.where(valid, composed.photo, -1)]), views=composed.views)
+            pixels = _blanked(composed.pixels, valid)
+            preview, shown = _reduced(pixels, valid, whole.factor)
+            numbers = _thinned(table[np.where(valid, composed.photo, -1)])
+            extras = BlockExtras(provenance=numbers, views=composed.views, preview=preview, shown=shown)
             store.put("blocks", digest(key, block.row0, block.col0), extras)
-            writer.write_block(block, _blanked(composed.pixels, valid), valid)
+            writer.write_block(block, pixels, valid)
             yield total - len(todo) + done + 1, total
     for row in range(0, spec.height, 2048):
         for column in range(0, spec.width, 2048):
             whole.add(row, column, store.get("blocks", digest(key, row, column)))
     _write_companions(output, whole, alignment)
     return Drawn(
-        provenance=whole.provenance, provenance_grid=whole.fine, views=whole.views, views_grid=whole.coarse
-    )
+        provenance=whole.provenance, provenance_grid=whole.fine, views=whole.views, views_grid=whole.coarse,
+        preview=coloured(whole.preview, whole.shown), preview_grid=whole.grid.coarser(whole.factor),
+    )  # fmt: skip
 
 
 def _thinned(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
@@ -227,16 +263,55 @@ def _keeper(
     return lambda b: inside_polygon(polygon, transform, row0=b.row0, col0=b.col0, height=b.height, width=b.width)
 
 
-class _Companions:
-    """Provenance and views, assembled from blocks."""
+def preview_factor(grid: Grid) -> int:
+    """Map pixels per preview pixel: a power of two that brings the longest side to 1600 px or less."""
+    factor = 1
+    while max(grid.width, grid.height) / factor > 1600 and factor < 2048:
+        factor *= 2
+    return factor
 
-    def __init__(self, grid: Grid) -> None:
-        self.fine, self.coarse = grid.coarser(PROVENANCE), grid.coarser(STEP)
+
+def _reduced(pixels: NDArray, valid: NDArray[np.bool_], factor: int) -> tuple[NDArray, NDArray[np.uint8]]:
+    """Area averages of the valid pixels (h, w, bands), and how much of each cell is valid (0 to 255)."""
+    size = (-(-pixels.shape[1] // factor), -(-pixels.shape[0] // factor))
+    share = cv2.resize(valid.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA)
+    solid = np.nan_to_num(pixels) if pixels.dtype.kind == "f" else pixels
+    mean = cv2.resize(solid, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], -1)
+    if share.min() < 255:  # pixels that are not valid are zero: divide by what was
+        whole = mean.astype(np.float32) * (255.0 / np.maximum(share, 1))[..., None]
+        mean = (np.minimum(whole, 255) if pixels.dtype == np.uint8 else whole).astype(pixels.dtype)
+    return mean, share
+
+
+def coloured(preview: NDArray, shown: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """RGBA (h, w, 4) of a preview: pictures as they are, measured values from dark to bright (inferno)."""
+    if preview.dtype == np.uint8 and preview.shape[2] == 3:
+        return np.dstack([preview, shown])
+    value = preview[..., 0].astype(np.float32)
+    seen = value[shown > 127]
+    low, high = np.percentile(seen, [1, 99]) if seen.size else (0.0, 1.0)
+    index = np.clip((value - low) / max(float(high - low), 1e-6) * 255, 0, 255).astype(np.uint8)
+    if preview.dtype == np.uint8:
+        return np.dstack([preview[..., :1]] * 3 + [shown])
+    return np.dstack([cv2.applyColorMap(index, cv2.COLORMAP_INFERNO)[..., ::-1], shown])
+
+
+class _Companions:
+    """Provenance, views and preview, assembled from blocks."""
+
+    def __init__(self, grid: Grid, bands: int, dtype: np.dtype) -> None:
+        self.grid, self.factor = grid, preview_factor(grid)
+        self.fine, self.coarse, small = grid.coarser(PROVENANCE), grid.coarser(STEP), grid.coarser(self.factor)
         self.provenance = np.zeros((self.fine.height, self.fine.width), np.uint32)
         self.views = np.zeros((self.coarse.height, self.coarse.width), np.uint16)
+        self.preview = np.zeros((small.height, small.width, bands), dtype)
+        self.shown = np.zeros((small.height, small.width), np.uint8)
 
     def add(self, row: int, column: int, extras: BlockExtras) -> None:
-        for target, part, step in ((self.provenance, extras.provenance, PROVENANCE), (self.views, extras.views, STEP)):
+        for target, part, step in (
+            (self.provenance, extras.provenance, PROVENANCE), (self.views, extras.views, STEP),
+            (self.preview, extras.preview, self.factor), (self.shown, extras.shown, self.factor),
+        ):  # fmt: skip
             r, c = row // step, column // step
             target[r : r + part.shape[0], c : c + part.shape[1]] = part
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from skyquilt.config import Methods
 from skyquilt.errors import NoPhotosError, UnreadablePhotoError
-from skyquilt.imaging.grey import shrink
+from skyquilt.imaging.grey import shrink, to_grey8
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.run.clock import Steps
@@ -17,6 +17,8 @@ from skyquilt.run.executor import in_order
 from skyquilt.run.pixel_cache import PixelCache
 from skyquilt.run.store import Store, digest
 
+PICTURE = 500
+"""Longest side in px of the grey pictures kept for the search of heights."""
 THUMBNAIL = 256
 """Longest side in px of the thumbnails kept for exposure and the report."""
 
@@ -29,6 +31,8 @@ class Looked:
     """Keypoints."""
     thumbnail: NDArray
     """(h, w[, bands])."""
+    picture: NDArray[np.uint8]
+    """(h, w) grey, longest side PICTURE px, for the search of heights."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,6 +51,10 @@ class Intake:
         """Features per photo."""
         return [k.features for k in self.looked]
 
+    def grey(self, photo: int, longest: int) -> NDArray[np.uint8]:
+        """Grey picture of a photo, its longest side at most `longest` px."""
+        return shrink(self.looked[photo].picture, longest)[0]
+
 
 def look(photo: Photo, index: int, cache: PixelCache, methods: Methods) -> Looked:
     """Features and thumbnail of a photo.
@@ -57,7 +65,10 @@ def look(photo: Photo, index: int, cache: PixelCache, methods: Methods) -> Looke
     pixels = cache(index)
     small, _ = shrink(pixels, methods.sift.longest)
     thumbnail, _ = shrink(small, THUMBNAIL)
-    return Looked(features=methods.sift.of_shrunken(small, pixels.shape[:2]), thumbnail=np.ascontiguousarray(thumbnail))
+    return Looked(
+        features=methods.sift.of_shrunken(small, pixels.shape[:2]), thumbnail=np.ascontiguousarray(thumbnail),
+        picture=to_grey8(shrink(small, PICTURE)[0]),
+    )  # fmt: skip
 
 
 def take_in(photos: Sequence[Photo], cache: PixelCache, methods: Methods, store: Store, jobs: int) -> Steps[Intake]:
@@ -71,7 +82,7 @@ def take_in(photos: Sequence[Photo], cache: PixelCache, methods: Methods, store:
     def one(index: int) -> Looked | RejectedPhoto:
         photo = photos[index]
         try:
-            key = digest(photo.digest, methods.sift, THUMBNAIL)
+            key = digest(photo.digest, methods.sift, THUMBNAIL, PICTURE)
             return store.get_or("features", key, lambda: look(photo, index, cache, methods))
         except UnreadablePhotoError as error:
             return RejectedPhoto(name=photo.name, reason=str(error))

@@ -12,8 +12,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from skyquilt.alignment.conflicts import conflicts
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.config import Methods, MosaicSettings, methods
@@ -77,10 +75,10 @@ def iter_mosaic(
         "align", placing.place(taken, frame, prior, links, control, parts, settings, store)
     )
     yield from (Note(text=n, warning=True) for n in alignment.notes)
-    ground = yield from clock.stage("surface", drawing.survey_ground(alignment, parts, settings, store))
+    ground = yield from clock.stage("surface", drawing.survey_ground(alignment, taken, parts, settings, store))
     exposure = yield from clock.stage("balance", _at_once(lambda: drawing.balance(taken, ground, alignment, parts, settings)))
     compose = drawing.composer(taken, ground, alignment, exposure, parts, cache)
-    key = digest(run.key, poses_digest(alignment), ground.surface.z, dict(exposure.gains))
+    key = digest(run.key, drawing.poses_digest(alignment), ground.surface.z, dict(exposure.gains))
     unit = drawing.unit_of(taken)
     drawn = yield from clock.stage(
         "mosaic", drawing.draw(run.path, compose, alignment, settings, store, key, unit, jobs)
@@ -132,13 +130,6 @@ def run_key(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSet
     side = [p.read_bytes().hex() for p in (settings.boundary,) if p is not None and p.is_file()]
     photos = [(p.name, p.digest, p.position, p.attitude, p.focal, p.calibration) for p in survey.photos]
     return digest(photos, list(control), shaping, side)
-
-
-def poses_digest(alignment: poses.Alignment) -> str:
-    """What of an alignment shapes the map."""
-    order = sorted(alignment.poses)
-    stack = [np.concatenate([alignment.poses[i].cam_R_map.ravel(), alignment.poses[i].map_C, alignment.camera(i).vector]) for i in order]
-    return digest(order, np.array(stack), alignment.frame)
 
 
 def pixel_budget(settings: MosaicSettings) -> int:

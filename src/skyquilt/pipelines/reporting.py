@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from skyquilt import __version__
 from skyquilt.config import MosaicSettings
 from skyquilt.metrics.seam_points import SeamPoint, seam_points
 from skyquilt.metrics.seams import PatchPairs, SeamReport, seam_disparity
@@ -19,6 +20,8 @@ from skyquilt.pipelines.intake import Intake
 from skyquilt.raster.atomic import write_text
 from skyquilt.render.compose import Composer
 from skyquilt.render.patches import grey_pairs
+from skyquilt.report.input import CameraResiduals, ReportInput, SeamMark, Shot
+from skyquilt.report.page import write_report
 from skyquilt.run.clock import Clock, Steps, cpu_seconds, peak_memory_mb
 
 SEAM_POINTS = 300
@@ -81,7 +84,7 @@ def finish(
     files.write_run(output / "run.toml", settings.as_table(), source, files.source_commit(), alignment.method)
     yield 1, 3
     metrics = figures | _times(clock)
-    write_text(output / "report.html", "")
+    write_report(output / "report.html", report_input(taken, priors, alignment, ground, drawn, seen, metrics, settings, source))
     yield 2, 3
     metrics |= _times(clock)
     write_text(output / "metrics.json", json.dumps(metrics, indent=1, allow_nan=False))
@@ -89,6 +92,54 @@ def finish(
         yield Note(text="the map is not georeferenced: the photos carry no usable positions", warning=True)
     yield 3, 3
     return metrics
+
+
+def report_input(
+    taken: Intake, priors: Sequence[Prior], alignment: Alignment, ground: Ground, drawn: Drawn, seen: Seams,
+    metrics: Mapping[str, Any], settings: MosaicSettings, title: str,
+) -> ReportInput:  # fmt: skip
+    """What the report shows."""
+    grid = drawn.provenance_grid
+    x, y = np.meshgrid(drawn.views_grid.x(np.arange(drawn.views_grid.width)), drawn.views_grid.y(np.arange(drawn.views_grid.height)))
+    heights = np.where(drawn.views > 0, ground.surface.at(x, y), np.float32(np.nan))
+    return ReportInput(
+        metrics=metrics, preview=drawn.preview, bounds=drawn.preview_grid.bounds, origin=alignment.frame.origin,
+        crs=alignment.frame.crs, metric=alignment.frame.metric, views=drawn.views, views_bounds=drawn.views_grid.bounds,
+        surface=heights, surface_bounds=drawn.views_grid.bounds, vertical_datum=alignment.frame.vertical_datum,
+        shots=_shots(taken, priors, alignment, ground), residuals=_residuals(taken, alignment),
+        seams=[
+            SeamMark(
+                x=float(grid.x(np.array(s.column))), y=float(grid.y(np.array(s.row))),
+                disparity_px=float(np.hypot(s.dx, s.dy)) if s.ok else None,
+            )
+            for s in seen.report.samples
+        ],
+        settings=settings.as_table(), title=Path(title).name, version=__version__,
+    )  # fmt: skip
+
+
+def _shots(taken: Intake, priors: Sequence[Prior], alignment: Alignment, ground: Ground) -> list[Shot]:
+    outline = {v.photo: v.footprint for v in ground.views}
+    block = {i: k for k, b in enumerate(alignment.blocks) for i in b}
+    return [
+        Shot(
+            name=taken.photos[i].name, xyz=pose.map_C, reported_xyz=priors[i].map_C, block=block.get(i, 0),
+            method=alignment.method if drawing.held(alignment, i) else "pose", footprint=outline.get(i, np.zeros((0, 2))),
+        )
+        for i, pose in sorted(alignment.poses.items())
+    ]  # fmt: skip
+
+
+def _residuals(taken: Intake, alignment: Alignment) -> list[CameraResiduals]:
+    ties = alignment.ties
+    name = np.array([alignment.camera_of.get(i, "") for i in range(len(taken.photos))])[ties.photo]
+    return [
+        CameraResiduals(
+            camera=key, width=alignment.cameras[key].width, height=alignment.cameras[key].height,
+            px=ties.px[name == key], residual_px=ties.residual_px[name == key],
+        )
+        for key in sorted(set(name.tolist()))
+    ]  # fmt: skip
 
 
 def _times(clock: Clock) -> dict[str, Any]:

@@ -30,12 +30,12 @@ MARGIN = 16
 class Sweep:
     """Coarse-to-fine plane sweep."""
 
-    sides: tuple[int, ...] = (250, 500)
+    sides: tuple[int, ...] = (500,)
     """Longest side in px of the pictures of each pass."""
-    below: float = 0.08
+    below: float = 0.05
     """Depth searched below the known surface in the first pass, as a share of the flying height."""
-    above: float = 0.35
-    """Height searched above it: trees and buildings that gave no tie points."""
+    above: float = 0.05
+    """Height searched above it."""
     window: int = 9
     """Side in px of the window that must agree."""
     agree: float = 0.55
