@@ -21,7 +21,7 @@ def positions_section(data: ReportInput, ground: Ground | None, layers: dict[str
     """GPS residuals on the map, along the flight and as a table."""
     shots = data.shots
     off = placed(shots) - reported(shots)
-    known: NDArray = np.isfinite(off[:, :2]).all(axis=1)
+    known = np.isfinite(off[:, 0]) & np.isfinite(off[:, 1])
     if not known.any() or ground is None:
         why = "No photo reports a position, so there is nothing to compare the solution with."
         return Section(id="positions", title="GPS and solution", blocks=(Missing(why=why),))
