@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyquilt.imaging.registration import has_texture, shift_between, shifts_between, weakest_gradient
+from skyquilt.imaging.gradients import has_texture, weakest_gradient
+from skyquilt.imaging.registration import shift_between, shifts_between
 from tests.texture import FINE, seen, texture
 
 REAL = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "brighton"

@@ -3,7 +3,7 @@ import time
 
 import numpy as np
 import pytest
-from tests.report.report_cases import Page, run, shots
+from report_cases import Page, run, shots
 
 from skyquilt.errors import OutputError
 from skyquilt.report import CameraResiduals, ReportInput, SeamMark, Shot, build_report, write_report

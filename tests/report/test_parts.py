@@ -3,7 +3,7 @@ import base64
 import cv2
 import numpy as np
 import pytest
-from tests.report.report_cases import run
+from report_cases import run
 
 from skyquilt.report import CameraResiduals, SeamMark, images
 from skyquilt.report.ground import ground_of

@@ -10,32 +10,23 @@ All sums are correlations, found by FFT; the summit is found by Newton's method 
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
 
-import cv2
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
+from skyquilt.imaging.gradients import Spectra, Stack, gradients, window
+
 RADIUS = 8
 """Largest shift in px looked for along each axis."""
-MIN_PEAK = 0.3
-"""Correlation below which a summit is weak: one in 3000 pairs of unrelated real patches comes higher."""
+MIN_PEAK = 0.35
+"""Correlation below which a summit is weak: that of 3000 pairs of unrelated real patches stays below."""
+BROAD_PEAK = 0.7
+"""Correlation below which a broad summit is weak: smooth patches have few details, which chance can match."""
+APART = 4
+"""Px from a summit at which the correlation has fallen below MAX_RATIO of it, or the summit is broad."""
 MAX_RATIO = 0.8
 """Second summit over the first above which the place is ambiguous."""
-APART = 4
-"""Px from the first summit within which its own flank lies."""
-NOISE = 1.5
-"""Standard deviation of the noise of a pixel value taken for granted, for pictures of 0 to 255."""
-TEXTURE = 2.0
-"""Times the noise's own gradient that a patch must vary in every direction to have texture."""
-RIM = 2
-"""Px at the border of a patch where its gradient is not used."""
-_DERIVE = np.array([-1, -2, 0, 2, 1], np.float32) / 8
-_SMOOTH = np.array([1, 4, 6, 4, 1], np.float32) / 16
-
-Stack = NDArray[np.float32]
-Spectra = NDArray[np.complex64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +40,7 @@ class Shift:
     peak: float
     """Correlation at the summit, at most 1."""
     second: float
-    """Highest correlation away from it."""
+    """Correlation at the next highest summit; 0 if there is no other."""
     reason: str = ""
     """Why it is not to be trusted; empty if it is."""
 
@@ -84,65 +75,34 @@ def shifts_between(a: NDArray, b: NDArray, *, radius: int = RADIUS) -> list[Shif
     return shifts
 
 
-def gradients(patches: NDArray) -> Spectra:
-    """Complex gradients (n, S, S), gx + i gy per px, of patches (n, S, S), lightly smoothed; rim 0."""
-    n, size, _ = patches.shape
-    if not n:
-        return np.zeros(patches.shape, np.complex64)
-    tall = np.ascontiguousarray(patches, np.float32).reshape(n * size, size)
-    g = np.zeros((n, size, size), np.complex64)
-    inner = (slice(None), slice(RIM, -RIM), slice(RIM, -RIM))
-    g.real[inner] = cv2.sepFilter2D(tall, cv2.CV_32F, _DERIVE, _SMOOTH).reshape(n, size, size)[inner]
-    g.imag[inner] = cv2.sepFilter2D(tall, cv2.CV_32F, _SMOOTH, _DERIVE).reshape(n, size, size)[inner]
-    return g
-
-
-def weakest_gradient(patches: NDArray) -> NDArray[np.float64]:
-    """RMS gradient (n,) per px of patches (n, S, S) along the direction in which each varies least.
-
-    A patch that holds one straight edge varies along one direction only and fixes no shift along the other.
-    """
-    g = gradients(patches) * np.sqrt(window(patches.shape[1]))
-    xx, yy = (g.real**2).sum((1, 2)), (g.imag**2).sum((1, 2))
-    xy = (g.real * g.imag).sum((1, 2))
-    least = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
-    return np.asarray(np.sqrt(np.maximum(least, 0) / window(patches.shape[1]).sum()), np.float64)
-
-
-def has_texture(patches: NDArray, *, noise: float = NOISE) -> NDArray[np.bool_]:
-    """Whether each of n patches (n, S, S) varies enough in every direction to fix a shift.
-
-    `noise` is the standard deviation of a value's noise in the patches' own unit.
-    """
-    of_noise = noise * float(np.linalg.norm(_DERIVE) * np.linalg.norm(_SMOOTH))
-    return weakest_gradient(patches) > TEXTURE * of_noise
-
-
-@lru_cache(maxsize=8)
-def window(size: int) -> Stack:
-    """Weights (S, S): 1 in the middle, falling to 0 over a quarter of the patch at each side."""
-    edge = (np.arange(size) + 0.5 - RIM) / (size / 4)
-    ramp = np.sin(np.pi / 2 * np.clip(edge, 0, 1)) ** 2
-    side = ramp * ramp[::-1]
-    return np.asarray(np.outer(side, side), np.float32)
-
-
 def _block(ga: Spectra, gb: Spectra, radius: int) -> list[Shift]:
     """Shifts from gradients."""
     w = window(ga.shape[1])
     cross = np.conj(scipy.fft.fft2(ga * w)) * scipy.fft.fft2(gb * w)
     energy = _energies(ga, gb, w, radius + 1)
-    field = _near(scipy.fft.ifft2(cross).real, radius + 1) / np.sqrt(energy)
+    field = (_near(scipy.fft.ifft2(cross).real, radius + 1) / np.sqrt(energy)).astype(np.float32)
     inner = field[:, 1:-1, 1:-1]
     top = inner.reshape(len(inner), -1).argmax(1)
     row, column = top // inner.shape[2], top % inner.shape[2]
     start = np.stack([row, column], 1) - radius
     slope = _slope(np.log(energy), row + 1, column + 1) / 2
     summit, steep = _summit(cross, start, slope)
+    peak = inner[np.arange(len(inner)), row, column]
+    weak = np.where(_farther(inner, start) > MAX_RATIO * peak, BROAD_PEAK, MIN_PEAK)
+    second = _second(field, row, column)
+    rules = {
+        "summit at the edge of the search": np.abs(start).max(1) == radius,
+        "no clear summit": ~steep,
+        "weak summit": peak < weak,
+        "ambiguous": second > MAX_RATIO * peak,
+    }
+    reasons = np.select(list(rules.values()), list(rules), default="")
     return [
-        _judge(inner[k], (int(row[k]), int(column[k])), summit[k], bool(steep[k]))
-        for k in range(len(inner))
-    ]  # fmt: skip
+        Shift(dx=dx, dy=dy, peak=p, second=q, reason=str(reason))
+        for (dy, dx), p, q, reason in zip(
+            summit.tolist(), peak.tolist(), second.tolist(), reasons, strict=True
+        )
+    ]
 
 
 def _near(field: Stack, radius: int) -> Stack:
@@ -204,19 +164,22 @@ def _taylor(cross: Spectra, d: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray((wave[:, 0].transpose(0, 2, 1) @ (cross @ wave[:, 1])).real / size**2, np.float64)
 
 
-def _judge(field: Stack, at: tuple[int, int], d: NDArray[np.float64], converged: bool) -> Shift:
-    """A shift with the verdict on its correlation field."""
-    peak = float(field[at])
-    rows, columns = np.ogrid[: field.shape[0], : field.shape[1]]
-    away = np.maximum(abs(rows - at[0]), abs(columns - at[1])) >= APART
-    second = float(field[away].max())
-    reason = ""
-    if min(at) == 0 or max(at) == len(field) - 1:
-        reason = "summit at the edge of the search"
-    elif not converged:
-        reason = "no clear summit"
-    elif peak < MIN_PEAK:
-        reason = "weak summit"
-    elif second > MAX_RATIO * peak:
-        reason = "ambiguous"
-    return Shift(dx=float(d[1]), dy=float(d[0]), peak=peak, second=second, reason=reason)
+def _farther(inner: Stack, start: NDArray) -> Stack:
+    """(n,) the highest correlation APART px or more from the summits at shifts `start` (n, 2)."""
+    shift = np.arange(inner.shape[1]) - inner.shape[1] // 2
+    rows, columns = np.abs(shift - start[:, :1]), np.abs(shift - start[:, 1:])
+    away = np.maximum(rows[:, :, None], columns[:, None, :]) >= APART
+    return np.where(away, inner, -1).max((1, 2)).astype(np.float32)
+
+
+def _second(field: Stack, row: NDArray, column: NDArray) -> Stack:
+    """(n,) the highest local maximum but the one at (row, column), which count without the field's margin.
+
+    The flank of a broad summit is no second summit: smooth patches with one clear place have such.
+    """
+    inner = field[:, 1:-1, 1:-1]
+    summit = np.ones(inner.shape, bool)
+    for i, j in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2)):
+        summit &= inner >= field[:, i : i + inner.shape[1], j : j + inner.shape[2]]
+    summit[np.arange(len(field)), row, column] = False
+    return np.where(summit, inner, 0).max((1, 2)).astype(np.float32)

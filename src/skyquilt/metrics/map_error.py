@@ -7,7 +7,8 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 
-from skyquilt.imaging.registration import NOISE, RADIUS, Shift, has_texture, shifts_between
+from skyquilt.imaging.gradients import NOISE, has_texture
+from skyquilt.imaging.registration import RADIUS, Shift, shifts_between
 from skyquilt.metrics.ground import patches
 
 SIZE = 64

@@ -7,7 +7,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.registration import NOISE, RADIUS, has_texture, shifts_between
+from skyquilt.imaging.gradients import NOISE, has_texture
+from skyquilt.imaging.registration import RADIUS, shifts_between
 from skyquilt.metrics.seam_points import SeamPoint
 
 LEAST_MEASURED = 0.6

@@ -265,7 +265,9 @@ def summary(data: ReportInput) -> str:
     m = data.metrics
     used, total = number(m.get("photos_used")), number(m.get("photos_total"))
     words = [
-        f"{fixed(used, 0)} of {count(total, 'photo')}" if used is not None and total is not None else "Photos"
+        f"{fixed(used, 0)} of {count(total, 'photo')}"
+        if used is not None and total is not None
+        else "A run without figures"
     ]
     if n := len(items(m.get("blocks"))):
         words.append(f"in {'one block' if n == 1 else count(n, 'block')}")

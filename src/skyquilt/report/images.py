@@ -70,7 +70,7 @@ def css(rgb: NDArray) -> str:
 def outline(
     alpha: NDArray[np.uint8], *, tolerance: float = 0.7, limit: int = 200
 ) -> list[NDArray[np.float64]]:
-    """Rings (k, 2) in px (the image spans 0 to its size) around all that is not transparent, and around holes.
+    """Rings (k, 2) in px (the image spans 0 to its size) around what is not transparent, and around holes.
 
     At most `limit` rings, the largest ones.
     """

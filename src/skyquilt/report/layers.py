@@ -17,6 +17,8 @@ from skyquilt.report.svg import arrows, dots, path, polyline
 
 PREVIEW_PX, VIEWS_PX, SURFACE_PX = 1600, 700, 480
 MOST_SHOTS, MOST_SEAMS = 2500, 4000
+MANY = 300
+"""From here on marks are drawn finer."""
 SEAM_EDGES = (0.5, 1.0, 2.0, 5.0)
 SEAM_COLOURS = ("#2166ac", "#67a9cf", "#f6e27f", "#ef8a62", "#c2183b", "#8b8f96")
 SEAM_LABELS = ("up to 0.5 px", "0.5 to 1 px", "1 to 2 px", "2 to 5 px", "more than 5 px", "not measured")
@@ -176,7 +178,7 @@ def centres(shots: Sequence[Shot], ground: Ground) -> Layer | None:
         id="centres",
         label="Photo centres",
         shape=shape,
-        styles=("dot-casing", "dots"),
+        styles=("dot-casing", "dots") if known.sum() <= MANY else ("small dot-casing", "small dots"),
         on=True,
         legend=tuple(legend) if len(kinds) > 1 else (),
     )
@@ -189,7 +191,8 @@ def exaggeration(shots: Sequence[Shot], ground: Ground) -> float:
     length = length[np.isfinite(length) & (length > 0)]
     if not len(length):
         return 1.0
-    wanted = 0.05 * ground.diagonal / float(np.percentile(length, 75))
+    room = min(0.05 * ground.diagonal, 0.8 * float(np.sqrt(ground.width * ground.height / len(length))))
+    wanted = room / float(np.percentile(length, 75))
     return max(1.0, nice(wanted / 2, 1)) if wanted > 1 else 1.0
 
 
@@ -206,7 +209,12 @@ def gps(shots: Sequence[Shot], ground: Ground) -> Layer | None:
             ground.xy(tails), ground.xy(tails + factor * off), ground.decimals, longest=ground.diagonal / 90
         )
     )
-    return Layer(id="gps", label=f"GPS to solution \u00d7{factor:g}", shape=shape, styles=("casing", "gps"))
+    return Layer(
+        id="gps",
+        label=f"GPS to solution \u00d7{factor:g}",
+        shape=shape,
+        styles=("casing", "gps") if len(tails) <= MANY else ("gps",),
+    )
 
 
 def seams(marks: Sequence[SeamMark], ground: Ground) -> Layer | None:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from skyquilt.report.ground import Ground, picture, use
 from skyquilt.report.input import ReportInput, Shot
-from skyquilt.report.layers import Layer, exaggeration, placed, reported
+from skyquilt.report.layers import MANY, Layer, exaggeration, placed, reported
 from skyquilt.report.numbers import count, fixed
 from skyquilt.report.parts import Figure, Missing, Section, Table
 from skyquilt.report.svg import HEIGHT, WIDTH, Axes, coordinate, dots, drawing, path, polyline
@@ -21,7 +21,7 @@ def positions_section(data: ReportInput, ground: Ground | None, layers: dict[str
     """GPS residuals on the map, along the flight and as a table."""
     shots = data.shots
     off = placed(shots) - reported(shots)
-    known: NDArray = np.isfinite(off[:, :2]).all(axis=1)
+    known = np.isfinite(off[:, 0]) & np.isfinite(off[:, 1])
     if not known.any() or ground is None:
         why = "No photo reports a position, so there is nothing to compare the solution with."
         return Section(id="positions", title="GPS and solution", blocks=(Missing(why=why),))
@@ -52,7 +52,7 @@ def _arrows(ground: Ground, layers: dict[str, Layer], shots: Sequence[Shot], off
             f" {count(far, 'photo')} reported further away than the map is wide: not drawn, see the table."
         )
     under = [use("mosaic", "faded")] if "mosaic" in layers else []
-    svg = picture(ground, [*under, *(use("gps", c) for c in ("casing", "gps"))], title)
+    svg = picture(ground, [*under, *(use("gps", c) for c in layers["gps"].styles)], title)
     return Figure(svg=svg, title=title, caption=caption)
 
 
@@ -76,7 +76,9 @@ def _series(off: NDArray, unit: str) -> Figure:
         )
         xy = axes.points(np.stack([index * stride + 1.0, value[index]], 1))
         runs = np.split(xy, np.flatnonzero(np.diff(index) > 1) + 1)
-        lines = path("".join(polyline(r) for r in runs), f"series {cls}") + path(dots(xy), f"points {cls}")
+        lines = path("".join(polyline(r) for r in runs), f"series {cls}") + (
+            path(dots(xy), f"points {cls}") if len(off) <= MANY else ""
+        )
         grid = axes.grid("photo" if k == 2 else "", f"{name}, {unit}", x_ticks=k == 2, y_parts=5)
         parts.append(
             Markup('<g transform="translate(0 {})">{}</g>').format(coordinate(k * strip), grid + lines)

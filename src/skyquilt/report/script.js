@@ -53,12 +53,12 @@
     tip.style.top = (ty > H - 80 ? ty - tip.offsetHeight - 12 : ty + 12) + "px";
   }
   map.addEventListener("wheel", event => {
-    if (document.activeElement !== map && !event.ctrlKey) { place.textContent = "Click the map, then scroll to zoom"; return; }
+    if (!map.contains(document.activeElement) && !event.ctrlKey) { place.textContent = "Click the map, then scroll to zoom"; return; }
     event.preventDefault(); zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0018)), ...point(event));
   }, {passive: false});
   map.addEventListener("pointerdown", event => {
     if (event.target.closest("button")) return;
-    if (event.pointerType === "touch" && document.activeElement !== map) return hover(point(event));
+    if (event.pointerType === "touch" && !map.contains(document.activeElement)) return hover(point(event));
     map.setPointerCapture(event.pointerId); touches.set(event.pointerId, point(event)); map.classList.add("moving");
   });
   map.addEventListener("pointermove", event => {

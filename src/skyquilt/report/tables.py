@@ -144,7 +144,10 @@ def conflicts_section(data: ReportInput) -> Section:
     found = [mapping(v) for v in items(data.metrics.get("metadata_conflicts"))]
     found = [c for c in found if c]
     if not found:
-        none = Missing(why="The metadata agree with what the photos show; no contradiction was found.")
+        why = "The metadata agree with what the photos show; no contradiction was found."
+        if "metadata_conflicts" not in data.metrics:
+            why = "The metadata were not compared with what the photos show."
+        none = Missing(why=why)
         return Section(id="conflicts", title="Metadata conflicts", blocks=(none,))
     rows = tuple(
         (
@@ -185,9 +188,10 @@ def rejected_section(data: ReportInput) -> Section:
     """Photos that take no part."""
     rejected = mapping(data.metrics.get("photos_rejected"))
     if not rejected:
-        return Section(
-            id="rejected", title="Rejected photos", blocks=(Missing(why="No photo was rejected."),)
+        why = (
+            "No photo was rejected." if "photos_rejected" in data.metrics else "Rejections were not recorded."
         )
+        return Section(id="rejected", title="Rejected photos", blocks=(Missing(why=why),))
     rows = tuple((str(k), plain(v)) for k, v in list(rejected.items())[:MOST_ROWS])
     table = Table(
         title=count(len(rejected), "photo"),

@@ -1,0 +1,62 @@
+"""Gradients of patches, and whether there is enough of them to tell one place from another."""
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+NOISE = 1.5
+"""Standard deviation of the noise of a pixel value taken for granted, for pictures of 0 to 255."""
+TEXTURE = 2.0
+"""Times the noise's own gradient that a patch must vary in every direction to have texture."""
+RIM = 2
+"""Px at the border of a patch where its gradient is not used."""
+_DERIVE = np.array([-1, -2, 0, 2, 1], np.float32) / 8
+_SMOOTH = np.array([1, 4, 6, 4, 1], np.float32) / 16
+
+Stack = NDArray[np.float32]
+Spectra = NDArray[np.complex64]
+
+
+def gradients(patches: NDArray) -> Spectra:
+    """Complex gradients (n, S, S), gx + i gy per px, of patches (n, S, S), lightly smoothed; rim 0."""
+    n, size, _ = patches.shape
+    if not n:
+        return np.zeros(patches.shape, np.complex64)
+    tall = np.ascontiguousarray(patches, np.float32).reshape(n * size, size)
+    g = np.zeros((n, size, size), np.complex64)
+    inner = (slice(None), slice(RIM, -RIM), slice(RIM, -RIM))
+    g.real[inner] = cv2.sepFilter2D(tall, cv2.CV_32F, _DERIVE, _SMOOTH).reshape(n, size, size)[inner]
+    g.imag[inner] = cv2.sepFilter2D(tall, cv2.CV_32F, _SMOOTH, _DERIVE).reshape(n, size, size)[inner]
+    return g
+
+
+def weakest_gradient(patches: NDArray) -> NDArray[np.float64]:
+    """RMS gradient (n,) per px of patches (n, S, S) along the direction in which each varies least.
+
+    A patch that holds one straight edge varies along one direction only and fixes no shift along the other.
+    """
+    g = gradients(patches) * np.sqrt(window(patches.shape[1]))
+    xx, yy = (g.real**2).sum((1, 2)), (g.imag**2).sum((1, 2))
+    xy = (g.real * g.imag).sum((1, 2))
+    least = (xx + yy) / 2 - np.hypot((xx - yy) / 2, xy)
+    return np.asarray(np.sqrt(np.maximum(least, 0) / window(patches.shape[1]).sum()), np.float64)
+
+
+def has_texture(patches: NDArray, *, noise: float = NOISE) -> NDArray[np.bool_]:
+    """Whether each of n patches (n, S, S) varies enough in every direction to fix a shift.
+
+    `noise` is the standard deviation of a value's noise in the patches' own unit.
+    """
+    of_noise = noise * float(np.linalg.norm(_DERIVE) * np.linalg.norm(_SMOOTH))
+    return weakest_gradient(patches) > TEXTURE * of_noise
+
+
+@lru_cache(maxsize=8)
+def window(size: int) -> Stack:
+    """Weights (S, S): 1 in the middle, falling to 0 over a quarter of the patch at each side."""
+    edge = (np.arange(size) + 0.5 - RIM) / (size / 4)
+    ramp = np.sin(np.pi / 2 * np.clip(edge, 0, 1)) ** 2
+    side = ramp * ramp[::-1]
+    return np.asarray(np.outer(side, side), np.float32)
