@@ -155,7 +155,7 @@ def balance(intake: Intake, ground: Ground, alignment: Alignment, methods: Metho
     if not settings.balance or intake.photos[0].dtype != "uint8":
         return NEUTRAL
     thumbnails = {v.photo: _three(intake.looked[v.photo].thumbnail) for v in ground.views}
-    return methods.balance(ground.views, thumbnails, alignment.camera_of, ground.surface, ground.grid.bounds)
+    return methods.balance(ground.views, thumbnails, ground.surface, ground.grid.bounds)
 
 
 def _three(thumbnail: NDArray) -> NDArray:

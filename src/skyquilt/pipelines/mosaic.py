@@ -78,7 +78,7 @@ def iter_mosaic(
     ground = yield from clock.stage("surface", drawing.survey_ground(alignment, taken, parts, settings, store))
     exposure = yield from clock.stage("balance", _at_once(lambda: drawing.balance(taken, ground, alignment, parts, settings)))
     compose = drawing.composer(taken, ground, alignment, exposure, parts, cache)
-    key = digest(run.key, drawing.poses_digest(alignment), ground.surface.z, dict(exposure.gains))
+    key = digest(run.key, drawing.poses_digest(alignment), ground.surface.z, dict(exposure.gains), dict(exposure.fields))
     unit = drawing.unit_of(taken)
     drawn = yield from clock.stage(
         "mosaic", drawing.draw(run.path, compose, alignment, settings, store, key, unit, jobs)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import STEP, Nodes, View, densify, inside, project_nodes
+from skyquilt.imaging.views import STEP, Nodes, View, densify, inside_everywhere, project_nodes
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
 
@@ -180,7 +180,7 @@ def _shown(
         warped = cv2.remap(
             picture, (u + 0.5) * scale - 0.5, (v + 0.5) * scale - 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
-        mine = (dense == photo) & inside(view.camera, u, v)
+        mine = (dense == photo) & inside_everywhere(n, u, v)
         np.copyto(out, warped, where=mine, casting="unsafe")
     return out
 
