@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.render.blend import Blend, Layer
-from skyquilt.render.exposure import NEUTRAL, Exposure, image_place
+from skyquilt.render.exposure import NEUTRAL, Exposure, image_place, with_odds
 from skyquilt.imaging.views import STEP, Nodes, View, cut, densify, inside_everywhere, window_nodes
 
 PhotoPixels = Callable[[int], NDArray]
@@ -120,6 +120,8 @@ class Composer:
         photo = n.view.photo
         if photo not in self.exposure.gains or warped.dtype != np.uint8:
             return warped
-        x, y = image_place(n.view, n.u, n.v)
-        h, w = warped.shape[:2]
-        return self.exposure.apply(photo, warped, densify(x.astype(np.float32), h, w), densify(y.astype(np.float32), h, w))
+        if self.exposure.uneven(photo):
+            odds = self.exposure.odds(photo, *image_place(n.view, n.u, n.v))
+            return with_odds(warped, densify(odds, *warped.shape[:2]).reshape(warped.shape))
+        table = self.exposure.table(photo)
+        return warped if table is None else np.asarray(cv2.LUT(warped, table)).reshape(warped.shape)

@@ -37,17 +37,26 @@ class Exposure:
     fields: Mapping[int, Float]
     """Photo -> (5,) in log odds, for x and y from -1 to 1 over the image."""
 
-    def apply(self, photo: int, pixels: NDArray[np.uint8], x: Float, y: Float) -> NDArray[np.uint8]:
-        """Pixels (h, w, bands) at the common brightness; x, y (h, w): place in the image, -1 to 1."""
-        gains, field = self.gains[photo], self.fields[photo]
-        if float(np.abs(field).max()) == 0:
-            if float(np.abs(gains).max()) < 0.005:
-                return pixels
-            return np.asarray(cv2.LUT(pixels, odds_table(gains))).reshape(pixels.shape)
-        odds = np.exp(_basis(x, y) @ field)[..., None] * np.exp(gains)
-        brighter = cv2.multiply(pixels, odds.astype(np.float32), dtype=cv2.CV_32F).reshape(pixels.shape)
-        white = brighter - pixels + np.float32(255)
-        return np.asarray(cv2.divide(brighter, white, scale=255, dtype=cv2.CV_8U)).reshape(pixels.shape)
+    def uneven(self, photo: int) -> bool:
+        """Whether the photo needs more than one gain per band."""
+        return bool(np.abs(self.fields[photo]).max() > 0)
+
+    def odds(self, photo: int, x: Float, y: Float) -> Float:
+        """Factors (h, w, bands) on the odds at places x, y (h, w) in the image, -1 to 1."""
+        field = np.exp(_basis(x, y) @ self.fields[photo])
+        return (field[..., None] * np.exp(self.gains[photo])).astype(np.float32)
+
+    def table(self, photo: int) -> NDArray[np.uint8] | None:
+        """Lookup table (1, 256, bands) of an even photo; None where nothing changes."""
+        gains = self.gains[photo]
+        return odds_table(gains) if float(np.abs(gains).max()) >= 0.005 else None
+
+
+def with_odds(pixels: NDArray[np.uint8], odds: Float) -> NDArray[np.uint8]:
+    """Pixels (h, w, bands) with their odds multiplied by odds (h, w, bands)."""
+    brighter = cv2.multiply(pixels, odds, dtype=cv2.CV_32F).reshape(pixels.shape)
+    white = cv2.add(cv2.subtract(brighter, pixels, dtype=cv2.CV_32F), (255.0,) * 4).reshape(pixels.shape)
+    return np.asarray(cv2.divide(brighter, white, scale=255, dtype=cv2.CV_8U)).reshape(pixels.shape)
 
 
 def _basis(x: NDArray, y: NDArray) -> NDArray:
