@@ -8,7 +8,22 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 OURS = ("src", "tests", "docs", "examples", "benchmarks", ".ci")
-TEXT = {".py", ".md", ".toml", ".txt", ".json", ".js", ".css", ".j2", ".html", ".csv", ".yaml", ".yml", ".cfg", ""}
+TEXT = {
+    ".py",
+    ".md",
+    ".toml",
+    ".txt",
+    ".json",
+    ".js",
+    ".css",
+    ".j2",
+    ".html",
+    ".csv",
+    ".yaml",
+    ".yml",
+    ".cfg",
+    "",
+}
 SLASH = "/"
 HOMES = [SLASH + name + SLASH for name in ("work", "home", "root", "Users", "opt", "mnt")]
 REGISTRIES = ["index-" + "url", "find-" + "links", "pypi" + ".", "trusted-" + "host"]

@@ -25,6 +25,8 @@ def test_an_unknown_name_is_an_attribute_error():
 
 
 def test_importing_the_package_imports_nothing_heavy():
-    code = "import sys, skyquilt; print(*(m for m in ('numpy', 'cv2', 'scipy', 'rasterio') if m in sys.modules))"
+    code = (
+        "import sys, skyquilt; print(*(m for m in ('numpy', 'cv2', 'scipy', 'rasterio') if m in sys.modules))"
+    )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == ""

@@ -62,7 +62,7 @@ def command(
     repair: Annotated[
         bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")
     ] = True,
-    features: Annotated[int, typer.Option(help="Features per photo.")] = 2000,
+    features: Annotated[int, typer.Option(help="Features per photo.")] = 1500,
     jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.")] = 0,
     memory: Annotated[
         float | None, typer.Option(help="Memory to stay within, in GB.", show_default="1.2")

@@ -134,10 +134,16 @@ class Topocentric:
 
 def write_run(path: Path, settings: Mapping[str, Any], photos: str, commit: str | None, method: str) -> None:
     """run.toml: what was asked for, by which version."""
-    lines = [f"version = {json.dumps(__version__)}", f"commit = {json.dumps(commit or 'unknown')}",
-             f"photos = {json.dumps(photos)}", f"method_used = {json.dumps(method)}", "", "[settings]"]  # fmt: skip
-    lines += [f"{key} = {json.dumps(value)}" for key, value in settings.items()]
+    about = {"version": __version__, "commit": commit or "unknown", "photos": photos, "method_used": method}
+    lines = [f"{key} = {_toml(value)}" for key, value in about.items()]
+    lines += ["", "[settings]", *(f"{key} = {_toml(value)}" for key, value in settings.items())]
     write_text(path, "\n".join(lines) + "\n")
+
+
+def _toml(value: Any) -> str:
+    """JSON is TOML, but for characters beyond 16 bits, lone surrogates (undecodable file names) and DEL."""
+    text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return text.encode("utf-8", "replace").decode()
 
 
 def source_commit() -> str | None:
