@@ -221,7 +221,7 @@ def draw(
                 valid &= keep(block)
             pixels = _blanked(composed.pixels, valid)
             preview, shown = _reduced(pixels, valid, whole.factor)
-            numbers = _thinned(table[np.where(valid, composed.photo, -1)])
+            numbers = table[np.where(_thinned(valid), _thinned(composed.photo), -1)]
             extras = BlockExtras(provenance=numbers, views=composed.views, preview=preview, shown=shown)
             store.put("blocks", digest(key, block.row0, block.col0), extras)
             writer.write_block(block, pixels, valid)
@@ -236,7 +236,8 @@ def draw(
     )  # fmt: skip
 
 
-def _thinned(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
+def _thinned(numbers: NDArray) -> NDArray:
+    """Every PROVENANCE-th pixel in both directions, from the middle of its cell."""
     half = PROVENANCE // 2
     thin = numbers[half::PROVENANCE, half::PROVENANCE]
     rows, columns = -(-numbers.shape[0] // PROVENANCE), -(-numbers.shape[1] // PROVENANCE)

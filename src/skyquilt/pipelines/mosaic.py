@@ -52,7 +52,7 @@ def iter_mosaic(
     Raises:
         SkyquiltError: anything a user can mend: no photos, an output that is taken, a malformed side file ...
     """
-    settings = settings or MosaicSettings()
+    settings, began = settings or MosaicSettings(), Clock.now()
     parts, jobs = methods(settings), settings.jobs or os.cpu_count() or 1
     survey, control = _read(folder, settings)
     run = open_run(Path(output), run_key(survey, control, settings), overwrite=overwrite or rerun_from is not None)
@@ -63,7 +63,8 @@ def iter_mosaic(
         yield Result(output=run.path, metrics=json.loads((run.path / "metrics.json").read_text()))
         return
     run.mark("running")
-    clock = Clock(store=store)
+    clock = Clock(store=store, began=began)
+    clock.lap("read", began)
     yield from (Note(text=n) for n in survey.notes)
     cache = PixelCache(read=lambda i: read_color(survey.photos[i]), budget_bytes=pixel_budget(settings))
     taken = yield from clock.stage("features", intake.take_in(survey.photos, cache, parts, store, jobs))

@@ -96,15 +96,16 @@ class Feather:
 
     def _soften(self, hard: NDArray, layers: Sequence[Layer], lead: NDArray[np.int32], gsd: float) -> None:
         """Blends, in place, the few pixels that lie within half a width of a seam."""
-        scores = np.stack([layer.score for layer in layers])
         slopes = [[self._slope(a, b, gsd) for b in layers] for a in layers]
         steepest = max(max(row) for row in slopes)
-        two = np.partition(scores, 1, axis=0)[:2]
-        with np.errstate(invalid="ignore"):
-            near = np.flatnonzero((two[1] - two[0]).ravel() < steepest * self.width_px / 2)
+        best, second = layers[0].score, np.full_like(layers[0].score, np.inf)
+        for layer in layers[1:]:
+            second = np.minimum(second, np.maximum(best, layer.score))
+            best = np.minimum(best, layer.score)
+        near = np.flatnonzero(second < best + np.float32(steepest * self.width_px / 2))
         if not len(near):
             return
-        s = scores.reshape(len(layers), -1)[:, near]
+        s = np.stack([layer.score.ravel()[near] for layer in layers])
         ramps = np.empty(s.shape, np.float32)
         with np.errstate(invalid="ignore"):
             for k in range(len(layers)):
