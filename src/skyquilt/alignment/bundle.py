@@ -75,7 +75,7 @@ def _refine(problem: Problem, state: State) -> tuple[Problem, State]:
 def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]:
     """Without the sightings off by more than `limit` deviations, and points then seen once; control stays."""
     error = np.linalg.norm(residuals_px(problem, state), axis=1) / problem.sigma_px
-    pinned = np.isfinite(problem.X0).any(1)
+    pinned = np.asarray(np.isfinite(problem.X0).any(1))
     good = (error < limit) | pinned[problem.point]
     enough = np.bincount(problem.point[good], minlength=len(state.X)) >= 2
     good &= enough[problem.point] | pinned[problem.point]

@@ -117,8 +117,8 @@ def georeference(
     known = np.isfinite(position)
     if not known.any():
         turn = _turn(solution.a, priors)
-        g, metric = _scale_by_height(solution.a, priors)
-        scaled = replace(solution, a=solution.a * g * turn, t=solution.t * g * turn)
+        height, metric = _scale_by_height(solution.a, priors)
+        scaled = replace(solution, a=solution.a * height * turn, t=solution.t * height * turn)
         return scaled, np.nan, metric
     where = position[known]
     spread = float(np.abs(where - where.mean()).max()) if known.sum() > 1 else 0.0

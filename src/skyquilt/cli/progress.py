@@ -58,7 +58,7 @@ def _bars(events: Iterable[Event], *, verbose: bool) -> None:
                 )
             elif isinstance(happened, Result):
                 result = happened
-    Console().print(summary(result), markup=False, highlight=False)
+    Console().print(summary(result), markup=False, highlight=False, soft_wrap=True)
 
 
 def summary(result: Result) -> str:

@@ -32,10 +32,9 @@ class Sift:
     def of_shrunken(self, small: NDArray, full: tuple[int, int]) -> Features:
         """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer to."""
         grey = to_grey8(small)
-        detector = cv2.SIFT_create(int(1.4 * self.count), contrastThreshold=self.contrast)
-        points, descriptors = detector.detectAndCompute(grey, None)
-        if descriptors is None:
-            points, descriptors = (), np.zeros((0, 128), np.float32)
+        detector = cv2.SIFT.create(int(1.4 * self.count), contrastThreshold=self.contrast)
+        points, found = detector.detectAndCompute(grey, None)
+        descriptors = np.zeros((0, 128), np.float32) if found is None else np.asarray(found, np.float32)
         xy = np.array([p.pt for p in points], np.float64).reshape(-1, 2)
         keep = _spread(xy, np.array([p.response for p in points]), grey.shape, self.count, self.cells)
         scale = full[1] / grey.shape[1]

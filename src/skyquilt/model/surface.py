@@ -37,4 +37,4 @@ class Surface:
                     borderMode=cv2.BORDER_REPLICATE,
                 )  # fmt: skip
             )
-        return np.concatenate(parts, 1).reshape(shape)
+        return np.concatenate(parts, 1, dtype=np.float32).reshape(shape)

@@ -3,13 +3,14 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.config import Methods, MosaicSettings
-from skyquilt.errors import UsageError
+from skyquilt.errors import OutputError, UsageError
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
@@ -17,6 +18,7 @@ from skyquilt.pipelines.intake import Intake
 from skyquilt.raster import Block, CogWriter, RasterSpec, write_array
 from skyquilt.raster.boundary import inside as inside_polygon
 from skyquilt.raster.boundary import read_boundary
+from skyquilt.raster.spec import Compression
 from skyquilt.render.compose import Composed, Composer, PhotoPixels
 from skyquilt.render.exposure import NEUTRAL, Exposure
 from skyquilt.imaging.views import STEP, View, grid_of, make_views, native_gsd
@@ -182,8 +184,8 @@ def geotransform(grid: Grid, alignment: Alignment) -> tuple[float, float, float,
 def mosaic_spec(compose: Composer, alignment: Alignment, settings: MosaicSettings, unit: str) -> RasterSpec:
     """How mosaic.tif is written."""
     picture = compose.dtype == np.uint8
-    compress = settings.compress
-    if compress == "auto":
+    compress = cast(Compression, settings.compress)
+    if settings.compress == "auto":
         compress = "jpeg" if picture and compose.bands in (1, 3) else "zstd"
     if compress == "jpeg" and not (picture and compose.bands in (1, 3)):
         raise UsageError(f"--compress jpeg is for 8-bit pictures; these photos are {compose.dtype}, {compose.bands} bands")
@@ -228,7 +230,10 @@ def draw(
             yield total - len(todo) + done + 1, total
     for row in range(0, spec.height, 2048):
         for column in range(0, spec.width, 2048):
-            whole.add(row, column, store.get("blocks", digest(key, row, column)))
+            kept: BlockExtras | None = store.get("blocks", digest(key, row, column))
+            if kept is None:  # the map itself is whole by now, so that the next run draws every block again
+                raise OutputError(f"intermediate results of {output} are gone; run the same command again")
+            whole.add(row, column, kept)
     _write_companions(output, whole, alignment)
     return Drawn(
         provenance=whole.provenance, provenance_grid=whole.fine, views=whole.views, views_grid=whole.coarse,
@@ -275,9 +280,11 @@ def preview_factor(grid: Grid) -> int:
 def _reduced(pixels: NDArray, valid: NDArray[np.bool_], factor: int) -> tuple[NDArray, NDArray[np.uint8]]:
     """Area averages of the valid pixels (h, w, bands), and how much of each cell is valid (0 to 255)."""
     size = (-(-pixels.shape[1] // factor), -(-pixels.shape[0] // factor))
-    share = cv2.resize(valid.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA)
+    opaque = valid.view(np.uint8) * np.uint8(255)
+    share = np.asarray(cv2.resize(opaque, size, interpolation=cv2.INTER_AREA), np.uint8)
     solid = np.nan_to_num(pixels) if pixels.dtype.kind == "f" else pixels
-    mean = cv2.resize(solid, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], -1)
+    mean: NDArray = np.asarray(cv2.resize(solid, size, interpolation=cv2.INTER_AREA))
+    mean = mean.reshape(size[1], size[0], -1)
     if share.min() < 255:  # pixels that are not valid are zero: divide by what was
         whole = mean.astype(np.float32) * (255.0 / np.maximum(share, 1))[..., None]
         mean = (np.minimum(whole, 255) if pixels.dtype == np.uint8 else whole).astype(pixels.dtype)

@@ -30,8 +30,9 @@ class Layer:
 class Blend(Protocol):
     """A merge rule."""
 
-    margin: int
-    """Pixels beyond the window that the rule must see."""
+    @property
+    def margin(self) -> int:
+        """Pixels beyond the window that the rule must see."""
 
     def rank(self, order: int, score: Float) -> Float:
         """What decides between photos: the lowest wins. `order`: position in order of capture."""
@@ -181,7 +182,7 @@ class Average:
         seen = [np.isfinite(layer.score).astype(np.float32) for layer in layers]
         number = np.maximum(np.sum(seen, axis=0, dtype=np.float32), 1e-6)
         lead = leader(layers, [layer.score for layer in layers])
-        merged = _weighted(layers, [s / number for s in seen])
+        merged = _weighted(layers, [np.asarray(s / number, np.float32) for s in seen])
         if merged.dtype.kind == "f":
             merged[lead < 0] = np.nan
         return merged, _photos(lead, layers)
@@ -243,7 +244,7 @@ def _filled(layer: Layer, hard: NDArray) -> Float:
 def _gaussian(image: Float, levels: int) -> list[Float]:
     out = [image]
     for _ in range(levels):
-        out.append(cv2.pyrDown(out[-1]))
+        out.append(np.asarray(cv2.pyrDown(out[-1]), np.float32))
     return out
 
 
@@ -254,7 +255,7 @@ def _laplacian(image: Float, levels: int) -> list[Float]:
 
 
 def _up(small: Float, like: Float) -> Float:
-    return np.asarray(cv2.pyrUp(small, dstsize=(like.shape[1], like.shape[0]))).reshape(like.shape)
+    return np.asarray(cv2.pyrUp(small, dstsize=(like.shape[1], like.shape[0])), np.float32).reshape(like.shape)
 
 
 def _collapse(bands: list[Float]) -> Float:

@@ -7,7 +7,7 @@ stays white, so nothing clips or turns purple, and two gains in a row are one ga
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -55,8 +55,9 @@ class Exposure:
 def with_odds(pixels: NDArray[np.uint8], odds: Float) -> NDArray[np.uint8]:
     """Pixels (h, w, bands) with their odds multiplied by odds (h, w, bands)."""
     brighter = cv2.multiply(pixels, odds, dtype=cv2.CV_32F).reshape(pixels.shape)
-    white = cv2.add(cv2.subtract(brighter, pixels, dtype=cv2.CV_32F), (255.0,) * 4).reshape(pixels.shape)
-    return np.asarray(cv2.divide(brighter, white, scale=255, dtype=cv2.CV_8U)).reshape(pixels.shape)
+    level: Any = (255.0,) * 4  # a scalar for each band: OpenCV's stubs know arrays only
+    white = cv2.add(cv2.subtract(brighter, pixels, dtype=cv2.CV_32F), level).reshape(pixels.shape)
+    return np.asarray(cv2.divide(brighter, white, scale=255, dtype=cv2.CV_8U), np.uint8).reshape(pixels.shape)
 
 
 def _basis(x: NDArray, y: NDArray) -> NDArray:

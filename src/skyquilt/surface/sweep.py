@@ -123,7 +123,7 @@ class Sweep:
             middle = np.where(number >= cell * cell // 3, _nanmedian(believed), np.nan)
         weight = np.where(np.isfinite(middle), 1.0, 0.05).astype(np.float32)
         value = np.where(np.isfinite(middle), middle, known).astype(np.float32)
-        value = cv2.medianBlur(value, 5)
+        value = np.asarray(cv2.medianBlur(value, 5), np.float32)
         spread = self.smoothing_cells
         total = cv2.GaussianBlur(weight, (0, 0), spread)
         smooth = cv2.GaussianBlur(value * weight, (0, 0), spread) / total
