@@ -83,7 +83,7 @@ def test_links_between_documents_lead_somewhere():
 def test_the_readme_names_every_file_of_a_run_and_every_option():
     from typer.main import get_command
 
-    from skyquilt.cli.main import app
+    from skyquilt.cli.app import app
     from skyquilt.run.folder import CONTRACT
 
     readme = (ROOT / "README.md").read_text()

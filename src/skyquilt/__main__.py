@@ -1,4 +1,4 @@
-"""`python -m skyquilt`: the same as the command `skyquilt`."""
+"""`python -m skyquilt`."""
 
 from skyquilt.cli.main import run
 

@@ -8,6 +8,7 @@ from typer.testing import CliRunner
 
 import skyquilt
 from skyquilt import config, errors
+from skyquilt.cli import app as commands
 from skyquilt.cli import main
 from skyquilt.pipelines.mosaic import STAGES
 
@@ -23,14 +24,14 @@ CHOICES = {
 
 def said(*words):
     """What a command prints, without the frames around it."""
-    result = CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(main.app, list(words))
+    result = CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(commands.app, list(words))
     assert result.exit_code == 0, result.output
     return re.sub(r"\s+", " ", re.sub(r"[\u2500-\u257f]", " ", result.output))
 
 
 def described(option):
     """The line of `skyquilt mosaic --help` about an option."""
-    result = CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(main.app, ["mosaic", "--help"])
+    result = CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(commands.app, ["mosaic", "--help"])
     return next(line for line in result.output.splitlines() if re.search(rf"{option}\b", line))
 
 
@@ -49,7 +50,7 @@ def test_every_command_explains_itself(command):
 def test_defaults_on_the_command_line_are_those_of_the_settings():
     import inspect
 
-    parameters = inspect.signature(main.mosaic_command.command).parameters
+    parameters = inspect.signature(commands.mosaic_command.command).parameters
     other_names = {"gsd": "gsd_cm", "feather": "feather_px", "height": "height_m", "heading": "heading_deg",
                    "memory": "memory_gb"}  # fmt: skip
     settings = config.MosaicSettings()
@@ -64,7 +65,7 @@ def test_version():
 
 
 def test_exit_codes_are_those_of_the_errors():
-    stated = {int(code) for code in re.findall(r"\b(\d+) [a-z]", main.EXIT_CODES)}
+    stated = {int(code) for code in re.findall(r"\b(\d+) [a-z]", commands.EXIT_CODES)}
     leaves = [e for e in vars(errors).values() if isinstance(e, type) and issubclass(e, errors.SkyquiltError)]
     assert stated == {0, 130} | {e.exit_code for e in leaves}
 
@@ -108,6 +109,6 @@ def test_an_interrupt_ends_with_130_and_says_how_to_go_on(monkeypatch, capsys):
     def interrupted():
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(main, "app", interrupted)
+    monkeypatch.setattr(commands, "app", interrupted)
     assert run(monkeypatch, "mosaic") == 130
     assert "again to resume" in capsys.readouterr().err

@@ -49,13 +49,9 @@ def _bars(events: Iterable[Event], *, verbose: bool) -> None:
                 progress.update(tasks[happened.stage], completed=1, total=1)
                 if verbose:
                     how = " (from an earlier run)" if happened.reused else ""
-                    progress.console.print(
-                        f"{happened.stage}: {happened.seconds:.2f} s, {happened.cpu_seconds:.2f} s of CPU{how}"
-                    )
+                    progress.console.print(f"{happened.stage}: {happened.seconds:.2f} s, {happened.cpu_seconds:.2f} s of CPU{how}")
             elif isinstance(happened, Note):
-                progress.console.print(
-                    happened.text, style="yellow" if happened.warning else None, markup=False, highlight=False
-                )
+                progress.console.print(happened.text, style="yellow" if happened.warning else None, markup=False, highlight=False, soft_wrap=True)
             elif isinstance(happened, Result):
                 result = happened
     Console().print(summary(result), markup=False, highlight=False, soft_wrap=True)
@@ -76,9 +72,7 @@ def summary(result: Result) -> str:
         )
     lines += [f"left out: {name}: {reason}" for name, reason in list(m["photos_rejected"].items())[:10]]
     if m["metadata_conflicts"]:
-        lines.append(
-            f"{len(m['metadata_conflicts'])} contradictions between metadata and pixels: see the report"
-        )
+        lines.append(f"{len(m['metadata_conflicts'])} contradictions between metadata and pixels: see the report")
     lines.append(f"{m['seconds']['total']:.1f} s, {m['cpu_seconds']:.1f} s of CPU, {m['peak_memory_mb']} MB")
     lines += [f"map:    {result.output / 'mosaic.tif'}", f"report: {result.output / 'report.html'}"]
     return "\n".join(lines)
