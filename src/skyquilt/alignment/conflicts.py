@@ -30,9 +30,9 @@ def _yaw(photo: Photo, prior: Prior, alignment: Alignment, i: int) -> list[Metad
     if abs(off) < max(YAW_DEG, 3 * prior.sigma_yaw_deg):
         return []
     convergence = alignment.frame.convergence_deg
-    why = "the file was turned upside down by another program" if abs(abs(off) - 180) < 20 and photo.editor else (
-        f"the heading reported ({prior.yaw_source}) is off by {off:+.0f} degrees"
-    )  # fmt: skip
+    why = f"the heading reported ({prior.yaw_source}) is off by {off:+.0f} degrees"
+    if abs(abs(off) - 180) < 20 and photo.editor:
+        why = "the file was turned upside down by another program"
     return [
         MetadataConflict(
             photo=photo.name, field="yaw", reported=round(angle_difference_deg(prior.yaw_deg + convergence, 0), 1),
@@ -58,11 +58,12 @@ def _altitudes(
     for i, e, height in zip(held, off, z - ground, strict=True):
         if np.isfinite(e) and abs(e) > max(2 * priors[i].sigma_C[2], 0.05 * height):
             reported = float(priors[i].map_C[2])
+            where = "lower" if e > 0 else "higher"
             out.append(
                 MetadataConflict(
                     photo=photos[i].name, field="altitude", reported=round(reported, 1),
                     estimated=round(reported - float(e), 1),
-                    meaning=f"image scale and neighbours put it {abs(e):.0f} m {'lower' if e > 0 else 'higher'}",
+                    meaning=f"image scale and neighbours put it {abs(e):.0f} m {where}",
                 )  # fmt: skip
             )
     return out

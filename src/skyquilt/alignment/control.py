@@ -128,7 +128,8 @@ def hold_to_control(
     fit = [c for c in usable if not c.check]
     if not setup.georeferenced and frame.crs is not None and len(fit) < 3:
         raise AlignmentError(
-            f"photos without positions need 3 control points seen in 2 placed photos each, the file gives {len(fit)}"
+            "photos without positions need 3 control points seen in 2 placed photos each,"
+            f" the file gives {len(fit)}"
         )
     if not fit:
         return problem, state, frame, usable

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from skyquilt.config import Methods, MosaicSettings
 from skyquilt.errors import OutputError, UsageError
+from skyquilt.imaging.views import STEP, View, grid_of, make_views, native_gsd
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
@@ -21,7 +22,6 @@ from skyquilt.raster.boundary import read_boundary
 from skyquilt.raster.spec import Compression
 from skyquilt.render.compose import Composed, Composer, PhotoPixels
 from skyquilt.render.exposure import NEUTRAL, Exposure
-from skyquilt.imaging.views import STEP, View, grid_of, make_views, native_gsd
 from skyquilt.run.clock import Steps
 from skyquilt.run.executor import in_order
 from skyquilt.run.store import Store, digest
@@ -111,7 +111,8 @@ def survey_ground(
         )  # fmt: skip
     if grid.width * grid.height > 4e11:
         raise UsageError(
-            f"at {gsd * 100:g} cm the map would have {grid.width} x {grid.height} px; check --gsd and the positions"
+            f"at {gsd * 100:g} cm the map would have {grid.width} x {grid.height} px;"
+            " check --gsd and the positions"
         )
     yield 1, 1
     return Ground(surface=surface, views=views, grid=grid, native_gsd=native)
@@ -346,10 +347,11 @@ def write_surface(output: Path, ground: Ground, alignment: Alignment) -> None:
     factor = max(1, int(ground.surface.cell / grid.gsd)) if ground.surface.source == "tie points" else max(grid.width, grid.height)
     coarse = grid.coarser(factor)
     x, y = np.meshgrid(coarse.x(np.arange(coarse.width)), coarse.y(np.arange(coarse.height)))
+    about = {"VERTICAL_DATUM": alignment.frame.vertical_datum, "SOURCE": ground.surface.source}
     spec = RasterSpec(
-        width=coarse.width, height=coarse.height, bands=1, dtype="float32", transform=geotransform(coarse, alignment),
-        crs=alignment.frame.crs, compress="zstd", nodata=float("nan"),
-        tags={"SOFTWARE": "Skyquilt", "VERTICAL_DATUM": alignment.frame.vertical_datum, "SOURCE": ground.surface.source},
+        width=coarse.width, height=coarse.height, bands=1, dtype="float32",
+        transform=geotransform(coarse, alignment), crs=alignment.frame.crs, compress="zstd",
+        nodata=float("nan"), tags={"SOFTWARE": "Skyquilt"} | about,
     )  # fmt: skip
     write_array(output / "surface.tif", ground.surface.at(x, y).astype(np.float32), spec)
 
@@ -374,7 +376,8 @@ def single_kind(intake: Intake) -> Intake:
     odd = tuple(
         RejectedPhoto(
             name=p.name,
-            reason=f"its pixels ({p.channels} x {p.dtype}, {p.band}) differ from the survey's ({common[0]} x {common[1]}, {common[2]})",
+            reason=f"its pixels ({p.channels} x {p.dtype}, {p.band}) differ from the survey's"
+            f" ({common[0]} x {common[1]}, {common[2]})",
         )
         for i, p in enumerate(intake.photos)
         if i not in keep

@@ -13,11 +13,11 @@ from pyproj import Transformer
 from skyquilt import __version__
 from skyquilt.geometry.camera_formats import camera_to_opensfm
 from skyquilt.geometry.frames import angles_from_cam_R_map, rotation_from_vector
+from skyquilt.imaging.views import View
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment
 from skyquilt.raster import vector
 from skyquilt.raster.atomic import write_text
-from skyquilt.imaging.views import View
 
 MOST_POINTS = 20000
 """Tie points written to reconstruction.json."""
@@ -66,7 +66,7 @@ def write_shots(path: Path, photos: Sequence[Photo], alignment: Alignment, order
 def write_footprints(path: Path, photos: Sequence[Photo], alignment: Alignment, views: Sequence[View]) -> None:
     """footprints.geojson: the ground that each photo shows."""
     x, y = alignment.frame.origin
-    features = [([v.footprint + (x, y)], {"filename": photos[v.photo].name}) for v in views]
+    features = [([v.footprint + np.array([x, y])], {"filename": photos[v.photo].name}) for v in views]
     vector.polygons(path, features, crs=alignment.frame.crs)
 
 

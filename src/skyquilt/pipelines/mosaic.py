@@ -8,26 +8,27 @@ so a second run recomputes nothing and a killed one goes on where it stopped.
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from skyquilt.alignment.conflicts import conflicts
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.config import Methods, MosaicSettings, methods
-from skyquilt.model import camera, event, features, poses, raster, surface
+from skyquilt.model import camera, features, poses, raster, surface
 from skyquilt.model.event import Event, Note, Result
-from skyquilt.model.photo import ControlPoint, Photo, RejectedPhoto, Survey
-from skyquilt.pipelines import drawing, files, intake, judging, linking, placing, reporting
+from skyquilt.model.photo import ControlPoint, RejectedPhoto, Survey
 from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.survey import read_survey
-from skyquilt.raster.atomic import write_text
-from skyquilt.run.clock import Clock, Steps, cpu_seconds, peak_memory_mb
+from skyquilt.pipelines import drawing, intake, judging, linking, placing, reporting
+from skyquilt.run.clock import Clock, Steps
 from skyquilt.run.folder import RunFolder, open_run
 from skyquilt.run.pixel_cache import PixelCache
 from skyquilt.run.store import Store, digest
 
+T = TypeVar("T")
 STAGES = ("read", "features", "links", "align", "surface", "balance", "mosaic", "measure", "report")
 """Stages in order."""
 ARTEFACTS = {"features": "features", "links": "links", "align": "alignment", "surface": "surface", "mosaic": "blocks"}
@@ -170,7 +171,7 @@ def _links(
     return (yield from linking.link_up(taken, prior, parts, store, jobs))
 
 
-def _at_once(work) -> Steps:  # type: ignore[no-untyped-def]
+def _at_once(work: Callable[[], T]) -> Steps[T]:
     """A stage of one step."""
     yield 0, 1
     result = work()
@@ -184,6 +185,3 @@ def _unplaced(taken: intake.Intake, alignment: poses.Alignment) -> list[Rejected
         for i, p in enumerate(taken.photos)
         if i not in alignment.poses
     ]
-
-
-__all__ = ["STAGES", "MosaicSettings", "Photo", "cpu_seconds", "event", "iter_mosaic", "mosaic", "peak_memory_mb", "write_text"]

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar, Protocol
 
 import cv2
@@ -251,7 +252,7 @@ def _gaussian(image: Float, levels: int) -> list[Float]:
 def _laplacian(image: Float, levels: int) -> list[Float]:
     gaussian = _gaussian(image, levels)
     gaussian = [g[..., None] if g.ndim == 2 else g for g in gaussian]
-    return [a - _up(b, a) for a, b in zip(gaussian[:-1], gaussian[1:], strict=True)] + [gaussian[-1]]
+    return [a - _up(b, a) for a, b in pairwise(gaussian)] + [gaussian[-1]]
 
 
 def _up(small: Float, like: Float) -> Float:

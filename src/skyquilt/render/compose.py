@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.imaging.views import STEP, Nodes, View, cut, densify, inside_everywhere, window_nodes
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.render.blend import Blend, Layer
 from skyquilt.render.exposure import NEUTRAL, Exposure, image_place, with_odds
-from skyquilt.imaging.views import STEP, Nodes, View, cut, densify, inside_everywhere, window_nodes
 
 PhotoPixels = Callable[[int], NDArray]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""

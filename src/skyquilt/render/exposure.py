@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
-from skyquilt.model.surface import Surface
 from skyquilt.imaging.views import View, project_nodes
+from skyquilt.model.surface import Surface
 
 Float = NDArray[np.float32]
 

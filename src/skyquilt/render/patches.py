@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.imaging.views import View, inside, project_nodes
 from skyquilt.model.surface import Surface
 from skyquilt.render.compose import PhotoPixels
-from skyquilt.imaging.views import View, inside, project_nodes
 
 SIDE = 64
 """Pixels of a patch's side."""

@@ -1,7 +1,6 @@
 """The run's folder: who may write there, and what may be taken up again."""
 
 import json
-import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +35,7 @@ class RunFolder:
         partial = target.with_suffix(".partial")
         try:
             partial.write_text(json.dumps({"key": self.key, "state": state}))
-            os.replace(partial, target)
+            partial.replace(target)
         except OSError as error:
             raise OutputError(f"cannot write to {self.path}: {error.strerror}") from error
 
@@ -67,7 +66,8 @@ def open_run(path: Path, key: str, *, overwrite: bool) -> RunFolder:
         if not overwrite:
             what = "another run" if known else "other files"
             raise OutputError(
-                f"{path} already holds {what}; add --overwrite to replace its results, or choose another folder"
+                f"{path} already holds {what}; add --overwrite to replace its results,"
+                " or choose another folder"
             )
         for name in CONTRACT:
             (path / name).unlink(missing_ok=True)
