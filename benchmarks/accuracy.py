@@ -2,8 +2,8 @@
 
     python benchmarks/accuracy.py [--flights default,default+gcp,strip] [--work FOLDER] [--json FILE]
 
-A flight is simulated once and kept in the work folder. `+gcp` uses its control points (check points stay out).
-Every figure has an error window on both sides: a result that is suspiciously good fails too.
+A flight is simulated once and kept in the work folder. `+gcp` uses its control points (check points stay
+out). Every figure has an error window on both sides: a result that is suspiciously good fails too.
 """
 
 import argparse

@@ -2,8 +2,8 @@
 
     python benchmarks/real.py [--data ../shared/data] [--only brighton,caliterra,...] [--work FOLDER]
 
-`stripped` is brighton without any metadata; `stripped+gcp` adds three control points whose pixels and coordinates
-come from the full run's own tie points, and judges by the others.
+`stripped` is brighton without any metadata; `stripped+gcp` adds three control points whose pixels and
+coordinates come from the full run's own tie points, and judges by the others.
 """
 
 import argparse
@@ -18,12 +18,15 @@ from skyquilt.pipelines.mosaic import mosaic
 
 ASKED = {
     "brighton": {
-        "photos": (18, 18), "reprojection_mean_px": (0.1, 0.7), "gps_x_m": (0.02, 0.6), "gps_y_m": (0.02, 0.6),
-        "focal_px": (2310 * 0.95, 2310 * 1.05), "seam_median_px": (0.1, 2.0), "seam_measured_share": (0.6, 1.0),
+        "photos": (18, 18), "reprojection_mean_px": (0.1, 0.7), "gps_x_m": (0.02, 0.6),
+        "gps_y_m": (0.02, 0.6),
+        "focal_px": (2310 * 0.95, 2310 * 1.05), "seam_median_px": (0.1, 2.0),
+        "seam_measured_share": (0.6, 1.0),
         "yaw_conflicts": (6, 6), "peak_memory_mb": (100, 1200),
     },
     "caliterra": {
-        "photos": (74, 75), "largest_block": (74, 75), "reprojection_mean_px": (0.1, 0.6), "altitude_conflicts": (1, 75),
+        "photos": (74, 75), "largest_block": (74, 75), "reprojection_mean_px": (0.1, 0.6),
+        "altitude_conflicts": (1, 75),
     },
     "thermal-strip": {"photos": (17, 17), "yaw_conflicts": (17, 17)},
     "stripped": {"photos": (18, 18), "largest_block": (18, 18), "georeferenced": (0, 0)},
@@ -68,7 +71,8 @@ def figures(name: str, data: Path, work: Path) -> dict[str, float]:
     check = [np.hypot(c["dx_m"], c["dy_m"]) for c in m["control"] if c["check"]]
     nan = float("nan")
     return {
-        "photos": m["photos_used"], "largest_block": m["blocks"][0], "georeferenced": float(m["georeferenced"]),
+        "photos": m["photos_used"], "largest_block": m["blocks"][0],
+        "georeferenced": float(m["georeferenced"]),
         "reprojection_mean_px": m["reprojection_error_px"]["mean"], "tie_points": m["tie_points"],
         "gps_x_m": gps.get("x", nan), "gps_y_m": gps.get("y", nan), "gps_z_m": gps.get("z", nan),
         "loo_x_m": loo.get("x", nan), "loo_y_m": loo.get("y", nan), "loo_z_m": loo.get("z", nan),

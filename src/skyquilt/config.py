@@ -132,9 +132,11 @@ def methods(settings: MosaicSettings) -> Methods:
     """The methods that settings name."""
     blend: Blend = Feather(width_px=settings.feather_px) if settings.blend == "feather" else BLENDS[settings.blend]()
     return Methods(
-        sift=Sift(count=settings.features), nearest=Nearest(), retrieval=Retrieval(), mutual=Mutual(), verify=Verify(),
+        sift=Sift(count=settings.features), nearest=Nearest(), retrieval=Retrieval(), mutual=Mutual(),
+        verify=Verify(),
         bundle=Bundle(distortion=settings.distortion, repair=settings.repair),
         by_pose=ByPose(height_m=settings.height_m),
         by_position=ByPosition(height_m=settings.height_m, heading_deg=settings.heading_deg),
-        surface=FromTiePoints(), sweep=Sweep() if settings.surface == "sweep" else None, balance=Balance(), blend=blend,
+        surface=FromTiePoints(), sweep=Sweep() if settings.surface == "sweep" else None, balance=Balance(),
+        blend=blend,
     )  # fmt: skip

@@ -272,8 +272,8 @@ def adjust(
 ) -> Adjusted:
     """Minimises the robust cost.
 
-    After each step the points settle under the moved photos before the step is judged: a strip that straightens
-    moves along a curve, and without that its long steps would all be refused.
+    After each step the points settle under the moved photos before the step is judged: a strip that
+    straightens moves along a curve, and without that its long steps would all be refused.
 
     Args:
         problem: sightings and priors.

@@ -29,7 +29,9 @@ class Bundle:
     """Bundle adjustment of all linked photos at once."""
 
     distortion: str = "4"
-    """Distortion that self-calibration may change: `none`, `2`, `4`, `6` (radial order) or `6t` (and tangential)."""
+    """Distortion that self-calibration may change: `none`, `2`, `4`, `6` (radial order) or
+    `6t` (and tangential).
+    """
     per_photo: int = 400
     """Sightings per photo in the adjustment; all the others are triangulated afterwards."""
     repair: bool = True
@@ -61,7 +63,9 @@ class Bundle:
 
 
 def _refine(problem: Problem, state: State) -> tuple[Problem, State]:
-    """From coarse to fine: intrinsics fixed under a wide loss, then all free under narrower ones, pruning between."""
+    """From coarse to fine: intrinsics fixed under a wide loss, then all free under narrower
+    ones, pruning between.
+    """
     fixed = replace(problem, free=np.zeros_like(problem.free), loss_px=20.0)
     state = adjust(fixed, state, iterations=10, tolerance=3e-2).state
     problem, state = prune(problem, state, 40.0)
@@ -107,7 +111,9 @@ def _believe_positions_less(problem: Problem, state: State, setup: Setup) -> tup
 
 
 def position_noise(error: Array) -> float:
-    """Robust deviation in m of each axis of position errors (n, 2), in order of capture, from their neighbours' mean."""
+    """Robust deviation in m of each axis of position errors (n, 2), in order of capture, from
+    their neighbours' mean.
+    """
     known = error[np.isfinite(error).all(1)]
     if len(known) < 6:
         return 0.0
@@ -118,7 +124,8 @@ def position_noise(error: Array) -> float:
 def leave_one_out(problem: Problem, state: State, C_covariance: Array | None) -> tuple[float, float, float] | None:
     """RMS per axis in m of each measured position against the position that everything else predicts.
 
-    From the covariance of the full solution (the usual identity for linear least squares), not by n solutions.
+    From the covariance of the full solution (the usual identity for linear least squares), not by n
+    solutions.
     """
     known = np.flatnonzero(np.isfinite(problem.C0[:, :2]).all(1))
     if C_covariance is None or len(known) < 3:

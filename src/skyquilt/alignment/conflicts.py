@@ -37,7 +37,7 @@ def _yaw(photo: Photo, prior: Prior, alignment: Alignment, i: int) -> list[Metad
         MetadataConflict(
             photo=photo.name, field="yaw", reported=round(angle_difference_deg(prior.yaw_deg + convergence, 0), 1),
             estimated=round(angle_difference_deg(grid_yaw + convergence, 0), 1), meaning=why,
-        )  # fmt: skip
+        )
     ]
 
 
@@ -64,7 +64,7 @@ def _altitudes(
                     photo=photos[i].name, field="altitude", reported=round(reported, 1),
                     estimated=round(reported - float(e), 1),
                     meaning=f"image scale and neighbours put it {abs(e):.0f} m {where}",
-                )  # fmt: skip
+                )
             )
     return out
 
@@ -80,7 +80,7 @@ def _positions(
                 MetadataConflict(
                     photo=photos[i].name, field="position", reported=round(off, 1), estimated=0.0,
                     meaning=f"the reported position lies {off:.1f} m from where the photo fits",
-                )  # fmt: skip
+                )
             )
     return out
 
@@ -97,6 +97,6 @@ def _focals(photos: Sequence[Photo], alignment: Alignment, held: Sequence[int]) 
                     photo=photo.name, field="focal", reported=round(photo.focal.px, 1),
                     estimated=round(camera.focal, 1),
                     meaning=f"self-calibration of {photo.camera_key} finds another focal length (in px)",
-                )  # fmt: skip
+                )
             )
     return out

@@ -158,7 +158,8 @@ def _with_points(problem: Problem, state: State, setup: Setup, fit: Sequence[Con
     joined = replace(
         problem,
         point=np.concatenate([problem.point, P + point]), photo=np.concatenate([problem.photo, row]),
-        px=np.concatenate([problem.px, px]), sigma_px=np.concatenate([problem.sigma_px, np.full(len(px), 0.7)]),
+        px=np.concatenate([problem.px, px]),
+        sigma_px=np.concatenate([problem.sigma_px, np.full(len(px), 0.7)]),
         X0=np.concatenate([problem.X0, surveyed]),
         sigma_X=np.concatenate([problem.sigma_X, np.array([[c.sigma_m] * 3 for c in fit])]),
     )  # fmt: skip

@@ -14,7 +14,9 @@ from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior, no_ties
 
 
 def reported_camera(photo: Photo) -> Camera:
-    """The calibration that metadata or a side file give, else an ideal camera of the reported focal length."""
+    """The calibration that metadata or a side file give, else an ideal camera of the
+    reported focal length.
+    """
     if photo.calibration is not None:
         return photo.calibration
     return Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
@@ -47,9 +49,11 @@ class ByMetadata:
         if not poses:
             raise AlignmentError(f"method {self.name} places photos by position, and none of {len(photos)} has one")
         return Alignment(
-            method=self.name, why="", frame=replace(frame, metric=frame.crs is not None or self.height_m is not None),
+            method=self.name, why="",
+            frame=replace(frame, metric=frame.crs is not None or self.height_m is not None),
             poses=poses, cameras={p.camera_key: reported_camera(p) for p in photos},
-            camera_of={i: p.camera_key for i, p in enumerate(photos)}, blocks=tuple((i,) for i in sorted(poses)),
+            camera_of={i: p.camera_key for i, p in enumerate(photos)},
+            blocks=tuple((i,) for i in sorted(poses)),
             ties=no_ties(), rejected=rejected,
         )  # fmt: skip
 

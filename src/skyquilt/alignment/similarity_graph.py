@@ -1,8 +1,8 @@
 """A first solution for all photos: every photo a similarity x = a p + t of the plane, from links alone.
 
-p = (x - cx) - i (y - cy) over the focal length (y up), a = height * exp(-i yaw). A linear least-squares fit of
-points shrinks the map to lower its cost; therefore scales and angles are averaged first and translations come
-after (B/C of the methods). Positions join last, robustly.
+p = (x - cx) - i (y - cy) over the focal length (y up), a = height * exp(-i yaw). A linear least-squares fit
+of points shrinks the map to lower its cost; therefore scales and angles are averaged first and translations
+come after (B/C of the methods). Positions join last, robustly.
 """
 
 from collections.abc import Sequence
@@ -109,7 +109,9 @@ def _robust_differences(
 
 
 def solve_block(members: NDArray[np.int64], links: Sequence[PlaneLink]) -> PlaneSolution:
-    """Similarities of one connected block; its first photo has a = 1, t = 0 (units of that photo's height)."""
+    """Similarities of one connected block; its first photo has a = 1, t = 0 (units of
+    that photo's height).
+    """
     index = {int(m): k for k, m in enumerate(members)}
     i = np.array([index[link.a] for link in links], int)
     j = np.array([index[link.b] for link in links], int)

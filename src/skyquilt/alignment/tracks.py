@@ -70,7 +70,8 @@ def build_tracks(features: Sequence[Features], links: Sequence[Link], *, sigma: 
 
 
 def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], *, per_photo: int, cells: int = 8) -> Tracks:
-    """The tracks an adjustment needs: long ones first, until every photo has `per_photo` spread over its area.
+    """The tracks an adjustment needs: long ones first, until every photo has `per_photo` spread over its
+    area.
 
     `sizes`: (width, height) of each photo.
     """

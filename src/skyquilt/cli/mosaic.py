@@ -95,8 +95,10 @@ def command(
         raise UsageError("--quiet, --verbose and --json exclude one another")
     settings = MosaicSettings(
         method=method, gsd_cm=gsd, crs=crs, gcp=gcp, geo=geo, cameras=cameras, bounds=parse_bounds(bounds),
-        boundary=boundary, surface=surface, blend=blend, feather_px=feather, balance=balance, compress=compress, quality=quality,
-        distortion=distortion, height_m=height, heading_deg=heading, repair=repair, features=features, jobs=jobs,
+        boundary=boundary, surface=surface, blend=blend, feather_px=feather, balance=balance,
+        compress=compress, quality=quality,
+        distortion=distortion, height_m=height, heading_deg=heading, repair=repair, features=features,
+        jobs=jobs,
         memory_gb=memory,
     )  # fmt: skip
     events = iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)

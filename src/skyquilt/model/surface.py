@@ -35,6 +35,6 @@ class Surface:
                 cv2.remap(
                     self.z, column[:, k : k + 30000], row[:, k : k + 30000], cv2.INTER_LINEAR,
                     borderMode=cv2.BORDER_REPLICATE,
-                )  # fmt: skip
+                )
             )
         return np.concatenate(parts, 1, dtype=np.float32).reshape(shape)

@@ -63,7 +63,9 @@ class Retrieval:
 
 
 def _vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Residuals to the nearest words, summed, normalised per word and as a whole: unit vector (words * D,)."""
+    """Residuals to the nearest words, summed, normalised per word and as a whole: unit
+    vector (words * D,).
+    """
     total = np.zeros_like(words)
     if len(descriptors):
         nearest = (descriptors @ words.T).argmax(1)

@@ -334,8 +334,10 @@ def _write_companions(output: Path, whole: _Companions, alignment: Alignment) ->
         write_array(
             output / name, array.astype(kind),
             RasterSpec(
-                width=grid.width, height=grid.height, bands=1, dtype=kind, transform=geotransform(grid, alignment),
-                crs=alignment.frame.crs, compress="deflate", nodata=0.0, overviews="mode" if name.startswith("p") else "max",
+                width=grid.width, height=grid.height, bands=1, dtype=kind,
+                transform=geotransform(grid, alignment),
+                crs=alignment.frame.crs, compress="deflate", nodata=0.0,
+                overviews="mode" if name.startswith("p") else "max",
                 tags={"SOFTWARE": "Skyquilt"},
             ),
         )  # fmt: skip

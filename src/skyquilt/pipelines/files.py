@@ -46,11 +46,14 @@ def shot_properties(photo: Photo, alignment: Alignment, i: int) -> dict[str, Any
     yaw, pitch, roll = angles_from_cam_R_map(pose.cam_R_map)
     block = next((k for k, b in enumerate(alignment.blocks) if i in b), -1)
     return {
-        "filename": photo.name, "camera": alignment.camera_of[i], "focal": camera.focal / max(photo.width, photo.height),
-        "width": photo.width, "height": photo.height, "capture_time": photo.time.timestamp() if photo.time else None,
+        "filename": photo.name, "camera": alignment.camera_of[i],
+        "focal": camera.focal / max(photo.width, photo.height),
+        "width": photo.width, "height": photo.height,
+        "capture_time": photo.time.timestamp() if photo.time else None,
         "translation": [float(v) for v in in_crs(alignment, pose.map_C)],
         "rotation": rotation_vector(pose.cam_R_map),
-        "yaw": round((yaw + alignment.frame.convergence_deg) % 360, 3), "pitch": round(pitch, 3), "roll": round(roll, 3),
+        "yaw": round((yaw + alignment.frame.convergence_deg) % 360, 3), "pitch": round(pitch, 3),
+        "roll": round(roll, 3),
         "block": block, "tie_points": int((alignment.ties.photo == i).sum()),
     }  # fmt: skip
 
@@ -91,7 +94,8 @@ def write_reconstruction(path: Path, photos: Sequence[Photo], alignment: Alignme
     used = {alignment.camera_of[i] for i in alignment.poses}
     record = {
         "cameras": {key: camera_to_opensfm(alignment.cameras[key]) for key in sorted(used)},
-        "shots": shots, "points": points, "reference_lla": enu.reference, "biases": {}, "rig_cameras": {}, "rig_instances": {},
+        "shots": shots, "points": points, "reference_lla": enu.reference, "biases": {}, "rig_cameras": {},
+        "rig_instances": {},
     }  # fmt: skip
     write_text(path, json.dumps([record]))
 

@@ -43,13 +43,15 @@ def alignment_figures(alignment: Alignment, priors: Sequence[Prior]) -> dict[str
         "blocks": [len(b) for b in alignment.blocks],
         "gps_residual_rms_m": xyz(rms),
         "gps_leave_one_out_rms_m": xyz(alignment.loo_rms_m) if alignment.frame.crs else None,
-        "reprojection_error_px": {"mean": _round(error.mean()), "rms": _round(rms_px)} if len(error) else None,
+        "reprojection_error_px": {"mean": _round(error.mean()),
+        "rms": _round(rms_px)} if len(error) else None,
         "tie_points": len(alignment.ties.xyz),
         "sightings": len(alignment.ties.point),
         "control": [
             {
                 "name": c.name, "check": c.check, "dx_m": _round(c.error_m[0]), "dy_m": _round(c.error_m[1]),
-                "dz_m": _round(c.error_m[2]), "reprojection_px": _round(c.reprojection_px), "sightings": c.sightings,
+                "dz_m": _round(c.error_m[2]), "reprojection_px": _round(c.reprojection_px),
+                "sightings": c.sightings,
             }
             for c in alignment.control
         ],
@@ -74,8 +76,10 @@ def camera_figures(photos: Sequence[Photo], alignment: Alignment) -> dict[str, A
 
 
 def figures(
-    *, photos: Sequence[Photo], total: int, rejected: Sequence[RejectedPhoto], priors: Sequence[Prior], links: Links,
-    alignment: Alignment, ground: Ground, drawn: Drawn, seams: Mapping[str, Any], conflicts: Sequence[MetadataConflict],
+    *, photos: Sequence[Photo], total: int, rejected: Sequence[RejectedPhoto], priors: Sequence[Prior],
+    links: Links,
+    alignment: Alignment, ground: Ground, drawn: Drawn, seams: Mapping[str, Any],
+    conflicts: Sequence[MetadataConflict],
     notes: Sequence[str],
 ) -> dict[str, Any]:  # fmt: skip
     """The figures of a run, without times."""

@@ -75,7 +75,9 @@ def _align(
 
 
 def with_loose_photos(alignment: Alignment, intake: Intake, priors: Sequence[Prior]) -> Alignment:
-    """Photos that nothing links, placed by their own metadata relative to the adjusted ones, and named as such."""
+    """Photos that nothing links, placed by their own metadata relative to the adjusted
+    ones, and named as such.
+    """
     from skyquilt.alignment.pose import reported_camera
     from skyquilt.geometry.frames import cam_R_map_from_angles
 

@@ -1,4 +1,6 @@
-"""Merge rules: what a map pixel shows where several photos see it. No ghost removal: every pixel is some photo's."""
+"""Merge rules: what a map pixel shows where several photos see it. No ghost removal: every
+pixel is some photo's.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -191,7 +193,9 @@ class Average:
 
 @dataclass(frozen=True, kw_only=True)
 class Multiband:
-    """The most vertical view wins; each band of detail is blended over its own width (Burt and Adelson 1983)."""
+    """The most vertical view wins; each band of detail is blended over its own width
+    (Burt and Adelson 1983).
+    """
 
     levels: int = 5
     """Halvings of the Laplacian pyramid; the widest blend is about 2 ** levels px."""

@@ -1,8 +1,8 @@
 """Exposure: what brings overlapping photos to one brightness, from the ground they both show.
 
-Per photo a gain for each band and a smooth field over the image (vignetting, a cloud's shadow, the sun's glare).
-Gains act on the odds x / (1 - x) of a pixel value x in (0, 1), not on the value: black stays black and white
-stays white, so nothing clips or turns purple, and two gains in a row are one gain.
+Per photo a gain for each band and a smooth field over the image (vignetting, a cloud's shadow, the sun's
+glare). Gains act on the odds x / (1 - x) of a pixel value x in (0, 1), not on the value: black stays black
+and white stays white, so nothing clips or turns purple, and two gains in a row are one gain.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,9 @@ Float = NDArray[np.float32]
 SIGMA_LEVEL = 0.15
 """Deviation in log odds of two photos' brightness of one ground point, all else equal."""
 EVEN = 0.1
-"""Fields smaller than this in log odds everywhere (6 of 255 on a middle grey) are left alone: it saves time."""
+"""Fields smaller than this in log odds everywhere (6 of 255 on a middle grey) are left
+alone: it saves time.
+"""
 CORRELATED = 30.0
 """Neighbouring samples err alike: so many count as one."""
 
@@ -160,7 +162,9 @@ def _sampled(thumbnail: NDArray[np.uint8], u: NDArray, v: NDArray, width: int, h
 
 
 def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: float) -> Exposure:
-    """log odds + gain + field is the same for all photos of a point: differences to the point's mean vanish."""
+    """log odds + gain + field is the same for all photos of a point: differences to the
+    point's mean vanish.
+    """
     n, N = len(photos), len(s.point)
     _, point = np.unique(s.point, return_inverse=True)
     terms = np.concatenate([np.ones((N, 1)), _basis(s.place[:, 0], s.place[:, 1])], 1)

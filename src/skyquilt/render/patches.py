@@ -19,7 +19,9 @@ COARSE = 8
 def grey_patch(
     view: View, surface: Surface, pixels: PhotoPixels, x: float, y: float, gsd: float, *, side: int = SIDE
 ) -> NDArray[np.float32] | None:
-    """What a photo shows around map coordinates x, y in m: grey (side, side), north up; None if not all of it."""
+    """What a photo shows around map coordinates x, y in m: grey (side, side), north up;
+    None if not all of it.
+    """
     nodes = (np.arange(-1, side // COARSE + 1) + 0.5) * COARSE - side / 2
     gx, gy = np.meshgrid(x + nodes * gsd, y - nodes * gsd)
     n = project_nodes(view, gx, gy, surface.at(gx, gy))

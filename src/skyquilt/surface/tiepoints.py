@@ -44,13 +44,16 @@ class FromTiePoints:
         k = min(self.neighbours, len(points))
         distance, index = cKDTree(points[:, :2]).query(at, k=k)
         distance, index = distance.reshape(len(at), k), index.reshape(len(at), k)
-        # beyond the points, the reach grows with the distance to them: the rim continues the average, not one point
+        # beyond the points, the reach grows with the distance to them: the rim continues the average, not one
+        # point
         weight = 1.0 / (distance + 0.5 * cell + 0.5 * distance[:, :1]) ** 2
         return np.asarray((weight * points[index, 2]).sum(1) / weight.sum(1))
 
 
 def without_outliers(xyz: Array, limit: float) -> Array:
-    """Points whose height agrees with their neighbours' median within `limit` robust deviations of the survey."""
+    """Points whose height agrees with their neighbours' median within `limit` robust
+    deviations of the survey.
+    """
     k = min(10, len(xyz))
     _, index = cKDTree(xyz[:, :2]).query(xyz[:, :2], k=k)
     around = xyz[index.reshape(len(xyz), k), 2]
