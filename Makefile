@@ -30,6 +30,7 @@ check: $(DEVELOP)
 
 # Puts code into the form that `make check` asks for.
 format: $(DEVELOP)
+	@$(BIN)/ruff format --quiet .
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
 

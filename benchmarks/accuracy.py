@@ -8,6 +8,7 @@ out). Every figure has an error window on both sides: a result that is suspiciou
 
 import argparse
 import json
+import shutil
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -72,6 +73,7 @@ def figures(name: str, work: Path) -> dict[str, object]:
     truth = Truth(json.loads((flight / "truth" / "truth.json").read_text()), flight)
     settings = MosaicSettings(gcp=flight / "gcp_list.txt" if extra == "gcp" else None)
     out = work / f"{name}.out"
+    shutil.rmtree(out, ignore_errors=True)  # a cold store
     metrics = dict(mosaic(flight / "photos", out, settings, overwrite=True).metrics)
     return {**pose_figures(out, truth, metrics), **surface_figures(out, truth), **map_figures(out, truth, metrics)}
 

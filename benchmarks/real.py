@@ -7,6 +7,7 @@ coordinates come from the full run's own tie points, and judges by the others.
 """
 
 import argparse
+import shutil
 import sys
 import tempfile
 from pathlib import Path
@@ -64,6 +65,7 @@ def figures(name: str, data: Path, work: Path) -> dict[str, float]:
         folder = strip_all(data / "brighton", work / "stripped-photos")
     if name == "stripped+gcp":
         settings = MosaicSettings(gcp=control_from_full_run(data / "brighton", work))
+    shutil.rmtree(work / f"{name}.out", ignore_errors=True)  # a cold store
     m = mosaic(folder, work / f"{name}.out", settings, overwrite=True).metrics
     fields = [c["field"] for c in m["metadata_conflicts"]]
     gps, seam = m["gps_residual_rms_m"] or {}, m["seam_disparity_px"]
@@ -119,15 +121,17 @@ def control_from_full_run(source: Path, work: Path) -> Path:
     taken = drain(intake.take_in(photos, cache, parts, store, 2))
     frame = choose_frame(photos, None)
     prior = priors(photos, frame)
+    pictures = intake.Pictures(photos, cache, store)
     links = drain(linking.link_up(taken, prior, parts, store, 2))
-    ties = drain(placing.place(taken, frame, prior, links, (), parts, settings, store))
+    ties = drain(placing.place(taken, frame, prior, links, (), parts, settings, store, pictures))
     ties, frame = ties.ties, ties.frame
     seen = np.bincount(ties.point)
     good = np.flatnonzero(seen >= 3)
     xy = ties.xyz[good, :2]
     first = int(np.argmin(xy.sum(1)))
     second = int(np.argmax(np.hypot(*(xy - xy[first]).T)))
-    area = np.abs(np.cross(xy[second] - xy[first], xy - xy[first]))
+    (ax, ay), (bx, by) = xy[second] - xy[first], (xy - xy[first]).T
+    area = np.abs(ax * by - ay * bx)
     chosen = [int(good[k]) for k in (first, second, int(np.argmax(area)))]
     checks = [int(k) for k in np.random.default_rng(0).permutation(good)[:40] if k not in chosen]
     lines = [str(frame.crs)]

@@ -43,7 +43,7 @@ class Retrieval:
         return sorted(pairs)
 
     def _vectors(self, features: list[Features]) -> NDArray[np.float32]:
-        chosen = [f.descriptors[np.argsort(-f.size)[: self.sample]] for f in features]
+        chosen = [f.unit[np.argsort(-f.size)[: self.sample]] for f in features]
         words = self._vocabulary(np.concatenate(chosen))
         return np.stack([_vlad(d, words) for d in chosen])
 

@@ -15,7 +15,7 @@ from skyquilt.imaging.views import STEP, View, grid_of, make_views, native_gsd
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
-from skyquilt.pipelines.intake import Intake
+from skyquilt.pipelines.intake import Intake, Pictures
 from skyquilt.raster import Block, CogWriter, RasterSpec, write_array
 from skyquilt.raster.boundary import inside as inside_polygon
 from skyquilt.raster.boundary import read_boundary
@@ -78,7 +78,7 @@ class Drawn:
 
 
 def survey_ground(
-    alignment: Alignment, intake: Intake, methods: Methods, settings: MosaicSettings, store: Store
+    alignment: Alignment, pictures: Pictures, methods: Methods, settings: MosaicSettings, store: Store
 ) -> Steps[Ground]:
     """Heights from the tie points (level ground where there are none), and the grid of the map.
 
@@ -107,7 +107,7 @@ def survey_ground(
         sweep, known = methods.sweep, surface
         surface = store.get_or(
             "surface", digest(key, poses_digest(alignment), grid, sweep),
-            lambda: sweep(known, [v for v in views if held(alignment, v.photo)], grid, intake.grey),
+            lambda: sweep(known, [v for v in views if held(alignment, v.photo)], grid, pictures),
         )  # fmt: skip
     if grid.width * grid.height > 4e11:
         raise UsageError(

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
+from skyquilt import __version__
 from skyquilt.alignment.conflicts import conflicts
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.config import Methods, MosaicSettings, methods
@@ -31,7 +32,7 @@ from skyquilt.run.store import Store, digest
 T = TypeVar("T")
 STAGES = ("read", "features", "links", "align", "surface", "balance", "mosaic", "measure", "report")
 """Stages in order."""
-ARTEFACTS = {"features": "features", "links": "links", "align": "alignment", "surface": "surface", "mosaic": "blocks"}
+ARTEFACTS = {"features": "features", "read": "pictures", "links": "links", "align": "alignment", "surface": "surface", "mosaic": "blocks"}
 """Stage -> folder in the store."""
 REGISTRY = {
     c.__name__: c
@@ -57,7 +58,7 @@ def iter_mosaic(
     settings, began = settings or MosaicSettings(), Clock.now()
     parts, jobs = methods(settings), settings.jobs or os.cpu_count() or 1
     survey, control = _read(folder, settings)
-    run = open_run(Path(output), run_key(survey, control, settings), overwrite=overwrite or rerun_from is not None)
+    run = open_run(Path(output), run_key(survey, control, settings, parts), overwrite=overwrite or rerun_from is not None)
     store = Store(folder=run.store, registry=REGISTRY)
     _forget(run, store, rerun_from)
     if run.done:
@@ -71,14 +72,15 @@ def iter_mosaic(
     cache = PixelCache(read=lambda i: read_color(survey.photos[i]), budget_bytes=pixel_budget(settings))
     taken = yield from clock.stage("features", intake.take_in(survey.photos, cache, parts, store, jobs))
     taken, cache = _one_kind(taken, survey, cache, settings)
+    pictures = intake.Pictures(taken.photos, cache, store)
     frame = choose_frame(taken.photos, settings.crs, control)
     prior = priors(taken.photos, frame)
     links = yield from clock.stage("links", _links(taken, prior, parts, settings, store, jobs))
     alignment = yield from clock.stage(
-        "align", placing.place(taken, frame, prior, links, control, parts, settings, store)
+        "align", placing.place(taken, frame, prior, links, control, parts, settings, store, pictures)
     )
     yield from (Note(text=n, warning=True) for n in alignment.notes)
-    ground = yield from clock.stage("surface", drawing.survey_ground(alignment, taken, parts, settings, store))
+    ground = yield from clock.stage("surface", drawing.survey_ground(alignment, pictures, parts, settings, store))
     exposure = yield from clock.stage("balance", _at_once(lambda: drawing.balance(taken, ground, alignment, parts, settings)))
     compose = drawing.composer(taken, ground, alignment, exposure, parts, cache)
     key = digest(run.key, drawing.poses_digest(alignment), ground.surface.z, dict(exposure.gains), dict(exposure.fields))
@@ -127,14 +129,12 @@ def _read(folder: Path | Sequence[Path], settings: MosaicSettings) -> tuple[Surv
     return replace(survey, notes=(*survey.notes, *notes)), control
 
 
-def run_key(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSettings) -> str:
-    """What a run depends on: content and metadata of its photos, side files, and the
-    settings that shape results.
-    """
+def run_key(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSettings, parts: Methods) -> str:
+    """What a run depends on: content and metadata of its photos, side files, and the settings that shape results."""
     shaping = {k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb")}
     side = [p.read_bytes().hex() for p in (settings.boundary,) if p is not None and p.is_file()]
     photos = [(p.name, p.digest, p.position, p.attitude, p.focal, p.calibration) for p in survey.photos]
-    return digest(photos, list(control), shaping, side)
+    return digest(photos, list(control), shaping, side, parts, __version__)
 
 
 def pixel_budget(settings: MosaicSettings) -> int:
