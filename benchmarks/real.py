@@ -146,7 +146,7 @@ def control_from_full_run(source: Path, work: Path) -> Path:
     return target
 
 
-def drain(steps):  # noqa: ANN001, ANN201
+def drain(steps):
     """The result of a stage run without its events."""
     try:
         while True:

@@ -1,7 +1,8 @@
 """Sightings made sharper: keypoints found in small pictures, moved to where larger pictures agree.
 
 With poses nearly right, every sighting of a point is a patch of the same ground: rectified to the ground, the
-patches differ by a translation, which is what the sightings' errors are. One sighting stays and the others follow it.
+patches differ by a translation, which is what the sightings' errors are. One sighting stays and the others
+follow it.
 """
 
 from collections.abc import Callable, Mapping
@@ -83,8 +84,8 @@ class Sharpen:
     def _patches(
         self, tracks: Tracks, xyz: Array, poses: Mapping[int, Pose], cameras: Mapping[int, Camera], grey: GreyPicture
     ) -> tuple[NDArray[np.uint8], Array]:
-        """Patches (N, s + 2 margin, ...) of all sightings rectified to the level ground of their point, centred where
-        each was seen, and the pictures' scales (N,): sensor px per px.
+        """Patches (N, s + 2 margin, ...) of all sightings rectified to the level ground of their point,
+        centred where each was seen, and the pictures' scales (N,): sensor px per px.
         """
         full = self.side + 2 * MARGIN
         out = np.zeros((len(tracks.point), full, full), np.uint8)
@@ -123,7 +124,9 @@ class Sharpen:
 
 
 def ground_axes(X: Array, pose: Pose, camera: Camera, scale: float) -> tuple[Array, Array]:
-    """How far a picture moves, in its px (n, 2), per patch px eastwards and southwards on level ground at X (n, 3)."""
+    """How far a picture moves, in its px (n, 2), per patch px eastwards and southwards on
+    level ground at X (n, 3).
+    """
     size = np.abs(pose.map_C[2] - X[:, 2]) / camera.focal * scale
     px = [_pixel(camera, pose, p) / scale for p in (X, X + _along(size, 0), X - _along(size, 1))]
     return px[1] - px[0], px[2] - px[0]

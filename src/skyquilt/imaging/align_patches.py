@@ -20,14 +20,14 @@ def translate(
         iterations: Gauss-Newton steps.
 
     Returns:
-        Shifts (n, 2) in px, x then y, and the correlation (n,) reached; both NaN where a shift ran out of the margin
-        or a patch is blank.
+        Shifts (n, 2) in px, x then y, and the correlation (n,) reached; both NaN where a shift ran out of the
+        margin or a patch is blank.
     """
     n, s, _ = reference.shape
     if not n:
         return np.zeros((0, 2)), np.zeros(0)
     ref = _normalised(reference.reshape(n, -1))
-    gy, gx = np.gradient(ref.reshape(n, s, s), axis=(1, 2))
+    gy, gx = (np.asarray(g) for g in np.gradient(ref.reshape(n, s, s), axis=(1, 2)))
     J = np.stack([gx.reshape(n, -1), gy.reshape(n, -1)], 1)
     H = J @ np.swapaxes(J, 1, 2) + 1e-6 * np.eye(2, dtype=np.float32)
     J = np.linalg.solve(H, J)

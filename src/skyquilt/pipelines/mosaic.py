@@ -130,7 +130,9 @@ def _read(folder: Path | Sequence[Path], settings: MosaicSettings) -> tuple[Surv
 
 
 def run_key(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSettings, parts: Methods) -> str:
-    """What a run depends on: content and metadata of its photos, side files, and the settings that shape results."""
+    """What a run depends on: content and metadata of its photos, side files, and the
+    settings that shape results.
+    """
     shaping = {k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb")}
     side = [p.read_bytes().hex() for p in (settings.boundary,) if p is not None and p.is_file()]
     photos = [(p.name, p.digest, p.position, p.attitude, p.focal, p.calibration) for p in survey.photos]
