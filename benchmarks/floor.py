@@ -136,9 +136,7 @@ def main() -> None:
     options = parser.parse_args(own)
     results = measure_floor(options)
     if options.run:
-        cpu, wall, peak = zip(
-            *(run_mosaic(options.photos, further) for _ in range(options.run)), strict=True
-        )
+        cpu, wall, peak = zip(*(run_mosaic(options.photos, further) for _ in range(options.run)), strict=True)
         results["run"] = Cost.of(list(cpu), list(wall), max(peak))
         results["ratio"] = results["run"].cpu_median / results["floor"]  # type: ignore[union-attr, operator]
     report = {"machine": machine()} | {

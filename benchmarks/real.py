@@ -37,7 +37,9 @@ ASKED = {
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--data", type=Path, default=Path(__file__).resolve().parents[2] / "shared" / "data")
     parser.add_argument("--only", default=",".join(ASKED))
     parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "skyquilt-real")
@@ -52,7 +54,9 @@ def main() -> int:
         print(name)
         for key, value in row.items():
             low, high = ASKED[name].get(key, (-np.inf, np.inf))
-            verdict = "" if key not in ASKED[name] else "ok" if low <= value <= high else f"MISSED {low}..{high}"
+            verdict = (
+                "" if key not in ASKED[name] else "ok" if low <= value <= high else f"MISSED {low}..{high}"
+            )
             missed += verdict.startswith("MISSED")
             print(f"  {key:24s} {value:12.3f} {verdict}")
     return int(missed > 0)
@@ -140,7 +144,9 @@ def control_from_full_run(source: Path, work: Path) -> Path:
         x, y, z = ties.xyz[k] + (*frame.origin, 0.0)
         for row in np.flatnonzero(ties.point == k):
             u, v = ties.px[row]
-            lines.append(f"{x:.4f} {y:.4f} {z:.4f} {u:.3f} {v:.3f} img{ties.photo[row]:02d}.jpg p{number}{kind}")
+            lines.append(
+                f"{x:.4f} {y:.4f} {z:.4f} {u:.3f} {v:.3f} img{ties.photo[row]:02d}.jpg p{number}{kind}"
+            )
     target = work / "gcp_list.txt"
     target.write_text("\n".join(lines) + "\n")
     return target

@@ -85,7 +85,9 @@ class MosaicSettings:
             if value is not None and not low <= value <= high:
                 raise UsageError(f"{name} {value} lies outside {low} to {high}")
         if self.bounds and not (self.bounds[0] < self.bounds[2] and self.bounds[1] < self.bounds[3]):
-            raise UsageError(f"--bounds is west,south,east,north with west < east and south < north, got {self.bounds}")
+            raise UsageError(
+                f"--bounds is west,south,east,north with west < east and south < north, got {self.bounds}"
+            )
 
     def as_table(self) -> dict[str, Any]:
         """Names and values as written to run.toml; unset ones left out."""
@@ -130,7 +132,9 @@ class Methods:
 
 def methods(settings: MosaicSettings) -> Methods:
     """The methods that settings name."""
-    blend: Blend = Feather(width_px=settings.feather_px) if settings.blend == "feather" else BLENDS[settings.blend]()
+    blend: Blend = (
+        Feather(width_px=settings.feather_px) if settings.blend == "feather" else BLENDS[settings.blend]()
+    )
     return Methods(
         sift=Sift(count=settings.features), nearest=Nearest(), retrieval=Retrieval(), mutual=Mutual(),
         verify=Verify(),

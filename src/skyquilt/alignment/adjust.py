@@ -213,7 +213,10 @@ class Reduced:
         place: Any = (cam_local, slice(None), point - first)
         np.add.at(cam_view, place, N.Wc[lo:hi] @ T)
         unknowns = np.concatenate(
-            [(6 * seen[:, None] + np.arange(6)).ravel(), (6 * self.n + 8 * cams[:, None] + np.arange(8)).ravel()]
+            [
+                (6 * seen[:, None] + np.arange(6)).ravel(),
+                (6 * self.n + 8 * cams[:, None] + np.arange(8)).ravel(),
+            ]
         )
         return unknowns, rows.reshape(len(rows), -1), slice(first, last)
 

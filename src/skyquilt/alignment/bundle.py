@@ -146,7 +146,9 @@ def position_noise(error: Array) -> float:
     return float(1.48 * np.median(np.abs(local)) / np.sqrt(1.5))
 
 
-def leave_one_out(problem: Problem, state: State, C_covariance: Array | None) -> tuple[float, float, float] | None:
+def leave_one_out(
+    problem: Problem, state: State, C_covariance: Array | None
+) -> tuple[float, float, float] | None:
     """RMS per axis in m of each measured position against the position that everything else predicts.
 
     From the covariance of the full solution (the usual identity for linear least squares), not by n
@@ -160,7 +162,9 @@ def leave_one_out(problem: Problem, state: State, C_covariance: Array | None) ->
         axes = np.isfinite(problem.C0[i])
         e = (state.C[i] - problem.C0[i])[axes]
         white = e / problem.sigma_C[i][axes]
-        precision = np.diag(1 / problem.sigma_C[i][axes] ** 2) / np.sqrt(1 + (white @ white) / problem.loss_C**2)
+        precision = np.diag(1 / problem.sigma_C[i][axes] ** 2) / np.sqrt(
+            1 + (white @ white) / problem.loss_C**2
+        )
         own = C_covariance[6 * i + 3 : 6 * i + 6, 6 * i + 3 : 6 * i + 6][np.ix_(axes, axes)]
         full = np.full(3, np.nan)
         full[axes] = np.linalg.solve(np.eye(len(e)) - own @ precision, e)

@@ -47,7 +47,9 @@ class ByMetadata:
             heights = self._heights(frame, priors)
             poses, rejected = self._placed(photos, priors, heights)
         if not poses:
-            raise AlignmentError(f"method {self.name} places photos by position, and none of {len(photos)} has one")
+            raise AlignmentError(
+                f"method {self.name} places photos by position, and none of {len(photos)} has one"
+            )
         return Alignment(
             method=self.name, why="",
             frame=replace(frame, metric=frame.crs is not None or self.height_m is not None),
@@ -61,7 +63,11 @@ class ByMetadata:
         """Camera heights (n,) in m above the ground, which is level at z = 0."""
         z = np.array([p.map_C[2] for p in priors])
         if self.height_m is not None:
-            return np.where(np.isfinite(z), self.height_m + z - np.nanmedian(z), self.height_m) if np.isfinite(z).any() else np.full(len(z), self.height_m)
+            return (
+                np.where(np.isfinite(z), self.height_m + z - np.nanmedian(z), self.height_m)
+                if np.isfinite(z).any()
+                else np.full(len(z), self.height_m)
+            )
         if frame.vertical_datum != "takeoff":
             raise AlignmentError(
                 f"method {self.name} needs heights above ground, and the photos give heights above"

@@ -43,7 +43,12 @@ class Sharpen:
     version: ClassVar[int] = 1
 
     def __call__(
-        self, tracks: Tracks, xyz: Array, poses: Mapping[int, Pose], cameras: Mapping[int, Camera], grey: GreyPicture
+        self,
+        tracks: Tracks,
+        xyz: Array,
+        poses: Mapping[int, Pose],
+        cameras: Mapping[int, Camera],
+        grey: GreyPicture,
     ) -> Tracks:
         """Tracks (file pixels) with sharper sightings; `xyz` (count, 3): their points in the map frame."""
         anchor = self._anchors(tracks, cameras)
@@ -82,7 +87,12 @@ class Sharpen:
         return order[np.searchsorted(tracks.point[order], np.arange(tracks.count))]
 
     def _patches(
-        self, tracks: Tracks, xyz: Array, poses: Mapping[int, Pose], cameras: Mapping[int, Camera], grey: GreyPicture
+        self,
+        tracks: Tracks,
+        xyz: Array,
+        poses: Mapping[int, Pose],
+        cameras: Mapping[int, Camera],
+        grey: GreyPicture,
     ) -> tuple[NDArray[np.uint8], Array]:
         """Patches (N, s + 2 margin, ...) of all sightings rectified to the level ground of their point,
         centred where each was seen, and the pictures' scales (N,): sensor px per px.

@@ -50,7 +50,13 @@ def _bars(events: Iterable[Event], *, verbose: bool) -> None:
                 if verbose:
                     progress.console.print(times(happened))
             elif isinstance(happened, Note):
-                progress.console.print(happened.text, style="yellow" if happened.warning else None, markup=False, highlight=False, soft_wrap=True)
+                progress.console.print(
+                    happened.text,
+                    style="yellow" if happened.warning else None,
+                    markup=False,
+                    highlight=False,
+                    soft_wrap=True,
+                )
             elif isinstance(happened, Result):
                 result = happened
     Console().print(summary(result), markup=False, highlight=False, soft_wrap=True)
@@ -79,7 +85,9 @@ def summary(result: Result) -> str:
         )
     lines += [f"left out: {name}: {reason}" for name, reason in list(m["photos_rejected"].items())[:10]]
     if m["metadata_conflicts"]:
-        lines.append(f"{len(m['metadata_conflicts'])} contradictions between metadata and pixels: see the report")
+        lines.append(
+            f"{len(m['metadata_conflicts'])} contradictions between metadata and pixels: see the report"
+        )
     lines.append(f"{m['seconds']['total']:.1f} s, {m['cpu_seconds']:.1f} s of CPU, {m['peak_memory_mb']} MB")
     lines += [f"map:    {result.output / 'mosaic.tif'}", f"report: {result.output / 'report.html'}"]
     return "\n".join(lines)

@@ -58,7 +58,9 @@ def _sampled(moving: Float, shift: NDArray[np.float64], margin: int, s: int) -> 
     x0 = np.clip(margin + whole[:, 0], 0, 2 * margin - 1)
     y0 = np.clip(margin + whole[:, 1], 0, 2 * margin - 1)
     span = np.arange(s + 1)
-    block = moving[np.arange(n)[:, None, None], (y0[:, None] + span)[:, :, None], (x0[:, None] + span)[:, None, :]]
+    block = moving[
+        np.arange(n)[:, None, None], (y0[:, None] + span)[:, :, None], (x0[:, None] + span)[:, None, :]
+    ]
     fx, fy = part[:, 0, None, None], part[:, 1, None, None]
     rows = block[:, :, :-1] * (1 - fx) + block[:, :, 1:] * fx
     return np.asarray(rows[:, :-1] * (1 - fy) + rows[:, 1:] * fy).reshape(n, -1)

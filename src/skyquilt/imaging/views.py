@@ -113,7 +113,9 @@ def project_nodes(view: View, x: NDArray, y: NDArray, z: NDArray) -> Nodes:
 def inside(camera: Camera, u: NDArray, v: NDArray) -> NDArray[np.bool_]:
     """Whether photo pixels lie in the photo, its border excluded."""
     edge = BORDER_PX
-    return np.asarray((u > edge) & (v > edge) & (u < camera.width - 1 - edge) & (v < camera.height - 1 - edge))
+    return np.asarray(
+        (u > edge) & (v > edge) & (u < camera.width - 1 - edge) & (v < camera.height - 1 - edge)
+    )
 
 
 def inside_everywhere(nodes: Nodes, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -164,7 +166,9 @@ def native_gsd(views: Sequence[View], surface: Surface) -> float:
     return float(np.median(drop / np.array([v.camera.focal for v in views])))
 
 
-def grid_of(views: Sequence[View], gsd: float, bounds: tuple[float, float, float, float] | None = None) -> Grid:
+def grid_of(
+    views: Sequence[View], gsd: float, bounds: tuple[float, float, float, float] | None = None
+) -> Grid:
     """The grid that covers all footprints, or the bounds (west, south, east, north)
     given, on multiples of gsd.
     """

@@ -99,7 +99,9 @@ def survey_ground(
     area = (w - margin, s - margin, e + margin, n + margin)
     key = digest(alignment.ties.xyz, area, methods.surface)
     surface = store.get_or(
-        "surface", key, lambda: methods.surface(alignment.ties.xyz, area) if len(alignment.ties.xyz) > 3 else level(z)
+        "surface",
+        key,
+        lambda: methods.surface(alignment.ties.xyz, area) if len(alignment.ties.xyz) > 3 else level(z),
     )
     views = tuple(make_views(alignment, surface))
     grid = grid_of(views, gsd, bounds)
@@ -122,7 +124,9 @@ def poses_digest(alignment: Alignment) -> str:
     """What of an alignment shapes the map."""
     order = sorted(alignment.poses)
     stack = [
-        np.concatenate([alignment.poses[i].cam_R_map.ravel(), alignment.poses[i].map_C, alignment.camera(i).vector])
+        np.concatenate(
+            [alignment.poses[i].cam_R_map.ravel(), alignment.poses[i].map_C, alignment.camera(i).vector]
+        )
         for i in order
     ]
     return digest(order, np.array(stack), alignment.frame)
@@ -153,7 +157,9 @@ def _local_bounds(settings: MosaicSettings, alignment: Alignment) -> tuple[float
     return bounds[0] - x, bounds[1] - y, bounds[2] - x, bounds[3] - y
 
 
-def balance(intake: Intake, ground: Ground, alignment: Alignment, methods: Methods, settings: MosaicSettings) -> Exposure:
+def balance(
+    intake: Intake, ground: Ground, alignment: Alignment, methods: Methods, settings: MosaicSettings
+) -> Exposure:
     """Exposure of the placed 8-bit photos; neutral for measured values."""
     if not settings.balance or intake.photos[0].dtype != "uint8":
         return NEUTRAL
@@ -166,7 +172,12 @@ def _three(thumbnail: NDArray) -> NDArray:
 
 
 def composer(
-    intake: Intake, ground: Ground, alignment: Alignment, exposure: Exposure, methods: Methods, pixels: PhotoPixels
+    intake: Intake,
+    ground: Ground,
+    alignment: Alignment,
+    exposure: Exposure,
+    methods: Methods,
+    pixels: PhotoPixels,
 ) -> Composer:
     """The composer of the survey's map."""
     first = intake.photos[ground.views[0].photo]
@@ -189,7 +200,9 @@ def mosaic_spec(compose: Composer, alignment: Alignment, settings: MosaicSetting
     if settings.compress == "auto":
         compress = "jpeg" if picture and compose.bands in (1, 3) else "zstd"
     if compress == "jpeg" and not (picture and compose.bands in (1, 3)):
-        raise UsageError(f"--compress jpeg is for 8-bit pictures; these photos are {compose.dtype}, {compose.bands} bands")
+        raise UsageError(
+            f"--compress jpeg is for 8-bit pictures; these photos are {compose.dtype}, {compose.bands} bands"
+        )
     real = compose.dtype.kind == "f"
     return RasterSpec(
         width=compose.grid.width, height=compose.grid.height, bands=compose.bands, dtype=str(compose.dtype),
@@ -247,7 +260,11 @@ def _thinned(numbers: NDArray) -> NDArray:
     half = PROVENANCE // 2
     thin = numbers[half::PROVENANCE, half::PROVENANCE]
     rows, columns = -(-numbers.shape[0] // PROVENANCE), -(-numbers.shape[1] // PROVENANCE)
-    return np.pad(thin, ((0, rows - thin.shape[0]), (0, columns - thin.shape[1])), mode="edge") if thin.size else numbers[:1, :1]
+    return (
+        np.pad(thin, ((0, rows - thin.shape[0]), (0, columns - thin.shape[1])), mode="edge")
+        if thin.size
+        else numbers[:1, :1]
+    )
 
 
 def _blanked(pixels: NDArray, valid: NDArray[np.bool_]) -> NDArray:
@@ -267,7 +284,9 @@ def _keeper(
         return None
     polygon = read_boundary(settings.boundary, alignment.frame.crs)
     transform = geotransform(compose.grid, alignment)
-    return lambda b: inside_polygon(polygon, transform, row0=b.row0, col0=b.col0, height=b.height, width=b.width)
+    return lambda b: inside_polygon(
+        polygon, transform, row0=b.row0, col0=b.col0, height=b.height, width=b.width
+    )
 
 
 def preview_factor(grid: Grid) -> int:
@@ -310,7 +329,11 @@ class _Companions:
 
     def __init__(self, grid: Grid, bands: int, dtype: np.dtype) -> None:
         self.grid, self.factor = grid, preview_factor(grid)
-        self.fine, self.coarse, small = grid.coarser(PROVENANCE), grid.coarser(STEP), grid.coarser(self.factor)
+        self.fine, self.coarse, small = (
+            grid.coarser(PROVENANCE),
+            grid.coarser(STEP),
+            grid.coarser(self.factor),
+        )
         self.provenance = np.zeros((self.fine.height, self.fine.width), np.uint32)
         self.views = np.zeros((self.coarse.height, self.coarse.width), np.uint16)
         self.preview = np.zeros((small.height, small.width, bands), dtype)
@@ -328,7 +351,12 @@ class _Companions:
 def _write_companions(output: Path, whole: _Companions, alignment: Alignment) -> None:
     top = int(whole.provenance.max(initial=0))
     for name, array, grid, kind in (
-        ("provenance.tif", whole.provenance, whole.fine, "uint8" if top < 256 else "uint16" if top < 65536 else "uint32"),
+        (
+            "provenance.tif",
+            whole.provenance,
+            whole.fine,
+            "uint8" if top < 256 else "uint16" if top < 65536 else "uint32",
+        ),
         ("views.tif", whole.views, whole.coarse, "uint8" if whole.views.max(initial=0) < 256 else "uint16"),
     ):
         write_array(
@@ -346,7 +374,11 @@ def _write_companions(output: Path, whole: _Companions, alignment: Alignment) ->
 def write_surface(output: Path, ground: Ground, alignment: Alignment) -> None:
     """surface.tif: heights over the map's area, and what they count from in its tags."""
     grid = ground.grid
-    factor = max(1, int(ground.surface.cell / grid.gsd)) if ground.surface.source == "tie points" else max(grid.width, grid.height)
+    factor = (
+        max(1, int(ground.surface.cell / grid.gsd))
+        if ground.surface.source == "tie points"
+        else max(grid.width, grid.height)
+    )
     coarse = grid.coarser(factor)
     x, y = np.meshgrid(coarse.x(np.arange(coarse.width)), coarse.y(np.arange(coarse.height)))
     about = {"VERTICAL_DATUM": alignment.frame.vertical_datum, "SOURCE": ground.surface.source}

@@ -66,14 +66,18 @@ def write_shots(path: Path, photos: Sequence[Photo], alignment: Alignment, order
     vector.points(path, features, crs=alignment.frame.crs)
 
 
-def write_footprints(path: Path, photos: Sequence[Photo], alignment: Alignment, views: Sequence[View]) -> None:
+def write_footprints(
+    path: Path, photos: Sequence[Photo], alignment: Alignment, views: Sequence[View]
+) -> None:
     """footprints.geojson: the ground that each photo shows."""
     x, y = alignment.frame.origin
     features = [([v.footprint + np.array([x, y])], {"filename": photos[v.photo].name}) for v in views]
     vector.polygons(path, features, crs=alignment.frame.crs)
 
 
-def write_reconstruction(path: Path, photos: Sequence[Photo], alignment: Alignment, colours: NDArray | None) -> None:
+def write_reconstruction(
+    path: Path, photos: Sequence[Photo], alignment: Alignment, colours: NDArray | None
+) -> None:
     """reconstruction.json in OpenSfM's form: topocentric east-north-up about `reference_lla`."""
     enu = Topocentric(alignment)
     shots = {}
@@ -85,10 +89,15 @@ def write_reconstruction(path: Path, photos: Sequence[Photo], alignment: Alignme
             "translation": [float(v) for v in -R @ C], "orientation": 1, "capture_time": 0.0,
             "gps_position": [float(v) for v in C], "gps_dop": 15.0,
         }  # fmt: skip
-    chosen = np.linspace(0, len(alignment.ties.xyz) - 1, min(MOST_POINTS, len(alignment.ties.xyz))).astype(int)
+    chosen = np.linspace(0, len(alignment.ties.xyz) - 1, min(MOST_POINTS, len(alignment.ties.xyz))).astype(
+        int
+    )
     coordinates = enu(alignment.ties.xyz[chosen]) if len(chosen) else np.zeros((0, 3))
     points = {
-        str(k): {"coordinates": [round(float(v), 4) for v in c], "color": [128.0, 128.0, 128.0] if colours is None else [float(v) for v in colours[k]]}
+        str(k): {
+            "coordinates": [round(float(v), 4) for v in c],
+            "color": [128.0, 128.0, 128.0] if colours is None else [float(v) for v in colours[k]],
+        }
         for k, c in zip(chosen.tolist(), coordinates, strict=True)
     }
     used = {alignment.camera_of[i] for i in alignment.poses}

@@ -107,7 +107,9 @@ def look(photo: Photo, index: int, cache: PhotoPixels, methods: Methods, store: 
     )
 
 
-def take_in(photos: Sequence[Photo], cache: PixelCache, methods: Methods, store: Store, jobs: int) -> Steps[Intake]:
+def take_in(
+    photos: Sequence[Photo], cache: PixelCache, methods: Methods, store: Store, jobs: int
+) -> Steps[Intake]:
     """Looks at every photo, or finds in the store what an earlier look gave.
 
     Raises:

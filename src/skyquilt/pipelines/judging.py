@@ -71,7 +71,11 @@ def camera_figures(photos: Sequence[Photo], alignment: Alignment) -> dict[str, A
             name: {"value": _round(value, 6), "sigma": _round(sigma, 6)}
             for name, value, sigma in zip(PARAMETERS, camera.vector, sigmas, strict=True)
         }
-        out[key]["focal"] |= {"prior": _round(focal.px, 2), "prior_sigma": _round(focal.sigma_px, 2), "source": focal.source}
+        out[key]["focal"] |= {
+            "prior": _round(focal.px, 2),
+            "prior_sigma": _round(focal.sigma_px, 2),
+            "source": focal.source,
+        }
     return out
 
 

@@ -32,7 +32,14 @@ from skyquilt.run.store import Store, digest
 T = TypeVar("T")
 STAGES = ("read", "features", "links", "align", "surface", "balance", "mosaic", "measure", "report")
 """Stages in order."""
-ARTEFACTS = {"features": "features", "read": "pictures", "links": "links", "align": "alignment", "surface": "surface", "mosaic": "blocks"}
+ARTEFACTS = {
+    "features": "features",
+    "read": "pictures",
+    "links": "links",
+    "align": "alignment",
+    "surface": "surface",
+    "mosaic": "blocks",
+}
 """Stage -> folder in the store."""
 REGISTRY = {
     c.__name__: c
@@ -58,7 +65,9 @@ def iter_mosaic(
     settings, began = settings or MosaicSettings(), Clock.now()
     parts, jobs = methods(settings), settings.jobs or os.cpu_count() or 1
     survey, control = _read(folder, settings)
-    run = open_run(Path(output), run_key(survey, control, settings, parts), overwrite=overwrite or rerun_from is not None)
+    run = open_run(
+        Path(output), run_key(survey, control, settings, parts), overwrite=overwrite or rerun_from is not None
+    )
     store = Store(folder=run.store, registry=REGISTRY)
     _forget(run, store, rerun_from)
     if run.done:
@@ -80,10 +89,20 @@ def iter_mosaic(
         "align", placing.place(taken, frame, prior, links, control, parts, settings, store, pictures)
     )
     yield from (Note(text=n, warning=True) for n in alignment.notes)
-    ground = yield from clock.stage("surface", drawing.survey_ground(alignment, pictures, parts, settings, store))
-    exposure = yield from clock.stage("balance", _at_once(lambda: drawing.balance(taken, ground, alignment, parts, settings)))
+    ground = yield from clock.stage(
+        "surface", drawing.survey_ground(alignment, pictures, parts, settings, store)
+    )
+    exposure = yield from clock.stage(
+        "balance", _at_once(lambda: drawing.balance(taken, ground, alignment, parts, settings))
+    )
     compose = drawing.composer(taken, ground, alignment, exposure, parts, cache)
-    key = digest(run.key, drawing.poses_digest(alignment), ground.surface.z, dict(exposure.gains), dict(exposure.fields))
+    key = digest(
+        run.key,
+        drawing.poses_digest(alignment),
+        ground.surface.z,
+        dict(exposure.gains),
+        dict(exposure.fields),
+    )
     unit = drawing.unit_of(taken)
     drawn = yield from clock.stage(
         "mosaic", drawing.draw(run.path, compose, alignment, settings, store, key, unit, jobs)
@@ -95,7 +114,9 @@ def iter_mosaic(
         links=links, alignment=alignment, ground=ground, drawn=drawn, seams=seams.figures,
         conflicts=conflicts(taken.photos, prior, alignment), notes=[*survey.notes, *alignment.notes],
     )  # fmt: skip
-    finish = reporting.finish(run.path, taken, prior, alignment, ground, drawn, seams, figures, settings, clock, folder)
+    finish = reporting.finish(
+        run.path, taken, prior, alignment, ground, drawn, seams, figures, settings, clock, folder
+    )
     metrics = yield from clock.stage("report", finish)
     run.mark("done")
     yield Result(output=run.path, metrics=metrics)
@@ -168,7 +189,12 @@ def replace_read(cache: PixelCache, old: Sequence[int]) -> PixelCache:
 
 
 def _links(
-    taken: intake.Intake, prior: Sequence[poses.Prior], parts: Methods, settings: MosaicSettings, store: Store, jobs: int
+    taken: intake.Intake,
+    prior: Sequence[poses.Prior],
+    parts: Methods,
+    settings: MosaicSettings,
+    store: Store,
+    jobs: int,
 ) -> Steps[linking.Links]:
     """Links, unless the method asked for does without."""
     if settings.method in ("pose", "position") or len(taken.photos) < 2:

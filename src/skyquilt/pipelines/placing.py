@@ -90,8 +90,16 @@ def with_loose_photos(alignment: Alignment, intake: Intake, priors: Sequence[Pri
             continue
         C = priors[i].map_C + np.nan_to_num(offset)
         if not np.isfinite(C).all() or alignment.frame.crs is None or not np.isfinite(priors[i].yaw_deg):
-            lacking = "no position" if not np.isfinite(C[:2]).all() else "no height" if not np.isfinite(C[2]) else "no heading"
-            rejected[i] = rejected.get(i, f"it could not be linked to the other photos, and it has {lacking} to place it by")
+            lacking = (
+                "no position"
+                if not np.isfinite(C[:2]).all()
+                else "no height"
+                if not np.isfinite(C[2])
+                else "no heading"
+            )
+            rejected[i] = rejected.get(
+                i, f"it could not be linked to the other photos, and it has {lacking} to place it by"
+            )
             continue
         rejected.pop(i, None)
         R = cam_R_map_from_angles(priors[i].yaw_deg, priors[i].pitch_deg, priors[i].roll_deg)

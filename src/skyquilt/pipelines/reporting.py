@@ -49,7 +49,12 @@ def seams(compose: Composer, drawn: Drawn, ground: Ground) -> Steps[Seams]:
     def patches(at: Sequence[SeamPoint]) -> PatchPairs:
         xy = np.array([(grid.x(np.array(p.column)), grid.y(np.array(p.row))) for p in at])
         a, b, seen = grey_pairs(
-            [views[p.a] for p in at], [views[p.b] for p in at], xy, ground.surface, compose.pixels, ground.native_gsd
+            [views[p.a] for p in at],
+            [views[p.b] for p in at],
+            xy,
+            ground.surface,
+            compose.pixels,
+            ground.native_gsd,
         )
         return PatchPairs(a=a, b=b, seen=seen)
 
@@ -85,7 +90,10 @@ def finish(
     files.write_run(output / "run.toml", settings.as_table(), source, files.source_commit(), alignment.method)
     yield 1, 3
     metrics = figures | _times(clock)
-    write_report(output / "report.html", report_input(taken, priors, alignment, ground, drawn, seen, metrics, settings, source))
+    write_report(
+        output / "report.html",
+        report_input(taken, priors, alignment, ground, drawn, seen, metrics, settings, source),
+    )
     yield 2, 3
     metrics |= _times(clock)
     write_text(output / "metrics.json", json.dumps(metrics, indent=1, allow_nan=False))
@@ -101,7 +109,10 @@ def report_input(
 ) -> ReportInput:  # fmt: skip
     """What the report shows."""
     grid = drawn.provenance_grid
-    x, y = np.meshgrid(drawn.views_grid.x(np.arange(drawn.views_grid.width)), drawn.views_grid.y(np.arange(drawn.views_grid.height)))
+    x, y = np.meshgrid(
+        drawn.views_grid.x(np.arange(drawn.views_grid.width)),
+        drawn.views_grid.y(np.arange(drawn.views_grid.height)),
+    )
     heights = np.where(drawn.views > 0, ground.surface.at(x, y), np.float32(np.nan))
     return ReportInput(
         metrics=metrics, preview=drawn.preview, bounds=drawn.preview_grid.bounds,

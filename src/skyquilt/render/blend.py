@@ -70,7 +70,11 @@ def _weighted(layers: Sequence[Layer], weights: Sequence[Float]) -> NDArray:
     for layer, weight in zip(layers, weights, strict=True):
         part = np.where(weight[..., None] > 0, layer.pixels, 0) if kind.kind == "f" else layer.pixels
         total += part * weight[..., None]
-    return np.clip(np.rint(total), 0, np.iinfo(kind).max).astype(kind) if kind.kind == "u" else total.astype(kind)
+    return (
+        np.clip(np.rint(total), 0, np.iinfo(kind).max).astype(kind)
+        if kind.kind == "u"
+        else total.astype(kind)
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -119,7 +123,10 @@ class Feather:
         ramps = np.where(np.isfinite(s), np.nan_to_num(ramps), 0)
         total = np.maximum(ramps.sum(0), 1e-6)
         flat = [layer.pixels.reshape(-1, layer.pixels.shape[2])[near] for layer in layers]
-        mixed = sum(np.nan_to_num(f.astype(np.float32)) * (r / total)[:, None] for f, r in zip(flat, ramps, strict=True))
+        mixed = sum(
+            np.nan_to_num(f.astype(np.float32)) * (r / total)[:, None]
+            for f, r in zip(flat, ramps, strict=True)
+        )
         seen = lead.ravel()[near] >= 0
         if hard.dtype.kind == "u":
             mixed = np.clip(np.rint(mixed), 0, np.iinfo(hard.dtype).max)
@@ -260,7 +267,9 @@ def _laplacian(image: Float, levels: int) -> list[Float]:
 
 
 def _up(small: Float, like: Float) -> Float:
-    return np.asarray(cv2.pyrUp(small, dstsize=(like.shape[1], like.shape[0])), np.float32).reshape(like.shape)
+    return np.asarray(cv2.pyrUp(small, dstsize=(like.shape[1], like.shape[0])), np.float32).reshape(
+        like.shape
+    )
 
 
 def _collapse(bands: list[Float]) -> Float:

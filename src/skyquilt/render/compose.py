@@ -54,7 +54,9 @@ class Composer:
 
     def __call__(self, window: Window) -> Composed:
         """The window, piece by piece."""
-        out = np.full((window.height, window.width, self.bands), np.nan if self.dtype.kind == "f" else 0, self.dtype)
+        out = np.full(
+            (window.height, window.width, self.bands), np.nan if self.dtype.kind == "f" else 0, self.dtype
+        )
         photo = np.full((window.height, window.width), -1, np.int32)
         margin = -(-self.blend.margin // STEP) * STEP
         wide = window.grown(margin)

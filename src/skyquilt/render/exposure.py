@@ -123,7 +123,9 @@ class Balance:
             place.append(np.stack(image_place(view, u, v), -1))
             value.append(_sampled(thumbnails[view.photo], u, v, view.camera.width, view.camera.height))
         if not point:
-            return Samples(point=np.zeros(0, int), row=np.zeros(0, int), place=np.zeros((0, 2)), log=np.zeros((0, 3)))
+            return Samples(
+                point=np.zeros(0, int), row=np.zeros(0, int), place=np.zeros((0, 2)), log=np.zeros((0, 3))
+            )
         levels = np.concatenate(value)
         good = ((levels > 8) & (levels < 247)).all(1)
         return Samples(
@@ -152,7 +154,9 @@ def image_place(view: View, u: NDArray, v: NDArray) -> tuple[NDArray, NDArray]:
     return np.clip(2 * u / w - 1, -1.1, 1.1), np.clip(2 * v / h - 1, -1.1, 1.1)
 
 
-def _sampled(thumbnail: NDArray[np.uint8], u: NDArray, v: NDArray, width: int, height: int) -> NDArray[np.float64]:
+def _sampled(
+    thumbnail: NDArray[np.uint8], u: NDArray, v: NDArray, width: int, height: int
+) -> NDArray[np.float64]:
     """Smoothed thumbnail values (n, bands) at photo pixels."""
     h, w = thumbnail.shape[:2]
     smooth = cv2.GaussianBlur(thumbnail.astype(np.float32), (0, 0), 1.5).reshape(h, w, -1)
@@ -172,7 +176,10 @@ def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: fl
     A = sparse.csr_matrix((terms.ravel(), columns.ravel(), 6 * np.arange(N + 1)), (N, 6 * n))
     ridge = np.tile(1 / np.array([sigma_gain] + 5 * [sigma_field]) ** 2, n)
     x = _robust_differences(A, point, s.log.mean(1), ridge).reshape(n, 6)
-    fields = x[:, 1:] * (np.abs(_basis(*np.meshgrid([-1, 0, 1], [-1, 0, 1])) @ x[:, 1:].T).max((0, 1)) > EVEN)[:, None]
+    fields = (
+        x[:, 1:]
+        * (np.abs(_basis(*np.meshgrid([-1, 0, 1], [-1, 0, 1])) @ x[:, 1:].T).max((0, 1)) > EVEN)[:, None]
+    )
     even = s.log + (terms[:, 1:] * fields[s.row]).sum(1)[:, None]
     ones = sparse.csr_matrix((np.ones(N), (np.arange(N), s.row)), (N, n))
     bands = [_robust_differences(ones, point, even[:, k], ridge[::6]) for k in range(s.log.shape[1])]
@@ -184,7 +191,9 @@ def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: fl
     )
 
 
-def _robust_differences(A: sparse.csr_matrix, point: NDArray, y: NDArray, ridge: NDArray) -> NDArray[np.float64]:
+def _robust_differences(
+    A: sparse.csr_matrix, point: NDArray, y: NDArray, ridge: NDArray
+) -> NDArray[np.float64]:
     """x that makes y + A x equal within each point, reweighted against moving things and shadows."""
     w = np.ones(len(y))
     x = np.zeros(A.shape[1])
@@ -194,7 +203,11 @@ def _robust_differences(A: sparse.csr_matrix, point: NDArray, y: NDArray, ridge:
         mean_A = sparse.diags(1 / np.maximum(mass, 1e-9)) @ (select @ A)
         mean_y = (select @ y) / np.maximum(mass, 1e-9)
         W = sparse.diags(w)
-        normal = A.T @ W @ A - mean_A.T @ sparse.diags(mass) @ mean_A + sparse.diags(ridge * SIGMA_LEVEL**2 * CORRELATED)
+        normal = (
+            A.T @ W @ A
+            - mean_A.T @ sparse.diags(mass) @ mean_A
+            + sparse.diags(ridge * SIGMA_LEVEL**2 * CORRELATED)
+        )
         rhs = -(A.T @ (w * y) - mean_A.T @ (mass * mean_y))
         x = sparse_linalg.spsolve(normal.tocsc(), rhs)
         level = y + A @ x

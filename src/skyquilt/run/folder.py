@@ -42,7 +42,9 @@ class RunFolder:
     @property
     def done(self) -> bool:
         """Whether this very run was finished before."""
-        return _state(self.path) == (self.key, "done") and all((self.path / name).is_file() for name in CONTRACT)
+        return _state(self.path) == (self.key, "done") and all(
+            (self.path / name).is_file() for name in CONTRACT
+        )
 
 
 def _state(path: Path) -> tuple[str, str]:

@@ -73,7 +73,9 @@ class Store:
             partial.write_bytes(encode(value))
             partial.replace(path)
         except OSError as error:
-            raise OutputError(f"cannot store intermediate results in {path.parent}: {error.strerror}") from error
+            raise OutputError(
+                f"cannot store intermediate results in {path.parent}: {error.strerror}"
+            ) from error
 
     def get_or(self, stage: str, key: str, make: Callable[[], T]) -> T:
         """The artefact, made and stored if need be."""

@@ -51,9 +51,16 @@ class Sweep:
         if len(views) < 2 or height <= 0:
             return surface
         for number, side in enumerate(self.sides):
-            gsd = float(np.median([height / v.camera.focal * max(v.camera.width, v.camera.height) for v in views])) / side
+            gsd = (
+                float(
+                    np.median([height / v.camera.focal * max(v.camera.width, v.camera.height) for v in views])
+                )
+                / side
+            )
             low, high = (-self.below * height, self.above * height) if number == 0 else (-3.0, 3.0)
-            surface = self._pass(surface, views, grid, grey, side, gsd, height, (low, high), relative=number > 0)
+            surface = self._pass(
+                surface, views, grid, grey, side, gsd, height, (low, high), relative=number > 0
+            )
         return surface
 
     def _pass(
@@ -130,7 +137,9 @@ class Sweep:
         total = cv2.GaussianBlur(weight, (0, 0), spread)
         smooth = cv2.GaussianBlur(value * weight, (0, 0), spread) / total
         x0, y0 = float(coarse.x(np.array(0))), float(coarse.y(np.array(rows - 1)))
-        return Surface(z=np.ascontiguousarray(smooth[::-1]), x0=x0, y0=y0, cell=coarse.gsd, source="tie points and sweep")
+        return Surface(
+            z=np.ascontiguousarray(smooth[::-1]), x0=x0, y0=y0, cell=coarse.gsd, source="tie points and sweep"
+        )
 
 
 def _nanmedian(values: Float) -> Float:

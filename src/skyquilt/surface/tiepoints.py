@@ -36,7 +36,9 @@ class FromTiePoints:
         rows = max(2, int(np.ceil((bounds[3] - bounds[1]) / cell)) + 1)
         x = bounds[0] + np.arange(columns) * cell
         y = bounds[1] + np.arange(rows) * cell
-        z = self._interpolate(points, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2), cell).reshape(rows, columns)
+        z = self._interpolate(points, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2), cell).reshape(
+            rows, columns
+        )
         smooth = np.asarray(cv2.GaussianBlur(z.astype(np.float32), (0, 0), self.smoothing_cells), np.float32)
         return Surface(z=smooth, x0=bounds[0], y0=bounds[1], cell=cell, source="tie points")
 
