@@ -92,5 +92,20 @@ def test_the_readme_names_every_file_of_a_run_and_every_option():
     assert [o for o in options if f"`{o}" not in readme and f"{o}`" not in readme] == []
 
 
+def test_the_readme_states_the_defaults():
+    import inspect
+
+    from skyquilt.cli.mosaic import command
+
+    readme = (ROOT / "README.md").read_text()
+    rows = dict(re.findall(r"^\| `(--[\w-]+)`[^|]*\|.*\| *([^|]*?) *\|$", readme, re.M))
+    for name, parameter in inspect.signature(command).parameters.items():
+        if isinstance(parameter.default, (int, float, str)) and not isinstance(parameter.default, bool):
+            stated = rows["--" + name].strip("`")
+            assert stated == (
+                "all processors" if name == "jobs" else str(parameter.default).removesuffix(".0")
+            ), name
+
+
 def plain(name):
     return re.sub(r"[-_.]+", "-", name).lower()
