@@ -51,10 +51,10 @@ def _bars(events: Iterable[Event], *, verbose: bool) -> None:
                     how = " (from an earlier run)" if happened.reused else ""
                     progress.console.print(f"{happened.stage}: {happened.seconds:.2f} s, {happened.cpu_seconds:.2f} s of CPU{how}")
             elif isinstance(happened, Note):
-                progress.console.print(happened.text, style="yellow" if happened.warning else None, markup=False, highlight=False)
+                progress.console.print(happened.text, style="yellow" if happened.warning else None, markup=False, highlight=False, soft_wrap=True)
             elif isinstance(happened, Result):
                 result = happened
-    Console().print(summary(result), markup=False, highlight=False)
+    Console().print(summary(result), markup=False, highlight=False, soft_wrap=True)
 
 
 def summary(result: Result) -> str:

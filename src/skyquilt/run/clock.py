@@ -44,7 +44,8 @@ class Clock:
 
     def stage(self, name: str, work: Steps[T]) -> Generator[Event, None, T]:
         """Runs a stage's steps as events and returns its result."""
-        begun, cpu, misses = time.perf_counter(), cpu_seconds(), self.store.misses
+        begun, cpu = time.perf_counter(), cpu_seconds()
+        hits, misses = self.store.hits, self.store.misses
         yield StageStarted(stage=name, total=0)
         try:
             while True:
@@ -57,7 +58,7 @@ class Clock:
         self.seconds[name] = round(time.perf_counter() - begun, 3)
         yield StageFinished(
             stage=name, seconds=self.seconds[name], cpu_seconds=round(cpu_seconds() - cpu, 3),
-            reused=self.store.misses == misses and self.store.hits > 0,
+            reused=self.store.misses == misses and self.store.hits > hits,
         )  # fmt: skip
         return result
 

@@ -6,11 +6,12 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from skyquilt.errors import OutputError
+from skyquilt.run.disk import refusal
 from skyquilt.run.codec import Registry, decode, encode
 
 T = TypeVar("T")
@@ -74,7 +75,9 @@ class Store:
             partial.write_bytes(encode(value))
             os.replace(partial, path)
         except OSError as error:
-            raise OutputError(f"cannot store intermediate results in {path.parent}: {error.strerror}") from error
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
+            raise refusal(path.parent, error) from error
 
     def get_or(self, stage: str, key: str, make: Callable[[], T]) -> T:
         """The artefact, made and stored if need be."""
