@@ -30,6 +30,8 @@ FINEST = 20
 """Map pixels per photo pixel, along a side, that may be asked for."""
 MOST_PIXELS = 4e11
 """Largest map."""
+WIDEST_M = 200_000.0
+"""Widest map: no drone flies further."""
 BLOCK = 2048
 """Side in px of the pieces that the map is drawn in."""
 SPOOL = "mosaic.spool"
@@ -140,15 +142,16 @@ def _check_place(
 def _check_size(grid: Grid, native: float) -> None:
     """Refuses what nobody can want: a map far finer than the photos, or larger than any survey."""
     size = f"{grid.width} x {grid.height} px"
-    if grid.gsd < native / FINEST:
+    wide = max(grid.width, grid.height) * grid.gsd
+    if grid.gsd < native / FINEST and wide < WIDEST_M:
         raise UsageError(
             f"--gsd {grid.gsd * 100:g} asks for {size}, more than {FINEST} times finer than the photos,"
             f" which show {native * 100:.2g} cm per pixel; leave --gsd out or choose one near that"
         )
-    if grid.width * grid.height > MOST_PIXELS:
+    if wide > WIDEST_M or grid.width * grid.height > MOST_PIXELS:
         raise UsageError(
-            f"at {grid.gsd * 100:g} cm the map would have {size} ({grid.width * grid.gsd / 1000:.0f} km wide):"
-            " the positions of some photos must be wrong. Correct them with --geo, or choose a larger --gsd"
+            f"the map would be {wide / 1000:.0f} km wide, {size} at {grid.gsd * 100:g} cm: the positions of some"
+            " photos (or --bounds) must be wrong; correct them with --geo, or choose a larger --gsd"
         )
 
 

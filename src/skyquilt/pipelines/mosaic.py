@@ -12,6 +12,7 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from numpy.typing import NDArray
 
@@ -64,9 +65,9 @@ def iter_mosaic(
     run = open_run(Path(output), run_key(survey, control, settings), overwrite=overwrite, again=rerun_from is not None)
     store = Store(folder=run.store, registry=REGISTRY)
     _forget(run, store, rerun_from)
-    if run.done:
+    if run.done and (former := _figures(run.path / "metrics.json")):
         yield Note(text=f"{run.path} holds this very mosaic already; nothing to do")
-        yield Result(output=run.path, metrics=json.loads((run.path / "metrics.json").read_text()))
+        yield Result(output=run.path, metrics=former)
         return
     run.mark("running")
     clock = Clock(store=store)
@@ -177,6 +178,14 @@ def _forget(run: RunFolder, store: Store, rerun_from: str | None) -> None:
         if "mosaic" in later:
             shutil.rmtree(run.path / STATE / drawing.SPOOL, ignore_errors=True)
         run.mark("running")
+
+
+def _figures(path: Path) -> dict[str, Any]:
+    """The figures of a finished run; none where somebody damaged the file."""
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return {}
 
 
 def _one_kind(
