@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from skyquilt.run.disk import refusal
 from skyquilt.run.codec import Registry, decode, encode
 
@@ -32,8 +34,10 @@ def _plain(value: Any) -> Any:
         return [_plain(v) for v in value]
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if hasattr(value, "tobytes"):
-        return hashlib.blake2b(value.tobytes(), digest_size=16).hexdigest()
+    if isinstance(value, np.ndarray):
+        return [value.dtype.str, value.shape, hashlib.blake2b(value.tobytes(), digest_size=16).hexdigest()]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
     return str(value)
 
 
