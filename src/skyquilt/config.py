@@ -66,7 +66,7 @@ class MosaicSettings:
     """Common heading for method `position`."""
     repair: bool = True
     """Treat metadata as measurements that may lie."""
-    features: int = 2000
+    features: int = 1500
     """Features per photo."""
     jobs: int = 0
     """Threads; 0 = all processors."""

@@ -41,7 +41,7 @@ def test_the_same_run_is_done_or_resumed(tmp_path):
 
 def test_another_run_is_refused_replaced_or_made_again(tmp_path):
     finish(tmp_path)
-    with pytest.raises(OutputError, match="another run.*--overwrite"):
+    with pytest.raises(OutputError, match=r"another run.*--overwrite"):
         open_run(tmp_path, "other", overwrite=False)
     assert (tmp_path / "mosaic.tif").exists()
     open_run(tmp_path, "other", overwrite=False, again=True)
@@ -51,7 +51,7 @@ def test_another_run_is_refused_replaced_or_made_again(tmp_path):
 def test_other_files_are_refused_and_survive_overwriting(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     for again in (False, True):
-        with pytest.raises(OutputError, match="other files.*--overwrite"):
+        with pytest.raises(OutputError, match=r"other files.*--overwrite"):
             open_run(tmp_path, "k", overwrite=False, again=again)
     open_run(tmp_path, "k", overwrite=True)
     assert (tmp_path / "notes.txt").read_text() == "mine"
@@ -73,7 +73,9 @@ def test_files_and_places_below_files_are_no_folders(tmp_path):
         open_run(tmp_path / "file" / "out", "k", overwrite=True)
 
 
-@pytest.mark.parametrize(("number", "words"), [(errno.ENOSPC, "disk is full"), (errno.EACCES, "another output folder")])
+@pytest.mark.parametrize(
+    ("number", "words"), [(errno.ENOSPC, "disk is full"), (errno.EACCES, "another output folder")]
+)
 def test_refusals_of_the_disk_say_what_to_do(tmp_path, monkeypatch, number, words):
     def refuse(*args, **options):
         raise OSError(number, "refused")

@@ -54,7 +54,7 @@ def test_a_full_disk_leaves_the_former_artefact(store, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OutputError, match="disk is full.*same command again"):
+    with pytest.raises(OutputError, match=r"disk is full.*same command again"):
         store.put("stage", "key", [2])
     monkeypatch.undo()
     assert store.get("stage", "key") == [1]

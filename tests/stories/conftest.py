@@ -25,6 +25,8 @@ from tests.photos.conftest import gps_exif, with_segment
 
 QUICK = ("--features", "300", "--surface", "ties", "--gsd", "30", "--jobs", "2")
 """Options with which the small flight is mapped in about a second."""
+WIDE, HIGH = 480, 360
+"""Size of its photos in px."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +59,7 @@ class Told:
         return self
 
     def refused(self, code: int, *words: str) -> "Told":
-        """The command said why in one sentence on standard error, and left nothing that looks like a result."""
+        """The command said why in one sentence on standard error, and left nothing like a result."""
         assert self.code == code, self.err or self.out
         assert "Traceback" not in self.err + self.out
         last = self.err.strip().splitlines()[-1] if self.err.strip() else ""
@@ -76,7 +78,7 @@ def leftovers(folder: Path) -> list[str]:
 
 
 def skyquilt(*words: str | Path) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error; an exception that a user would see as a traceback escapes."""
+    """Exit code, standard output and standard error; what a user would see as a traceback escapes."""
     out, err, argv = io.StringIO(), io.StringIO(), sys.argv
     sys.argv = ["skyquilt", *map(str, words)]
     try:
@@ -108,10 +110,10 @@ def mosaic(tmp_path: Path) -> Mosaic:
 
 @pytest.fixture(scope="session")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Nine photos of 640 x 480 px with `gcp_list.txt` beside their folder `photos`."""
+    """Nine photos of WIDE x HIGH px with `gcp_list.txt` beside their folder `photos`."""
     folder = tmp_path_factory.mktemp("flight")
     settings = FlightSettings(
-        seed=3, lens=Lens().scaled(640, 480), route=Route(photos=9), control=Control(points=5, checks=1)
+        seed=3, lens=Lens().scaled(WIDE, HIGH), route=Route(photos=9), control=Control(points=5, checks=1)
     )
     for _ in simulate(settings, folder, overwrite=True):
         pass
@@ -169,8 +171,8 @@ def taken_apart(data: bytes) -> tuple[bytes, str, bytes]:
 
 
 def relabel(
-    path: Path, *, place: tuple[float, float] | None = None, heights: float | None = None, drop: Sequence[str] = (),
-    xmp: dict[str, str] | None = None, strip: bool = False, model: str | None = None,
+    path: Path, *, place: tuple[float, float] | None = None, heights: float | None = None,
+    drop: Sequence[str] = (), xmp: dict[str, str] | None = None, strip: bool = False, model: str | None = None,
 ) -> None:  # fmt: skip
     """Rewrites metadata: another place (latitude, longitude), heights moved by metres, parts dropped.
 
@@ -221,7 +223,7 @@ def _raised(exif: dict[str, Any], packet: str, metres: float) -> tuple[dict[str,
 
 
 def other_camera(flight: Path, folder: Path, *, model: str = "Simulated 3:2") -> list[Path]:
-    """The flight's last four photos again as another camera made them: three quarters the size, other name."""
+    """The flight's last four photos again as another camera made them, three quarters the size."""
     made = []
     for source in named(flight / "photos")[-4:]:
         block, packet, _ = taken_apart(source.read_bytes())
@@ -231,11 +233,11 @@ def other_camera(flight: Path, folder: Path, *, model: str = "Simulated 3:2") ->
             int(v * f) for v, f in zip(exif["Exif"][piexif.ExifIFD.FocalLength], (0.75, 1), strict=True)
         )
         buffer = io.BytesIO()
-        Image.fromarray(pixels_of(source)).resize((480, 360), Image.Resampling.BOX).save(buffer, "JPEG", quality=92)
+        Image.fromarray(pixels_of(source)).resize((WIDE * 3 // 4, HIGH * 3 // 4), Image.Resampling.BOX).save(
+            buffer, "JPEG", quality=92
+        )
         data = with_segment(buffer.getvalue(), 0xE1, b"http://ns.adobe.com/xap/1.0/\x00" + packet.encode())
         target = folder / f"B_{source.name}"
         target.write_bytes(with_segment(data, 0xE1, piexif.dump(exif)))
         made.append(target)
     return made
-
-

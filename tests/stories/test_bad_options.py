@@ -59,6 +59,7 @@ def test_usage_errors_end_with_2(flight, tmp_path, words):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_wrong_option_does_not_cost_the_results_it_would_have_replaced(mosaic, flight):
     output = mosaic(flight / "photos").made().output
     before = (output / "mosaic.tif").read_bytes()
@@ -70,20 +71,26 @@ def test_a_wrong_option_does_not_cost_the_results_it_would_have_replaced(mosaic,
     assert (output / "mosaic.tif").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_gsd_far_finer_than_the_photos(mosaic, flight):
     mosaic(flight / "photos", "--gsd", "0.1").refused(2, "--gsd 0.1", "times finer than the photos")
 
 
+@pytest.mark.slow
 def test_gsd_coarser_than_the_map(mosaic, flight):
     told = mosaic(flight / "photos", "--gsd", "9000").made()
     assert told.metrics["size_px"] == pytest.approx([2, 2], abs=1)
 
 
+@pytest.mark.slow
 def test_bounds_outside_the_map(mosaic, flight):
-    told = mosaic(flight / "photos", "--bounds", "1,2,3,4").refused(2, "--bounds 1,2,3,4", "outside the photos", "which cover 44")
+    told = mosaic(flight / "photos", "--bounds", "1,2,3,4").refused(
+        2, "--bounds 1,2,3,4", "outside the photos", "which cover 44"
+    )
     assert "EPSG:32633" in told.err
 
 
+@pytest.mark.slow
 def test_bounds_that_cut_the_map(mosaic, flight, finished):
     with rasterio.open(finished / "mosaic.tif") as whole:
         west, south, east, north = whole.bounds
@@ -92,6 +99,7 @@ def test_bounds_that_cut_the_map(mosaic, flight, finished):
     assert told.metrics["size_px"] == pytest.approx([100, 100], abs=2)
 
 
+@pytest.mark.slow
 def test_little_memory_is_enough(mosaic, flight):
     told = mosaic(flight / "photos", "--memory", "0.5").made()
     assert told.metrics["photos_used"] == 9
@@ -122,6 +130,7 @@ def test_a_malformed_gcp_list(mosaic, flight, tmp_path, spoil, words):
     assert not told.output.exists()
 
 
+@pytest.mark.slow
 def test_a_gcp_list_that_names_some_unknown_photos(mosaic, flight, tmp_path):
     text = (flight / "gcp_list.txt").read_text()
     (tmp_path / "gcp.txt").write_text(text.replace("SIM_0005.jpg", "DJI_0777.JPG"))
@@ -158,7 +167,13 @@ def square(west, south, east, north):
         ("area.geojson", "{ nonsense", ("area.geojson", "not a readable")),
         ("area.geojson", '{"type": "Point", "coordinates": [14.3, 46.6]}', ("at least one polygon", "Point")),
         ("area.docx", "hello", ("a boundary is one of", ".geojson")),
-        ("area.geojson", square(10, 40, 11, 41), ("--boundary", "outside the photos", "which cover")),
+        pytest.param(
+            "area.geojson",
+            square(10, 40, 11, 41),
+            ("--boundary", "outside the photos", "which cover"),
+            marks=pytest.mark.slow,
+            id="elsewhere",
+        ),
     ],
 )
 def test_a_boundary_that_cannot_be_used(mosaic, flight, tmp_path, name, content, words):
@@ -187,12 +202,13 @@ def test_json_is_one_object_per_line(mosaic, flight):
     assert told.err == ""
 
 
+@pytest.mark.slow
 def test_json_has_no_values_that_json_does_not_know(mosaic, photos):
     for path in named(photos):
         relabel(path, strip=True)
     told = mosaic(photos, "--json").made()
     for text in told.out.splitlines():
-        json.loads(text, parse_constant=lambda word: pytest.fail(f"{word} in {text[:80]}"))
+        json.loads(text, parse_constant=lambda word: pytest.fail(word))
 
 
 def test_quiet_is_silent(mosaic, photos):
@@ -207,15 +223,27 @@ def test_an_error_in_json_mode_goes_to_standard_error(mosaic, tmp_path):
     assert told.out == ""
 
 
+@pytest.mark.slow
 def test_paths_are_never_broken_over_lines(mosaic, flight, tmp_path):
     output = tmp_path / ("very " * 20 + "long name")
     told = mosaic(flight / "photos", output=output).made()
     assert f"map:    {output / 'mosaic.tif'}" in told.out.splitlines()
 
 
+@pytest.mark.slow
 def test_the_module_runs_and_a_reader_that_leaves_is_no_error(flight, tmp_path):
     """`skyquilt mosaic --json | head -1`."""
-    words = [sys.executable, "-m", "skyquilt", "mosaic", str(flight / "photos"), "-o", str(tmp_path / "out"), "--json", *QUICK]
+    words = [
+        sys.executable,
+        "-m",
+        "skyquilt",
+        "mosaic",
+        str(flight / "photos"),
+        "-o",
+        str(tmp_path / "out"),
+        "--json",
+        *QUICK,
+    ]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=dict(os.environ))
     assert process.stdout is not None
     assert process.stderr is not None
@@ -226,6 +254,7 @@ def test_the_module_runs_and_a_reader_that_leaves_is_no_error(flight, tmp_path):
     assert "Traceback" not in err
 
 
+@pytest.mark.slow
 def test_a_mistake_of_the_program_is_not_hidden(mosaic, flight, monkeypatch):
     from skyquilt.pipelines import mosaic as story
 
@@ -235,5 +264,3 @@ def test_a_mistake_of_the_program_is_not_hidden(mosaic, flight, monkeypatch):
     monkeypatch.setattr(story.judging, "figures", broken)
     with pytest.raises(ZeroDivisionError):
         mosaic(flight / "photos")
-
-

@@ -5,14 +5,14 @@ wheel of pycolmap offers priors on positions only, and a strip without loops nee
 intrinsic as well. The tests hold this code against pycolmap's Ceres on problems that both can state.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 from scipy.sparse import linalg as sparse_linalg
 
-from skyquilt.alignment.problem import Linearised, Problem, State, attitude_error, linearise
+from skyquilt.alignment.problem import Problem, State, attitude_error, linearise, residuals_px
 
 Array = NDArray[np.float64]
 DENSE_LIMIT = 4000
@@ -65,11 +65,35 @@ def _cauchy(squared: Array, scale: float) -> tuple[Array, Array]:
     return 1 / (1 + u), scale**2 * np.log1p(u)
 
 
-def _sum_by(index: NDArray[np.int64], values: Array, count: int) -> Array:
-    """Sums of values (N, ...) by index: (count, ...)."""
+def _pseudo_huber(squared: Array, scale: float) -> tuple[Array, Array]:
+    """Weights and costs under the pseudo-Huber loss: what lies counts less, but it never stops counting.
+
+    A strip that bends away from its positions and angles does so with all of them together; a loss that
+    forgets outliers would forget them all.
+    """
+    root = np.sqrt(1 + squared / scale**2)
+    return 1 / root, 2 * scale**2 * (root - 1)
+
+
+def _by_point(problem: Problem, values: Array, count: int) -> Array:
+    """Sums of values (N, ...) of each point's sightings: (count, ...). Sightings are sorted by point."""
     flat = values.reshape(len(values), -1)
-    selector = sparse.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))), (count, len(index)))
-    return np.asarray(selector @ flat).reshape(count, *values.shape[1:])
+    starts = np.searchsorted(problem.point, np.arange(count))
+    total = np.add.reduceat(flat, np.minimum(starts, len(flat) - 1), axis=0)
+    total[np.diff(np.r_[starts, len(flat)]) == 0] = 0
+    return total.reshape(count, *values.shape[1:])
+
+
+def _by_photo(problem: Problem, rows: Array, count: int) -> Array:
+    """Products A^T A (count, k, k) of each photo's rows A; rows (N, 2, k)."""
+    order = np.argsort(problem.photo, kind="stable")
+    cuts = np.searchsorted(problem.photo[order], np.arange(count + 1))
+    sorted_rows = rows[order].reshape(-1, rows.shape[2])
+    out = np.empty((count, rows.shape[2], rows.shape[2]))
+    for i in range(count):
+        own = sorted_rows[2 * cuts[i] : 2 * cuts[i + 1]]
+        out[i] = own.T @ own
+    return out
 
 
 def _sighting_weights(problem: Problem, residual: Array) -> tuple[Array, float]:
@@ -80,10 +104,10 @@ def _sighting_weights(problem: Problem, residual: Array) -> tuple[Array, float]:
 def _prior_terms(problem: Problem, state: State) -> tuple[list[tuple[Array, Array]], float]:
     """(precision, residual*precision) of centres, attitudes, intrinsics, points; and their cost."""
     e = np.nan_to_num((state.C - problem.C0) / problem.sigma_C)
-    wc, cost_c = _cauchy((e**2).sum(1), problem.loss_C)
+    wc, cost_c = _pseudo_huber((e**2).sum(1), problem.loss_C)
     pc = np.where(np.isfinite(problem.C0), wc[:, None] / problem.sigma_C**2, 0.0)
     rotation = attitude_error(state.R, problem.R0)
-    wr, cost_r = _cauchy(((rotation / problem.sigma_R) ** 2).sum(1), problem.loss_R)
+    wr, cost_r = _pseudo_huber(((rotation / problem.sigma_R) ** 2).sum(1), problem.loss_R)
     pr = wr[:, None] / problem.sigma_R**2
     pk = problem.free / problem.sigma_K**2
     dk = state.K - problem.K0
@@ -103,30 +127,33 @@ def normal_equations(problem: Problem, state: State) -> Normal:
     """Normal equations of the reweighted problem at a state."""
     lin = linearise(problem, state)
     weight, cost = _sighting_weights(problem, lin.residual)
-    root = np.sqrt(weight)[:, None]
-    A = np.concatenate([lin.J_photo, lin.J_camera, lin.J_point, lin.residual[..., None]], 2) * root[..., None]
-    G = np.swapaxes(A, 1, 2) @ A  # (N, 18, 18): every product at once
+    root = np.sqrt(weight)[:, None, None]
+    e, J_point = lin.residual[..., None] * root, lin.J_point * root
+    rows = np.concatenate([lin.J_photo, lin.J_camera, lin.residual[..., None]], 2) * root
     n, m, count = len(state.C), len(state.K), len(state.X)
-    by_photo = _sum_by(problem.photo, G[:, :14, [*range(14), 17]], n)
-    by_camera = _sum_by(problem.camera, by_photo[:, 6:], m)
-    by_point = _sum_by(problem.point, G[:, 14:17, 14:18], count)
+    by_photo = _by_photo(problem, rows, n)
+    by_camera = np.zeros((m, 8, 9))
+    np.add.at(by_camera, problem.camera, by_photo[:, 6:14, 6:15])
+    point_rows = np.concatenate([J_point, e], 2)
+    by_point = _by_point(problem, np.swapaxes(J_point, 1, 2) @ point_rows, count)
+    W = np.swapaxes(rows[:, :, :14], 1, 2) @ J_point
     (pc, gc), (pr, gr), (pk, gk), (px, gx) = (terms := _prior_terms(problem, state))[0]
-    U, Uc, V = by_photo[:, :6, :6].copy(), by_camera[:, :, 6:14].copy(), by_point[:, :, :3].copy()
+    U, Uc, V = by_photo[:, :6, :6].copy(), by_camera[:, :, :8].copy(), by_point[:, :, :3].copy()
     _add_diagonal(U, 0, pr)
     _add_diagonal(U, 3, pc)
     _add_diagonal(Uc, 0, np.where(problem.free, pk, 1.0))
     _add_diagonal(V, 0, px)
     gp = by_photo[:, :6, 14] + np.concatenate([gr, gc], 1)
     return Normal(
-        U=U, Uc=Uc, Upc=by_photo[:, :6, 6:14], V=V, Wp=G[:, :6, 14:17], Wc=G[:, 6:14, 14:17],
-        gp=gp, gc=by_camera[:, :, 14] + gk, gv=by_point[:, :, 3] + gx, cost=cost + terms[1],
+        U=U, Uc=Uc, Upc=by_photo[:, :6, 6:14], V=V, Wp=W[:, :6], Wc=W[:, 6:],
+        gp=gp, gc=by_camera[:, :, 8] + gk, gv=by_point[:, :, 3] + gx, cost=cost + terms[1],
     )  # fmt: skip
 
 
 def robust_cost(problem: Problem, state: State) -> float:
     """Robust cost of a state."""
-    lin: Linearised = linearise(problem, state)
-    return _sighting_weights(problem, lin.residual)[1] + _prior_terms(problem, state)[1]
+    error = np.nan_to_num(residuals_px(problem, state)) / problem.sigma_px[:, None]
+    return _sighting_weights(problem, error)[1] + _prior_terms(problem, state)[1]
 
 
 def _chunks(problem: Problem, count: int) -> list[tuple[int, int]]:
@@ -219,33 +246,51 @@ class Reduced:
         p, N = self.problem, self.normal
         coupled = np.einsum("nij,ni->nj", N.Wp, photo_step[p.photo])
         coupled += np.einsum("nij,ni->nj", N.Wc, camera_step[p.camera[p.photo]])
-        rhs = N.gv + _sum_by(p.point, coupled, len(N.V))
+        rhs = N.gv + _by_point(p, coupled, len(N.V))
         half = np.einsum("pij,pj->pi", self.L_inv, rhs)
         return photo_step, camera_step, -np.einsum("pji,pj->pi", self.L_inv, half)
 
 
-def adjust(problem: Problem, state: State, *, iterations: int = 30, tolerance: float = 1e-5) -> Adjusted:
+def polish_points(problem: Problem, state: State) -> State:
+    """One Gauss-Newton step of the points alone."""
+    lin = linearise(problem, state)
+    weight, _ = _sighting_weights(problem, lin.residual)
+    rows = np.concatenate([lin.J_point, lin.residual[..., None]], 2) * np.sqrt(weight)[:, None, None]
+    sums = _by_point(problem, np.swapaxes(rows[:, :, :3], 1, 2) @ rows, len(state.X))
+    pull = np.where(np.isfinite(problem.X0), 1 / problem.sigma_X**2, 0.0)
+    H = sums[:, :, :3]
+    _add_diagonal(H, 0, pull + 1e-9)
+    g = sums[:, :, 3] + pull * np.nan_to_num(state.X - problem.X0)
+    return replace(state, X=state.X - np.linalg.solve(H, g[..., None])[..., 0])
+
+
+def adjust(
+    problem: Problem, state: State, *, iterations: int = 30, tolerance: float = 1e-5, damping: float = 1e-4
+) -> Adjusted:
     """Minimises the robust cost.
+
+    After each step the points settle under the moved photos before the step is judged: a strip that straightens
+    moves along a curve, and without that its long steps would all be refused.
 
     Args:
         problem: sightings and priors.
         state: where to start.
         iterations: most steps to take.
         tolerance: relative decrease of the cost at which it counts as converged.
+        damping: first damping, relative to the diagonal of the normal equations.
     """
-    damping, cost = 1e-4, np.inf
+    cost = np.inf
     for iteration in range(iterations):
         normal = normal_equations(problem, state)
-        cost = normal.cost
-        accepted = False
+        cost, new_cost, accepted, candidate = normal.cost, np.inf, False, state
         while not accepted and damping < 1e8:
             try:
-                candidate = state.moved(*Reduced(problem, normal, damping).step())
+                candidate = polish_points(problem, state.moved(*Reduced(problem, normal, damping).step()))
                 new_cost = robust_cost(problem, candidate)
             except np.linalg.LinAlgError:
                 new_cost = np.inf
             accepted = bool(new_cost <= cost * (1 + 1e-12))
-            damping = max(damping / 8, 1e-9) if accepted else damping * 8
+            damping = max(damping / 4, 1e-9) if accepted else damping * 8
         if not accepted:
             return Adjusted(state=state, cost=cost, iterations=iteration, converged=True)
         state = candidate

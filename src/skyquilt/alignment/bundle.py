@@ -34,7 +34,7 @@ class Bundle:
     """Sightings per photo in the adjustment; all the others are triangulated afterwards."""
     repair: bool = True
     """Treat metadata as measurements that may lie; False believes them to their stated deviations."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(
         self, photos: Sequence[Photo], frame: MapFrame, priors: Sequence[Prior], features: Sequence[Features],
@@ -65,11 +65,11 @@ def _refine(problem: Problem, state: State) -> tuple[Problem, State]:
     fixed = replace(problem, free=np.zeros_like(problem.free), loss_px=20.0)
     state = adjust(fixed, state, iterations=10, tolerance=3e-2).state
     problem, state = prune(problem, state, 40.0)
-    state = adjust(problem.with_loss(6.0), state, iterations=12, tolerance=5e-3).state
+    state = adjust(problem.with_loss(6.0), state, iterations=20, tolerance=3e-3, damping=1e-5).state
     problem, state = prune(problem, state, 12.0)
-    state = adjust(problem.with_loss(2.5), state, iterations=12, tolerance=1e-3).state
+    state = adjust(problem.with_loss(2.5), state, iterations=20, tolerance=2e-3, damping=1e-6).state
     problem, state = prune(problem, state, 5.0)
-    return problem, adjust(problem.with_loss(2.0), state, iterations=15, tolerance=1e-4).state
+    return problem, adjust(problem.with_loss(2.0), state, iterations=15, tolerance=3e-4, damping=1e-6).state
 
 
 def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]:
@@ -128,7 +128,7 @@ def leave_one_out(problem: Problem, state: State, C_covariance: Array | None) ->
         axes = np.isfinite(problem.C0[i])
         e = (state.C[i] - problem.C0[i])[axes]
         white = e / problem.sigma_C[i][axes]
-        precision = np.diag(1 / problem.sigma_C[i][axes] ** 2) / (1 + (white @ white) / problem.loss_C**2)
+        precision = np.diag(1 / problem.sigma_C[i][axes] ** 2) / np.sqrt(1 + (white @ white) / problem.loss_C**2)
         own = C_covariance[6 * i + 3 : 6 * i + 6, 6 * i + 3 : 6 * i + 6][np.ix_(axes, axes)]
         full = np.full(3, np.nan)
         full[axes] = np.linalg.solve(np.eye(len(e)) - own @ precision, e)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.geometry.camera import project_with_derivatives
+from skyquilt.geometry.camera import distort, project_with_derivatives
 from skyquilt.geometry.frames import rotation_from_vector
 
 Array = NDArray[np.float64]
@@ -70,9 +70,9 @@ class Problem:
     loss_px: float
     """Scale of the Cauchy loss on sightings, in units of their deviation."""
     loss_C: float = 3.0
-    """Scale of the Cauchy loss on positions, in units of their deviation: a GPS may lie."""
+    """Scale of the pseudo-Huber loss on positions, in units of their deviation: a GPS may lie."""
     loss_R: float = 2.0
-    """Scale of the Cauchy loss on attitudes: a gimbal may lie."""
+    """Scale of the pseudo-Huber loss on attitudes: a gimbal may lie."""
     trust: float = 1.0
     """Factor on the cost of sightings. Errors of neighbouring sightings are correlated (lens model, rolling
     shutter, features of one kind); a photo's hundreds of sightings weigh like some dozens of independent ones."""
@@ -127,8 +127,9 @@ def linearise(problem: Problem, state: State) -> Linearised:
 def residuals_px(problem: Problem, state: State) -> Array:
     """Projected minus seen (N, 2) in px; NaN for points behind their camera."""
     local, behind = _local(problem, state)
-    p = project_with_derivatives(state.K[problem.camera[problem.photo]], local)
-    return np.where(behind[:, None], np.nan, p.px - problem.px)
+    k = state.K[problem.camera[problem.photo]]
+    px = distort(local[:, :2] / local[:, 2:], k) * k[:, :1] + k[:, 1:3]
+    return np.where(behind[:, None], np.nan, px - problem.px)
 
 
 def attitude_error(R: Array, R0: Array) -> Array:

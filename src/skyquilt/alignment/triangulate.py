@@ -27,7 +27,7 @@ def polish(problem: Problem, state: State, *, iterations: int = 5) -> tuple[Stat
         w = 1 / (1 + (lin.residual**2).sum(1) / problem.loss_px**2)
         J = lin.J_point
         H, g = np.zeros((len(state.X), 3, 3)), np.zeros((len(state.X), 3))
-        np.add.at(H, problem.point, np.einsum("nki,nkj->nij", J, J) * w[:, None, None])
+        np.add.at(H, problem.point, np.swapaxes(J, 1, 2) @ J * w[:, None, None])
         np.add.at(g, problem.point, np.einsum("nki,nk->ni", J, lin.residual) * w[:, None])
         H += np.eye(3) * 1e-9
         step = -np.linalg.solve(H, g[..., None])[..., 0]

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from skyquilt.cli.interrupt import ends_at_once
 from skyquilt.errors import UsageError
 
 METHOD_HELP = "How photos are aligned: auto, bundle, pose, position."
@@ -46,9 +47,10 @@ def command(
     1 other errors, 2 wrong options, 3 no readable photo, 4 photos cannot be aligned, 5 output cannot be
     written, 6 malformed side file, 130 interrupted.
     """
-    from skyquilt.cli.progress import show
-    from skyquilt.config import MosaicSettings
-    from skyquilt.pipelines.mosaic import STAGES, iter_mosaic
+    with ends_at_once():
+        from skyquilt.cli.progress import show
+        from skyquilt.config import MosaicSettings
+        from skyquilt.pipelines.mosaic import STAGES, iter_mosaic
 
     if rerun_from is not None and rerun_from not in STAGES[1:]:
         raise UsageError(f"--rerun-from {rerun_from!r} is not one of {', '.join(STAGES[1:])}")

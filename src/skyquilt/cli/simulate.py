@@ -3,15 +3,16 @@
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from skyquilt import simulate as sim
 from skyquilt.errors import UsageError
-from skyquilt.simulate.settings import FlightSettings, Thermal
-from skyquilt.simulate.weather import Weather
+
+if TYPE_CHECKING:
+    from skyquilt import simulate as sim
+    from skyquilt.simulate.settings import FlightSettings
+    from skyquilt.simulate.weather import Weather
 
 PresetName = Literal["default", "demo", "strip", "roundtrip", "thermal", "drones"]
 
@@ -67,6 +68,9 @@ def command(
     quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar")] = False,
 ) -> None:
     """Simulate a drone survey: photos with metadata, control points, and beside them the truth."""
+    from skyquilt import simulate as sim
+    from skyquilt.simulate.weather import Weather
+
     base = sim.preset(preset)
     if no_focal:
         base = _with(base, "reporting", focal_missing=True)
@@ -106,21 +110,23 @@ def _share(percent: float | None) -> float | None:
     return None if percent is None else percent / 100
 
 
-def _with(settings: FlightSettings, part: str, **values: Any) -> FlightSettings:
+def _with(settings: "FlightSettings", part: str, **values: Any) -> "FlightSettings":
     """The settings with those values of one part that are given."""
     given = {name: value for name, value in values.items() if value is not None}
     changed: Any = {part: replace(getattr(settings, part), **given)}
     return replace(settings, **changed)
 
 
-def _thermal(settings: FlightSettings, wanted: bool | None, weather: Weather) -> FlightSettings:
+def _thermal(settings: "FlightSettings", wanted: bool | None, weather: "Weather") -> "FlightSettings":
     flight = settings.thermal
     if wanted is not None:
+        from skyquilt.simulate.settings import Thermal
+
         flight = (flight or Thermal()) if wanted else None
     return replace(settings, thermal=None if flight is None else replace(flight, weather=weather))
 
 
-def _lens(settings: FlightSettings, size: str | None) -> Any:
+def _lens(settings: "FlightSettings", size: str | None) -> Any:
     """The preset's lens on another number of pixels."""
     if size is None:
         return settings.lens
@@ -130,12 +136,14 @@ def _lens(settings: FlightSettings, size: str | None) -> Any:
     return settings.lens.scaled(int(words[0]), int(words[1]))
 
 
-def _show(events: Iterable[sim.Progress], quiet: bool) -> None:
+def _show(events: "Iterable[sim.Progress]", quiet: bool) -> None:
     """A bar for each stage."""
     if quiet:
         for _ in events:
             pass
         return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
     columns = (TextColumn("{task.description:16}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns) as bars:
         tasks: dict[str, TaskID] = {}

@@ -15,7 +15,7 @@ from skyquilt.model.features import Features
 class Sift:
     """SIFT (Lowe 2004) on a shrunken image, descriptors as RootSIFT (Arandjelovic and Zisserman 2012)."""
 
-    count: int = 2000
+    count: int = 1500
     """Most keypoints kept per photo."""
     longest: int = 1000
     """Longest side in px of the image searched; smaller photos are searched as they are."""

@@ -4,6 +4,7 @@ One convention inside the project: OpenCV's, from undistorted to distorted coord
 other direction (Y 2.1); conversions live at the edges (`geometry.camera_formats`).
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -111,6 +112,7 @@ def rays(camera: Camera, px: Array) -> Array:
     return np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], -1)
 
 
+@lru_cache(maxsize=256)
 def monotone_radius(camera: Camera) -> float:
     """Largest undistorted radius (units of the focal length) up to which distortion is invertible.
 

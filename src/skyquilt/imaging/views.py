@@ -56,6 +56,8 @@ class Nodes:
     """(r, c) squared tangent of the angle off the vertical: small is better."""
     seen: NDArray[np.bool_]
     """(r, c) whether the node lies in the photo."""
+    real: NDArray[np.bool_]
+    """(r, c) whether the projection means anything: before the camera, and where distortion does not fold back."""
     height: float
     """Median height of the camera above the window's ground in m."""
 
@@ -100,7 +102,7 @@ def project_nodes(view: View, x: NDArray, y: NDArray, z: NDArray) -> Nodes:
     u, v = np.where(real[..., None], px, -1e4).astype(np.float32).transpose(2, 0, 1)
     drop2 = np.maximum(d[..., 2] ** 2, 1e-6)
     return Nodes(
-        view=view, u=u, v=v, seen=inside(view.camera, u, v),
+        view=view, u=u, v=v, seen=inside(view.camera, u, v), real=real,
         score=((d[..., 0] ** 2 + d[..., 1] ** 2) / drop2).astype(np.float32), height=float(np.median(-d[..., 2])),
     )  # fmt: skip
 
@@ -109,6 +111,17 @@ def inside(camera: Camera, u: NDArray, v: NDArray) -> NDArray[np.bool_]:
     """Whether photo pixels lie in the photo, its border excluded."""
     edge = BORDER_PX
     return np.asarray((u > edge) & (v > edge) & (u < camera.width - 1 - edge) & (v < camera.height - 1 - edge))
+
+
+def inside_everywhere(nodes: Nodes, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Whether each pixel lies in the photo, from dense photo pixels u, v (h, w) of these nodes.
+
+    Next to a node without a real projection the interpolated u and v sweep over the whole photo: those do not count.
+    """
+    within = inside(nodes.view.camera, u, v)
+    if nodes.real.all():
+        return within
+    return within & (densify(nodes.real.astype(np.float32), *u.shape) > 0.999)
 
 
 def window_nodes(views: Sequence[View], grid: Grid, surface: Surface, window: Window) -> list[Nodes]:
@@ -128,7 +141,8 @@ def cut(nodes: Nodes, row: int, column: int, height: int, width: int) -> Nodes:
     columns = slice(column // STEP, column // STEP - (-width // STEP) + 2)
     return Nodes(
         view=nodes.view, u=nodes.u[rows, columns], v=nodes.v[rows, columns],
-        score=nodes.score[rows, columns], seen=nodes.seen[rows, columns], height=nodes.height,
+        score=nodes.score[rows, columns], seen=nodes.seen[rows, columns], real=nodes.real[rows, columns],
+        height=nodes.height,
     )  # fmt: skip
 
 

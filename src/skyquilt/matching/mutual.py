@@ -14,7 +14,7 @@ class Mutual:
 
     ratio: float = 0.85
     """Largest distance to the nearest over distance to the second nearest."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(self, a: Features, b: Features) -> Matches:
         """Putative matches of two photos."""
@@ -23,10 +23,13 @@ class Mutual:
         similarity = a.descriptors @ b.descriptors.T
         rows = np.arange(len(a))
         best = similarity.argmax(1)
-        first = similarity[rows, best]
-        back = similarity.argmax(0)
+        first = similarity[rows, best].copy()
         similarity[rows, best] = -1.0
         second = similarity.max(1)
+        similarity[rows, best] = first
         # for unit vectors d^2 = 2 - 2 s
-        good = (back[best] == rows) & ((1 - first) < self.ratio**2 * (1 - second))
-        return Matches(index_a=np.flatnonzero(good), index_b=best[good])
+        clear = np.flatnonzero((1 - first) < self.ratio**2 * (1 - second))
+        # who is nearest the other way round matters for the clear ones only
+        mutual = similarity[:, best[clear]].max(0) <= first[clear]
+        kept = clear[mutual]
+        return Matches(index_a=kept, index_b=best[kept])

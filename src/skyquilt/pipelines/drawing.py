@@ -195,7 +195,7 @@ def balance(intake: Intake, ground: Ground, alignment: Alignment, methods: Metho
     if not settings.balance or intake.photos[0].dtype != "uint8":
         return NEUTRAL
     thumbnails = {v.photo: _three(intake.looked[v.photo].thumbnail) for v in ground.views}
-    return methods.balance(ground.views, thumbnails, alignment.camera_of, ground.surface, ground.grid.bounds)
+    return methods.balance(ground.views, thumbnails, ground.surface, ground.grid.bounds)
 
 
 def _three(thumbnail: NDArray) -> NDArray:
@@ -295,11 +295,12 @@ def _shot_numbers(compose: Composer) -> NDArray[np.uint32]:
 
 def _extras(composed: Composed, valid: NDArray[np.bool_], table: NDArray[np.uint32], factor: int) -> BlockExtras:
     preview, shown = _reduced(composed.pixels, valid, factor)
-    numbers = _thinned(table[np.where(valid, composed.photo, -1)])
+    numbers = table[np.where(_thinned(valid), _thinned(composed.photo), -1)]
     return BlockExtras(provenance=numbers, views=composed.views, preview=preview, shown=shown)
 
 
-def _thinned(numbers: NDArray[np.uint32]) -> NDArray[np.uint32]:
+def _thinned(numbers: NDArray) -> NDArray:
+    """Every PROVENANCE-th pixel in both directions, from the middle of its cell."""
     half = PROVENANCE // 2
     thin = numbers[half::PROVENANCE, half::PROVENANCE]
     rows, columns = -(-numbers.shape[0] // PROVENANCE), -(-numbers.shape[1] // PROVENANCE)

@@ -58,7 +58,7 @@ def iter_mosaic(
     Raises:
         SkyquiltError: anything a user can mend: no photos, an output that is taken, a malformed side file ...
     """
-    settings = settings or MosaicSettings()
+    settings, began = settings or MosaicSettings(), Clock.now()
     parts, jobs = methods(settings), settings.jobs or os.cpu_count() or 1
     _apart(folder, Path(output))
     survey, control = _read(folder, settings)
@@ -70,7 +70,8 @@ def iter_mosaic(
         yield Result(output=run.path, metrics=former)
         return
     run.mark("running")
-    clock = Clock(store=store)
+    clock = Clock(store=store, began=began)
+    clock.lap("read", began)
     yield from (Note(text=n) for n in survey.notes)
     cache = PixelCache(read=lambda i: read_color(survey.photos[i]), budget_bytes=pixel_budget(settings))
     taken = yield from clock.stage("features", intake.take_in(survey.photos, cache, parts, store, jobs))
@@ -85,7 +86,7 @@ def iter_mosaic(
     ground = yield from clock.stage("surface", drawing.survey_ground(alignment, taken, parts, settings, store))
     exposure = yield from clock.stage("balance", _at_once(lambda: drawing.balance(taken, ground, alignment, parts, settings)))
     compose = drawing.composer(taken, ground, alignment, exposure, parts, _still_there(taken.photos, cache))
-    key = digest(run.key, drawing.poses_digest(alignment), ground.surface.z, dict(exposure.gains))
+    key = digest(run.key, drawing.poses_digest(alignment), ground.surface.z, dict(exposure.gains), dict(exposure.fields))
     unit = drawing.unit_of(taken)
     drawn = yield from clock.stage(
         "mosaic", drawing.draw(run.path, compose, alignment, settings, store, key, unit, jobs)

@@ -22,7 +22,7 @@ from skyquilt.render.compose import Composer
 from skyquilt.render.patches import grey_pairs
 from skyquilt.report.input import CameraResiduals, ReportInput, SeamMark, Shot
 from skyquilt.report.page import write_report
-from skyquilt.run.clock import Clock, Steps, cpu_seconds, peak_memory_mb
+from skyquilt.run.clock import Clock, Steps, peak_memory_mb
 
 SEAM_POINTS = 300
 """Points at which seams are measured."""
@@ -146,6 +146,6 @@ def _times(clock: Clock) -> dict[str, Any]:
     memory = peak_memory_mb()
     return {
         "seconds": {**clock.seconds, "total": round(clock.total(), 3)},
-        "cpu_seconds": round(cpu_seconds(), 3),
+        "cpu_seconds": round(clock.cpu_total(), 3),
         "peak_memory_mb": None if memory is None else round(memory, 1),
     }

@@ -76,7 +76,7 @@ class Feather:
     width_px: float = 6.0
     """Width of the blend in map pixels; 0 = hard seams."""
     margin: ClassVar[int] = 0
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def rank(self, order: int, score: Float) -> Float:
         """The angle off the vertical."""
@@ -89,27 +89,43 @@ class Feather:
     def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray, NDArray[np.int32]]:
         """Ramps across seams, whose distance follows from the ranks: they differ linearly in the plane."""
         lead = leader(layers, [layer.score for layer in layers])
-        if self.width_px <= 0:
-            return _picked(layers, lead), _photos(lead, layers)
-        near = [self._margin(layers, position, gsd) for position in range(len(layers))]
-        ramps = [np.clip(0.5 + m / self.width_px, 0, 1) for m in near]
-        total = np.maximum(np.sum(ramps, axis=0, dtype=np.float32), 1e-6)
-        if all((ramp == (lead == k)).all() for k, ramp in enumerate(ramps)):
-            return _picked(layers, lead), _photos(lead, layers)
-        return _weighted(layers, [ramp / total for ramp in ramps]), _photos(lead, layers)
+        hard = _picked(layers, lead)
+        if self.width_px > 0 and len(layers) > 1:
+            self._soften(hard, layers, lead, gsd)
+        return hard, _photos(lead, layers)
 
-    def _margin(self, layers: Sequence[Layer], position: int, gsd: float) -> Float:
-        """Signed distance in px to the nearest seam: positive where this layer wins (h, w)."""
-        own = layers[position]
-        closest = np.full(own.score.shape, np.float32(1e6))
+    def _soften(self, hard: NDArray, layers: Sequence[Layer], lead: NDArray[np.int32], gsd: float) -> None:
+        """Blends, in place, the few pixels that lie within half a width of a seam."""
+        slopes = [[self._slope(a, b, gsd) for b in layers] for a in layers]
+        steepest = max(max(row) for row in slopes)
+        best, second = layers[0].score, np.full_like(layers[0].score, np.inf)
+        for layer in layers[1:]:
+            second = np.minimum(second, np.maximum(best, layer.score))
+            best = np.minimum(best, layer.score)
+        near = np.flatnonzero(second < best + np.float32(steepest * self.width_px / 2))
+        if not len(near):
+            return
+        s = np.stack([layer.score.ravel()[near] for layer in layers])
+        ramps = np.empty(s.shape, np.float32)
         with np.errstate(invalid="ignore"):
-            for k, other in enumerate(layers):
-                if k != position:
-                    apart = np.hypot(own.centre[0] - other.centre[0], own.centre[1] - other.centre[1])
-                    h2 = own.height * other.height
-                    slope = np.float32(2 * max(apart, 0.05 * own.height) * gsd / h2)  # rank per px across the seam
-                    np.minimum(closest, (other.score - own.score) / slope, out=closest)
-        return np.where(np.isfinite(own.score), np.nan_to_num(closest, nan=-1e6), np.float32(-1e6))
+            for k in range(len(layers)):
+                # signed distance in px to the nearest seam: positive where this layer wins
+                rows = [(s[j] - s[k]) / slopes[k][j] for j in range(len(layers)) if j != k]
+                ramps[k] = np.clip(0.5 + np.min(rows, axis=0) / self.width_px, 0, 1)
+        ramps = np.where(np.isfinite(s), np.nan_to_num(ramps), 0)
+        total = np.maximum(ramps.sum(0), 1e-6)
+        flat = [layer.pixels.reshape(-1, layer.pixels.shape[2])[near] for layer in layers]
+        mixed = sum(np.nan_to_num(f.astype(np.float32)) * (r / total)[:, None] for f, r in zip(flat, ramps, strict=True))
+        seen = lead.ravel()[near] >= 0
+        if hard.dtype.kind == "u":
+            mixed = np.clip(np.rint(mixed), 0, np.iinfo(hard.dtype).max)
+        hard.reshape(-1, hard.shape[2])[near[seen]] = mixed[seen].astype(hard.dtype)
+
+    @staticmethod
+    def _slope(a: Layer, b: Layer, gsd: float) -> float:
+        """Change of the ranks' difference per px across the seam of two photos."""
+        apart = float(np.hypot(a.centre[0] - b.centre[0], a.centre[1] - b.centre[1]))
+        return 2 * max(apart, 0.05 * a.height) * gsd / (a.height * b.height)
 
 
 def _picked(layers: Sequence[Layer], lead: NDArray[np.int32]) -> NDArray:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.render.blend import Blend, Layer
-from skyquilt.render.exposure import NEUTRAL, Exposure, corner_radius2
-from skyquilt.imaging.views import STEP, Nodes, View, cut, densify, inside, window_nodes
+from skyquilt.render.exposure import NEUTRAL, Exposure, image_place, with_odds
+from skyquilt.imaging.views import STEP, Nodes, View, cut, densify, inside_everywhere, window_nodes
 
 PhotoPixels = Callable[[int], NDArray]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""
@@ -110,7 +110,7 @@ class Composer:
         warped = warped.reshape(h, w, -1)
         score = np.zeros((h, w), np.float32) if alone else densify(n.score, h, w)
         if not n.seen.all():
-            score = np.where(inside(n.view.camera, u, v), score, np.float32(np.inf))
+            score = np.where(inside_everywhere(n, u, v), score, np.float32(np.inf))
         return Layer(
             photo=n.view.photo, pixels=self._exposed(n, u, v, warped), score=score,
             centre=(float(n.view.pose.map_C[0]), float(n.view.pose.map_C[1])), height=n.height,
@@ -120,5 +120,8 @@ class Composer:
         photo = n.view.photo
         if photo not in self.exposure.gains or warped.dtype != np.uint8:
             return warped
-        r2 = np.clip(corner_radius2(n.view, n.u, n.v), 0, 1.2).astype(np.float32)
-        return self.exposure.apply(photo, warped, densify(r2, *warped.shape[:2]))
+        if self.exposure.uneven(photo):
+            odds = self.exposure.odds(photo, *image_place(n.view, n.u, n.v))
+            return with_odds(warped, densify(odds, *warped.shape[:2]).reshape(warped.shape))
+        table = self.exposure.table(photo)
+        return warped if table is None else np.asarray(cv2.LUT(warped, table)).reshape(warped.shape)

@@ -1,5 +1,6 @@
-"""Exposure: one gain per photo and band and one vignetting per camera, from what overlapping photos show alike.
+"""Exposure: what brings overlapping photos to one brightness, from the ground they both show.
 
+Per photo a gain for each band and a smooth field over the image (vignetting, a cloud's shadow, the sun's glare).
 Gains act on the odds x / (1 - x) of a pixel value x in (0, 1), not on the value: black stays black and white
 stays white, so nothing clips or turns purple, and two gains in a row are one gain.
 """
@@ -21,33 +22,46 @@ Float = NDArray[np.float32]
 
 SIGMA_LEVEL = 0.15
 """Deviation in log odds of two photos' brightness of one ground point, all else equal."""
-NO_VIGNETTING = 0.08
-"""Falls in log odds below this (two percent of a middle grey, in the corners) are left alone: it saves a second."""
+EVEN = 0.1
+"""Fields smaller than this in log odds everywhere (6 of 255 on a middle grey) are left alone: it saves time."""
 CORRELATED = 30.0
 """Neighbouring samples err alike: so many count as one."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Exposure:
-    """What brings photos to one brightness: log odds + gain[band] + v2 r^2 + v4 r^4, r = 1 at the corner."""
+    """What brings photos to one brightness: log odds + gain[band] + field . (x, y, x^2, y^2, x y)."""
 
     gains: Mapping[int, Float]
     """Photo -> (bands,) in log odds."""
-    vignetting: Mapping[int, tuple[float, float]]
-    """Photo -> (v2, v4) in log odds."""
+    fields: Mapping[int, Float]
+    """Photo -> (5,) in log odds, for x and y from -1 to 1 over the image."""
 
-    def apply(self, photo: int, pixels: NDArray[np.uint8], radius2: Float) -> NDArray[np.uint8]:
-        """Pixels (h, w, bands) at the common brightness; radius2 (h, w): squared radius, 1 at the corner."""
-        v2, v4 = self.vignetting[photo]
+    def uneven(self, photo: int) -> bool:
+        """Whether the photo needs more than one gain per band."""
+        return bool(np.abs(self.fields[photo]).max() > 0)
+
+    def odds(self, photo: int, x: Float, y: Float) -> Float:
+        """Factors (h, w, bands) on the odds at places x, y (h, w) in the image, -1 to 1."""
+        field = np.exp(_basis(x, y) @ self.fields[photo])
+        return (field[..., None] * np.exp(self.gains[photo])).astype(np.float32)
+
+    def table(self, photo: int) -> NDArray[np.uint8] | None:
+        """Lookup table (1, 256, bands) of an even photo; None where nothing changes."""
         gains = self.gains[photo]
-        if max(abs(v2 + v4), abs(v2) / 2) < NO_VIGNETTING:
-            if float(np.abs(gains).max()) < 0.005:
-                return pixels
-            return np.asarray(cv2.LUT(pixels, odds_table(gains))).reshape(pixels.shape)
-        odds = np.exp(v2 * radius2 + v4 * radius2**2)[..., None] * np.exp(gains)
-        brighter = cv2.multiply(pixels, odds.astype(np.float32), dtype=cv2.CV_32F).reshape(pixels.shape)
-        white = brighter - pixels + np.float32(255)
-        return np.asarray(cv2.divide(brighter, white, scale=255, dtype=cv2.CV_8U)).reshape(pixels.shape)
+        return odds_table(gains) if float(np.abs(gains).max()) >= 0.005 else None
+
+
+def with_odds(pixels: NDArray[np.uint8], odds: Float) -> NDArray[np.uint8]:
+    """Pixels (h, w, bands) with their odds multiplied by odds (h, w, bands)."""
+    brighter = cv2.multiply(pixels, odds, dtype=cv2.CV_32F).reshape(pixels.shape)
+    white = cv2.add(cv2.subtract(brighter, pixels, dtype=cv2.CV_32F), (255.0,) * 4).reshape(pixels.shape)
+    return np.asarray(cv2.divide(brighter, white, scale=255, dtype=cv2.CV_8U)).reshape(pixels.shape)
+
+
+def _basis(x: NDArray, y: NDArray) -> NDArray:
+    """(..., 5) terms of the field."""
+    return np.stack([x, y, x * x, y * y, x * y], -1)
 
 
 def odds_table(gains: Float) -> NDArray[np.uint8]:
@@ -57,7 +71,7 @@ def odds_table(gains: Float) -> NDArray[np.uint8]:
     return np.rint(255 * g * x / (1 + (g - 1) * x)).astype(np.uint8)
 
 
-NEUTRAL = Exposure(gains={}, vignetting={})
+NEUTRAL = Exposure(gains={}, fields={})
 """No change."""
 
 
@@ -66,16 +80,16 @@ class Balance:
     """Robust least squares of log-odds differences at ground points seen by several photos."""
 
     points: int = 2500
-    """Ground points looked at."""
+    """Ground points looked at; more on surveys of many photos."""
     sigma_gain: float = 0.5
     """Prior deviation of a gain in log odds."""
-    sigma_vignetting: float = 0.15
-    """Prior deviation of a vignetting coefficient in log odds."""
-    version: ClassVar[int] = 1
+    sigma_field: float = 0.15
+    """Prior deviation of a term of the field in log odds."""
+    version: ClassVar[int] = 2
 
     def __call__(
-        self, views: Sequence[View], thumbnails: Mapping[int, NDArray[np.uint8]], camera_of: Mapping[int, str],
-        surface: Surface, bounds: tuple[float, float, float, float],
+        self, views: Sequence[View], thumbnails: Mapping[int, NDArray[np.uint8]], surface: Surface,
+        bounds: tuple[float, float, float, float],
     ) -> Exposure:  # fmt: skip
         """Estimates the exposure from thumbnails (h, w, bands) of the photos."""
         usable = [v for v in views if v.photo in thumbnails]
@@ -84,17 +98,17 @@ class Balance:
         samples = self._samples(usable, thumbnails, surface, bounds)
         if not len(samples.point):
             return NEUTRAL
-        return _solve(samples, [v.photo for v in usable], camera_of, self.sigma_gain, self.sigma_vignetting)
+        return _solve(samples, [v.photo for v in usable], self.sigma_gain, self.sigma_field)
 
     def _samples(
         self, views: Sequence[View], thumbnails: Mapping[int, NDArray[np.uint8]], surface: Surface,
         bounds: tuple[float, float, float, float],
     ) -> "Samples":  # fmt: skip
         west, south, east, north = bounds
-        step = np.sqrt((east - west) * (north - south) / self.points)
+        step = np.sqrt((east - west) * (north - south) / max(self.points, 60 * len(views)))
         x, y = np.meshgrid(np.arange(west, east, step), np.arange(south, north, step))
         z = surface.at(x, y)
-        point, row, radius2, value = [], [], [], []
+        point, row, place, value = [], [], [], []
         for index, view in enumerate(views):
             nodes = project_nodes(view, x, y, z)
             seen = np.flatnonzero(nodes.seen.ravel())
@@ -103,15 +117,15 @@ class Balance:
             u, v = nodes.u.ravel()[seen], nodes.v.ravel()[seen]
             point.append(seen)
             row.append(np.full(len(seen), index))
-            radius2.append(corner_radius2(view, u, v))
+            place.append(np.stack(image_place(view, u, v), -1))
             value.append(_sampled(thumbnails[view.photo], u, v, view.camera.width, view.camera.height))
         if not point:
-            return Samples(point=np.zeros(0, int), row=np.zeros(0, int), radius2=np.zeros(0), log=np.zeros((0, 3)))
+            return Samples(point=np.zeros(0, int), row=np.zeros(0, int), place=np.zeros((0, 2)), log=np.zeros((0, 3)))
         levels = np.concatenate(value)
         good = ((levels > 8) & (levels < 247)).all(1)
         return Samples(
             point=np.concatenate(point)[good], row=np.concatenate(row)[good],
-            radius2=np.concatenate(radius2)[good], log=np.log(levels[good] / (255 - levels[good])),
+            place=np.concatenate(place)[good], log=np.log(levels[good] / (255 - levels[good])),
         )  # fmt: skip
 
 
@@ -123,16 +137,16 @@ class Samples:
     """(N,) ground point."""
     row: NDArray[np.int64]
     """(N,) view."""
-    radius2: NDArray[np.float64]
-    """(N,) squared radius in the photo, 1 at the corner."""
+    place: NDArray[np.float64]
+    """(N, 2) x and y in the photo, -1 to 1."""
     log: NDArray[np.float64]
     """(N, bands) log odds of the brightness."""
 
 
-def corner_radius2(view: View, u: NDArray, v: NDArray) -> NDArray:
-    """Squared distance from the image centre over that of the corner."""
+def image_place(view: View, u: NDArray, v: NDArray) -> tuple[NDArray, NDArray]:
+    """x and y from -1 to 1 over the image, of photo pixels."""
     w, h = view.camera.width - 1.0, view.camera.height - 1.0
-    return ((u - w / 2) ** 2 + (v - h / 2) ** 2) / ((w / 2) ** 2 + (h / 2) ** 2)
+    return np.clip(2 * u / w - 1, -1.1, 1.1), np.clip(2 * v / h - 1, -1.1, 1.1)
 
 
 def _sampled(thumbnail: NDArray[np.uint8], u: NDArray, v: NDArray, width: int, height: int) -> NDArray[np.float64]:
@@ -144,31 +158,25 @@ def _sampled(thumbnail: NDArray[np.uint8], u: NDArray, v: NDArray, width: int, h
     return smooth[row, column].astype(np.float64)
 
 
-def _solve(
-    s: Samples, photos: Sequence[int], camera_of: Mapping[int, str], sigma_gain: float, sigma_v: float
-) -> Exposure:
-    """log odds + g + v2 r^2 + v4 r^4 is the same for all photos of a point: differences to the point's mean vanish."""
-    lens = [camera_of[p].removesuffix("/turned") for p in photos]
-    cameras = sorted(set(lens))
-    camera = np.array([cameras.index(name) for name in lens])[s.row]
+def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: float) -> Exposure:
+    """log odds + gain + field is the same for all photos of a point: differences to the point's mean vanish."""
     n, N = len(photos), len(s.point)
     _, point = np.unique(s.point, return_inverse=True)
-    columns = [s.row, n + 2 * camera, n + 2 * camera + 1]
-    values = [np.ones(N), s.radius2, s.radius2**2]
-    A = sparse.csr_matrix(
-        (np.concatenate(values), (np.tile(np.arange(N), 3), np.concatenate(columns))), (N, n + 2 * len(cameras))
-    )
-    ridge = np.r_[np.full(n, 1 / sigma_gain**2), np.full(2 * len(cameras), 1 / sigma_v**2)]
-    x = _robust_differences(A, point, s.log.mean(1), ridge)
-    shared = A[:, n:] @ x[n:]
-    bands = [
-        _robust_differences(A[:, :n], point, s.log[:, band] + shared, ridge[:n]) for band in range(s.log.shape[1])
-    ]
+    terms = np.concatenate([np.ones((N, 1)), _basis(s.place[:, 0], s.place[:, 1])], 1)
+    columns = 6 * s.row[:, None] + np.arange(6)
+    A = sparse.csr_matrix((terms.ravel(), columns.ravel(), 6 * np.arange(N + 1)), (N, 6 * n))
+    ridge = np.tile(1 / np.array([sigma_gain] + 5 * [sigma_field]) ** 2, n)
+    x = _robust_differences(A, point, s.log.mean(1), ridge).reshape(n, 6)
+    fields = x[:, 1:] * (np.abs(_basis(*np.meshgrid([-1, 0, 1], [-1, 0, 1])) @ x[:, 1:].T).max((0, 1)) > EVEN)[:, None]
+    even = s.log + (terms[:, 1:] * fields[s.row]).sum(1)[:, None]
+    ones = sparse.csr_matrix((np.ones(N), (np.arange(N), s.row)), (N, n))
+    bands = [_robust_differences(ones, point, even[:, k], ridge[::6]) for k in range(s.log.shape[1])]
     gains = np.stack(bands, 1)
     gains = (gains - np.median(gains, axis=0)).astype(np.float32)
-    v = x[n:].reshape(-1, 2)
-    fall = {p: (float(v[k, 0]), float(v[k, 1])) for p, k in zip(photos, map(cameras.index, lens), strict=True)}
-    return Exposure(gains=dict(zip(photos, gains, strict=True)), vignetting=fall)
+    return Exposure(
+        gains=dict(zip(photos, gains, strict=True)),
+        fields=dict(zip(photos, fields.astype(np.float32), strict=True)),
+    )
 
 
 def _robust_differences(A: sparse.csr_matrix, point: NDArray, y: NDArray, ridge: NDArray) -> NDArray[np.float64]:

@@ -1,7 +1,6 @@
 """The run's folder: who may write there, and what may be taken up again."""
 
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,7 +35,7 @@ class RunFolder:
         partial = target.with_suffix(".partial")
         try:
             partial.write_text(json.dumps({"key": self.key, "state": state}))
-            os.replace(partial, target)
+            partial.replace(target)
         except OSError as error:
             partial.unlink(missing_ok=True)
             raise refusal(self.path, error) from error

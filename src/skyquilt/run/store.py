@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -13,8 +12,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from skyquilt.run.disk import refusal
 from skyquilt.run.codec import Registry, decode, encode
+from skyquilt.run.disk import refusal
 
 T = TypeVar("T")
 
@@ -77,7 +76,7 @@ class Store:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             partial.write_bytes(encode(value))
-            os.replace(partial, path)
+            partial.replace(path)
         except OSError as error:
             with suppress(OSError):
                 partial.unlink(missing_ok=True)

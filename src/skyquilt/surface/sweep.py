@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import STEP, Nodes, View, densify, inside, project_nodes
+from skyquilt.imaging.views import STEP, Nodes, View, densify, project_nodes
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
 
@@ -42,7 +42,7 @@ class Sweep:
     """Correlation from which a height is believed."""
     smoothing_cells: float = 1.0
     """Standard deviation of the final Gaussian in cells."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture) -> Surface:
         """The surface with the heights found; where pictures do not agree it stays as it was."""
@@ -169,32 +169,37 @@ def _shown(
 ) -> Float:  # fmt: skip
     """The ground at heights z as the labelled photos show it (full, full); NaN where none does."""
     out = np.full((full, full), np.nan, np.float32)
-    dense = cv2.resize(labels.astype(np.float32), None, fx=STEP, fy=STEP, interpolation=cv2.INTER_NEAREST)
-    dense = dense[STEP : STEP + full, STEP : STEP + full]
-    for photo in np.unique(labels[labels >= 0]).tolist():
+    inner = labels[1:-1, 1:-1]
+    for photo in np.unique(inner[inner >= 0]).tolist():
         view = next(v for v in views if v.photo == photo)
-        n = project_nodes(view, x, y, z)
+        rows, columns = np.nonzero(inner == photo)
+        r0, r1, c0, c1 = rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
+        box = (slice(r0, r1 + 2), slice(c0, c1 + 2))
+        n = project_nodes(view, x[box], y[box], z[box])
         picture = grey(photo, side)
         scale = picture.shape[1] / view.camera.width
-        u, v = densify(n.u, full, full), densify(n.v, full, full)
-        warped = cv2.remap(
-            picture, (u + 0.5) * scale - 0.5, (v + 0.5) * scale - 0.5, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-        mine = (dense == photo) & inside(view.camera, u, v)
-        np.copyto(out, warped, where=mine, casting="unsafe")
+        h, w = int(r1 - r0) * STEP, int(c1 - c0) * STEP
+        u, v = densify((n.u + 0.5) * scale - 0.5, h, w), densify((n.v + 0.5) * scale - 0.5, h, w)
+        warped = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        cells = (inner[r0:r1, c0:c1] == photo) & n.seen[1:-1, 1:-1]
+        mine = np.repeat(np.repeat(cells, STEP, 0), STEP, 1)
+        np.copyto(out[r0 * STEP : r1 * STEP, c0 * STEP : c1 * STEP], warped, where=mine, casting="unsafe")
     return out
 
 
 def _agreement(a: Float, b: Float, window: int) -> Float:
     """Normalised cross-correlation of two pictures in a sliding window; -1 where either is missing."""
     missing = np.isnan(a) | np.isnan(b)
-    a, b = np.where(missing, 0, a), np.where(missing, 0, b)
+    whole = not missing.any()
+    if not whole:
+        a, b = np.where(missing, 0, a), np.where(missing, 0, b)
     size = (window, window)
-    stack = cv2.boxFilter(np.dstack([a, b, a * a, b * b]), cv2.CV_32F, size)
-    ab = cv2.boxFilter(a * b, cv2.CV_32F, size)
-    ma, mb = stack[..., 0], stack[..., 1]
-    va, vb = stack[..., 2] - ma * ma, stack[..., 3] - mb * mb
-    score = (ab - ma * mb) / np.sqrt(np.maximum(va, 4.0) * np.maximum(vb, 4.0))
+    ma, mb = cv2.blur(a, size), cv2.blur(b, size)
+    va = cv2.blur(a * a, size) - ma * ma
+    vb = cv2.blur(b * b, size) - mb * mb
+    score = (cv2.blur(a * b, size) - ma * mb) / np.sqrt(np.maximum(va, 4.0) * np.maximum(vb, 4.0))
+    if whole:
+        return np.asarray(score)
     near = cv2.dilate(missing.astype(np.uint8), np.ones(size, np.uint8)) > 0
     return np.where(near, np.float32(-1), score)
 
