@@ -314,5 +314,7 @@ def covariance(problem: Problem, state: State) -> Array | None:
     reduced = Reduced(problem, normal, 0.0)
     if not isinstance(reduced.S, np.ndarray):
         return None
-    S = reduced.S + np.diag(np.full(reduced.size, 1e-9))
-    return np.asarray(linalg.inv(S, check_finite=False))
+    # unknowns of unlike units: scaled to a unit diagonal before the inversion, back after it
+    scale = np.sqrt(np.maximum(np.diag(reduced.S), 1e-12))
+    correlation = reduced.S / np.outer(scale, scale) + 1e-12 * np.eye(reduced.size)
+    return np.asarray(np.linalg.inv(correlation) / np.outer(scale, scale))

@@ -102,7 +102,10 @@ def _nothing_placed(method: str, photos: int, rejected: dict[int, str]) -> str:
         if "height" in reasons
         else "give positions and headings with --geo, or use --method bundle"
     )
-    return f"method {method} places photos by their metadata, and none of {photos} can be placed ({reasons[:200]}); {advice}"
+    return (
+        f"method {method} places photos by their metadata, and none of {photos} can be placed"
+        f" ({reasons[:200]}); {advice}"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
