@@ -42,12 +42,11 @@ def both(seed, *, free, cauchy=None, lies=0.0, **ceres_options):
 def test_both_find_the_same_minimum(free, options, cauchy, lies):
     problem, mine, theirs = both(1, free=free, cauchy=cauchy, lies=lies, **options)
     cost = robust_cost(problem, theirs)
-    print(mine.cost, cost, mine.iterations, np.abs(mine.state.C - theirs.C).max(), mine.state.K[0,0]-theirs.K[0,0],np.abs(residuals_px(problem, mine.state)- residuals_px(problem, theirs)).max())
-    assert mine.cost <= cost * (1 + 1e-6)
-    assert mine.cost == pytest.approx(cost, rel=1e-5)
-    assert np.abs(residuals_px(problem, mine.state) - residuals_px(problem, theirs)).max() < 1e-3
-    assert np.abs(mine.state.C - theirs.C).max() < 5e-3
-    assert mine.state.K[0, :5] == pytest.approx(theirs.K[0, :5], rel=1e-5, abs=1e-6)
+    assert mine.cost <= cost * (1 + 1e-9)
+    assert mine.cost == pytest.approx(cost, rel=1e-9)
+    assert np.abs(residuals_px(problem, mine.state) - residuals_px(problem, theirs)).max() < 1e-4
+    assert np.abs(mine.state.C - theirs.C).max() < 1e-5
+    assert mine.state.K[0, :5] == pytest.approx(theirs.K[0, :5], rel=1e-6, abs=1e-7)
 
 
 def test_the_pixel_convention_matters():
