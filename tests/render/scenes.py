@@ -1,5 +1,7 @@
 """Flat textured ground, photographed exactly by ideal cameras, and the composer's parts around it."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 
@@ -30,7 +32,11 @@ def view(number, x, y, *, z=40.0, yaw=0.0, pitch=0.0, roll=0.0, camera=CAMERA, s
 
 def ground_of(shot, px):
     """Map coordinates (n, 2) on z = 0 of photo pixels: the pixels' rays cut with the ground."""
-    d = np.c_[undistort(shot.camera, px), np.ones(len(px))] @ shot.pose.cam_R_map
+    return _on_ground(shot, undistort(shot.camera, px))
+
+
+def _on_ground(shot, xy):
+    d = np.c_[xy, np.ones(len(xy))] @ shot.pose.cam_R_map
     return shot.pose.map_C[:2] - d[:, :2] * (shot.pose.map_C[2] / d[:, 2])[:, None]
 
 
@@ -38,14 +44,20 @@ def photograph(shot, ground=GROUND):
     """The photo's picture: every pixel the mean of 3 x 3 rays into the ground."""
     h, w = shot.camera.height, shot.camera.width
     total = np.zeros((h, w), np.float32)
-    u, v = np.meshgrid(np.arange(w), np.arange(h))
-    for du in (-1 / 3, 0, 1 / 3):
-        for dv in (-1 / 3, 0, 1 / 3):
-            xy = ground_of(shot, np.c_[(u + du).ravel(), (v + dv).ravel()])
-            column = (xy[:, 0] / FINE_M + ground.shape[1] / 2 - 0.5).astype(np.float32).reshape(h, w)
-            row = (ground.shape[0] / 2 - xy[:, 1] / FINE_M - 0.5).astype(np.float32).reshape(h, w)
-            total += cv2.remap(ground, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    for plane in _sub_pixels(shot.camera):
+        xy = _on_ground(shot, plane)
+        column = (xy[:, 0] / FINE_M + ground.shape[1] / 2 - 0.5).astype(np.float32).reshape(h, w)
+        row = (ground.shape[0] / 2 - xy[:, 1] / FINE_M - 0.5).astype(np.float32).reshape(h, w)
+        total += cv2.remap(ground, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
     return total / 9
+
+
+@cache
+def _sub_pixels(camera):
+    """Undistorted coordinates of nine places in every pixel."""
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    thirds = (-1 / 3, 0, 1 / 3)
+    return [undistort(camera, np.c_[(u + du).ravel(), (v + dv).ravel()]) for du in thirds for dv in thirds]
 
 
 def truth(grid, ground=GROUND):

@@ -33,19 +33,18 @@ class Sift:
         """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer to."""
         grey = to_grey8(small)
         # without precise upscaling OpenCV reports every keypoint a quarter pixel down and to the right
-        detector = cv2.SIFT_create(contrastThreshold=self.contrast, enable_precise_upscale=True)
-        # all of them: a detector that keeps the strongest of the whole photo leaves a tenth of its cells bare
-        points = detector.detect(grey, None)
-        xy = np.array([p.pt for p in points], np.float64).reshape(-1, 2)
-        keep = _spread(xy, np.array([p.response for p in points]), grey.shape, self.count, self.cells)
-        points, descriptors = detector.compute(grey, [points[k] for k in keep]) if len(keep) else ((), None)
+        detector = cv2.SIFT_create(
+            int(1.4 * self.count), contrastThreshold=self.contrast, enable_precise_upscale=True
+        )
+        points, descriptors = detector.detectAndCompute(grey, None)
         if descriptors is None:
             points, descriptors = (), np.zeros((0, 128), np.float32)
         xy = np.array([p.pt for p in points], np.float64).reshape(-1, 2)
+        keep = _spread(xy, np.array([p.response for p in points]), grey.shape, self.count, self.cells)
         scale = full[1] / grey.shape[1]
-        size = np.array([p.size for p in points], np.float32) * scale
-        px = full_px(xy, grey.shape, full)
-        return Features(px=px, size=size, descriptors=_root(descriptors), scale=scale)
+        size = np.array([p.size for p in points], np.float32)[keep] * scale
+        px = full_px(xy[keep], grey.shape, full)
+        return Features(px=px, size=size, descriptors=_root(descriptors[keep]), scale=scale)
 
 
 def _root(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:

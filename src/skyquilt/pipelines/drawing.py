@@ -336,7 +336,7 @@ def _write_companions(output: Path, whole: _Companions, alignment: Alignment) ->
 def write_surface(output: Path, ground: Ground, alignment: Alignment) -> None:
     """surface.tif: heights over the map's area, and what they count from in its tags."""
     grid = ground.grid
-    factor = max(1, int(ground.surface.cell / grid.gsd)) if ground.surface.source == "tie points" else max(grid.width, grid.height)
+    factor = max(1, int(ground.surface.cell / grid.gsd)) if ground.surface.source != "plane" else max(grid.width, grid.height)
     coarse = grid.coarser(factor)
     x, y = np.meshgrid(coarse.x(np.arange(coarse.width)), coarse.y(np.arange(coarse.height)))
     spec = RasterSpec(
