@@ -7,6 +7,7 @@ import pytest
 from skyquilt.features.sift import Sift, _spread
 from skyquilt.imaging.grey import full_px, shrink, to_grey8
 from skyquilt.matching.mutual import Mutual
+from skyquilt.model.features import DESCRIPTOR_UNIT
 from tests.texture import texture
 
 
@@ -99,8 +100,15 @@ def test_no_corner_of_a_photo_stays_bare(picture):
 def test_descriptors_are_roots_of_unit_length(picture):
     found = Sift(count=300)(picture)
     assert len(found) == 300
-    assert np.linalg.norm(found.descriptors, axis=1) == pytest.approx(1, abs=1e-3)
-    assert (found.descriptors >= 0).all()
+    stored = found.descriptors.astype(float)
+    assert found.descriptors.dtype == np.uint8 and found.descriptors.max() < 255
+    assert np.linalg.norm(stored, axis=1) / DESCRIPTOR_UNIT == pytest.approx(1, abs=0.01)  # rounding
+    assert np.linalg.norm(found.unit, axis=1) == pytest.approx(1, abs=1e-5)
+    # RootSIFT squared adds up to one: the L1 norm of SIFT
+    detector = cv2.SIFT.create(420, contrastThreshold=0.015, enable_precise_upscale=True)
+    raw = detector.detectAndCompute(picture, None)[1]
+    root = np.sqrt(raw / raw.sum(1, keepdims=True))
+    assert (found.unit @ root.T).max(1) == pytest.approx(1, abs=1e-3)
 
 
 @pytest.mark.parametrize("kind", ["uint16", "float32", "float32 with gaps", "colour", "one band"])

@@ -14,7 +14,9 @@ from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior, no_ties
 
 
 def reported_camera(photo: Photo) -> Camera:
-    """The calibration that metadata or a side file give, else an ideal camera of the reported focal length."""
+    """The calibration that metadata or a side file give, else an ideal camera of the
+    reported focal length.
+    """
     if photo.calibration is not None:
         return photo.calibration
     return Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
@@ -45,11 +47,15 @@ class ByMetadata:
             heights = self._heights(frame, priors)
             poses, rejected = self._placed(photos, priors, heights)
         if not poses:
-            raise AlignmentError(f"method {self.name} places photos by position, and none of {len(photos)} has one")
+            raise AlignmentError(
+                f"method {self.name} places photos by position, and none of {len(photos)} has one"
+            )
         return Alignment(
-            method=self.name, why="", frame=replace(frame, metric=frame.crs is not None or self.height_m is not None),
+            method=self.name, why="",
+            frame=replace(frame, metric=frame.crs is not None or self.height_m is not None),
             poses=poses, cameras={p.camera_key: reported_camera(p) for p in photos},
-            camera_of={i: p.camera_key for i, p in enumerate(photos)}, blocks=tuple((i,) for i in sorted(poses)),
+            camera_of={i: p.camera_key for i, p in enumerate(photos)},
+            blocks=tuple((i,) for i in sorted(poses)),
             ties=no_ties(), rejected=rejected,
         )  # fmt: skip
 
@@ -57,7 +63,11 @@ class ByMetadata:
         """Camera heights (n,) in m above the ground, which is level at z = 0."""
         z = np.array([p.map_C[2] for p in priors])
         if self.height_m is not None:
-            return np.where(np.isfinite(z), self.height_m + z - np.nanmedian(z), self.height_m) if np.isfinite(z).any() else np.full(len(z), self.height_m)
+            return (
+                np.where(np.isfinite(z), self.height_m + z - np.nanmedian(z), self.height_m)
+                if np.isfinite(z).any()
+                else np.full(len(z), self.height_m)
+            )
         if frame.vertical_datum != "takeoff":
             raise AlignmentError(
                 f"method {self.name} needs heights above ground, and the photos give heights above"

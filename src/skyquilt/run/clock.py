@@ -35,32 +35,47 @@ class Clock:
 
     store: Store
     """Watched to tell reused stages."""
+    began: tuple[float, float]
+    """When the run began: wall clock and CPU time in s, as `now` gives them."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall-clock time per stage in s."""
-    started: float = field(default_factory=time.perf_counter)
-    """When the run began."""
-    cpu_started: float = field(default_factory=cpu_seconds)
-    """CPU time spent before the run."""
+
+    @staticmethod
+    def now() -> tuple[float, float]:
+        """Wall clock and CPU time in s."""
+        return time.perf_counter(), cpu_seconds()
+
+    def lap(self, stage: str, since: tuple[float, float]) -> None:
+        """Notes a stage's time from an earlier `now`."""
+        self.seconds[stage] = round(time.perf_counter() - since[0], 3)
 
     def stage(self, name: str, work: Steps[T]) -> Generator[Event, None, T]:
         """Runs a stage's steps as events and returns its result."""
-        begun, cpu, misses = time.perf_counter(), cpu_seconds(), self.store.misses
+        begun, misses = self.now(), self.store.misses
         yield StageStarted(stage=name, total=0)
         try:
             while True:
                 step = next(work)
-                yield StageProgress(stage=name, done=step[0], total=step[1]) if isinstance(step, tuple) else step
+                yield (
+                    StageProgress(stage=name, done=step[0], total=step[1])
+                    if isinstance(step, tuple)
+                    else step
+                )
         except StopIteration as stop:
             result: T = stop.value
         finally:
             work.close()
-        self.seconds[name] = round(time.perf_counter() - begun, 3)
+        self.lap(name, begun)
         yield StageFinished(
-            stage=name, seconds=self.seconds[name], cpu_seconds=round(cpu_seconds() - cpu, 3),
+            stage=name, seconds=self.seconds[name], cpu_seconds=round(cpu_seconds() - begun[1], 3),
             reused=self.store.misses == misses and self.store.hits > 0,
         )  # fmt: skip
         return result
 
     def total(self) -> float:
         """Wall-clock time so far in s."""
-        return time.perf_counter() - self.started
+        return time.perf_counter() - self.began[0]
+
+    def cpu_total(self) -> float:
+        """CPU time so far in s, of this process."""
+        return cpu_seconds() - self.began[1]

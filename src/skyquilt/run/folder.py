@@ -1,7 +1,6 @@
 """The run's folder: who may write there, and what may be taken up again."""
 
 import json
-import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,14 +35,16 @@ class RunFolder:
         partial = target.with_suffix(".partial")
         try:
             partial.write_text(json.dumps({"key": self.key, "state": state}))
-            os.replace(partial, target)
+            partial.replace(target)
         except OSError as error:
             raise OutputError(f"cannot write to {self.path}: {error.strerror}") from error
 
     @property
     def done(self) -> bool:
         """Whether this very run was finished before."""
-        return _state(self.path) == (self.key, "done") and all((self.path / name).is_file() for name in CONTRACT)
+        return _state(self.path) == (self.key, "done") and all(
+            (self.path / name).is_file() for name in CONTRACT
+        )
 
 
 def _state(path: Path) -> tuple[str, str]:
@@ -67,7 +68,8 @@ def open_run(path: Path, key: str, *, overwrite: bool) -> RunFolder:
         if not overwrite:
             what = "another run" if known else "other files"
             raise OutputError(
-                f"{path} already holds {what}; add --overwrite to replace its results, or choose another folder"
+                f"{path} already holds {what}; add --overwrite to replace its results,"
+                " or choose another folder"
             )
         for name in CONTRACT:
             (path / name).unlink(missing_ok=True)

@@ -3,7 +3,6 @@
 import dataclasses
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -72,9 +71,11 @@ class Store:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             partial.write_bytes(encode(value))
-            os.replace(partial, path)
+            partial.replace(path)
         except OSError as error:
-            raise OutputError(f"cannot store intermediate results in {path.parent}: {error.strerror}") from error
+            raise OutputError(
+                f"cannot store intermediate results in {path.parent}: {error.strerror}"
+            ) from error
 
     def get_or(self, stage: str, key: str, make: Callable[[], T]) -> T:
         """The artefact, made and stored if need be."""

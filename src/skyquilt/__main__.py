@@ -1,0 +1,6 @@
+"""`python -m skyquilt`."""
+
+from skyquilt.cli.main import run
+
+if __name__ == "__main__":
+    run()
