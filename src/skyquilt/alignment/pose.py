@@ -72,7 +72,7 @@ class ByMetadata:
             raise AlignmentError(
                 f"method {self.name} needs heights above ground, and the photos give {given}; add --height METRES"
             )
-        return np.where(np.isfinite(z), z, np.nanmedian(z))
+        return np.where(np.isfinite(z), z, np.nanmedian(z) if np.isfinite(z).any() else np.nan)
 
     def _placed(
         self, photos: Sequence[Photo], priors: Sequence[Prior], heights: np.ndarray
@@ -102,8 +102,10 @@ def _nothing_placed(method: str, photos: int, rejected: dict[int, str]) -> str:
         if "height" in reasons
         else "give positions and headings with --geo, or use --method bundle"
     )
-    placed = f"none of {photos} can be placed ({reasons[:200]})"
-    return f"method {method} places photos by their metadata, and {placed}; {advice}"
+    return (
+        f"method {method} places photos by their metadata, and none of {photos} can be placed"
+        f" ({reasons[:200]}); {advice}"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
