@@ -28,12 +28,21 @@ def link(a, b, pairs):
 
 def test_chains_become_tracks_and_a_photo_visited_twice_spoils_its_track():
     f = [features(5, k, scale=1.0 + k) for k in range(3)]
-    links = [link(0, 1, [(0, 0), (1, 1), (2, 2)]), link(1, 2, [(0, 4), (1, 3), (2, 1)]), link(0, 2, [(2, 0), (4, 2)])]
+    links = [
+        link(0, 1, [(0, 0), (1, 1), (2, 2)]),
+        link(1, 2, [(0, 4), (1, 3), (2, 1)]),
+        link(0, 2, [(2, 0), (4, 2)]),
+    ]
     tracks = build_tracks(f, links)
     # (0,0)-(1,0)-(2,4); (0,1)-(1,1)-(2,3); (0,2)-(1,2)-(2,1) and (2,0): photo 2 twice, dropped; (0,4)-(2,2)
-    found = {frozenset(zip(tracks.photo[m].tolist(), map(tuple, tracks.px[m].tolist()), strict=True)) for m in (tracks.point == p for p in range(tracks.count))}  # fmt: skip
+    found = {
+        frozenset(zip(tracks.photo[m].tolist(), map(tuple, tracks.px[m].tolist()), strict=True))
+        for m in (tracks.point == p for p in range(tracks.count))
+    }
+
     def at(photo, k):
         return photo, tuple(f[photo].px[k].tolist())
+
     assert found == {
         frozenset({at(0, 0), at(1, 0), at(2, 4)}), frozenset({at(0, 1), at(1, 1), at(2, 3)}),
         frozenset({at(0, 4), at(2, 2)}),
@@ -43,7 +52,11 @@ def test_chains_become_tracks_and_a_photo_visited_twice_spoils_its_track():
 
 
 @settings(max_examples=80, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 5), st.integers(0, 3), st.integers(0, 5)), max_size=25))
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 3), st.integers(0, 5), st.integers(0, 3), st.integers(0, 5)), max_size=25
+    )
+)
 def test_tracks_are_the_connected_components(matches):
     f = [features(6, k) for k in range(4)]
     by_pair = {}
@@ -69,9 +82,9 @@ def test_tracks_are_the_connected_components(matches):
     }  # fmt: skip
     tracks = build_tracks(f, [link(a, b, sorted(p)) for (a, b), p in by_pair.items()])
     found = [
-        frozenset((int(a), *p.tolist()) for a, p in zip(tracks.photo[tracks.point == k], tracks.px[tracks.point == k], strict=True))
-        for k in range(tracks.count)
-    ]  # fmt: skip
+        frozenset((int(a), *p.tolist()) for a, p in zip(tracks.photo[m], tracks.px[m], strict=True))
+        for m in (tracks.point == k for k in range(tracks.count))
+    ]
     assert set(found) == expected and len(found) == len(expected)
 
 
@@ -104,28 +117,36 @@ def test_thinning_keeps_every_cell_of_every_photo_and_its_longest_tracks():
     cells, per_photo = 4, 64
     thinned = thin(tracks, [(800, 600)] * 12, per_photo=per_photo, cells=cells)
     assert len(thinned.point) < 0.75 * len(tracks.point)
+
     def slots(t):
         column, row = np.clip(((t.px + 0.5) / (800, 600) * cells).astype(int), 0, cells - 1).T
         return t.photo * cells**2 + row * cells + column
+
     all_, kept = np.bincount(slots(tracks), minlength=192), np.bincount(slots(thinned), minlength=192)
     assert (kept >= np.minimum(all_, per_photo // cells**2)).all()
     assert np.bincount(thinned.point).mean() > np.bincount(tracks.point).mean() + 0.3
     # whole tracks survive or none of them
-    lengths = {p: n for p, n in zip(map(tuple, tracks.px.tolist()), np.bincount(tracks.point)[tracks.point], strict=True)}
-    assert all(lengths[tuple(p)] == n for p, n in zip(thinned.px.tolist(), np.bincount(thinned.point)[thinned.point], strict=True))
+    number = np.bincount(tracks.point)[tracks.point]
+    lengths = dict(zip(map(tuple, tracks.px.tolist()), number, strict=True))
+    assert all(
+        lengths[tuple(p)] == n
+        for p, n in zip(thinned.px.tolist(), np.bincount(thinned.point)[thinned.point], strict=True)
+    )
 
 
 def test_rays_meet_in_their_point():
     rng = np.random.default_rng(3)
     X = rng.normal(0, 20, (30, 3))
     point = np.repeat(np.arange(30), 3)
-    origin = rng.normal(0, 20, (90, 3)) + (0, 0, 80)
+    origin = rng.normal(0, 20, (90, 3)) + np.array([0, 0, 80])
     direction = (X[point] - origin) * rng.uniform(0.1, 5, (90, 1))
     assert intersect(point, origin, direction, 30) == pytest.approx(X, abs=1e-5)
 
 
 def test_two_skew_rays_meet_halfway_between():
-    found = intersect(np.array([0, 0]), np.array([[0.0, 0, 0], [0, 0, 1]]), np.array([[3.0, 0, 0], [0, 2, 0]]), 1)
+    found = intersect(
+        np.array([0, 0]), np.array([[0.0, 0, 0], [0, 0, 1]]), np.array([[3.0, 0, 0], [0, 2, 0]]), 1
+    )
     assert found[0] == pytest.approx([0, 0, 0.5], abs=1e-6)
 
 

@@ -73,7 +73,8 @@ def block():
     """Six overlapping photos, tilted and turned."""
     rng = np.random.default_rng(4)
     return [
-        view(3 * k, 14.0 * (k % 3) - 14, 12.0 * (k // 3) - 6, yaw=rng.uniform(0, 360), pitch=rng.normal(0, 3), roll=rng.normal(0, 3))
+        view(3 * k, 14.0 * (k % 3) - 14, 12.0 * (k // 3) - 6, yaw=rng.uniform(0, 360),
+             pitch=rng.normal(0, 3), roll=rng.normal(0, 3))
         for k in range(6)
     ]  # fmt: skip
 

@@ -12,10 +12,22 @@ from tests.alignment.blocks import FLYING, HEIGHT, LENS, WIDTH, ground, seen_by
 
 
 def features(px, scale=1.0):
-    return Features(px=px, size=np.ones(len(px), np.float32), descriptors=np.zeros((len(px), 4), np.float32), scale=scale)
+    return Features(
+        px=px, size=np.ones(len(px), np.float32), descriptors=np.zeros((len(px), 4), np.float32), scale=scale
+    )
 
 
-def view_pair(seed, *, count=150, outliers=0.3, yaw=(5.0, 187.0), base=(20.0, 12.0), height=(1.0, 1.0), noise=0.4, tilt=2.0):
+def view_pair(
+    seed,
+    *,
+    count=150,
+    outliers=0.3,
+    yaw=(5.0, 187.0),
+    base=(20.0, 12.0),
+    height=(1.0, 1.0),
+    noise=0.4,
+    tilt=2.0,
+):
     """Sightings of rolling ground by two tilted cameras; returns pixels of both and which matches are right."""
     rng = np.random.default_rng(seed)
     C = np.array([[0, 0, FLYING * height[0]], [*base, FLYING * height[1]]])
@@ -55,7 +67,7 @@ def test_the_similarity_maps_y_up_points():
     pa = rng.uniform(200, 400, (200, 2))
     s = 1.2 * np.exp(1j * np.radians(30))
     zb = s * (pa[:, 0] - 1j * pa[:, 1])
-    pb = np.column_stack([zb.real, -zb.imag]) + (50, 300)
+    pb = np.column_stack([zb.real, -zb.imag]) + np.array([50, 300])
     link = verified(pa, pb + rng.normal(0, 0.1, pb.shape))
     assert link.b_S_a == pytest.approx(s, abs=2e-3)
 
@@ -70,23 +82,30 @@ def test_unrelated_photos_are_refused():
         result = verified(pa, pb)
         assert not result, f"seed {seed}: {len(result)} of {n} accepted"
         reasons.append(result.reason.split(" (")[0])
-    assert set(reasons) <= {"weak inliers", "implausible scale", "weak inliers after epipolar check", "no common similarity"}
+    assert set(reasons) <= {
+        "weak inliers",
+        "implausible scale",
+        "weak inliers after epipolar check",
+        "no common similarity",
+    }
 
 
 def test_reasons():
     pa, pb, _ = view_pair(0)
     few = verified(pa[:14], pb[:14])
     assert isinstance(few, RejectedLink) and not few and few.reason == "too few matches (14 of 15)"
-    pa, pb, right = view_pair(1, height=(1.0, 2.0), base=(3.0, 2.0), outliers=0.0)
+    pa, pb, _ = view_pair(1, height=(1.0, 2.0), base=(3.0, 2.0), outliers=0.0)
     assert verified(pa, pb).reason.startswith("implausible scale (0.5")
     rng = np.random.default_rng(2)
-    loose = pa * 1.0 + rng.normal(0, 6, pa.shape)  # a similarity within its loose tolerance, no epipolar geometry
+    loose = pa * 1.0 + rng.normal(
+        0, 6, pa.shape
+    )  # a similarity within its loose tolerance, no epipolar geometry
     assert "epipolar" in verified(pa[:40], loose[:40], minimum=30).reason
 
 
 def test_the_threshold_counts_pixels_of_the_picture_searched():
     """Keypoints found in a picture four times smaller err four times as much in full pixels."""
-    pa, pb, right = view_pair(3, outliers=0.0, noise=1.6)
+    pa, pb, _ = view_pair(3, outliers=0.0, noise=1.6)
     n = np.arange(len(pa))
     m = Matches(index_a=n, index_b=n)
     full = Verify()(0, 1, features(pa), features(pb), m, WIDTH)
