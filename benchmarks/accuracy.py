@@ -2,12 +2,13 @@
 
     python benchmarks/accuracy.py [--flights default,default+gcp,strip] [--work FOLDER] [--json FILE]
 
-A flight is simulated once and kept in the work folder. `+gcp` uses its control points (check points stay out).
-Every figure has an error window on both sides: a result that is suspiciously good fails too.
+A flight is simulated once and kept in the work folder. `+gcp` uses its control points (check points stay
+out). Every figure has an error window on both sides: a result that is suspiciously good fails too.
 """
 
 import argparse
 import json
+import shutil
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -43,7 +44,9 @@ class Truth:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--flights", default="default,default+gcp,strip")
     parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "skyquilt-accuracy")
     parser.add_argument("--json", type=Path)
@@ -54,9 +57,19 @@ def main() -> int:
         print(f"{name}")
         for key, value in rows[name].items():
             low, high = WINDOWS.get(name, {}).get(key, (-np.inf, np.inf))
-            verdict = "" if key not in WINDOWS.get(name, {}) else "ok" if low <= value <= high else f"OUTSIDE {low}..{high}"
+            verdict = (
+                ""
+                if key not in WINDOWS.get(name, {})
+                else "ok"
+                if low <= value <= high
+                else f"OUTSIDE {low}..{high}"
+            )
             bad += verdict.startswith("OUTSIDE")
-            print(f"  {key:28s} {value:12.4f} {verdict}" if isinstance(value, float) else f"  {key:28s} {value!s:>12s} {verdict}")
+            print(
+                f"  {key:28s} {value:12.4f} {verdict}"
+                if isinstance(value, float)
+                else f"  {key:28s} {value!s:>12s} {verdict}"
+            )
     if args.json:
         args.json.write_text(json.dumps(rows, indent=1))
     return int(bad > 0)
@@ -72,8 +85,13 @@ def figures(name: str, work: Path) -> dict[str, object]:
     truth = Truth(json.loads((flight / "truth" / "truth.json").read_text()), flight)
     settings = MosaicSettings(gcp=flight / "gcp_list.txt" if extra == "gcp" else None)
     out = work / f"{name}.out"
+    shutil.rmtree(out, ignore_errors=True)  # a cold store
     metrics = dict(mosaic(flight / "photos", out, settings, overwrite=True).metrics)
-    return {**pose_figures(out, truth, metrics), **surface_figures(out, truth), **map_figures(out, truth, metrics)}
+    return {
+        **pose_figures(out, truth, metrics),
+        **surface_figures(out, truth),
+        **map_figures(out, truth, metrics),
+    }
 
 
 def pose_figures(out: Path, truth: Truth, metrics: dict) -> dict[str, object]:
@@ -87,7 +105,9 @@ def pose_figures(out: Path, truth: Truth, metrics: dict) -> dict[str, object]:
     if metrics["vertical_datum"] == "takeoff":
         error[:, 2] += truth.record["vertical"]["takeoff_m"]
     tilt = [
-        np.degrees(np.arccos(np.clip(_axis(found[k]["rotation"]) @ np.array(truth.shots[k]["cam_R_map"])[2], -1, 1)))
+        np.degrees(
+            np.arccos(np.clip(_axis(found[k]["rotation"]) @ np.array(truth.shots[k]["cam_R_map"])[2], -1, 1))
+        )
         for k in common
     ]
     camera = truth.record["cameras"]["visible"]
@@ -101,17 +121,24 @@ def pose_figures(out: Path, truth: Truth, metrics: dict) -> dict[str, object]:
         "position_rms_x_m": float(np.sqrt((error[:, 0] ** 2).mean())),
         "position_rms_y_m": float(np.sqrt((error[:, 1] ** 2).mean())),
         "position_rms_z_m": float(np.sqrt((error[:, 2] ** 2).mean())),
-        "bias_x_m": float(bias[0]), "bias_y_m": float(bias[1]), "bias_z_m": float(bias[2]),
+        "bias_x_m": float(bias[0]),
+        "bias_y_m": float(bias[1]),
+        "bias_z_m": float(bias[2]),
         "bias_over_gps": float(np.hypot(*bias[:2]) / (2.0 / np.sqrt(n))),
-        "tilt_max_deg": float(np.max(tilt)), "tilt_median_deg": float(np.median(tilt)),
+        "tilt_max_deg": float(np.max(tilt)),
+        "tilt_median_deg": float(np.median(tilt)),
         "height_error_pct": height_error(out, truth, C, C0),
-        "check_rms_xy_m": _check(metrics, ("dx_m", "dy_m")), "check_rms_z_m": _check(metrics, ("dz_m",)),
+        "check_rms_xy_m": _check(metrics, ("dx_m", "dy_m")),
+        "check_rms_z_m": _check(metrics, ("dz_m",)),
     }
 
 
 def height_error(out: Path, truth: Truth, C: np.ndarray, C0: np.ndarray) -> float:
     """Median error of the flying height above ground in percent."""
-    with rasterio.open(out / "surface.tif") as found, rasterio.open(truth.folder / "truth" / "truth_surface.tif") as real:
+    with (
+        rasterio.open(out / "surface.tif") as found,
+        rasterio.open(truth.folder / "truth" / "truth_surface.tif") as real,
+    ):
         ground = np.array([v[0] for v in found.sample(C[:, :2])])
         true_ground = np.array([v[0] for v in real.sample(C0[:, :2])])
     return float(np.nanmedian((C[:, 2] - ground) / (C0[:, 2] - true_ground) - 1) * 100)
@@ -131,14 +158,23 @@ def _check(metrics: dict, keys: tuple[str, ...]) -> float:
 
 def surface_figures(out: Path, truth: Truth) -> dict[str, object]:
     """Heights against the true surface (objects included), offset taken out."""
-    with rasterio.open(out / "surface.tif") as found, rasterio.open(truth.folder / "truth" / "truth_surface.tif") as real:
-        x, y = np.meshgrid(np.linspace(real.bounds.left, real.bounds.right, 60)[8:-8], np.linspace(real.bounds.bottom, real.bounds.top, 60)[8:-8])
+    with (
+        rasterio.open(out / "surface.tif") as found,
+        rasterio.open(truth.folder / "truth" / "truth_surface.tif") as real,
+    ):
+        x, y = np.meshgrid(
+            np.linspace(real.bounds.left, real.bounds.right, 60)[8:-8],
+            np.linspace(real.bounds.bottom, real.bounds.top, 60)[8:-8],
+        )
         places = list(zip(x.ravel(), y.ravel(), strict=True))
         a = np.array([v[0] for v in found.sample(places)], float)
         b = np.array([v[0] for v in real.sample(places)], float)
     good = np.isfinite(a) & np.isfinite(b) & (b > -1e4) & (a > -1e4)
     d = (a - b)[good]
-    return {"surface_offset_m": float(np.median(d)), "surface_median_abs_m": float(np.median(np.abs(d - np.median(d))))}
+    return {
+        "surface_offset_m": float(np.median(d)),
+        "surface_median_abs_m": float(np.median(np.abs(d - np.median(d)))),
+    }
 
 
 def map_figures(out: Path, truth: Truth, metrics: dict) -> dict[str, object]:
@@ -146,10 +182,15 @@ def map_figures(out: Path, truth: Truth, metrics: dict) -> dict[str, object]:
     e = map_error(out / "mosaic.tif", truth.folder / "truth" / "truth_ortho.tif")
     gsd = metrics["gsd_m"]
     return {
-        "gsd_cm": gsd * 100, "map_median_gsd": float(e.absolute.median_m / gsd), "map_p95_gsd": float(e.absolute.p95_m / gsd),
-        "map_median_m": float(e.absolute.median_m), "map_relative_median_gsd": float(e.relative.median_m / gsd),
-        "map_bias_x_m": float(e.bias_x_m), "map_bias_y_m": float(e.bias_y_m),
-        "map_measured": f"{e.measured}/{e.attempted}", "seam_median_px": float(metrics["seam_disparity_px"]["median"] or np.nan),
+        "gsd_cm": gsd * 100,
+        "map_median_gsd": float(e.absolute.median_m / gsd),
+        "map_p95_gsd": float(e.absolute.p95_m / gsd),
+        "map_median_m": float(e.absolute.median_m),
+        "map_relative_median_gsd": float(e.relative.median_m / gsd),
+        "map_bias_x_m": float(e.bias_x_m),
+        "map_bias_y_m": float(e.bias_y_m),
+        "map_measured": f"{e.measured}/{e.attempted}",
+        "seam_median_px": float(metrics["seam_disparity_px"]["median"] or np.nan),
         "cpu_seconds": float(metrics["cpu_seconds"]),
     }
 

@@ -3,7 +3,9 @@
 The floor is (a) decoding every JPEG once at full resolution plus (b) encoding the finished COG, overviews
 included, from memory. `--run` measures the whole command beside it, from a cold store, in its own process.
 
-    python benchmarks/floor.py PHOTOS --mosaic OUT/mosaic.tif --run 3
+    python benchmarks/floor.py PHOTOS --mosaic OUT/mosaic.tif --run 3 -- --gsd 2
+
+Words after `--` go to skyquilt mosaic.
 """
 
 import argparse
@@ -117,6 +119,9 @@ def measure_floor(options: argparse.Namespace) -> dict[str, Cost | float]:
 
 
 def main() -> None:
+    words = sys.argv[1:]
+    cut = words.index("--") if "--" in words else len(words)
+    own, further = words[:cut], words[cut + 1 :]
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -128,13 +133,10 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=5, help="runs of each measurement after one warm-up")
     parser.add_argument("--run", type=int, default=0, metavar="N", help="also run skyquilt mosaic N times")
     parser.add_argument("--json", type=Path, help="write all figures to this file")
-    parser.add_argument("arguments", nargs="*", help="further words for skyquilt mosaic, after --")
-    options = parser.parse_args()
+    options = parser.parse_args(own)
     results = measure_floor(options)
     if options.run:
-        cpu, wall, peak = zip(
-            *(run_mosaic(options.photos, options.arguments) for _ in range(options.run)), strict=True
-        )
+        cpu, wall, peak = zip(*(run_mosaic(options.photos, further) for _ in range(options.run)), strict=True)
         results["run"] = Cost.of(list(cpu), list(wall), max(peak))
         results["ratio"] = results["run"].cpu_median / results["floor"]  # type: ignore[union-attr, operator]
     report = {"machine": machine()} | {

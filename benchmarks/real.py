@@ -2,11 +2,12 @@
 
     python benchmarks/real.py [--data ../shared/data] [--only brighton,caliterra,...] [--work FOLDER]
 
-`stripped` is brighton without any metadata; `stripped+gcp` adds three control points whose pixels and coordinates
-come from the full run's own tie points, and judges by the others.
+`stripped` is brighton without any metadata; `stripped+gcp` adds three control points whose pixels and
+coordinates come from the full run's own tie points, and judges by the others.
 """
 
 import argparse
+import shutil
 import sys
 import tempfile
 from pathlib import Path
@@ -18,12 +19,15 @@ from skyquilt.pipelines.mosaic import mosaic
 
 ASKED = {
     "brighton": {
-        "photos": (18, 18), "reprojection_mean_px": (0.1, 0.7), "gps_x_m": (0.02, 0.6), "gps_y_m": (0.02, 0.6),
-        "focal_px": (2310 * 0.95, 2310 * 1.05), "seam_median_px": (0.1, 2.0), "seam_measured_share": (0.6, 1.0),
+        "photos": (18, 18), "reprojection_mean_px": (0.1, 0.7), "gps_x_m": (0.02, 0.6),
+        "gps_y_m": (0.02, 0.6),
+        "focal_px": (2310 * 0.95, 2310 * 1.05), "seam_median_px": (0.1, 2.0),
+        "seam_measured_share": (0.6, 1.0),
         "yaw_conflicts": (6, 6), "peak_memory_mb": (100, 1200),
     },
     "caliterra": {
-        "photos": (74, 75), "largest_block": (74, 75), "reprojection_mean_px": (0.1, 0.6), "altitude_conflicts": (1, 75),
+        "photos": (74, 75), "largest_block": (74, 75), "reprojection_mean_px": (0.1, 0.6),
+        "altitude_conflicts": (1, 75),
     },
     "thermal-strip": {"photos": (17, 17), "yaw_conflicts": (17, 17)},
     "stripped": {"photos": (18, 18), "largest_block": (18, 18), "georeferenced": (0, 0)},
@@ -33,7 +37,9 @@ ASKED = {
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--data", type=Path, default=Path(__file__).resolve().parents[2] / "shared" / "data")
     parser.add_argument("--only", default=",".join(ASKED))
     parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "skyquilt-real")
@@ -48,7 +54,9 @@ def main() -> int:
         print(name)
         for key, value in row.items():
             low, high = ASKED[name].get(key, (-np.inf, np.inf))
-            verdict = "" if key not in ASKED[name] else "ok" if low <= value <= high else f"MISSED {low}..{high}"
+            verdict = (
+                "" if key not in ASKED[name] else "ok" if low <= value <= high else f"MISSED {low}..{high}"
+            )
             missed += verdict.startswith("MISSED")
             print(f"  {key:24s} {value:12.3f} {verdict}")
     return int(missed > 0)
@@ -61,6 +69,7 @@ def figures(name: str, data: Path, work: Path) -> dict[str, float]:
         folder = strip_all(data / "brighton", work / "stripped-photos")
     if name == "stripped+gcp":
         settings = MosaicSettings(gcp=control_from_full_run(data / "brighton", work))
+    shutil.rmtree(work / f"{name}.out", ignore_errors=True)  # a cold store
     m = mosaic(folder, work / f"{name}.out", settings, overwrite=True).metrics
     fields = [c["field"] for c in m["metadata_conflicts"]]
     gps, seam = m["gps_residual_rms_m"] or {}, m["seam_disparity_px"]
@@ -68,7 +77,8 @@ def figures(name: str, data: Path, work: Path) -> dict[str, float]:
     check = [np.hypot(c["dx_m"], c["dy_m"]) for c in m["control"] if c["check"]]
     nan = float("nan")
     return {
-        "photos": m["photos_used"], "largest_block": m["blocks"][0], "georeferenced": float(m["georeferenced"]),
+        "photos": m["photos_used"], "largest_block": m["blocks"][0],
+        "georeferenced": float(m["georeferenced"]),
         "reprojection_mean_px": m["reprojection_error_px"]["mean"], "tie_points": m["tie_points"],
         "gps_x_m": gps.get("x", nan), "gps_y_m": gps.get("y", nan), "gps_z_m": gps.get("z", nan),
         "loo_x_m": loo.get("x", nan), "loo_y_m": loo.get("y", nan), "loo_z_m": loo.get("z", nan),
@@ -115,15 +125,17 @@ def control_from_full_run(source: Path, work: Path) -> Path:
     taken = drain(intake.take_in(photos, cache, parts, store, 2))
     frame = choose_frame(photos, None)
     prior = priors(photos, frame)
+    pictures = intake.Pictures(photos, cache, store)
     links = drain(linking.link_up(taken, prior, parts, store, 2))
-    ties = drain(placing.place(taken, frame, prior, links, (), parts, settings, store))
+    ties = drain(placing.place(taken, frame, prior, links, (), parts, settings, store, pictures))
     ties, frame = ties.ties, ties.frame
     seen = np.bincount(ties.point)
     good = np.flatnonzero(seen >= 3)
     xy = ties.xyz[good, :2]
     first = int(np.argmin(xy.sum(1)))
     second = int(np.argmax(np.hypot(*(xy - xy[first]).T)))
-    area = np.abs(np.cross(xy[second] - xy[first], xy - xy[first]))
+    (ax, ay), (bx, by) = xy[second] - xy[first], (xy - xy[first]).T
+    area = np.abs(ax * by - ay * bx)
     chosen = [int(good[k]) for k in (first, second, int(np.argmax(area)))]
     checks = [int(k) for k in np.random.default_rng(0).permutation(good)[:40] if k not in chosen]
     lines = [str(frame.crs)]
@@ -132,13 +144,15 @@ def control_from_full_run(source: Path, work: Path) -> Path:
         x, y, z = ties.xyz[k] + (*frame.origin, 0.0)
         for row in np.flatnonzero(ties.point == k):
             u, v = ties.px[row]
-            lines.append(f"{x:.4f} {y:.4f} {z:.4f} {u:.3f} {v:.3f} img{ties.photo[row]:02d}.jpg p{number}{kind}")
+            lines.append(
+                f"{x:.4f} {y:.4f} {z:.4f} {u:.3f} {v:.3f} img{ties.photo[row]:02d}.jpg p{number}{kind}"
+            )
     target = work / "gcp_list.txt"
     target.write_text("\n".join(lines) + "\n")
     return target
 
 
-def drain(steps):  # noqa: ANN001, ANN201
+def drain(steps):
     """The result of a stage run without its events."""
     try:
         while True:

@@ -1,3 +1,62 @@
-"""Skyquilt: drone photos, visible and thermal, to a georeferenced, orthorectified mosaic."""
+"""Skyquilt: drone photos, visible and thermal, to a georeferenced, orthorectified mosaic.
+
+The public names. They are imported when first used, so that `import skyquilt` costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from skyquilt import simulate
+    from skyquilt.config import MosaicSettings
+    from skyquilt.errors import SkyquiltError
+    from skyquilt.model.camera import Camera
+    from skyquilt.model.event import Result
+    from skyquilt.model.photo import Photo, Survey
+    from skyquilt.model.poses import Alignment
+    from skyquilt.photos.survey import read_survey
+    from skyquilt.pipelines.mosaic import iter_mosaic, mosaic
 
 __version__ = "0.1.0"
+
+_HOME = {
+    "Alignment": "skyquilt.model.poses",
+    "Camera": "skyquilt.model.camera",
+    "MosaicSettings": "skyquilt.config",
+    "Photo": "skyquilt.model.photo",
+    "Result": "skyquilt.model.event",
+    "SkyquiltError": "skyquilt.errors",
+    "Survey": "skyquilt.model.photo",
+    "iter_mosaic": "skyquilt.pipelines.mosaic",
+    "mosaic": "skyquilt.pipelines.mosaic",
+    "read_survey": "skyquilt.photos.survey",
+}
+"""Public name -> module that defines it."""
+
+__all__ = [
+    "Alignment",
+    "Camera",
+    "MosaicSettings",
+    "Photo",
+    "Result",
+    "SkyquiltError",
+    "Survey",
+    "iter_mosaic",
+    "mosaic",
+    "read_survey",
+    "simulate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "simulate":
+        return import_module("skyquilt.simulate")
+    if name not in _HOME:
+        raise AttributeError(f"module 'skyquilt' has no attribute {name!r}")
+    value = getattr(import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -87,8 +87,14 @@ class MosaicSettings:
         ):  # fmt: skip
             if value is not None and not low <= value <= high:
                 raise UsageError(f"{name} {value} lies outside {low} to {high}")
-        if self.bounds and not (np.isfinite(self.bounds).all() and self.bounds[0] < self.bounds[2] and self.bounds[1] < self.bounds[3]):
-            raise UsageError(f"--bounds is west,south,east,north with west < east and south < north, got {self.bounds}")
+        if self.bounds and not (
+            np.isfinite(self.bounds).all()
+            and self.bounds[0] < self.bounds[2]
+            and self.bounds[1] < self.bounds[3]
+        ):
+            raise UsageError(
+                f"--bounds is west,south,east,north with west < east and south < north, got {self.bounds}"
+            )
 
     def as_table(self) -> dict[str, Any]:
         """Names and values as written to run.toml; unset ones left out."""
@@ -133,11 +139,15 @@ class Methods:
 
 def methods(settings: MosaicSettings) -> Methods:
     """The methods that settings name."""
-    blend: Blend = Feather(width_px=settings.feather_px) if settings.blend == "feather" else BLENDS[settings.blend]()
+    blend: Blend = (
+        Feather(width_px=settings.feather_px) if settings.blend == "feather" else BLENDS[settings.blend]()
+    )
     return Methods(
-        sift=Sift(count=settings.features), nearest=Nearest(), retrieval=Retrieval(), mutual=Mutual(), verify=Verify(),
+        sift=Sift(count=settings.features), nearest=Nearest(), retrieval=Retrieval(), mutual=Mutual(),
+        verify=Verify(),
         bundle=Bundle(distortion=settings.distortion, repair=settings.repair),
         by_pose=ByPose(height_m=settings.height_m),
         by_position=ByPosition(height_m=settings.height_m, heading_deg=settings.heading_deg),
-        surface=FromTiePoints(), sweep=Sweep() if settings.surface == "sweep" else None, balance=Balance(), blend=blend,
+        surface=FromTiePoints(), sweep=Sweep() if settings.surface == "sweep" else None, balance=Balance(),
+        blend=blend,
     )  # fmt: skip

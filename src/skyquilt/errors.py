@@ -32,7 +32,9 @@ class OutputError(SkyquiltError):
 
 
 class SideFileError(SkyquiltError):
-    """A side file (geo.txt, gcp_list.txt, boundary, cameras.json ...) is malformed or names unknown photos."""
+    """A side file (geo.txt, gcp_list.txt, boundary, cameras.json ...) is malformed or
+    names unknown photos.
+    """
 
     exit_code = 6
 

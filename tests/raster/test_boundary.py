@@ -8,12 +8,13 @@ import zipfile
 import numpy as np
 import pyproj
 import pytest
-from raster_cases import PLACE
 from shapely import Polygon, box, to_wkb
 from shapely.geometry import mapping
 
 from skyquilt.errors import SideFileError
 from skyquilt.raster.boundary import inside, read_boundary
+
+from .raster_cases import PLACE
 
 UTM = Polygon(
     [(500_000, 4_500_000), (500_900, 4_500_000), (500_900, 4_500_700), (500_000, 4_500_700)],

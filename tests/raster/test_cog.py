@@ -7,10 +7,11 @@ import pytest
 import rasterio
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from raster_cases import PLACE, assert_valid_cog, disc, picture, psnr, read, spec_for
 from rasterio.enums import MaskFlags
 
 from skyquilt.raster import CogWriter, write_array
+
+from .raster_cases import PLACE, assert_valid_cog, disc, picture, psnr, read, spec_for
 
 RNG = np.random.default_rng(1)
 

@@ -4,10 +4,11 @@ import numpy as np
 import pyproj
 import pytest
 import rasterio
-from raster_cases import PLACE, spec_for
 from rasterio.crs import CRS
 
 from skyquilt.raster import write_array
+
+from .raster_cases import PLACE, spec_for
 
 ARRAY = np.zeros((5, 7), np.uint8)
 LAEA = "+proj=laea +lat_0=12.5 +lon_0=33.25 +datum=WGS84 +units=m"

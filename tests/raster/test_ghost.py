@@ -2,9 +2,10 @@
 
 import numpy as np
 import tifffile
-from raster_cases import disc, picture, spec_for
 
 from skyquilt.raster import write_array
+
+from .raster_cases import disc, picture, spec_for
 
 
 def test_tiles_lie_as_promised(tmp_path):

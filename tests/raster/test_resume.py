@@ -9,10 +9,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from raster_cases import assert_valid_cog, disc, picture, read, spec_for
 
 from skyquilt.errors import OutputError
 from skyquilt.raster import CogWriter, write_array
+
+from .raster_cases import assert_valid_cog, disc, picture, read, spec_for
 
 ARRAY, VALID = picture(1400, 1900), disc(1400, 1900)
 SPEC = spec_for(ARRAY, compress="jpeg", mask=True, tile=64)
@@ -95,7 +96,7 @@ KILLED = """
 import sys, os
 sys.path[:0] = sys.argv[2:]
 from pathlib import Path
-from test_resume import *
+from tests.raster.test_resume import *
 with CogWriter(Path(sys.argv[1]), SPEC, digest="x") as writer:
     write_some(writer, 11)
     block = next(writer.blocks())
@@ -107,7 +108,7 @@ with CogWriter(Path(sys.argv[1]), SPEC, digest="x") as writer:
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 def test_killed_process(tmp_path, whole):
     path = tmp_path / "a.tif"
-    command = [sys.executable, "-c", KILLED, str(path), os.path.dirname(__file__), *sys.path]  # noqa: PTH120
+    command = [sys.executable, "-c", KILLED, str(path), *sys.path]
     assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
     with CogWriter(path, SPEC, digest="x") as writer:
         assert len(list(writer.blocks())) == 6 * 8 - 11

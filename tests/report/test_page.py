@@ -3,10 +3,11 @@ import time
 
 import numpy as np
 import pytest
-from report_cases import Page, run, shots
 
 from skyquilt.errors import OutputError
 from skyquilt.report import CameraResiduals, ReportInput, SeamMark, Shot, build_report, write_report
+
+from .report_cases import Page, run, shots
 
 SECTIONS = [
     "map",

@@ -3,7 +3,6 @@ import base64
 import cv2
 import numpy as np
 import pytest
-from report_cases import run
 
 from skyquilt.report import CameraResiduals, SeamMark, images
 from skyquilt.report.ground import ground_of
@@ -11,6 +10,8 @@ from skyquilt.report.layers import exaggeration, seam_kinds
 from skyquilt.report.numbers import decimals_of, fixed, nice, seconds, significant
 from skyquilt.report.residuals import COLUMNS, ROWS, mean_field, systematic
 from skyquilt.report.svg import ticks
+
+from .report_cases import run
 
 
 def test_numbers_are_written_for_people():

@@ -6,6 +6,8 @@ intrinsic as well. The tests hold this code against pycolmap's Ceres on problems
 """
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,7 +166,7 @@ def _chunks(problem: Problem, count: int) -> list[tuple[int, int]]:
         reach = np.searchsorted(starts, cuts[-1] + 6000, "right") - 1
         nxt = int(starts[reach])
         cuts.append(nxt if nxt > cuts[-1] else int(starts[reach + 1]))
-    return list(zip(cuts[:-1], cuts[1:], strict=True))
+    return list(pairwise(cuts))
 
 
 class Reduced:
@@ -208,9 +210,13 @@ class Reduced:
         view = rows[: 6 * len(seen)].reshape(len(seen), 6, last - first, 3)
         view[local, :, point - first] = N.Wp[lo:hi] @ T
         cam_view = rows[6 * len(seen) :].reshape(len(cams), 8, last - first, 3)
-        np.add.at(cam_view, (cam_local, slice(None), point - first), N.Wc[lo:hi] @ T)
+        place: Any = (cam_local, slice(None), point - first)
+        np.add.at(cam_view, place, N.Wc[lo:hi] @ T)
         unknowns = np.concatenate(
-            [(6 * seen[:, None] + np.arange(6)).ravel(), (6 * self.n + 8 * cams[:, None] + np.arange(8)).ravel()]
+            [
+                (6 * seen[:, None] + np.arange(6)).ravel(),
+                (6 * self.n + 8 * cams[:, None] + np.arange(8)).ravel(),
+            ]
         )
         return unknowns, rows.reshape(len(rows), -1), slice(first, last)
 
@@ -269,8 +275,8 @@ def adjust(
 ) -> Adjusted:
     """Minimises the robust cost.
 
-    After each step the points settle under the moved photos before the step is judged: a strip that straightens
-    moves along a curve, and without that its long steps would all be refused.
+    After each step the points settle under the moved photos before the step is judged: a strip that
+    straightens moves along a curve, and without that its long steps would all be refused.
 
     Args:
         problem: sightings and priors.

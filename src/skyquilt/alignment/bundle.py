@@ -1,7 +1,7 @@
 """`bundle`: similarity graph -> adjustment with self-calibration and priors -> points of the ground."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -11,12 +11,13 @@ from skyquilt.alignment.adjust import adjust, covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
+from skyquilt.alignment.sharpen import GreyPicture, Sharpen
 from skyquilt.alignment.start import Start, find_start
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import intersect, polish
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.camera import undistort
-from skyquilt.model.camera import Camera
+from skyquilt.model.camera import PARAMETERS, Camera
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
@@ -29,18 +30,22 @@ class Bundle:
     """Bundle adjustment of all linked photos at once."""
 
     distortion: str = "4"
-    """Distortion that self-calibration may change: `none`, `2`, `4`, `6` (radial order) or `6t` (and tangential)."""
+    """Distortion that self-calibration may change: `none`, `2`, `4`, `6` (radial order) or
+    `6t` (and tangential).
+    """
     per_photo: int = 400
     """Sightings per photo in the adjustment; all the others are triangulated afterwards."""
     repair: bool = True
     """Treat metadata as measurements that may lie; False believes them to their stated deviations."""
-    version: ClassVar[int] = 2
+    sharpen: Sharpen | None = field(default_factory=Sharpen)
+    """Registration of sightings in larger pictures; None leaves keypoints as they were found."""
+    version: ClassVar[int] = 3
 
     def __call__(
         self, photos: Sequence[Photo], frame: MapFrame, priors: Sequence[Prior], features: Sequence[Features],
-        links: Sequence[Link], control: Sequence[Control] = (),
+        links: Sequence[Link], control: Sequence[Control] = (), grey: GreyPicture | None = None,
     ) -> Alignment:  # fmt: skip
-        """Aligns the photos that hang together by links.
+        """Aligns the photos that hang together by links; `grey` gives pictures to sharpen sightings in.
 
         Raises:
             AlignmentError: no two photos are linked.
@@ -53,20 +58,44 @@ class Bundle:
         sizes = [(p.width, p.height) for p in photos]
         used = setup.sensor_tracks(tracks)
         problem, state = setup.problem(thin(used, sizes, per_photo=self.per_photo))
-        problem, state = _refine(problem, state)
+        problem, state = _rough(problem, state)
+        if grey is not None and self.sharpen is not None:
+            used = _sharpened(used, photos, setup, problem, state, self.sharpen, grey)
+            problem, fresh = setup.problem(thin(used, sizes, per_photo=self.per_photo))
+            state = replace(state, X=_triangulated(problem, replace(state, X=fresh.X)).X)
+        problem, state = _fine(problem, state)
         if self.repair:
             problem, state = _believe_positions_less(problem, state, setup)
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
         return _outcome(photos, frame, setup, start, used, problem, state, reports)
 
 
-def _refine(problem: Problem, state: State) -> tuple[Problem, State]:
-    """From coarse to fine: intrinsics fixed under a wide loss, then all free under narrower ones, pruning between."""
+def _sharpened(
+    tracks: Tracks, photos: Sequence[Photo], setup: Setup, problem: Problem, state: State, sharpen: Sharpen,
+    grey: GreyPicture,
+) -> Tracks:  # fmt: skip
+    """Tracks (sensor pixels) with sightings registered in larger pictures."""
+    everything, _ = setup.problem(tracks)
+    xyz = _triangulated(everything, state).X
+    cameras, camera_of = camera_records(photos, setup, state, None)
+    poses = pose_records(setup, state)
+    filed = replace(tracks, px=setup.file_px(tracks.photo, tracks.px))
+    sharp = sharpen(filed, xyz, poses, {i: cameras[k] for i, k in camera_of.items()}, grey)
+    return replace(sharp, px=setup.file_px(sharp.photo, sharp.px))
+
+
+def _rough(problem: Problem, state: State) -> tuple[Problem, State]:
+    """Intrinsics fixed under a wide loss, then all free under a narrower one, pruning between."""
     fixed = replace(problem, free=np.zeros_like(problem.free), loss_px=20.0)
     state = adjust(fixed, state, iterations=10, tolerance=3e-2).state
     problem, state = prune(problem, state, 40.0)
     state = adjust(problem.with_loss(6.0), state, iterations=20, tolerance=3e-3, damping=1e-5).state
-    problem, state = prune(problem, state, 12.0)
+    return prune(problem, state, 12.0)
+
+
+def _fine(problem: Problem, state: State) -> tuple[Problem, State]:
+    """All free under ever narrower losses, pruning between."""
+    problem, state = prune(problem, state, 20.0)
     state = adjust(problem.with_loss(2.5), state, iterations=20, tolerance=2e-3, damping=1e-6).state
     problem, state = prune(problem, state, 5.0)
     return problem, adjust(problem.with_loss(2.0), state, iterations=15, tolerance=3e-4, damping=1e-6).state
@@ -75,7 +104,7 @@ def _refine(problem: Problem, state: State) -> tuple[Problem, State]:
 def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]:
     """Without the sightings off by more than `limit` deviations, and points then seen once; control stays."""
     error = np.linalg.norm(residuals_px(problem, state), axis=1) / problem.sigma_px
-    pinned = np.isfinite(problem.X0).any(1)
+    pinned = np.asarray(np.isfinite(problem.X0).any(1))
     good = (error < limit) | pinned[problem.point]
     enough = np.bincount(problem.point[good], minlength=len(state.X)) >= 2
     good &= enough[problem.point] | pinned[problem.point]
@@ -107,7 +136,9 @@ def _believe_positions_less(problem: Problem, state: State, setup: Setup) -> tup
 
 
 def position_noise(error: Array) -> float:
-    """Robust deviation in m of each axis of position errors (n, 2), in order of capture, from their neighbours' mean."""
+    """Robust deviation in m of each axis of position errors (n, 2), in order of capture, from
+    their neighbours' mean.
+    """
     known = error[np.isfinite(error).all(1)]
     if len(known) < 6:
         return 0.0
@@ -115,10 +146,13 @@ def position_noise(error: Array) -> float:
     return float(1.48 * np.median(np.abs(local)) / np.sqrt(1.5))
 
 
-def leave_one_out(problem: Problem, state: State, C_covariance: Array | None) -> tuple[float, float, float] | None:
+def leave_one_out(
+    problem: Problem, state: State, C_covariance: Array | None
+) -> tuple[float, float, float] | None:
     """RMS per axis in m of each measured position against the position that everything else predicts.
 
-    From the covariance of the full solution (the usual identity for linear least squares), not by n solutions.
+    From the covariance of the full solution (the usual identity for linear least squares), not by n
+    solutions.
     """
     known = np.flatnonzero(np.isfinite(problem.C0[:, :2]).all(1))
     if C_covariance is None or len(known) < 3:
@@ -128,7 +162,9 @@ def leave_one_out(problem: Problem, state: State, C_covariance: Array | None) ->
         axes = np.isfinite(problem.C0[i])
         e = (state.C[i] - problem.C0[i])[axes]
         white = e / problem.sigma_C[i][axes]
-        precision = np.diag(1 / problem.sigma_C[i][axes] ** 2) / np.sqrt(1 + (white @ white) / problem.loss_C**2)
+        precision = np.diag(1 / problem.sigma_C[i][axes] ** 2) / np.sqrt(
+            1 + (white @ white) / problem.loss_C**2
+        )
         own = C_covariance[6 * i + 3 : 6 * i + 6, 6 * i + 3 : 6 * i + 6][np.ix_(axes, axes)]
         full = np.full(3, np.nan)
         full[axes] = np.linalg.solve(np.eye(len(e)) - own @ precision, e)
@@ -137,20 +173,24 @@ def leave_one_out(problem: Problem, state: State, C_covariance: Array | None) ->
     return float(rms[0]), float(rms[1]), float(rms[2])
 
 
+def _triangulated(problem: Problem, state: State) -> State:
+    """The state with the problem's points where their rays meet best."""
+    xy = np.empty((len(problem.px), 2))
+    for row, k in enumerate(state.K):
+        own = problem.camera[problem.photo] == row
+        camera = Camera(width=1, height=1, **dict(zip(PARAMETERS, k, strict=True)))
+        xy[own] = undistort(camera, problem.px[own])
+    local = np.column_stack([xy, np.ones(len(xy))])
+    direction = np.einsum("nji,nj->ni", state.R[problem.photo], local)
+    X = intersect(problem.point, state.C[problem.photo], direction, int(problem.point[-1]) + 1)
+    return replace(state, X=X)
+
+
 def ground_points(tracks: Tracks, setup: Setup, problem: Problem, state: State) -> TiePoints:
     """All tracks triangulated with the final poses; bad sightings and unstable points dropped."""
     everything, _ = setup.problem(tracks)
     everything = replace(everything, loss_px=2.0)
-    origin = state.C[everything.photo]
-    xy = np.empty((len(everything.px), 2))
-    for row, k in enumerate(state.K):
-        own = setup.camera[everything.photo] == row
-        camera = Camera(width=1, height=1, **dict(zip(("focal", "cx", "cy", "k1", "k2", "k3", "p1", "p2"), k, strict=True)))
-        xy[own] = undistort(camera, everything.px[own])
-    local = np.column_stack([xy, np.ones(len(xy))])
-    direction = np.einsum("nji,nj->ni", state.R[everything.photo], local)
-    X = intersect(everything.point, origin, direction, tracks.count)
-    whole = replace(state, X=X)
+    whole = _triangulated(everything, state)
     whole, _ = polish(everything, whole, iterations=3)
     everything, whole = prune(everything, whole, 5.0)
     whole, sigma_z = polish(everything, whole, iterations=2)

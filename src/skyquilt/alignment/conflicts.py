@@ -13,12 +13,16 @@ YAW_DEG = 15.0
 """Yaws further apart than this contradict each other."""
 
 
-def conflicts(photos: Sequence[Photo], priors: Sequence[Prior], alignment: Alignment) -> list[MetadataConflict]:
+def conflicts(
+    photos: Sequence[Photo], priors: Sequence[Prior], alignment: Alignment
+) -> list[MetadataConflict]:
     """All contradictions of photos that tie points hold, in order of capture."""
     held = [i for block in alignment.blocks if len(block) > 1 for i in block if i in alignment.poses]
     found = [c for i in sorted(held) for c in _yaw(photos[i], priors[i], alignment, i)]
     if alignment.frame.crs is not None:
-        found += _altitudes(photos, priors, alignment, sorted(held)) + _positions(photos, priors, alignment, sorted(held))
+        found += _altitudes(photos, priors, alignment, sorted(held)) + _positions(
+            photos, priors, alignment, sorted(held)
+        )
     return found + _focals(photos, alignment, sorted(held))
 
 
@@ -30,14 +34,17 @@ def _yaw(photo: Photo, prior: Prior, alignment: Alignment, i: int) -> list[Metad
     if abs(off) < max(YAW_DEG, 3 * prior.sigma_yaw_deg):
         return []
     convergence = alignment.frame.convergence_deg
-    why = "the file was turned upside down by another program" if abs(abs(off) - 180) < 20 and photo.editor else (
-        f"the heading reported ({prior.yaw_source}) is off by {off:+.0f} degrees"
-    )  # fmt: skip
+    why = f"the heading reported ({prior.yaw_source}) is off by {off:+.0f} degrees"
+    if abs(abs(off) - 180) < 20 and photo.editor:
+        why = "the file was turned upside down by another program"
     return [
         MetadataConflict(
-            photo=photo.name, field="yaw", reported=round(angle_difference_deg(prior.yaw_deg + convergence, 0), 1),
-            estimated=round(angle_difference_deg(grid_yaw + convergence, 0), 1), meaning=why,
-        )  # fmt: skip
+            photo=photo.name,
+            field="yaw",
+            reported=round(angle_difference_deg(prior.yaw_deg + convergence, 0), 1),
+            estimated=round(angle_difference_deg(grid_yaw + convergence, 0), 1),
+            meaning=why,
+        )
     ]
 
 
@@ -58,12 +65,15 @@ def _altitudes(
     for i, e, height in zip(held, off, z - ground, strict=True):
         if np.isfinite(e) and abs(e) > max(2 * priors[i].sigma_C[2], 0.05 * height):
             reported = float(priors[i].map_C[2])
+            where = "lower" if e > 0 else "higher"
             out.append(
                 MetadataConflict(
-                    photo=photos[i].name, field="altitude", reported=round(reported, 1),
+                    photo=photos[i].name,
+                    field="altitude",
+                    reported=round(reported, 1),
                     estimated=round(reported - float(e), 1),
-                    meaning=f"image scale and neighbours put it {abs(e):.0f} m {'lower' if e > 0 else 'higher'}",
-                )  # fmt: skip
+                    meaning=f"image scale and neighbours put it {abs(e):.0f} m {where}",
+                )
             )
     return out
 
@@ -77,9 +87,12 @@ def _positions(
         if np.isfinite(off) and off > 5 * priors[i].sigma_C[0]:
             out.append(
                 MetadataConflict(
-                    photo=photos[i].name, field="position", reported=round(off, 1), estimated=0.0,
+                    photo=photos[i].name,
+                    field="position",
+                    reported=round(off, 1),
+                    estimated=0.0,
                     meaning=f"the reported position lies {off:.1f} m from where the photo fits",
-                )  # fmt: skip
+                )
             )
     return out
 
@@ -93,9 +106,11 @@ def _focals(photos: Sequence[Photo], alignment: Alignment, held: Sequence[int]) 
             seen.add(photo.camera_key)
             out.append(
                 MetadataConflict(
-                    photo=photo.name, field="focal", reported=round(photo.focal.px, 1),
+                    photo=photo.name,
+                    field="focal",
+                    reported=round(photo.focal.px, 1),
                     estimated=round(camera.focal, 1),
                     meaning=f"self-calibration of {photo.camera_key} finds another focal length (in px)",
-                )  # fmt: skip
+                )
             )
     return out

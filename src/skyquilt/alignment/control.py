@@ -64,7 +64,9 @@ def _placed(control: Control, setup: Setup) -> tuple[NDArray[np.int64], Array]:
     return np.searchsorted(setup.members, photo), setup.file_px(photo, control.px[mine])
 
 
-def _sightings(control: Sequence[Control], setup: Setup) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+def _sightings(
+    control: Sequence[Control], setup: Setup
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Point numbers, rows and sensor pixels of all sightings."""
     parts = [_placed(c, setup) for c in control]
     point = np.repeat(np.arange(len(parts)), [len(row) for row, _ in parts])
@@ -84,12 +86,20 @@ def _alone(control: Sequence[Control], setup: Setup, problem: Problem, state: St
     X = intersect(point, state.C[row], direction, len(control))
     empty = np.full((len(control), 3), np.nan)
     own_problem = replace(
-        problem, point=point, photo=row, px=px, sigma_px=np.ones(len(px)), X0=empty, sigma_X=np.ones_like(empty)
+        problem,
+        point=point,
+        photo=row,
+        px=px,
+        sigma_px=np.ones(len(px)),
+        X0=empty,
+        sigma_X=np.ones_like(empty),
     )
     return own_problem, polish(own_problem, replace(state, X=X))[0]
 
 
-def intersected(control: Sequence[Control], setup: Setup, problem: Problem, state: State) -> tuple[Array, Array]:
+def intersected(
+    control: Sequence[Control], setup: Setup, problem: Problem, state: State
+) -> tuple[Array, Array]:
     """Where the poses see the points (k, 3) in m, and the RMS reprojection error of each in px."""
     own, solved = _alone(control, setup, problem, state)
     error = (residuals_px(own, solved) ** 2).sum(1)
@@ -128,14 +138,17 @@ def hold_to_control(
     fit = [c for c in usable if not c.check]
     if not setup.georeferenced and frame.crs is not None and len(fit) < 3:
         raise AlignmentError(
-            f"photos without positions need 3 control points seen in 2 placed photos each, the file gives {len(fit)}"
+            "photos without positions need 3 control points seen in 2 placed photos each,"
+            f" the file gives {len(fit)}"
         )
     if not fit:
         return problem, state, frame, usable
     surveyed = np.array([c.xyz for c in fit])
     seen, _ = intersected(fit, setup, problem, state)
     if not setup.georeferenced:
-        level = np.nan_to_num(surveyed, nan=float(np.nanmean(surveyed[:, 2])) if np.isfinite(surveyed).all(1).any() else 0.0)
+        level = np.nan_to_num(
+            surveyed, nan=float(np.nanmean(surveyed[:, 2])) if np.isfinite(surveyed).all(1).any() else 0.0
+        )
         problem, state = _moved(problem, state, *fit_similarity_3d(seen, level))
     else:
         shift = np.nan_to_num(np.nanmedian(surveyed - seen, axis=0))
@@ -148,7 +161,9 @@ def hold_to_control(
     return problem, state, replace(frame, vertical_datum="control", metric=True) if heights else frame, usable
 
 
-def _with_points(problem: Problem, state: State, setup: Setup, fit: Sequence[Control]) -> tuple[Problem, State]:
+def _with_points(
+    problem: Problem, state: State, setup: Setup, fit: Sequence[Control]
+) -> tuple[Problem, State]:
     """Tie points and control points together."""
     point, row, px = _sightings(fit, setup)
     P = len(state.X)
@@ -157,7 +172,8 @@ def _with_points(problem: Problem, state: State, setup: Setup, fit: Sequence[Con
     joined = replace(
         problem,
         point=np.concatenate([problem.point, P + point]), photo=np.concatenate([problem.photo, row]),
-        px=np.concatenate([problem.px, px]), sigma_px=np.concatenate([problem.sigma_px, np.full(len(px), 0.7)]),
+        px=np.concatenate([problem.px, px]),
+        sigma_px=np.concatenate([problem.sigma_px, np.full(len(px), 0.7)]),
         X0=np.concatenate([problem.X0, surveyed]),
         sigma_X=np.concatenate([problem.sigma_X, np.array([[c.sigma_m] * 3 for c in fit])]),
     )  # fmt: skip
@@ -173,7 +189,11 @@ def residuals_of_control(
     X, rms = intersected(control, setup, problem, state)
     return tuple(
         ControlResidual(
-            name=c.name, check=c.check, error_m=x - c.xyz, reprojection_px=float(r), sightings=len(_placed(c, setup)[0])
+            name=c.name,
+            check=c.check,
+            error_m=x - c.xyz,
+            reprojection_px=float(r),
+            sightings=len(_placed(c, setup)[0]),
         )
         for c, x, r in zip(control, X, rms, strict=True)
     )

@@ -14,7 +14,9 @@ from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior, no_ties
 
 
 def reported_camera(photo: Photo) -> Camera:
-    """The calibration that metadata or a side file give, else an ideal camera of the reported focal length."""
+    """The calibration that metadata or a side file give, else an ideal camera of the
+    reported focal length.
+    """
     if photo.calibration is not None:
         return photo.calibration
     return Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
@@ -47,9 +49,11 @@ class ByMetadata:
         if not poses:
             raise AlignmentError(_nothing_placed(self.name, len(photos), rejected))
         return Alignment(
-            method=self.name, why="", frame=replace(frame, metric=frame.crs is not None or self.height_m is not None),
+            method=self.name, why="",
+            frame=replace(frame, metric=frame.crs is not None or self.height_m is not None),
             poses=poses, cameras={p.camera_key: reported_camera(p) for p in photos},
-            camera_of={i: p.camera_key for i, p in enumerate(photos)}, blocks=tuple((i,) for i in sorted(poses)),
+            camera_of={i: p.camera_key for i, p in enumerate(photos)},
+            blocks=tuple((i,) for i in sorted(poses)),
             ties=no_ties(), rejected=rejected,
         )  # fmt: skip
 
@@ -57,12 +61,17 @@ class ByMetadata:
         """Camera heights (n,) in m above the ground, which is level at z = 0."""
         z = np.array([p.map_C[2] for p in priors])
         if self.height_m is not None:
-            return np.where(np.isfinite(z), self.height_m + z - np.nanmedian(z), self.height_m) if np.isfinite(z).any() else np.full(len(z), self.height_m)
+            return (
+                np.where(np.isfinite(z), self.height_m + z - np.nanmedian(z), self.height_m)
+                if np.isfinite(z).any()
+                else np.full(len(z), self.height_m)
+            )
         if frame.vertical_datum != "takeoff":
             known = frame.vertical_datum != "unknown"
             given = f"heights above {frame.vertical_datum.replace('_', ' ')}" if known else "no heights"
             raise AlignmentError(
-                f"method {self.name} needs heights above ground, and the photos give {given}; add --height METRES"
+                f"method {self.name} needs heights above ground, and the photos give {given};"
+                " add --height METRES"
             )
         return np.where(np.isfinite(z), z, np.nanmedian(z))
 
@@ -89,8 +98,13 @@ class ByMetadata:
 def _nothing_placed(method: str, photos: int, rejected: dict[int, str]) -> str:
     """Why no photo could be placed, and what to do."""
     reasons = "; ".join(dict.fromkeys(rejected.values()))
-    advice = "add --height METRES" if "height" in reasons else "give positions and headings with --geo, or use --method bundle"
-    return f"method {method} places photos by their metadata, and none of {photos} can be placed ({reasons[:200]}); {advice}"
+    advice = "give positions and headings with --geo, or use --method bundle"
+    if "height" in reasons:
+        advice = "add --height METRES"
+    return (
+        f"method {method} places photos by their metadata, and none of {photos} can be placed"
+        f" ({reasons[:200]}); {advice}"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

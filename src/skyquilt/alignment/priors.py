@@ -41,16 +41,24 @@ def choose_frame(photos: Sequence[Photo], crs: str | None, control: Sequence[Con
     x, y = Transformer.from_crs(4326, name, always_xy=True).transform(longitude, latitude)
     origin = (float(np.round(x, -2)), float(np.round(y, -2)))
     convergence = Proj(name).get_factors(longitude, latitude).meridian_convergence
-    return MapFrame(crs=name, origin=origin, vertical_datum=_datum(photos), convergence_deg=float(convergence))
+    return MapFrame(
+        crs=name, origin=origin, vertical_datum=_datum(photos), convergence_deg=float(convergence)
+    )
 
 
 def _checked_crs(crs: str) -> str:
     try:
         parsed = CRS.from_user_input(crs)
     except CRSError as error:
-        raise UsageError(f"--crs {crs!r} is no coordinate system that PROJ knows; try e.g. EPSG:32633") from error
-    if not parsed.is_projected or any(axis.unit_name not in ("metre", "meter") for axis in parsed.axis_info[:2]):
-        raise UsageError(f"--crs {crs!r} ({parsed.name}) is not projected in metres; a mosaic needs one that is")
+        raise UsageError(
+            f"--crs {crs!r} is no coordinate system that PROJ knows; try e.g. EPSG:32633"
+        ) from error
+    if not parsed.is_projected or any(
+        axis.unit_name not in ("metre", "meter") for axis in parsed.axis_info[:2]
+    ):
+        raise UsageError(
+            f"--crs {crs!r} ({parsed.name}) is not projected in metres; a mosaic needs one that is"
+        )
     return crs
 
 

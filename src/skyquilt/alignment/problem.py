@@ -26,7 +26,9 @@ class State:
     """(P, 3) points in m."""
 
     def moved(self, photo_step: Array, camera_step: Array, point_step: Array) -> "State":
-        """The state after a step: photos (n, 6) = rotation vector then centre, cameras (m, 8), points (P, 3)."""
+        """The state after a step: photos (n, 6) = rotation vector then centre, cameras
+        (m, 8), points (P, 3).
+        """
         return State(
             R=rotation_from_vector(photo_step[:, :3]) @ self.R,
             C=self.C + photo_step[:, 3:],
@@ -75,7 +77,8 @@ class Problem:
     """Scale of the pseudo-Huber loss on attitudes: a gimbal may lie."""
     trust: float = 1.0
     """Factor on the cost of sightings. Errors of neighbouring sightings are correlated (lens model, rolling
-    shutter, features of one kind); a photo's hundreds of sightings weigh like some dozens of independent ones."""
+    shutter, features of one kind); a photo's hundreds of sightings weigh like some dozens of independent
+    ones."""
 
     def with_loss(self, loss_px: float) -> "Problem":
         """The same problem with another scale of the loss on sightings."""

@@ -110,7 +110,9 @@ def set_up(
     C0, sigma_C, stated, z_ground = _positions(members, priors, start, np.abs(a), repair)
     R0, sigma_R = _attitudes(members, priors, yaw, lies, repair, turned)
     start_C = np.column_stack([t.real, t.imag, z_ground + np.abs(a)])
-    start_R = np.array([_start_R(priors[m], y, bool(turned[m])) for m, y in zip(members.tolist(), yaw, strict=True)])
+    start_R = np.array(
+        [_start_R(priors[m], y, bool(turned[m])) for m, y in zip(members.tolist(), yaw, strict=True)]
+    )
     K0, sigma_K, free = _intrinsics([photos[m] for m in first], distortion)
     base = Problem(
         point=np.zeros(0, np.int64), photo=np.zeros(0, np.int64), px=np.zeros((0, 2)), sigma_px=np.zeros(0),
@@ -208,7 +210,11 @@ def pose_records(setup: Setup, state: State) -> dict[int, Pose]:
 def mirrored(camera: Camera) -> Camera:
     """The calibration of the same camera's files turned by 180 degrees."""
     return replace(
-        camera, cx=camera.width - 1 - camera.cx, cy=camera.height - 1 - camera.cy, p1=-camera.p1, p2=-camera.p2
+        camera,
+        cx=camera.width - 1 - camera.cx,
+        cy=camera.height - 1 - camera.cy,
+        p1=-camera.p1,
+        p2=-camera.p2,
     )
 
 
@@ -227,7 +233,17 @@ def camera_records(
             spread = np.sqrt(np.abs(covariance[at, at])) * setup.base.free[row]
             sigmas = tuple(float(s) for s in spread)
         cameras[key] = Camera(
-            width=photo.width, height=photo.height, focal=f, cx=cx, cy=cy, k1=k1, k2=k2, k3=k3, p1=p1, p2=p2, sigmas=sigmas
+            width=photo.width,
+            height=photo.height,
+            focal=f,
+            cx=cx,
+            cy=cy,
+            k1=k1,
+            k2=k2,
+            k3=k3,
+            p1=p1,
+            p2=p2,
+            sigmas=sigmas,
         )
     camera_of = {}
     for m in setup.members.tolist():

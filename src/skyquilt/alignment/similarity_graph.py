@@ -1,8 +1,8 @@
 """A first solution for all photos: every photo a similarity x = a p + t of the plane, from links alone.
 
-p = (x - cx) - i (y - cy) over the focal length (y up), a = height * exp(-i yaw). A linear least-squares fit of
-points shrinks the map to lower its cost; therefore scales and angles are averaged first and translations come
-after (B/C of the methods). Positions join last, robustly.
+p = (x - cx) - i (y - cy) over the focal length (y up), a = height * exp(-i yaw). A linear least-squares fit
+of points shrinks the map to lower its cost; therefore scales and angles are averaged first and translations
+come after (B/C of the methods). Positions join last, robustly.
 """
 
 from collections.abc import Sequence
@@ -77,12 +77,12 @@ def _spanning_start(members: NDArray, links: Sequence[PlaneLink], index: dict[in
     return log_a
 
 
-def _solve_differences(i: Array, j: Array, d: Complex, w: Array, count: int, anchor: Complex, wa: Array) -> Complex:
+def _solve_differences(
+    i: Array, j: Array, d: Complex, w: Array, count: int, anchor: Complex, wa: Array
+) -> Complex:
     """Least squares of x_j - x_i = d with weights w and of x = anchor with weights wa (>= 1e-6)."""
     rows = np.arange(len(i))
-    B = sparse.csr_matrix(
-        (np.r_[w, -w], (np.r_[rows, rows], np.r_[j, i])), (len(i), count)
-    )
+    B = sparse.csr_matrix((np.r_[w, -w], (np.r_[rows, rows], np.r_[j, i])), (len(i), count))
     normal = (B.T @ B + sparse.diags(wa**2)).tocsc()
     rhs = B.T @ (w * d) + wa**2 * anchor
     return np.asarray(sparse_linalg.splu(normal.astype(complex)).solve(rhs))
@@ -109,7 +109,9 @@ def _robust_differences(
 
 
 def solve_block(members: NDArray[np.int64], links: Sequence[PlaneLink]) -> PlaneSolution:
-    """Similarities of one connected block; its first photo has a = 1, t = 0 (units of that photo's height)."""
+    """Similarities of one connected block; its first photo has a = 1, t = 0 (units of
+    that photo's height).
+    """
     index = {int(m): k for k, m in enumerate(members)}
     i = np.array([index[link.a] for link in links], int)
     j = np.array([index[link.b] for link in links], int)
@@ -128,7 +130,9 @@ def solve_block(members: NDArray[np.int64], links: Sequence[PlaneLink]) -> Plane
     return PlaneSolution(members=members, a=a, t=t - t[0], link_error=np.maximum(error, 0.5 * turn))
 
 
-def fit_similarity(x: Complex, y: Complex, sigma: Array, *, turn: complex | None = None) -> tuple[complex, complex, float]:
+def fit_similarity(
+    x: Complex, y: Complex, sigma: Array, *, turn: complex | None = None
+) -> tuple[complex, complex, float]:
     """g, c and the robust misfit of y = g x + c; `turn` fixes g's direction when points cannot.
 
     Started from the median of all pairs' ratios, so up to half of the positions may lie.

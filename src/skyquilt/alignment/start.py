@@ -111,14 +111,16 @@ def _consistent_blocks(
 def georeference(
     solution: PlaneSolution, links: Sequence[PlaneLink], priors: Sequence[Prior]
 ) -> tuple[PlaneSolution, float, bool]:
-    """The block in map metres, the scatter of its positions in m (NaN without), and whether its scale is known."""
+    """The block in map metres, the scatter of its positions in m (NaN without), and
+    whether its scale is known.
+    """
     position = np.array([complex(p.map_C[0], p.map_C[1]) for p in priors])
     sigma = np.array([p.sigma_C[0] for p in priors])
     known = np.isfinite(position)
     if not known.any():
         turn = _turn(solution.a, priors)
-        g, metric = _scale_by_height(solution.a, priors)
-        scaled = replace(solution, a=solution.a * g * turn, t=solution.t * g * turn)
+        height, metric = _scale_by_height(solution.a, priors)
+        scaled = replace(solution, a=solution.a * height * turn, t=solution.t * height * turn)
         return scaled, np.nan, metric
     where = position[known]
     spread = float(np.abs(where - where.mean()).max()) if known.sum() > 1 else 0.0
@@ -135,7 +137,9 @@ def georeference(
 
 
 def _turn(a: NDArray[np.complex128], priors: Sequence[Prior]) -> complex:
-    """The direction that brings the block's yaws to the reported ones, by majority; 1 where none is reported."""
+    """The direction that brings the block's yaws to the reported ones, by majority; 1
+    where none is reported.
+    """
     yaw = np.radians([p.yaw_deg for p in priors])
     known = np.isfinite(yaw)
     if not known.any():
@@ -147,7 +151,9 @@ def _turn(a: NDArray[np.complex128], priors: Sequence[Prior]) -> complex:
 
 
 def _scale_by_height(a: NDArray[np.complex128], priors: Sequence[Prior]) -> tuple[float, bool]:
-    """Metres per block unit from heights above take-off, taken as heights above ground; else a nominal height."""
+    """Metres per block unit from heights above take-off, taken as heights above ground;
+    else a nominal height.
+    """
     height = np.array([p.map_C[2] for p in priors])
     ratio = (height / np.abs(a))[np.isfinite(height) & (height > 1)]
     if len(ratio):

@@ -37,7 +37,10 @@ class Tracks:
         keep = np.flatnonzero(sighting)[np.bincount(point, minlength=self.count)[point] >= 2]
         _, renumbered = np.unique(self.point[keep], return_inverse=True)
         return Tracks(
-            point=renumbered.astype(np.int64), photo=self.photo[keep], px=self.px[keep], sigma_px=self.sigma_px[keep]
+            point=renumbered.astype(np.int64),
+            photo=self.photo[keep],
+            px=self.px[keep],
+            sigma_px=self.sigma_px[keep],
         )
 
 
@@ -49,12 +52,17 @@ def build_tracks(features: Sequence[Features], links: Sequence[Link], *, sigma: 
     offset = np.r_[0, np.cumsum([len(f) for f in features])]
     if not links:
         return Tracks(
-            point=np.zeros(0, np.int64), photo=np.zeros(0, np.int64), px=np.zeros((0, 2)), sigma_px=np.zeros(0)
+            point=np.zeros(0, np.int64),
+            photo=np.zeros(0, np.int64),
+            px=np.zeros((0, 2)),
+            sigma_px=np.zeros(0),
         )
     a = np.concatenate([offset[k.a] + k.index_a for k in links])
     b = np.concatenate([offset[k.b] + k.index_b for k in links])
     total = int(offset[-1])
-    _, label = connected_components(sparse.coo_matrix((np.ones(len(a)), (a, b)), (total, total)), directed=False)
+    _, label = connected_components(
+        sparse.coo_matrix((np.ones(len(a)), (a, b)), (total, total)), directed=False
+    )
     used = np.unique(np.concatenate([a, b]))
     photo = np.searchsorted(offset, used, "right") - 1
     order = np.lexsort((photo, label[used]))
@@ -70,7 +78,8 @@ def build_tracks(features: Sequence[Features], links: Sequence[Link], *, sigma: 
 
 
 def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], *, per_photo: int, cells: int = 8) -> Tracks:
-    """The tracks an adjustment needs: long ones first, until every photo has `per_photo` spread over its area.
+    """The tracks an adjustment needs: long ones first, until every photo has `per_photo` spread over its
+    area.
 
     `sizes`: (width, height) of each photo.
     """

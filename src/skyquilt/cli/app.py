@@ -1,12 +1,35 @@
 """The commands, one file each."""
 
+from typing import Annotated
+
 import typer
 
+from skyquilt import __version__
 from skyquilt.cli import inspect as inspect_command
 from skyquilt.cli import mosaic as mosaic_command
 from skyquilt.cli import simulate as simulate_command
 
+EXIT_CODES = (
+    "Exit codes: 0 done, 1 other errors, 2 wrong options, 3 no readable photo, 4 photos cannot be aligned,"
+    " 5 output cannot be written, 6 malformed side file, 7 refused with a reason, 130 interrupted."
+)
+
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
-app.command("mosaic")(mosaic_command.command)
-app.command("inspect")(inspect_command.command)
-app.command("simulate")(simulate_command.command)
+app.command("mosaic", epilog=EXIT_CODES)(mosaic_command.command)
+app.command("inspect", epilog=EXIT_CODES)(inspect_command.command)
+app.command("simulate", epilog=EXIT_CODES)(simulate_command.command)
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"skyquilt {__version__}")
+        raise typer.Exit
+
+
+@app.callback(epilog=EXIT_CODES)
+def skyquilt(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
+    ] = False,
+) -> None:
+    """Drone photos to a georeferenced, orthorectified mosaic."""

@@ -8,44 +8,83 @@ import typer
 from skyquilt.cli.interrupt import ends_at_once
 from skyquilt.errors import UsageError
 
-METHOD_HELP = "How photos are aligned: auto, bundle, pose, position."
-
 
 def command(
     photos: Annotated[Path, typer.Argument(help="Folder of photos (subfolders included).")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
-    method: Annotated[str, typer.Option(help=METHOD_HELP)] = "auto",
-    gsd: Annotated[float | None, typer.Option(help="Ground size of a map pixel in cm. [default: the photos' own]")] = None,
-    crs: Annotated[str | None, typer.Option(help="Output CRS, e.g. EPSG:32633. [default: local UTM]")] = None,
-    gcp: Annotated[Path | None, typer.Option(help="Control points (gcp_list.txt). [default: the one beside the photos]")] = None,
-    geo: Annotated[Path | None, typer.Option(help="Positions: geo.txt, CSV, .MRK or .SRT. [default: geo.txt beside the photos]")] = None,
+    method: Annotated[
+        str, typer.Option(help="How photos are aligned: auto, bundle, pose, position.")
+    ] = "auto",
+    gsd: Annotated[
+        float | None, typer.Option(help="Ground size of a map pixel in cm.", show_default="the photos' own")
+    ] = None,
+    crs: Annotated[
+        str | None, typer.Option(help="Output CRS, e.g. EPSG:32633.", show_default="local UTM")
+    ] = None,
+    gcp: Annotated[
+        Path | None,
+        typer.Option(help="Control points.", show_default="gcp_list.txt among the photos, if any"),
+    ] = None,
+    geo: Annotated[
+        Path | None,
+        typer.Option(
+            help="Positions: geo.txt, CSV, .MRK or .SRT.", show_default="geo.txt among the photos, if any"
+        ),
+    ] = None,
     cameras: Annotated[Path | None, typer.Option(help="Calibrations (cameras.json).")] = None,
     bounds: Annotated[str | None, typer.Option(help="west,south,east,north in the output CRS.")] = None,
-    boundary: Annotated[Path | None, typer.Option(help="Polygon to cut the map to: GeoJSON, KML, GeoPackage, Shapefile.")] = None,
-    surface: Annotated[str, typer.Option(help="Heights: ties (tie points alone) or sweep (refined from the pictures).")] = "sweep",
-    blend: Annotated[str, typer.Option(help="Where photos meet: feather, first, average, multiband.")] = "feather",
+    boundary: Annotated[
+        Path | None, typer.Option(help="Polygon to cut the map to: GeoJSON, KML, GeoPackage, Shapefile.")
+    ] = None,
+    surface: Annotated[
+        str, typer.Option(help="Heights: ties (tie points alone) or sweep (refined from the pictures).")
+    ] = "sweep",
+    blend: Annotated[
+        str, typer.Option(help="Where photos meet: feather, first, average, multiband.")
+    ] = "feather",
     feather: Annotated[float, typer.Option(help="Width of feathered seams in map pixels.")] = 6.0,
-    balance: Annotated[bool, typer.Option("--balance/--no-balance", help="Bring photos to one brightness.")] = True,
-    compress: Annotated[str, typer.Option(help="auto, jpeg, or lossless: deflate, zstd, lzw, none.")] = "auto",
+    balance: Annotated[
+        bool, typer.Option("--balance/--no-balance", help="Bring photos to one brightness.")
+    ] = True,
+    compress: Annotated[
+        str, typer.Option(help="auto, jpeg, or lossless: deflate, zstd, lzw, none.")
+    ] = "auto",
     quality: Annotated[int, typer.Option(help="JPEG quality.")] = 85,
-    distortion: Annotated[str, typer.Option(help="Lens terms to calibrate: none, 2, 4, 6 (radial order), 6t (and tangential).")] = "4",
-    height: Annotated[float | None, typer.Option(help="Height above ground in m, for methods pose and position where altitudes do not tell it.")] = None,
-    heading: Annotated[float, typer.Option(help="Heading of all photos in degrees, for method position.")] = 0.0,
-    repair: Annotated[bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")] = True,
-    features: Annotated[int, typer.Option(help="Features per photo.")] = 2000,
+    distortion: Annotated[
+        str, typer.Option(help="Lens terms to calibrate: none, 2, 4, 6 (radial order), 6t (and tangential).")
+    ] = "4",
+    height: Annotated[
+        float | None,
+        typer.Option(help="Height above ground in m, for methods pose and position."),
+    ] = None,
+    heading: Annotated[
+        float, typer.Option(help="Heading of all photos in degrees, for method position.")
+    ] = 0.0,
+    repair: Annotated[
+        bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")
+    ] = True,
+    features: Annotated[int, typer.Option(help="Features per photo.")] = 1500,
     jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.")] = 0,
-    memory: Annotated[float | None, typer.Option(help="Memory to stay within, in GB. [default: 1.2]")] = None,
-    rerun_from: Annotated[str | None, typer.Option(help="Make everything anew from this stage on: features, links, align, surface, balance, mosaic, measure, report.")] = None,
-    overwrite: Annotated[bool, typer.Option(help="Replace the results of another run in OUTPUT.")] = False,
+    memory: Annotated[
+        float | None, typer.Option(help="Memory to stay within, in GB.", show_default="1.2")
+    ] = None,
+    rerun_from: Annotated[
+        str | None,
+        typer.Option(
+            help="Make everything anew from this stage on: features, links, align, surface, balance, mosaic,"
+            " measure, report."
+        ),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the results of another run in OUTPUT.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Say more: every stage's time.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
-) -> None:  # fmt: skip
+) -> None:
     """Turn a folder of drone photos into a georeferenced, orthorectified mosaic.
 
-    Sensible without any option. The same command again resumes a run that was killed. Exit codes: 0 done,
-    1 other errors, 2 wrong options, 3 no readable photo, 4 photos cannot be aligned, 5 output cannot be
-    written, 6 malformed side file, 130 interrupted.
+    Sensible without any option. The same command again resumes a run that was killed.
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
@@ -58,8 +97,10 @@ def command(
         raise UsageError("--quiet, --verbose and --json exclude one another")
     settings = MosaicSettings(
         method=method, gsd_cm=gsd, crs=crs, gcp=gcp, geo=geo, cameras=cameras, bounds=parse_bounds(bounds),
-        boundary=boundary, surface=surface, blend=blend, feather_px=feather, balance=balance, compress=compress, quality=quality,
-        distortion=distortion, height_m=height, heading_deg=heading, repair=repair, features=features, jobs=jobs,
+        boundary=boundary, surface=surface, blend=blend, feather_px=feather, balance=balance,
+        compress=compress, quality=quality,
+        distortion=distortion, height_m=height, heading_deg=heading, repair=repair, features=features,
+        jobs=jobs,
         memory_gb=memory,
     )  # fmt: skip
     events = iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)

@@ -48,31 +48,46 @@ def _bars(events: Iterable[Event], *, verbose: bool) -> None:
             elif isinstance(happened, StageFinished):
                 progress.update(tasks[happened.stage], completed=1, total=1)
                 if verbose:
-                    how = " (from an earlier run)" if happened.reused else ""
-                    progress.console.print(f"{happened.stage}: {happened.seconds:.2f} s, {happened.cpu_seconds:.2f} s of CPU{how}")
+                    progress.console.print(times(happened))
             elif isinstance(happened, Note):
-                progress.console.print(happened.text, style="yellow" if happened.warning else None, markup=False, highlight=False, soft_wrap=True)
+                progress.console.print(
+                    happened.text,
+                    style="yellow" if happened.warning else None,
+                    markup=False,
+                    highlight=False,
+                    soft_wrap=True,
+                )
             elif isinstance(happened, Result):
                 result = happened
     Console().print(summary(result), markup=False, highlight=False, soft_wrap=True)
+
+
+def times(happened: StageFinished) -> str:
+    """A finished stage in a line."""
+    how = " (from an earlier run)" if happened.reused else ""
+    return f"{happened.stage}: {happened.seconds:.2f} s, {happened.cpu_seconds:.2f} s of CPU{how}"
 
 
 def summary(result: Result) -> str:
     """The result in a few lines."""
     m = result.metrics
     lines = [
-        f"{m['photos_used']} of {m['photos_total']} photos in {len(m['blocks'])} block(s), method {m['method']}: {m['why']}",
-        f"map: {m['size_px'][0]} x {m['size_px'][1]} px at {m['gsd_m'] * 100:g} cm, {m['crs'] or 'not georeferenced'}",
+        f"{m['photos_used']} of {m['photos_total']} photos in {len(m['blocks'])} block(s),"
+        f" method {m['method']}: {m['why']}",
+        f"map: {m['size_px'][0]} x {m['size_px'][1]} px at {m['gsd_m'] * 100:g} cm,"
+        f" {m['crs'] or 'not georeferenced'}",
     ]
     if m["reprojection_error_px"]:
         seam = m["seam_disparity_px"]
         lines.append(
-            f"reprojection error {m['reprojection_error_px']['mean']:.2f} px, seams {seam['median']} px (median;"
-            f" {seam['measured']} of {seam['attempted']} measured)"
+            f"reprojection error {m['reprojection_error_px']['mean']:.2f} px, seams {seam['median']} px"
+            f" (median; {seam['measured']} of {seam['attempted']} measured)"
         )
     lines += [f"left out: {name}: {reason}" for name, reason in list(m["photos_rejected"].items())[:10]]
     if m["metadata_conflicts"]:
-        lines.append(f"{len(m['metadata_conflicts'])} contradictions between metadata and pixels: see the report")
+        lines.append(
+            f"{len(m['metadata_conflicts'])} contradictions between metadata and pixels: see the report"
+        )
     lines.append(f"{m['seconds']['total']:.1f} s, {m['cpu_seconds']:.1f} s of CPU, {m['peak_memory_mb']} MB")
     lines += [f"map:    {result.output / 'mosaic.tif'}", f"report: {result.output / 'report.html'}"]
     return "\n".join(lines)

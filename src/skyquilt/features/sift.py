@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.imaging.grey import full_px, shrink, to_grey8
-from skyquilt.model.features import Features
+from skyquilt.model.features import DESCRIPTOR_UNIT, Features
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,13 +17,13 @@ class Sift:
 
     count: int = 1500
     """Most keypoints kept per photo."""
-    longest: int = 1000
+    longest: int = 640
     """Longest side in px of the image searched; smaller photos are searched as they are."""
     contrast: float = 0.015
     """OpenCV's contrast threshold."""
     cells: int = 10
     """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(self, image: NDArray) -> Features:
         """Features of pixels (H, W[, C]) of a full sensor image."""
@@ -32,10 +32,9 @@ class Sift:
     def of_shrunken(self, small: NDArray, full: tuple[int, int]) -> Features:
         """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer to."""
         grey = to_grey8(small)
-        detector = cv2.SIFT_create(int(1.4 * self.count), contrastThreshold=self.contrast)
-        points, descriptors = detector.detectAndCompute(grey, None)
-        if descriptors is None:
-            points, descriptors = (), np.zeros((0, 128), np.float32)
+        detector = cv2.SIFT.create(int(1.4 * self.count), contrastThreshold=self.contrast)
+        points, found = detector.detectAndCompute(grey, None)
+        descriptors = np.zeros((0, 128), np.float32) if found is None else np.asarray(found, np.float32)
         xy = np.array([p.pt for p in points], np.float64).reshape(-1, 2)
         keep = _spread(xy, np.array([p.response for p in points]), grey.shape, self.count, self.cells)
         scale = full[1] / grey.shape[1]
@@ -44,10 +43,10 @@ class Sift:
         return Features(px=px, size=size, descriptors=_root(descriptors[keep]), scale=scale)
 
 
-def _root(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """RootSIFT: L1-normalised, then the square root, which has unit length."""
+def _root(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """RootSIFT: L1-normalised, then the square root, which has unit length; 8 bits hold it (see Features)."""
     total = np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
-    return np.asarray(np.sqrt(descriptors / total), np.float32)
+    return np.clip(np.rint(DESCRIPTOR_UNIT * np.sqrt(descriptors / total)), 0, 255).astype(np.uint8)
 
 
 def _spread(

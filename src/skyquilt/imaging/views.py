@@ -57,7 +57,9 @@ class Nodes:
     seen: NDArray[np.bool_]
     """(r, c) whether the node lies in the photo."""
     real: NDArray[np.bool_]
-    """(r, c) whether the projection means anything: before the camera, and where distortion does not fold back."""
+    """(r, c) whether the projection means anything: before the camera, and where
+    distortion does not fold back.
+    """
     height: float
     """Median height of the camera above the window's ground in m."""
 
@@ -103,20 +105,24 @@ def project_nodes(view: View, x: NDArray, y: NDArray, z: NDArray) -> Nodes:
     drop2 = np.maximum(d[..., 2] ** 2, 1e-6)
     return Nodes(
         view=view, u=u, v=v, seen=inside(view.camera, u, v), real=real,
-        score=((d[..., 0] ** 2 + d[..., 1] ** 2) / drop2).astype(np.float32), height=float(np.median(-d[..., 2])),
+        score=((d[..., 0] ** 2 + d[..., 1] ** 2) / drop2).astype(np.float32),
+        height=float(np.median(-d[..., 2])),
     )  # fmt: skip
 
 
 def inside(camera: Camera, u: NDArray, v: NDArray) -> NDArray[np.bool_]:
     """Whether photo pixels lie in the photo, its border excluded."""
     edge = BORDER_PX
-    return np.asarray((u > edge) & (v > edge) & (u < camera.width - 1 - edge) & (v < camera.height - 1 - edge))
+    return np.asarray(
+        (u > edge) & (v > edge) & (u < camera.width - 1 - edge) & (v < camera.height - 1 - edge)
+    )
 
 
 def inside_everywhere(nodes: Nodes, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Whether each pixel lies in the photo, from dense photo pixels u, v (h, w) of these nodes.
 
-    Next to a node without a real projection the interpolated u and v sweep over the whole photo: those do not count.
+    Next to a node without a real projection the interpolated u and v sweep over the whole photo: those do not
+    count.
     """
     within = inside(nodes.view.camera, u, v)
     if nodes.real.all():
@@ -160,8 +166,12 @@ def native_gsd(views: Sequence[View], surface: Surface) -> float:
     return float(np.median(drop / np.array([v.camera.focal for v in views])))
 
 
-def grid_of(views: Sequence[View], gsd: float, bounds: tuple[float, float, float, float] | None = None) -> Grid:
-    """The grid that covers all footprints, or the bounds (west, south, east, north) given, on multiples of gsd."""
+def grid_of(
+    views: Sequence[View], gsd: float, bounds: tuple[float, float, float, float] | None = None
+) -> Grid:
+    """The grid that covers all footprints, or the bounds (west, south, east, north)
+    given, on multiples of gsd.
+    """
     if bounds is None:
         low = np.min([v.footprint.min(0) for v in views], axis=0)
         high = np.max([v.footprint.max(0) for v in views], axis=0)

@@ -14,13 +14,13 @@ class Mutual:
 
     ratio: float = 0.85
     """Largest distance to the nearest over distance to the second nearest."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def __call__(self, a: Features, b: Features) -> Matches:
         """Putative matches of two photos."""
         if len(a) < 2 or len(b) < 2:
             return Matches(index_a=np.zeros(0, np.int64), index_b=np.zeros(0, np.int64))
-        similarity = a.descriptors @ b.descriptors.T
+        similarity = a.unit @ b.unit.T
         rows = np.arange(len(a))
         best = similarity.argmax(1)
         first = similarity[rows, best].copy()

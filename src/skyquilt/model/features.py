@@ -5,6 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+DESCRIPTOR_UNIT = 400
+"""What a component of 1 is stored as; components of a RootSIFT vector hardly exceed 0.6."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Features:
@@ -14,13 +17,19 @@ class Features:
     """(N, 2) in px of the full sensor image, centres at integers."""
     size: NDArray[np.float32]
     """(N,) diameter in px of the full sensor image."""
-    descriptors: NDArray[np.float32]
-    """(N, D), unit length: the dot product of two is their similarity."""
+    descriptors: NDArray[np.uint8]
+    """(N, D), DESCRIPTOR_UNIT times a vector of about unit length: a quarter of the memory of floats."""
     scale: float
     """Full-resolution px per px of the image the keypoints were found in."""
 
     def __len__(self) -> int:
         return len(self.px)
+
+    @property
+    def unit(self) -> NDArray[np.float32]:
+        """(N, D) descriptors of unit length: the dot product of two is their similarity."""
+        d = self.descriptors.astype(np.float32)
+        return d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), np.float32(1e-6))
 
     def __sizeof__(self) -> int:
         return self.px.nbytes + self.size.nbytes + self.descriptors.nbytes

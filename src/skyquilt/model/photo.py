@@ -39,7 +39,8 @@ class GeoPosition:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attitude:
-    """A measured camera attitude: R_ned_body = Rz(yaw) Ry(pitch) Rx(roll) of a body whose belly camera looks down.
+    """A measured camera attitude: R_ned_body = Rz(yaw) Ry(pitch) Rx(roll) of a body whose belly camera looks
+    down.
 
     The image top points along the body's nose, so yaw 0 = image top to true north, clockwise positive;
     pitch 0 = nadir, positive = looking ahead; roll positive = right wing down. Gimbal angles of other

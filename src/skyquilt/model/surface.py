@@ -33,8 +33,11 @@ class Surface:
         for k in range(0, column.shape[1], 30000):  # remap's maps must stay below 32768 columns
             parts.append(
                 cv2.remap(
-                    self.z, column[:, k : k + 30000], row[:, k : k + 30000], cv2.INTER_LINEAR,
+                    self.z,
+                    column[:, k : k + 30000],
+                    row[:, k : k + 30000],
+                    cv2.INTER_LINEAR,
                     borderMode=cv2.BORDER_REPLICATE,
-                )  # fmt: skip
+                )
             )
-        return np.concatenate(parts, 1).reshape(shape)
+        return np.concatenate(parts, 1, dtype=np.float32).reshape(shape)

@@ -15,7 +15,8 @@ class Nearest:
     """Photos whose footprints can overlap by the measured positions.
 
     Altitudes lie (A2 of the methods), so the footprint is not computed from them here: the caller gives the
-    ground distance within which photos overlap, learnt from links already found, or None to take neighbours only.
+    ground distance within which photos overlap, learnt from links already found, or None to take neighbours
+    only.
     """
 
     neighbours: int = 12

@@ -43,7 +43,7 @@ class Retrieval:
         return sorted(pairs)
 
     def _vectors(self, features: list[Features]) -> NDArray[np.float32]:
-        chosen = [f.descriptors[np.argsort(-f.size)[: self.sample]] for f in features]
+        chosen = [f.unit[np.argsort(-f.size)[: self.sample]] for f in features]
         words = self._vocabulary(np.concatenate(chosen))
         return np.stack([_vlad(d, words) for d in chosen])
 
@@ -63,7 +63,9 @@ class Retrieval:
 
 
 def _vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Residuals to the nearest words, summed, normalised per word and as a whole: unit vector (words * D,)."""
+    """Residuals to the nearest words, summed, normalised per word and as a whole: unit
+    vector (words * D,).
+    """
     total = np.zeros_like(words)
     if len(descriptors):
         nearest = (descriptors @ words.T).argmax(1)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
@@ -10,16 +11,17 @@ from numpy.typing import NDArray
 
 from skyquilt.config import Methods, MosaicSettings
 from skyquilt.errors import SideFileError, UsageError
+from skyquilt.imaging.views import STEP, View, grid_of, make_views, native_gsd
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
-from skyquilt.pipelines.intake import Intake
+from skyquilt.pipelines.intake import Intake, Pictures
 from skyquilt.raster import Block, CogWriter, RasterSpec, write_array
 from skyquilt.raster.boundary import inside as inside_polygon
 from skyquilt.raster.boundary import read_boundary
+from skyquilt.raster.spec import Compression
 from skyquilt.render.compose import Composed, Composer, PhotoPixels
 from skyquilt.render.exposure import NEUTRAL, Exposure
-from skyquilt.imaging.views import STEP, View, grid_of, make_views, native_gsd
 from skyquilt.run.clock import Steps
 from skyquilt.run.executor import in_order
 from skyquilt.run.folder import STATE
@@ -87,7 +89,7 @@ class Drawn:
 
 
 def survey_ground(
-    alignment: Alignment, intake: Intake, methods: Methods, settings: MosaicSettings, store: Store
+    alignment: Alignment, pictures: Pictures, methods: Methods, settings: MosaicSettings, store: Store
 ) -> Steps[Ground]:
     """Heights from the tie points (level ground where there are none), and the grid of the map.
 
@@ -110,7 +112,9 @@ def survey_ground(
     area = (w - margin, s - margin, e + margin, n + margin)
     key = digest(alignment.ties.xyz, area, methods.surface)
     surface = store.get_or(
-        "surface", key, lambda: methods.surface(alignment.ties.xyz, area) if len(alignment.ties.xyz) > 3 else level(z)
+        "surface",
+        key,
+        lambda: methods.surface(alignment.ties.xyz, area) if len(alignment.ties.xyz) > 3 else level(z),
     )
     views = tuple(make_views(alignment, surface))
     grid = grid_of(views, gsd, bounds)
@@ -118,7 +122,7 @@ def survey_ground(
         sweep, known = methods.sweep, surface
         surface = store.get_or(
             "surface", digest(key, poses_digest(alignment), grid, sweep),
-            lambda: sweep(known, [v for v in views if held(alignment, v.photo)], grid, intake.grey),
+            lambda: sweep(known, [v for v in views if held(alignment, v.photo)], grid, pictures),
         )  # fmt: skip
     yield 1, 1
     return Ground(surface=surface, views=views, grid=grid, native_gsd=native)
@@ -133,9 +137,11 @@ def _check_place(
         return
     outline = np.concatenate([v.footprint for v in views]) + alignment.frame.origin
     (west, south), (east, north) = outline.min(0), outline.max(0)
-    where = f"which cover {west:.0f},{south:.0f},{east:.0f},{north:.0f} in {alignment.frame.crs or 'their own frame'}"
+    frame = alignment.frame.crs or "their own frame"
+    where = f"which cover {west:.0f},{south:.0f},{east:.0f},{north:.0f} in {frame}"
     if settings.bounds is not None:
-        raise UsageError(f"--bounds {','.join(f'{b:g}' for b in settings.bounds)} lies outside the photos, {where}")
+        asked = ",".join(f"{b:g}" for b in settings.bounds)
+        raise UsageError(f"--bounds {asked} lies outside the photos, {where}")
     raise SideFileError(f"the area of --boundary {settings.boundary} lies outside the photos, {where}")
 
 
@@ -150,8 +156,8 @@ def _check_size(grid: Grid, native: float) -> None:
         )
     if wide > WIDEST_M or grid.width * grid.height > MOST_PIXELS:
         raise UsageError(
-            f"the map would be {wide / 1000:.0f} km wide, {size} at {grid.gsd * 100:g} cm: the positions of some"
-            " photos (or --bounds) must be wrong; correct them with --geo, or choose a larger --gsd"
+            f"the map would be {wide / 1000:.0f} km wide, {size} at {grid.gsd * 100:g} cm: the positions of"
+            " some photos (or --bounds) must be wrong; correct them with --geo, or choose a larger --gsd"
         )
 
 
@@ -159,7 +165,9 @@ def poses_digest(alignment: Alignment) -> str:
     """What of an alignment shapes the map."""
     order = sorted(alignment.poses)
     stack = [
-        np.concatenate([alignment.poses[i].cam_R_map.ravel(), alignment.poses[i].map_C, alignment.camera(i).vector])
+        np.concatenate(
+            [alignment.poses[i].cam_R_map.ravel(), alignment.poses[i].map_C, alignment.camera(i).vector]
+        )
         for i in order
     ]
     return digest(order, np.array(stack), alignment.frame)
@@ -190,7 +198,9 @@ def _local_bounds(settings: MosaicSettings, alignment: Alignment) -> tuple[float
     return bounds[0] - x, bounds[1] - y, bounds[2] - x, bounds[3] - y
 
 
-def balance(intake: Intake, ground: Ground, alignment: Alignment, methods: Methods, settings: MosaicSettings) -> Exposure:
+def balance(
+    intake: Intake, ground: Ground, alignment: Alignment, methods: Methods, settings: MosaicSettings
+) -> Exposure:
     """Exposure of the placed 8-bit photos; neutral for measured values."""
     if not settings.balance or intake.photos[0].dtype != "uint8":
         return NEUTRAL
@@ -203,7 +213,12 @@ def _three(thumbnail: NDArray) -> NDArray:
 
 
 def composer(
-    intake: Intake, ground: Ground, alignment: Alignment, exposure: Exposure, methods: Methods, pixels: PhotoPixels
+    intake: Intake,
+    ground: Ground,
+    alignment: Alignment,
+    exposure: Exposure,
+    methods: Methods,
+    pixels: PhotoPixels,
 ) -> Composer:
     """The composer of the survey's map."""
     first = intake.photos[ground.views[0].photo]
@@ -222,11 +237,13 @@ def geotransform(grid: Grid, alignment: Alignment) -> tuple[float, float, float,
 def mosaic_spec(compose: Composer, alignment: Alignment, settings: MosaicSettings, unit: str) -> RasterSpec:
     """How mosaic.tif is written."""
     picture = compose.dtype == np.uint8
-    compress = settings.compress
-    if compress == "auto":
+    compress = cast(Compression, settings.compress)
+    if settings.compress == "auto":
         compress = "jpeg" if picture and compose.bands in (1, 3) else "zstd"
     if compress == "jpeg" and not (picture and compose.bands in (1, 3)):
-        raise UsageError(f"--compress jpeg is for 8-bit pictures; these photos are {compose.dtype}, {compose.bands} bands")
+        raise UsageError(
+            f"--compress jpeg is for 8-bit pictures; these photos are {compose.dtype}, {compose.bands} bands"
+        )
     real = compose.dtype.kind == "f"
     return RasterSpec(
         width=compose.grid.width, height=compose.grid.height, bands=compose.bands, dtype=str(compose.dtype),
@@ -274,7 +291,13 @@ def draw(
 def _blocks(spec: RasterSpec) -> list[Block]:
     """All blocks of the map, finished or not."""
     return [
-        Block(row0=row, col0=col, height=min(BLOCK, spec.height - row), width=min(BLOCK, spec.width - col), tile=spec.tile)
+        Block(
+            row0=row,
+            col0=col,
+            height=min(BLOCK, spec.height - row),
+            width=min(BLOCK, spec.width - col),
+            tile=spec.tile,
+        )
         for row in range(0, spec.height, BLOCK)
         for col in range(0, spec.width, BLOCK)
     ]
@@ -293,7 +316,9 @@ def _shot_numbers(compose: Composer) -> NDArray[np.uint32]:
     return table
 
 
-def _extras(composed: Composed, valid: NDArray[np.bool_], table: NDArray[np.uint32], factor: int) -> BlockExtras:
+def _extras(
+    composed: Composed, valid: NDArray[np.bool_], table: NDArray[np.uint32], factor: int
+) -> BlockExtras:
     preview, shown = _reduced(composed.pixels, valid, factor)
     numbers = table[np.where(_thinned(valid), _thinned(composed.photo), -1)]
     return BlockExtras(provenance=numbers, views=composed.views, preview=preview, shown=shown)
@@ -304,7 +329,11 @@ def _thinned(numbers: NDArray) -> NDArray:
     half = PROVENANCE // 2
     thin = numbers[half::PROVENANCE, half::PROVENANCE]
     rows, columns = -(-numbers.shape[0] // PROVENANCE), -(-numbers.shape[1] // PROVENANCE)
-    return np.pad(thin, ((0, rows - thin.shape[0]), (0, columns - thin.shape[1])), mode="edge") if thin.size else numbers[:1, :1]
+    return (
+        np.pad(thin, ((0, rows - thin.shape[0]), (0, columns - thin.shape[1])), mode="edge")
+        if thin.size
+        else numbers[:1, :1]
+    )
 
 
 def _blanked(pixels: NDArray, valid: NDArray[np.bool_]) -> NDArray:
@@ -324,7 +353,9 @@ def _keeper(
         return None
     polygon = read_boundary(settings.boundary, alignment.frame.crs)
     transform = geotransform(compose.grid, alignment)
-    return lambda b: inside_polygon(polygon, transform, row0=b.row0, col0=b.col0, height=b.height, width=b.width)
+    return lambda b: inside_polygon(
+        polygon, transform, row0=b.row0, col0=b.col0, height=b.height, width=b.width
+    )
 
 
 def preview_factor(grid: Grid) -> int:
@@ -338,9 +369,11 @@ def preview_factor(grid: Grid) -> int:
 def _reduced(pixels: NDArray, valid: NDArray[np.bool_], factor: int) -> tuple[NDArray, NDArray[np.uint8]]:
     """Area averages of the valid pixels (h, w, bands), and how much of each cell is valid (0 to 255)."""
     size = (-(-pixels.shape[1] // factor), -(-pixels.shape[0] // factor))
-    share = cv2.resize(valid.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA)
+    opaque = valid.view(np.uint8) * np.uint8(255)
+    share = np.asarray(cv2.resize(opaque, size, interpolation=cv2.INTER_AREA), np.uint8)
     solid = np.nan_to_num(pixels) if pixels.dtype.kind == "f" else pixels
-    mean = cv2.resize(solid, size, interpolation=cv2.INTER_AREA).reshape(size[1], size[0], -1)
+    mean: NDArray = np.asarray(cv2.resize(solid, size, interpolation=cv2.INTER_AREA))
+    mean = mean.reshape(size[1], size[0], -1)
     if share.min() < 255:  # pixels that are not valid are zero: divide by what was
         whole = mean.astype(np.float32) * (255.0 / np.maximum(share, 1))[..., None]
         mean = (np.minimum(whole, 255) if pixels.dtype == np.uint8 else whole).astype(pixels.dtype)
@@ -365,7 +398,11 @@ class _Companions:
 
     def __init__(self, grid: Grid, bands: int, dtype: np.dtype) -> None:
         self.grid, self.factor = grid, preview_factor(grid)
-        self.fine, self.coarse, small = grid.coarser(PROVENANCE), grid.coarser(STEP), grid.coarser(self.factor)
+        self.fine, self.coarse, small = (
+            grid.coarser(PROVENANCE),
+            grid.coarser(STEP),
+            grid.coarser(self.factor),
+        )
         self.provenance = np.zeros((self.fine.height, self.fine.width), np.uint32)
         self.views = np.zeros((self.coarse.height, self.coarse.width), np.uint16)
         self.preview = np.zeros((small.height, small.width, bands), dtype)
@@ -383,14 +420,21 @@ class _Companions:
 def _write_companions(output: Path, whole: _Companions, alignment: Alignment) -> None:
     top = int(whole.provenance.max(initial=0))
     for name, array, grid, kind in (
-        ("provenance.tif", whole.provenance, whole.fine, "uint8" if top < 256 else "uint16" if top < 65536 else "uint32"),
+        (
+            "provenance.tif",
+            whole.provenance,
+            whole.fine,
+            "uint8" if top < 256 else "uint16" if top < 65536 else "uint32",
+        ),
         ("views.tif", whole.views, whole.coarse, "uint8" if whole.views.max(initial=0) < 256 else "uint16"),
     ):
         write_array(
             output / name, array.astype(kind),
             RasterSpec(
-                width=grid.width, height=grid.height, bands=1, dtype=kind, transform=geotransform(grid, alignment),
-                crs=alignment.frame.crs, compress="deflate", nodata=0.0, overviews="mode" if name.startswith("p") else "max",
+                width=grid.width, height=grid.height, bands=1, dtype=kind,
+                transform=geotransform(grid, alignment),
+                crs=alignment.frame.crs, compress="deflate", nodata=0.0,
+                overviews="mode" if name.startswith("p") else "max",
                 tags={"SOFTWARE": "Skyquilt"},
             ),
         )  # fmt: skip
@@ -399,13 +443,18 @@ def _write_companions(output: Path, whole: _Companions, alignment: Alignment) ->
 def write_surface(output: Path, ground: Ground, alignment: Alignment) -> None:
     """surface.tif: heights over the map's area, and what they count from in its tags."""
     grid = ground.grid
-    factor = max(1, int(ground.surface.cell / grid.gsd)) if ground.surface.source == "tie points" else max(grid.width, grid.height)
+    factor = (
+        max(1, int(ground.surface.cell / grid.gsd))
+        if ground.surface.source == "tie points"
+        else max(grid.width, grid.height)
+    )
     coarse = grid.coarser(factor)
     x, y = np.meshgrid(coarse.x(np.arange(coarse.width)), coarse.y(np.arange(coarse.height)))
+    about = {"VERTICAL_DATUM": alignment.frame.vertical_datum, "SOURCE": ground.surface.source}
     spec = RasterSpec(
-        width=coarse.width, height=coarse.height, bands=1, dtype="float32", transform=geotransform(coarse, alignment),
-        crs=alignment.frame.crs, compress="zstd", nodata=float("nan"),
-        tags={"SOFTWARE": "Skyquilt", "VERTICAL_DATUM": alignment.frame.vertical_datum, "SOURCE": ground.surface.source},
+        width=coarse.width, height=coarse.height, bands=1, dtype="float32",
+        transform=geotransform(coarse, alignment), crs=alignment.frame.crs, compress="zstd",
+        nodata=float("nan"), tags={"SOFTWARE": "Skyquilt"} | about,
     )  # fmt: skip
     write_array(output / "surface.tif", ground.surface.at(x, y).astype(np.float32), spec)
 
@@ -430,7 +479,8 @@ def single_kind(intake: Intake) -> Intake:
     odd = tuple(
         RejectedPhoto(
             name=p.name,
-            reason=f"its pixels ({p.channels} x {p.dtype}, {p.band}) differ from the survey's ({common[0]} x {common[1]}, {common[2]})",
+            reason=f"its pixels ({p.channels} x {p.dtype}, {p.band}) differ from the survey's"
+            f" ({common[0]} x {common[1]}, {common[2]})",
         )
         for i, p in enumerate(intake.photos)
         if i not in keep

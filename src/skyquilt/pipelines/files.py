@@ -13,11 +13,11 @@ from pyproj import Transformer
 from skyquilt import __version__
 from skyquilt.geometry.camera_formats import camera_to_opensfm
 from skyquilt.geometry.frames import angles_from_cam_R_map, rotation_from_vector
+from skyquilt.imaging.views import View
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment
 from skyquilt.raster import vector
 from skyquilt.raster.atomic import write_text
-from skyquilt.imaging.views import View
 
 MOST_POINTS = 20000
 """Tie points written to reconstruction.json."""
@@ -46,11 +46,14 @@ def shot_properties(photo: Photo, alignment: Alignment, i: int) -> dict[str, Any
     yaw, pitch, roll = angles_from_cam_R_map(pose.cam_R_map)
     block = next((k for k, b in enumerate(alignment.blocks) if i in b), -1)
     return {
-        "filename": photo.name, "camera": alignment.camera_of[i], "focal": camera.focal / max(photo.width, photo.height),
-        "width": photo.width, "height": photo.height, "capture_time": photo.time.timestamp() if photo.time else None,
+        "filename": photo.name, "camera": alignment.camera_of[i],
+        "focal": camera.focal / max(photo.width, photo.height),
+        "width": photo.width, "height": photo.height,
+        "capture_time": photo.time.timestamp() if photo.time else None,
         "translation": [float(v) for v in in_crs(alignment, pose.map_C)],
         "rotation": rotation_vector(pose.cam_R_map),
-        "yaw": round((yaw + alignment.frame.convergence_deg) % 360, 3), "pitch": round(pitch, 3), "roll": round(roll, 3),
+        "yaw": round((yaw + alignment.frame.convergence_deg) % 360, 3), "pitch": round(pitch, 3),
+        "roll": round(roll, 3),
         "block": block, "tie_points": int((alignment.ties.photo == i).sum()),
     }  # fmt: skip
 
@@ -63,14 +66,18 @@ def write_shots(path: Path, photos: Sequence[Photo], alignment: Alignment, order
     vector.points(path, features, crs=alignment.frame.crs)
 
 
-def write_footprints(path: Path, photos: Sequence[Photo], alignment: Alignment, views: Sequence[View]) -> None:
+def write_footprints(
+    path: Path, photos: Sequence[Photo], alignment: Alignment, views: Sequence[View]
+) -> None:
     """footprints.geojson: the ground that each photo shows."""
     x, y = alignment.frame.origin
-    features = [([v.footprint + (x, y)], {"filename": photos[v.photo].name}) for v in views]
+    features = [([v.footprint + np.array([x, y])], {"filename": photos[v.photo].name}) for v in views]
     vector.polygons(path, features, crs=alignment.frame.crs)
 
 
-def write_reconstruction(path: Path, photos: Sequence[Photo], alignment: Alignment, colours: NDArray | None) -> None:
+def write_reconstruction(
+    path: Path, photos: Sequence[Photo], alignment: Alignment, colours: NDArray | None
+) -> None:
     """reconstruction.json in OpenSfM's form: topocentric east-north-up about `reference_lla`."""
     enu = Topocentric(alignment)
     shots = {}
@@ -82,16 +89,22 @@ def write_reconstruction(path: Path, photos: Sequence[Photo], alignment: Alignme
             "translation": [float(v) for v in -R @ C], "orientation": 1, "capture_time": 0.0,
             "gps_position": [float(v) for v in C], "gps_dop": 15.0,
         }  # fmt: skip
-    chosen = np.linspace(0, len(alignment.ties.xyz) - 1, min(MOST_POINTS, len(alignment.ties.xyz))).astype(int)
+    chosen = np.linspace(0, len(alignment.ties.xyz) - 1, min(MOST_POINTS, len(alignment.ties.xyz))).astype(
+        int
+    )
     coordinates = enu(alignment.ties.xyz[chosen]) if len(chosen) else np.zeros((0, 3))
     points = {
-        str(k): {"coordinates": [round(float(v), 4) for v in c], "color": [128.0, 128.0, 128.0] if colours is None else [float(v) for v in colours[k]]}
+        str(k): {
+            "coordinates": [round(float(v), 4) for v in c],
+            "color": [128.0, 128.0, 128.0] if colours is None else [float(v) for v in colours[k]],
+        }
         for k, c in zip(chosen.tolist(), coordinates, strict=True)
     }
     used = {alignment.camera_of[i] for i in alignment.poses}
     record = {
         "cameras": {key: camera_to_opensfm(alignment.cameras[key]) for key in sorted(used)},
-        "shots": shots, "points": points, "reference_lla": enu.reference, "biases": {}, "rig_cameras": {}, "rig_instances": {},
+        "shots": shots, "points": points, "reference_lla": enu.reference, "biases": {}, "rig_cameras": {},
+        "rig_instances": {},
     }  # fmt: skip
     write_text(path, json.dumps([record]))
 
@@ -134,10 +147,16 @@ class Topocentric:
 
 def write_run(path: Path, settings: Mapping[str, Any], photos: str, commit: str | None, method: str) -> None:
     """run.toml: what was asked for, by which version."""
-    lines = [f"version = {json.dumps(__version__)}", f"commit = {json.dumps(commit or 'unknown')}",
-             f"photos = {json.dumps(photos)}", f"method_used = {json.dumps(method)}", "", "[settings]"]  # fmt: skip
-    lines += [f"{key} = {json.dumps(value)}" for key, value in settings.items()]
+    about = {"version": __version__, "commit": commit or "unknown", "photos": photos, "method_used": method}
+    lines = [f"{key} = {_toml(value)}" for key, value in about.items()]
+    lines += ["", "[settings]", *(f"{key} = {_toml(value)}" for key, value in settings.items())]
     write_text(path, "\n".join(lines) + "\n")
+
+
+def _toml(value: Any) -> str:
+    """JSON is TOML, but for characters beyond 16 bits, lone surrogates (undecodable file names) and DEL."""
+    text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return text.encode("utf-8", "replace").decode()
 
 
 def source_commit() -> str | None:

@@ -1,6 +1,6 @@
 """Photos in: what they say, their features, and a thumbnail each, each photo decoded once."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -17,8 +17,12 @@ from skyquilt.run.executor import in_order
 from skyquilt.run.pixel_cache import PixelCache
 from skyquilt.run.store import Store, digest
 
-PICTURE = 500
-"""Longest side in px of the grey pictures kept for the search of heights."""
+PICTURE = 1000
+"""Longest side in px of the grey pictures kept for sharpening sightings and the search of heights."""
+KEPT_BYTES = 150_000_000
+"""Grey pictures held in memory at a time; the others wait in the store."""
+PhotoPixels = Callable[[int], NDArray]
+"""Full-size pixels of a photo by its index."""
 THUMBNAIL = 256
 """Longest side in px of the thumbnails kept for exposure and the report."""
 
@@ -31,8 +35,6 @@ class Looked:
     """Keypoints."""
     thumbnail: NDArray
     """(h, w[, bands])."""
-    picture: NDArray[np.uint8]
-    """(h, w) grey, longest side PICTURE px, for the search of heights."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,27 +53,63 @@ class Intake:
         """Features per photo."""
         return [k.features for k in self.looked]
 
-    def grey(self, photo: int, longest: int) -> NDArray[np.uint8]:
-        """Grey picture of a photo, its longest side at most `longest` px."""
-        return shrink(self.looked[photo].picture, longest)[0]
+
+class Pictures:
+    """Grey pictures of the photos, from the store, the last ones used at hand."""
+
+    def __init__(self, photos: Sequence[Photo], pixels: PhotoPixels, store: Store) -> None:
+        self._photos, self._pixels, self._store = photos, pixels, store
+        self._cache = PixelCache(read=self._load, budget_bytes=KEPT_BYTES)
+        self._small = PixelCache(read=self._shrunken, budget_bytes=KEPT_BYTES // 3)
+        self._longest = 0
+
+    def __call__(self, photo: int, longest: int) -> NDArray[np.uint8]:
+        """Grey picture of a photo (index), its longest side at most `longest` px."""
+        if longest >= PICTURE:
+            return self._cache(photo)
+        if longest != self._longest:
+            self._small.clear()
+            self._longest = longest
+        return self._small(photo)
+
+    def _shrunken(self, photo: int) -> NDArray[np.uint8]:
+        return np.ascontiguousarray(shrink(self._cache(photo), self._longest)[0])
+
+    def _load(self, photo: int) -> NDArray[np.uint8]:
+        return self._store.get_or(
+            "pictures", picture_key(self._photos[photo]), lambda: picture_of(self._pixels(photo))
+        )
 
 
-def look(photo: Photo, index: int, cache: PixelCache, methods: Methods) -> Looked:
-    """Features and thumbnail of a photo.
+def picture_key(photo: Photo) -> str:
+    """The key of a photo's grey picture in the store."""
+    return digest(photo.digest, PICTURE)
+
+
+def picture_of(pixels: NDArray) -> NDArray[np.uint8]:
+    """The grey picture of a photo's pixels."""
+    return np.ascontiguousarray(to_grey8(shrink(pixels, PICTURE)[0]))
+
+
+def look(photo: Photo, index: int, cache: PhotoPixels, methods: Methods, store: Store) -> Looked:
+    """Features and thumbnail of a photo; its grey picture goes to the store.
 
     Raises:
         UnreadablePhotoError: its pixels cannot be decoded.
     """
     pixels = cache(index)
-    small, _ = shrink(pixels, methods.sift.longest)
+    middle, _ = shrink(pixels, PICTURE)
+    store.put("pictures", picture_key(photo), np.ascontiguousarray(to_grey8(middle)))
+    small, _ = shrink(middle, methods.sift.longest)
     thumbnail, _ = shrink(small, THUMBNAIL)
     return Looked(
-        features=methods.sift.of_shrunken(small, pixels.shape[:2]), thumbnail=np.ascontiguousarray(thumbnail),
-        picture=to_grey8(shrink(small, PICTURE)[0]),
-    )  # fmt: skip
+        features=methods.sift.of_shrunken(small, pixels.shape[:2]), thumbnail=np.ascontiguousarray(thumbnail)
+    )
 
 
-def take_in(photos: Sequence[Photo], cache: PixelCache, methods: Methods, store: Store, jobs: int) -> Steps[Intake]:
+def take_in(
+    photos: Sequence[Photo], cache: PixelCache, methods: Methods, store: Store, jobs: int
+) -> Steps[Intake]:
     """Looks at every photo, or finds in the store what an earlier look gave.
 
     Raises:
@@ -82,8 +120,8 @@ def take_in(photos: Sequence[Photo], cache: PixelCache, methods: Methods, store:
     def one(index: int) -> Looked | RejectedPhoto:
         photo = photos[index]
         try:
-            key = digest(photo.digest, methods.sift, THUMBNAIL, PICTURE)
-            return store.get_or("features", key, lambda: look(photo, index, cache, methods))
+            key = digest(photo.digest, methods.sift, THUMBNAIL)
+            return store.get_or("features", key, lambda: look(photo, index, cache, methods, store))
         except UnreadablePhotoError as error:
             return RejectedPhoto(name=photo.name, reason=str(error))
 

@@ -1,6 +1,7 @@
 """How good the result is, in figures: everything that goes into metrics.json but times."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,7 @@ def _rms(values: NDArray[np.float64]) -> float:
 def alignment_figures(alignment: Alignment, priors: Sequence[Prior]) -> dict[str, Any]:
     """Blocks, residuals, calibration, control."""
     error = np.linalg.norm(alignment.ties.residual_px, axis=1)
+    rms_px = float(np.sqrt((error**2).mean())) if len(error) else None
     residual = gps_residuals(alignment, priors) if alignment.frame.crs else np.zeros((0, 3))
     rms = [_rms(axis[np.isfinite(axis)]) for axis in residual.T]
     loo = alignment.loo_rms_m if alignment.frame.crs else None
@@ -46,15 +48,15 @@ def alignment_figures(alignment: Alignment, priors: Sequence[Prior]) -> dict[str
         "blocks": [len(b) for b in alignment.blocks],
         "gps_residual_rms_m": xyz(rms),
         "gps_leave_one_out_rms_m": xyz(np.where(np.isfinite(rms), loo, np.nan) if loo is not None else None),
-        "reprojection_error_px": (
-            {"mean": _round(float(error.mean())), "rms": _round(float(np.sqrt((error**2).mean())))} if len(error) else None
-        ),
+        "reprojection_error_px": {"mean": _round(error.mean()),
+        "rms": _round(rms_px)} if len(error) else None,
         "tie_points": len(alignment.ties.xyz),
         "sightings": len(alignment.ties.point),
         "control": [
             {
                 "name": c.name, "check": c.check, "dx_m": _round(c.error_m[0]), "dy_m": _round(c.error_m[1]),
-                "dz_m": _round(c.error_m[2]), "reprojection_px": _round(c.reprojection_px), "sightings": c.sightings,
+                "dz_m": _round(c.error_m[2]), "reprojection_px": _round(c.reprojection_px),
+                "sightings": c.sightings,
             }
             for c in alignment.control
         ],
@@ -74,13 +76,19 @@ def camera_figures(photos: Sequence[Photo], alignment: Alignment) -> dict[str, A
             name: {"value": _round(value, 6), "sigma": _round(sigma, 6)}
             for name, value, sigma in zip(PARAMETERS, camera.vector, sigmas, strict=True)
         }
-        out[key]["focal"] |= {"prior": _round(focal.px, 2), "prior_sigma": _round(focal.sigma_px, 2), "source": focal.source}
+        out[key]["focal"] |= {
+            "prior": _round(focal.px, 2),
+            "prior_sigma": _round(focal.sigma_px, 2),
+            "source": focal.source,
+        }
     return out
 
 
 def figures(
-    *, photos: Sequence[Photo], total: int, rejected: Sequence[RejectedPhoto], priors: Sequence[Prior], links: Links,
-    alignment: Alignment, ground: Ground, drawn: Drawn, seams: Mapping[str, Any], conflicts: Sequence[MetadataConflict],
+    *, photos: Sequence[Photo], total: int, rejected: Sequence[RejectedPhoto], priors: Sequence[Prior],
+    links: Links,
+    alignment: Alignment, ground: Ground, drawn: Drawn, seams: Mapping[str, Any],
+    conflicts: Sequence[MetadataConflict],
     notes: Sequence[str],
 ) -> dict[str, Any]:  # fmt: skip
     """The figures of a run, without times."""
@@ -104,10 +112,7 @@ def figures(
         "links": len(links.links),
         "pairs_rejected": _reasons([r.reason for r in links.rejected]),
         "seam_disparity_px": seams,
-        "metadata_conflicts": [
-            {"photo": c.photo, "field": c.field, "reported": c.reported, "estimated": c.estimated, "meaning": c.meaning}
-            for c in conflicts
-        ],
+        "metadata_conflicts": [asdict(c) for c in conflicts],
         "cameras": camera_figures(photos, alignment),
         "notes": list(notes),
     }  # fmt: skip

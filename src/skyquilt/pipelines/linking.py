@@ -28,7 +28,9 @@ class Links:
     """Pairs that do not, with reasons."""
 
 
-def link_up(intake: Intake, priors: Sequence[Prior], methods: Methods, store: Store, jobs: int) -> Steps[Links]:
+def link_up(
+    intake: Intake, priors: Sequence[Prior], methods: Methods, store: Store, jobs: int
+) -> Steps[Links]:
     """Neighbours first; what they overlap tells how far the other candidates may lie apart."""
     n = len(intake.photos)
     xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)

@@ -12,36 +12,45 @@ import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from numpy.typing import NDArray
 
+from skyquilt import __version__
 from skyquilt.alignment.conflicts import conflicts
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.config import Methods, MosaicSettings, methods
-from skyquilt.model import camera, event, features, poses, raster, surface
+from skyquilt.errors import SkyquiltError, UnreadablePhotoError, UsageError
+from skyquilt.model import camera, features, poses, raster, surface
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.model.photo import ControlPoint, Photo, RejectedPhoto, Survey
-from skyquilt.pipelines import drawing, files, intake, judging, linking, placing, reporting
-from skyquilt.errors import SkyquiltError, UnreadablePhotoError, UsageError
 from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.survey import read_survey
-from skyquilt.raster.atomic import write_text
+from skyquilt.pipelines import drawing, intake, judging, linking, placing, reporting
 from skyquilt.raster.boundary import read_boundary
-from skyquilt.run.clock import Clock, Steps, cpu_seconds, peak_memory_mb
+from skyquilt.run.clock import Clock, Steps
 from skyquilt.run.folder import STATE, RunFolder, open_run
 from skyquilt.run.pixel_cache import PixelCache
 from skyquilt.run.store import Store, digest
 
+T = TypeVar("T")
 STAGES = ("read", "features", "links", "align", "surface", "balance", "mosaic", "measure", "report")
 """Stages in order."""
-ARTEFACTS = {"features": "features", "links": "links", "align": "alignment", "surface": "surface", "mosaic": "blocks"}
+ARTEFACTS = {
+    "features": "features",
+    "read": "pictures",
+    "links": "links",
+    "align": "alignment",
+    "surface": "surface",
+    "mosaic": "blocks",
+}
 """Stage -> folder in the store."""
 REGISTRY = {
     c.__name__: c
     for c in (
-        intake.Looked, features.Features, features.Link, features.RejectedLink, features.Matches, camera.Camera,
+        intake.Looked, features.Features, features.Link, features.RejectedLink, features.Matches,
+        camera.Camera,
         poses.Alignment, poses.MapFrame, poses.Pose, poses.TiePoints, poses.ControlResidual, surface.Surface,
         RejectedPhoto, drawing.BlockExtras, raster.Grid,
     )
@@ -62,7 +71,8 @@ def iter_mosaic(
     parts, jobs = methods(settings), settings.jobs or os.cpu_count() or 1
     _apart(folder, Path(output))
     survey, control = _read(folder, settings)
-    run = open_run(Path(output), run_key(survey, control, settings), overwrite=overwrite, again=rerun_from is not None)
+    run_id = run_key(survey, control, settings, parts)
+    run = open_run(Path(output), run_id, overwrite=overwrite, again=rerun_from is not None)
     store = Store(folder=run.store, registry=REGISTRY)
     _forget(run, store, rerun_from)
     if run.done and (former := _figures(run.path / "metrics.json")):
@@ -76,17 +86,29 @@ def iter_mosaic(
     cache = PixelCache(read=lambda i: read_color(survey.photos[i]), budget_bytes=pixel_budget(settings))
     taken = yield from clock.stage("features", intake.take_in(survey.photos, cache, parts, store, jobs))
     taken, cache = _one_kind(taken, survey, cache, settings)
+    pixels = _still_there(taken.photos, cache)
+    pictures = intake.Pictures(taken.photos, pixels, store)
     frame = choose_frame(taken.photos, settings.crs, control)
     prior = priors(taken.photos, frame)
     links = yield from clock.stage("links", _links(taken, prior, parts, settings, store, jobs))
     alignment = yield from clock.stage(
-        "align", placing.place(taken, frame, prior, links, control, parts, settings, store)
+        "align", placing.place(taken, frame, prior, links, control, parts, settings, store, pictures)
     )
     yield from (Note(text=n, warning=True) for n in alignment.notes)
-    ground = yield from clock.stage("surface", drawing.survey_ground(alignment, taken, parts, settings, store))
-    exposure = yield from clock.stage("balance", _at_once(lambda: drawing.balance(taken, ground, alignment, parts, settings)))
-    compose = drawing.composer(taken, ground, alignment, exposure, parts, _still_there(taken.photos, cache))
-    key = digest(run.key, drawing.poses_digest(alignment), ground.surface.z, dict(exposure.gains), dict(exposure.fields))
+    ground = yield from clock.stage(
+        "surface", drawing.survey_ground(alignment, pictures, parts, settings, store)
+    )
+    exposure = yield from clock.stage(
+        "balance", _at_once(lambda: drawing.balance(taken, ground, alignment, parts, settings))
+    )
+    compose = drawing.composer(taken, ground, alignment, exposure, parts, pixels)
+    key = digest(
+        run.key,
+        drawing.poses_digest(alignment),
+        ground.surface.z,
+        dict(exposure.gains),
+        dict(exposure.fields),
+    )
     unit = drawing.unit_of(taken)
     drawn = yield from clock.stage(
         "mosaic", drawing.draw(run.path, compose, alignment, settings, store, key, unit, jobs)
@@ -98,7 +120,9 @@ def iter_mosaic(
         links=links, alignment=alignment, ground=ground, drawn=drawn, seams=seams.figures,
         conflicts=conflicts(taken.photos, prior, alignment), notes=[*survey.notes, *alignment.notes],
     )  # fmt: skip
-    finish = reporting.finish(run.path, taken, prior, alignment, ground, drawn, seams, figures, settings, clock, folder)
+    finish = reporting.finish(
+        run.path, taken, prior, alignment, ground, drawn, seams, figures, settings, clock, folder
+    )
     metrics = yield from clock.stage("report", finish)
     run.mark("done")
     yield Result(output=run.path, metrics=metrics)
@@ -143,7 +167,9 @@ def _with_control(
 def _apart(folder: Path | Sequence[Path], output: Path) -> None:
     """Refuses the folder of photos as output: a second run would take its own map for a photo."""
     if isinstance(folder, Path) and folder.is_dir() and folder.resolve() == output.resolve():
-        raise UsageError(f"{output} holds the photos; choose another folder for the results, such as {output / 'map'}")
+        raise UsageError(
+            f"{output} holds the photos; choose another folder for the results, such as {output / 'map'}"
+        )
 
 
 def _checked(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSettings) -> None:
@@ -155,16 +181,21 @@ def _checked(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSe
     frame = choose_frame(survey.photos, settings.crs, control)
     if settings.boundary is not None:
         if frame.crs is None:
-            raise UsageError("--boundary needs a georeferenced survey, and these photos have no positions; add --geo or --gcp")
+            raise UsageError(
+                "--boundary needs a georeferenced survey, and these photos have no positions;"
+                " add --geo or --gcp"
+            )
         read_boundary(settings.boundary, frame.crs)
 
 
-def run_key(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSettings) -> str:
-    """What a run depends on: content and metadata of its photos, side files, and the settings that shape results."""
+def run_key(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSettings, parts: Methods) -> str:
+    """What a run depends on: content and metadata of its photos, side files, and the
+    settings that shape results.
+    """
     shaping = {k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb")}
     side = [p.read_bytes().hex() for p in (settings.boundary,) if p is not None and p.is_file()]
     photos = [(p.name, p.digest, p.position, p.attitude, p.focal, p.calibration) for p in survey.photos]
-    return digest(photos, list(control), shaping, side)
+    return digest(photos, list(control), shaping, side, parts, __version__)
 
 
 def pixel_budget(settings: MosaicSettings) -> int:
@@ -213,15 +244,20 @@ def _still_there(photos: Sequence[Photo], cache: PixelCache) -> Callable[[int], 
             return cache(photo)
         except UnreadablePhotoError as error:
             raise SkyquiltError(
-                f"{photos[photo].path} could be read at first, and now {error}; see to its disk and run the same"
-                " command again to resume"
+                f"{photos[photo].path} could be read at first, and now {error}; see to its disk and run"
+                " the same command again to resume"
             ) from error
 
     return pixels
 
 
 def _links(
-    taken: intake.Intake, prior: Sequence[poses.Prior], parts: Methods, settings: MosaicSettings, store: Store, jobs: int
+    taken: intake.Intake,
+    prior: Sequence[poses.Prior],
+    parts: Methods,
+    settings: MosaicSettings,
+    store: Store,
+    jobs: int,
 ) -> Steps[linking.Links]:
     """Links, unless the method asked for does without."""
     if settings.method in ("pose", "position") or len(taken.photos) < 2:
@@ -229,7 +265,7 @@ def _links(
     return (yield from linking.link_up(taken, prior, parts, store, jobs))
 
 
-def _at_once(work) -> Steps:  # type: ignore[no-untyped-def]
+def _at_once(work: Callable[[], T]) -> Steps[T]:
     """A stage of one step."""
     yield 0, 1
     result = work()
@@ -243,6 +279,3 @@ def _unplaced(taken: intake.Intake, alignment: poses.Alignment) -> list[Rejected
         for i, p in enumerate(taken.photos)
         if i not in alignment.poses
     ]
-
-
-__all__ = ["STAGES", "MosaicSettings", "Photo", "cpu_seconds", "event", "iter_mosaic", "mosaic", "peak_memory_mb", "write_text"]

@@ -10,7 +10,7 @@ from skyquilt.config import Methods, MosaicSettings
 from skyquilt.errors import AlignmentError
 from skyquilt.model.photo import ControlPoint
 from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior
-from skyquilt.pipelines.intake import Intake
+from skyquilt.pipelines.intake import Intake, Pictures
 from skyquilt.pipelines.linking import Links
 from skyquilt.run.clock import Steps
 from skyquilt.run.store import Store, digest
@@ -35,7 +35,7 @@ def choose_method(asked: str, photos: int, links: int, positions: int) -> tuple[
 
 def place(
     intake: Intake, frame: MapFrame, priors: Sequence[Prior], links: Links, control: Sequence[ControlPoint],
-    methods: Methods, settings: MosaicSettings, store: Store,
+    methods: Methods, settings: MosaicSettings, store: Store, pictures: Pictures,
 ) -> Steps[Alignment]:  # fmt: skip
     """Poses and calibration of the survey."""
     positions = sum(bool(np.isfinite(p.map_C[:2]).all()) for p in priors)
@@ -43,7 +43,7 @@ def place(
     yield 0, 1
     alignment = store.get_or(
         "alignment", _key(intake, frame, priors, links, control, methods, method),
-        lambda: _align(intake, frame, priors, links, control, methods, method),
+        lambda: _align(intake, frame, priors, links, control, methods, method, pictures),
     )  # fmt: skip
     alignment = replace(alignment, why=why)
     if method == "bundle":
@@ -67,18 +67,20 @@ def _of(methods: Methods, method: str) -> object:
 
 def _align(
     intake: Intake, frame: MapFrame, priors: Sequence[Prior], links: Links, control: Sequence[ControlPoint],
-    methods: Methods, method: str,
+    methods: Methods, method: str, pictures: Pictures,
 ) -> Alignment:  # fmt: skip
     if method == "pose":
         return methods.by_pose(intake.photos, frame, priors)
     if method == "position":
         return methods.by_position(intake.photos, frame, priors)
     points = control_in_frame(control, intake.photos, frame)
-    return methods.bundle(intake.photos, frame, priors, intake.features, links.links, points)
+    return methods.bundle(intake.photos, frame, priors, intake.features, links.links, points, pictures)
 
 
 def with_loose_photos(alignment: Alignment, intake: Intake, priors: Sequence[Prior]) -> Alignment:
-    """Photos that nothing links, placed by their own metadata relative to the adjusted ones, and named as such."""
+    """Photos that nothing links, placed by their own metadata relative to the adjusted
+    ones, and named as such.
+    """
     from skyquilt.alignment.pose import reported_camera
     from skyquilt.geometry.frames import cam_R_map_from_angles
 
@@ -91,8 +93,16 @@ def with_loose_photos(alignment: Alignment, intake: Intake, priors: Sequence[Pri
             continue
         C = priors[i].map_C + offset
         if not np.isfinite(C).all() or alignment.frame.crs is None or not np.isfinite(priors[i].yaw_deg):
-            lacking = "no position" if not np.isfinite(C[:2]).all() else "no height" if not np.isfinite(C[2]) else "no heading"
-            rejected[i] = rejected.get(i, f"it could not be linked to the other photos, and it has {lacking} to place it by")
+            lacking = (
+                "no position"
+                if not np.isfinite(C[:2]).all()
+                else "no height"
+                if not np.isfinite(C[2])
+                else "no heading"
+            )
+            rejected[i] = rejected.get(
+                i, f"it could not be linked to the other photos, and it has {lacking} to place it by"
+            )
             continue
         rejected.pop(i, None)
         R = cam_R_map_from_angles(priors[i].yaw_deg, priors[i].pitch_deg, priors[i].roll_deg)

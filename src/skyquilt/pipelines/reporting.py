@@ -49,7 +49,12 @@ def seams(compose: Composer, drawn: Drawn, ground: Ground) -> Steps[Seams]:
     def patches(at: Sequence[SeamPoint]) -> PatchPairs:
         xy = np.array([(grid.x(np.array(p.column)), grid.y(np.array(p.row))) for p in at])
         a, b, seen = grey_pairs(
-            [views[p.a] for p in at], [views[p.b] for p in at], xy, ground.surface, compose.pixels, ground.native_gsd
+            [views[p.a] for p in at],
+            [views[p.b] for p in at],
+            xy,
+            ground.surface,
+            compose.pixels,
+            ground.native_gsd,
         )
         return PatchPairs(a=a, b=b, seen=seen)
 
@@ -70,7 +75,8 @@ def _figures(report: SeamReport) -> dict[str, Any]:
 
 def finish(
     output: Path, taken: Intake, priors: Sequence[Prior], alignment: Alignment, ground: Ground, drawn: Drawn,
-    seen: Seams, figures: dict[str, Any], settings: MosaicSettings, clock: Clock, folder: Path | Sequence[Path],
+    seen: Seams, figures: dict[str, Any], settings: MosaicSettings, clock: Clock,
+    folder: Path | Sequence[Path],
 ) -> Steps[dict[str, Any]]:  # fmt: skip
     """Writes every file of the run but the rasters already there; metrics.json comes last."""
     yield 0, 3
@@ -84,7 +90,10 @@ def finish(
     files.write_run(output / "run.toml", settings.as_table(), source, files.source_commit(), alignment.method)
     yield 1, 3
     metrics = figures | _times(clock)
-    write_report(output / "report.html", report_input(taken, priors, alignment, ground, drawn, seen, metrics, settings, source))
+    write_report(
+        output / "report.html",
+        report_input(taken, priors, alignment, ground, drawn, seen, metrics, settings, source),
+    )
     yield 2, 3
     metrics |= _times(clock)
     write_text(output / "metrics.json", json.dumps(metrics, indent=1, allow_nan=False))
@@ -100,12 +109,18 @@ def report_input(
 ) -> ReportInput:  # fmt: skip
     """What the report shows."""
     grid = drawn.provenance_grid
-    x, y = np.meshgrid(drawn.views_grid.x(np.arange(drawn.views_grid.width)), drawn.views_grid.y(np.arange(drawn.views_grid.height)))
+    x, y = np.meshgrid(
+        drawn.views_grid.x(np.arange(drawn.views_grid.width)),
+        drawn.views_grid.y(np.arange(drawn.views_grid.height)),
+    )
     heights = np.where(drawn.views > 0, ground.surface.at(x, y), np.float32(np.nan))
     return ReportInput(
-        metrics=metrics, preview=drawn.preview, bounds=drawn.preview_grid.bounds, origin=alignment.frame.origin,
-        crs=alignment.frame.crs, metric=alignment.frame.metric, views=drawn.views, views_bounds=drawn.views_grid.bounds,
-        surface=heights, surface_bounds=drawn.views_grid.bounds, vertical_datum=alignment.frame.vertical_datum,
+        metrics=metrics, preview=drawn.preview, bounds=drawn.preview_grid.bounds,
+        origin=alignment.frame.origin,
+        crs=alignment.frame.crs, metric=alignment.frame.metric, views=drawn.views,
+        views_bounds=drawn.views_grid.bounds,
+        surface=heights, surface_bounds=drawn.views_grid.bounds,
+        vertical_datum=alignment.frame.vertical_datum,
         shots=_shots(taken, priors, alignment, ground), residuals=_residuals(taken, alignment),
         seams=[
             SeamMark(
@@ -124,7 +139,8 @@ def _shots(taken: Intake, priors: Sequence[Prior], alignment: Alignment, ground:
     return [
         Shot(
             name=taken.photos[i].name, xyz=pose.map_C, reported_xyz=priors[i].map_C, block=block.get(i, 0),
-            method=alignment.method if drawing.held(alignment, i) else "pose", footprint=outline.get(i, np.zeros((0, 2))),
+            method=alignment.method if drawing.held(alignment, i) else "pose",
+            footprint=outline.get(i, np.zeros((0, 2))),
         )
         for i, pose in sorted(alignment.poses.items())
     ]  # fmt: skip

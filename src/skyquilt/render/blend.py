@@ -1,7 +1,10 @@
-"""Merge rules: what a map pixel shows where several photos see it. No ghost removal: every pixel is some photo's."""
+"""Merge rules: what a map pixel shows where several photos see it. No ghost removal: every
+pixel is some photo's.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar, Protocol
 
 import cv2
@@ -30,8 +33,9 @@ class Layer:
 class Blend(Protocol):
     """A merge rule."""
 
-    margin: int
-    """Pixels beyond the window that the rule must see."""
+    @property
+    def margin(self) -> int:
+        """Pixels beyond the window that the rule must see."""
 
     def rank(self, order: int, score: Float) -> Float:
         """What decides between photos: the lowest wins. `order`: position in order of capture."""
@@ -66,7 +70,11 @@ def _weighted(layers: Sequence[Layer], weights: Sequence[Float]) -> NDArray:
     for layer, weight in zip(layers, weights, strict=True):
         part = np.where(weight[..., None] > 0, layer.pixels, 0) if kind.kind == "f" else layer.pixels
         total += part * weight[..., None]
-    return np.clip(np.rint(total), 0, np.iinfo(kind).max).astype(kind) if kind.kind == "u" else total.astype(kind)
+    return (
+        np.clip(np.rint(total), 0, np.iinfo(kind).max).astype(kind)
+        if kind.kind == "u"
+        else total.astype(kind)
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +123,10 @@ class Feather:
         ramps = np.where(np.isfinite(s), np.nan_to_num(ramps), 0)
         total = np.maximum(ramps.sum(0), 1e-6)
         flat = [layer.pixels.reshape(-1, layer.pixels.shape[2])[near] for layer in layers]
-        mixed = sum(np.nan_to_num(f.astype(np.float32)) * (r / total)[:, None] for f, r in zip(flat, ramps, strict=True))
+        mixed = sum(
+            np.nan_to_num(f.astype(np.float32)) * (r / total)[:, None]
+            for f, r in zip(flat, ramps, strict=True)
+        )
         seen = lead.ravel()[near] >= 0
         if hard.dtype.kind == "u":
             mixed = np.clip(np.rint(mixed), 0, np.iinfo(hard.dtype).max)
@@ -181,7 +192,7 @@ class Average:
         seen = [np.isfinite(layer.score).astype(np.float32) for layer in layers]
         number = np.maximum(np.sum(seen, axis=0, dtype=np.float32), 1e-6)
         lead = leader(layers, [layer.score for layer in layers])
-        merged = _weighted(layers, [s / number for s in seen])
+        merged = _weighted(layers, [np.asarray(s / number, np.float32) for s in seen])
         if merged.dtype.kind == "f":
             merged[lead < 0] = np.nan
         return merged, _photos(lead, layers)
@@ -189,7 +200,9 @@ class Average:
 
 @dataclass(frozen=True, kw_only=True)
 class Multiband:
-    """The most vertical view wins; each band of detail is blended over its own width (Burt and Adelson 1983)."""
+    """The most vertical view wins; each band of detail is blended over its own width
+    (Burt and Adelson 1983).
+    """
 
     levels: int = 5
     """Halvings of the Laplacian pyramid; the widest blend is about 2 ** levels px."""
@@ -243,18 +256,20 @@ def _filled(layer: Layer, hard: NDArray) -> Float:
 def _gaussian(image: Float, levels: int) -> list[Float]:
     out = [image]
     for _ in range(levels):
-        out.append(cv2.pyrDown(out[-1]))
+        out.append(np.asarray(cv2.pyrDown(out[-1]), np.float32))
     return out
 
 
 def _laplacian(image: Float, levels: int) -> list[Float]:
     gaussian = _gaussian(image, levels)
     gaussian = [g[..., None] if g.ndim == 2 else g for g in gaussian]
-    return [a - _up(b, a) for a, b in zip(gaussian[:-1], gaussian[1:], strict=True)] + [gaussian[-1]]
+    return [a - _up(b, a) for a, b in pairwise(gaussian)] + [gaussian[-1]]
 
 
 def _up(small: Float, like: Float) -> Float:
-    return np.asarray(cv2.pyrUp(small, dstsize=(like.shape[1], like.shape[0]))).reshape(like.shape)
+    return np.asarray(cv2.pyrUp(small, dstsize=(like.shape[1], like.shape[0])), np.float32).reshape(
+        like.shape
+    )
 
 
 def _collapse(bands: list[Float]) -> Float:

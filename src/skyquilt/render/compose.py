@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.imaging.views import STEP, Nodes, View, cut, densify, inside_everywhere, window_nodes
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.render.blend import Blend, Layer
 from skyquilt.render.exposure import NEUTRAL, Exposure, image_place, with_odds
-from skyquilt.imaging.views import STEP, Nodes, View, cut, densify, inside_everywhere, window_nodes
 
 PhotoPixels = Callable[[int], NDArray]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""
@@ -54,7 +54,9 @@ class Composer:
 
     def __call__(self, window: Window) -> Composed:
         """The window, piece by piece."""
-        out = np.full((window.height, window.width, self.bands), np.nan if self.dtype.kind == "f" else 0, self.dtype)
+        out = np.full(
+            (window.height, window.width, self.bands), np.nan if self.dtype.kind == "f" else 0, self.dtype
+        )
         photo = np.full((window.height, window.width), -1, np.int32)
         margin = -(-self.blend.margin // STEP) * STEP
         wide = window.grown(margin)

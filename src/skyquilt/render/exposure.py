@@ -1,13 +1,13 @@
 """Exposure: what brings overlapping photos to one brightness, from the ground they both show.
 
-Per photo a gain for each band and a smooth field over the image (vignetting, a cloud's shadow, the sun's glare).
-Gains act on the odds x / (1 - x) of a pixel value x in (0, 1), not on the value: black stays black and white
-stays white, so nothing clips or turns purple, and two gains in a row are one gain.
+Per photo a gain for each band and a smooth field over the image (vignetting, a cloud's shadow, the sun's
+glare). Gains act on the odds x / (1 - x) of a pixel value x in (0, 1), not on the value: black stays black
+and white stays white, so nothing clips or turns purple, and two gains in a row are one gain.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -15,15 +15,17 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 
-from skyquilt.model.surface import Surface
 from skyquilt.imaging.views import View, project_nodes
+from skyquilt.model.surface import Surface
 
 Float = NDArray[np.float32]
 
 SIGMA_LEVEL = 0.15
 """Deviation in log odds of two photos' brightness of one ground point, all else equal."""
 EVEN = 0.1
-"""Fields smaller than this in log odds everywhere (6 of 255 on a middle grey) are left alone: it saves time."""
+"""Fields smaller than this in log odds everywhere (6 of 255 on a middle grey) are left
+alone: it saves time.
+"""
 CORRELATED = 30.0
 """Neighbouring samples err alike: so many count as one."""
 
@@ -55,8 +57,9 @@ class Exposure:
 def with_odds(pixels: NDArray[np.uint8], odds: Float) -> NDArray[np.uint8]:
     """Pixels (h, w, bands) with their odds multiplied by odds (h, w, bands)."""
     brighter = cv2.multiply(pixels, odds, dtype=cv2.CV_32F).reshape(pixels.shape)
-    white = cv2.add(cv2.subtract(brighter, pixels, dtype=cv2.CV_32F), (255.0,) * 4).reshape(pixels.shape)
-    return np.asarray(cv2.divide(brighter, white, scale=255, dtype=cv2.CV_8U)).reshape(pixels.shape)
+    level: Any = (255.0,) * 4  # a scalar for each band: OpenCV's stubs know arrays only
+    white = cv2.add(cv2.subtract(brighter, pixels, dtype=cv2.CV_32F), level).reshape(pixels.shape)
+    return np.asarray(cv2.divide(brighter, white, scale=255, dtype=cv2.CV_8U), np.uint8).reshape(pixels.shape)
 
 
 def _basis(x: NDArray, y: NDArray) -> NDArray:
@@ -120,7 +123,9 @@ class Balance:
             place.append(np.stack(image_place(view, u, v), -1))
             value.append(_sampled(thumbnails[view.photo], u, v, view.camera.width, view.camera.height))
         if not point:
-            return Samples(point=np.zeros(0, int), row=np.zeros(0, int), place=np.zeros((0, 2)), log=np.zeros((0, 3)))
+            return Samples(
+                point=np.zeros(0, int), row=np.zeros(0, int), place=np.zeros((0, 2)), log=np.zeros((0, 3))
+            )
         levels = np.concatenate(value)
         good = ((levels > 8) & (levels < 247)).all(1)
         return Samples(
@@ -149,7 +154,9 @@ def image_place(view: View, u: NDArray, v: NDArray) -> tuple[NDArray, NDArray]:
     return np.clip(2 * u / w - 1, -1.1, 1.1), np.clip(2 * v / h - 1, -1.1, 1.1)
 
 
-def _sampled(thumbnail: NDArray[np.uint8], u: NDArray, v: NDArray, width: int, height: int) -> NDArray[np.float64]:
+def _sampled(
+    thumbnail: NDArray[np.uint8], u: NDArray, v: NDArray, width: int, height: int
+) -> NDArray[np.float64]:
     """Smoothed thumbnail values (n, bands) at photo pixels."""
     h, w = thumbnail.shape[:2]
     smooth = cv2.GaussianBlur(thumbnail.astype(np.float32), (0, 0), 1.5).reshape(h, w, -1)
@@ -159,7 +166,9 @@ def _sampled(thumbnail: NDArray[np.uint8], u: NDArray, v: NDArray, width: int, h
 
 
 def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: float) -> Exposure:
-    """log odds + gain + field is the same for all photos of a point: differences to the point's mean vanish."""
+    """log odds + gain + field is the same for all photos of a point: differences to the
+    point's mean vanish.
+    """
     n, N = len(photos), len(s.point)
     _, point = np.unique(s.point, return_inverse=True)
     terms = np.concatenate([np.ones((N, 1)), _basis(s.place[:, 0], s.place[:, 1])], 1)
@@ -167,7 +176,10 @@ def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: fl
     A = sparse.csr_matrix((terms.ravel(), columns.ravel(), 6 * np.arange(N + 1)), (N, 6 * n))
     ridge = np.tile(1 / np.array([sigma_gain] + 5 * [sigma_field]) ** 2, n)
     x = _robust_differences(A, point, s.log.mean(1), ridge).reshape(n, 6)
-    fields = x[:, 1:] * (np.abs(_basis(*np.meshgrid([-1, 0, 1], [-1, 0, 1])) @ x[:, 1:].T).max((0, 1)) > EVEN)[:, None]
+    fields = (
+        x[:, 1:]
+        * (np.abs(_basis(*np.meshgrid([-1, 0, 1], [-1, 0, 1])) @ x[:, 1:].T).max((0, 1)) > EVEN)[:, None]
+    )
     even = s.log + (terms[:, 1:] * fields[s.row]).sum(1)[:, None]
     ones = sparse.csr_matrix((np.ones(N), (np.arange(N), s.row)), (N, n))
     bands = [_robust_differences(ones, point, even[:, k], ridge[::6]) for k in range(s.log.shape[1])]
@@ -179,7 +191,9 @@ def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: fl
     )
 
 
-def _robust_differences(A: sparse.csr_matrix, point: NDArray, y: NDArray, ridge: NDArray) -> NDArray[np.float64]:
+def _robust_differences(
+    A: sparse.csr_matrix, point: NDArray, y: NDArray, ridge: NDArray
+) -> NDArray[np.float64]:
     """x that makes y + A x equal within each point, reweighted against moving things and shadows."""
     w = np.ones(len(y))
     x = np.zeros(A.shape[1])
@@ -189,7 +203,11 @@ def _robust_differences(A: sparse.csr_matrix, point: NDArray, y: NDArray, ridge:
         mean_A = sparse.diags(1 / np.maximum(mass, 1e-9)) @ (select @ A)
         mean_y = (select @ y) / np.maximum(mass, 1e-9)
         W = sparse.diags(w)
-        normal = A.T @ W @ A - mean_A.T @ sparse.diags(mass) @ mean_A + sparse.diags(ridge * SIGMA_LEVEL**2 * CORRELATED)
+        normal = (
+            A.T @ W @ A
+            - mean_A.T @ sparse.diags(mass) @ mean_A
+            + sparse.diags(ridge * SIGMA_LEVEL**2 * CORRELATED)
+        )
         rhs = -(A.T @ (w * y) - mean_A.T @ (mass * mean_y))
         x = sparse_linalg.spsolve(normal.tocsc(), rhs)
         level = y + A @ x

@@ -1,6 +1,5 @@
 """The page: sections in order, one template, one file."""
 
-import os
 import re
 from contextlib import suppress
 from functools import cache
@@ -70,7 +69,7 @@ def write_report(path: Path, data: ReportInput) -> None:
     partial = path.with_name(path.name + ".partial")
     try:
         partial.write_text(page, encoding="utf-8")
-        os.replace(partial, path)  # noqa: PTH105
+        partial.replace(path)
     except OSError as error:
         with suppress(OSError):
             partial.unlink()

@@ -56,7 +56,11 @@ class Clock:
         try:
             while True:
                 step = next(work)
-                yield StageProgress(stage=name, done=step[0], total=step[1]) if isinstance(step, tuple) else step
+                yield (
+                    StageProgress(stage=name, done=step[0], total=step[1])
+                    if isinstance(step, tuple)
+                    else step
+                )
         except StopIteration as stop:
             result: T = stop.value
         finally:

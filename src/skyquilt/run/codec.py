@@ -14,7 +14,7 @@ Registry = Mapping[str, type]
 
 def encode(value: Any) -> bytes:
     """Bytes of dataclasses, tuples, lists, dicts, sets, arrays and scalars."""
-    arrays: dict[str, np.ndarray] = {}
+    arrays: dict[str, Any] = {}
     tree = _down(value, arrays)
     buffer = io.BytesIO()
     np.savez(buffer, __tree__=np.frombuffer(json.dumps(tree).encode(), np.uint8), **arrays)

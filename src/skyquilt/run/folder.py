@@ -43,7 +43,9 @@ class RunFolder:
     @property
     def done(self) -> bool:
         """Whether this very run was finished before."""
-        return _state(self.path) == (self.key, "done") and all((self.path / name).is_file() for name in CONTRACT)
+        return _state(self.path) == (self.key, "done") and all(
+            (self.path / name).is_file() for name in CONTRACT
+        )
 
 
 def _state(path: Path) -> tuple[str, str]:
@@ -70,7 +72,8 @@ def open_run(path: Path, key: str, *, overwrite: bool, again: bool = False) -> R
         if taken and not overwrite and not (again and known):
             what = "another run (other photos or other settings)" if known else "other files"
             raise OutputError(
-                f"{path} already holds {what}; add --overwrite to replace its results, or choose another folder"
+                f"{path} already holds {what}; add --overwrite to replace its results,"
+                " or choose another folder"
             )
         if taken:
             for name in CONTRACT:

@@ -1,8 +1,9 @@
 """Heights where tie points are few: a plane sweep over the ground, from the two best views of every place.
 
 The ground is shown twice, by its most vertical view and by the next one that sees it from elsewhere, at many
-heights about the surface known so far; the height at which the two pictures agree is kept. Coarse pictures find
-canopies and roofs, finer ones polish. In the manner of Collins (1996), on a map grid instead of an image.
+heights about the surface known so far; the height at which the two pictures agree is kept. Coarse pictures
+find canopies and roofs, finer ones polish. In the manner of Collins (1996), on a map grid instead of an
+image.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,9 +51,16 @@ class Sweep:
         if len(views) < 2 or height <= 0:
             return surface
         for number, side in enumerate(self.sides):
-            gsd = float(np.median([height / v.camera.focal * max(v.camera.width, v.camera.height) for v in views])) / side
+            gsd = (
+                float(
+                    np.median([height / v.camera.focal * max(v.camera.width, v.camera.height) for v in views])
+                )
+                / side
+            )
             low, high = (-self.below * height, self.above * height) if number == 0 else (-3.0, 3.0)
-            surface = self._pass(surface, views, grid, grey, side, gsd, height, (low, high), relative=number > 0)
+            surface = self._pass(
+                surface, views, grid, grey, side, gsd, height, (low, high), relative=number > 0
+            )
         return surface
 
     def _pass(
@@ -73,7 +81,8 @@ class Sweep:
         return self._fused(surface, work, z, trust)
 
     def _piece(
-        self, surface: Surface, views: Sequence[View], work: Grid, grey: GreyPicture, side: int, height: float,
+        self, surface: Surface, views: Sequence[View], work: Grid, grey: GreyPicture, side: int,
+        height: float,
         span: tuple[float, float], relative: bool, row: int, column: int,
     ) -> tuple[Float, Float]:  # fmt: skip
         """Heights and trust (TILE, TILE) of a piece."""
@@ -123,12 +132,14 @@ class Sweep:
             middle = np.where(number >= cell * cell // 3, _nanmedian(believed), np.nan)
         weight = np.where(np.isfinite(middle), 1.0, 0.05).astype(np.float32)
         value = np.where(np.isfinite(middle), middle, known).astype(np.float32)
-        value = cv2.medianBlur(value, 5)
+        value = np.asarray(cv2.medianBlur(value, 5), np.float32)
         spread = self.smoothing_cells
         total = cv2.GaussianBlur(weight, (0, 0), spread)
         smooth = cv2.GaussianBlur(value * weight, (0, 0), spread) / total
         x0, y0 = float(coarse.x(np.array(0))), float(coarse.y(np.array(rows - 1)))
-        return Surface(z=np.ascontiguousarray(smooth[::-1]), x0=x0, y0=y0, cell=coarse.gsd, source="tie points and sweep")
+        return Surface(
+            z=np.ascontiguousarray(smooth[::-1]), x0=x0, y0=y0, cell=coarse.gsd, source="tie points and sweep"
+        )
 
 
 def _nanmedian(values: Float) -> Float:
@@ -142,8 +153,8 @@ def _nanmedian(values: Float) -> Float:
 def pair_labels(
     nodes: Sequence[Nodes], gsd: float
 ) -> tuple[NDArray[np.int32] | None, NDArray[np.int32] | None, float]:
-    """Per node the most vertical photo and the most vertical one seen from elsewhere (-1 = none), and the step
-    in m of height that moves one picture against the other by about one pixel of gsd.
+    """Per node the most vertical photo and the most vertical one seen from elsewhere (-1 = none), and the
+    step in m of height that moves one picture against the other by about one pixel of gsd.
     """
     if len(nodes) < 2:
         return None, None, 0.0
@@ -205,7 +216,9 @@ def _agreement(a: Float, b: Float, window: int) -> Float:
 
 
 def _summit(scores: Float, offsets: Float) -> tuple[Float, Float]:
-    """Offset of the best score per pixel, refined by a parabola, and that score; 0 at the ends of the search."""
+    """Offset of the best score per pixel, refined by a parabola, and that score; 0 at
+    the ends of the search.
+    """
     best = scores.argmax(0)
     top = np.take_along_axis(scores, best[None], 0)[0]
     inner = np.clip(best, 1, len(offsets) - 2)

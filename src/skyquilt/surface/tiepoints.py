@@ -36,21 +36,26 @@ class FromTiePoints:
         rows = max(2, int(np.ceil((bounds[3] - bounds[1]) / cell)) + 1)
         x = bounds[0] + np.arange(columns) * cell
         y = bounds[1] + np.arange(rows) * cell
-        z = self._interpolate(points, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2), cell).reshape(rows, columns)
-        smooth = cv2.GaussianBlur(z.astype(np.float32), (0, 0), self.smoothing_cells)
+        z = self._interpolate(points, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2), cell).reshape(
+            rows, columns
+        )
+        smooth = np.asarray(cv2.GaussianBlur(z.astype(np.float32), (0, 0), self.smoothing_cells), np.float32)
         return Surface(z=smooth, x0=bounds[0], y0=bounds[1], cell=cell, source="tie points")
 
     def _interpolate(self, points: Array, at: Array, cell: float) -> Array:
         k = min(self.neighbours, len(points))
         distance, index = cKDTree(points[:, :2]).query(at, k=k)
         distance, index = distance.reshape(len(at), k), index.reshape(len(at), k)
-        # beyond the points, the reach grows with the distance to them: the rim continues the average, not one point
+        # beyond the points, the reach grows with the distance to them: the rim continues the average, not one
+        # point
         weight = 1.0 / (distance + 0.5 * cell + 0.5 * distance[:, :1]) ** 2
         return np.asarray((weight * points[index, 2]).sum(1) / weight.sum(1))
 
 
 def without_outliers(xyz: Array, limit: float) -> Array:
-    """Points whose height agrees with their neighbours' median within `limit` robust deviations of the survey."""
+    """Points whose height agrees with their neighbours' median within `limit` robust
+    deviations of the survey.
+    """
     k = min(10, len(xyz))
     _, index = cKDTree(xyz[:, :2]).query(xyz[:, :2], k=k)
     around = xyz[index.reshape(len(xyz), k), 2]

@@ -11,7 +11,9 @@ from skyquilt.model.features import Features, Link, Matches, RejectedLink
 
 @dataclass(frozen=True, kw_only=True)
 class Verify:
-    """Near-nadir photos of one ground differ by a similarity up to relief and tilt; relief obeys epipolar geometry."""
+    """Near-nadir photos of one ground differ by a similarity up to relief and tilt; relief
+    obeys epipolar geometry.
+    """
 
     similarity_share: float = 0.03
     """Tolerance of the similarity as a share of the image width: room for relief and tilt."""

@@ -1,0 +1,59 @@
+# Nothing is assumed but make and python3 (3.11 or newer). Everything lives in .venv beside this file.
+
+PYTHON ?= python3
+BIN := .venv/bin
+USE := .venv/installed
+DEVELOP := .venv/installed-for-tests
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --quiet --constraint constraints.txt
+
+.PHONY: demo test test-all check format clean
+
+# A simulated flight, its map, and how far the map lies from the simulator's truth.
+demo: $(USE)
+	@$(BIN)/skyquilt simulate demo/flight --preset demo --overwrite
+	@$(BIN)/skyquilt mosaic demo/flight/photos -o demo/map --overwrite
+	@$(BIN)/python examples/04_map_against_truth.py demo/map/mosaic.tif demo/flight/truth/truth_ortho.tif
+
+# Lint, format, types and import contract, then the tests that take no more than a few seconds each.
+test: check
+	@$(BIN)/pytest -m "not slow"
+
+# Every test, the slow ones included.
+test-all: $(DEVELOP)
+	@$(BIN)/pytest
+
+check: $(DEVELOP)
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+
+# Puts code into the form that `make check` asks for.
+format: $(DEVELOP)
+	@$(BIN)/ruff format --quiet .
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+.venv/pyvenv.cfg:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	    echo "Skyquilt needs Python 3.11 or newer, and $(PYTHON) is: $$($(PYTHON) --version 2>&1)."; \
+	    echo "Name another one: make PYTHON=python3.12 ..."; exit 1; }
+	@$(PYTHON) -m venv .venv || { rm -rf .venv; \
+	    echo "$(PYTHON) cannot make a virtual environment; on Debian and Ubuntu: apt install python3-venv"; exit 1; }
+
+# Installed anew only when what is to be installed has changed.
+$(USE): .venv/pyvenv.cfg pyproject.toml constraints.txt
+	@echo "installing Skyquilt into .venv (a minute or two, the first time)"
+	@$(PIP) setuptools
+	@$(PIP) --no-build-isolation --editable .
+	@touch $@
+
+$(DEVELOP): $(USE)
+	@echo "installing what the tests need"
+	@$(PIP) --no-build-isolation --editable '.[test]'
+	@touch $@
+
+clean:
+	rm -rf .venv demo build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf src/*.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,155 @@
+"""Sightings made sharper: keypoints found in small pictures, moved to where larger pictures agree.
+
+With poses nearly right, every sighting of a point is a patch of the same ground: rectified to the ground, the
+patches differ by a translation, which is what the sightings' errors are. One sighting stays and the others
+follow it.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.tracks import Tracks
+from skyquilt.geometry.camera import distort
+from skyquilt.imaging.align_patches import translate
+from skyquilt.model.camera import Camera
+from skyquilt.model.poses import Pose
+
+Array = NDArray[np.float64]
+GreyPicture = Callable[[int, int], NDArray[np.uint8]]
+"""Grey picture (h, w) of a photo (index), its longest side at most the px given."""
+MARGIN = 3
+"""Pixels by which a sighting may move."""
+BATCH = 4000
+"""Sightings registered at a time: bounds the memory."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sharpen:
+    """Registration of all sightings of a point to the most central one."""
+
+    side: int = 15
+    """Pixels of a patch's side, in the picture it is cut from."""
+    longest: int = 1000
+    """Longest side in px of the pictures."""
+    agree: float = 0.75
+    """Least correlation of two sightings; others stay as they were found, with their deviation."""
+    sigma: float = 0.12
+    """Standard deviation of a sharpened sighting in px of the picture."""
+    version: ClassVar[int] = 1
+
+    def __call__(
+        self,
+        tracks: Tracks,
+        xyz: Array,
+        poses: Mapping[int, Pose],
+        cameras: Mapping[int, Camera],
+        grey: GreyPicture,
+    ) -> Tracks:
+        """Tracks (file pixels) with sharper sightings; `xyz` (count, 3): their points in the map frame."""
+        anchor = self._anchors(tracks, cameras)
+        patches, scale = self._patches(tracks, xyz, poses, cameras, grey)
+        others = np.flatnonzero(anchor[tracks.point] != np.arange(len(tracks.point)))
+        first = anchor[tracks.point[others]]
+        shift, score = self._registered(patches, first, others)
+        moved = self._on_image(tracks, xyz, poses, cameras, others, shift, scale)
+        good = np.nan_to_num(score) > self.agree
+        px, sigma = tracks.px.copy(), tracks.sigma_px.copy()
+        px[others[good]] = moved[good]
+        sharp = np.maximum(self.sigma * scale[others[good]], 0.2)
+        sigma[others[good]] = sharp
+        sigma[first[good]] = np.maximum(self.sigma * scale[first[good]], 0.2)
+        return replace(tracks, px=px, sigma_px=sigma)
+
+    def _registered(
+        self, patches: NDArray[np.uint8], first: NDArray[np.int64], others: NDArray[np.int64]
+    ) -> tuple[Array, Array]:
+        """Shifts (m, 2) in patch px and correlations (m,), some thousand pairs at a time."""
+        inner = slice(MARGIN, -MARGIN)
+        parts = []
+        for k in range(0, len(others), BATCH):
+            part = slice(k, k + BATCH)
+            reference = patches[first[part]][:, inner, inner].astype(np.float32)
+            parts.append(translate(reference, patches[others[part]].astype(np.float32), margin=MARGIN))
+        if not parts:
+            return np.zeros((0, 2)), np.zeros(0)
+        return np.concatenate([s for s, _ in parts]), np.concatenate([c for _, c in parts])
+
+    def _anchors(self, tracks: Tracks, cameras: Mapping[int, Camera]) -> NDArray[np.int64]:
+        """The most central sighting of each track (count,)."""
+        size = np.array([(cameras[p].width, cameras[p].height) for p in tracks.photo.tolist()], float)
+        off = np.linalg.norm(tracks.px / size - 0.5, axis=1)
+        order = np.lexsort((off, tracks.point))
+        return order[np.searchsorted(tracks.point[order], np.arange(tracks.count))]
+
+    def _patches(
+        self,
+        tracks: Tracks,
+        xyz: Array,
+        poses: Mapping[int, Pose],
+        cameras: Mapping[int, Camera],
+        grey: GreyPicture,
+    ) -> tuple[NDArray[np.uint8], Array]:
+        """Patches (N, s + 2 margin, ...) of all sightings rectified to the level ground of their point,
+        centred where each was seen, and the pictures' scales (N,): sensor px per px.
+        """
+        full = self.side + 2 * MARGIN
+        out = np.zeros((len(tracks.point), full, full), np.uint8)
+        scale = np.ones(len(tracks.point))
+        step = (np.arange(full) - full // 2).astype(float)
+        for photo in np.unique(tracks.photo).tolist():
+            own = np.flatnonzero(tracks.photo == photo)
+            picture, camera = grey(photo, self.longest), cameras[photo]
+            scale[own] = camera.width / picture.shape[1]
+            gx, gy = ground_axes(xyz[tracks.point[own]], poses[photo], camera, scale[own[0]])
+            # the ground around a point is nearly affine in the picture over a few pixels
+            centre = (tracks.px[own] + 0.5) / scale[own[0]] - 0.5
+            u = centre[:, 0, None, None] + gx[:, 0, None, None] * step + gy[:, 0, None, None] * step[:, None]
+            v = centre[:, 1, None, None] + gx[:, 1, None, None] * step + gy[:, 1, None, None] * step[:, None]
+            flat_u, flat_v = (m.reshape(len(own), -1).astype(np.float32) for m in (u, v))
+            for k in range(0, len(own), 30000):
+                part = slice(k, k + 30000)
+                warped = cv2.remap(
+                    picture, flat_u[part], flat_v[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+                )
+                out[own[part]] = warped.reshape(-1, full, full)
+        return out, scale
+
+    def _on_image(
+        self, tracks: Tracks, xyz: Array, poses: Mapping[int, Pose], cameras: Mapping[int, Camera],
+        rows: NDArray[np.int64], shift: Array, scale: Array,
+    ) -> Array:  # fmt: skip
+        """Sensor pixels (m, 2) of sightings moved by shifts (m, 2) in patch px."""
+        moved = tracks.px[rows].copy()
+        for photo in np.unique(tracks.photo[rows]).tolist():
+            own = np.flatnonzero(tracks.photo[rows] == photo)
+            s = scale[rows[own[0]]]
+            gx, gy = ground_axes(xyz[tracks.point[rows[own]]], poses[photo], cameras[photo], s)
+            moved[own] += s * (gx * shift[own, :1] + gy * shift[own, 1:])
+        return moved
+
+
+def ground_axes(X: Array, pose: Pose, camera: Camera, scale: float) -> tuple[Array, Array]:
+    """How far a picture moves, in its px (n, 2), per patch px eastwards and southwards on
+    level ground at X (n, 3).
+    """
+    size = np.abs(pose.map_C[2] - X[:, 2]) / camera.focal * scale
+    px = [_pixel(camera, pose, p) / scale for p in (X, X + _along(size, 0), X - _along(size, 1))]
+    return px[1] - px[0], px[2] - px[0]
+
+
+def _along(size: Array, axis: int) -> Array:
+    """Steps (n, 3) of size (n,) along an axis of the map."""
+    out = np.zeros((len(size), 3))
+    out[:, axis] = size
+    return out
+
+
+def _pixel(camera: Camera, pose: Pose, X: Array) -> Array:
+    local = pose.to_camera(X)
+    k = camera.vector
+    return np.asarray(distort(local[:, :2] / np.maximum(local[:, 2:], 1e-6), k) * k[0] + k[1:3])

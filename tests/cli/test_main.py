@@ -1,0 +1,114 @@
+"""The command line's promises: choices, exit codes, sentences instead of tracebacks."""
+
+import re
+import sys
+
+import pytest
+from typer.testing import CliRunner
+
+import skyquilt
+from skyquilt import config, errors
+from skyquilt.cli import app as commands
+from skyquilt.cli import main
+from skyquilt.pipelines.mosaic import STAGES
+
+CHOICES = {
+    "--method": config.METHODS,
+    "--blend": config.BLENDS,
+    "--compress": config.COMPRESSIONS,
+    "--surface": config.SURFACES,
+    "--distortion": config.DISTORTIONS,
+    "--rerun-from": STAGES[1:],
+}
+
+
+def said(*words):
+    """What a command prints, without the frames around it."""
+    result = CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(commands.app, list(words))
+    assert result.exit_code == 0, result.output
+    return re.sub(r"\s+", " ", re.sub(r"[\u2500-\u257f]", " ", result.output))
+
+
+def described(option):
+    """The line of `skyquilt mosaic --help` about an option."""
+    result = CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(commands.app, ["mosaic", "--help"])
+    return next(line for line in result.output.splitlines() if re.search(rf"{option}\b", line))
+
+
+@pytest.mark.parametrize("option", CHOICES)
+def test_help_lists_every_choice(option):
+    words = re.findall(r"[\w-]+", described(option))
+    assert [c for c in CHOICES[option] if c not in words] == []
+
+
+@pytest.mark.parametrize("command", ["mosaic", "inspect", "simulate"])
+def test_every_command_explains_itself(command):
+    assert "Exit codes" in said(command, "--help")
+    assert command in said("--help")
+
+
+def test_defaults_on_the_command_line_are_those_of_the_settings():
+    import inspect
+
+    parameters = inspect.signature(commands.mosaic_command.command).parameters
+    other_names = {"gsd": "gsd_cm", "feather": "feather_px", "height": "height_m", "heading": "heading_deg",
+                   "memory": "memory_gb"}  # fmt: skip
+    settings = config.MosaicSettings()
+    named = {other_names.get(name, name): p.default for name, p in parameters.items()}
+    shared = [name for name in named if hasattr(settings, name)]
+    assert len(shared) > 15
+    assert {n: named[n] for n in shared} == {n: getattr(settings, n) for n in shared}
+
+
+def test_version():
+    assert said("--version").strip() == f"skyquilt {skyquilt.__version__}"
+
+
+def test_exit_codes_are_those_of_the_errors():
+    stated = {int(code) for code in re.findall(r"\b(\d+) [a-z]", commands.EXIT_CODES)}
+    leaves = [e for e in vars(errors).values() if isinstance(e, type) and issubclass(e, errors.SkyquiltError)]
+    assert stated == {0, 130} | {e.exit_code for e in leaves}
+
+
+def test_codes_tell_errors_apart():
+    leaves = [errors.UsageError, errors.NoPhotosError, errors.AlignmentError, errors.OutputError,
+              errors.SideFileError, errors.RefusedError]  # fmt: skip
+    assert [e.exit_code for e in leaves] == [2, 3, 4, 5, 6, 7]
+
+
+def run(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["skyquilt", *map(str, words)])
+    with pytest.raises(SystemExit) as end:
+        main.run()
+    return end.value.code or 0
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "sentence"),
+    [
+        (["--method", "magic"], 2, "auto, bundle, pose, position"),
+        (["--blend", "magic"], 2, "feather, first, average, multiband"),
+        (["--gsd", "0"], 2, "--gsd 0.0 lies outside"),
+        (["--bounds", "1,2,3"], 2, "four numbers"),
+        (["--bounds", "5,0,1,9"], 2, "west < east"),
+        (["--rerun-from", "lunch"], 2, "features, links, align"),
+        (["--quiet", "--json"], 2, "exclude one another"),
+        ([], 3, ""),
+    ],
+)
+def test_mistakes_get_a_sentence_and_a_code(monkeypatch, capsys, tmp_path, words, code, sentence):
+    (tmp_path / "photos").mkdir()
+    assert run(monkeypatch, "mosaic", tmp_path / "photos", "-o", tmp_path / "out", *words) == code
+    told = capsys.readouterr().err
+    assert told.startswith("skyquilt: ")
+    assert len(told.strip().splitlines()) == 1
+    assert sentence in told
+
+
+def test_an_interrupt_ends_with_130_and_says_how_to_go_on(monkeypatch, capsys):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "app", interrupted)
+    assert run(monkeypatch, "mosaic") == 130
+    assert "again to resume" in capsys.readouterr().err

@@ -1,0 +1,77 @@
+"""Every example runs, and says what it should, on a small simulated flight."""
+
+import os
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from skyquilt.simulate import preset, simulate
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    base = preset("demo")
+    small = replace(base, lens=base.lens.scaled(800, 600), route=replace(base.route, photos=6))
+    folder = tmp_path_factory.mktemp("flight")
+    for _ in simulate(small, folder):
+        pass
+    return folder
+
+
+def run(name, *arguments):
+    command = [sys.executable, EXAMPLES / name, *arguments]
+    done = subprocess.run(
+        list(map(str, command)),
+        capture_output=True,
+        text=True,
+        check=False,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_two_photos(flight):
+    said = run("00_two_photos.py", *sorted((flight / "photos").iterdir())[:2])
+    assert re.search(r"linked by \d{2,} matches", said)
+
+
+def test_photo_by_photo(flight):
+    said = run("02_photo_by_photo.py", flight / "photos")
+    assert re.search(r"6 photos, ([5-9]|1\d) links, frame EPSG:32633", said)
+
+
+def test_your_own_features(flight):
+    said = run("03_your_own_features.py", flight / "photos")
+    placed = re.findall(r"(\d) of 6 photos placed", said)
+    assert placed[0] == "6"
+    assert len(placed) == 2
+    assert all(0.05 < float(px) < 1.0 for px in re.findall(r"reprojection error ([\d.]+) px", said))
+
+
+def test_a_folder_becomes_a_map_that_fits_the_truth(flight, tmp_path):
+    said = run("01_folder_to_cog.py", flight / "photos", tmp_path / "out", "15")
+    assert "6 of 6 photos by bundle" in said
+    assert "EPSG:32633" in said
+    judged = run(
+        "04_map_against_truth.py", tmp_path / "out" / "mosaic.tif", flight / "truth" / "truth_ortho.tif"
+    )
+    bias = [float(m) for m in re.findall(r"([+-][\d.]+) m (?:east|north)", judged)]
+    assert max(map(abs, bias)) < 4.0  # GPS noise of 2 m over six photos
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda p: p.name)
+def test_without_arguments_each_says_how_to_call_it(path):
+    done = subprocess.run([sys.executable, str(path)], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert f"python examples/{path.name}" in done.stderr
+
+
+def test_they_are_numbered_without_gaps():
+    assert [int(p.name[:2]) for p in sorted(EXAMPLES.glob("*.py"))] == list(range(5))

@@ -1,0 +1,96 @@
+"""What no committed file may hold, and files that must say the same as others."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+OURS = ("src", "tests", "docs", "examples", "benchmarks", ".ci")
+TEXT = {
+    ".py",
+    ".md",
+    ".toml",
+    ".txt",
+    ".json",
+    ".js",
+    ".css",
+    ".j2",
+    ".html",
+    ".csv",
+    ".yaml",
+    ".yml",
+    ".cfg",
+    "",
+}
+SLASH = "/"
+HOMES = [SLASH + name + SLASH for name in ("work", "home", "root", "Users", "opt", "mnt")]
+REGISTRIES = ["index-" + "url", "find-" + "links", "pypi" + ".", "trusted-" + "host"]
+
+
+def committed():
+    top = [p for p in ROOT.iterdir() if p.is_file() and p.name != ".git"]
+    below = [p for name in OURS for p in (ROOT / name).rglob("*") if p.is_file()]
+    return [p for p in top + below if p.suffix in TEXT and not {"__pycache__"} & set(p.parts)]
+
+
+def test_the_whole_house_is_looked_at():
+    names = {p.relative_to(ROOT).as_posix() for p in committed()}
+    assert {"README.md", "Makefile", "pyproject.toml", "constraints.txt", ".ci/run"} <= names
+    assert len(names) > 150
+
+
+def test_no_file_names_a_place_on_a_machine_or_an_address_of_a_registry():
+    found = []
+    for path in committed():
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            for word in HOMES + REGISTRIES:
+                at = line.find(word)
+                # a path that goes on from something (docs/work/..., a/home/b) is relative, not a machine's
+                if at >= 0 and (word in REGISTRIES or at == 0 or not re.match(r"[\w.}\]-]", line[at - 1])):
+                    found.append(f"{path.relative_to(ROOT)}:{number}: {line.strip()}")
+    assert not found, "\n".join(found)
+
+
+@pytest.mark.parametrize("line", (ROOT / "constraints.txt").read_text().split())
+def test_constraints_are_names_with_versions(line):
+    assert re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*==[0-9][0-9A-Za-z.+]*", line)
+
+
+def test_everything_asked_for_is_pinned():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["test"], "setuptools"]
+    pinned = {plain(line.split("==")[0]) for line in (ROOT / "constraints.txt").read_text().split()}
+    assert {plain(re.split(r"[<>=~! ;\[]", name)[0]) for name in wanted} <= pinned
+
+
+def test_one_version():
+    import skyquilt
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["version"] == skyquilt.__version__
+    assert f"## {skyquilt.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_links_between_documents_lead_somewhere():
+    for page in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]:
+        for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text()):
+            if "://" not in target:
+                assert (page.parent / target).exists(), f"{page.relative_to(ROOT)} -> {target}"
+
+
+def test_the_readme_names_every_file_of_a_run_and_every_option():
+    from typer.main import get_command
+
+    from skyquilt.cli.app import app
+    from skyquilt.run.folder import CONTRACT
+
+    readme = (ROOT / "README.md").read_text()
+    assert [name for name in CONTRACT if f"`{name}`" not in readme] == []
+    options = [o for p in get_command(app).commands["mosaic"].params for o in p.opts if o.startswith("--")]
+    assert [o for o in options if f"`{o}" not in readme and f"{o}`" not in readme] == []
+
+
+def plain(name):
+    return re.sub(r"[-_.]+", "-", name).lower()

@@ -1,0 +1,32 @@
+"""What `import skyquilt` promises."""
+
+import subprocess
+import sys
+
+import pytest
+
+import skyquilt
+
+
+def test_every_public_name_is_there_and_listed():
+    for name in skyquilt.__all__:
+        assert getattr(skyquilt, name) is not None
+        assert name in dir(skyquilt)
+
+
+def test_there_are_about_ten():
+    assert len(skyquilt.__all__) <= 12
+    assert sorted(skyquilt.__all__) == skyquilt.__all__
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'moasic'"):
+        _ = skyquilt.moasic
+
+
+def test_importing_the_package_imports_nothing_heavy():
+    code = (
+        "import sys, skyquilt; print(*(m for m in ('numpy', 'cv2', 'scipy', 'rasterio') if m in sys.modules))"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == ""
