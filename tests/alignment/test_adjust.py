@@ -291,7 +291,12 @@ def strip(seed):
         seed, lines=1, per_line=20, points=500, gps=1.5, lens=lens, free=np.zeros(8, bool), lens_errs=False,
         true_tilt_deg=0.0, tilt_deg=1.0,
     )  # fmt: skip
-    wrong = replace(block.problem, K0=np.array([[700.0, 399.5, 299.5, 0, 0, 0, 0, 0]]), R0=block.truth.R, trust=min(1.0, 40 * 20 / len(block.problem.px)))
+    wrong = replace(
+        block.problem,
+        K0=np.array([[700.0, 399.5, 299.5, 0, 0, 0, 0, 0]]),
+        R0=block.truth.R,
+        trust=min(1.0, 40 * 20 / len(block.problem.px)),
+    )
     return block, wrong
 
 
