@@ -87,8 +87,11 @@ class MosaicSettings:
         ):  # fmt: skip
             if value is not None and not low <= value <= high:
                 raise UsageError(f"{name} {value} lies outside {low} to {high}")
-        west, south, east, north = self.bounds or (0.0, 0.0, 1.0, 1.0)
-        if not (np.isfinite([west, south, east, north]).all() and west < east and south < north):
+        if self.bounds and not (
+            np.isfinite(self.bounds).all()
+            and self.bounds[0] < self.bounds[2]
+            and self.bounds[1] < self.bounds[3]
+        ):
             raise UsageError(
                 f"--bounds is west,south,east,north with west < east and south < north, got {self.bounds}"
             )

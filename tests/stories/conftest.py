@@ -172,7 +172,7 @@ def taken_apart(data: bytes) -> tuple[bytes, str, bytes]:
 
 def relabel(
     path: Path, *, place: tuple[float, float] | None = None, heights: float | None = None,
-    drop: Sequence[str] = (), xmp: dict[str, str] | None = None, strip: bool = False, model: str | None = None,
+    drop: Sequence[str] = (), xmp: dict[str, str] | None = None, strip: bool = False,
 ) -> None:  # fmt: skip
     """Rewrites metadata: another place (latitude, longitude), heights moved by metres, parts dropped.
 
@@ -201,8 +201,6 @@ def relabel(
         for tag in (piexif.ExifIFD.FocalLength, piexif.ExifIFD.FocalLengthIn35mmFilm,
                     piexif.ExifIFD.FocalPlaneXResolution, piexif.ExifIFD.FocalPlaneYResolution):  # fmt: skip
             exif["Exif"].pop(tag, None)
-    if model is not None:
-        exif["0th"][piexif.ImageIFD.Model] = model
     for name, value in (xmp or {}).items():
         packet = packet.replace('rdf:about=""', f'rdf:about="" drone-dji:{name}="{value}"', 1)
     data = picture

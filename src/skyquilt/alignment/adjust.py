@@ -310,13 +310,18 @@ def adjust(
 def covariance(problem: Problem, state: State) -> Array | None:
     """Covariance ((6n+8m), (6n+8m)) of photos and cameras at the minimum, points marginalised.
 
-    For sightings that err as stated (scale it by their variance factor otherwise); None beyond `DENSE_LIMIT`.
+    In units of the whitened residuals, scaled by their robust variance factor; None beyond
+    `DENSE_LIMIT`, and where nothing holds some of them.
     """
     normal = normal_equations(problem, state)
     reduced = Reduced(problem, normal, 0.0)
     if not isinstance(reduced.S, np.ndarray):
         return None
-    # unknowns of unlike units: scaled to a unit diagonal before the inversion, back after it
-    scale = np.sqrt(np.maximum(np.diag(reduced.S), 1e-12))
-    correlation = reduced.S / np.outer(scale, scale) + 1e-12 * np.eye(reduced.size)
-    return np.asarray(np.linalg.inv(correlation) / np.outer(scale, scale))
+    S = reduced.S + np.diag(np.full(reduced.size, 1e-9))
+    scale = 1 / np.sqrt(np.maximum(np.diag(S), 1e-9))  # radians and metres differ by orders of magnitude
+    scale = scale[:, None] * scale
+    try:
+        inverse = np.linalg.inv(S * scale) * scale
+    except np.linalg.LinAlgError:
+        return None
+    return inverse if np.isfinite(inverse).all() else None

@@ -70,7 +70,8 @@ class ByMetadata:
             known = frame.vertical_datum != "unknown"
             given = f"heights above {frame.vertical_datum.replace('_', ' ')}" if known else "no heights"
             raise AlignmentError(
-                f"method {self.name} needs heights above ground, and the photos give {given}; add --height METRES"
+                f"method {self.name} needs heights above ground, and the photos give {given};"
+                " add --height METRES"
             )
         return np.where(np.isfinite(z), z, np.nanmedian(z) if np.isfinite(z).any() else np.nan)
 
@@ -97,11 +98,9 @@ class ByMetadata:
 def _nothing_placed(method: str, photos: int, rejected: dict[int, str]) -> str:
     """Why no photo could be placed, and what to do."""
     reasons = "; ".join(dict.fromkeys(rejected.values()))
-    advice = (
-        "add --height METRES"
-        if "height" in reasons
-        else "give positions and headings with --geo, or use --method bundle"
-    )
+    advice = "give positions and headings with --geo, or use --method bundle"
+    if "height" in reasons:
+        advice = "add --height METRES"
     return (
         f"method {method} places photos by their metadata, and none of {photos} can be placed"
         f" ({reasons[:200]}); {advice}"

@@ -1,4 +1,4 @@
-"""Positions that cannot be: one photo far from all others, all in one place, a whole flight at height zero."""
+"""Positions that cannot be: one far from all others, all in one place, a whole flight at height zero."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -54,8 +54,9 @@ def without_stuck(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str
         return tuple(photos), ()
     place = placed[0].position
     note = (
-        f"All {len(placed)} positions are one and the same ({place.latitude_deg:.6f}, {place.longitude_deg:.6f}): "
-        "the receiver stood still, and they were not used. Give positions in a geo.txt, or control points."
+        f"All {len(placed)} positions are one and the same"
+        f" ({place.latitude_deg:.6f}, {place.longitude_deg:.6f}): the receiver stood still, and they were not"
+        " used. Give positions in a geo.txt, or control points."
         if place
         else ""
     )

@@ -137,11 +137,11 @@ def _check_place(
         return
     outline = np.concatenate([v.footprint for v in views]) + alignment.frame.origin
     (west, south), (east, north) = outline.min(0), outline.max(0)
-    where = f"which cover {west:.0f},{south:.0f},{east:.0f},{north:.0f} in {alignment.frame.crs or 'their own frame'}"
+    frame = alignment.frame.crs or "their own frame"
+    where = f"which cover {west:.0f},{south:.0f},{east:.0f},{north:.0f} in {frame}"
     if settings.bounds is not None:
-        raise UsageError(
-            f"--bounds {','.join(f'{b:g}' for b in settings.bounds)} lies outside the photos, {where}"
-        )
+        asked = ",".join(f"{b:g}" for b in settings.bounds)
+        raise UsageError(f"--bounds {asked} lies outside the photos, {where}")
     raise SideFileError(f"the area of --boundary {settings.boundary} lies outside the photos, {where}")
 
 
@@ -156,8 +156,8 @@ def _check_size(grid: Grid, native: float) -> None:
         )
     if wide > WIDEST_M or grid.width * grid.height > MOST_PIXELS:
         raise UsageError(
-            f"the map would be {wide / 1000:.0f} km wide, {size} at {grid.gsd * 100:g} cm: the positions of some"
-            " photos (or --bounds) must be wrong; correct them with --geo, or choose a larger --gsd"
+            f"the map would be {wide / 1000:.0f} km wide, {size} at {grid.gsd * 100:g} cm: the positions of"
+            " some photos (or --bounds) must be wrong; correct them with --geo, or choose a larger --gsd"
         )
 
 

@@ -54,9 +54,8 @@ def alignment_figures(alignment: Alignment, priors: Sequence[Prior]) -> dict[str
         "blocks": [len(b) for b in alignment.blocks],
         "gps_residual_rms_m": xyz(rms),
         "gps_leave_one_out_rms_m": xyz(np.where(np.isfinite(rms), loo, np.nan) if loo is not None else None),
-        "reprojection_error_px": (
-            {"mean": _round(float(error.mean())), "rms": _round(rms_px)} if len(error) else None
-        ),
+        "reprojection_error_px": {"mean": _round(error.mean()),
+        "rms": _round(rms_px)} if len(error) else None,
         "tie_points": len(alignment.ties.xyz),
         "sightings": len(alignment.ties.point),
         "control": [

@@ -71,8 +71,8 @@ def iter_mosaic(
     parts, jobs = methods(settings), settings.jobs or os.cpu_count() or 1
     _apart(folder, Path(output))
     survey, control = _read(folder, settings)
-    key = run_key(survey, control, settings, parts)
-    run = open_run(Path(output), key, overwrite=overwrite, again=rerun_from is not None)
+    run_id = run_key(survey, control, settings, parts)
+    run = open_run(Path(output), run_id, overwrite=overwrite, again=rerun_from is not None)
     store = Store(folder=run.store, registry=REGISTRY)
     _forget(run, store, rerun_from)
     if run.done and (former := _figures(run.path / "metrics.json")):
@@ -86,7 +86,8 @@ def iter_mosaic(
     cache = PixelCache(read=lambda i: read_color(survey.photos[i]), budget_bytes=pixel_budget(settings))
     taken = yield from clock.stage("features", intake.take_in(survey.photos, cache, parts, store, jobs))
     taken, cache = _one_kind(taken, survey, cache, settings)
-    pictures = intake.Pictures(taken.photos, cache, store)
+    pixels = _still_there(taken.photos, cache)
+    pictures = intake.Pictures(taken.photos, pixels, store)
     frame = choose_frame(taken.photos, settings.crs, control)
     prior = priors(taken.photos, frame)
     links = yield from clock.stage("links", _links(taken, prior, parts, settings, store, jobs))
@@ -100,7 +101,7 @@ def iter_mosaic(
     exposure = yield from clock.stage(
         "balance", _at_once(lambda: drawing.balance(taken, ground, alignment, parts, settings))
     )
-    compose = drawing.composer(taken, ground, alignment, exposure, parts, _still_there(taken.photos, cache))
+    compose = drawing.composer(taken, ground, alignment, exposure, parts, pixels)
     key = digest(
         run.key,
         drawing.poses_digest(alignment),
@@ -243,8 +244,8 @@ def _still_there(photos: Sequence[Photo], cache: PixelCache) -> Callable[[int], 
             return cache(photo)
         except UnreadablePhotoError as error:
             raise SkyquiltError(
-                f"{photos[photo].path} could be read at first, and now {error}; see to its disk and run the same"
-                " command again to resume"
+                f"{photos[photo].path} could be read at first, and now {error}; see to its disk and run"
+                " the same command again to resume"
             ) from error
 
     return pixels
