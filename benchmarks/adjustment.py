@@ -18,14 +18,15 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 
 from benchmarks.cost import measure  # noqa: E402
-from skyquilt.alignment.adjust import adjust, robust_cost  # noqa: E402
-from skyquilt.alignment.problem import Problem, State  # noqa: E402
 from tests.alignment import ceres  # noqa: E402
 from tests.alignment.blocks import HEIGHT, WIDTH, make_block  # noqa: E402
 
+from skyquilt.alignment.adjust import adjust, robust_cost  # noqa: E402
+from skyquilt.alignment.problem import Problem, State  # noqa: E402
+
 SIZES = {
-    "18 photos": dict(lines=3, per_line=6, points=1000),
-    "75 photos": dict(lines=5, per_line=15, points=8200),
+    "18 photos": {"lines": 3, "per_line": 6, "points": 1000},
+    "75 photos": {"lines": 5, "per_line": 15, "points": 8200},
 }
 """Name -> layout: about 4000 and 46,000 sightings."""
 
