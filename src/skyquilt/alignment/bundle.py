@@ -219,11 +219,12 @@ def _outcome(
     cameras, camera_of = camera_records(photos, setup, state, None if full is None else full * variance)
     poses = {i: p for i, p in pose_records(setup, state).items() if i not in weak}
     blocks = tuple(tuple(i for i in b if i not in weak) for b in start.blocks)
+    metric = frame.metric and (start.metric or any(not c.check for c in control))
     return Alignment(
-        method="bundle", why="", frame=replace(frame, metric=frame.metric and start.metric), poses=poses,
+        method="bundle", why="", frame=replace(frame, metric=metric), poses=poses,
         cameras=cameras, camera_of=camera_of, blocks=tuple(b for b in blocks if b), ties=ties, rejected=weak,
         control=residuals_of_control(control, frame, setup, problem, state),
-        loo_rms_m=leave_one_out(problem, state, full),
+        loo_rms_m=leave_one_out(problem, state, full) if setup.georeferenced else None,
     )  # fmt: skip
 
 

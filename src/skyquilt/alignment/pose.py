@@ -73,7 +73,7 @@ class ByMetadata:
                 f"method {self.name} needs heights above ground, and the photos give {given};"
                 " add --height METRES"
             )
-        return np.where(np.isfinite(z), z, np.nanmedian(z))
+        return np.where(np.isfinite(z), z, np.nanmedian(z) if np.isfinite(z).any() else np.nan)
 
     def _placed(
         self, photos: Sequence[Photo], priors: Sequence[Prior], heights: np.ndarray

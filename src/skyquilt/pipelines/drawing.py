@@ -445,7 +445,7 @@ def write_surface(output: Path, ground: Ground, alignment: Alignment) -> None:
     grid = ground.grid
     factor = (
         max(1, int(ground.surface.cell / grid.gsd))
-        if ground.surface.source == "tie points"
+        if ground.surface.source != "plane"
         else max(grid.width, grid.height)
     )
     coarse = grid.coarser(factor)

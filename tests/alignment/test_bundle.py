@@ -1,0 +1,332 @@
+"""`bundle` from photos and links, its set-up, files turned upside down, and control points."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from skyquilt.alignment.bundle import Bundle, position_noise, prune
+from skyquilt.alignment.control import Control, control_in_frame, fit_similarity_3d
+from skyquilt.alignment.setup import HALF_TURN, mirrored
+from skyquilt.errors import AlignmentError
+from skyquilt.geometry.camera import project
+from skyquilt.geometry.frames import angles_from_cam_R_map, rotation_from_vector
+from skyquilt.model.camera import Camera
+from skyquilt.model.features import Features, Link, Matches
+from skyquilt.model.photo import ControlPoint, PointObservation
+from skyquilt.model.poses import MapFrame
+from skyquilt.twoview.verify import Verify
+from tests.alignment.blocks import HEIGHT, LENS, WIDTH, make_block
+from tests.alignment.surveys import photo, prior
+
+FRAME = MapFrame(crs="EPSG:32630", origin=(500000.0, 5600000.0), vertical_datum="takeoff")
+
+
+class Flown:
+    """A simulated block as photos, priors, features and links."""
+
+    def __init__(self, seed=0, *, turned=(), yaw_lies=(), gps=1.0, **options):
+        sigma_k = np.array([4.0, 2.0, 2.0, 0.01, 0.01, 0.01, 1e-3, 1e-3])
+        self.block = b = make_block(seed, points=500, gps=gps, tilt_deg=0.5, sigma_k=sigma_k, **options)
+        n = len(b.truth.C)
+        self.truth, self.turned = b.truth, set(turned)
+        self.photos = [
+            photo(f"{i:02d}.jpg", focal=LENS[0], sigma_focal=10.0, editor="Some Viewer" if i in self.turned else None)
+            for i in range(n)
+        ]  # fmt: skip
+        self.priors = []
+        for i in range(n):
+            yaw, pitch, roll = angles_from_cam_R_map(b.problem.R0[i])
+            self.priors.append(
+                prior(
+                    b.problem.C0[i],
+                    yaw=yaw + (180 if i in yaw_lies else 0),
+                    pitch=pitch,
+                    roll=roll,
+                    sigma=gps,
+                    sigma_z=2 * gps,
+                )
+            )
+        self.features, index = [], []
+        for i in range(n):
+            mine = np.flatnonzero(b.problem.photo == i)
+            px = b.problem.px[mine]
+            if i in self.turned:
+                px = np.array([WIDTH - 1, HEIGHT - 1]) - px
+            self.features.append(
+                Features(
+                    px=px,
+                    size=np.ones(len(px), np.float32),
+                    descriptors=np.zeros((len(px), 4), np.uint8),
+                    scale=1.0,
+                )
+            )
+            index.append(dict(zip(b.problem.point[mine].tolist(), range(len(mine)), strict=True)))
+        self.links = []
+        for i in range(n):
+            for j in range(i + 1, n):
+                shared = sorted(set(index[i]) & set(index[j]))
+                if len(shared) >= 20:
+                    m = Matches(
+                        index_a=np.array([index[i][p] for p in shared]),
+                        index_b=np.array([index[j][p] for p in shared]),
+                    )
+                    link = Verify()(i, j, self.features[i], self.features[j], m, WIDTH)
+                    if isinstance(link, Link):
+                        self.links.append(link)
+
+    def aligned(self, **options):
+        control = options.pop("control", ())
+        frame = options.pop("frame", FRAME)
+        return Bundle(**options)(self.photos, frame, self.priors, self.features, self.links, control)
+
+    def file_pose(self, i):
+        """True rotation of the file, which is its sensor's, turned if the file was."""
+        return HALF_TURN @ self.truth.R[i] if i in self.turned else self.truth.R[i]
+
+
+def worst_turn_deg(flown, alignment):
+    turn = [cv2.Rodrigues(p.cam_R_map @ flown.file_pose(i).T)[0] for i, p in alignment.poses.items()]
+    return float(np.degrees(np.linalg.norm(turn, axis=1)).max())
+
+
+def relative_error(flown, alignment):
+    """RMS in m of camera centres after the common shift is taken away."""
+    e = np.array([p.map_C - flown.truth.C[i] for i, p in sorted(alignment.poses.items())])
+    return float(np.sqrt(((e - e.mean(0)) ** 2).mean()))
+
+
+@pytest.fixture(scope="module")
+def plain():
+    flown = Flown()
+    return flown, flown.aligned()
+
+
+def test_a_block_is_found(plain):
+    flown, found = plain
+    assert found.blocks == (tuple(range(18)),) and found.method == "bundle" and not found.rejected
+    assert worst_turn_deg(flown, found) < 0.6
+    assert 0.02 < relative_error(flown, found) < 0.5
+    residual = np.linalg.norm(found.ties.residual_px, axis=1)
+    assert 0.2 < residual.mean() < 0.4  # noise of 0.3 px per axis: 0.376 less what the points absorb
+    (camera,) = found.cameras.values()
+    assert camera.focal == pytest.approx(flown.truth.K[0, 0], abs=12)
+    assert camera.sigmas is not None and 0.5 < camera.sigmas[0] < 10 and camera.sigmas[5] == 0.0
+
+
+def test_tie_points_project_where_they_were_seen(plain):
+    _, found = plain
+    t = found.ties
+    for i in (0, 7, 17):
+        mine = t.photo == i
+        px = project(found.camera(i), found.poses[i].to_camera(t.xyz[t.point[mine]]))
+        assert px - t.px[mine] == pytest.approx(t.residual_px[mine], abs=1e-6)
+    assert (np.diff(t.point) >= 0).all() and np.bincount(t.point).min() >= 2
+
+
+def test_files_turned_by_half_a_turn(plain):
+    """The middle line upside down: the same residuals and ground, its calibration mirrored, its poses turned."""
+    line = range(6, 12)
+    flown = Flown(turned=line)
+    found = flown.aligned()
+    assert set(found.camera_of.values()) == {"cam", "cam/turned"}
+    assert {i for i, k in found.camera_of.items() if k == "cam/turned"} == set(line)
+    straight, upside = found.cameras["cam"], found.cameras["cam/turned"]
+    assert upside.cx == pytest.approx(WIDTH - 1 - straight.cx) and upside.cy == pytest.approx(
+        HEIGHT - 1 - straight.cy
+    )
+    assert straight.cx == pytest.approx(plain[1].cameras["cam"].cx, abs=0.3)
+    assert worst_turn_deg(flown, found) < 0.6
+    error, before = (np.sqrt((a.ties.residual_px**2).mean()) for a in (found, plain[1]))
+    assert error == pytest.approx(before, rel=0.03)
+    for i in (7, 13):
+        t = found.ties
+        mine = t.photo == i
+        px = project(found.camera(i), found.poses[i].to_camera(t.xyz[t.point[mine]]))
+        assert px - t.px[mine] == pytest.approx(t.residual_px[mine], abs=1e-6)
+
+
+def test_a_mirrored_camera_is_the_turned_file_s():
+    """Every coefficient: a point's pixel in the turned file is the half turn of its pixel in the sensor."""
+    camera = Camera(
+        width=800, height=600, focal=700, cx=410, cy=290, k1=-0.1, k2=0.03, k3=-0.01, p1=2e-3, p2=-1e-3
+    )
+    xyz = np.random.default_rng(0).uniform((-20, -15, 40), (20, 15, 80), (50, 3))
+    turned = project(mirrored(camera), xyz @ HALF_TURN.T)
+    assert np.array([799, 599]) - turned == pytest.approx(project(camera, xyz), abs=1e-9)
+    assert mirrored(mirrored(camera)) == camera
+
+
+def test_yaws_that_lie_do_not_matter(plain):
+    """A line whose reported yaw is half a turn off, but whose files nobody turned."""
+    flown = Flown(yaw_lies=range(6, 12))
+    found = flown.aligned()
+    assert set(found.camera_of.values()) == {"cam"}
+    assert worst_turn_deg(flown, found) < 0.6
+    assert relative_error(flown, found) < relative_error(*plain) + 0.1
+
+
+def test_a_position_that_lies_is_outvoted():
+    flown = Flown(2)
+    flown.priors[4] = replace(flown.priors[4], map_C=flown.priors[4].map_C + (60.0, -40.0, 0.0))
+    found = flown.aligned()
+    assert np.abs(found.poses[4].map_C - flown.truth.C[4])[:2].max() < 2.0
+    trusting = flown.aligned(repair=False)
+    assert (
+        np.abs(trusting.poses[4].map_C - flown.truth.C[4])[:2].max() > 3.0
+    )  # `--trust-metadata` believes it
+
+
+def test_two_blocks_are_both_kept():
+    flown = Flown(3)
+    flown.links = [k for k in flown.links if (k.a < 12) == (k.b < 12)]
+    found = flown.aligned()
+    assert found.blocks == (tuple(range(12)), tuple(range(12, 18)))
+    assert len(found.poses) == 18
+
+
+def test_no_links():
+    flown = Flown(4)
+    flown.links = []
+    with pytest.raises(AlignmentError, match="none of 18"):
+        flown.aligned()
+
+
+def test_leave_one_out_is_larger_than_the_residual_and_of_the_noise_s_size(plain):
+    flown, found = plain
+    residual = np.array([found.poses[i].map_C - flown.priors[i].map_C for i in range(18)])
+    rms = np.sqrt((residual**2).mean(0))
+    assert (np.array(found.loo_rms_m)[:2] > rms[:2]).all()
+    assert 0.6 < np.mean(found.loo_rms_m[:2]) < 1.6  # GPS noise of 1 m
+
+
+def test_position_noise_is_what_neighbours_do_not_share():
+    rng = np.random.default_rng(0)
+    n = 400
+    smooth = np.column_stack([np.sin(np.arange(n) / 60) * 20, np.arange(n) * 0.05])
+    assert position_noise(smooth + rng.normal(0, 1.5, (n, 2))) == pytest.approx(1.5, rel=0.15)
+    assert position_noise(smooth[:5]) == 0.0
+    assert position_noise(np.full((10, 2), np.nan)) == 0.0
+
+
+def test_pruning_drops_lies_and_lonely_points_but_no_control():
+    block = make_block(5, lies=0.05)
+    problem = replace(block.problem, X0=block.problem.X0.copy())
+    problem.X0[0] = block.truth.X[0] + 50  # a control point that fits nothing
+    pruned, state = prune(
+        problem, replace(block.truth, X=np.r_[block.truth.X[:1] + 50, block.truth.X[1:]]), 8.0
+    )
+    assert (pruned.point == 0).sum() == (problem.point == 0).sum()
+    assert len(pruned.px) >= (~block.wrong).sum() - 2 * block.wrong.sum()
+    error = np.abs(pruned.px[:, None] - block.problem.px[block.wrong][None]).sum(2).min(1)
+    near = np.linalg.norm(block.problem.px[block.wrong], axis=1)
+    assert (error[pruned.point > 0] == 0).sum() < 0.05 * len(near)
+    assert np.bincount(pruned.point).min() >= 1 and len(state.X) == pruned.point.max() + 1
+
+
+# control points
+
+
+def test_umeyama():
+    rng = np.random.default_rng(0)
+    x = rng.normal(0, 10, (6, 3))
+    s, R, t = 2.5, rotation_from_vector(np.array([0.4, -1.2, 2.0])), np.array([5.0, -7.0, 100.0])
+    found_s, found_R, found_t = fit_similarity_3d(x, s * x @ R.T + t)
+    assert found_s == pytest.approx(s) and found_R == pytest.approx(R) and found_t == pytest.approx(t)
+    mirror = x * (1, 1, -1)  # no rotation makes a mirror image: the best proper one is found
+    assert np.linalg.det(fit_similarity_3d(x, mirror)[1]) == pytest.approx(1)
+    plane = x * (1, 1, 0)
+    assert fit_similarity_3d(plane, s * plane @ R.T + t)[1] == pytest.approx(R)
+
+
+def sighted(flown, xyz, name, *, check=False, rng=None, offset=0.0):
+    """A surveyed point seen by all photos that show it, with 0.3 px of noise."""
+    from tests.alignment.blocks import seen_by
+
+    photos, pixels = [], []
+    for i in range(len(flown.photos)):
+        px = seen_by(flown.truth.R[i], flown.truth.C[i], flown.truth.K[0], xyz[None])[0] + rng.normal(
+            0, 0.3, 2
+        )
+        if (px > 5).all() and px[0] < WIDTH - 5 and px[1] < HEIGHT - 5:
+            photos.append(i)
+            pixels.append(px)
+    return Control(
+        name=name, check=check, xyz=xyz + offset, sigma_m=0.02, photo=np.array(photos), px=np.array(pixels)
+    )
+
+
+def surveyed(flown, *, offset=0.0, checks=()):
+    rng = np.random.default_rng(1)
+    places = np.array([[5, 5, 1.0], [60, 4, 0.5], [8, 55, -1.0], [62, 60, 2.0], [35, 30, 0.0], [30, 12, 1.0]])
+    return [
+        sighted(flown, p, f"{'c' if k in checks else 'g'}{k}", check=k in checks, rng=rng, offset=offset)
+        for k, p in enumerate(places)
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("offset", [0.0, np.array([1.5, -2.0, 430.0])])
+def test_control_points_move_the_block_to_the_ground(offset):
+    """The GPS shares an offset with nothing on the ground: the points win, in height by hundreds of metres."""
+    flown = Flown(6)
+    found = flown.aligned(control=surveyed(flown, offset=offset, checks=(5,)))
+    residuals = {c.name: c for c in found.control}
+    for c in residuals.values():
+        assert np.abs(c.error_m[:2]).max() < 0.08 and abs(c.error_m[2]) < 0.5
+        assert c.reprojection_px < 1.0
+    assert residuals["c5"].check
+    shift = np.mean([p.map_C - flown.truth.C[i] for i, p in found.poses.items()], axis=0)
+    assert shift[:2] == pytest.approx(np.zeros(2) + offset if np.isscalar(offset) else offset[:2], abs=0.3)
+    assert found.frame.vertical_datum == "control"
+
+
+def test_check_points_take_no_part():
+    """A check point surveyed 5 m wrong is reported as such and changes nothing else."""
+    flown = Flown(6)
+    control = surveyed(flown, checks=(5,))
+    good = flown.aligned(control=control)
+    control[5] = replace(control[5], xyz=control[5].xyz + (5.0, 0, 0))
+    bad = flown.aligned(control=control)
+    for i in good.poses:
+        assert bad.poses[i].map_C == pytest.approx(good.poses[i].map_C, abs=1e-9)
+    off = [next(c for c in a.control if c.name == "c5").error_m for a in (good, bad)]
+    assert off[1] - off[0] == pytest.approx([-5.0, 0, 0], abs=1e-9)
+
+
+def without_positions(flown):
+    flown.priors = [
+        replace(p, map_C=np.full(3, np.nan), sigma_C=np.full(3, np.inf), yaw_deg=np.nan) for p in flown.priors
+    ]
+    return flown
+
+
+def test_three_control_points_georeference_photos_without_positions():
+    flown = without_positions(Flown(7))
+    found = flown.aligned(control=surveyed(flown, checks=(4, 5)))
+    assert found.frame.metric and found.loo_rms_m is None  # there was no position to leave out
+    assert worst_turn_deg(flown, found) < 1.0
+    assert max(np.abs(p.map_C - flown.truth.C[i]).max() for i, p in found.poses.items()) < 2.0
+    for c in found.control:
+        assert np.abs(c.error_m[:2]).max() < 0.3
+
+
+def test_two_control_points_are_too_few():
+    flown = without_positions(Flown(7))
+    with pytest.raises(AlignmentError, match="3 control points"):
+        flown.aligned(control=surveyed(flown)[:2])
+
+
+def test_control_points_in_another_crs():
+    from pyproj import Transformer
+
+    photos = [photo("a.jpg"), photo("sub/b.jpg")]
+    x, y = Transformer.from_crs(32630, 27700, always_xy=True).transform(500010.0, 5600020.0)
+    point = ControlPoint(
+        name="p", x=x, y=y, z=None, crs="EPSG:27700",
+        observations=(PointObservation(photo="sub/b.jpg", x=3, y=4), PointObservation(photo="gone.jpg", x=1, y=2)),
+    )  # fmt: skip
+    unseen = replace(point, name="q", observations=(PointObservation(photo="gone.jpg", x=1, y=2),))
+    (found,) = control_in_frame([point, unseen], photos, FRAME)
+    assert found.xyz[:2] == pytest.approx([10.0, 20.0], abs=1e-3) and np.isnan(found.xyz[2])
+    assert found.photo.tolist() == [1] and found.px.tolist() == [[3.0, 4.0]]

@@ -1,0 +1,123 @@
+"""Projection against OpenCV, its derivatives against differences, its inverse against itself."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from skyquilt.geometry.camera import (
+    distort,
+    monotone_radius,
+    project,
+    project_with_derivatives,
+    rays,
+    undistort,
+)
+from skyquilt.model.camera import Camera
+
+small = st.floats(-0.01, 0.01)
+
+
+@st.composite
+def cameras(draw):
+    width, height = draw(st.integers(300, 6000)), draw(st.integers(300, 6000))
+    focal = draw(st.floats(0.5, 3.0)) * max(width, height)
+    return Camera(
+        width=width, height=height, focal=focal,
+        cx=(width - 1) / 2 + draw(st.floats(-0.05, 0.05)) * width,
+        cy=(height - 1) / 2 + draw(st.floats(-0.05, 0.05)) * height,
+        k1=draw(st.floats(-0.35, 0.35)), k2=draw(st.floats(-0.15, 0.15)), k3=draw(st.floats(-0.05, 0.05)),
+        p1=draw(small), p2=draw(small),
+    )  # fmt: skip
+
+
+def points(seed, count=40, spread=0.6):
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(0.5, 200, count)
+    return np.column_stack([rng.uniform(-spread, spread, (count, 2)) * z[:, None], z])
+
+
+@given(cameras(), st.integers(0, 2**31))
+def test_projection_is_opencv_s(camera, seed):
+    xyz = points(seed)
+    k = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
+    theirs = cv2.projectPoints(xyz, np.zeros(3), np.zeros(3), camera.matrix, k)[0][:, 0]
+    assert project(camera, xyz) == pytest.approx(theirs, abs=1e-8 * camera.focal)
+
+
+def test_behind_the_camera_is_nowhere():
+    camera = Camera.ideal(width=400, height=300, focal=350)
+    px = project(camera, np.array([[0.0, 0, 5], [1.0, 1, -5], [0.0, 0, 0], [2.0, 0, 1e-9]]))
+    assert np.isnan(px).all(1).tolist() == [False, True, True, False]
+    assert px[0] == pytest.approx([199.5, 149.5])
+
+
+@settings(max_examples=40)
+@given(cameras(), st.integers(0, 2**31))
+def test_derivatives_are_those_of_the_projection(camera, seed):
+    xyz = points(seed, 12)
+    k = np.tile(camera.vector, (len(xyz), 1))
+    exact = project_with_derivatives(k, xyz)
+    assert exact.px == pytest.approx(project(camera, xyz), abs=1e-9 * camera.focal)
+
+    def px(k, xyz):
+        return distort(xyz[:, :2] / xyz[:, 2:], k) * k[:, :1] + k[:, 1:3]
+
+    for axis in range(3):
+        h = 1e-6 * xyz[:, 2:]
+        step = np.eye(3)[axis] * h
+        numeric = (px(k, xyz + step) - px(k, xyz - step)) / (2 * h)
+        assert exact.d_point[:, :, axis] == pytest.approx(numeric, rel=1e-6, abs=2e-6 * camera.focal / 0.5)
+    for column in range(8):
+        h = 1e-6 * (camera.focal if column < 3 else 1.0)
+        step = np.eye(8)[column] * h
+        numeric = (px(k + step, xyz) - px(k - step, xyz)) / (2 * h)
+        scale = max(1.0, float(np.abs(numeric).max()))
+        assert exact.d_intrinsics[:, :, column] == pytest.approx(numeric, abs=1e-7 * scale)
+
+
+@settings(max_examples=200)
+@given(cameras(), st.integers(0, 2**31))
+def test_undistortion_inverts_distortion(camera, seed):
+    """Wherever the image's own pixels are (their radius may be beyond what folds: not asked of those)."""
+    rng = np.random.default_rng(seed)
+    reach = min(0.98 * monotone_radius(camera), 0.9)
+    radius, angle = reach * np.sqrt(rng.random(60)), rng.uniform(0, 2 * np.pi, 60)
+    xy = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
+    jacobian = project_with_derivatives(
+        np.tile(np.r_[1, 0, 0, camera.vector[3:]], (60, 1)), np.c_[xy, np.ones(60)]
+    )
+    assume(np.linalg.det(jacobian.d_point[:, :, :2]).min() > 0.02)  # tangential terms may fold earlier
+    px = project(camera, np.c_[xy, np.ones(60)])
+    assert undistort(camera, px) == pytest.approx(xy, abs=1e-9)
+    assert rays(camera, px) == pytest.approx(np.c_[xy, np.ones(60)], abs=1e-9)
+
+
+def test_any_shape_and_no_points():
+    camera = Camera(width=400, height=300, focal=350, cx=200, cy=150, k1=-0.1, p1=0.001)
+    px = np.random.default_rng(0).uniform(0, 300, (4, 5, 2))
+    assert undistort(camera, px)[2, 3] == pytest.approx(undistort(camera, px[2, 3:4])[0], abs=1e-12)
+    assert undistort(camera, np.zeros((0, 2))).shape == (0, 2)
+    assert rays(camera, px).shape == (4, 5, 3)
+
+
+@given(st.floats(-2, -0.05))
+def test_radius_of_the_fold_of_a_barrel(k1):
+    """Slope 1 + 3 k1 r^2 falls to 0.05 at r = sqrt(0.95 / (-3 k1)), on steps of 0.005."""
+    exact = np.sqrt(0.95 / (-3 * k1))
+    found = monotone_radius(Camera(width=100, height=100, focal=100, cx=50, cy=50, k1=k1))
+    assert min(exact, 3.0) <= found + 1e-12 <= min(exact, 3.0) + 0.005 + 1e-9
+
+
+@given(cameras())
+def test_distortion_grows_up_to_that_radius_and_hardly_beyond(camera):
+    limit = monotone_radius(camera)
+    r = np.linspace(0, limit - 0.006, 500)
+    k = np.r_[camera.vector[:6], 0, 0]
+    assert (np.diff(distort(np.c_[r, 0 * r], k)[:, 0]) > 0).all()
+    if limit < 3:
+        step = distort(np.array([[limit, 0.0], [limit + 1e-6, 0.0]]), k)[:, 0]
+        assert np.diff(step)[0] <= 0.051e-6
+    mirror = Camera.ideal(width=10, height=10, focal=10)
+    assert monotone_radius(mirror) == 3.0

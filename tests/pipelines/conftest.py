@@ -1,0 +1,53 @@
+"""A small simulated flight and its mosaic, made once."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skyquilt.config import MosaicSettings
+from skyquilt.model.event import Event, Result
+from skyquilt.pipelines.mosaic import iter_mosaic
+from skyquilt.simulate import FlightSettings, simulate
+from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.settings import Control, Route
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finished:
+    """A run's folder and what it told."""
+
+    output: Path
+    events: list[Event]
+
+    def json(self, name: str) -> Any:
+        return json.loads((self.output / name).read_text())
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        return self.json("metrics.json")
+
+
+@pytest.fixture(scope="session")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Nine photos of 800 x 600 px, `gcp_list.txt` beside their folder `photos`, and `truth`."""
+    folder = tmp_path_factory.mktemp("flight")
+    settings = FlightSettings(
+        seed=3, lens=Lens().scaled(800, 600), route=Route(photos=9), control=Control(points=5, checks=3)
+    )
+    for _ in simulate(settings, folder, overwrite=True):
+        pass
+    return folder
+
+
+@pytest.fixture(scope="session")
+def finished(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """The flight's mosaic with control points."""
+    output = tmp_path_factory.mktemp("finished") / "out"
+    gcp = next(flight.rglob("gcp_list.txt"))
+    settings = MosaicSettings(gcp=gcp, jobs=2)
+    events = list(iter_mosaic(flight / "photos", output, settings))
+    assert isinstance(events[-1], Result)
+    return Finished(output=output, events=events)

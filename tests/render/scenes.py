@@ -1,0 +1,89 @@
+"""Flat textured ground, photographed exactly by ideal cameras, and the composer's parts around it."""
+
+from functools import cache
+
+import cv2
+import numpy as np
+
+from skyquilt.geometry.camera import undistort
+from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.imaging.views import View, footprint
+from skyquilt.model.camera import Camera
+from skyquilt.model.poses import Pose
+from skyquilt.model.raster import Grid
+from skyquilt.model.surface import Surface
+from skyquilt.render.blend import Feather
+from skyquilt.render.compose import Composer
+from skyquilt.render.exposure import NEUTRAL
+from tests.texture import texture
+
+FLAT = Surface(z=np.zeros((2, 2), np.float32), x0=0.0, y0=0.0, cell=1.0, source="plane")
+CAMERA = Camera(width=400, height=300, focal=350.0, cx=203.0, cy=148.0, k1=-0.06, k2=0.02, p1=5e-4, p2=-3e-4)
+FINE_M = 0.025
+"""Ground size of a texture pixel in m."""
+GROUND = np.clip(texture(3200, 3200, seed=11, roughness=1.2), 5, 250).astype(np.float32)
+"""80 m x 80 m about the origin, row 0 in the north."""
+
+
+def view(number, x, y, *, z=40.0, yaw=0.0, pitch=0.0, roll=0.0, camera=CAMERA, surface=FLAT):
+    pose = Pose(cam_R_map=cam_R_map_from_angles(yaw, pitch, roll), map_C=np.array([x, y, z]))
+    return View(photo=number, camera=camera, pose=pose, footprint=footprint(camera, pose, surface))
+
+
+def ground_of(shot, px):
+    """Map coordinates (n, 2) on z = 0 of photo pixels: the pixels' rays cut with the ground."""
+    return _on_ground(shot, undistort(shot.camera, px))
+
+
+def _on_ground(shot, xy):
+    d = np.c_[xy, np.ones(len(xy))] @ shot.pose.cam_R_map
+    return shot.pose.map_C[:2] - d[:, :2] * (shot.pose.map_C[2] / d[:, 2])[:, None]
+
+
+def photograph(shot, ground=GROUND):
+    """The photo's picture: every pixel the mean of 3 x 3 rays into the ground."""
+    h, w = shot.camera.height, shot.camera.width
+    total = np.zeros((h, w), np.float32)
+    for plane in _sub_pixels(shot.camera):
+        xy = _on_ground(shot, plane)
+        column = (xy[:, 0] / FINE_M + ground.shape[1] / 2 - 0.5).astype(np.float32).reshape(h, w)
+        row = (ground.shape[0] / 2 - xy[:, 1] / FINE_M - 0.5).astype(np.float32).reshape(h, w)
+        total += cv2.remap(ground, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    return total / 9
+
+
+@cache
+def _sub_pixels(camera):
+    """Undistorted coordinates of nine places in every pixel."""
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    thirds = (-1 / 3, 0, 1 / 3)
+    return [undistort(camera, np.c_[(u + du).ravel(), (v + dv).ravel()]) for du in thirds for dv in thirds]
+
+
+def truth(grid, ground=GROUND):
+    """The ground averaged over the pixels of a grid whose resolution is a multiple of the texture's."""
+    k = round(grid.gsd / FINE_M)
+    top = round((ground.shape[0] / 2) - grid.north / FINE_M)
+    left = round(ground.shape[1] / 2 + grid.west / FINE_M)
+    cut = ground[top : top + k * grid.height, left : left + k * grid.width]
+    return cv2.resize(cut, (grid.width, grid.height), interpolation=cv2.INTER_AREA)
+
+
+def block():
+    """Six overlapping photos, tilted and turned."""
+    rng = np.random.default_rng(4)
+    return [
+        view(3 * k, 14.0 * (k % 3) - 14, 12.0 * (k // 3) - 6, yaw=rng.uniform(0, 360), pitch=rng.normal(0, 3), roll=rng.normal(0, 3))
+        for k in range(6)
+    ]  # fmt: skip
+
+
+def composer(views, pictures, grid, blend=None, *, exposure=NEUTRAL, surface=FLAT, dtype=np.uint8, bands=1):
+    """`pictures`: photo -> pixels."""
+    return Composer(
+        grid=grid, views=views, surface=surface, blend=blend or Feather(), pixels=lambda i: pictures[i], bands=bands,
+        dtype=np.dtype(dtype), exposure=exposure,
+    )  # fmt: skip
+
+
+GRID = Grid(west=-24.0, north=18.0, gsd=0.1, width=480, height=360)

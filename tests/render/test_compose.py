@@ -1,0 +1,189 @@
+"""Composition of exact photos of known ground against the ground, and its rules against brute force."""
+
+import numpy as np
+import pytest
+
+from skyquilt.geometry.camera import project
+from skyquilt.imaging.registration import shifts_between
+from skyquilt.imaging.views import STEP, inside
+from skyquilt.model.raster import Grid, Window
+from skyquilt.model.surface import Surface
+from skyquilt.render.blend import Average, Feather, First, Multiband
+from tests.render.scenes import CAMERA, GRID, block, composer, photograph, truth, view
+
+WHOLE = Window(row=0, column=0, height=GRID.height, width=GRID.width)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    views = block()
+    pictures = {v.photo: np.clip(np.rint(photograph(v)), 0, 255).astype(np.uint8)[..., None] for v in views}
+    return views, pictures
+
+
+def exact_pixels(views, grid=GRID):
+    """u, v (photos, h, w) of every map pixel in every photo, each projected by itself, and what decides between photos."""
+    x, y = np.meshgrid(grid.x(np.arange(grid.width)), grid.y(np.arange(grid.height)))
+    xyz = np.stack([x, y, 0 * x], -1)
+    px = np.stack(
+        [project(v.camera, v.pose.to_camera(xyz.reshape(-1, 3))).reshape(*x.shape, 2) for v in views]
+    )
+    C = np.array([v.pose.map_C for v in views])
+    tangent2 = ((x - C[:, 0, None, None]) ** 2 + (y - C[:, 1, None, None]) ** 2) / C[:, 2, None, None] ** 2
+    seen = np.stack([inside(v.camera, p[..., 0], p[..., 1]) for v, p in zip(views, px, strict=True)])
+    return px, np.where(seen, tangent2, np.inf), seen
+
+
+@pytest.mark.parametrize(
+    "blend", [Feather(), First(), Average(), Multiband(levels=3)], ids=lambda b: type(b).__name__
+)
+def test_the_map_is_the_ground(scene, blend):
+    views, pictures = scene
+    made = composer(views, pictures, GRID, blend)(WHOLE)
+    expected = truth(GRID)
+    valid = made.photo >= 0
+    error = made.pixels[..., 0].astype(float) - expected
+    assert abs(error[valid].mean()) < 0.3 and np.sqrt((error[valid] ** 2).mean()) < 4.0
+    a, b = [], []
+    for row in range(0, 360 - 64, 48):
+        for column in range(0, 480 - 64, 48):
+            cut = np.s_[row : row + 64, column : column + 64]
+            if valid[cut].all():
+                a.append(expected[cut])
+                b.append(made.pixels[cut][..., 0].astype(np.float32))
+    shifts = [(s.dx, s.dy) for s in shifts_between(np.array(a), np.array(b)) if s.ok]
+    assert len(shifts) > 0.9 * len(a) > 15
+    assert np.hypot(*np.array(shifts).T).max() < 0.1
+    assert np.abs(np.mean(shifts, axis=0)).max() < 0.03
+
+
+def test_a_shifted_camera_would_be_noticed(scene):
+    """The tolerance above is worth something: half a photo pixel of principal point shows."""
+    from dataclasses import replace
+
+    views, pictures = scene
+    bent = [replace(v, camera=replace(v.camera, cx=v.camera.cx + 0.5)) for v in views]
+    made = composer(bent, pictures, GRID, First())(WHOLE)
+    cut = np.s_[150:214, 200:264]
+    (shift,) = shifts_between(truth(GRID)[cut][None], made.pixels[cut][None, ..., 0].astype(np.float32))
+    assert np.hypot(shift.dx, shift.dy) > 0.3
+
+
+def test_the_most_vertical_view_wins(scene):
+    views, pictures = scene
+    made = composer(views, pictures, GRID, Feather(width_px=0))(WHOLE)
+    px, score, seen = exact_pixels(views)
+    numbers = np.array([v.photo for v in views])
+    expected = np.where(seen.any(0), numbers[score.argmin(0)], -1)
+    differs = made.photo != expected
+    # at seams nodes interpolate a parabola linearly: pixels that differ lie within a pixel of equal scores or of a rim
+    two = np.sort(score, axis=0)[:2]
+    with np.errstate(invalid="ignore"):
+        near_seam = two[1] - two[0] < 4e-3
+    edge = np.min([np.abs(np.stack([p[..., 0] - 2, p[..., 1] - 2, CAMERA.width - 3 - p[..., 0], CAMERA.height - 3 - p[..., 1]])).min(0) for p in px], axis=0) < 1.0  # fmt: skip
+    assert differs.mean() < 0.01
+    assert not (differs & ~near_seam & ~edge).any()
+
+
+def test_the_first_photo_stays(scene):
+    views, pictures = scene
+    made = composer(views, pictures, GRID, First())(WHOLE)
+    _, _, seen = exact_pixels(views)
+    numbers = np.array([v.photo for v in views])
+    expected = np.where(seen.any(0), numbers[seen.argmax(0)], -1)
+    assert (made.photo != expected).mean() < 0.003
+
+
+def test_the_average_is_the_mean_of_all_that_see(scene):
+    views, _ = scene
+    levels = {
+        v.photo: np.full((CAMERA.height, CAMERA.width, 1), 20 + 31 * k, np.uint8) for k, v in enumerate(views)
+    }
+    made = composer(views, levels, GRID, Average())(WHOLE)
+    _, _, seen = exact_pixels(views)
+    mean = (seen * (20 + 31 * np.arange(6))[:, None, None]).sum(0) / np.maximum(seen.sum(0), 1)
+    off = np.abs(made.pixels[..., 0] - mean) > 0.501
+    assert off.mean() < 0.012  # rims move by a fraction of a pixel
+    assert (made.photo >= 0).sum() == pytest.approx(seen.any(0).sum(), rel=2e-3)
+
+
+def test_views_are_counted_at_the_cells_middles(scene):
+    views, pictures = scene
+    made = composer(views, pictures, GRID)(WHOLE)
+    coarse = Grid(
+        west=GRID.west,
+        north=GRID.north,
+        gsd=GRID.gsd * STEP,
+        width=GRID.width // STEP,
+        height=-(-GRID.height // STEP),
+    )
+    _, _, seen = exact_pixels(views, coarse)
+    assert made.views.shape == (coarse.height, coarse.width)
+    assert (made.views == seen.sum(0)).mean() > 0.995 and made.views.max() >= 4
+
+
+@pytest.mark.parametrize(
+    "blend", [Feather(), First(), Average(), Multiband(levels=3)], ids=lambda b: type(b).__name__
+)
+def test_pieces_fit_together(scene, blend):
+    """Windows at multiples of the step, composed by themselves, equal the whole."""
+    views, pictures = scene
+    compose = composer(views, pictures, GRID, blend)
+    whole = compose(WHOLE)
+    for row in range(0, GRID.height, 128):
+        for column in range(0, GRID.width, 160):
+            h, w = min(128, GRID.height - row), min(160, GRID.width - column)
+            part = compose(Window(row=row, column=column, height=h, width=w))
+            cut = np.s_[row : row + h, column : column + w]
+            # nodes in float32 differ in the last digit; multiband sees a finite margin
+            assert np.abs(part.pixels.astype(int) - whole.pixels[cut].astype(int)).max() <= 1
+            assert (part.photo != whole.photo[cut]).mean() < 1e-3
+            k = np.s_[row // STEP : -(-(row + h) // STEP), column // STEP : -(-(column + w) // STEP)]
+            assert (part.views == whole.views[k]).all()
+
+
+def test_measured_values_are_resampled_and_nothing_else():
+    """Float bands: a photo that shows a linear field of its own pixels gives exactly that field; gaps are NaN."""
+    shot = view(5, 0, 0, yaw=30)
+    u, v = np.meshgrid(np.arange(400, dtype=np.float32), np.arange(300, dtype=np.float32))
+    picture = (0.25 * u - 0.5 * v - 273.0)[..., None]
+    compose = composer([shot], {5: picture}, GRID, Feather(), dtype=np.float32)
+    made = compose(WHOLE)
+    px, _, seen = exact_pixels([shot])
+    expected = 0.25 * px[0, ..., 0] - 0.5 * px[0, ..., 1] - 273.0
+    valid = made.photo >= 0
+    assert valid.sum() == pytest.approx(seen.sum(), rel=3e-3)
+    assert np.isnan(made.pixels[~valid]).all() and np.isfinite(made.pixels[valid]).all()
+    # remap rounds positions to 1/32 px, nodes interpolate the projection
+    assert np.abs(made.pixels[valid][:, 0] - expected[valid]).max() < 0.06
+    assert abs((made.pixels[valid][:, 0] - expected[valid]).mean()) < 2e-3
+
+
+def test_values_far_beyond_bytes_survive_blending():
+    shots = [view(0, -5, 0), view(1, 5, 0)]
+    pictures = {0: np.full((300, 400, 1), 1e6, np.float32), 1: np.full((300, 400, 1), -40.0, np.float32)}
+    made = composer(shots, pictures, GRID, Feather(width_px=0), dtype=np.float32)(WHOLE)
+    assert set(np.unique(made.pixels[np.isfinite(made.pixels)])) == {-40.0, 1e6}
+
+
+def test_relief_is_taken_out():
+    """A slope of 20 %: photos of it, projected point by point, meet the true places of its texture."""
+    x = np.arange(0, 400.0, 1.0)
+    slope = Surface(
+        z=np.tile((0.2 * (x - 200)).astype(np.float32), (400, 1)), x0=-200.0, y0=-200.0, cell=1.0, source="t"
+    )
+    shot = view(0, 2, 1, z=45, yaw=75, pitch=3, surface=slope)
+    u, v = np.meshgrid(np.arange(400, dtype=np.float32), np.arange(300, dtype=np.float32))
+    pictures = {0: np.dstack([u, v])}
+    made = composer([shot], pictures, GRID, Feather(), surface=slope, dtype=np.float32, bands=2)(WHOLE)
+    rows, columns = np.nonzero(made.photo >= 0)
+    pick = np.random.default_rng(0).choice(len(rows), 500, replace=False)
+    x, y = GRID.x(columns[pick]), GRID.y(rows[pick])
+    px = project(shot.camera, shot.pose.to_camera(np.c_[x, y, 0.2 * x]))
+    assert np.abs(made.pixels[rows[pick], columns[pick]] - px).max() < 0.08
+
+
+def test_nothing_to_see():
+    far = view(0, 500, 500)
+    made = composer([far], {0: np.zeros((300, 400, 1), np.uint8)}, GRID)(WHOLE)
+    assert (made.photo == -1).all() and not made.pixels.any() and not made.views.any()
