@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skyquilt.model.raster import Window
 from skyquilt.render.exposure import NEUTRAL, Balance, Exposure, odds_table, with_odds
 from tests.render.scenes import FLAT, GRID, block, composer, photograph
-from skyquilt.model.raster import Window
 
 gains = st.floats(-1.5, 1.5)
 

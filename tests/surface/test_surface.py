@@ -7,12 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyquilt.geometry.camera import undistort
+from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.imaging.views import View, footprint
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Pose
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
-from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.surface.plane import level
 from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints, grid_spacing, without_outliers
