@@ -1,6 +1,7 @@
 """The command line's promises: choices, exit codes, sentences instead of tracebacks."""
 
 import re
+import subprocess
 import sys
 
 import pytest
@@ -105,10 +106,19 @@ def test_mistakes_get_a_sentence_and_a_code(monkeypatch, capsys, tmp_path, words
     assert sentence in told
 
 
-def test_an_interrupt_ends_with_130_and_says_how_to_go_on(monkeypatch, capsys):
-    def interrupted():
-        raise KeyboardInterrupt
+INTERRUPTED = """
+import sys
+from skyquilt.cli import app, main
+def interrupted():
+    raise KeyboardInterrupt
+app.app = interrupted
+sys.argv = ["skyquilt", "mosaic"]
+main.run()
+"""
 
-    monkeypatch.setattr(commands, "app", interrupted)
-    assert run(monkeypatch, "mosaic") == 130
-    assert "again to resume" in capsys.readouterr().err
+
+def test_an_interrupt_ends_with_130_and_says_how_to_go_on():
+    """In a process of its own: an interrupt takes all threads with it."""
+    done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False)
+    assert done.returncode == 130
+    assert done.stderr == "skyquilt: interrupted; run the same command again to resume\n"
