@@ -18,12 +18,16 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 
 from benchmarks.cost import measure  # noqa: E402
-from skyquilt.alignment.adjust import adjust, robust_cost  # noqa: E402
-from skyquilt.alignment.problem import Problem, State  # noqa: E402
 from tests.alignment import ceres  # noqa: E402
 from tests.alignment.blocks import HEIGHT, WIDTH, make_block  # noqa: E402
 
-SIZES = {"18 photos": dict(lines=3, per_line=6, points=1000), "75 photos": dict(lines=5, per_line=15, points=8200)}
+from skyquilt.alignment.adjust import adjust, robust_cost  # noqa: E402
+from skyquilt.alignment.problem import Problem, State  # noqa: E402
+
+SIZES = {
+    "18 photos": dict(lines=3, per_line=6, points=1000),
+    "75 photos": dict(lines=5, per_line=15, points=8200),
+}
 """Name -> layout: about 4000 and 46,000 sightings."""
 
 
@@ -35,7 +39,11 @@ def problem_of(layout: dict[str, int]) -> tuple[Problem, State]:
         block.problem, sigma_px=np.ones(len(block.problem.px)), loss_px=2.0, loss_C=1e6, loss_R=1e6,
         free=np.array([[1, 0, 0, 1, 1, 0, 0, 0]], bool), sigma_R=np.full((n, 3), np.inf), sigma_K=np.full((1, 8), np.inf),
     )  # fmt: skip
-    start = replace(block.start, R=block.truth.R, X=block.truth.X + np.random.default_rng(0).normal(0, 0.5, block.truth.X.shape))
+    start = replace(
+        block.start,
+        R=block.truth.R,
+        X=block.truth.X + np.random.default_rng(0).normal(0, 0.5, block.truth.X.shape),
+    )
     return problem, start
 
 
@@ -44,8 +52,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--runs", type=int, default=5)
     runs = parser.parse_args().runs
-    print(f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}")
-    print(f"{'problem':<12}{'sightings':>10}  {'solver':<22}{'CPU s':>8}{'min':>8}{'max':>8}{'above the minimum':>20}")
+    print(
+        f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}"
+    )
+    print(
+        f"{'problem':<12}{'sightings':>10}  {'solver':<22}{'CPU s':>8}{'min':>8}{'max':>8}{'above the minimum':>20}"
+    )
     for name, layout in SIZES.items():
         problem, start = problem_of(layout)
         best = adjust(problem, start, iterations=200, tolerance=1e-13).cost
@@ -54,7 +66,9 @@ def main() -> None:
             return adjust(problem, start, iterations=60, tolerance=tolerance).state
 
         def theirs(exact: bool, problem: Problem = problem, start: State = start) -> State:
-            return ceres.solve(problem, start, WIDTH, HEIGHT, focal=True, lens=True, cauchy=2.0, threads=1, exact=exact)
+            return ceres.solve(
+                problem, start, WIDTH, HEIGHT, focal=True, lens=True, cauchy=2.0, threads=1, exact=exact
+            )
 
         def building(problem: Problem = problem, start: State = start) -> object:
             return ceres.reconstruction(problem, start, WIDTH, HEIGHT)

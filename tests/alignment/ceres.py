@@ -15,21 +15,32 @@ def reconstruction(problem: Problem, state: State, width: int, height: int) -> p
     for j, K in enumerate(state.K):
         f, cx, cy, k1, k2 = K[:5]
         made.add_camera_with_trivial_rig(
-            pycolmap.Camera(model="RADIAL", width=width, height=height, params=[f, cx + CORNER, cy + CORNER, k1, k2], camera_id=j + 1)
+            pycolmap.Camera(
+                model="RADIAL",
+                width=width,
+                height=height,
+                params=[f, cx + CORNER, cy + CORNER, k1, k2],
+                camera_id=j + 1,
+            )
         )
     number = np.zeros(len(problem.px), int)
     for i in range(len(state.C)):
         mine = np.flatnonzero(problem.photo == i)
         number[mine] = np.arange(len(mine))
         image = pycolmap.Image(
-            name=f"{i}", keypoints=problem.px[mine] + CORNER, camera_id=int(problem.camera[i]) + 1, image_id=i + 1
+            name=f"{i}",
+            keypoints=problem.px[mine] + CORNER,
+            camera_id=int(problem.camera[i]) + 1,
+            image_id=i + 1,
         )
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(state.R[i]), -state.R[i] @ state.C[i])
         made.add_image_with_trivial_frame(image, pose)
     cuts = np.searchsorted(problem.point, np.arange(len(state.X) + 1))
     for p in range(len(state.X)):
         seen = range(cuts[p], cuts[p + 1])
-        track = pycolmap.Track([pycolmap.TrackElement(int(problem.photo[k]) + 1, int(number[k])) for k in seen])
+        track = pycolmap.Track(
+            [pycolmap.TrackElement(int(problem.photo[k]) + 1, int(number[k])) for k in seen]
+        )
         made.add_point3D(state.X[p], track)
     return made
 
@@ -42,7 +53,11 @@ def solve(
     made = reconstruction(problem, state, width, height)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.refine_focal_length, options.refine_extra_params, options.refine_principal_point = focal, lens, centre
+    options.refine_focal_length, options.refine_extra_params, options.refine_principal_point = (
+        focal,
+        lens,
+        centre,
+    )
     options.ceres.solver_options.num_threads = threads
     if exact:
         options.ceres.solver_options.gradient_tolerance = 1e-10

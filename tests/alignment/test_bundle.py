@@ -5,6 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from pyproj import Transformer
 
 from skyquilt.alignment.bundle import Bundle, position_noise, prune
 from skyquilt.alignment.control import Control, control_in_frame, fit_similarity_3d
@@ -17,7 +18,7 @@ from skyquilt.model.features import Features, Link, Matches
 from skyquilt.model.photo import ControlPoint, PointObservation
 from skyquilt.model.poses import MapFrame
 from skyquilt.twoview.verify import Verify
-from tests.alignment.blocks import HEIGHT, LENS, WIDTH, make_block
+from tests.alignment.blocks import HEIGHT, LENS, WIDTH, make_block, seen_by
 from tests.alignment.surveys import photo, prior
 
 FRAME = MapFrame(crs="EPSG:32630", origin=(500000.0, 5600000.0), vertical_datum="takeoff")
@@ -39,7 +40,14 @@ class Flown:
         for i in range(n):
             yaw, pitch, roll = angles_from_cam_R_map(b.problem.R0[i])
             self.priors.append(
-                prior(b.problem.C0[i], yaw=yaw + (180 if i in yaw_lies else 0), pitch=pitch, roll=roll, sigma=gps, sigma_z=2 * gps)
+                prior(
+                    b.problem.C0[i],
+                    yaw=yaw + (180 if i in yaw_lies else 0),
+                    pitch=pitch,
+                    roll=roll,
+                    sigma=gps,
+                    sigma_z=2 * gps,
+                )
             )
         self.features, index = [], []
         for i in range(n):
@@ -47,14 +55,24 @@ class Flown:
             px = b.problem.px[mine]
             if i in self.turned:
                 px = np.array([WIDTH - 1, HEIGHT - 1]) - px
-            self.features.append(Features(px=px, size=np.ones(len(px), np.float32), descriptors=np.zeros((len(px), 4), np.uint8), scale=1.0))
+            self.features.append(
+                Features(
+                    px=px,
+                    size=np.ones(len(px), np.float32),
+                    descriptors=np.zeros((len(px), 4), np.uint8),
+                    scale=1.0,
+                )
+            )
             index.append(dict(zip(b.problem.point[mine].tolist(), range(len(mine)), strict=True)))
         self.links = []
         for i in range(n):
             for j in range(i + 1, n):
                 shared = sorted(set(index[i]) & set(index[j]))
                 if len(shared) >= 20:
-                    m = Matches(index_a=np.array([index[i][p] for p in shared]), index_b=np.array([index[j][p] for p in shared]))
+                    m = Matches(
+                        index_a=np.array([index[i][p] for p in shared]),
+                        index_b=np.array([index[j][p] for p in shared]),
+                    )
                     link = Verify()(i, j, self.features[i], self.features[j], m, WIDTH)
                     if isinstance(link, Link):
                         self.links.append(link)
@@ -116,7 +134,9 @@ def test_files_turned_by_half_a_turn(plain):
     assert set(found.camera_of.values()) == {"cam", "cam/turned"}
     assert {i for i, k in found.camera_of.items() if k == "cam/turned"} == set(line)
     straight, upside = found.cameras["cam"], found.cameras["cam/turned"]
-    assert upside.cx == pytest.approx(WIDTH - 1 - straight.cx) and upside.cy == pytest.approx(HEIGHT - 1 - straight.cy)
+    assert upside.cx == pytest.approx(WIDTH - 1 - straight.cx) and upside.cy == pytest.approx(
+        HEIGHT - 1 - straight.cy
+    )
     assert straight.cx == pytest.approx(plain[1].cameras["cam"].cx, abs=0.3)
     assert worst_turn_deg(flown, found) < 0.6
     error, before = (np.sqrt((a.ties.residual_px**2).mean()) for a in (found, plain[1]))
@@ -130,7 +150,9 @@ def test_files_turned_by_half_a_turn(plain):
 
 def test_a_mirrored_camera_is_the_turned_file_s():
     """Every coefficient: a point's pixel in the turned file is the half turn of its pixel in the sensor."""
-    camera = Camera(width=800, height=600, focal=700, cx=410, cy=290, k1=-0.1, k2=0.03, k3=-0.01, p1=2e-3, p2=-1e-3)
+    camera = Camera(
+        width=800, height=600, focal=700, cx=410, cy=290, k1=-0.1, k2=0.03, k3=-0.01, p1=2e-3, p2=-1e-3
+    )
     xyz = np.random.default_rng(0).uniform((-20, -15, 40), (20, 15, 80), (50, 3))
     turned = project(mirrored(camera), xyz @ HALF_TURN.T)
     assert np.array([799, 599]) - turned == pytest.approx(project(camera, xyz), abs=1e-9)
@@ -152,7 +174,9 @@ def test_a_position_that_lies_is_outvoted():
     found = flown.aligned()
     assert np.abs(found.poses[4].map_C - flown.truth.C[4])[:2].max() < 2.0
     trusting = flown.aligned(repair=False)
-    assert np.abs(trusting.poses[4].map_C - flown.truth.C[4])[:2].max() > 3.0  # `--trust-metadata` believes it
+    assert (
+        np.abs(trusting.poses[4].map_C - flown.truth.C[4])[:2].max() > 3.0
+    )  # `--trust-metadata` believes it
 
 
 def test_two_blocks_are_both_kept():
@@ -191,7 +215,9 @@ def test_pruning_drops_lies_and_lonely_points_but_no_control():
     block = make_block(5, lies=0.05)
     problem = replace(block.problem, X0=block.problem.X0.copy())
     problem.X0[0] = block.truth.X[0] + 50  # a control point that fits nothing
-    pruned, state = prune(problem, replace(block.truth, X=np.r_[block.truth.X[:1] + 50, block.truth.X[1:]]), 8.0)
+    pruned, state = prune(
+        problem, replace(block.truth, X=np.r_[block.truth.X[:1] + 50, block.truth.X[1:]]), 8.0
+    )
     assert (pruned.point == 0).sum() == (problem.point == 0).sum()
     assert len(pruned.px) >= (~block.wrong).sum() - 2 * block.wrong.sum()
     error = np.abs(pruned.px[:, None] - block.problem.px[block.wrong][None]).sum(2).min(1)
@@ -217,15 +243,17 @@ def test_umeyama():
 
 def sighted(flown, xyz, name, *, check=False, rng=None, offset=0.0):
     """A surveyed point seen by all photos that show it, with 0.3 px of noise."""
-    from tests.alignment.blocks import seen_by
-
     photos, pixels = [], []
     for i in range(len(flown.photos)):
-        px = seen_by(flown.truth.R[i], flown.truth.C[i], flown.truth.K[0], xyz[None])[0] + rng.normal(0, 0.3, 2)
+        px = seen_by(flown.truth.R[i], flown.truth.C[i], flown.truth.K[0], xyz[None])[0] + rng.normal(
+            0, 0.3, 2
+        )
         if (px > 5).all() and px[0] < WIDTH - 5 and px[1] < HEIGHT - 5:
             photos.append(i)
             pixels.append(px)
-    return Control(name=name, check=check, xyz=xyz + offset, sigma_m=0.02, photo=np.array(photos), px=np.array(pixels))
+    return Control(
+        name=name, check=check, xyz=xyz + offset, sigma_m=0.02, photo=np.array(photos), px=np.array(pixels)
+    )
 
 
 def surveyed(flown, *, offset=0.0, checks=()):
@@ -266,7 +294,9 @@ def test_check_points_take_no_part():
 
 
 def without_positions(flown):
-    flown.priors = [replace(p, map_C=np.full(3, np.nan), sigma_C=np.full(3, np.inf), yaw_deg=np.nan) for p in flown.priors]
+    flown.priors = [
+        replace(p, map_C=np.full(3, np.nan), sigma_C=np.full(3, np.inf), yaw_deg=np.nan) for p in flown.priors
+    ]
     return flown
 
 
@@ -280,6 +310,31 @@ def test_three_control_points_georeference_photos_without_positions():
         assert np.abs(c.error_m[:2]).max() < 0.3
 
 
+def focal_errors(count, control):
+    """Errors of the focal length in units of their stated deviation, over several blocks."""
+    errors = []
+    for seed in range(10, 10 + count):
+        flown = Flown(seed)
+        (camera,) = flown.aligned(control=surveyed(flown) if control else ()).cameras.values()
+        errors.append((camera.focal - flown.truth.K[0, 0]) / camera.sigmas[0])
+    return np.sqrt(np.mean(np.square(errors)))
+
+
+@pytest.mark.slow
+def test_the_focal_length_s_deviation_is_honest():
+    """It may be cautious (sightings count for less than they are, as real ones err together) but not boast."""
+    assert 0.3 < focal_errors(12, control=False) < 1.3
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(
+    reason="the offset between control points and measured positions is taken from the solution without control and"
+    " then believed: a common offset among the unknowns would be honest. Errors are 1.5 of the stated deviations"
+)
+def test_the_focal_length_s_deviation_is_honest_with_control_points():
+    assert 0.3 < focal_errors(12, control=True) < 1.3
+
+
 def test_two_control_points_are_too_few():
     flown = without_positions(Flown(7))
     with pytest.raises(AlignmentError, match="3 control points"):
@@ -287,8 +342,6 @@ def test_two_control_points_are_too_few():
 
 
 def test_control_points_in_another_crs():
-    from pyproj import Transformer
-
     photos = [photo("a.jpg"), photo("sub/b.jpg")]
     x, y = Transformer.from_crs(32630, 27700, always_xy=True).transform(500010.0, 5600020.0)
     point = ControlPoint(

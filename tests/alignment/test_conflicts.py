@@ -39,7 +39,10 @@ def test_a_yaw_that_lies():
     assert "upside down" in found[1].meaning and "upside down" not in found[0].meaning
 
 
-@pytest.mark.parametrize(("off", "sigma", "accused"), [(14.0, 5.0, 0), (16.0, 5.0, 1), (40.0, 15.0, 0), (50.0, 15.0, 1), (-16, 5, 1)])
+@pytest.mark.parametrize(
+    ("off", "sigma", "accused"),
+    [(14.0, 5.0, 0), (16.0, 5.0, 1), (40.0, 15.0, 0), (50.0, 15.0, 1), (-16, 5, 1)],
+)
 def test_how_far_a_yaw_may_be_off(off, sigma, accused):
     photos, told = survey()
     told[2] = prior((0, 30, 60), yaw=10 + off, sigma_yaw=sigma)

@@ -18,7 +18,10 @@ TOLD = [prior((3.0 * i, 10.0 * i, 50.0 + 4 * i), yaw=30.0 * i, pitch=2.0, roll=-
 def ground_of(alignment, i, px):
     """Map coordinates on z = 0 of a pixel of a camera without distortion, by hand."""
     pose, camera = alignment.poses[i], alignment.camera(i)
-    ray = np.array([(px[0] - camera.cx) / camera.focal, (px[1] - camera.cy) / camera.focal, 1.0]) @ pose.cam_R_map
+    ray = (
+        np.array([(px[0] - camera.cx) / camera.focal, (px[1] - camera.cy) / camera.focal, 1.0])
+        @ pose.cam_R_map
+    )
     return (pose.map_C - ray * pose.map_C[2] / ray[2])[:2]
 
 
@@ -48,7 +51,9 @@ def test_pose_believes_angles_and_heights():
         assert pose.map_C == pytest.approx(TOLD[i].map_C)
         # projecting the ground of a pixel gives the pixel
         xy = ground_of(found, i, (123.0, 456.0))
-        assert project(found.camera(i), pose.to_camera(np.array([*xy, 0.0]))[None])[0] == pytest.approx([123, 456])
+        assert project(found.camera(i), pose.to_camera(np.array([*xy, 0.0]))[None])[0] == pytest.approx(
+            [123, 456]
+        )
 
 
 def test_what_cannot_be_placed_says_why():
@@ -72,5 +77,7 @@ def test_heights_that_do_not_tell_the_ground():
 def test_no_position_at_all():
     with pytest.raises(AlignmentError, match="none of 5 has one"):
         ByPose()(PHOTOS, FRAME, [prior((np.nan,) * 3)] * 5)
-    alone = ByPose()(PHOTOS[:1], MapFrame(crs=None, origin=(0, 0), vertical_datum="unknown"), [prior((np.nan,) * 3)])
+    alone = ByPose()(
+        PHOTOS[:1], MapFrame(crs=None, origin=(0, 0), vertical_datum="unknown"), [prior((np.nan,) * 3)]
+    )
     assert list(alone.poses) == [0] and not alone.frame.metric

@@ -15,7 +15,11 @@ places = (st.floats(-79, 79), st.floats(-179.9, 179.9))
 
 
 def at(latitude, longitude, **more):
-    return photo(position=GeoPosition(latitude_deg=latitude, longitude_deg=longitude, **{"altitude_m": 60.0, "datum": "takeoff", **more}))
+    return photo(
+        position=GeoPosition(
+            latitude_deg=latitude, longitude_deg=longitude, **{"altitude_m": 60.0, "datum": "takeoff", **more}
+        )
+    )
 
 
 @pytest.mark.parametrize(
@@ -42,7 +46,9 @@ def test_the_zone_holds_its_place(latitude, longitude):
 def test_grid_yaw_is_where_a_step_that_way_leads(latitude, longitude, yaw):
     """A metre along a true heading, projected: the map's direction is the prior's yaw (sign of the convergence)."""
     there = photo(
-        position=GeoPosition(latitude_deg=latitude, longitude_deg=longitude, altitude_m=60.0, datum="takeoff"),
+        position=GeoPosition(
+            latitude_deg=latitude, longitude_deg=longitude, altitude_m=60.0, datum="takeoff"
+        ),
         attitude=Attitude(yaw_deg=yaw, pitch_deg=3.0, roll_deg=-2.0),
     )
     frame = choose_frame([there], None)

@@ -46,6 +46,7 @@ def test_jacobians_are_those_of_the_residuals(seed):
     def difference(step, h):
         def at(sign):
             return linearise(p, s.moved(*(sign * h * part for part in step))).residual
+
         return (at(1) - at(-1)) / (2 * h)
 
     def close(exact, numeric):
@@ -109,5 +110,7 @@ def test_a_step_of_a_state():
     assert isinstance(moved, State)
     assert moved.C[1] - s.C[1] == pytest.approx([1, 2, 3])
     # a turn about the camera's own axis z: x goes to y
-    assert (moved.R[1] @ s.R[1].T)[:, 0] == pytest.approx([np.cos(np.radians(10)), np.sin(np.radians(10)), 0], abs=1e-12)
+    assert (moved.R[1] @ s.R[1].T)[:, 0] == pytest.approx(
+        [np.cos(np.radians(10)), np.sin(np.radians(10)), 0], abs=1e-12
+    )
     assert (moved.R[0] == s.R[0]).all() and (moved.C[0] == s.C[0]).all()

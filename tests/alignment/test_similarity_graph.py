@@ -62,13 +62,16 @@ def test_exact_links_give_the_exact_block():
 def test_members_need_not_be_numbered_from_zero():
     a, t = plane(lines=2, per_line=3)
     rng = np.random.default_rng(1)
-    own = [PlaneLink(a=10 + 3 * k.a, b=10 + 3 * k.b, b_S_a=k.b_S_a, p_a=k.p_a, p_b=k.p_b, weight=1.0) for k in links_of(a, t, rng)]
+    own = [
+        PlaneLink(a=10 + 3 * k.a, b=10 + 3 * k.b, b_S_a=k.b_S_a, p_a=k.p_a, p_b=k.p_b, weight=1.0)
+        for k in links_of(a, t, rng)
+    ]
     found_a, found_t = aligned(solve_block(10 + 3 * np.arange(6), own), a, t)
     assert found_t == pytest.approx(t, abs=1e-5) and found_a == pytest.approx(a, abs=1e-6)
 
 
 def test_noisy_links_do_not_shrink_the_map():
-    """Least squares of points would: its cost falls with the scale. Mean scale and extent stay within 0.1 %... """
+    """Least squares of points would: its cost falls with the scale. Mean scale and extent stay within 0.1 %..."""
     scales, extents = [], []
     for seed in range(12):
         a, t = plane(seed, lines=6, per_line=8)
@@ -128,9 +131,7 @@ def solved(seed, **noise):
 
 
 @settings(max_examples=60, deadline=None)
-@given(
-    st.integers(5, 40), st.floats(0.1, 100), st.floats(-3.1, 3.1), st.integers(0, 1000), st.floats(0, 0.4)
-)
+@given(st.integers(5, 40), st.floats(0.1, 100), st.floats(-3.1, 3.1), st.integers(0, 1000), st.floats(0, 0.4))
 def test_a_similarity_survives_two_lies_in_five(count, scale, angle, seed, share):
     rng = np.random.default_rng(seed)
     x = rng.normal(0, 1, count) + 1j * rng.normal(0, 1, count)
@@ -184,7 +185,9 @@ def test_one_position_or_all_the_same(known):
     a, t, links, solution = solved(8)
     position = np.full(len(a), np.nan, complex)
     position[known] = 1000 + 2000j
-    found, _, metric = georeference(solution, links, priors_at(position, yaw=-np.degrees(np.angle(a)), z=60.0))
+    found, _, metric = georeference(
+        solution, links, priors_at(position, yaw=-np.degrees(np.angle(a)), z=60.0)
+    )
     assert metric
     shape_a, shape_t = found.a / a, found.t
     assert np.abs(shape_a).mean() == pytest.approx(1, abs=0.02)
@@ -207,7 +210,9 @@ def test_positions_straighten_a_strip_that_links_bend():
         for j in range(i + 1, min(i + 4, n)):
             k = link(a, t, i, j, rng)
             links.append(
-                PlaneLink(a=i, b=j, b_S_a=k.b_S_a * np.exp(0.003j * (j - i)), p_a=k.p_a, p_b=k.p_b, weight=100.0)
+                PlaneLink(
+                    a=i, b=j, b_S_a=k.b_S_a * np.exp(0.003j * (j - i)), p_a=k.p_a, p_b=k.p_b, weight=100.0
+                )
             )
     solution = solve_block(np.arange(n), links)
     position = t + rng.normal(0, 1.5, n) + 1j * rng.normal(0, 1.5, n)

@@ -28,12 +28,18 @@ def link(a, b, pairs):
 
 def test_chains_become_tracks_and_a_photo_visited_twice_spoils_its_track():
     f = [features(5, k, scale=1.0 + k) for k in range(3)]
-    links = [link(0, 1, [(0, 0), (1, 1), (2, 2)]), link(1, 2, [(0, 4), (1, 3), (2, 1)]), link(0, 2, [(2, 0), (4, 2)])]
+    links = [
+        link(0, 1, [(0, 0), (1, 1), (2, 2)]),
+        link(1, 2, [(0, 4), (1, 3), (2, 1)]),
+        link(0, 2, [(2, 0), (4, 2)]),
+    ]
     tracks = build_tracks(f, links)
     # (0,0)-(1,0)-(2,4); (0,1)-(1,1)-(2,3); (0,2)-(1,2)-(2,1) and (2,0): photo 2 twice, dropped; (0,4)-(2,2)
     found = {frozenset(zip(tracks.photo[m].tolist(), map(tuple, tracks.px[m].tolist()), strict=True)) for m in (tracks.point == p for p in range(tracks.count))}  # fmt: skip
+
     def at(photo, k):
         return photo, tuple(f[photo].px[k].tolist())
+
     assert found == {
         frozenset({at(0, 0), at(1, 0), at(2, 4)}), frozenset({at(0, 1), at(1, 1), at(2, 3)}),
         frozenset({at(0, 4), at(2, 2)}),
@@ -43,7 +49,11 @@ def test_chains_become_tracks_and_a_photo_visited_twice_spoils_its_track():
 
 
 @settings(max_examples=80, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 5), st.integers(0, 3), st.integers(0, 5)), max_size=25))
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 3), st.integers(0, 5), st.integers(0, 3), st.integers(0, 5)), max_size=25
+    )
+)
 def test_tracks_are_the_connected_components(matches):
     f = [features(6, k) for k in range(4)]
     by_pair = {}
@@ -104,15 +114,23 @@ def test_thinning_keeps_every_cell_of_every_photo_and_its_longest_tracks():
     cells, per_photo = 4, 64
     thinned = thin(tracks, [(800, 600)] * 12, per_photo=per_photo, cells=cells)
     assert len(thinned.point) < 0.75 * len(tracks.point)
+
     def slots(t):
         column, row = np.clip(((t.px + 0.5) / (800, 600) * cells).astype(int), 0, cells - 1).T
         return t.photo * cells**2 + row * cells + column
+
     all_, kept = np.bincount(slots(tracks), minlength=192), np.bincount(slots(thinned), minlength=192)
     assert (kept >= np.minimum(all_, per_photo // cells**2)).all()
     assert np.bincount(thinned.point).mean() > np.bincount(tracks.point).mean() + 0.3
     # whole tracks survive or none of them
-    lengths = {p: n for p, n in zip(map(tuple, tracks.px.tolist()), np.bincount(tracks.point)[tracks.point], strict=True)}
-    assert all(lengths[tuple(p)] == n for p, n in zip(thinned.px.tolist(), np.bincount(thinned.point)[thinned.point], strict=True))
+    lengths = {
+        p: n
+        for p, n in zip(map(tuple, tracks.px.tolist()), np.bincount(tracks.point)[tracks.point], strict=True)
+    }
+    assert all(
+        lengths[tuple(p)] == n
+        for p, n in zip(thinned.px.tolist(), np.bincount(thinned.point)[thinned.point], strict=True)
+    )
 
 
 def test_rays_meet_in_their_point():
@@ -125,7 +143,9 @@ def test_rays_meet_in_their_point():
 
 
 def test_two_skew_rays_meet_halfway_between():
-    found = intersect(np.array([0, 0]), np.array([[0.0, 0, 0], [0, 0, 1]]), np.array([[3.0, 0, 0], [0, 2, 0]]), 1)
+    found = intersect(
+        np.array([0, 0]), np.array([[0.0, 0, 0], [0, 0, 1]]), np.array([[3.0, 0, 0], [0, 2, 0]]), 1
+    )
     assert found[0] == pytest.approx([0, 0, 0.5], abs=1e-6)
 
 

@@ -47,10 +47,14 @@ def test_a_blob_is_found_where_it_is_in_full_pixels(size):
     """Shrunken or not, the centre of a Gaussian blob comes back in coordinates of the full image."""
     height, width = size
     y, x = np.mgrid[:height, :width]
-    centres = np.random.default_rng(1).uniform(0, 1, (16, 2)) * 20 + np.stack(np.meshgrid([80, 260, 440, 620], [80, 220, 360, 500]), -1).reshape(-1, 2)
+    centres = np.random.default_rng(1).uniform(0, 1, (16, 2)) * 20 + np.stack(
+        np.meshgrid([80, 260, 440, 620], [80, 220, 360, 500]), -1
+    ).reshape(-1, 2)
     image = np.full(size, 60.0)
     for cx, cy in centres:
-        image += 160 * np.exp(-((x - cx) ** 2 + 1.2 * (y - cy) ** 2 + 0.3 * (x - cx) * (y - cy)) / (2 * 10.0**2))
+        image += 160 * np.exp(
+            -((x - cx) ** 2 + 1.2 * (y - cy) ** 2 + 0.3 * (x - cx) * (y - cy)) / (2 * 10.0**2)
+        )
     found = Sift(count=400, longest=800)(image.astype(np.uint8))
     assert found.scale == pytest.approx(max(1.0, width / 800), rel=2e-3)
     off = np.array([found.px[np.linalg.norm(found.px - c, axis=1).argmin()] - c for c in centres])
@@ -61,7 +65,10 @@ def test_a_blob_is_found_where_it_is_in_full_pixels(size):
 
 def test_the_pixel_convention_of_shrinking():
     """A pixel of a picture shrunk by k covers k of the full one's: centre 0 lies at (k - 1) / 2."""
-    assert full_px(np.array([[0.0, 0.0], [9.0, 4.0]]), (5, 10), (20, 40)).tolist() == [[1.5, 1.5], [37.5, 17.5]]
+    assert full_px(np.array([[0.0, 0.0], [9.0, 4.0]]), (5, 10), (20, 40)).tolist() == [
+        [1.5, 1.5],
+        [37.5, 17.5],
+    ]
     image = np.zeros((40, 80), np.uint8)
     small, scale = shrink(image, 20)
     assert small.shape == (10, 20) and scale == 4.0
@@ -79,7 +86,10 @@ def test_spreading_keeps_the_strongest_of_every_cell():
     fair = kept[crowd > kept].min()  # cells that lost some all keep at least what the fair share is
     assert (kept >= np.minimum(crowd, fair)).all() and kept.max() <= fair + 1
     for c in range(100):
-        mine, lost = np.intersect1d(keep, np.flatnonzero(cell == c)), np.setdiff1d(np.flatnonzero(cell == c), keep)
+        mine, lost = (
+            np.intersect1d(keep, np.flatnonzero(cell == c)),
+            np.setdiff1d(np.flatnonzero(cell == c), keep),
+        )
         if len(mine) and len(lost):
             assert response[mine].min() >= response[lost].max()
     assert (_spread(xy[:10], response[:10], (480, 640), 600, 10) == np.arange(10)).all()
@@ -114,9 +124,11 @@ def test_descriptors_are_roots_of_unit_length(picture):
 @pytest.mark.parametrize("kind", ["uint16", "float32", "float32 with gaps", "colour", "one band"])
 def test_whatever_the_sensor_gives(picture, kind):
     image = {
-        "uint16": lambda: (picture.astype(np.uint16) * 16 + 7000),
+        "uint16": lambda: picture.astype(np.uint16) * 16 + 7000,
         "float32": lambda: picture.astype(np.float32) * 0.02 + 15,
-        "float32 with gaps": lambda: np.where(np.arange(640) < 100, np.nan, picture * 0.02 + 15).astype(np.float32),
+        "float32 with gaps": lambda: np.where(np.arange(640) < 100, np.nan, picture * 0.02 + 15).astype(
+            np.float32
+        ),
         "colour": lambda: np.dstack([picture] * 3),
         "one band": lambda: picture[..., None],
     }[kind]()

@@ -85,7 +85,9 @@ def test_undistortion_inverts_distortion(camera, seed):
     reach = min(0.98 * monotone_radius(camera), 0.9)
     radius, angle = reach * np.sqrt(rng.random(60)), rng.uniform(0, 2 * np.pi, 60)
     xy = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
-    jacobian = project_with_derivatives(np.tile(np.r_[1, 0, 0, camera.vector[3:]], (60, 1)), np.c_[xy, np.ones(60)])
+    jacobian = project_with_derivatives(
+        np.tile(np.r_[1, 0, 0, camera.vector[3:]], (60, 1)), np.c_[xy, np.ones(60)]
+    )
     assume(np.linalg.det(jacobian.d_point[:, :, :2]).min() > 0.02)  # tangential terms may fold earlier
     px = project(camera, np.c_[xy, np.ones(60)])
     assert undistort(camera, px) == pytest.approx(xy, abs=1e-9)

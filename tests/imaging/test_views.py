@@ -4,7 +4,16 @@ import numpy as np
 import pytest
 
 from skyquilt.geometry.camera import project
-from skyquilt.imaging.views import STEP, cut, densify, footprint, grid_of, native_gsd, project_nodes, window_nodes
+from skyquilt.imaging.views import (
+    STEP,
+    cut,
+    densify,
+    footprint,
+    grid_of,
+    native_gsd,
+    project_nodes,
+    window_nodes,
+)
 from skyquilt.model.camera import Camera
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
@@ -19,7 +28,13 @@ def test_a_footprint_is_the_rim_on_the_ground():
 
 
 def test_a_footprint_climbs_a_slope():
-    slope = Surface(z=np.tile(np.arange(-40, 41, dtype=np.float32) * 0.3, (81, 1)), x0=-40.0, y0=-40.0, cell=1.0, source="t")
+    slope = Surface(
+        z=np.tile(np.arange(-40, 41, dtype=np.float32) * 0.3, (81, 1)),
+        x0=-40.0,
+        y0=-40.0,
+        cell=1.0,
+        source="t",
+    )
     shot = view(0, 0, 0, yaw=90, surface=slope)
     z = 0.3 * shot.footprint[:, 0]
     px = project(CAMERA, shot.pose.to_camera(np.c_[shot.footprint, z]))
@@ -37,12 +52,16 @@ def test_nodes_are_exact_projections_and_in_between_nearly():
     (nodes,) = window_nodes([shot], GRID, FLAT, window)
     assert nodes.u.shape == (-(-100 // STEP) + 2, -(-130 // STEP) + 2)
     x, y = np.meshgrid(GRID.x(np.arange(320, 450)), GRID.y(np.arange(160, 260)))
-    exact = project(CAMERA, shot.pose.to_camera(np.stack([x, y, 0 * x], -1).reshape(-1, 3))).reshape(100, 130, 2)
+    exact = project(CAMERA, shot.pose.to_camera(np.stack([x, y, 0 * x], -1).reshape(-1, 3))).reshape(
+        100, 130, 2
+    )
     dense = np.stack([densify(nodes.u, 100, 130), densify(nodes.v, 100, 130)], -1)
     assert np.abs(dense - exact).max() < 0.03
     # node 1 is the middle of the window's first cell
     middle = np.array([[GRID.x(320 + STEP / 2 - 0.5), GRID.y(160 + STEP / 2 - 0.5), 0.0]])
-    assert (nodes.u[1, 1], nodes.v[1, 1]) == pytest.approx(project(CAMERA, shot.pose.to_camera(middle))[0], abs=1e-3)
+    assert (nodes.u[1, 1], nodes.v[1, 1]) == pytest.approx(
+        project(CAMERA, shot.pose.to_camera(middle))[0], abs=1e-3
+    )
     d = middle[0] - shot.pose.map_C
     assert nodes.score[1, 1] == pytest.approx((d[0] ** 2 + d[1] ** 2) / d[2] ** 2, rel=1e-5)
     assert nodes.height == pytest.approx(40.0)
@@ -76,8 +95,15 @@ def test_the_grid_covers_all_footprints_on_round_coordinates():
     grid = grid_of(views, 0.13)
     low, high = np.min([v.footprint.min(0) for v in views], 0), np.max([v.footprint.max(0) for v in views], 0)
     west, south, east, north = grid.bounds
-    assert west <= low[0] < west + 0.13 and south <= low[1] and high[0] <= east < high[0] + 0.131 and high[1] <= north
-    assert (grid.west / 0.13) % 1 == pytest.approx(0, abs=1e-9) or (grid.west / 0.13) % 1 == pytest.approx(1, abs=1e-9)
+    assert (
+        west <= low[0] < west + 0.13
+        and south <= low[1]
+        and high[0] <= east < high[0] + 0.131
+        and high[1] <= north
+    )
+    assert (grid.west / 0.13) % 1 == pytest.approx(0, abs=1e-9) or (grid.west / 0.13) % 1 == pytest.approx(
+        1, abs=1e-9
+    )
     asked = grid_of(views, 0.5, (-3.2, -2.0, 7.7, 4.1))
     assert asked == Grid(west=-3.5, north=4.5, gsd=0.5, width=23, height=13)
 
@@ -90,6 +116,8 @@ def test_the_photos_own_resolution():
 def test_boxes_that_meet():
     shot = view(0, 0, 0)
     low, high = shot.footprint.min(0), shot.footprint.max(0)
-    assert shot.overlaps((high[0] - 0.1, -1, high[0] + 9, 1)) and not shot.overlaps((high[0] + 0.1, -1, high[0] + 9, 1))
+    assert shot.overlaps((high[0] - 0.1, -1, high[0] + 9, 1)) and not shot.overlaps(
+        (high[0] + 0.1, -1, high[0] + 9, 1)
+    )
     assert not shot.overlaps((-1, low[1] - 9, 1, low[1] - 0.1)) and shot.overlaps((-1, -1, 1, 1))
     assert len(footprint(CAMERA, shot.pose, FLAT, per_side=3)) == 12

@@ -31,7 +31,9 @@ def test_the_definition(seed, m, n, ratio):
     for i in range(m):
         j, k = np.argsort(distance[i])[:2]
         back = np.sort(distance[:, j])
-        if abs(distance[i, j] - ratio * distance[i, k]) < 1e-3 or (m > 1 and abs(distance[i, j] - back[0]) < 1e-4 and back[1] - back[0] < 1e-4):
+        if abs(distance[i, j] - ratio * distance[i, k]) < 1e-3 or (
+            m > 1 and abs(distance[i, j] - back[0]) < 1e-4 and back[1] - back[0] < 1e-4
+        ):
             doubtful.add((i, int(j)))
         elif distance[i, j] < ratio * distance[i, k] and distance[:, j].argmin() == i:
             expected.add((i, int(j)))
@@ -42,8 +44,13 @@ def test_the_definition(seed, m, n, ratio):
 def test_against_opencv_with_cross_check():
     a = unit(0, 400, 128)
     b = unit(1, 400, 128, base=a.descriptors.astype(float), noise=0.06)
-    b = Features(px=b.px, size=b.size, scale=1.0, descriptors=np.r_[b.descriptors[::-1], unit(2, 200, 128).descriptors])
-    crossed = {(m.queryIdx, m.trainIdx) for m in cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(a.descriptors, b.descriptors)}
+    b = Features(
+        px=b.px, size=b.size, scale=1.0, descriptors=np.r_[b.descriptors[::-1], unit(2, 200, 128).descriptors]
+    )
+    crossed = {
+        (m.queryIdx, m.trainIdx)
+        for m in cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(a.descriptors, b.descriptors)
+    }
     clear = {
         (m.queryIdx, m.trainIdx) for m, n in cv2.BFMatcher(cv2.NORM_L2).knnMatch(a.descriptors, b.descriptors, k=2)
         if m.distance < 0.85 * n.distance

@@ -13,7 +13,13 @@ from tests.texture import texture
 
 
 @settings(max_examples=80, deadline=None)
-@given(st.integers(0, 10**6), st.integers(0, 40), st.integers(1, 8), st.one_of(st.none(), st.floats(1, 60)), st.floats(0, 0.5))
+@given(
+    st.integers(0, 10**6),
+    st.integers(0, 40),
+    st.integers(1, 8),
+    st.one_of(st.none(), st.floats(1, 60)),
+    st.floats(0, 0.5),
+)
 def test_nearest_is_brute_force(seed, count, neighbours, reach, lost):
     rng = np.random.default_rng(seed)
     xy = rng.uniform(0, 100, (count, 2))
@@ -96,5 +102,10 @@ def test_small_surveys_are_paired_completely(flown):
 
 def test_photos_without_features_do_no_harm(flown):
     features, _ = flown
-    empty = Features(px=np.zeros((0, 2)), size=np.zeros(0, np.float32), descriptors=np.zeros((0, 128), np.float32), scale=1.0)
+    empty = Features(
+        px=np.zeros((0, 2)),
+        size=np.zeros(0, np.float32),
+        descriptors=np.zeros((0, 128), np.float32),
+        scale=1.0,
+    )
     assert Retrieval(exhaustive_below=3, neighbours=2)([*features[:5], empty])

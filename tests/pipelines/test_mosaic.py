@@ -9,10 +9,10 @@ import pytest
 import rasterio
 from pyproj import Transformer
 
+from skyquilt.config import MosaicSettings
 from skyquilt.metrics.map_error import map_error
 from skyquilt.model.event import Result, StageFinished, StageStarted
 from skyquilt.pipelines.mosaic import iter_mosaic
-from skyquilt.config import MosaicSettings
 
 
 @pytest.fixture(scope="module")
@@ -106,13 +106,21 @@ def test_the_map_lies_where_the_truth_does(finished, flight):
 
 
 def test_heights_are_those_of_the_country(finished, flight):
-    with rasterio.open(finished.output / "surface.tif") as mine, rasterio.open(flight / "truth" / "truth_surface.tif") as true:
+    with (
+        rasterio.open(finished.output / "surface.tif") as mine,
+        rasterio.open(flight / "truth" / "truth_surface.tif") as true,
+    ):
         tags = mine.tags()
         z = mine.read(1)
         rows, columns = np.nonzero(np.isfinite(z))
         x, y = mine.transform * (columns + 0.5, rows + 0.5)
         expected = np.array([v[0] for v in true.sample(np.column_stack([x, y]))])
-        inside = (x > true.bounds.left) & (x < true.bounds.right) & (y > true.bounds.bottom) & (y < true.bounds.top)
+        inside = (
+            (x > true.bounds.left)
+            & (x < true.bounds.right)
+            & (y > true.bounds.bottom)
+            & (y < true.bounds.top)
+        )
     assert tags["VERTICAL_DATUM"] == "control" == finished.metrics["vertical_datum"]
     with rasterio.open(finished.output / "views.tif") as source:
         seen = np.array([v[0] for v in source.sample(np.column_stack([x, y]))]) >= 3
@@ -123,7 +131,10 @@ def test_heights_are_those_of_the_country(finished, flight):
 
 def test_provenance_names_the_photo_shown(finished, shots):
     """At sampled pixels the named photo really looks there, and none looks there more steeply."""
-    with rasterio.open(finished.output / "provenance.tif") as source, rasterio.open(finished.output / "surface.tif") as heights:
+    with (
+        rasterio.open(finished.output / "provenance.tif") as source,
+        rasterio.open(finished.output / "surface.tif") as heights,
+    ):
         numbers = source.read(1)
         assert numbers.max() <= len(shots)
         rng = np.random.default_rng(0)
@@ -143,11 +154,16 @@ def test_provenance_names_the_photo_shown(finished, shots):
     assert inside[named[shown] - 1, np.flatnonzero(shown)].mean() > 0.99
     lost = best.min(0)[shown] - best[named[shown] - 1, np.flatnonzero(shown)]
     assert (np.abs(lost) < 0.02).mean() > 0.98  # provenance pixels are four map pixels wide
-    assert (np.isfinite(best.min(0)) == shown).mean() > 0.97  # nothing seen is left empty, nothing unseen is shown
+    assert (
+        np.isfinite(best.min(0)) == shown
+    ).mean() > 0.97  # nothing seen is left empty, nothing unseen is shown
 
 
 def test_views_count_the_photos(finished, shots):
-    with rasterio.open(finished.output / "views.tif") as source, rasterio.open(finished.output / "surface.tif") as heights:
+    with (
+        rasterio.open(finished.output / "views.tif") as source,
+        rasterio.open(finished.output / "surface.tif") as heights,
+    ):
         count = source.read(1)
         rows, columns = np.indices(count.shape).reshape(2, -1)
         x, y = source.transform * (columns + 0.5, rows + 0.5)
@@ -168,7 +184,9 @@ def test_shots_are_the_photos_in_their_true_places(shots, truth, finished):
     to_crs = Transformer.from_crs(4326, finished.metrics["crs"], always_xy=True)
     for s in shots:
         p, t = s["properties"], true[s["properties"]["filename"]]
-        assert to_crs.transform(*s["geometry"]["coordinates"][:2]) == pytest.approx(p["translation"][:2], abs=0.01)
+        assert to_crs.transform(*s["geometry"]["coordinates"][:2]) == pytest.approx(
+            p["translation"][:2], abs=0.01
+        )
         assert p["translation"][:2] == pytest.approx(t["position"][:2], abs=0.8)
         assert p["translation"][2] == pytest.approx(t["position"][2], abs=1.2)  # 2 % of the flying height
         R, T = cv2.Rodrigues(np.array(p["rotation"]))[0], np.array(t["cam_R_map"])
@@ -192,7 +210,7 @@ def test_the_camera_is_the_true_one(finished, truth):
 def test_the_focal_length_errs_as_its_deviation_says(finished, truth):
     true = truth["cameras"]["visible"]
     (told,) = finished.metrics["cameras"].values()
-    assert abs(told["focal"]["value"] - true["focal"]) < 4 * told["focal"]["sigma"] + 0.005 * true["focal"]
+    assert abs(told["focal"]["value"] - true["focal"]) < 4 * told["focal"]["sigma"]
 
 
 def test_the_reconstruction_is_our_model(finished, shots):
@@ -211,7 +229,9 @@ def test_the_reconstruction_is_our_model(finished, shots):
     worst = []
     for s in shots:
         shot = record["shots"][s["properties"]["filename"]]
-        theirs = opensfm_px(record["cameras"][shot["camera"]], shot["rotation"], np.array(shot["translation"]), enu)
+        theirs = opensfm_px(
+            record["cameras"][shot["camera"]], shot["rotation"], np.array(shot["translation"]), enu
+        )
         mine = in_shot(finished, s, np.column_stack([x, y, h]))
         inside = (mine > 0).all(1) & (mine[:, 0] < 799) & (mine[:, 1] < 599)
         assert inside.sum() > 100
@@ -231,7 +251,9 @@ def test_footprints_are_the_rims_of_the_photos(finished, shots):
             z = np.array([v[0] for v in heights.sample(np.column_stack([x, y]))])
             ok = np.isfinite(z)
             px = in_shot(finished, s, np.column_stack([x, y, z]))[ok]
-            rim = np.min([np.abs(px[:, 0]), np.abs(px[:, 1]), np.abs(px[:, 0] - 799), np.abs(px[:, 1] - 599)], axis=0)
+            rim = np.min(
+                [np.abs(px[:, 0]), np.abs(px[:, 1]), np.abs(px[:, 0] - 799), np.abs(px[:, 1] - 599)], axis=0
+            )
             assert ok.sum() > 10 and np.median(rim) < 2
 
 

@@ -14,7 +14,9 @@ def layer(photo, x, value, *, y=0.0, hide=None, height=FLYING, dtype=np.uint8, b
     score = (((gx - x) ** 2 + (gy - y) ** 2) / height**2).astype(np.float32)
     if hide is not None:
         score = np.where(hide, np.float32(np.inf), score)
-    return Layer(photo=photo, pixels=np.full((H, W, bands), value, dtype), score=score, centre=(x, y), height=height)
+    return Layer(
+        photo=photo, pixels=np.full((H, W, bands), value, dtype), score=score, centre=(x, y), height=height
+    )
 
 
 @pytest.mark.parametrize("width", [4.0, 6.0, 12.0])
@@ -54,14 +56,18 @@ def test_where_one_photo_ends_the_other_is_pure():
     assert (photo == -1).all() and not pixels.any()
 
 
-@pytest.mark.parametrize("rule", [Feather(), Average(), Multiband(levels=3), First()], ids=lambda r: type(r).__name__)
+@pytest.mark.parametrize(
+    "rule", [Feather(), Average(), Multiband(levels=3), First()], ids=lambda r: type(r).__name__
+)
 def test_photos_of_one_colour_make_a_map_of_it(rule):
     layers = [layer(k, 5 * k - 10, 137, y=3 * (-1) ** k) for k in range(5)]
     pixels, _ = rule.merge(layers, GSD)
     assert (pixels == 137).all()
 
 
-@pytest.mark.parametrize("rule", [Feather(), Average(), Multiband(levels=2), First()], ids=lambda r: type(r).__name__)
+@pytest.mark.parametrize(
+    "rule", [Feather(), Average(), Multiband(levels=2), First()], ids=lambda r: type(r).__name__
+)
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_type_and_range_are_kept(rule, dtype):
     rng = np.random.default_rng(1)
@@ -79,7 +85,9 @@ def test_average_is_exact():
     hide = np.arange(W)[None].repeat(H, 0) < 50
     pixels, photo = Average().merge([layer(0, 0, 10), layer(1, 3, 20, hide=hide), layer(2, 6, 40)], GSD)
     assert (pixels[:, :50] == 25).all() and (pixels[:, 50:] == 23).all()  # 70 / 3 = 23.3
-    values, _ = Average().merge([layer(0, 0, 10.5, dtype=np.float32), layer(1, 3, 21.0, dtype=np.float32)], GSD)
+    values, _ = Average().merge(
+        [layer(0, 0, 10.5, dtype=np.float32), layer(1, 3, 21.0, dtype=np.float32)], GSD
+    )
     assert values == pytest.approx(15.75)
 
 

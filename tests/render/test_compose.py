@@ -1,5 +1,7 @@
 """Composition of exact photos of known ground against the ground, and its rules against brute force."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -25,14 +27,18 @@ def exact_pixels(views, grid=GRID):
     """u, v (photos, h, w) of every map pixel in every photo, each projected by itself, and what decides between photos."""
     x, y = np.meshgrid(grid.x(np.arange(grid.width)), grid.y(np.arange(grid.height)))
     xyz = np.stack([x, y, 0 * x], -1)
-    px = np.stack([project(v.camera, v.pose.to_camera(xyz.reshape(-1, 3))).reshape(*x.shape, 2) for v in views])
+    px = np.stack(
+        [project(v.camera, v.pose.to_camera(xyz.reshape(-1, 3))).reshape(*x.shape, 2) for v in views]
+    )
     C = np.array([v.pose.map_C for v in views])
     tangent2 = ((x - C[:, 0, None, None]) ** 2 + (y - C[:, 1, None, None]) ** 2) / C[:, 2, None, None] ** 2
     seen = np.stack([inside(v.camera, p[..., 0], p[..., 1]) for v, p in zip(views, px, strict=True)])
     return px, np.where(seen, tangent2, np.inf), seen
 
 
-@pytest.mark.parametrize("blend", [Feather(), First(), Average(), Multiband(levels=3)], ids=lambda b: type(b).__name__)
+@pytest.mark.parametrize(
+    "blend", [Feather(), First(), Average(), Multiband(levels=3)], ids=lambda b: type(b).__name__
+)
 def test_the_map_is_the_ground(scene, blend):
     views, pictures = scene
     made = composer(views, pictures, GRID, blend)(WHOLE)
@@ -55,8 +61,6 @@ def test_the_map_is_the_ground(scene, blend):
 
 def test_a_shifted_camera_would_be_noticed(scene):
     """The tolerance above is worth something: half a photo pixel of principal point shows."""
-    from dataclasses import replace
-
     views, pictures = scene
     bent = [replace(v, camera=replace(v.camera, cx=v.camera.cx + 0.5)) for v in views]
     made = composer(bent, pictures, GRID, First())(WHOLE)
@@ -92,7 +96,9 @@ def test_the_first_photo_stays(scene):
 
 def test_the_average_is_the_mean_of_all_that_see(scene):
     views, _ = scene
-    levels = {v.photo: np.full((CAMERA.height, CAMERA.width, 1), 20 + 31 * k, np.uint8) for k, v in enumerate(views)}
+    levels = {
+        v.photo: np.full((CAMERA.height, CAMERA.width, 1), 20 + 31 * k, np.uint8) for k, v in enumerate(views)
+    }
     made = composer(views, levels, GRID, Average())(WHOLE)
     _, _, seen = exact_pixels(views)
     mean = (seen * (20 + 31 * np.arange(6))[:, None, None]).sum(0) / np.maximum(seen.sum(0), 1)
@@ -104,13 +110,21 @@ def test_the_average_is_the_mean_of_all_that_see(scene):
 def test_views_are_counted_at_the_cells_middles(scene):
     views, pictures = scene
     made = composer(views, pictures, GRID)(WHOLE)
-    coarse = Grid(west=GRID.west, north=GRID.north, gsd=GRID.gsd * STEP, width=GRID.width // STEP, height=-(-GRID.height // STEP))
+    coarse = Grid(
+        west=GRID.west,
+        north=GRID.north,
+        gsd=GRID.gsd * STEP,
+        width=GRID.width // STEP,
+        height=-(-GRID.height // STEP),
+    )
     _, _, seen = exact_pixels(views, coarse)
     assert made.views.shape == (coarse.height, coarse.width)
     assert (made.views == seen.sum(0)).mean() > 0.995 and made.views.max() >= 4
 
 
-@pytest.mark.parametrize("blend", [Feather(), First(), Average(), Multiband(levels=3)], ids=lambda b: type(b).__name__)
+@pytest.mark.parametrize(
+    "blend", [Feather(), First(), Average(), Multiband(levels=3)], ids=lambda b: type(b).__name__
+)
 def test_pieces_fit_together(scene, blend):
     """Windows at multiples of the step, composed by themselves, equal the whole."""
     views, pictures = scene
@@ -155,7 +169,9 @@ def test_values_far_beyond_bytes_survive_blending():
 def test_relief_is_taken_out():
     """A slope of 20 %: photos of it, projected point by point, meet the true places of its texture."""
     x = np.arange(0, 400.0, 1.0)
-    slope = Surface(z=np.tile((0.2 * (x - 200)).astype(np.float32), (400, 1)), x0=-200.0, y0=-200.0, cell=1.0, source="t")
+    slope = Surface(
+        z=np.tile((0.2 * (x - 200)).astype(np.float32), (400, 1)), x0=-200.0, y0=-200.0, cell=1.0, source="t"
+    )
     shot = view(0, 2, 1, z=45, yaw=75, pitch=3, surface=slope)
     u, v = np.meshgrid(np.arange(400, dtype=np.float32), np.arange(300, dtype=np.float32))
     pictures = {0: np.dstack([u, v])}

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skyquilt.model.raster import Window
 from skyquilt.render.exposure import NEUTRAL, Balance, Exposure, odds_table, with_odds
 from tests.render.scenes import FLAT, GRID, block, composer, photograph
-from skyquilt.model.raster import Window
 
 gains = st.floats(-1.5, 1.5)
 
@@ -80,7 +80,9 @@ def test_gains_are_found_again(lit):
 def test_the_map_loses_its_patches(lit):
     views, pictures, _ = lit
     whole = Window(row=0, column=0, height=GRID.height, width=GRID.width)
-    neutral = {v.photo: np.rint(np.dstack([np.clip(photograph(v), 12, 240)] * 3)).astype(np.uint8) for v in views}
+    neutral = {
+        v.photo: np.rint(np.dstack([np.clip(photograph(v), 12, 240)] * 3)).astype(np.uint8) for v in views
+    }
     target = composer(views, neutral, GRID, bands=3)(whole)
 
     def spread(exposure):
@@ -98,7 +100,10 @@ def test_vignetting_is_found_as_a_field(lit):
     views, _, _ = lit
     x, y = np.meshgrid(np.linspace(-1, 1, 400), np.linspace(-1, 1, 300))
     dark = -0.25 * (x * x + y * y)
-    pictures = {v.photo: np.rint(odds_scaled(np.clip(photograph(v), 12, 240), dark))[..., None].astype(np.uint8) for v in views}
+    pictures = {
+        v.photo: np.rint(odds_scaled(np.clip(photograph(v), 12, 240), dark))[..., None].astype(np.uint8)
+        for v in views
+    }
     found = Balance()(views, pictures, FLAT, GRID.bounds)
     assert all(found.uneven(v.photo) for v in views)
     squares = np.array([found.fields[v.photo][2:4] for v in views])
@@ -130,7 +135,10 @@ def test_measured_values_are_never_touched(lit):
     views, _, _ = lit
     values = {v.photo: np.full((300, 400, 1), 21.5, np.float32) for v in views}
     exposure = Exposure(
-        gains={v.photo: np.array([0.7], np.float32) for v in views}, fields={v.photo: np.ones(5, np.float32) for v in views}
+        gains={v.photo: np.array([0.7], np.float32) for v in views},
+        fields={v.photo: np.ones(5, np.float32) for v in views},
     )
-    made = composer(views, values, GRID, dtype=np.float32, exposure=exposure)(Window(row=64, column=64, height=64, width=64))
+    made = composer(views, values, GRID, dtype=np.float32, exposure=exposure)(
+        Window(row=64, column=64, height=64, width=64)
+    )
     assert made.pixels == pytest.approx(21.5)

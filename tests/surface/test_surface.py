@@ -7,12 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyquilt.geometry.camera import undistort
+from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.imaging.views import View, footprint
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Pose
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
-from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.surface.plane import level
 from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints, grid_spacing, without_outliers
@@ -29,7 +29,10 @@ def points(z, *, seed=0, count=1500, noise=0.0, bounds=BOUNDS):
 
 def at(surface, margin=8.0):
     """Places well inside, and the surface's heights there."""
-    x, y = np.meshgrid(np.linspace(BOUNDS[0] + margin, BOUNDS[2] - margin, 40), np.linspace(BOUNDS[1] + margin, BOUNDS[3] - margin, 40))
+    x, y = np.meshgrid(
+        np.linspace(BOUNDS[0] + margin, BOUNDS[2] - margin, 40),
+        np.linspace(BOUNDS[1] + margin, BOUNDS[3] - margin, 40),
+    )
     return x, y, surface.at(x, y)
 
 
@@ -137,7 +140,9 @@ def render(view, ground):
     xy = np.where((relief(*top.T) > 0)[:, None], top, bottom)
     n = ground.shape[0]
     column, row = (xy[:, 0] / FINE + n / 2).astype(np.float32), (n / 2 - xy[:, 1] / FINE).astype(np.float32)
-    image = cv2.remap(ground, column.reshape(h, w), row.reshape(h, w), cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT)
+    image = cv2.remap(
+        ground, column.reshape(h, w), row.reshape(h, w), cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT
+    )
     return np.clip(cv2.GaussianBlur(image, (0, 0), 0.6), 0, 255).astype(np.uint8)
 
 

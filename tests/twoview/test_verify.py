@@ -12,10 +12,22 @@ from tests.alignment.blocks import FLYING, HEIGHT, LENS, WIDTH, ground, seen_by
 
 
 def features(px, scale=1.0):
-    return Features(px=px, size=np.ones(len(px), np.float32), descriptors=np.zeros((len(px), 4), np.float32), scale=scale)
+    return Features(
+        px=px, size=np.ones(len(px), np.float32), descriptors=np.zeros((len(px), 4), np.float32), scale=scale
+    )
 
 
-def view_pair(seed, *, count=150, outliers=0.3, yaw=(5.0, 187.0), base=(20.0, 12.0), height=(1.0, 1.0), noise=0.4, tilt=2.0):
+def view_pair(
+    seed,
+    *,
+    count=150,
+    outliers=0.3,
+    yaw=(5.0, 187.0),
+    base=(20.0, 12.0),
+    height=(1.0, 1.0),
+    noise=0.4,
+    tilt=2.0,
+):
     """Sightings of rolling ground by two tilted cameras; returns pixels of both and which matches are right."""
     rng = np.random.default_rng(seed)
     C = np.array([[0, 0, FLYING * height[0]], [*base, FLYING * height[1]]])
@@ -70,7 +82,12 @@ def test_unrelated_photos_are_refused():
         result = verified(pa, pb)
         assert not result, f"seed {seed}: {len(result)} of {n} accepted"
         reasons.append(result.reason.split(" (")[0])
-    assert set(reasons) <= {"weak inliers", "implausible scale", "weak inliers after epipolar check", "no common similarity"}
+    assert set(reasons) <= {
+        "weak inliers",
+        "implausible scale",
+        "weak inliers after epipolar check",
+        "no common similarity",
+    }
 
 
 def test_reasons():
@@ -80,7 +97,9 @@ def test_reasons():
     pa, pb, right = view_pair(1, height=(1.0, 2.0), base=(3.0, 2.0), outliers=0.0)
     assert verified(pa, pb).reason.startswith("implausible scale (0.5")
     rng = np.random.default_rng(2)
-    loose = pa * 1.0 + rng.normal(0, 6, pa.shape)  # a similarity within its loose tolerance, no epipolar geometry
+    loose = pa * 1.0 + rng.normal(
+        0, 6, pa.shape
+    )  # a similarity within its loose tolerance, no epipolar geometry
     assert "epipolar" in verified(pa[:40], loose[:40], minimum=30).reason
 
 
