@@ -25,8 +25,8 @@ from skyquilt.alignment.adjust import adjust, robust_cost  # noqa: E402
 from skyquilt.alignment.problem import Problem, State  # noqa: E402
 
 SIZES = {
-    "18 photos": dict(lines=3, per_line=6, points=1000),
-    "75 photos": dict(lines=5, per_line=15, points=8200),
+    "18 photos": {"lines": 3, "per_line": 6, "points": 1000},
+    "75 photos": {"lines": 5, "per_line": 15, "points": 8200},
 }
 """Name -> layout: about 4000 and 46,000 sightings."""
 
@@ -37,7 +37,8 @@ def problem_of(layout: dict[str, int]) -> tuple[Problem, State]:
     n = len(block.truth.C)
     problem = replace(
         block.problem, sigma_px=np.ones(len(block.problem.px)), loss_px=2.0, loss_C=1e6, loss_R=1e6,
-        free=np.array([[1, 0, 0, 1, 1, 0, 0, 0]], bool), sigma_R=np.full((n, 3), np.inf), sigma_K=np.full((1, 8), np.inf),
+        free=np.array([[1, 0, 0, 1, 1, 0, 0, 0]], bool), sigma_R=np.full((n, 3), np.inf),
+        sigma_K=np.full((1, 8), np.inf),
     )  # fmt: skip
     start = replace(
         block.start,

@@ -4,6 +4,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.pose import ByPose, ByPosition
 from skyquilt.errors import UsageError
@@ -81,10 +83,15 @@ class MosaicSettings:
             ("--gsd", self.gsd_cm, 0.05, 10000), ("--quality", self.quality, 1, 100),
             ("--height", self.height_m, 0.5, 1e5), ("--memory", self.memory_gb, 0.5, 4096),
             ("--jobs", self.jobs, 0, 1024), ("--features", self.features, 100, 50000),
+            ("--feather", self.feather_px, 0, 10000), ("--heading", self.heading_deg, -360, 360),
         ):  # fmt: skip
             if value is not None and not low <= value <= high:
                 raise UsageError(f"{name} {value} lies outside {low} to {high}")
-        if self.bounds and not (self.bounds[0] < self.bounds[2] and self.bounds[1] < self.bounds[3]):
+        if self.bounds and not (
+            np.isfinite(self.bounds).all()
+            and self.bounds[0] < self.bounds[2]
+            and self.bounds[1] < self.bounds[3]
+        ):
             raise UsageError(
                 f"--bounds is west,south,east,north with west < east and south < north, got {self.bounds}"
             )

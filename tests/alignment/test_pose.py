@@ -75,7 +75,7 @@ def test_heights_that_do_not_tell_the_ground():
 
 
 def test_no_position_at_all():
-    with pytest.raises(AlignmentError, match="none of 5 has one"):
+    with pytest.raises(AlignmentError, match="none of 5 can be placed .it has no position"):
         ByPose()(PHOTOS, FRAME, [prior((np.nan,) * 3)] * 5)
     alone = ByPose()(
         PHOTOS[:1], MapFrame(crs=None, origin=(0, 0), vertical_datum="unknown"), [prior((np.nan,) * 3)]

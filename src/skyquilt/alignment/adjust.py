@@ -310,11 +310,18 @@ def adjust(
 def covariance(problem: Problem, state: State) -> Array | None:
     """Covariance ((6n+8m), (6n+8m)) of photos and cameras at the minimum, points marginalised.
 
-    For sightings that err as stated (scale it by their variance factor otherwise); None beyond `DENSE_LIMIT`.
+    In units of the whitened residuals, scaled by their robust variance factor; None beyond
+    `DENSE_LIMIT`, and where nothing holds some of them.
     """
     normal = normal_equations(problem, state)
     reduced = Reduced(problem, normal, 0.0)
     if not isinstance(reduced.S, np.ndarray):
         return None
     S = reduced.S + np.diag(np.full(reduced.size, 1e-9))
-    return np.asarray(linalg.inv(S, check_finite=False))
+    scale = 1 / np.sqrt(np.maximum(np.diag(S), 1e-9))  # radians and metres differ by orders of magnitude
+    scale = scale[:, None] * scale
+    try:
+        inverse = np.linalg.inv(S * scale) * scale
+    except np.linalg.LinAlgError:
+        return None
+    return inverse if np.isfinite(inverse).all() else None

@@ -47,9 +47,7 @@ class ByMetadata:
             heights = self._heights(frame, priors)
             poses, rejected = self._placed(photos, priors, heights)
         if not poses:
-            raise AlignmentError(
-                f"method {self.name} places photos by position, and none of {len(photos)} has one"
-            )
+            raise AlignmentError(_nothing_placed(self.name, len(photos), rejected))
         return Alignment(
             method=self.name, why="",
             frame=replace(frame, metric=frame.crs is not None or self.height_m is not None),
@@ -69,9 +67,11 @@ class ByMetadata:
                 else np.full(len(z), self.height_m)
             )
         if frame.vertical_datum != "takeoff":
+            known = frame.vertical_datum != "unknown"
+            given = f"heights above {frame.vertical_datum.replace('_', ' ')}" if known else "no heights"
             raise AlignmentError(
-                f"method {self.name} needs heights above ground, and the photos give heights above"
-                f" {frame.vertical_datum.replace('_', ' ')}; add --height METRES"
+                f"method {self.name} needs heights above ground, and the photos give {given};"
+                " add --height METRES"
             )
         return np.where(np.isfinite(z), z, np.nanmedian(z) if np.isfinite(z).any() else np.nan)
 
@@ -93,6 +93,18 @@ class ByMetadata:
     def _pose(self, prior: Prior, heights: np.ndarray, i: int) -> Pose:
         R = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
         return Pose(cam_R_map=R, map_C=np.array([prior.map_C[0], prior.map_C[1], heights[i]]))
+
+
+def _nothing_placed(method: str, photos: int, rejected: dict[int, str]) -> str:
+    """Why no photo could be placed, and what to do."""
+    reasons = "; ".join(dict.fromkeys(rejected.values()))
+    advice = "give positions and headings with --geo, or use --method bundle"
+    if "height" in reasons:
+        advice = "add --height METRES"
+    return (
+        f"method {method} places photos by their metadata, and none of {photos} can be placed"
+        f" ({reasons[:200]}); {advice}"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

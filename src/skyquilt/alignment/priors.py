@@ -32,11 +32,12 @@ def choose_frame(photos: Sequence[Photo], crs: str | None, control: Sequence[Con
         to_wgs = Transformer.from_crs(control[0].crs, 4326, always_xy=True)
         lon, lat = to_wgs.transform([c.x for c in control], [c.y for c in control])
         places = list(zip(lat, lon, strict=True))
+    name = _checked_crs(crs) if crs else ""
     if not places:
         metric = any(p.position and p.position.takeoff_m for p in photos)
         return MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="unknown", metric=metric)
     latitude, longitude = np.median(np.array(places), axis=0)
-    name = _checked_crs(crs) if crs else utm_epsg(latitude, longitude)
+    name = name or utm_epsg(latitude, longitude)
     x, y = Transformer.from_crs(4326, name, always_xy=True).transform(longitude, latitude)
     origin = (float(np.round(x, -2)), float(np.round(y, -2)))
     convergence = Proj(name).get_factors(longitude, latitude).meridian_convergence

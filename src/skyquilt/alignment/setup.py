@@ -159,6 +159,9 @@ def _positions(
         a_t = np.array([[start.placed[int(m)][1].real, start.placed[int(m)][1].imag] for m in members])
         C0 = np.column_stack([a_t, z_ground + height])
         sigma = stated = np.full(C0.shape, 0.1 * float(np.median(height)))
+    elif not known.any():  # nor does anything hold its height
+        C0[:, 2] = z_ground + height
+        sigma[:, 2] = stated[:, 2] = 0.1 * float(np.median(height))
     return C0, np.where(np.isfinite(C0), sigma, 1.0), np.where(np.isfinite(C0), stated, 1.0), z_ground
 
 

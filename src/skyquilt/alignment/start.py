@@ -56,9 +56,8 @@ def plane_link(link: Link, photos: Sequence[Photo], features: Sequence[Features]
 
 
 def find_start(
-    photos: Sequence[Photo], priors: Sequence[Prior], features: Sequence[Features], links: Sequence[Link],
-    *, trust_yaw: bool = False,
-) -> Start:  # fmt: skip
+    photos: Sequence[Photo], priors: Sequence[Prior], features: Sequence[Features], links: Sequence[Link]
+) -> Start:
     """Solves every block, drops links that contradict it, and places it by its own positions."""
     plane = {(k.a, k.b): plane_link(k, photos, features) for k in links}
     solutions, kept = _consistent_blocks(len(photos), plane)

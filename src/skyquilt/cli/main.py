@@ -5,10 +5,8 @@ import sys
 from io import TextIOWrapper
 from typing import Any
 
+from skyquilt.cli import interrupt
 from skyquilt.errors import SkyquiltError
-
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells know it."""
 
 
 def run() -> None:
@@ -22,24 +20,19 @@ def run() -> None:
     if isinstance(sys.stdout, TextIOWrapper):  # names may hold what a terminal cannot show
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        from skyquilt.cli.app import app  # importing takes a moment, and Ctrl-C may come then
-
+        with interrupt.ends_at_once():
+            from skyquilt.cli.app import app
         app()
     except SkyquiltError as error:
         sys.stderr.write(f"skyquilt: {error}\n")
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        _interrupted()
+        interrupt.say()
+        sys.exit(interrupt.CODE)
     except SystemExit as end:
-        if end.code != INTERRUPTED:
-            raise
-        _interrupted()  # typer ends so, without a word
-
-
-def _interrupted() -> None:
-    resumable = "; run the same command again to resume" if sys.argv[1:2] == ["mosaic"] else ""
-    sys.stderr.write(f"skyquilt: interrupted{resumable}\n")
-    sys.exit(INTERRUPTED)
+        if end.code == interrupt.CODE:  # typer ends so, without a word
+            interrupt.say()
+        raise
 
 
 def __getattr__(name: str) -> Any:

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from skyquilt.cli.interrupt import ends_at_once
 from skyquilt.errors import UsageError
 
 
@@ -85,9 +86,10 @@ def command(
 
     Sensible without any option. The same command again resumes a run that was killed.
     """
-    from skyquilt.cli.progress import show
-    from skyquilt.config import MosaicSettings
-    from skyquilt.pipelines.mosaic import STAGES, iter_mosaic
+    with ends_at_once():
+        from skyquilt.cli.progress import show
+        from skyquilt.config import MosaicSettings
+        from skyquilt.pipelines.mosaic import STAGES, iter_mosaic
 
     if rerun_from is not None and rerun_from not in STAGES[1:]:
         raise UsageError(f"--rerun-from {rerun_from!r} is not one of {', '.join(STAGES[1:])}")

@@ -25,8 +25,9 @@ def _euler_zyx(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matrix:
 
 def _zyx_angles(R: Matrix) -> tuple[float, float, float]:
     """Yaw, pitch, roll in degrees of Rz Ry Rx; roll 0 at pitch +-90 deg."""
-    pitch = np.arcsin(np.clip(-R[2, 0], -1, 1))
-    if abs(R[2, 0]) > 1 - 1e-12:
+    level = np.hypot(R[2, 1], R[2, 2])
+    pitch = np.arctan2(-R[2, 0], level)  # an arcsine would lose digits near 90 degrees
+    if level < 1e-9:
         return float(np.degrees(np.arctan2(-R[0, 1], R[1, 1]))), float(np.degrees(pitch)), 0.0
     yaw, roll = np.arctan2(R[1, 0], R[0, 0]), np.arctan2(R[2, 1], R[2, 2])
     return float(np.degrees(yaw)), float(np.degrees(pitch)), float(np.degrees(roll))

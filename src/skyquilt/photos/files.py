@@ -9,6 +9,7 @@ from skyquilt.errors import UsageError
 
 _PHOTO_ENDINGS = frozenset({".jpg", ".jpeg", ".tif", ".tiff", ".png"})
 _RUN_MARK = "run.toml"
+_RUN_STATE = ".skyquilt"
 _SIDE_NAMES = frozenset({"geo.txt", "gcp_list.txt"})
 
 
@@ -29,7 +30,8 @@ class FoundFiles:
 def find_files(source: Path | Sequence[Path]) -> FoundFiles:
     """Photos by their endings below a folder, or among files given one by one.
 
-    Hidden files and folders are passed over, and so are folders of earlier runs (they hold `run.toml`).
+    Hidden files and folders are passed over, and so are folders of earlier runs (they hold `run.toml`, or
+    `.skyquilt` while they are under way).
     Raises `UsageError` where something named does not exist.
     """
     if isinstance(source, (str, Path)) and Path(source).is_dir():
@@ -43,7 +45,7 @@ def find_files(source: Path | Sequence[Path]) -> FoundFiles:
 
 def _in_folder(folder: Path) -> FoundFiles:
     runs: list[str] = []
-    files = [(p.relative_to(folder).as_posix(), p) for p in _walk(folder, runs, folder)]
+    files = [(_text(p.relative_to(folder).as_posix()), p) for p in _walk(folder, runs, folder)]
     geo = next((p for name, p in files if name.lower() == "geo.txt"), None)
     return _sorted(files, geo, tuple(sorted(runs)))
 
@@ -51,8 +53,8 @@ def _in_folder(folder: Path) -> FoundFiles:
 def _walk(folder: Path, runs: list[str], top: Path) -> Iterator[Path]:
     for where, folders, files in os.walk(folder):
         here = Path(where)
-        if _RUN_MARK in files and here != top:
-            runs.append(here.relative_to(top).as_posix())
+        if here != top and (_RUN_MARK in files or _RUN_STATE in folders):
+            runs.append(_text(here.relative_to(top).as_posix()))
             folders.clear()
             continue
         folders[:] = sorted(f for f in folders if not f.startswith("."))
@@ -67,7 +69,12 @@ def _listed(paths: Sequence[Path]) -> FoundFiles:
     unique = list(dict.fromkeys(p.absolute() for p in files))
     top = Path(os.path.commonpath([p.parent for p in unique])) if unique else Path()
     bare = len({p.name for p in unique}) == len(unique)
-    return _sorted([(p.name if bare else p.relative_to(top).as_posix(), p) for p in unique], None, ())
+    return _sorted([(_text(p.name if bare else p.relative_to(top).as_posix()), p) for p in unique], None, ())
+
+
+def _text(name: str) -> str:
+    """A name that can be written to any file: Linux allows bytes in names that are no text."""
+    return name.encode("utf-8", "backslashreplace").decode()
 
 
 def _sorted(files: Sequence[tuple[str, Path]], geo: Path | None, runs: tuple[str, ...]) -> FoundFiles:

@@ -12,7 +12,7 @@ from skyquilt.photos.read import read_photo
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
 from skyquilt.photos.survey_notes import survey_notes
-from skyquilt.photos.voids import without_ground_heights, without_outliers
+from skyquilt.photos.voids import without_ground_heights, without_outliers, without_stuck
 
 
 def read_survey(
@@ -39,12 +39,13 @@ def read_survey(
         photos, more = apply_cameras(photos, read_cameras_json(cameras), file=cameras)
         notes = (*notes, *more)
     photos, grounded = without_ground_heights(sorted(photos, key=capture_order))
+    photos, stuck = without_stuck(photos)
     photos, far = without_outliers(photos)
     return Survey(
         photos=photos,
         rejected=tuple(sorted((*rejected, *copies), key=lambda r: r.name)),
         ignored=found.ignored,
-        notes=(*notes, *_run_notes(found), *grounded, *far, *survey_notes(photos, len(copies))),
+        notes=(*notes, *_run_notes(found), *grounded, *stuck, *far, *survey_notes(photos, len(copies))),
     )
 
 

@@ -1,4 +1,4 @@
-"""Positions that cannot be: one photo far from all others, a whole flight at height zero."""
+"""Positions that cannot be: one far from all others, all in one place, a whole flight at height zero."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,6 +12,8 @@ _FAR_M = 5_000.0
 _FAR_SPREADS = 20.0
 _METRES_PER_DEGREE = 111_320.0
 _GROUND_M = 2.0
+_STUCK_M = 0.05
+_STUCK_PHOTOS = 4
 
 
 def without_outliers(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
@@ -40,6 +42,25 @@ def without_ground_heights(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], 
         return tuple(photos), ()
     note = f"The heights above take-off stay within {_GROUND_M:.0f} m of zero and were not used."
     return tuple(_unraised(p) for p in photos), (note,)
+
+
+def without_stuck(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    """The photos, without positions where four or more report one and the same: a receiver that stood still.
+
+    Believed, they would shrink the map to a point.
+    """
+    placed = [p for p in photos if p.position]
+    if len(placed) < _STUCK_PHOTOS or distances_to_median(placed).max() > _STUCK_M:
+        return tuple(photos), ()
+    place = placed[0].position
+    note = (
+        f"All {len(placed)} positions are one and the same"
+        f" ({place.latitude_deg:.6f}, {place.longitude_deg:.6f}): the receiver stood still, and they were not"
+        " used. Give positions in a geo.txt, or control points."
+        if place
+        else ""
+    )
+    return tuple(replace(p, position=None) for p in photos), (note,)
 
 
 def _unraised(photo: Photo) -> Photo:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.config import Methods, MosaicSettings
-from skyquilt.errors import OutputError, UsageError
+from skyquilt.errors import SideFileError, UsageError
 from skyquilt.imaging.views import STEP, View, grid_of, make_views, native_gsd
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid, Window
@@ -24,9 +24,20 @@ from skyquilt.render.compose import Composed, Composer, PhotoPixels
 from skyquilt.render.exposure import NEUTRAL, Exposure
 from skyquilt.run.clock import Steps
 from skyquilt.run.executor import in_order
+from skyquilt.run.folder import STATE
 from skyquilt.run.store import Store, digest
 from skyquilt.surface.plane import level
 
+FINEST = 20
+"""Map pixels per photo pixel, along a side, that may be asked for."""
+MOST_PIXELS = 4e11
+"""Largest map."""
+WIDEST_M = 200_000.0
+"""Widest map: no drone flies further."""
+BLOCK = 2048
+"""Side in px of the pieces that the map is drawn in."""
+SPOOL = "mosaic.spool"
+"""Where the map's tiles wait, below the run's state."""
 PROVENANCE = 4
 """Map pixels per provenance pixel."""
 
@@ -93,7 +104,9 @@ def survey_ground(
     native = native_gsd(rough, level(z))
     gsd = settings.gsd_cm / 100 if settings.gsd_cm else round_gsd(native)
     bounds = _local_bounds(settings, alignment)
+    _check_place(bounds, rough, settings, alignment)
     wide = grid_of(rough, gsd, bounds)
+    _check_size(wide, native)
     margin = 0.05 * max(wide.width, wide.height) * gsd
     w, s, e, n = wide.bounds
     area = (w - margin, s - margin, e + margin, n + margin)
@@ -111,13 +124,41 @@ def survey_ground(
             "surface", digest(key, poses_digest(alignment), grid, sweep),
             lambda: sweep(known, [v for v in views if held(alignment, v.photo)], grid, pictures),
         )  # fmt: skip
-    if grid.width * grid.height > 4e11:
-        raise UsageError(
-            f"at {gsd * 100:g} cm the map would have {grid.width} x {grid.height} px;"
-            " check --gsd and the positions"
-        )
     yield 1, 1
     return Ground(surface=surface, views=views, grid=grid, native_gsd=native)
+
+
+def _check_place(
+    bounds: tuple[float, float, float, float] | None, views: Sequence[View], settings: MosaicSettings,
+    alignment: Alignment,
+) -> None:  # fmt: skip
+    """Refuses an area that no photo shows."""
+    if bounds is None or any(v.overlaps(bounds) for v in views):
+        return
+    outline = np.concatenate([v.footprint for v in views]) + alignment.frame.origin
+    (west, south), (east, north) = outline.min(0), outline.max(0)
+    frame = alignment.frame.crs or "their own frame"
+    where = f"which cover {west:.0f},{south:.0f},{east:.0f},{north:.0f} in {frame}"
+    if settings.bounds is not None:
+        asked = ",".join(f"{b:g}" for b in settings.bounds)
+        raise UsageError(f"--bounds {asked} lies outside the photos, {where}")
+    raise SideFileError(f"the area of --boundary {settings.boundary} lies outside the photos, {where}")
+
+
+def _check_size(grid: Grid, native: float) -> None:
+    """Refuses what nobody can want: a map far finer than the photos, or larger than any survey."""
+    size = f"{grid.width} x {grid.height} px"
+    wide = max(grid.width, grid.height) * grid.gsd
+    if grid.gsd < native / FINEST and wide < WIDEST_M:
+        raise UsageError(
+            f"--gsd {grid.gsd * 100:g} asks for {size}, more than {FINEST} times finer than the photos,"
+            f" which show {native * 100:.2g} cm per pixel; leave --gsd out or choose one near that"
+        )
+    if wide > WIDEST_M or grid.width * grid.height > MOST_PIXELS:
+        raise UsageError(
+            f"the map would be {wide / 1000:.0f} km wide, {size} at {grid.gsd * 100:g} cm: the positions of"
+            " some photos (or --bounds) must be wrong; correct them with --geo, or choose a larger --gsd"
+        )
 
 
 def poses_digest(alignment: Alignment) -> str:
@@ -217,37 +258,29 @@ def draw(
     unit: str, jobs: int,
 ) -> Steps[Drawn]:  # fmt: skip
     """Writes mosaic.tif, provenance.tif and views.tif; a killed run goes on at the block where it stopped."""
-    keep = _keeper(compose, alignment, settings)
-    number = {v.photo: k + 1 for k, v in enumerate(sorted(compose.views, key=lambda v: v.photo))}
-    table = np.zeros(max(number) + 2, np.uint32)
-    table[list(number)] = list(number.values())  # index -1 (no photo) is the last entry: 0
     whole = _Companions(compose.grid, compose.bands, compose.dtype)
     spec = mosaic_spec(compose, alignment, settings, unit)
-    spool = output / ".skyquilt" / "mosaic.spool"
-    with CogWriter(output / "mosaic.tif", spec, spool=spool, digest=key) as writer:
-        todo = list(writer.blocks())
-        total = -(-spec.height // 2048) * -(-spec.width // 2048)
+    path, spool = output / "mosaic.tif", output / STATE / SPOOL
+    keep, table = _keeper(compose, alignment, settings), _shot_numbers(compose)
 
-        def one(block: Block) -> tuple[Block, Composed]:
-            return block, compose(_window(block))
+    def one(block: Block) -> tuple[Block, NDArray, NDArray[np.bool_], BlockExtras]:
+        composed = compose(_window(block))
+        valid = composed.photo >= 0
+        if keep is not None:
+            valid &= keep(block)
+        return block, _blanked(composed.pixels, valid), valid, _extras(composed, valid, table, whole.factor)
 
-        for done, (block, composed) in enumerate(in_order(one, todo, jobs=jobs)):
-            valid = composed.photo >= 0
-            if keep is not None:
-                valid &= keep(block)
-            pixels = _blanked(composed.pixels, valid)
-            preview, shown = _reduced(pixels, valid, whole.factor)
-            numbers = table[np.where(_thinned(valid), _thinned(composed.photo), -1)]
-            extras = BlockExtras(provenance=numbers, views=composed.views, preview=preview, shown=shown)
-            store.put("blocks", digest(key, block.row0, block.col0), extras)
-            writer.write_block(block, pixels, valid)
-            yield total - len(todo) + done + 1, total
-    for row in range(0, spec.height, 2048):
-        for column in range(0, spec.width, 2048):
-            kept: BlockExtras | None = store.get("blocks", digest(key, row, column))
-            if kept is None:  # the map itself is whole by now, so that the next run draws every block again
-                raise OutputError(f"intermediate results of {output} are gone; run the same command again")
-            whole.add(row, column, kept)
+    if store.get("blocks", digest(key, "file")) != _stamp(path):
+        with CogWriter(path, spec, spool=spool, digest=key) as writer:
+            todo, total = list(writer.blocks()), len(_blocks(spec))
+            for done, (block, pixels, valid, extras) in enumerate(in_order(one, todo, jobs=jobs)):
+                store.put("blocks", digest(key, block.row0, block.col0), extras)
+                writer.write_block(block, pixels, valid)
+                yield total - len(todo) + done + 1, total
+        store.put("blocks", digest(key, "file"), _stamp(path))
+    for block in _blocks(spec):
+        kept = store.get("blocks", digest(key, block.row0, block.col0))
+        whole.add(block.row0, block.col0, kept or one(block)[3])  # none where the store was damaged
     _write_companions(output, whole, alignment)
     return Drawn(
         provenance=whole.provenance, provenance_grid=whole.fine, views=whole.views, views_grid=whole.coarse,
@@ -255,16 +288,49 @@ def draw(
     )  # fmt: skip
 
 
+def _blocks(spec: RasterSpec) -> list[Block]:
+    """All blocks of the map, finished or not."""
+    return [
+        Block(
+            row0=row,
+            col0=col,
+            height=min(BLOCK, spec.height - row),
+            width=min(BLOCK, spec.width - col),
+            tile=spec.tile,
+        )
+        for row in range(0, spec.height, BLOCK)
+        for col in range(0, spec.width, BLOCK)
+    ]
+
+
+def _stamp(path: Path) -> list[int]:
+    """Size and time of a file: whether it is still the one that was written."""
+    return [path.stat().st_size, path.stat().st_mtime_ns] if path.is_file() else []
+
+
+def _shot_numbers(compose: Composer) -> NDArray[np.uint32]:
+    """Number in shots.geojson of each photo; the last entry, which index -1 (no photo) finds, is 0."""
+    number = {v.photo: k + 1 for k, v in enumerate(sorted(compose.views, key=lambda v: v.photo))}
+    table = np.zeros(max(number) + 2, np.uint32)
+    table[list(number)] = list(number.values())
+    return table
+
+
+def _extras(
+    composed: Composed, valid: NDArray[np.bool_], table: NDArray[np.uint32], factor: int
+) -> BlockExtras:
+    preview, shown = _reduced(composed.pixels, valid, factor)
+    numbers = table[np.where(_thinned(valid), _thinned(composed.photo), -1)]
+    return BlockExtras(provenance=numbers, views=composed.views, preview=preview, shown=shown)
+
+
 def _thinned(numbers: NDArray) -> NDArray:
     """Every PROVENANCE-th pixel in both directions, from the middle of its cell."""
-    half = PROVENANCE // 2
-    thin = numbers[half::PROVENANCE, half::PROVENANCE]
-    rows, columns = -(-numbers.shape[0] // PROVENANCE), -(-numbers.shape[1] // PROVENANCE)
-    return (
-        np.pad(thin, ((0, rows - thin.shape[0]), (0, columns - thin.shape[1])), mode="edge")
-        if thin.size
-        else numbers[:1, :1]
+    rows, columns = (
+        np.minimum(np.arange(PROVENANCE // 2, size + PROVENANCE // 2, PROVENANCE), size - 1)
+        for size in numbers.shape
     )
+    return np.asarray(numbers[np.ix_(rows, columns)])
 
 
 def _blanked(pixels: NDArray, valid: NDArray[np.bool_]) -> NDArray:

@@ -38,17 +38,22 @@ def gps_residuals(alignment: Alignment, priors: Sequence[Prior]) -> NDArray[np.f
     return residual
 
 
+def _rms(values: NDArray[np.float64]) -> float:
+    """NaN for none."""
+    return float(np.sqrt((values**2).mean())) if len(values) else np.nan
+
+
 def alignment_figures(alignment: Alignment, priors: Sequence[Prior]) -> dict[str, Any]:
     """Blocks, residuals, calibration, control."""
     error = np.linalg.norm(alignment.ties.residual_px, axis=1)
     rms_px = float(np.sqrt((error**2).mean())) if len(error) else None
     residual = gps_residuals(alignment, priors) if alignment.frame.crs else np.zeros((0, 3))
-    with np.errstate(invalid="ignore"):
-        rms = np.sqrt(np.nanmean(residual**2, axis=0)) if np.isfinite(residual).any() else None
+    rms = [_rms(axis[np.isfinite(axis)]) for axis in residual.T]
+    loo = alignment.loo_rms_m if alignment.frame.crs else None
     return {
         "blocks": [len(b) for b in alignment.blocks],
         "gps_residual_rms_m": xyz(rms),
-        "gps_leave_one_out_rms_m": xyz(alignment.loo_rms_m) if alignment.frame.crs else None,
+        "gps_leave_one_out_rms_m": xyz(np.where(np.isfinite(rms), loo, np.nan) if loo is not None else None),
         "reprojection_error_px": {"mean": _round(error.mean()),
         "rms": _round(rms_px)} if len(error) else None,
         "tie_points": len(alignment.ties.xyz),

@@ -8,24 +8,29 @@ so a second run recomputes nothing and a killed one goes on where it stopped.
 
 import json
 import os
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
+
+from numpy.typing import NDArray
 
 from skyquilt import __version__
 from skyquilt.alignment.conflicts import conflicts
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.config import Methods, MosaicSettings, methods
+from skyquilt.errors import SkyquiltError, UnreadablePhotoError, UsageError
 from skyquilt.model import camera, features, poses, raster, surface
 from skyquilt.model.event import Event, Note, Result
-from skyquilt.model.photo import ControlPoint, RejectedPhoto, Survey
+from skyquilt.model.photo import ControlPoint, Photo, RejectedPhoto, Survey
 from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.survey import read_survey
 from skyquilt.pipelines import drawing, intake, judging, linking, placing, reporting
+from skyquilt.raster.boundary import read_boundary
 from skyquilt.run.clock import Clock, Steps
-from skyquilt.run.folder import RunFolder, open_run
+from skyquilt.run.folder import STATE, RunFolder, open_run
 from skyquilt.run.pixel_cache import PixelCache
 from skyquilt.run.store import Store, digest
 
@@ -64,15 +69,15 @@ def iter_mosaic(
     """
     settings, began = settings or MosaicSettings(), Clock.now()
     parts, jobs = methods(settings), settings.jobs or os.cpu_count() or 1
+    _apart(folder, Path(output))
     survey, control = _read(folder, settings)
-    run = open_run(
-        Path(output), run_key(survey, control, settings, parts), overwrite=overwrite or rerun_from is not None
-    )
+    run_id = run_key(survey, control, settings, parts)
+    run = open_run(Path(output), run_id, overwrite=overwrite, again=rerun_from is not None)
     store = Store(folder=run.store, registry=REGISTRY)
     _forget(run, store, rerun_from)
-    if run.done:
+    if run.done and (former := _figures(run.path / "metrics.json")):
         yield Note(text=f"{run.path} holds this very mosaic already; nothing to do")
-        yield Result(output=run.path, metrics=json.loads((run.path / "metrics.json").read_text()))
+        yield Result(output=run.path, metrics=former)
         return
     run.mark("running")
     clock = Clock(store=store, began=began)
@@ -81,7 +86,8 @@ def iter_mosaic(
     cache = PixelCache(read=lambda i: read_color(survey.photos[i]), budget_bytes=pixel_budget(settings))
     taken = yield from clock.stage("features", intake.take_in(survey.photos, cache, parts, store, jobs))
     taken, cache = _one_kind(taken, survey, cache, settings)
-    pictures = intake.Pictures(taken.photos, cache, store)
+    pixels = _still_there(taken.photos, cache)
+    pictures = intake.Pictures(taken.photos, pixels, store)
     frame = choose_frame(taken.photos, settings.crs, control)
     prior = priors(taken.photos, frame)
     links = yield from clock.stage("links", _links(taken, prior, parts, settings, store, jobs))
@@ -95,7 +101,7 @@ def iter_mosaic(
     exposure = yield from clock.stage(
         "balance", _at_once(lambda: drawing.balance(taken, ground, alignment, parts, settings))
     )
-    compose = drawing.composer(taken, ground, alignment, exposure, parts, cache)
+    compose = drawing.composer(taken, ground, alignment, exposure, parts, pixels)
     key = digest(
         run.key,
         drawing.poses_digest(alignment),
@@ -141,6 +147,14 @@ def mosaic(
 def _read(folder: Path | Sequence[Path], settings: MosaicSettings) -> tuple[Survey, tuple[ControlPoint, ...]]:
     """Metadata and side files; a gcp_list.txt beside the photos is used unasked."""
     survey = read_survey(folder, geo=settings.geo, cameras=settings.cameras)
+    survey, control = _with_control(survey, folder, settings)
+    _checked(survey, control, settings)
+    return survey, control
+
+
+def _with_control(
+    survey: Survey, folder: Path | Sequence[Path], settings: MosaicSettings
+) -> tuple[Survey, tuple[ControlPoint, ...]]:
     gcp = settings.gcp
     if gcp is None and isinstance(folder, Path) and (folder / "gcp_list.txt").is_file():
         gcp = folder / "gcp_list.txt"
@@ -148,6 +162,30 @@ def _read(folder: Path | Sequence[Path], settings: MosaicSettings) -> tuple[Surv
         return survey, ()
     control, notes = read_gcp_list(gcp, [p.name for p in survey.photos])
     return replace(survey, notes=(*survey.notes, *notes)), control
+
+
+def _apart(folder: Path | Sequence[Path], output: Path) -> None:
+    """Refuses the folder of photos as output: a second run would take its own map for a photo."""
+    if isinstance(folder, Path) and folder.is_dir() and folder.resolve() == output.resolve():
+        raise UsageError(
+            f"{output} holds the photos; choose another folder for the results, such as {output / 'map'}"
+        )
+
+
+def _checked(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSettings) -> None:
+    """Whether the options fit the survey, before anything is computed or replaced.
+
+    Raises:
+        UsageError, SideFileError: they do not.
+    """
+    frame = choose_frame(survey.photos, settings.crs, control)
+    if settings.boundary is not None:
+        if frame.crs is None:
+            raise UsageError(
+                "--boundary needs a georeferenced survey, and these photos have no positions;"
+                " add --geo or --gcp"
+            )
+        read_boundary(settings.boundary, frame.crs)
 
 
 def run_key(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSettings, parts: Methods) -> str:
@@ -169,7 +207,17 @@ def _forget(run: RunFolder, store: Store, rerun_from: str | None) -> None:
     if rerun_from is not None:
         later = STAGES[STAGES.index(rerun_from) :]
         store.forget([ARTEFACTS[s] for s in later if s in ARTEFACTS])
+        if "mosaic" in later:
+            shutil.rmtree(run.path / STATE / drawing.SPOOL, ignore_errors=True)
         run.mark("running")
+
+
+def _figures(path: Path) -> dict[str, Any]:
+    """The figures of a finished run; none where somebody damaged the file."""
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return {}
 
 
 def _one_kind(
@@ -186,6 +234,21 @@ def _one_kind(
 def replace_read(cache: PixelCache, old: Sequence[int]) -> PixelCache:
     """A cache over a cache: photo k of the new is photo old[k] of the old."""
     return PixelCache(read=lambda i: cache(old[i]), budget_bytes=0)
+
+
+def _still_there(photos: Sequence[Photo], cache: PixelCache) -> Callable[[int], NDArray]:
+    """Pixels of photos that could be read once; an error names the one that cannot be any more."""
+
+    def pixels(photo: int) -> NDArray:
+        try:
+            return cache(photo)
+        except UnreadablePhotoError as error:
+            raise SkyquiltError(
+                f"{photos[photo].path} could be read at first, and now {error}; see to its disk and run"
+                " the same command again to resume"
+            ) from error
+
+    return pixels
 
 
 def _links(

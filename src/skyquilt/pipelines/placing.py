@@ -27,7 +27,10 @@ def choose_method(asked: str, photos: int, links: int, positions: int) -> tuple[
         return "bundle", f"{links} links hold the photos together, {where}"
     if positions:
         return "pose", "no two photos could be linked, so each lies where its metadata say"
-    raise AlignmentError(f"no two of {photos} photos overlap recognisably and none has a position")
+    raise AlignmentError(
+        f"no two of {photos} photos overlap recognisably and none has a position;"
+        " give positions with --geo, or photos that overlap by half or more"
+    )
 
 
 def place(
@@ -83,12 +86,12 @@ def with_loose_photos(alignment: Alignment, intake: Intake, priors: Sequence[Pri
 
     poses, cameras, camera_of = dict(alignment.poses), dict(alignment.cameras), dict(alignment.camera_of)
     rejected, blocks, notes = dict(alignment.rejected), list(alignment.blocks), list(alignment.notes)
-    known = [d for i in alignment.poses if np.isfinite(d := alignment.poses[i].map_C - priors[i].map_C).all()]
-    offset = np.median(known, axis=0) if known else np.full(3, np.nan)
+    apart = np.array([alignment.poses[i].map_C - priors[i].map_C for i in alignment.poses]).reshape(-1, 3)
+    offset = np.array([np.median(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in apart.T])
     for i, photo in enumerate(intake.photos):
         if i in poses:
             continue
-        C = priors[i].map_C + np.nan_to_num(offset)
+        C = priors[i].map_C + offset
         if not np.isfinite(C).all() or alignment.frame.crs is None or not np.isfinite(priors[i].yaw_deg):
             lacking = (
                 "no position"

@@ -35,7 +35,7 @@ def whole_file(path: Path, *, needed: int = 0) -> Iterator[BinaryIO]:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file whole, UTF-8."""
-    data = text.encode()
+    data = text.encode("utf-8", "backslashreplace")  # names of files need not be text
     with whole_file(path, needed=len(data)) as file:
         file.write(data)
 

@@ -51,7 +51,7 @@ class Clock:
 
     def stage(self, name: str, work: Steps[T]) -> Generator[Event, None, T]:
         """Runs a stage's steps as events and returns its result."""
-        begun, misses = self.now(), self.store.misses
+        begun, hits, misses = self.now(), self.store.hits, self.store.misses
         yield StageStarted(stage=name, total=0)
         try:
             while True:
@@ -68,7 +68,7 @@ class Clock:
         self.lap(name, begun)
         yield StageFinished(
             stage=name, seconds=self.seconds[name], cpu_seconds=round(cpu_seconds() - begun[1], 3),
-            reused=self.store.misses == misses and self.store.hits > 0,
+            reused=self.store.misses == misses and self.store.hits > hits,
         )  # fmt: skip
         return result
 

@@ -4,7 +4,6 @@ import dataclasses
 import io
 import json
 import math
-import zipfile
 from collections.abc import Mapping
 from typing import Any
 
@@ -32,7 +31,7 @@ def decode(data: bytes, registry: Registry) -> Any:
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             tree = json.loads(bytes(arrays["__tree__"]).decode())
             return _up(tree, arrays, registry)
-    except (zipfile.BadZipFile, KeyError, EOFError, OSError, json.JSONDecodeError, TypeError) as error:
+    except Exception as error:  # damaged zip, npy and JSON raise many kinds; all mean that there is no record
         raise ValueError(f"not a stored record: {error}") from error
 
 
@@ -46,6 +45,8 @@ def _down(value: Any, arrays: dict[str, np.ndarray]) -> Any:
     if isinstance(value, np.generic):
         return _down(value.item(), arrays)
     if isinstance(value, np.ndarray):
+        if value.dtype.hasobject:
+            raise TypeError("cannot store an array of object type")
         name = f"a{len(arrays)}"
         arrays[name] = value
         return {"!": "array", "v": name}

@@ -1,11 +1,11 @@
 """The run's folder: who may write there, and what may be taken up again."""
 
 import json
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 from skyquilt.errors import OutputError
+from skyquilt.run.disk import refusal
 
 CONTRACT = (
     "mosaic.tif", "provenance.tif", "views.tif", "surface.tif", "cameras.json", "shots.geojson",
@@ -37,7 +37,8 @@ class RunFolder:
             partial.write_text(json.dumps({"key": self.key, "state": state}))
             partial.replace(target)
         except OSError as error:
-            raise OutputError(f"cannot write to {self.path}: {error.strerror}") from error
+            partial.unlink(missing_ok=True)
+            raise refusal(self.path, error) from error
 
     @property
     def done(self) -> bool:
@@ -55,8 +56,10 @@ def _state(path: Path) -> tuple[str, str]:
         return "", ""
 
 
-def open_run(path: Path, key: str, *, overwrite: bool) -> RunFolder:
+def open_run(path: Path, key: str, *, overwrite: bool, again: bool = False) -> RunFolder:
     """Opens a folder for a run: new, empty, the same run again (resumed), or overwritten.
+
+    `again` allows to replace another run's results, but not to write among other files.
 
     Raises:
         OutputError: it holds something else, or cannot be written.
@@ -64,24 +67,23 @@ def open_run(path: Path, key: str, *, overwrite: bool) -> RunFolder:
     if path.exists() and not path.is_dir():
         raise OutputError(f"{path} is a file; the output is a folder")
     known, state = _state(path)
-    if path.is_dir() and any(path.iterdir()) and known != key:
-        if not overwrite:
-            what = "another run" if known else "other files"
+    try:
+        taken = path.is_dir() and any(p.name != STATE or known for p in path.iterdir()) and known != key
+        if taken and not overwrite and not (again and known):
+            what = "another run (other photos or other settings)" if known else "other files"
             raise OutputError(
                 f"{path} already holds {what}; add --overwrite to replace its results,"
                 " or choose another folder"
             )
-        for name in CONTRACT:
-            (path / name).unlink(missing_ok=True)
-        for left in path.glob("*.spool"):
-            shutil.rmtree(left, ignore_errors=True)
-    try:
+        if taken:
+            for name in CONTRACT:
+                (path / name).unlink(missing_ok=True)
         (path / STATE).mkdir(parents=True, exist_ok=True)
         probe = path / STATE / "probe"
         probe.write_bytes(b"x")
         probe.unlink()
     except OSError as error:
-        raise OutputError(f"cannot write to {path}: {error.strerror}; choose another folder") from error
+        raise refusal(path, error) from error
     folder = RunFolder(path=path, key=key)
     if state != "done" or known != key:
         folder.mark("running")

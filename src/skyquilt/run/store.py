@@ -5,12 +5,15 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from skyquilt.errors import OutputError
+import numpy as np
+
 from skyquilt.run.codec import Registry, decode, encode
+from skyquilt.run.disk import refusal
 
 T = TypeVar("T")
 
@@ -30,8 +33,10 @@ def _plain(value: Any) -> Any:
         return [_plain(v) for v in value]
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if hasattr(value, "tobytes"):
-        return hashlib.blake2b(value.tobytes(), digest_size=16).hexdigest()
+    if isinstance(value, np.ndarray):
+        return [value.dtype.str, value.shape, hashlib.blake2b(value.tobytes(), digest_size=16).hexdigest()]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
     return str(value)
 
 
@@ -73,9 +78,9 @@ class Store:
             partial.write_bytes(encode(value))
             partial.replace(path)
         except OSError as error:
-            raise OutputError(
-                f"cannot store intermediate results in {path.parent}: {error.strerror}"
-            ) from error
+            with suppress(OSError):
+                partial.unlink(missing_ok=True)
+            raise refusal(path.parent, error) from error
 
     def get_or(self, stage: str, key: str, make: Callable[[], T]) -> T:
         """The artefact, made and stored if need be."""

@@ -1,0 +1,40 @@
+"""Ctrl-C: one sentence and exit code 130, whenever it comes."""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NoReturn
+
+CODE = 130
+"""What shells know an interrupt by."""
+
+
+def say() -> None:
+    """The sentence, on standard error."""
+    resumable = "; run the same command again to resume" if sys.argv[1:2] == ["mosaic"] else ""
+    sys.stderr.write(f"skyquilt: interrupted{resumable}\n")
+    sys.stderr.flush()
+
+
+@contextmanager
+def ends_at_once() -> Iterator[None]:
+    """While modules load, Ctrl-C ends the program then and there.
+
+    Nothing is under way yet that needs care, and some modules swallow every exception while they load.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    former = signal.signal(signal.SIGINT, _end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, former)
+
+
+def _end(*_: object) -> NoReturn:
+    say()
+    os._exit(CODE)

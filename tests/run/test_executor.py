@@ -1,0 +1,78 @@
+import threading
+import time
+
+import pytest
+
+from skyquilt.run.executor import in_order
+
+
+@pytest.mark.parametrize("jobs", [0, 1, 2, 7])
+def test_results_come_in_order(jobs):
+    def work(item):
+        time.sleep(0.002 * (item % 3))
+        return item * item
+
+    assert list(in_order(work, range(40), jobs=jobs)) == [i * i for i in range(40)]
+
+
+def test_no_items():
+    assert list(in_order(str, [], jobs=3)) == []
+
+
+def test_it_never_runs_far_ahead():
+    begun = []
+
+    def work(item):
+        begun.append(item)
+        return item
+
+    results = in_order(work, iter(range(1000)), jobs=2)
+    next(results)
+    time.sleep(0.05)
+    assert len(begun) <= 6
+    results.close()
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_an_exception_arrives_in_its_place_and_stops_the_rest(jobs):
+    begun = []
+
+    def work(item):
+        begun.append(item)
+        if item == 5:
+            raise KeyError("five")
+        return item
+
+    got = []
+    with pytest.raises(KeyError, match="five"):
+        for result in in_order(work, range(500), jobs=jobs):
+            got.append(result)
+    assert got == [0, 1, 2, 3, 4]
+    assert len(begun) < 20
+
+
+def test_an_interrupt_waits_only_for_what_is_under_way():
+    begun = []
+
+    def work(item):
+        begun.append(item)
+        time.sleep(0.1)
+        return item
+
+    results = in_order(work, range(100), jobs=2)
+    next(results)
+    at = time.perf_counter()
+    with pytest.raises(KeyboardInterrupt):
+        results.throw(KeyboardInterrupt)
+    assert time.perf_counter() - at < 0.4
+    count = len(begun)
+    time.sleep(0.15)
+    assert len(begun) == count
+    assert not [t for t in threading.enumerate() if t.name.startswith("ThreadPoolExecutor")]
+
+
+def test_an_abandoned_generator_leaves_no_threads():
+    results = in_order(lambda item: item, range(100), jobs=3)
+    next(results)
+    del results
+    assert not [t for t in threading.enumerate() if t.name.startswith("ThreadPoolExecutor")]

@@ -1,0 +1,97 @@
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from skyquilt.run.pixel_cache import PixelCache
+
+
+def cache(budget, read=None):
+    return PixelCache(read=read or (lambda i: np.full(100, i, np.uint8)), budget_bytes=budget)
+
+
+def test_kept_while_there_is_room_then_the_oldest_goes():
+    kept = cache(300)
+    for i in (0, 1, 2, 0, 3):  # 0 was used last but one: 1 makes room
+        assert kept(i)[0] == i
+    assert kept.decoded == 4
+    kept(0)
+    kept(2)
+    assert kept.decoded == 4
+    kept(1)
+    assert kept.decoded == 5
+
+
+@pytest.mark.parametrize("budget", [0, 99])
+def test_what_is_larger_than_the_budget_is_handed_out_and_not_kept(budget):
+    small = cache(budget)
+    assert small(4)[0] == 4
+    assert small(4)[0] == 4
+    assert small.decoded == 2
+
+
+def test_pixels_are_read_only():
+    with pytest.raises(ValueError, match="read-only"):
+        cache(1000)(1)[0] = 7
+
+
+def test_two_threads_that_want_one_photo_decode_it_once():
+    def slow(i):
+        time.sleep(0.05)
+        return np.full(100, i, np.uint8)
+
+    shared = cache(10_000, slow)
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(shared, [3] * 8 + [4] * 8))
+    assert shared.decoded == 2
+    assert [int(f[0]) for f in found] == [3] * 8 + [4] * 8
+
+
+def test_two_photos_are_decoded_at_the_same_time():
+    both = threading.Barrier(2, timeout=5)
+
+    def meet(i):
+        both.wait()
+        return np.full(100, i, np.uint8)
+
+    shared = cache(10_000, meet)
+    with ThreadPoolExecutor(2) as pool:
+        assert [int(f[0]) for f in pool.map(shared, [1, 2])] == [1, 2]
+
+
+def test_many_threads_never_exceed_the_budget():
+    shared = cache(550)
+    most = []
+
+    def use(i):
+        assert shared(i % 9)[0] == i % 9
+        most.append(sum(p.nbytes for p in list(shared._kept.values())))
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(use, range(800)))
+    assert max(most) <= 550
+
+
+def test_an_error_does_not_block_the_next_try():
+    tries = []
+
+    def flaky(i):
+        tries.append(i)
+        if len(tries) == 1:
+            raise OSError("gone")
+        return np.zeros(10)
+
+    shared = cache(1000, flaky)
+    with pytest.raises(OSError, match="gone"):
+        shared(1)
+    assert shared(1).shape == (10,)
+
+
+def test_cleared():
+    kept = cache(1000)
+    kept(1)
+    kept.clear()
+    kept(1)
+    assert kept.decoded == 2

@@ -1,0 +1,90 @@
+import errno
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skyquilt.config import MosaicSettings, methods
+from skyquilt.errors import OutputError
+from skyquilt.run.store import Store, digest
+
+
+@pytest.fixture
+def store(tmp_path):
+    return Store(folder=tmp_path / "store", registry={})
+
+
+def test_made_once_then_found(store):
+    calls = []
+    for _ in range(3):
+        value = store.get_or("stage", "key", lambda: calls.append(1) or [1, np.arange(3)])
+    assert (len(calls), store.misses, store.hits) == (1, 1, 2)
+    assert value[1].tolist() == [0, 1, 2]
+
+
+def test_another_store_on_the_same_folder_finds_it(store):
+    store.put("stage", "key", [1.5, float("nan")])
+    value = Store(folder=store.folder, registry={}).get("stage", "key")
+    assert value[0] == 1.5
+    assert np.isnan(value[1])
+
+
+@pytest.mark.parametrize("size", [0, 1, 50, -1])
+def test_a_torn_artefact_is_made_again(store, size):
+    store.put("stage", "key", list(range(10)))
+    path = store.folder / "stage" / "key.npz"
+    path.write_bytes(path.read_bytes()[:size])
+    assert store.get("stage", "key") is None
+    assert store.get_or("stage", "key", lambda: [7]) == [7]
+    assert store.get("stage", "key") == [7]
+
+
+def test_values_that_count_as_nothing_are_kept(store):
+    for value in ([], 0, "", {}):
+        store.put("stage", "key", value)
+        assert store.get_or("stage", "key", lambda: pytest.fail("made again")) == value
+
+
+def test_a_full_disk_leaves_the_former_artefact(store, monkeypatch):
+    store.put("stage", "key", [1])
+    write = Path.write_bytes
+
+    def full(path, data):
+        write(path, data[:10])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OutputError, match=r"disk is full.*same command again"):
+        store.put("stage", "key", [2])
+    monkeypatch.undo()
+    assert store.get("stage", "key") == [1]
+    assert [p.name for p in (store.folder / "stage").iterdir()] == ["key.npz"]
+
+
+def test_forgetting_concerns_only_the_stages_named(store):
+    for stage in ("a", "b"):
+        store.put(stage, "key", [1])
+    store.forget(["a", "never there"])
+    assert store.get("a", "key") is None
+    assert store.get("b", "key") == [1]
+
+
+def test_a_digest_depends_on_values_only():
+    array = np.arange(6.0).reshape(2, 3)
+    assert digest(array, (1, "a"), {"x": 1, "y": 2}) == digest(array.copy(), [1, "a"], {"y": 2, "x": 1})
+    assert len({digest(v) for v in (1, 2, "1", None, True, (1,), array, -array)}) == 8
+
+
+def test_arrays_of_other_shape_or_type_are_other_inputs():
+    """Equal bytes do not make equal arrays."""
+    flat = np.arange(6.0)
+    assert len({digest(flat), digest(flat.reshape(2, 3)), digest(flat.view(np.int64))}) == 3
+
+
+def test_a_method_is_known_by_its_parameters_and_version(monkeypatch):
+    first = methods(MosaicSettings())
+    assert digest(first.sift) == digest(methods(MosaicSettings()).sift)
+    assert digest(first.sift) != digest(methods(MosaicSettings(features=500)).sift)
+    before = digest(first.bundle)
+    monkeypatch.setattr(type(first.bundle), "version", 99)
+    assert digest(first.bundle) != before
