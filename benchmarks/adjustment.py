@@ -37,8 +37,8 @@ def problem_of(layout: dict[str, int]) -> tuple[Problem, State]:
     n = len(block.truth.C)
     problem = replace(
         block.problem, sigma_px=np.ones(len(block.problem.px)), loss_px=2.0, loss_C=1e6, loss_R=1e6,
-        free=np.array([[1, 0, 0, 1, 1, 0, 0, 0]], bool), sigma_R=np.full((n, 3), np.inf),
-        sigma_K=np.full((1, 8), np.inf),
+        free=np.array([[1, 0, 0, 1, 1, 0, 0, 0]], bool),
+        sigma_R=np.full((n, 3), np.inf), sigma_K=np.full((1, 8), np.inf),
     )  # fmt: skip
     start = replace(
         block.start,

@@ -3,13 +3,16 @@
 import contextlib
 import io
 import json
+import os
 import re
 import shutil
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import piexif
@@ -79,16 +82,21 @@ def leftovers(folder: Path) -> list[str]:
 
 def skyquilt(*words: str | Path) -> tuple[int, str, str]:
     """Exit code, standard output and standard error; what a user would see as a traceback escapes."""
-    out, err, argv = io.StringIO(), io.StringIO(), sys.argv
+    out, err, argv, on_interrupt = io.StringIO(), io.StringIO(), sys.argv, signal.getsignal(signal.SIGINT)
     sys.argv = ["skyquilt", *map(str, words)]
     try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        with (
+            contextlib.redirect_stdout(out),
+            contextlib.redirect_stderr(err),
+            mock.patch.object(os, "_exit", sys.exit),
+        ):
             run()
         code = 0
     except SystemExit as end:
         code = int(end.code or 0)
     finally:
         sys.argv = argv
+        signal.signal(signal.SIGINT, on_interrupt)
     return code, out.getvalue(), err.getvalue()
 
 

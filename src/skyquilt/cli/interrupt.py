@@ -13,10 +13,19 @@ CODE = 130
 
 
 def say() -> None:
-    """The sentence, on standard error."""
+    """The sentence, on standard error; a second Ctrl-C while the program goes down is ignored."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     resumable = "; run the same command again to resume" if sys.argv[1:2] == ["mosaic"] else ""
     sys.stderr.write(f"skyquilt: interrupted{resumable}\n")
     sys.stderr.flush()
+
+
+def leave() -> NoReturn:
+    """Ends the program, all of its threads included: Python's own way out is no place for a second Ctrl-C."""
+    say()
+    sys.stdout.flush()
+    os._exit(CODE)
 
 
 @contextmanager
@@ -28,13 +37,8 @@ def ends_at_once() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    former = signal.signal(signal.SIGINT, _end)
+    former = signal.signal(signal.SIGINT, lambda *_: leave())
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, former)
-
-
-def _end(*_: object) -> NoReturn:
-    say()
-    os._exit(CODE)

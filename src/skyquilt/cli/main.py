@@ -27,11 +27,10 @@ def run() -> None:
         sys.stderr.write(f"skyquilt: {error}\n")
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        interrupt.say()
-        sys.exit(interrupt.CODE)
+        interrupt.leave()
     except SystemExit as end:
         if end.code == interrupt.CODE:  # typer ends so, without a word
-            interrupt.say()
+            interrupt.leave()
         raise
 
 
