@@ -39,7 +39,7 @@ class Bundle:
     """Treat metadata as measurements that may lie; False believes them to their stated deviations."""
     sharpen: Sharpen | None = field(default_factory=Sharpen)
     """Registration of sightings in larger pictures; None leaves keypoints as they were found."""
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
 
     def __call__(
         self, photos: Sequence[Photo], frame: MapFrame, priors: Sequence[Prior], features: Sequence[Features],

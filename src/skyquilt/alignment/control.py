@@ -157,6 +157,12 @@ def hold_to_control(
     if not setup.georeferenced:
         problem = replace(problem, sigma_C=np.full_like(problem.sigma_C, 1e4))
     state = adjust(problem, state, iterations=25, tolerance=1e-5).state
+    if setup.georeferenced and len(fit) >= 3:
+        # the positions' common offset was taken from a solution that they still held: control knows it better
+        for _ in range(3):
+            offset = np.nan_to_num(np.nanmedian(state.C - problem.C0, axis=0))
+            problem = replace(problem, C0=problem.C0 + offset)
+            state = adjust(problem, state, iterations=15, tolerance=1e-5, damping=1e-6).state
     heights = np.isfinite(surveyed[:, 2]).any()
     return problem, state, replace(frame, vertical_datum="control", metric=True) if heights else frame, usable
 
