@@ -133,7 +133,7 @@ def solved(seed, **noise):
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(5, 40), st.floats(0.1, 100), st.floats(-3.1, 3.1), st.integers(0, 1000), st.floats(0, 0.4))
+@given(st.integers(8, 40), st.floats(0.1, 100), st.floats(-3.1, 3.1), st.integers(0, 1000), st.floats(0, 0.4))
 def test_a_similarity_survives_two_lies_in_five(count, scale, angle, seed, share):
     rng = np.random.default_rng(seed)
     x = rng.normal(0, 1, count) + 1j * rng.normal(0, 1, count)

@@ -59,7 +59,7 @@ REGISTRY = {
 
 
 def iter_mosaic(
-    folder: Path | Sequence[Path], output: Path, settings: MosaicSettings | None = None, *,
+    folder: Path | str | Sequence[Path], output: Path | str, settings: MosaicSettings | None = None, *,
     overwrite: bool = False, rerun_from: str | None = None,
 ) -> Iterator[Event]:  # fmt: skip
     """Makes a mosaic, telling its progress; the last event is the `Result`.
@@ -68,11 +68,12 @@ def iter_mosaic(
         SkyquiltError: anything a user can mend: no photos, an output that is taken, a malformed side file ...
     """
     settings, began = settings or MosaicSettings(), Clock.now()
+    folder, output = Path(folder) if isinstance(folder, str) else folder, Path(output)
     parts, jobs = methods(settings), settings.jobs or os.cpu_count() or 1
-    _apart(folder, Path(output))
+    _apart(folder, output)
     survey, control = _read(folder, settings)
     run_id = run_key(survey, control, settings, parts)
-    run = open_run(Path(output), run_id, overwrite=overwrite, again=rerun_from is not None)
+    run = open_run(output, run_id, overwrite=overwrite, again=rerun_from is not None)
     store = Store(folder=run.store, registry=REGISTRY)
     _forget(run, store, rerun_from)
     if run.done and (former := _figures(run.path / "metrics.json")):
@@ -137,8 +138,7 @@ def mosaic(
     Raises:
         SkyquiltError: anything a user can mend.
     """
-    source = Path(folder) if isinstance(folder, str) else folder
-    for happened in iter_mosaic(source, Path(output), settings, overwrite=overwrite):
+    for happened in iter_mosaic(folder, output, settings, overwrite=overwrite):
         if isinstance(happened, Result):
             return happened
     raise RuntimeError("the story ended without a result")
