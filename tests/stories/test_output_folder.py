@@ -277,6 +277,11 @@ def test_an_unfinished_output_inside_the_folder_of_photos_is_no_input_either(mos
 # interrupts and kills
 
 
+def hears_interrupts() -> None:
+    """A shell's background jobs ignore Ctrl-C, and their children inherit that: not what is tested here."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 class Running:
     """The command in a process of its own, its events read as they come."""
 
@@ -293,8 +298,9 @@ class Running:
             *options,
         ]
         self.process = subprocess.Popen(
-            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ)
-        )
+            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ),
+            preexec_fn=hears_interrupts,
+        )  # fmt: skip
 
     def until(self, event: str, stage: str, count: int = 1) -> None:
         assert self.process.stdout is not None
