@@ -74,9 +74,8 @@ def _pseudo_huber(squared: Array, scale: float) -> tuple[Array, Array]:
     forgets outliers would forget them all.
     """
     root = np.sqrt(1 + squared / scale**2)
-    return 1 / root, 2 * squared / (
-        root + 1
-    )  # 2 scale^2 (root - 1), without its cancellation at large scales
+    # the cost is 2 scale^2 (root - 1), written without its cancellation at large scales
+    return 1 / root, 2 * squared / (root + 1)
 
 
 def _by_point(problem: Problem, values: Array, count: int) -> Array:

@@ -14,10 +14,8 @@ from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
 from skyquilt.alignment.sharpen import GreyPicture, Sharpen
 from skyquilt.alignment.start import Start, find_start
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
-from skyquilt.alignment.triangulate import intersect, polish
+from skyquilt.alignment.triangulate import polish, triangulated
 from skyquilt.errors import AlignmentError
-from skyquilt.geometry.camera import undistort
-from skyquilt.model.camera import PARAMETERS, Camera
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
@@ -61,8 +59,8 @@ class Bundle:
         problem, state = _rough(problem, state)
         if grey is not None and self.sharpen is not None:
             used = _sharpened(used, photos, setup, problem, state, self.sharpen, grey)
-            problem, fresh = setup.problem(thin(used, sizes, per_photo=self.per_photo))
-            state = replace(state, X=_triangulated(problem, replace(state, X=fresh.X)).X)
+            problem, _ = setup.problem(thin(used, sizes, per_photo=self.per_photo))
+            state = triangulated(problem, state)
         problem, state = _fine(problem, state)
         if self.repair:
             problem, state = _believe_positions_less(problem, state, setup)
@@ -76,7 +74,7 @@ def _sharpened(
 ) -> Tracks:  # fmt: skip
     """Tracks (sensor pixels) with sightings registered in larger pictures."""
     everything, _ = setup.problem(tracks)
-    xyz = _triangulated(everything, state).X
+    xyz = triangulated(everything, state).X
     cameras, camera_of = camera_records(photos, setup, state, None)
     poses = pose_records(setup, state)
     filed = replace(tracks, px=setup.file_px(tracks.photo, tracks.px))
@@ -173,24 +171,11 @@ def leave_one_out(
     return float(rms[0]), float(rms[1]), float(rms[2])
 
 
-def _triangulated(problem: Problem, state: State) -> State:
-    """The state with the problem's points where their rays meet best."""
-    xy = np.empty((len(problem.px), 2))
-    for row, k in enumerate(state.K):
-        own = problem.camera[problem.photo] == row
-        camera = Camera(width=1, height=1, **dict(zip(PARAMETERS, k, strict=True)))
-        xy[own] = undistort(camera, problem.px[own])
-    local = np.column_stack([xy, np.ones(len(xy))])
-    direction = np.einsum("nji,nj->ni", state.R[problem.photo], local)
-    X = intersect(problem.point, state.C[problem.photo], direction, int(problem.point[-1]) + 1)
-    return replace(state, X=X)
-
-
 def ground_points(tracks: Tracks, setup: Setup, problem: Problem, state: State) -> TiePoints:
     """All tracks triangulated with the final poses; bad sightings and unstable points dropped."""
     everything, _ = setup.problem(tracks)
     everything = replace(everything, loss_px=2.0)
-    whole = _triangulated(everything, state)
+    whole = triangulated(everything, state)
     whole, _ = polish(everything, whole, iterations=3)
     everything, whole = prune(everything, whole, 5.0)
     whole, sigma_z = polish(everything, whole, iterations=2)

@@ -17,13 +17,11 @@ def conflicts(
     photos: Sequence[Photo], priors: Sequence[Prior], alignment: Alignment
 ) -> list[MetadataConflict]:
     """All contradictions of photos that tie points hold, in order of capture."""
-    held = [i for block in alignment.blocks if len(block) > 1 for i in block if i in alignment.poses]
-    found = [c for i in sorted(held) for c in _yaw(photos[i], priors[i], alignment, i)]
+    held = alignment.held
+    found = [c for i in held for c in _yaw(photos[i], priors[i], alignment, i)]
     if alignment.frame.crs is not None:
-        found += _altitudes(photos, priors, alignment, sorted(held)) + _positions(
-            photos, priors, alignment, sorted(held)
-        )
-    return found + _focals(photos, alignment, sorted(held))
+        found += _altitudes(photos, priors, alignment, held) + _positions(photos, priors, alignment, held)
+    return found + _focals(photos, alignment, held)
 
 
 def _yaw(photo: Photo, prior: Prior, alignment: Alignment, i: int) -> list[MetadataConflict]:

@@ -10,10 +10,8 @@ from pyproj import Transformer
 from skyquilt.alignment.adjust import adjust
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import Setup
-from skyquilt.alignment.triangulate import intersect, polish
+from skyquilt.alignment.triangulate import polish, triangulated
 from skyquilt.errors import AlignmentError
-from skyquilt.geometry.camera import undistort
-from skyquilt.model.camera import PARAMETERS, Camera
 from skyquilt.model.photo import ControlPoint, Photo
 from skyquilt.model.poses import ControlResidual, MapFrame
 
@@ -77,13 +75,6 @@ def _sightings(
 def _alone(control: Sequence[Control], setup: Setup, problem: Problem, state: State) -> tuple[Problem, State]:
     """The control points alone, seen by the poses as they are, intersected from their rays."""
     point, row, px = _sightings(control, setup)
-    xy = np.empty_like(px)
-    for k, values in enumerate(state.K):
-        own = problem.camera[row] == k
-        camera = Camera(width=1, height=1, **dict(zip(PARAMETERS, values, strict=True)))
-        xy[own] = undistort(camera, px[own])
-    direction = np.einsum("nji,nj->ni", state.R[row], np.column_stack([xy, np.ones(len(xy))]))
-    X = intersect(point, state.C[row], direction, len(control))
     empty = np.full((len(control), 3), np.nan)
     own_problem = replace(
         problem,
@@ -94,7 +85,7 @@ def _alone(control: Sequence[Control], setup: Setup, problem: Problem, state: St
         X0=empty,
         sigma_X=np.ones_like(empty),
     )
-    return own_problem, polish(own_problem, replace(state, X=X))[0]
+    return own_problem, polish(own_problem, triangulated(own_problem, state))[0]
 
 
 def intersected(

@@ -1,9 +1,13 @@
 """Points from sightings with known poses."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.problem import Problem, State, linearise
+from skyquilt.geometry.camera import undistort
+from skyquilt.model.camera import PARAMETERS, Camera
 
 Array = NDArray[np.float64]
 
@@ -17,6 +21,19 @@ def intersect(point: NDArray[np.int64], origin: Array, direction: Array, count: 
     np.add.at(b, point, np.einsum("nij,nj->ni", M, origin))
     A += np.eye(3) * 1e-9
     return np.asarray(np.linalg.solve(A, b[..., None])[..., 0])
+
+
+def triangulated(problem: Problem, state: State) -> State:
+    """The state with the problem's points (as many as `X0` has) where their rays meet best."""
+    xy = np.empty((len(problem.px), 2))
+    for row, k in enumerate(state.K):
+        own = problem.camera[problem.photo] == row
+        camera = Camera(width=1, height=1, **dict(zip(PARAMETERS, k, strict=True)))
+        xy[own] = undistort(camera, problem.px[own])
+    local = np.column_stack([xy, np.ones(len(xy))])
+    direction = np.einsum("nji,nj->ni", state.R[problem.photo], local)
+    X = intersect(problem.point, state.C[problem.photo], direction, len(problem.X0))
+    return replace(state, X=X)
 
 
 def polish(problem: Problem, state: State, *, iterations: int = 5) -> tuple[State, Array]:

@@ -124,6 +124,11 @@ class Alignment:
     notes: tuple[str, ...] = ()
     """Plain sentences worth a reader's attention."""
 
+    @property
+    def held(self) -> tuple[int, ...]:
+        """Placed photos that tie points hold to others, ascending."""
+        return tuple(sorted(i for block in self.blocks if len(block) > 1 for i in block if i in self.poses))
+
     def camera(self, photo: int) -> Camera:
         """The calibration of a photo."""
         return self.cameras[self.camera_of[photo]]

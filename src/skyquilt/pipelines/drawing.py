@@ -119,10 +119,10 @@ def survey_ground(
     views = tuple(make_views(alignment, surface))
     grid = grid_of(views, gsd, bounds)
     if methods.sweep is not None and len(alignment.ties.xyz) > 3:
-        sweep, known = methods.sweep, surface
+        sweep, known, held = methods.sweep, surface, set(alignment.held)
         surface = store.get_or(
             "surface", digest(key, poses_digest(alignment), grid, sweep),
-            lambda: sweep(known, [v for v in views if held(alignment, v.photo)], grid, pictures),
+            lambda: sweep(known, [v for v in views if v.photo in held], grid, pictures),
         )  # fmt: skip
     yield 1, 1
     return Ground(surface=surface, views=views, grid=grid, native_gsd=native)
@@ -171,11 +171,6 @@ def poses_digest(alignment: Alignment) -> str:
         for i in order
     ]
     return digest(order, np.array(stack), alignment.frame)
-
-
-def held(alignment: Alignment, photo: int) -> bool:
-    """Whether tie points hold the photo."""
-    return any(photo in block for block in alignment.blocks if len(block) > 1)
 
 
 def round_gsd(gsd: float) -> float:

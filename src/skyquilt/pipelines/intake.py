@@ -99,7 +99,7 @@ def look(photo: Photo, index: int, cache: PhotoPixels, methods: Methods, store: 
     """
     pixels = cache(index)
     middle, _ = shrink(pixels, PICTURE)
-    store.put("pictures", picture_key(photo), np.ascontiguousarray(to_grey8(middle)))
+    store.put("pictures", picture_key(photo), picture_of(middle))
     small, _ = shrink(middle, methods.sift.longest)
     thumbnail, _ = shrink(small, THUMBNAIL)
     return Looked(

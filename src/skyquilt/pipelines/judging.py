@@ -31,8 +31,7 @@ def gps_residuals(alignment: Alignment, priors: Sequence[Prior]) -> NDArray[np.f
 
     Where control points give the heights, the offset of their datum from the photos' is no residual.
     """
-    held = [i for b in alignment.blocks if len(b) > 1 for i in b if i in alignment.poses]
-    residual = np.array([alignment.poses[i].map_C - priors[i].map_C for i in sorted(held)]).reshape(-1, 3)
+    residual = np.array([alignment.poses[i].map_C - priors[i].map_C for i in alignment.held]).reshape(-1, 3)
     if alignment.frame.vertical_datum == "control" and np.isfinite(residual[:, 2]).any():
         residual[:, 2] -= np.nanmedian(residual[:, 2])
     return residual

@@ -6,8 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from skyquilt.alignment.control import control_in_frame
+from skyquilt.alignment.pose import reported_camera
 from skyquilt.config import Methods, MosaicSettings
 from skyquilt.errors import AlignmentError
+from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.model.photo import ControlPoint
 from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior
 from skyquilt.pipelines.intake import Intake, Pictures
@@ -81,9 +83,6 @@ def with_loose_photos(alignment: Alignment, intake: Intake, priors: Sequence[Pri
     """Photos that nothing links, placed by their own metadata relative to the adjusted
     ones, and named as such.
     """
-    from skyquilt.alignment.pose import reported_camera
-    from skyquilt.geometry.frames import cam_R_map_from_angles
-
     poses, cameras, camera_of = dict(alignment.poses), dict(alignment.cameras), dict(alignment.camera_of)
     rejected, blocks, notes = dict(alignment.rejected), list(alignment.blocks), list(alignment.notes)
     apart = np.array([alignment.poses[i].map_C - priors[i].map_C for i in alignment.poses]).reshape(-1, 3)

@@ -136,10 +136,11 @@ def report_input(
 def _shots(taken: Intake, priors: Sequence[Prior], alignment: Alignment, ground: Ground) -> list[Shot]:
     outline = {v.photo: v.footprint for v in ground.views}
     block = {i: k for k, b in enumerate(alignment.blocks) for i in b}
+    held = set(alignment.held)
     return [
         Shot(
             name=taken.photos[i].name, xyz=pose.map_C, reported_xyz=priors[i].map_C, block=block.get(i, 0),
-            method=alignment.method if drawing.held(alignment, i) else "pose",
+            method=alignment.method if i in held else "pose",
             footprint=outline.get(i, np.zeros((0, 2))),
         )
         for i, pose in sorted(alignment.poses.items())
