@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
 from skyquilt.model.registration import Matrix
@@ -117,11 +118,5 @@ def turned(fields: Fields, angle: float) -> Fields:
 
 def spectra(fields: Fields, shape: tuple[int, int]) -> NDArray[np.complex64]:
     """Fourier transforms (2, h, w) of both complex fields, padded to `shape`."""
-    import scipy.fft
-
-    both = fields.view(np.complex64) if fields.flags.c_contiguous else _complex(fields)
+    both = np.ascontiguousarray(fields).view(np.complex64)
     return np.asarray(scipy.fft.fft2(np.moveaxis(both, -1, 0), s=shape, axes=(1, 2)))
-
-
-def _complex(fields: Fields) -> NDArray[np.complex64]:
-    return np.ascontiguousarray(fields).view(np.complex64)

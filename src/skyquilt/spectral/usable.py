@@ -62,7 +62,7 @@ def _frame(grey: NDArray[np.float32], given: NDArray[np.bool_], slack: float) ->
         return frame
     low, high = float(grey[given].min()), float(grey[given].max())
     for end in ((grey <= low + slack) & given, (grey >= high - slack) & given):
-        count, label, stats, _ = cv2.connectedComponentsWithStats(end.astype(np.uint8), connectivity=4)
+        _count, label, stats, _ = cv2.connectedComponentsWithStats(end.astype(np.uint8), connectivity=4)
         for region in np.unique(np.r_[label[0], label[-1], label[:, 0], label[:, -1]]):
             if region and stats[region, cv2.CC_STAT_AREA] > LEAST_FRAME * grey.size:
                 frame |= label == region
