@@ -1,5 +1,6 @@
 """Names and numbers -> methods: the one place where words on a command line become parts of a story."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,12 @@ from skyquilt.alignment.pose import ByPose, ByPosition
 from skyquilt.errors import UsageError
 from skyquilt.features.sift import Sift
 from skyquilt.matching.mutual import Mutual
+from skyquilt.model.registration import Registers
 from skyquilt.pairs.nearest import Nearest
 from skyquilt.pairs.retrieval import Retrieval
 from skyquilt.render.blend import Average, Blend, Feather, First, Multiband
 from skyquilt.render.exposure import Balance
+from skyquilt.spectral.auto import Auto
 from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints
 from skyquilt.twoview.verify import Verify
@@ -23,6 +26,8 @@ METHODS = ("auto", "bundle", "pose", "position")
 BLENDS = {"feather": Feather, "first": First, "average": Average, "multiband": Multiband}
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
+REGISTRATIONS: dict[str, Callable[[], Registers]] = {"auto": Auto}
+"""Ways to register two pictures of different spectra."""
 DISTORTIONS = ("none", "2", "4", "6", "6t")
 
 
@@ -100,6 +105,25 @@ class MosaicSettings:
         """Names and values as written to run.toml; unset ones left out."""
         table = {f.name: getattr(self, f.name) for f in fields(self)}
         return {k: str(v) if isinstance(v, Path) else v for k, v in table.items() if v is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegisterSettings:
+    """Everything a registration of two pictures can be asked for."""
+
+    method: str = "auto"
+    """One of `REGISTRATIONS`."""
+    use_metadata: bool = True
+    """Whether metadata and places are tried first; what they say is a guess only."""
+
+    def __post_init__(self) -> None:
+        _one_of("--method", self.method, REGISTRATIONS)
+
+
+def registration_method(name: str) -> Registers:
+    """The registration that a word names."""
+    _one_of("--method", name, REGISTRATIONS)
+    return REGISTRATIONS[name]()
 
 
 def _one_of(option: str, value: str, allowed: Any) -> None:

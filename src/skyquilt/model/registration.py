@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,3 +75,13 @@ class RefusedRegistration:
 
     def __bool__(self) -> bool:
         return False
+
+
+class Registers(Protocol):
+    """A way to lay two pictures on one another."""
+
+    def __call__(
+        self, a: Picture, b: Picture, guess: Guess | None = None
+    ) -> Registration | RefusedRegistration:
+        """The registration of b to a in px of the pictures, or why there is none."""
+        ...

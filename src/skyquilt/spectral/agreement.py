@@ -66,7 +66,7 @@ class Agree:
         )
 
     def _patches(
-        self, fields: Fields, target: Fields, both: NDArray[np.float32], across: int
+        self, fields: Fields, target: Fields, both: NDArray, across: int
     ) -> Iterator[tuple[float, float, float, float, float]]:
         """Rank, middle and shift of each patch."""
         height, width = both.shape
@@ -86,10 +86,10 @@ class Agree:
                     float(reach - x), float(reach - y),
                 )  # fmt: skip
 
-    def _rank(self, score: NDArray[np.float32]) -> float:
+    def _rank(self, score: NDArray) -> float:
         """Share of places at least as good as the registered one, each with its neighbourhood."""
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * self.near + 1, 2 * self.near + 1))
-        best = cv2.dilate(score, disc)
+        best = np.asarray(cv2.dilate(score, disc))
         rivals = best[self.near : -self.near, self.near : -self.near]
         own = best[self.reach, self.reach]
         return float((1 + (rivals >= own).sum()) / (1 + rivals.size))
@@ -102,13 +102,13 @@ def _scores(around: Fields, patch: Fields) -> NDArray[np.float32]:
         np.einsum("ijk,ijk->ij", around, around), -1, (side, side), anchor=(0, 0), normalize=False,
         borderType=cv2.BORDER_CONSTANT,
     )  # fmt: skip
-    product = np.float32(0)
+    rows, columns = (size - side + 1 for size in around.shape[:2])
+    product = np.zeros((rows, columns), np.float32)
     for k in range(around.shape[2]):
         one = np.ascontiguousarray(around[..., k])
-        product = product + cv2.matchTemplate(one, np.ascontiguousarray(patch[..., k]), cv2.TM_CCORR)
-    rows, columns = product.shape
+        product += cv2.matchTemplate(one, np.ascontiguousarray(patch[..., k]), cv2.TM_CCORR)
     own = float((patch * patch).sum())
-    return np.asarray(product / np.sqrt(energy[:rows, :columns] * own + 1e-6), np.float32)
+    return np.asarray(product / np.sqrt(np.asarray(energy)[:rows, :columns] * own + 1e-6), np.float32)
 
 
 def _fisher(ranks: NDArray[np.float64]) -> float:

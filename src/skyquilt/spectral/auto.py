@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistration, Registration
 from skyquilt.spectral.agreement import Agree, Agreement
@@ -13,7 +14,7 @@ from skyquilt.spectral.distinctness import distinctness
 from skyquilt.spectral.everywhere import Everywhere
 from skyquilt.spectral.nearby import Nearby, same_view
 from skyquilt.spectral.orientation import Orientation, between, full_size, orientation
-from skyquilt.spectral.sharpen import Fit, Sharpen
+from skyquilt.spectral.sharpen import Fit, Freedom, Sharpen
 from skyquilt.spectral.usable import Usable, usable
 
 Outcome = Registration | RefusedRegistration
@@ -39,13 +40,23 @@ class Auto:
     version: ClassVar[int] = 1
 
     def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
-        """The registration of b to a, or why there is none."""
+        """The registration of b to a, or why there is none.
+
+        A guess is tried first; where it is not confirmed the search goes on everywhere: metadata may lie.
+        """
         ua, ub = usable(a), usable(b)
         for name, one in (("A", ua), ("B", ub)):
             if not one:
                 return RefusedRegistration(reason=f"picture {name} {one.reason}")
         pyramid = _Pyramid(a=ua, b=ub, sides=self.sides)
-        fits = self._fits(pyramid, guess or same_view(a.shape, b.shape), everywhere=guess is None)
+        if guess is not None and (
+            found := self._judged(pyramid, self._fits(pyramid, guess, everywhere=False))
+        ):
+            return found
+        return self._judged(pyramid, self._fits(pyramid, same_view(a.shape, b.shape), everywhere=True))
+
+    def _judged(self, pyramid: "_Pyramid", fits: list[Fit]) -> Outcome:
+        """The fit that most patches confirm, or why none is believed."""
         judged = [(self.agree(*pyramid.at(3), fit.b_H_a), fit) for fit in fits]
         if not judged:
             return RefusedRegistration(reason="no place was found where enough of both pictures overlaps")
@@ -80,8 +91,9 @@ class Auto:
     def _finished(self, pyramid: "_Pyramid", fit: Fit, agreement: Agreement) -> Registration:
         """The model that the pictures support, in full-size pixels."""
         a, b = pyramid.at(3)
-        model = "similarity"
-        for freer in ("affine", "homography"):
+        freedoms: tuple[Freedom, ...] = ("affine", "homography")
+        model: Freedom = "similarity"
+        for freer in freedoms:
             other = Sharpen(freedom=freer)(a, b, fit.b_H_a)
             if other.correlation > (1 + self.gain) * fit.correlation:
                 model, fit = freer, other
@@ -118,7 +130,7 @@ def _sharpened(a: Orientation, b: Orientation, places: Sequence[Matrix], steps: 
     return [Candidate(b_H_a=fit.b_H_a, score=fit.score) for fit in fits]
 
 
-def _apply(matrix: Matrix, px: np.ndarray) -> np.ndarray:
+def _apply(matrix: NDArray, px: NDArray) -> np.ndarray:
     moved = np.c_[px, np.ones(len(px))] @ matrix.T
     return np.asarray(moved[:, :2] / moved[:, 2:])
 

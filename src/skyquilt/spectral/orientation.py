@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from skyquilt.model.registration import Matrix
 
-Fields = NDArray[np.float32]
+Fields = NDArray
+"""(h, w, 4) of 32-bit numbers, see above."""
 BLUR = 1.0
 """Standard deviation in px of the smoothing before gradients are taken."""
 SURROUNDINGS = 1 / 16
@@ -34,7 +35,7 @@ class Orientation:
 
     fields: Fields
     """(h, w, 4): real and imaginary parts of w exp(2 i t), then of w exp(4 i t)."""
-    valid: NDArray[np.float32]
+    valid: NDArray
     """(h, w) 1 where a gradient could be taken, else 0."""
     small_S_full: Matrix
     """(3, 3) takes full-size pixels to pixels of this resolution."""
@@ -62,7 +63,7 @@ def orientation(grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float
     )  # fmt: skip
 
 
-def _fields(small: NDArray[np.float32], valid: NDArray[np.float32]) -> Fields:
+def _fields(small: NDArray, valid: NDArray) -> Fields:
     gx, gy = cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1)
     length = np.hypot(gx, gy)
     weight = np.minimum(length / _surroundings(length, valid), STRONGEST) * valid
@@ -72,7 +73,7 @@ def _fields(small: NDArray[np.float32], valid: NDArray[np.float32]) -> Fields:
     return np.stack([first.real, first.imag, second.real, second.imag], -1).astype(np.float32)
 
 
-def _surroundings(length: NDArray[np.float32], valid: NDArray[np.float32]) -> NDArray[np.float32]:
+def _surroundings(length: NDArray, valid: NDArray) -> NDArray[np.float32]:
     """RMS gradient about each pixel, over valid ones, and the floor."""
     sigma = np.sqrt(length.size) * SURROUNDINGS
     share = cv2.GaussianBlur(valid, (0, 0), sigma) + 1e-3
@@ -97,7 +98,7 @@ def full_size(a: Orientation, b: Orientation, small: Matrix) -> Matrix:
     return np.asarray(m / m[2, 2])
 
 
-def warped(a: Orientation, b_H_a: Matrix, shape: tuple[int, int]) -> tuple[Fields, NDArray[np.float32]]:
+def warped(a: Orientation, b_H_a: Matrix, shape: tuple[int, int]) -> tuple[Fields, NDArray]:
     """a's fields and validity as they would be in b's frame, (h, w, 4) and (h, w); orientations turn along."""
     size = (shape[1], shape[0])
     fields = cv2.warpPerspective(a.fields, b_H_a, size)
