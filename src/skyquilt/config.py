@@ -1,7 +1,7 @@
 """Names and numbers -> methods: the one place where words on a command line become parts of a story."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,23 +11,31 @@ from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.pose import ByPose, ByPosition
 from skyquilt.errors import UsageError
 from skyquilt.features.sift import Sift
+from skyquilt.features.surf import Surf
 from skyquilt.matching.mutual import Mutual
+from skyquilt.matching.one_way import OneWay
+from skyquilt.metrics.registration_quality import spread_quality
 from skyquilt.model.registration import Registers
 from skyquilt.pairs.nearest import Nearest
 from skyquilt.pairs.retrieval import Retrieval
 from skyquilt.render.blend import Average, Blend, Feather, First, Multiband
 from skyquilt.render.exposure import Balance
 from skyquilt.spectral.auto import Auto
+from skyquilt.spectral.by_features import BetterByQ, ByFeatures, Outliers, Rfae
 from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints
+from skyquilt.twoview.lmeds import Lmeds
+from skyquilt.twoview.ransac import Ransac
 from skyquilt.twoview.verify import Verify
 
 METHODS = ("auto", "bundle", "pose", "position")
 BLENDS = {"feather": Feather, "first": First, "average": Average, "multiband": Multiband}
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
-REGISTRATIONS: dict[str, Callable[[], Registers]] = {"auto": Auto}
+REGISTRATIONS = ("auto", "sift", "surf", "usurf", "rfae", "rfae-sift", "surf+rfae")
 """Ways to register two pictures of different spectra."""
+INLIERS = 9
+"""Fewest inliers of an accepted registration by the thesis's methods [Y 6.4.1]."""
 DISTORTIONS = ("none", "2", "4", "6", "6t")
 
 
@@ -121,9 +129,26 @@ class RegisterSettings:
 
 
 def registration_method(name: str) -> Registers:
-    """The registration that a word names."""
+    """The registration that a word names, with the thesis's parameters [Y 5.2, Fig. 5.8]."""
     _one_of("--method", name, REGISTRATIONS)
-    return REGISTRATIONS[name]()
+    surf, sift = Surf(lobe=1, step=1), Sift(levels=43, root=False, longest=1000, count=3000)
+    ways: dict[str, Callable[[], Registers]] = {
+        "auto": Auto,
+        "sift": lambda: ByFeatures(detect=sift, relate=_outliers()),
+        "surf": lambda: ByFeatures(detect=surf, relate=_outliers()),
+        "usurf": lambda: ByFeatures(detect=replace(surf, upright=True), relate=_outliers()),
+        "rfae": lambda: Rfae(detect=surf, relate=_outliers()),
+        "rfae-sift": lambda: Rfae(detect=sift, relate=_outliers()),
+        "surf+rfae": lambda: BetterByQ(methods=(registration_method("surf"), registration_method("rfae"))),
+    }
+    return ways[name]()
+
+
+def _outliers() -> Outliers:
+    return Outliers(
+        match=OneWay(), quality=spread_quality,
+        estimators=(Ransac(model="similarity", minimum=INLIERS), Lmeds(model="similarity", minimum=INLIERS)),
+    )  # fmt: skip
 
 
 def _one_of(option: str, value: str, allowed: Any) -> None:
