@@ -86,7 +86,8 @@ class Auto:
 
     def _anywhere(self, a: Orientation, b: Orientation) -> list[Matrix]:
         rough = distinct(self.everywhere(a, b), a.shape, 3, 40)
-        return [c.b_H_a for c in distinct(_sharpened(a, b, [c.b_H_a for c in rough], 5), a.shape, 1.5, 8)]
+        better = distinct(_sharpened(a, b, [c.b_H_a for c in rough], 2), a.shape, 1.5, 16)
+        return [c.b_H_a for c in distinct(_sharpened(a, b, [c.b_H_a for c in better], 3), a.shape, 1.5, 8)]
 
     def _finished(self, pyramid: "_Pyramid", fit: Fit, agreement: Agreement) -> Registration:
         """The model that the pictures support, in full-size pixels."""
