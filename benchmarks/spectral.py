@@ -37,8 +37,10 @@ def main() -> None:
     asked = parser.parse_args()
     pairs = read_pairs(Path(asked.pairs))
     rng = np.random.default_rng(asked.seed)
-    unrelated(pairs, asked.unrelated, rng)
-    variations(pairs, asked.rounds, rng)
+    if asked.unrelated:
+        unrelated(pairs, asked.unrelated, rng)
+    if asked.rounds:
+        variations(pairs, asked.rounds, rng)
 
 
 def unrelated(pairs: tuple[Pair, ...], count: int, rng: np.random.Generator) -> None:

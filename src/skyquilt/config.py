@@ -22,6 +22,7 @@ from skyquilt.render.blend import Average, Blend, Feather, First, Multiband
 from skyquilt.render.exposure import Balance
 from skyquilt.spectral.auto import Auto
 from skyquilt.spectral.by_features import BetterByQ, ByFeatures, Outliers, Rfae
+from skyquilt.spectral.structure import Structure
 from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints
 from skyquilt.twoview.lmeds import Lmeds
@@ -32,7 +33,7 @@ METHODS = ("auto", "bundle", "pose", "position")
 BLENDS = {"feather": Feather, "first": First, "average": Average, "multiband": Multiband}
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
-REGISTRATIONS = ("auto", "sift", "surf", "usurf", "rfae", "rfae-sift", "surf+rfae")
+REGISTRATIONS = ("auto", "sift", "surf", "usurf", "rfae", "rfae-sift", "surf+rfae", "structure")
 """Ways to register two pictures of different spectra."""
 SAMPLES = 1000
 """Most samples drawn for a similarity: enough for 7 % of right matches."""
@@ -141,6 +142,9 @@ def registration_method(name: str) -> Registers:
         "usurf": lambda: ByFeatures(detect=replace(surf, upright=True), relate=_outliers()),
         "rfae": lambda: Rfae(detect=surf, relate=_outliers()),
         "rfae-sift": lambda: Rfae(detect=sift, relate=_outliers()),
+        "structure": lambda: Structure(
+            estimate=Ransac(model="similarity", minimum=INLIERS, threshold_px=4.0, max_iterations=5 * SAMPLES)
+        ),
         "surf+rfae": lambda: BetterByQ(methods=(registration_method("surf"), registration_method("rfae"))),
     }
     return ways[name]()
