@@ -13,6 +13,7 @@ from skyquilt.spectral.nearby import Nearby, same_view
 from skyquilt.spectral.orientation import Orientation
 from skyquilt.spectral.pyramid import Pyramid
 from skyquilt.spectral.sharpen import Fit, Sharpen
+from skyquilt.spectral.structure import StructureMatches, sharpened
 from skyquilt.spectral.usable import both_usable
 
 _SEARCH, _NEARBY, _SELECT, _DECIDE = range(4)
@@ -20,8 +21,12 @@ _SEARCH, _NEARBY, _SELECT, _DECIDE = range(4)
 
 @dataclass(frozen=True, kw_only=True)
 class Auto:
-    """The default: every rotation and a range of scales are searched, plus the neighbourhood of a guess."""
+    """The default. Structure matches are quick and bear distortion; where patches do not confirm them beyond doubt,
+    every rotation and a range of scales are searched, and the neighbourhood of a guess.
+    """
 
+    propose: StructureMatches
+    """Structure matches."""
     everywhere: Everywhere = field(default_factory=Everywhere)
     """Search without knowledge."""
     nearby: Nearby = field(default_factory=Nearby)
@@ -30,6 +35,8 @@ class Auto:
     """The verdict."""
     sides: tuple[float, float, float, float] = (80.0, 128.0, 160.0, 256.0)
     """Px of the squares whose areas the pictures are shrunken to: search, search nearby, selection, verdict."""
+    sure: float = 8.0
+    """Agreement beyond which nothing else is tried."""
     version: ClassVar[int] = 1
 
     def __call__(
@@ -47,8 +54,13 @@ class Auto:
             found := self.decide(pyramid, self._best(pyramid, self._near(pyramid, guess)))
         ):
             return found
+        matched = self.propose(*pictures).b_H_a
+        first = [] if matched is None else [sharpened(pyramid, matched, _SELECT)]
+        found = self.decide(pyramid, first)
+        if found.evidence.get("surprise", 0.0) >= self.sure:
+            return found
         places = self._near(pyramid, same_view(a.shape, b.shape)) + self._anywhere(pyramid)
-        return self.decide(pyramid, self._best(pyramid, places))
+        return self.decide(pyramid, first + self._best(pyramid, places))
 
     def _near(self, pyramid: Pyramid, guess: Guess) -> list[Matrix]:
         """Places near a guess, in px of the level that selects."""

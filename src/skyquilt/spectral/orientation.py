@@ -48,9 +48,7 @@ class Orientation:
 
 def orientation(grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float) -> Orientation:
     """Fields of a picture (H, W) shrunken to the area of a square of `side` px (never enlarged)."""
-    height, width = grey.shape
-    factor = max(1.0, np.sqrt(height * width) / side)
-    size = (max(1, round(width / factor)), max(1, round(height / factor)))
+    size, small_S_full = shrinking(grey.shape, side)
     small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     share = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     inner = cv2.erode(
@@ -59,7 +57,7 @@ def orientation(grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float
     )  # fmt: skip
     return Orientation(
         fields=_fields(cv2.GaussianBlur(small, (0, 0), BLUR), inner), valid=inner,
-        small_S_full=_shrinking(size[0] / width, size[1] / height),
+        small_S_full=small_S_full,
     )  # fmt: skip
 
 
@@ -82,8 +80,14 @@ def _surroundings(length: NDArray, valid: NDArray) -> NDArray[np.float32]:
     return np.asarray(rms + FLOOR * (np.median(inside) if inside.size else 0) + 1e-3 * (rms.max() or 1.0))
 
 
-def _shrinking(x: float, y: float) -> Matrix:
-    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
+def shrinking(shape: tuple[int, ...], side: float) -> tuple[tuple[int, int], Matrix]:
+    """Width and height of a picture of `shape` (H, W) shrunken to the area of a square of `side` px (never
+    enlarged), and the (3, 3) that takes its pixels there.
+    """
+    factor = max(1.0, float(np.sqrt(shape[0] * shape[1])) / side)
+    size = (max(1, round(shape[1] / factor)), max(1, round(shape[0] / factor)))
+    x, y = size[0] / shape[1], size[1] / shape[0]
+    return size, np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
 
 
 def between(a: Orientation, b: Orientation, b_H_a: Matrix) -> Matrix:

@@ -29,7 +29,11 @@ class Pyramid:
 
     def moved(self, small: Matrix, source: int, target: int) -> Matrix:
         """A transform in px of one level in those of another."""
-        return between(*self.at(target), self.full(small, source))
+        return self.small(self.full(small, source), target)
+
+    def small(self, full: Matrix, level: int) -> Matrix:
+        """A transform in px of the pictures in those of a level."""
+        return between(*self.at(level), full)
 
     def full(self, small: Matrix, level: int) -> Matrix:
         """A transform in px of a level in those of the pictures."""

@@ -7,19 +7,32 @@ import cv2
 import numpy as np
 
 from skyquilt.model.estimate import NoEstimate
-from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registration
+from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistration, Registration
 from skyquilt.spectral.by_features import Estimator
 from skyquilt.spectral.decision import Decide
 from skyquilt.spectral.index_features import IndexFeatures, index_features, mutual
 from skyquilt.spectral.log_gabor import phase
+from skyquilt.spectral.orientation import shrinking
 from skyquilt.spectral.pyramid import Pyramid
-from skyquilt.spectral.sharpen import Sharpen
+from skyquilt.spectral.sharpen import Fit, Sharpen
 from skyquilt.spectral.usable import Usable, both_usable
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Proposal:
+    """What matches say, not yet verified."""
+
+    b_H_a: Matrix | None
+    """(3, 3) in px of the pictures; None where matches agree on nothing."""
+    matches: int
+    """How many there were."""
+    reason: str = ""
+    """Why there is no transform."""
+
+
 @dataclass(frozen=True, kw_only=True)
-class Structure:
-    """Phase congruency, maximum index map, mutual matches, one similarity, sharpened and verified."""
+class StructureMatches:
+    """Phase congruency, maximum index map, mutual matches, one similarity."""
 
     estimate: Estimator
     """A similarity from matches (n, 2), or none."""
@@ -29,8 +42,39 @@ class Structure:
     """Px of a descriptor's patch, a multiple of 6."""
     side: float = 320.0
     """Px of the square whose area the pictures are shrunken to."""
+    version: ClassVar[int] = 1
+
+    def __call__(self, a: Usable, b: Usable) -> Proposal:
+        """The transform that most matches agree on."""
+        (fa, full_a), (fb, full_b) = self._features(a), self._features(b)
+        in_a, in_b = mutual(fa, fb)
+        found = self.estimate(fa.px[in_a], fb.px[in_b])
+        if isinstance(found, NoEstimate):
+            return Proposal(b_H_a=None, matches=len(in_a), reason=found.reason)
+        full = np.linalg.inv(full_b) @ found.b_H_a @ full_a
+        return Proposal(b_H_a=full / full[2, 2], matches=len(in_a))
+
+    def _features(self, picture: Usable) -> tuple[IndexFeatures, Matrix]:
+        """Features, and what takes full-size pixels to theirs."""
+        size, small_S_full = shrinking(picture.grey.shape, self.side)
+        grey = cv2.resize(picture.grey, size, interpolation=cv2.INTER_AREA)
+        share = np.asarray(cv2.resize(picture.valid.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+        valid = share > 0.99
+        # what is no picture gets the mean, whose edge is weaker than that of black or white
+        filled = np.where(valid, grey, grey[valid].mean() if valid.any() else 0).astype(np.float32)
+        return index_features(phase(filled), valid, count=self.count, patch=self.patch), small_S_full
+
+
+@dataclass(frozen=True, kw_only=True)
+class Structure:
+    """Structure matches, sharpened and verified."""
+
+    propose: StructureMatches
+    """The matches."""
     decide: Decide = field(default_factory=Decide)
     """The verdict."""
+    sides: tuple[float, float] = (160.0, 256.0)
+    """Px of the squares whose areas the pictures are shrunken to: sharpening, verdict."""
     version: ClassVar[int] = 1
 
     def __call__(
@@ -40,20 +84,14 @@ class Structure:
         pictures = both_usable(a, b)
         if isinstance(pictures, RefusedRegistration):
             return pictures
-        pyramid = Pyramid(a=pictures[0], b=pictures[1], sides=(self.side, 160.0, 256.0))
-        fa, fb = (self._features(p, o.shape) for p, o in zip(pictures, pyramid.at(0), strict=True))
-        in_a, in_b = mutual(fa, fb)
-        found = self.estimate(fa.px[in_a], fb.px[in_b])
-        evidence = {"matches": float(len(in_a))}
-        if isinstance(found, NoEstimate):
-            return RefusedRegistration(reason=found.reason, evidence=evidence)
-        rough = Sharpen()(*pyramid.at(1), pyramid.moved(found.b_H_a, 0, 1))
-        fine = Sharpen()(*pyramid.at(2), pyramid.moved(rough.b_H_a, 1, 2))
-        return self.decide(pyramid, [fine])
+        proposal = self.propose(*pictures)
+        if proposal.b_H_a is None:
+            return RefusedRegistration(reason=proposal.reason, evidence={"matches": float(proposal.matches)})
+        pyramid = Pyramid(a=pictures[0], b=pictures[1], sides=self.sides)
+        return self.decide(pyramid, [sharpened(pyramid, proposal.b_H_a, pyramid.last - 1)])
 
-    def _features(self, picture: Usable, shape: tuple[int, int]) -> IndexFeatures:
-        size = (shape[1], shape[0])
-        grey = cv2.resize(picture.grey, size, interpolation=cv2.INTER_AREA)
-        valid = cv2.resize(picture.valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
-        filled = np.where(valid, grey, grey[valid].mean()).astype(np.float32)
-        return index_features(phase(filled), valid, count=self.count, patch=self.patch)
+
+def sharpened(pyramid: Pyramid, b_H_a: Matrix, level: int) -> Fit:
+    """A transform of the pictures' pixels sharpened at a level, then at the last one, in whose px it is."""
+    rough = Sharpen()(*pyramid.at(level), pyramid.small(b_H_a, level))
+    return Sharpen()(*pyramid.at(pyramid.last), pyramid.moved(rough.b_H_a, level, pyramid.last))
