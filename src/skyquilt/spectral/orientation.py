@@ -48,13 +48,10 @@ class Orientation:
 
 def orientation(grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float) -> Orientation:
     """Fields of a picture (H, W) shrunken to the area of a square of `side` px (never enlarged)."""
-    size, small_S_full = shrinking(grey.shape, side)
-    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    share = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    small, whole, small_S_full = shrunken(grey, valid, side)
     inner = cv2.erode(
-        (share > 0.99).astype(np.float32), np.ones((MARGIN, MARGIN)),
-        borderType=cv2.BORDER_CONSTANT, borderValue=0,
-    )  # fmt: skip
+        whole.astype(np.float32), np.ones((MARGIN, MARGIN)), borderType=cv2.BORDER_CONSTANT, borderValue=0
+    )
     return Orientation(
         fields=_fields(cv2.GaussianBlur(small, (0, 0), BLUR), inner), valid=inner,
         small_S_full=small_S_full,
@@ -80,14 +77,19 @@ def _surroundings(length: NDArray, valid: NDArray) -> NDArray[np.float32]:
     return np.asarray(rms + FLOOR * (np.median(inside) if inside.size else 0) + 1e-3 * (rms.max() or 1.0))
 
 
-def shrinking(shape: tuple[int, ...], side: float) -> tuple[tuple[int, int], Matrix]:
-    """Width and height of a picture of `shape` (H, W) shrunken to the area of a square of `side` px (never
-    enlarged), and the (3, 3) that takes its pixels there.
+def shrunken(
+    grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float
+) -> tuple[NDArray, NDArray[np.bool_], Matrix]:
+    """A picture and its validity (H, W) averaged down to the area of a square of `side` px (never enlarged), and the
+    (3, 3) that takes its pixels there. Both axes shrink alike, so a similarity stays one.
     """
-    factor = max(1.0, float(np.sqrt(shape[0] * shape[1])) / side)
-    size = (max(1, round(shape[1] / factor)), max(1, round(shape[0] / factor)))
-    x, y = size[0] / shape[1], size[1] / shape[0]
-    return size, np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
+    factor = min(1.0, side / float(np.sqrt(grey.size)))
+    small, share = (
+        np.asarray(cv2.resize(one, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
+        for one in (grey, valid.astype(np.float32))
+    )
+    off = (factor - 1) / 2
+    return small, share > 0.99, np.array([[factor, 0, off], [0, factor, off], [0, 0, 1.0]])
 
 
 def between(a: Orientation, b: Orientation, b_H_a: Matrix) -> Matrix:

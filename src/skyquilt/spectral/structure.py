@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-import cv2
 import numpy as np
 
 from skyquilt.model.estimate import NoEstimate
@@ -12,7 +11,7 @@ from skyquilt.spectral.by_features import Estimator
 from skyquilt.spectral.decision import Decide
 from skyquilt.spectral.index_features import IndexFeatures, index_features, mutual
 from skyquilt.spectral.log_gabor import phase
-from skyquilt.spectral.orientation import shrinking
+from skyquilt.spectral.orientation import shrunken
 from skyquilt.spectral.pyramid import Pyramid
 from skyquilt.spectral.sharpen import Fit, Sharpen
 from skyquilt.spectral.usable import Usable, both_usable
@@ -56,10 +55,7 @@ class StructureMatches:
 
     def _features(self, picture: Usable) -> tuple[IndexFeatures, Matrix]:
         """Features, and what takes full-size pixels to theirs."""
-        size, small_S_full = shrinking(picture.grey.shape, self.side)
-        grey = cv2.resize(picture.grey, size, interpolation=cv2.INTER_AREA)
-        share = np.asarray(cv2.resize(picture.valid.astype(np.float32), size, interpolation=cv2.INTER_AREA))
-        valid = share > 0.99
+        grey, valid, small_S_full = shrunken(picture.grey, picture.valid, self.side)
         # what is no picture gets the mean, whose edge is weaker than that of black or white
         filled = np.where(valid, grey, grey[valid].mean() if valid.any() else 0).astype(np.float32)
         return index_features(phase(filled), valid, count=self.count, patch=self.patch), small_S_full
