@@ -1,10 +1,15 @@
 """Registration of two spectra against simulated truth, and everything that must be refused."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 
 from skyquilt.config import REGISTRATIONS, registration_method
+from skyquilt.model.estimate import NoEstimate
 from skyquilt.model.registration import Guess, Picture, RefusedRegistration
+from skyquilt.spectral.structure import StructureMatches
 from tests.spectral.scenes import error, layout, pair, spectrum, turned
 
 SHAPE = (400, 480)
@@ -21,15 +26,10 @@ def test_any_rotation_is_found_to_a_part_of_a_pixel(auto, scale, degrees):
     a, b = pair(truth, seed=int(degrees) % 7)
     found = auto(Picture(values=a), Picture(values=b))
     assert found, found.reason
-    assert 1e-4 < error(found.b_H_a, truth) < 0.5  # an error of exactly 0 would mean the truth had leaked
+    assert 1e-4 < error(found.b_H_a, truth) < 0.3  # an error of exactly 0 would mean the truth had leaked
 
 
 def test_the_search_alone_finds_it_too(auto):
-    from dataclasses import replace
-
-    from skyquilt.model.estimate import NoEstimate
-    from skyquilt.spectral.structure import StructureMatches
-
     blind = replace(auto, propose=StructureMatches(estimate=lambda a, b: NoEstimate(reason="not asked")))
     truth = turned(1.15, 251.0, SHAPE, SHAPE, (-20.0, 11.0))
     a, b = pair(truth, seed=3)
@@ -90,7 +90,7 @@ def test_a_good_guess_is_used_and_a_wrong_one_does_no_harm(auto):
         assert found and error(found.b_H_a, truth) < 0.5
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 8))])
 def test_unrelated_pictures_are_refused_with_figures(auto, seed):
     a = np.clip(spectrum(layout(seed=seed), seed), 0, 255).astype(np.uint8)
     b = np.clip(spectrum(layout(seed=50 + seed), seed), 0, 255).astype(np.uint8)
@@ -123,11 +123,12 @@ def test_what_shows_nothing_is_refused_by_every_method(what, method):
     values, reason = BAD[what]
     register = registration_method(method)
     for a, b, name in ((SCENE, values, "B"), (values, SCENE, "A")):
-        refused = register(Picture(values=a), Picture(values=values if b is values else b))
+        refused = register(Picture(values=a), Picture(values=b))
         assert not refused
         assert reason in refused.reason and f"picture {name}" in refused.reason
 
 
+@pytest.mark.slow
 def test_noise_is_refused(auto):
     rng = np.random.default_rng(0)
     a, b = (np.clip(rng.normal(120, 30, SHAPE), 0, 255).astype(np.uint8) for _ in "ab")
@@ -136,8 +137,6 @@ def test_noise_is_refused(auto):
 
 def test_a_frame_of_noise_over_a_common_frame_is_refused(auto):
     """A black frame is no picture: two unrelated pictures turned by one angle have it in common."""
-    import cv2
-
     turn = cv2.getRotationMatrix2D((240, 200), 30, 0.8)
     a, b = (
         cv2.warpAffine(np.clip(spectrum(layout(seed=s), s), 10, 255).astype(np.uint8), turn, (480, 400))

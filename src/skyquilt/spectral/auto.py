@@ -35,7 +35,7 @@ class Auto:
     """The verdict."""
     sides: tuple[float, float, float, float] = (80.0, 128.0, 160.0, 256.0)
     """Px of the squares whose areas the pictures are shrunken to: search, search nearby, selection, verdict."""
-    sure: float = 8.0
+    sure: float = 6.0
     """Agreement beyond which nothing else is tried."""
     version: ClassVar[int] = 1
 
