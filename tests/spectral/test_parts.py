@@ -79,7 +79,9 @@ def test_a_correlation_is_the_sum_over_the_overlap(scene, turn):
         assert field[y, x] == pytest.approx(
             (moved * b.fields).sum(dtype=float), abs=0.03 * float(np.abs(field).max())
         )
-        assert overlap[y, x] == pytest.approx((valid * b.valid).sum(), rel=0.08)
+        assert overlap[y, x] == pytest.approx(
+            float((valid * b.valid).sum()), rel=0.15
+        )  # counted on a grid of 4 px
 
 
 @pytest.mark.parametrize("degrees", [17.0, 205.0])
