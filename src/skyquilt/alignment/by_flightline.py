@@ -1,6 +1,6 @@
 """`flightline`: mosaics of flight lines, joined, and laid on the map by regression (Arteaga et al. 2019)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -42,7 +42,7 @@ class ByFlightline:
 
     def __call__(
         self, photos: Sequence[Photo], frame: MapFrame, priors: Sequence[Prior], features: Sequence[Features],
-        order: Sequence[int], jobs: Callable = map,
+        order: Sequence[int],
     ) -> Alignment:  # fmt: skip
         """Aligns photos in the order of capture given (indices).
 
