@@ -25,6 +25,7 @@ from skyquilt.render.exposure import Balance
 from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints
 from skyquilt.twoview.ransac import Ransac
+from skyquilt.twoview.rescued import Rescued
 from skyquilt.twoview.ste import RansacSte
 from skyquilt.twoview.verify import Verify
 
@@ -37,6 +38,10 @@ TRANSFORMS = ("translation", "similarity", "affine", "homography")
 IMAGE_SEARCHES = ("chain", "overview")
 OPTIMISERS = ("anneal", "surfaces")
 LINES = ("heading", "distance")
+VLFEAT = 1.5**-0.5
+"""Ratio of distances that VLFeat's matcher asks for."""
+SECOND_PX2 = 12.0
+"""STE of an inlier, px^2 at 1500 px, where the threshold by deviations fails: 5.99 times one px, both ways."""
 LEAST_INLIERS = 12
 """Matches that must agree before two photos count as registered."""
 BLENDS: dict[str, type[Blend]] = {"feather": Feather, "first": First, "average": Average, "multiband": Multiband}
@@ -103,8 +108,8 @@ class MosaicSettings:
     """Known distances (CSV) by which the map is judged."""
     height_m: float | None = None
     """Height above ground for methods without tie points, where altitudes do not tell it."""
-    heading_deg: float = 0.0
-    """Common heading for method `position`."""
+    heading_deg: float | None = None
+    """Common heading for method `position`; None = the commonest reported one, north where none is."""
     repair: bool = True
     """Treat metadata as measurements that may lie."""
     features: int = 1500
@@ -228,7 +233,11 @@ def _hybrid(settings: MosaicSettings) -> Hybrid:
 
 
 def _by_flightline(settings: MosaicSettings) -> ByFlightline:
+    estimate = Rescued(
+        first=RansacSte(seed=settings.seed),
+        second=RansacSte(threshold_px2=SECOND_PX2, minimum=LEAST_INLIERS, seed=settings.seed),
+    )
     return ByFlightline(
-        within=Best(count=150), across=Best(count=50), estimate=RansacSte(seed=settings.seed),
+        within=Best(count=150, ratio=VLFEAT), across=Best(count=50, ratio=VLFEAT), estimate=estimate,
         split="distance" if settings.lines == "distance" else "heading", distortion=settings.distortion or "none",
     )  # fmt: skip

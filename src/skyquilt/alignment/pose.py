@@ -128,18 +128,31 @@ class ByPose(ByMetadata):
 class ByPosition(ByMetadata):
     """`position`: translations only, one common scale and one survey heading (Y 4.2)."""
 
-    heading_deg: float = 0.0
-    """Grid heading of every photo's image top in degrees clockwise from north."""
+    heading_deg: float | None = None
+    """Grid heading of every photo's image top in degrees clockwise from north; None = the commonest reported one,
+    north where none is reported.
+    """
     name: ClassVar[str] = "position"
 
     def _placed(
         self, photos: Sequence[Photo], priors: Sequence[Prior], heights: NDArray[np.float64]
     ) -> tuple[dict[int, Pose], dict[int, str]]:
         common = float(np.median(heights))
-        R = cam_R_map_from_angles(self.heading_deg)
+        R = cam_R_map_from_angles(self._heading(priors))
         poses = {
             i: Pose(cam_R_map=R, map_C=np.array([p.map_C[0], p.map_C[1], common]))
             for i, p in enumerate(priors)
             if np.isfinite(p.map_C[:2]).all()
         }
         return poses, {i: "it has no position" for i in range(len(photos)) if i not in poses}
+
+    def _heading(self, priors: Sequence[Prior]) -> float:
+        """The survey's heading in degrees: the reported one that most others agree with, and their mean."""
+        if self.heading_deg is not None:
+            return self.heading_deg
+        yaw = np.array([p.yaw_deg for p in priors])
+        unit = np.exp(1j * np.radians(yaw[np.isfinite(yaw)]))
+        if not unit.size:
+            return 0.0
+        near = np.abs(unit[:, None] - unit[None]) < np.radians(20)
+        return float(np.degrees(np.angle(unit[near[near.sum(1).argmax()]].mean())))

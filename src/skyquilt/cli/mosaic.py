@@ -116,8 +116,11 @@ def command(
         typer.Option(help="Height above ground in m, for methods that do not find it."),
     ] = None,
     heading: Annotated[
-        float, typer.Option(help="Heading of all photos in degrees, for method position.")
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            help="Heading of all photos in degrees, for method position.", show_default="the commonest reported"
+        ),
+    ] = None,
     repair: Annotated[
         bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")
     ] = True,
