@@ -96,7 +96,7 @@ class MosaicSettings:
     """Largest height variation on the ground in m; None = a tenth of the flying height."""
     alpha: float = 0.5
     """Weight of distances against looks in lambda (Y 4.6), for method `hybrid`."""
-    optimiser: str = "anneal"
+    optimiser: str = "surfaces"
     """One of `OPTIMISERS`: how `hybrid` maximises lambda."""
     seed: int = 0
     """Of everything random in methods `image`, `hybrid`, `flightline`."""

@@ -32,7 +32,7 @@ class Hybrid:
     """Weight of distances against looks."""
     across: int = 400
     """Width in px of a photo on the finest level (the thesis's scale)."""
-    deviations: float = 2.5
+    deviations: float = 2.0
     """Standard deviations of position, tilt and heading that the search reaches out to."""
     seed: int = 0
     """Of the annealing."""

@@ -92,8 +92,8 @@ def command(
     ] = 0.5,
     optimiser: Annotated[
         str,
-        typer.Option(help="How method hybrid searches: anneal (simulated annealing), surfaces (correlation)."),
-    ] = "anneal",
+        typer.Option(help="How method hybrid searches: surfaces (correlation), anneal (simulated annealing)."),
+    ] = "surfaces",
     seed: Annotated[int, typer.Option(help="Of everything random; equal seeds give equal maps.")] = 0,
     sequence: Annotated[
         str,

@@ -7,8 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.geometry.camera import distort, monotone_radius, rays
+from skyquilt.imaging.views import View, project_nodes
 from skyquilt.model.camera import Camera
+from skyquilt.model.surface import Surface
 
+NODES = 4
+"""Pixels between the points at which a view is projected exactly."""
 CENTRE = 0.5
 """Side of the central region of a photo that is laid over what is there, over that of the photo (Y 6.1.3)."""
 
@@ -55,6 +59,40 @@ def to_grid(picture: NDArray[np.uint8], camera: Camera, cam_H_grid: NDArray, *, 
     return Patch(
         column=int(c0), row=int(r0), pixels=pixels.astype(np.float32), shown=shown,
         central=shown & (off < CENTRE / 2).all(-1),
+    )  # fmt: skip
+
+
+def view_patch(picture: NDArray[np.uint8], view: View, surface: Surface, gsd: float) -> Patch | None:
+    """A grey picture (h, w) of a placed photo, of any size, orthorectified; column = east / gsd, row = -north / gsd.
+
+    Projected exactly at every `NODES`-th pixel and interpolated between.
+    """
+    (west, south), (east, north) = view.footprint.min(0), view.footprint.max(0)
+    c0, r0 = int(np.floor(west / gsd)), int(np.floor(-north / gsd))
+    columns, rows = (int(np.ceil(e / gsd / NODES)) + 1 for e in (east - west, north - south))
+    x = (c0 + NODES * (np.arange(-1, columns + 1) + 0.5) - 0.5) * gsd
+    y = -(r0 + NODES * (np.arange(-1, rows + 1) + 0.5) - 0.5) * gsd
+    gx, gy = np.meshgrid(x, y)
+    nodes = project_nodes(view, gx, gy, surface.at(gx, gy))
+    if not nodes.seen.any():
+        return None
+    size = ((columns + 2) * NODES, (rows + 2) * NODES)
+    inner = slice(NODES, -NODES)
+    u, v, real = (
+        cv2.resize(m, size, interpolation=cv2.INTER_LINEAR)[inner, inner]
+        for m in (nodes.u, nodes.v, nodes.real.astype(np.float32))
+    )
+    camera = view.camera
+    across, down = picture.shape[1] / camera.width, picture.shape[0] / camera.height
+    pixels = cv2.remap(
+        picture, (u + 0.5) * np.float32(across) - 0.5, (v + 0.5) * np.float32(down) - 0.5, cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    off_u, off_v = np.abs((u + 0.5) / camera.width - 0.5), np.abs((v + 0.5) / camera.height - 0.5)
+    shown = (real > 0.999) & (off_u < 0.5 - 1.5 / picture.shape[1]) & (off_v < 0.5 - 1.5 / picture.shape[0])
+    return Patch(
+        column=c0, row=r0, pixels=pixels.astype(np.float32), shown=shown,
+        central=shown & (off_u < CENTRE / 2) & (off_v < CENTRE / 2),
     )  # fmt: skip
 
 
