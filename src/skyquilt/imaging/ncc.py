@@ -9,7 +9,7 @@ Floats = NDArray[np.float64]
 
 
 def ncc(a: NDArray, b: NDArray, mask: NDArray[np.bool_] | None = None) -> float:
-    """Zero-mean correlation in [-1, 1] of two pictures (H, W) where `mask` holds; 0 if one is flat or nothing is left."""
+    """Zero-mean correlation in [-1, 1] of two pictures (H, W) where `mask` holds; 0 if one is flat or none is left."""
     x, y = (np.asarray(p, np.float64)[... if mask is None else mask].ravel() for p in (a, b))
     if x.size < 2:
         return 0.0
