@@ -51,21 +51,26 @@ def build_report(data: ReportInput) -> str:
         time_section(data),
         settings_section(data),
     )
-    return _template().render(
+    return template("page.html.j2").render(
         data=data,
         summary=summary(data),
         tiles=tiles(data),
         attention=attention(data),
         map=map_view(data, ground, layers) if ground and layers else None,
         sections=sections,
-        style=_asset("style.css"),
-        script=_asset("script.js"),
+        style=asset("style.css"),
+        script=asset("script.js"),
     )
 
 
 def write_report(path: Path, data: ReportInput) -> None:
     """Build the page and put it at `path`, whole or not at all; `OutputError` if it cannot be written."""
-    path, page = Path(path), build_report(data)
+    write_page(path, build_report(data))
+
+
+def write_page(path: Path, page: str) -> None:
+    """Put a page at `path`, whole or not at all; `OutputError` if it cannot be written."""
+    path = Path(path)
     partial = path.with_name(path.name + ".partial")
     try:
         partial.write_text(page, encoding="utf-8")
@@ -101,7 +106,8 @@ def tied(words: str) -> str:
 
 
 @cache
-def _template() -> Template:
+def template(name: str) -> Template:
+    """A template of this folder."""
     environment = Environment(
         loader=FileSystemLoader(HERE),
         autoescape=True,
@@ -110,9 +116,10 @@ def _template() -> Template:
         lstrip_blocks=True,
     )
     environment.filters["tied"] = tied
-    return environment.get_template("page.html.j2")
+    return environment.get_template(name)
 
 
 @cache
-def _asset(name: str) -> Markup:
+def asset(name: str) -> Markup:
+    """A style sheet or script of this folder."""
     return Markup((HERE / name).read_text(encoding="utf-8"))  # ours, not the user's
