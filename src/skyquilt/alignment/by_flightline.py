@@ -60,7 +60,7 @@ class ByFlightline:
         whole = work.joined(strips, pairs_across(xy, [list(s) for s in strips]))
         poses, lost_too = _on_map(whole, xy, lens)
         alone = [i for s in strips for i in s if i not in whole]
-        lost |= {i: "nothing links its flight line to the others" for i in alone} | lost_too
+        lost |= dict.fromkeys(alone, "nothing links its flight line to the others") | lost_too
         placed = plane_alignment(
             self.name, frame, photos, poses, True, cameras, [{i: np.eye(3) for i in poses}], work.joins, work.notes
         )

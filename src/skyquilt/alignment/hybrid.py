@@ -13,7 +13,7 @@ from skyquilt.alignment.planar import map_H_cam_of
 from skyquilt.geometry.frames import rotation_from_vector
 from skyquilt.imaging.plane import Overview, Patch, to_grid
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Alignment, Join, MapFrame, Pose, Prior
+from skyquilt.model.poses import Alignment, Join, Pose, Prior
 
 Array = NDArray[np.float64]
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]

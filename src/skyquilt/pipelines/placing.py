@@ -151,7 +151,7 @@ def _flightline(known: Known, methods: Methods, repaired: Repaired | None) -> Al
 def _named(alignment: Alignment, known: Known) -> Alignment:
     """With a reason for photos that the sequence does not name."""
     missing = set(range(len(known.intake.photos))) - set(known.order)
-    reasons = {i: "the sequence does not name it" for i in missing}
+    reasons = dict.fromkeys(missing, "the sequence does not name it")
     return replace(alignment, rejected={**alignment.rejected, **reasons})
 
 

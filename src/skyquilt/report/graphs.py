@@ -1,34 +1,17 @@
-"""A page of sections alone: what comparisons, tests and calibrations report."""
+"""Pictures and graphs of several lines for pages of sections."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
 from skyquilt.report.images import jpeg_uri, shrunk
-from skyquilt.report.page import asset, template, write_page
-from skyquilt.report.parts import Figure, Section
+from skyquilt.report.parts import Figure
 from skyquilt.report.svg import Axes, drawing, polyline
 
 COLOURS = ("#1f6f8b", "#d1495b", "#edae49", "#66a182", "#8d5fa8", "#2e4057", "#b5651d", "#5f6c7b", "#c2185b", "#00897b")
 """Of lines in one graph, in order."""
-
-
-def write_plain_report(
-    path: Path, *, what: str, title: str, summary: str, sections: Sequence[Section], version: str, footer: str = ""
-) -> None:
-    """Put a page of sections at `path`; it needs no other file and no network.
-
-    Raises:
-        OutputError: it cannot be written.
-    """
-    page = template("plain.html.j2").render(
-        what=what, title=title, summary=summary, sections=sections, version=version, footer=footer,
-        style=asset("style.css"),
-    )  # fmt: skip
-    write_page(path, page)
 
 
 def picture(pixels: NDArray, title: str, caption: str, *, longest: int = 1000, wide: bool = False) -> Figure:
