@@ -52,7 +52,12 @@ SECOND_PX2 = 12.0
 """STE of an inlier, px^2 at 1500 px, where the threshold by deviations fails: 5.99 times one px, both ways."""
 LEAST_INLIERS = 12
 """Matches that must agree before two photos count as registered."""
-BLENDS: dict[str, type[Blend]] = {"feather": Feather, "first": First, "average": Average, "multiband": Multiband}
+BLENDS: dict[str, type[Blend]] = {
+    "feather": Feather,
+    "first": First,
+    "average": Average,
+    "multiband": Multiband,
+}
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
 REGISTRATIONS = ("auto", "sift", "surf", "usurf", "rfae", "rfae-sift", "surf+rfae")
@@ -252,7 +257,11 @@ def methods(settings: MosaicSettings) -> Methods:
     flightline = settings.method == "flightline"
     blend = ("average" if flightline else "feather") if settings.blend == "auto" else settings.blend
     # the thresholds of flight lines are meant for pictures of 1500 px
-    sift = Sift(count=max(settings.features, 4000), longest=1500) if flightline else Sift(count=settings.features)
+    sift = (
+        Sift(count=max(settings.features, 4000), longest=1500)
+        if flightline
+        else Sift(count=settings.features)
+    )
     return Methods(
         sift=sift, nearest=Nearest(), retrieval=Retrieval(), mutual=Mutual(),
         verify=Verify(),

@@ -37,6 +37,7 @@ from skyquilt.run.pixel_cache import PixelCache
 from skyquilt.run.store import Store, digest
 
 T = TypeVar("T")
+U = TypeVar("U")
 STAGES = ("read", "features", "links", "align", "surface", "balance", "mosaic", "measure", "report")
 """Stages in order."""
 ARTEFACTS = {
@@ -53,7 +54,8 @@ REGISTRY = {
     for c in (
         intake.Looked, features.Features, features.Link, features.RejectedLink, features.Matches,
         camera.Camera,
-        poses.Alignment, poses.MapFrame, poses.Pose, poses.TiePoints, poses.ControlResidual, poses.Join, surface.Surface,
+        poses.Alignment, poses.MapFrame, poses.Pose, poses.TiePoints, poses.ControlResidual, poses.Join,
+        surface.Surface,
         RejectedPhoto, drawing.BlockExtras, raster.Grid,
     )
 }  # fmt: skip
@@ -119,10 +121,11 @@ def iter_mosaic(
     drawn = yield from clock.stage(
         "mosaic", drawing.draw(run.path, compose, alignment, settings, store, key, unit, jobs)
     )
-    seams = yield from clock.stage("measure", reporting.seams(compose, drawn, ground))
-    judged = yield from clock.stage(
-        "measure",
-        quality.judge(taken, alignment, prior, ground, pictures, distances, settings.alpha, known.order),
+    judging_it = quality.judge(
+        taken, alignment, prior, ground, pictures, distances, settings.alpha, known.order
+    )
+    seams, judged = yield from clock.stage(
+        "measure", _both(reporting.seams(compose, drawn, ground), judging_it)
     )
     rejected = [*survey.rejected, *taken.rejected, *_unplaced(taken, alignment)]
     figures = judging.figures(
@@ -292,6 +295,11 @@ def _at_once(work: Callable[[], T]) -> Steps[T]:
     result = work()
     yield 1, 1
     return result
+
+
+def _both(first: Steps[T], second: Steps[U]) -> Steps[tuple[T, U]]:
+    """Two works as one stage."""
+    return (yield from first), (yield from second)
 
 
 def _unplaced(taken: intake.Intake, alignment: poses.Alignment) -> list[RejectedPhoto]:

@@ -79,7 +79,14 @@ def _key(known: Known, methods: Methods, way: object) -> str:
     photos = [(p.digest, p.name, p.camera_key, p.focal, p.calibration, p.editor) for p in known.intake.photos]
     held = [(k.a, k.b, k.index_a, k.index_b) for k in known.links.links]
     return digest(
-        photos, known.frame, list(known.priors), held, list(known.control), methods.sift, list(known.order), way
+        photos,
+        known.frame,
+        list(known.priors),
+        held,
+        list(known.control),
+        methods.sift,
+        list(known.order),
+        way,
     )
 
 

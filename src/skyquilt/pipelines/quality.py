@@ -32,7 +32,7 @@ class Quality:
     """Photos in the order replayed."""
     replayed: Replay
     """Correlations, in that order."""
-    off_gps: NDArray[np.float64]
+    off_position: NDArray[np.float64]
     """Distance of each from its reported position over the width of a photo on the ground, in that order."""
 
 
@@ -49,20 +49,29 @@ def judge(
     seen = replay(view_patch(pictures(i, ACROSS), views[i], ground.surface, gsd) for i in order)
     off = np.array([np.hypot(*(alignment.poses[i].map_C - priors[i].map_C)[:2]) for i in order])
     figures = _figures(seen, taken, views, ground, known, alpha) | _geolocation(alignment, priors, order)
-    figures |= _joins(alignment)
+    off = off / (ground.native_gsd * wide)
+    figures |= _joins(alignment) | {
+        "photos": [taken.photos[i].name for i in order],
+        "correlation_with_last_of_photo": [_short(c) for c in seen.with_last],
+        "correlation_with_map_of_photo": [_short(c) for c in seen.with_overview],
+        "off_position_over_width": [_short(o) for o in off],
+    }
     yield 1, 1
-    return Quality(
-        figures=figures, order=order, replayed=seen, off_gps=off / (ground.native_gsd * wide)
-    )  # fmt: skip
+    return Quality(figures=figures, order=order, replayed=seen, off_position=off)
 
 
 def _figures(
-    seen: Replay, taken: Intake, views: dict[int, View], ground: Ground, known: Sequence[KnownDistance], alpha: float
+    seen: Replay,
+    taken: Intake,
+    views: dict[int, View],
+    ground: Ground,
+    known: Sequence[KnownDistance],
+    alpha: float,
 ) -> dict[str, Any]:
     corr = lambda_corr(seen.with_overview)
     out: dict[str, Any] = {
         "alpha": alpha, "lambda_corr": _short(corr), "lambda_spat": None, "lambda_spat_of_table": None, "lambda": None,
-        "correlation_with_last": _short(float(np.nanmean(seen.with_last))) if np.isfinite(seen.with_last).any() else None,
+        "correlation_with_last": _mean(seen.with_last),
     }  # fmt: skip
     rows, actual, found = [], [], []
     index = {p.name: i for i, p in enumerate(taken.photos)}
@@ -118,7 +127,16 @@ def _joins(alignment: Alignment) -> dict[str, Any]:
     """STE per inlier (A 15) over the registrations of a method that has them, px^2 of the working image."""
     ste = np.array([j.ste_px2 for j in alignment.joins])
     ste = ste[np.isfinite(ste)]
-    return {"ste_per_inlier_px2": {"median": _short(float(np.median(ste))), "worst": _short(float(ste.max()))}} if len(ste) else {}
+    if not len(ste):
+        return {}
+    return {
+        "ste_per_inlier_px2": {"median": _short(float(np.median(ste))), "worst": _short(float(ste.max()))}
+    }
+
+
+def _mean(values: NDArray[np.float64]) -> float | None:
+    known = values[np.isfinite(values)]
+    return _short(float(known.mean())) if len(known) else None
 
 
 def _short(value: float | None) -> float | None:

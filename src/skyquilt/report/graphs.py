@@ -10,7 +10,18 @@ from skyquilt.report.images import jpeg_uri, shrunk
 from skyquilt.report.parts import Figure
 from skyquilt.report.svg import Axes, drawing, polyline
 
-COLOURS = ("#1f6f8b", "#d1495b", "#edae49", "#66a182", "#8d5fa8", "#2e4057", "#b5651d", "#5f6c7b", "#c2185b", "#00897b")
+COLOURS = (
+    "#1f6f8b",
+    "#d1495b",
+    "#edae49",
+    "#66a182",
+    "#8d5fa8",
+    "#2e4057",
+    "#b5651d",
+    "#5f6c7b",
+    "#c2185b",
+    "#00897b",
+)
 """Of lines in one graph, in order."""
 
 
@@ -22,7 +33,9 @@ def picture(pixels: NDArray, title: str, caption: str, *, longest: int = 1000, w
         small = (small[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
     rgba = np.dstack([small, np.full(small.shape[:2], 255, np.uint8)])
     h, w = rgba.shape[:2]
-    svg = Markup('<svg viewBox="0 0 {} {}" role="img" aria-label="{}"><image href="{}" width="{}" height="{}"/></svg>')
+    svg = Markup(
+        '<svg viewBox="0 0 {} {}" role="img" aria-label="{}"><image href="{}" width="{}" height="{}"/></svg>'
+    )
     return Figure(svg=svg.format(w, h, title, jpeg_uri(rgba), w, h), title=title, caption=caption, wide=wide)
 
 
@@ -43,5 +56,7 @@ def lines(
         runs = np.split(np.arange(len(value)), np.flatnonzero(np.diff(whole.astype(int)) != 0) + 1)
         d = "".join(polyline(points[r]) for r in runs if whole[r[0]])
         if d:
-            parts.append(Markup('<path d="{}" style="fill:none;stroke:{};stroke-width:2"/>').format(d, colour))
+            parts.append(
+                Markup('<path d="{}" style="fill:none;stroke:{};stroke-width:2"/>').format(d, colour)
+            )
     return drawing(parts, title, width=900, height=360)
