@@ -8,6 +8,7 @@ from skyquilt import __version__
 from skyquilt.cli import inspect as inspect_command
 from skyquilt.cli import mosaic as mosaic_command
 from skyquilt.cli import simulate as simulate_command
+from skyquilt.cli import strip_test as strip_test_command
 
 EXIT_CODES = (
     "Exit codes: 0 done, 1 other errors, 2 wrong options, 3 no readable photo, 4 photos cannot be aligned,"
@@ -18,6 +19,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 app.command("mosaic", epilog=EXIT_CODES)(mosaic_command.command)
 app.command("inspect", epilog=EXIT_CODES)(inspect_command.command)
 app.command("simulate", epilog=EXIT_CODES)(simulate_command.command)
+app.command("strip-test", epilog=EXIT_CODES)(strip_test_command.command)
 
 
 def _version(asked: bool) -> None:

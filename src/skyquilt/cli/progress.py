@@ -2,15 +2,17 @@
 
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from typing import Any
 
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
 
 
-def show(events: Iterable[Event], *, mode: str) -> None:
-    """Consumes a story and tells it: mode `normal`, `verbose`, `quiet` or `json`."""
+def show(events: Iterable[Event], *, mode: str, tell: Callable[[Result], str] | None = None) -> None:
+    """Consumes a story and tells it: mode `normal`, `verbose`, `quiet` or `json`; `tell` puts its result in a few
+    lines, None is a mosaic's.
+    """
     if mode == "json":
         for happened in events:
             sys.stdout.write(json.dumps(as_record(happened), default=str) + "\n")
@@ -19,7 +21,7 @@ def show(events: Iterable[Event], *, mode: str) -> None:
         for _ in events:
             pass
     else:
-        _bars(events, verbose=mode == "verbose")
+        _bars(events, verbose=mode == "verbose", tell=tell or summary)
 
 
 def as_record(happened: Event) -> dict[str, Any]:
@@ -29,7 +31,7 @@ def as_record(happened: Event) -> dict[str, Any]:
     return {"event": type(happened).__name__, **asdict(happened)}
 
 
-def _bars(events: Iterable[Event], *, verbose: bool) -> None:
+def _bars(events: Iterable[Event], *, verbose: bool, tell: Callable[[Result], str]) -> None:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -59,7 +61,7 @@ def _bars(events: Iterable[Event], *, verbose: bool) -> None:
                 )
             elif isinstance(happened, Result):
                 result = happened
-    Console().print(summary(result), markup=False, highlight=False, soft_wrap=True)
+    Console().print(tell(result), markup=False, highlight=False, soft_wrap=True)
 
 
 def times(happened: StageFinished) -> str:

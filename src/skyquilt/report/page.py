@@ -1,7 +1,9 @@
 """The page: sections in order, one template, one file."""
 
 import re
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from skyquilt.report.layers import layers_of
 from skyquilt.report.mapview import map_view
 from skyquilt.report.numbers import count, items, mapping, plain
 from skyquilt.report.overlap import overlap_section, surface_section
+from skyquilt.report.parts import Section, Tile
 from skyquilt.report.positions import positions_section
 from skyquilt.report.residuals import residuals_section
 from skyquilt.report.seams import seams_section
@@ -77,6 +80,22 @@ def write_report(path: Path, data: ReportInput) -> None:
             f"the report cannot be written to {path}: {error.strerror or error}. "
             "Make room or choose another output folder."
         ) from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Head:
+    title: str
+    version: str
+
+
+def small_page(
+    title: str, version: str, *, summary: str, tiles: Sequence[Tile], sections: Sequence[Section], footer: str
+) -> str:
+    """A page about something other than a mosaic, in the same dress."""
+    return _template().render(
+        data=_Head(title=title, version=version), summary=summary, tiles=tiles, attention=(), map=None,
+        sections=sections, style=_asset("style.css"), script="", footer=footer,
+    )  # fmt: skip
 
 
 def attention(data: ReportInput) -> tuple[tuple[str, str], ...]:

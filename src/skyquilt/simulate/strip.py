@@ -1,4 +1,4 @@
-"""A strip over chess-boards as a camera sights it: corners, things on the boards, and views of a board to calibrate with."""
+"""A strip over chess-boards as a camera sights it: corners, things on the boards, views to calibrate with."""
 
 from dataclasses import dataclass, field
 
@@ -54,8 +54,8 @@ class StripSettings:
             (0.3 <= self.overlap <= 0.95, f"overlap must be 30 to 95 %, not {100 * self.overlap:.0f} %"),
             (self.height >= 1, f"height must be at least 1 m, not {self.height:g} m"),
             (
-                0 <= self.relief <= self.height / 3,
-                f"relief must be 0 m to a third of the height, not {self.relief:g} m",
+                0 <= 3 * self.relief <= self.height,
+                f"relief must be 0 to a third of the height, not {self.relief:g} m",
             ),
             (0 <= self.tilt <= 8, f"tilt must be 0 to 8 degrees, not {self.tilt:g}"),
             (self.noise >= 0, f"noise must not be negative, not {self.noise:g} px"),
