@@ -31,6 +31,7 @@ from skyquilt.spectral.auto import Auto
 from skyquilt.spectral.by_features import BetterByQ, ByFeatures, Outliers, Rfae
 from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints
+from skyquilt.twoview.levelled import Level
 from skyquilt.twoview.lmeds import Lmeds
 from skyquilt.twoview.ransac import Ransac
 from skyquilt.twoview.rescued import Rescued
@@ -279,13 +280,13 @@ def _by_image(settings: MosaicSettings) -> Chain | ByOverview:
     order, height = settings.distortion or "6t", settings.height_m
     if settings.image_search == "overview":
         estimate = Ransac(model=model, threshold_px=3.0, minimum=LEAST_INLIERS, seed=settings.seed)
-        level = None
+        level = Level(relief_m=settings.relief_m, height_m=height, width=640) if settings.levelled else None
         return ByOverview(
             detect=Sift(longest=1_000_000), match=Mutual(), estimate=estimate, level=level, distortion=order,
             height_m=height,
         )  # fmt: skip
     estimate = Ransac(model=model, threshold_px=6.0, minimum=LEAST_INLIERS, seed=settings.seed)
-    level = None
+    level = Level(relief_m=settings.relief_m, height_m=height) if settings.levelled else None
     return Chain(match=Mutual(), estimate=estimate, level=level, distortion=order, height_m=height)
 
 
