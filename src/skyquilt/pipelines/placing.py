@@ -18,6 +18,7 @@ from skyquilt.pipelines.intake import Intake, Pictures
 from skyquilt.pipelines.linking import Links
 from skyquilt.run.clock import Steps
 from skyquilt.run.store import Store, digest
+from skyquilt.twoview.levelled import Level
 
 
 def choose_method(asked: str, photos: int, links: int, positions: int) -> tuple[str, str]:
@@ -137,10 +138,20 @@ def _by_metadata(method: ByMetadata, known: Known, repaired: Repaired | None) ->
 
 
 def _image(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
-    photos, features = known.intake.photos, known.intake.features
-    if isinstance(methods.by_image, ByOverview):
-        return methods.by_image(photos, known.frame, known.priors, features, known.order, known.pictures)
-    return methods.by_image(photos, known.frame, known.priors, features, known.order)
+    photos, features, method = known.intake.photos, known.intake.features, methods.by_image
+    if isinstance(method.level, Level) and method.level.height_m is None:
+        method = replace(method, level=replace(method.level, height_m=_least_height(known)))
+    if isinstance(method, ByOverview):
+        return method(photos, known.frame, known.priors, features, known.order, known.pictures)
+    return method(photos, known.frame, known.priors, features, known.order)
+
+
+def _least_height(known: Known) -> float | None:
+    """Least height above take-off in m, which stands for that above ground in (4.9); None where none is reported."""
+    heights = np.array([p.map_C[2] for p in known.priors])
+    known_heights = heights[np.isfinite(heights) & (heights > 1)]
+    takeoff = known.frame.vertical_datum == "takeoff"
+    return float(known_heights.min()) if takeoff and len(known_heights) else None
 
 
 def _hybrid(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:

@@ -43,7 +43,7 @@ def strip_page(found: Mapping[str, Any]) -> str:
     )
     sections = (_curves(variants, found["flights"]), _table(variants), _how(found))
     return plain_page(
-        title="Strip test", version=str(found["version"]), summary=summary, tiles=tiles, sections=sections,
+        title="Strip test", version=str(found["version"]), summary=summary, tiles=tuple(tiles), sections=sections,
         source="The figures behind this page are in strip.json.",
     )  # fmt: skip
 
