@@ -37,7 +37,7 @@ def shooting_distances(xy: Array) -> Shooting:
     """The histogram of distances of photos (n, 2) m in order of capture (A 2.1)."""
     d = np.linalg.norm(np.diff(xy, axis=0), axis=1)
     width = float(d.max() - d.min()) / BINS
-    if width == 0:
+    if width < 1e-6 * d.max():  # one distance, but for rounding: no histogram
         return Shooting(distance_m=d, commonest_m=float(d[0]), width_m=0.0)
     count, edges = np.histogram(d, bins=BINS)
     k = int(np.argmax(count))
