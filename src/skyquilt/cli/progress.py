@@ -9,9 +9,10 @@ from typing import Any
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
 
 
-def show(events: Iterable[Event], *, mode: str, tell: Callable[[Result], str] | None = None) -> None:
-    """Consumes a story and tells it: mode `normal`, `verbose`, `quiet` or `json`; `tell` puts its result in a few
-    lines, None is a mosaic's.
+def show(events: Iterable[Event], *, mode: str, summary: Callable[[Result], str] | None = None) -> None:
+    """Consumes a story and tells it: mode `normal`, `verbose`, `quiet` or `json`.
+
+    `summary` puts the result in a few lines; that of a mosaic if none is given.
     """
     if mode == "json":
         for happened in events:
@@ -21,7 +22,7 @@ def show(events: Iterable[Event], *, mode: str, tell: Callable[[Result], str] | 
         for _ in events:
             pass
     else:
-        _bars(events, verbose=mode == "verbose", tell=tell or summary)
+        _bars(events, summary or mosaic_summary, verbose=mode == "verbose")
 
 
 def as_record(happened: Event) -> dict[str, Any]:
@@ -31,7 +32,7 @@ def as_record(happened: Event) -> dict[str, Any]:
     return {"event": type(happened).__name__, **asdict(happened)}
 
 
-def _bars(events: Iterable[Event], *, verbose: bool, tell: Callable[[Result], str]) -> None:
+def _bars(events: Iterable[Event], summary: Callable[[Result], str], *, verbose: bool) -> None:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -61,7 +62,7 @@ def _bars(events: Iterable[Event], *, verbose: bool, tell: Callable[[Result], st
                 )
             elif isinstance(happened, Result):
                 result = happened
-    Console().print(tell(result), markup=False, highlight=False, soft_wrap=True)
+    Console().print(summary(result), markup=False, highlight=False, soft_wrap=True)
 
 
 def times(happened: StageFinished) -> str:
@@ -70,8 +71,8 @@ def times(happened: StageFinished) -> str:
     return f"{happened.stage}: {happened.seconds:.2f} s, {happened.cpu_seconds:.2f} s of CPU{how}"
 
 
-def summary(result: Result) -> str:
-    """The result in a few lines."""
+def mosaic_summary(result: Result) -> str:
+    """A mosaic in a few lines."""
     m = result.metrics
     lines = [
         f"{m['photos_used']} of {m['photos_total']} photos in {len(m['blocks'])} block(s),"

@@ -40,7 +40,7 @@ def command(
         photos=photos, overlap=overlap / 100, height=height, relief=relief, tilt=tilt, noise=noise, seed=seed
     )
     events = iter_strip_test(output, settings, flights=flights, overwrite=overwrite)
-    show(events, mode="quiet" if quiet else "json" if json else "normal", tell=_summary)
+    show(events, mode="quiet" if quiet else "json" if json else "normal", summary=_summary)
 
 
 def _summary(result: "Result") -> str:

@@ -1,9 +1,7 @@
 """The page: sections in order, one template, one file."""
 
 import re
-from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -11,9 +9,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from skyquilt.errors import OutputError
+from skyquilt.report import headline
 from skyquilt.report.effort import time_section
 from skyquilt.report.ground import ground_of
-from skyquilt.report.headline import summary, tiles
 from skyquilt.report.input import ReportInput
 from skyquilt.report.layers import layers_of
 from skyquilt.report.mapview import map_view
@@ -21,6 +19,7 @@ from skyquilt.report.numbers import count, items, mapping, plain
 from skyquilt.report.overlap import overlap_section, surface_section
 from skyquilt.report.parts import Section, Tile
 from skyquilt.report.positions import positions_section
+from skyquilt.report.quality import quality_section
 from skyquilt.report.residuals import residuals_section
 from skyquilt.report.seams import seams_section
 from skyquilt.report.tables import (
@@ -46,6 +45,7 @@ def build_report(data: ReportInput) -> str:
         residuals_section(data),
         seams_section(data, ground, named),
         surface_section(data, ground, named),
+        quality_section(data),
         calibration_section(data),
         control_section(data),
         conflicts_section(data),
@@ -56,8 +56,8 @@ def build_report(data: ReportInput) -> str:
     )
     return _template().render(
         data=data,
-        summary=summary(data),
-        tiles=tiles(data),
+        summary=headline.summary(data),
+        tiles=headline.tiles(data),
         attention=attention(data),
         map=map_view(data, ground, layers) if ground and layers else None,
         sections=sections,
@@ -68,7 +68,12 @@ def build_report(data: ReportInput) -> str:
 
 def write_report(path: Path, data: ReportInput) -> None:
     """Build the page and put it at `path`, whole or not at all; `OutputError` if it cannot be written."""
-    path, page = Path(path), build_report(data)
+    write_page(path, build_report(data))
+
+
+def write_page(path: Path, page: str) -> None:
+    """Put a page at `path`, whole or not at all; `OutputError` if it cannot be written."""
+    path = Path(path)
     partial = path.with_name(path.name + ".partial")
     try:
         partial.write_text(page, encoding="utf-8")
@@ -82,29 +87,13 @@ def write_report(path: Path, data: ReportInput) -> None:
         ) from error
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Head:
-    title: str
-    version: str
-
-
-def small_page(
-    title: str, version: str, *, summary: str, tiles: Sequence[Tile], sections: Sequence[Section], footer: str
-) -> str:
-    """A page about something other than a mosaic, in the same dress."""
-    return _template().render(
-        data=_Head(title=title, version=version), summary=summary, tiles=tiles, attention=(), map=None,
-        sections=sections, style=_asset("style.css"), script="", footer=footer,
-    )  # fmt: skip
-
-
 def attention(data: ReportInput) -> tuple[tuple[str, str], ...]:
     """What deserves a look first: sentences with the section that shows more."""
     m = data.metrics
     found = [(plain(w), "") for w in items(m.get("warnings"))[:20]]
     found += [
         (f"{t.label}: {t.value} {t.unit}".rstrip() + ".", t.anchor)
-        for t in tiles(data)
+        for t in headline.tiles(data)
         if t.verdict == "poor"
     ]
     if n := len(items(m.get("metadata_conflicts"))):
@@ -119,8 +108,19 @@ def tied(words: str) -> str:
     return re.sub(r"(\d) (px|m|cm|s|GB|MB)\b", "\\1\u00a0\\2", words)
 
 
+def plain_page(
+    *, title: str, summary: str, version: str, source: str, sections: tuple[Section, ...],
+    tiles: tuple[Tile, ...] = (),
+) -> str:  # fmt: skip
+    """A page of sections without a map; `source` says where the figures lie. Whole in itself."""
+    return _template("plain.html.j2").render(
+        title=title, summary=summary, version=version, source=source, sections=sections, tiles=tiles,
+        style=_asset("style.css"),
+    )  # fmt: skip
+
+
 @cache
-def _template() -> Template:
+def _template(name: str = "page.html.j2") -> Template:
     environment = Environment(
         loader=FileSystemLoader(HERE),
         autoescape=True,
@@ -129,7 +129,7 @@ def _template() -> Template:
         lstrip_blocks=True,
     )
     environment.filters["tied"] = tied
-    return environment.get_template("page.html.j2")
+    return environment.get_template(name)
 
 
 @cache

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from skyquilt.report.page import small_page
+from skyquilt.report.page import plain_page
 from skyquilt.report.parts import Figure, LegendItem, Section, Sentences, Table, Tile
 from skyquilt.report.svg import Axes, drawing, polyline
 
@@ -42,9 +42,9 @@ def strip_page(found: Mapping[str, Any]) -> str:
         f" eta falls from 1 to {ends[0]:.2f} for {worst['name']}, to {ends[-1]:.2f} for {best['name']}."
     )
     sections = (_curves(variants, found["flights"]), _table(variants), _how(found))
-    return small_page(
-        "Strip test", found["version"], summary=summary, tiles=tiles, sections=sections,
-        footer="The figures behind this page are in strip.json.",
+    return plain_page(
+        title="Strip test", version=str(found["version"]), summary=summary, tiles=tuple(tiles), sections=sections,
+        source="The figures behind this page are in strip.json.",
     )  # fmt: skip
 
 
