@@ -94,6 +94,7 @@ def main():
         "| outliers | " + " | ".join(METHODS) + " |",
         "|---" * (len(METHODS) + 1) + "|",
     ]
+    print("\n".join(lines), flush=True)
     for percent in range(0, 81, 10):
         cells = []
         for estimate in METHODS.values():
@@ -106,10 +107,9 @@ def main():
             median = f"{np.median(errors):.2f}" if np.isfinite(np.median(errors)) else "none"
             cells.append(f"{median} / {100 * np.mean(errors <= SUCCESS_PX):.0f} / {1000 * spent.mean():.0f}")
         lines.append(f"| {percent} % | " + " | ".join(cells) + " |")
-    text = "\n".join(lines)
-    print(text)
+        print(lines[-1], flush=True)
     if arguments.output:
-        arguments.output.write_text(text + "\n")
+        arguments.output.write_text("\n".join(lines) + "\n")
 
 
 if __name__ == "__main__":
