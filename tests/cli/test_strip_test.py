@@ -4,6 +4,8 @@ import json
 import subprocess
 import sys
 
+import pytest
+
 
 def skyquilt(*words):
     return subprocess.run(
@@ -11,6 +13,7 @@ def skyquilt(*words):
     )
 
 
+@pytest.mark.slow
 def test_strip_test(tmp_path):
     out = tmp_path / "out"
     done = skyquilt("-o", out, "--photos", 4, "--flights", 1)

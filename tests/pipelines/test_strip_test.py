@@ -16,7 +16,7 @@ from skyquilt.simulate import StripSettings, fly_strip
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("strip") / "out"
-    events = list(iter_strip_test(folder, flights=2))
+    events = list(iter_strip_test(folder, flights=1))
     return folder, events
 
 
@@ -35,12 +35,13 @@ def test_the_order_of_the_thesis(finished):
     assert rms == sorted(rms, reverse=True) and rms[0] > 5 * rms[-1]
     for v in found["variants"]:
         assert len(v["eta"]) == 21 and v["eta"][0] == 1 and 0 < min(v["eta"]) <= max(v["eta"]) <= 1
-    assert isinstance(events[-1], Result) and events[-1].metrics["flights"] == 2
-    assert [e.done for e in events if isinstance(e, StageProgress)] == list(range(1, 15))
+    assert isinstance(events[-1], Result) and events[-1].metrics["flights"] == 1
+    assert [e.done for e in events if isinstance(e, StageProgress)] == list(range(1, 8))
 
 
 def test_the_page_is_whole(finished):
     page = (finished[0] / "report.html").read_text()
+    assert "map" not in re.findall(r'<section id="(\w+)"', page)
     assert page.count("<svg") == 2 and not re.search(r"(src|href)=\"http", page)
     _, found = ends(finished[0])
     for v in found["variants"]:
@@ -57,7 +58,7 @@ def test_a_perfect_camera_over_level_boards_keeps_the_shape(tmp_path):
 
 
 def test_equal_seeds_give_equal_results(tmp_path):
-    settings = StripSettings(photos=4, seed=7)
+    settings = StripSettings(photos=3, seed=7, views=10)
     found = [
         [
             v["eta"]
