@@ -1,6 +1,6 @@
 """SIFT with RootSIFT descriptors, spread over the image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import cv2
@@ -33,6 +33,10 @@ class Sift:
     def __call__(self, image: NDArray) -> Features:
         """Features of pixels (H, W[, C]) of a full sensor image."""
         return self.of_shrunken(shrink(image, self.longest)[0], image.shape[:2])
+
+    def counted(self, count: int) -> "Sift":
+        """The same with another number of keypoints at most."""
+        return replace(self, count=count)
 
     def of_shrunken(self, small: NDArray, full: tuple[int, int]) -> Features:
         """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer to."""
