@@ -20,7 +20,7 @@ def auto():
     return registration_method("auto")
 
 
-@pytest.mark.parametrize(("scale", "degrees"), [(1.0, 0.0), (0.85, 137.0), (1.2, -64.0), (1.0, 180.0)])
+@pytest.mark.parametrize(("scale", "degrees"), [(0.85, 137.0), (1.2, -64.0), (1.0, 180.0)])
 def test_any_rotation_is_found_to_a_part_of_a_pixel(auto, scale, degrees):
     truth = turned(scale, degrees, SHAPE, SHAPE, (9.0, -14.0))
     a, b = pair(truth, seed=int(degrees) % 7)
@@ -100,6 +100,7 @@ def test_unrelated_pictures_are_refused_with_figures(auto, seed):
     assert refused.evidence["surprise"] < 3.5  # well below the 5 that acceptance asks for
 
 
+@pytest.mark.slow
 def test_mirrored_pictures_are_refused(auto):
     a, b = pair(np.eye(3), seed=11)
     assert not auto(Picture(values=a), Picture(values=np.ascontiguousarray(b[:, ::-1])))
@@ -135,6 +136,7 @@ def test_noise_is_refused(auto):
     assert not auto(Picture(values=a), Picture(values=b))
 
 
+@pytest.mark.slow
 def test_a_frame_of_noise_over_a_common_frame_is_refused(auto):
     """A black frame is no picture: two unrelated pictures turned by one angle have it in common."""
     turn = cv2.getRotationMatrix2D((240, 200), 30, 0.8)
