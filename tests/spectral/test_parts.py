@@ -84,7 +84,7 @@ def test_a_correlation_is_the_sum_over_the_overlap(scene, turn):
         )  # counted on a grid of 4 px
 
 
-@pytest.mark.parametrize("degrees", [17.0, 205.0])
+@pytest.mark.parametrize("degrees", [205.0])
 def test_everywhere_has_the_truth_among_its_best(degrees):
     truth = turned_by(1.0, degrees, SHAPE, SHAPE, (12, -8))
     a, b = (of(p, 80.0) for p in pair(truth, seed=1))
@@ -149,7 +149,7 @@ def test_fisher_is_fishers():
 
 def test_agreement_is_uniform_for_unrelated_pictures_and_large_for_related_ones():
     surprises = []
-    for seed in range(12):
+    for seed in range(7):
         a, b = (
             of(np.clip(spectrum(layout(seed=s), s), 0, 255).astype(np.uint8), 200.0)
             for s in (seed, 60 + seed)

@@ -7,8 +7,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.model.registration import RefusedRegistration, Registration
+from skyquilt.model.registration import Matrix, RefusedRegistration, Registration
 from skyquilt.spectral.agreement import Agree, Agreement
+from skyquilt.spectral.orientation import between, full_size
 from skyquilt.spectral.pyramid import Pyramid
 from skyquilt.spectral.sharpen import Fit, Freedom, Sharpen
 
@@ -25,6 +26,8 @@ class Decide:
     """Agreement below which a registration is refused; docs/methods.md says what chance reaches."""
     gain: float = 0.02
     """Relative gain in correlation that a freer model must bring to be preferred."""
+    finest: float = 640.0
+    """Px of the square whose area larger pictures are sharpened at in the end."""
     version: ClassVar[int] = 1
 
     def __call__(self, pyramid: Pyramid, fits: Sequence[Fit]) -> Outcome:
@@ -49,13 +52,21 @@ class Decide:
             other = Sharpen(freedom=freer)(a, b, fit.b_H_a)
             if other.correlation > (1 + self.gain) * fit.correlation:
                 model, fit, agreement = freer, other, self.agree(a, b, other.b_H_a)
-        full = pyramid.full(fit.b_H_a, pyramid.last)
+        full = self._finest(pyramid, pyramid.full(fit.b_H_a, pyramid.last), model)
         to_full = np.linalg.inv(b.small_S_full)
         return Registration(
             model=model, b_H_a=full, evidence=_evidence(agreement, fit),
             px_a=_apply(np.linalg.inv(full) @ to_full, agreement.px),
             px_b=_apply(to_full, agreement.px + agreement.shift),
         )  # fmt: skip
+
+    def _finest(self, pyramid: Pyramid, full: Matrix, model: Freedom) -> Matrix:
+        """The transform sharpened once more where pictures are so large that a pixel of the verdict is many."""
+        larger = pyramid.finest(self.finest)
+        if larger is None:
+            return full
+        fit = Sharpen(freedom=model, steps=3)(*larger, between(*larger, full))
+        return full_size(*larger, fit.b_H_a)
 
 
 def _apply(matrix: NDArray, px: NDArray) -> NDArray:

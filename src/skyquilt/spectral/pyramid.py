@@ -15,6 +15,13 @@ class Pyramid:
         self._pictures, self._sides = (a, b), tuple(sides)
         self._levels: dict[int, tuple[Orientation, Orientation]] = {}
 
+    def finest(self, side: float) -> tuple[Orientation, Orientation] | None:
+        """a and b at a side beyond the last level; None where one of them is not that large."""
+        if any(one.grey.size < side**2 for one in self._pictures):
+            return None
+        a, b = (orientation(p.grey, p.valid, side) for p in self._pictures)
+        return a, b
+
     @property
     def last(self) -> int:
         """The finest level."""
