@@ -134,10 +134,10 @@ def test_what_methods_need_is_said_when_it_is_missing(mosaic, photos):
         4, "positions of at least two flight lines", "--method image"
     )
     two, three, four = (photos.parent / name for name in ("two", "three", "four"))
-    mosaic(photos, "--method", "hybrid", output=two).refused(
+    mosaic(photos, "--method", "hybrid", "--height", "60", output=two).refused(
         4, "places photos by their metadata", "no position"
     )
-    mosaic(photos, "--method", "position", output=three).refused(4, "no position")
+    mosaic(photos, "--method", "position", "--height", "60", output=three).refused(4, "no position")
     told = mosaic(photos, "--method", "image", output=four).made()
     assert told.metrics["crs"] is None and told.metrics["photos_used"] == 9
 
