@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from skyquilt import simulate
-    from skyquilt.config import MosaicSettings, RegisterSettings
+    from skyquilt.config import MosaicSettings
     from skyquilt.errors import SkyquiltError
     from skyquilt.model.camera import Camera
     from skyquilt.model.event import Result
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from skyquilt.model.poses import Alignment
     from skyquilt.photos.survey import read_survey
     from skyquilt.pipelines.mosaic import iter_mosaic, mosaic
-    from skyquilt.pipelines.register import iter_register, register
+    from skyquilt.pipelines.register import register
 
 __version__ = "0.1.0"
 
@@ -25,12 +25,10 @@ _HOME = {
     "Camera": "skyquilt.model.camera",
     "MosaicSettings": "skyquilt.config",
     "Photo": "skyquilt.model.photo",
-    "RegisterSettings": "skyquilt.config",
     "Result": "skyquilt.model.event",
     "SkyquiltError": "skyquilt.errors",
     "Survey": "skyquilt.model.photo",
     "iter_mosaic": "skyquilt.pipelines.mosaic",
-    "iter_register": "skyquilt.pipelines.register",
     "mosaic": "skyquilt.pipelines.mosaic",
     "read_survey": "skyquilt.photos.survey",
     "register": "skyquilt.pipelines.register",
@@ -42,12 +40,10 @@ __all__ = [
     "Camera",
     "MosaicSettings",
     "Photo",
-    "RegisterSettings",
     "Result",
     "SkyquiltError",
     "Survey",
     "iter_mosaic",
-    "iter_register",
     "mosaic",
     "read_survey",
     "register",
