@@ -4,8 +4,8 @@
 
 six-N: N photos in six lines; flightline and bundle, geolocation MAE and RMS per axis against the TRUE positions (which
 the papers could not have), and CPU seconds. loop: the thesis's round trip of 40 planned photos, three lost; each
-method's step where the loop closes: how far apart the first and the last photo put the same ground over level ground (bundle,
-which knows the relief, is not asked; null for others: too far apart to be registered).
+method's step where the loop closes: how far apart the first and the last photo put the same ground over level ground
+(bundle, which knows the relief, is not asked; null for others: too far apart to be registered).
 
 Photos have 640 x 480 px (six lines) and 1600 x 1200 px (loop). A survey is simulated once and kept in the work folder.
 """
@@ -29,7 +29,11 @@ from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
 
 LINES = 6
-METHODS = ("flightline", "bundle")
+METHODS = {
+    "flightline": {"method": "flightline"},
+    "flightline-similarity": {"method": "flightline", "transform": "similarity"},
+    "bundle": {"method": "bundle"},
+}
 LOOP = (
     ("pose", {}), ("image", {}), ("hybrid", {"optimiser": "surfaces"}), ("hybrid-anneal", {"optimiser": "anneal"}),
     ("bundle", {}),
@@ -81,7 +85,7 @@ def six(photos: int, work: Path) -> dict:
         began = time.process_time()
         try:
             result = mosaic(
-                chosen, work / f"six{photos}-{method}", MosaicSettings(method=method), overwrite=True
+                chosen, work / f"six{photos}-{method}", MosaicSettings(**METHODS[method]), overwrite=True
             )
         except SkyquiltError as error:
             found[method] = {"refused": str(error)}
@@ -116,7 +120,8 @@ def loop(work: Path) -> dict:
         solved = {s["properties"]["filename"]: np.array(s["properties"]["translation"]) for s in shots}
         off = np.array([solved[n][:2] - places[n][:2] for n in sorted(solved)])
         found[name] = {
-            "lambda_corr": q["lambda_corr"], "closing_step_m": closing_step(result.output, sorted(solved)) if name != "bundle" else None,
+            "lambda_corr": q["lambda_corr"],
+            "closing_step_m": None if name == "bundle" else closing_step(result.output, sorted(solved)),
             "nadirs_rms_m": round(float(np.sqrt(((off - off.mean(0)) ** 2).sum(1).mean())), 2),
             "align_seconds": result.metrics["seconds"]["align"], "cpu_seconds": result.metrics["cpu_seconds"],
         }  # fmt: skip

@@ -62,8 +62,8 @@ def command(
     transform: Annotated[
         str | None,
         typer.Option(
-            help="How two photos may differ, for method image: translation, similarity, affine, homography.",
-            show_default="similarity",
+            help="How two photos may differ: translation, similarity, affine, homography.",
+            show_default="similarity for image, homography for flightline",
         ),
     ] = None,
     levelled: Annotated[
