@@ -24,7 +24,7 @@ class Assemble:
     """
 
     version: ClassVar[int] = 1
-    power: float = 1.0
+    power: float = 0.5
     """Exponent of 1 / phi."""
     cell_px: int | None = None
     """Side of a cell in px; None = two of the largest squares that the board can have in the frame."""

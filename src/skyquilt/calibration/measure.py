@@ -1,6 +1,8 @@
 """Centroids of squares and inner corners to a fraction of a pixel, once the board's place is known."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -11,7 +13,8 @@ from skyquilt.model.board import Board
 
 Array = NDArray[np.float64]
 Image = NDArray[np.float32]
-_ROUNDS = 3
+_ROUNDS = 2
+_FEWEST = 6
 _AREA = (0.5, 1.5)
 _MARGIN = 0.3
 """Cells around the board that are looked at, so that the outer sides of its squares are seen."""
@@ -19,13 +22,13 @@ _MARGIN = 0.3
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """Where squares and corners lie."""
+    """Where squares lie: blobs, parted where they touch at corners, and the centroids of their hulls."""
 
-    version = 1
-    side_px: float = 48.0
-    """Pictures are enlarged until a square has this side: blobs have whole pixels."""
-    opening: float = 0.25
-    """Radius of erosion and dilation in sides of a square: parts squares that touch at their corners."""
+    version: ClassVar[int] = 1
+    side_px: float = 100.0
+    """Pictures are enlarged until a square has about this side: blobs have whole pixels."""
+    openings: tuple[float, ...] = (0.1, 0.25)
+    """Radii of erosion and dilation in sides of a square; a larger one is tried where squares still cling."""
 
     def centroids(self, image: Image, placed: Placed, board: Board) -> tuple[Array, Array]:
         """Centroids (rows, columns, 2) in px, NaN where none was measured, and the refined px_H_cell."""
@@ -34,46 +37,55 @@ class Measure:
         for _ in range(_ROUNDS):
             px = self._once(image, H, placed.white_first, board)
             known = np.isfinite(px[..., 0])
-            if known.sum() < 6:
-                return px, H
+            if known.sum() < _FEWEST:
+                break
             cells = np.argwhere(known)[:, ::-1].astype(np.float64)
             H = cv2.findHomography(cells, px[known], 0)[0]
         return px, H
 
     def _once(self, image: Image, H: Array, white_first: bool, board: Board) -> Array:
         area = _areas(H, board)
-        factor = int(np.clip(np.ceil(self.side_px / np.sqrt(np.median(area))), 1, 8))
-        part, px_of_part = _enlarged(image, H, board, factor)
-        grid = _grid_of(part.shape, px_of_part, H)
+        side = float(np.sqrt(np.median(area)))
+        factor = int(np.clip(round(self.side_px / side), 1, 8))
+        part, px_H_part = _enlarged(image, H, board, factor)
+        cell = _cell_of(part.shape, px_H_part, H)
+        middle = middle_levels(cell_levels(image, H, board)[0])
         threshold = cv2.remap(
-            middle_levels(cell_levels(image, H, board)[0]), grid[..., 0], grid[..., 1], cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )  # fmt: skip
+            middle, cell[..., 0], cell[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
         size = np.array([board.columns, board.rows], np.float32)
-        inside = np.all((grid > -0.5 - _MARGIN) & (grid < size - 0.5 + _MARGIN), -1)
-        radius = max(1, round(self.opening * factor * float(np.sqrt(np.median(area)))))
-        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2)
+        near = np.all((cell > -0.5 - _MARGIN) & (cell < size - 0.5 + _MARGIN), -1)
         out = np.full((board.rows, board.columns, 2), np.nan)
-        for white in (True, False):
-            colour = ((part > threshold) == white) & inside
-            opened = cv2.morphologyEx(colour.view(np.uint8), cv2.MORPH_OPEN, disc)
-            outlines = cv2.findContours(opened, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
-            for outline in outlines:
-                hull = cv2.convexHull(outline)
-                moments = cv2.moments(hull)
-                if moments["m00"] <= 0:
-                    continue
-                centre = through(
-                    px_of_part, np.array([[moments["m10"], moments["m01"]]]) / moments["m00"]
-                )
-                column, row = np.rint(through(np.linalg.inv(H), centre)[0]).astype(int)
-                if not (0 <= column < board.columns and 0 <= row < board.rows):
-                    continue
-                own = ((row + column) % 2 == 0) == (white_first == white)
-                share = (np.sqrt(moments["m00"]) + 1) ** 2 / factor**2 / area[row, column]
-                if own and _AREA[0] < share < _AREA[1]:
-                    out[row, column] = centre[0]
+        for opening in self.openings:
+            for white in (True, False):
+                colour = opened(((part > threshold) == white) & near, opening * side * factor)
+                for centre, share in _hulls(colour, px_H_part):
+                    column, row = np.rint(through(np.linalg.inv(H), centre[None])[0]).astype(int)
+                    if not (0 <= column < board.columns and 0 <= row < board.rows):
+                        continue
+                    own = ((row + column) % 2 == 0) == (white_first == white)
+                    fits = _AREA[0] < share / area[row, column] < _AREA[1]
+                    if own and fits and np.isnan(out[row, column, 0]):
+                        out[row, column] = centre
         return out
+
+
+def opened(mask: NDArray[np.bool_], radius: float) -> NDArray[np.uint8]:
+    """Erosion and dilation by a disc (radius in px), by distances: exact for any radius and equally fast."""
+    parts = cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) > radius
+    away = cv2.distanceTransform((~parts).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(away < radius, np.uint8)
+
+
+def _hulls(blobs: NDArray[np.uint8], px_H_part: Array) -> Iterator[tuple[Array, float]]:
+    """Centroid (2,) in px and area in px^2 of the convex hull of each blob [Suzuki's outlines]."""
+    scale = float(px_H_part[0, 0])
+    for outline in cv2.findContours(blobs, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
+        moments = cv2.moments(cv2.convexHull(outline))
+        if moments["m00"] > 0:
+            centre = np.array([[moments["m10"], moments["m01"]]]) / moments["m00"]
+            # the outline runs through the middles of the outermost pixels
+            yield through(px_H_part, centre)[0], ((np.sqrt(moments["m00"]) + 1) * scale) ** 2
 
 
 def corners(image: Image, px_H_cell: Array, board: Board) -> Array:
@@ -126,7 +138,7 @@ def _enlarged(image: Image, H: Array, board: Board, factor: int) -> tuple[Image,
     return part, np.array([[1 / factor, 0, x0 + offset], [0, 1 / factor, y0 + offset], [0, 0, 1]])
 
 
-def _grid_of(shape: tuple[int, ...], px_H_part: Array, px_H_cell: Array) -> Image:
+def _cell_of(shape: tuple[int, ...], px_H_part: Array, px_H_cell: Array) -> Image:
     """(column, row) of the board at every pixel (h, w, 2)."""
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]]
     cell_H_part = np.linalg.inv(px_H_cell) @ px_H_part

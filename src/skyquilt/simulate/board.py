@@ -12,7 +12,7 @@ from skyquilt.simulate.grid import Doubles, Floats
 
 _STEP = 0.004
 """Side in m of the board's texture cells, per 0.1 m of a square."""
-_OVER = 3
+_OVER = 2
 """Rays per pixel and axis."""
 
 
@@ -128,13 +128,16 @@ def _cell(board: Chessboard) -> float:
 
 
 def _ink(board: Chessboard) -> Floats:
-    """1 for black, 0 for white, on a raster over the board and its rim."""
-    cell = _cell(board)
-    x = (np.arange(round((board.columns * board.square + 2 * board.margin) / cell)) + 0.5) * cell - board.margin
-    y = (np.arange(round((board.rows * board.square + 2 * board.margin) / cell)) + 0.5) * cell - board.margin
+    """1 for black, 0 for white, on a raster over the board and its rim; shares where an edge crosses a cell."""
+    cell, fine = _cell(board), 8
+    x, y = (
+        (np.arange(round((n * board.square + 2 * board.margin) / cell) * fine) + 0.5) * cell / fine - board.margin
+        for n in (board.columns, board.rows)
+    )
     i, j = np.floor(x / board.square).astype(int), np.floor(y / board.square).astype(int)
     on = ((i >= 0) & (i < board.columns))[None, :] & ((j >= 0) & (j < board.rows))[:, None]
-    return np.asarray(on & ((i[None, :] + j[:, None]) % 2 == 1), np.float32)
+    black = (on & ((i[None, :] + j[:, None]) % 2 == 1)).astype(np.float32)
+    return np.asarray(black.reshape(len(y) // fine, fine, len(x) // fine, fine).mean((1, 3)), np.float32)
 
 
 def _rays_on_board(lens: Lens, board: Chessboard, pose: BoardPose) -> Floats:
