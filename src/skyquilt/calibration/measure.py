@@ -16,6 +16,10 @@ Image = NDArray[np.float32]
 _ROUNDS = 2
 _FEWEST = 6
 _AREA = (0.5, 1.5)
+_SMOOTH, _BESIDE, _AROUND = 0.03, 0.2, 0.6
+"""Radii in sides of a square: of smoothing, of what lies beside an edge, of what surely holds black and white."""
+_STEP = 0.6
+"""Share of the contrast around that an edge must have."""
 _MARGIN = 0.3
 """Cells around the board that are looked at, so that the outer sides of its squares are seen."""
 
@@ -49,10 +53,7 @@ class Measure:
         factor = int(np.clip(round(self.side_px / side), 1, 8))
         part, px_H_part = _enlarged(image, H, board, factor)
         cell = _cell_of(part.shape, px_H_part, H)
-        middle = middle_levels(cell_levels(image, H, board)[0])
-        threshold = cv2.remap(
-            middle, cell[..., 0], cell[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
+        threshold = half_way(part, middle_levels(cell_levels(image, H, board)[0]), cell, side * factor)
         size = np.array([board.columns, board.rows], np.float32)
         near = np.all((cell > -0.5 - _MARGIN) & (cell < size - 0.5 + _MARGIN), -1)
         out = np.full((board.rows, board.columns, 2), np.nan)
@@ -68,6 +69,26 @@ class Measure:
                     if own and fits and np.isnan(out[row, column, 0]):
                         out[row, column] = centre
         return out
+
+
+def half_way(image: Image, middle: Image, cell: Image, side: float) -> Image:
+    """Between black and white (h, w) at every pixel: at an edge half-way between what lies on both sides of it,
+    so that uneven heat does not move it; elsewhere between the levels of whole squares, `middle` (rows, columns).
+
+    `cell` (h, w, 2) says which square a pixel is of, `side` is that of a square in px.
+    """
+    whole = cv2.remap(middle, cell[..., 0], cell[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    smooth = cv2.GaussianBlur(image, (0, 0), _SMOOTH * side)
+    low, high = _extremes(smooth, _BESIDE * side)
+    darkest, brightest = _extremes(smooth, _AROUND * side)
+    at_edge = high - low > _STEP * (brightest - darkest)
+    return np.asarray(np.where(at_edge, (low + high) / 2, whole), np.float32)
+
+
+def _extremes(image: Image, radius: float) -> tuple[Image, Image]:
+    """Least and largest value around every pixel (h, w)."""
+    kernel = np.ones((2 * max(1, round(radius)) + 1,) * 2, np.uint8)
+    return cv2.erode(image, kernel), cv2.dilate(image, kernel)
 
 
 def opened(mask: NDArray[np.bool_], radius: float) -> NDArray[np.uint8]:
