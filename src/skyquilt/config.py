@@ -2,14 +2,21 @@
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from skyquilt.alignment.bundle import Bundle
+from skyquilt.alignment.by_flightline import ByFlightline
+from skyquilt.alignment.chain import Chain
+from skyquilt.alignment.hybrid import Hybrid
+from skyquilt.alignment.optimise import Anneal, Surfaces
+from skyquilt.alignment.overview import ByOverview
 from skyquilt.alignment.pose import ByPose, ByPosition
 from skyquilt.errors import UsageError
 from skyquilt.features.sift import Sift
+from skyquilt.geometry.transforms import Model
+from skyquilt.matching.best import Best
 from skyquilt.matching.mutual import Mutual
 from skyquilt.pairs.nearest import Nearest
 from skyquilt.pairs.retrieval import Retrieval
@@ -17,10 +24,27 @@ from skyquilt.render.blend import Average, Blend, Feather, First, Multiband
 from skyquilt.render.exposure import Balance
 from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints
+from skyquilt.twoview.ransac import Ransac
+from skyquilt.twoview.rescued import Rescued
+from skyquilt.twoview.ste import RansacSte
 from skyquilt.twoview.verify import Verify
 
-METHODS = ("auto", "bundle", "pose", "position")
-BLENDS = {"feather": Feather, "first": First, "average": Average, "multiband": Multiband}
+METHODS = ("auto", "bundle", "position", "pose", "image", "hybrid", "flightline")
+BY_METADATA = ("position", "pose", "hybrid")
+"""Methods that place photos by metadata, which links may repair."""
+IN_SEQUENCE = ("image", "hybrid", "flightline")
+"""Methods that take photos one after the other."""
+TRANSFORMS = ("translation", "similarity", "affine", "homography")
+IMAGE_SEARCHES = ("chain", "overview")
+OPTIMISERS = ("anneal", "surfaces")
+LINES = ("heading", "distance")
+VLFEAT = 1.5**-0.5
+"""Ratio of distances that VLFeat's matcher asks for."""
+SECOND_PX2 = 12.0
+"""STE of an inlier, px^2 at 1500 px, where the threshold by deviations fails: 5.99 times one px, both ways."""
+LEAST_INLIERS = 12
+"""Matches that must agree before two photos count as registered."""
+BLENDS: dict[str, type[Blend]] = {"feather": Feather, "first": First, "average": Average, "multiband": Multiband}
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
 DISTORTIONS = ("none", "2", "4", "6", "6t")
@@ -48,8 +72,8 @@ class MosaicSettings:
     """Polygon that the map is cut to."""
     surface: str = "sweep"
     """One of `SURFACES`: heights from tie points alone, or refined by a plane sweep."""
-    blend: str = "feather"
-    """One of `BLENDS`."""
+    blend: str = "auto"
+    """One of `BLENDS`; auto = feather, and average for method `flightline`, whose blend it is."""
     feather_px: float = 6.0
     """Width of feathered seams in map pixels."""
     balance: bool = True
@@ -58,12 +82,34 @@ class MosaicSettings:
     """One of `COMPRESSIONS`; auto = JPEG for 8-bit pictures, zstd for measured values."""
     quality: int = 85
     """JPEG quality."""
-    distortion: str = "4"
-    """One of `DISTORTIONS`: what self-calibration may change of the lens model."""
+    distortion: str | None = None
+    """One of `DISTORTIONS`: what self-calibration may change of the lens model (None = 4), or, for methods that
+    do not calibrate, the order fitted to a calibration that photos bring along (None = 6t; `flightline` none).
+    """
+    transform: str | None = None
+    """One of `TRANSFORMS`: how two photos may differ, for method `image`; None = similarity."""
+    levelled: bool = True
+    """Method `image` registers by features of the dominant plane only."""
+    image_search: str = "chain"
+    """One of `IMAGE_SEARCHES`: against the last photo, or against the whole map so far, for method `image`."""
+    relief_m: float | None = None
+    """Largest height variation on the ground in m; None = a tenth of the flying height."""
+    alpha: float = 0.5
+    """Weight of distances against looks in lambda (Y 4.6), for method `hybrid`."""
+    optimiser: str = "anneal"
+    """One of `OPTIMISERS`: how `hybrid` maximises lambda."""
+    seed: int = 0
+    """Of everything random in methods `image`, `hybrid`, `flightline`."""
+    sequence: str = "time"
+    """Order in which photos are joined: time, name, or a file of names."""
+    lines: str = "heading"
+    """One of `LINES`: how method `flightline` tells lines apart."""
+    distances: Path | None = None
+    """Known distances (CSV) by which the map is judged."""
     height_m: float | None = None
     """Height above ground for methods without tie points, where altitudes do not tell it."""
-    heading_deg: float = 0.0
-    """Common heading for method `position`."""
+    heading_deg: float | None = None
+    """Common heading for method `position`; None = the commonest reported one, north where none is."""
     repair: bool = True
     """Treat metadata as measurements that may lie."""
     features: int = 1500
@@ -76,14 +122,19 @@ class MosaicSettings:
     def __post_init__(self) -> None:
         _one_of("--method", self.method, METHODS)
         _one_of("--surface", self.surface, SURFACES)
-        _one_of("--blend", self.blend, BLENDS)
+        _one_of("--blend", self.blend, ("auto", *BLENDS))
         _one_of("--compress", self.compress, COMPRESSIONS)
-        _one_of("--distortion", self.distortion, DISTORTIONS)
+        _one_of("--distortion", self.distortion or "4", DISTORTIONS)
+        _one_of("--transform", self.transform or "similarity", TRANSFORMS)
+        _one_of("--image-search", self.image_search, IMAGE_SEARCHES)
+        _one_of("--optimiser", self.optimiser, OPTIMISERS)
+        _one_of("--lines", self.lines, LINES)
         for name, value, low, high in (
             ("--gsd", self.gsd_cm, 0.05, 10000), ("--quality", self.quality, 1, 100),
             ("--height", self.height_m, 0.5, 1e5), ("--memory", self.memory_gb, 0.5, 4096),
             ("--jobs", self.jobs, 0, 1024), ("--features", self.features, 100, 50000),
             ("--feather", self.feather_px, 0, 10000), ("--heading", self.heading_deg, -360, 360),
+            ("--alpha", self.alpha, 0, 1), ("--relief", self.relief_m, 0, 1e4), ("--seed", self.seed, 0, 2**32 - 1),
         ):  # fmt: skip
             if value is not None and not low <= value <= high:
                 raise UsageError(f"{name} {value} lies outside {low} to {high}")
@@ -127,6 +178,12 @@ class Methods:
     """Alignment from metadata."""
     by_position: ByPosition
     """Alignment from positions."""
+    by_image: Chain | ByOverview
+    """Alignment from pixels alone."""
+    hybrid: Hybrid
+    """Alignment from metadata, corrected by pixels."""
+    by_flightline: ByFlightline
+    """Alignment of flight lines."""
     surface: FromTiePoints
     """Heights."""
     sweep: Sweep | None
@@ -139,15 +196,48 @@ class Methods:
 
 def methods(settings: MosaicSettings) -> Methods:
     """The methods that settings name."""
-    blend: Blend = (
-        Feather(width_px=settings.feather_px) if settings.blend == "feather" else BLENDS[settings.blend]()
-    )
+    flightline = settings.method == "flightline"
+    blend = ("average" if flightline else "feather") if settings.blend == "auto" else settings.blend
+    # the thresholds of flight lines are meant for pictures of 1500 px
+    sift = Sift(count=max(settings.features, 4000), longest=1500) if flightline else Sift(count=settings.features)
     return Methods(
-        sift=Sift(count=settings.features), nearest=Nearest(), retrieval=Retrieval(), mutual=Mutual(),
+        sift=sift, nearest=Nearest(), retrieval=Retrieval(), mutual=Mutual(),
         verify=Verify(),
-        bundle=Bundle(distortion=settings.distortion, repair=settings.repair),
+        bundle=Bundle(distortion=settings.distortion or "4", repair=settings.repair),
         by_pose=ByPose(height_m=settings.height_m),
         by_position=ByPosition(height_m=settings.height_m, heading_deg=settings.heading_deg),
+        by_image=_by_image(settings), hybrid=_hybrid(settings), by_flightline=_by_flightline(settings),
         surface=FromTiePoints(), sweep=Sweep() if settings.surface == "sweep" else None, balance=Balance(),
-        blend=blend,
+        blend=Feather(width_px=settings.feather_px) if blend == "feather" else BLENDS[blend](),
+    )  # fmt: skip
+
+
+def _by_image(settings: MosaicSettings) -> Chain | ByOverview:
+    model = cast(Model, settings.transform or "similarity")
+    order, height = settings.distortion or "6t", settings.height_m
+    if settings.image_search == "overview":
+        estimate = Ransac(model=model, threshold_px=3.0, minimum=LEAST_INLIERS, seed=settings.seed)
+        level = None
+        return ByOverview(
+            detect=Sift(longest=1_000_000), match=Mutual(), estimate=estimate, level=level, distortion=order,
+            height_m=height,
+        )  # fmt: skip
+    estimate = Ransac(model=model, threshold_px=6.0, minimum=LEAST_INLIERS, seed=settings.seed)
+    level = None
+    return Chain(match=Mutual(), estimate=estimate, level=level, distortion=order, height_m=height)
+
+
+def _hybrid(settings: MosaicSettings) -> Hybrid:
+    optimise = Anneal() if settings.optimiser == "anneal" else Surfaces()
+    return Hybrid(optimise=optimise, alpha=settings.alpha, seed=settings.seed)
+
+
+def _by_flightline(settings: MosaicSettings) -> ByFlightline:
+    estimate = Rescued(
+        first=RansacSte(seed=settings.seed),
+        second=RansacSte(threshold_px2=SECOND_PX2, minimum=LEAST_INLIERS, seed=settings.seed),
+    )
+    return ByFlightline(
+        within=Best(count=150, ratio=VLFEAT), across=Best(count=50, ratio=VLFEAT), estimate=estimate,
+        split="distance" if settings.lines == "distance" else "heading", distortion=settings.distortion or "none",
     )  # fmt: skip

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from skyquilt.features.sift import Sift, _spread
+from skyquilt.features.sift import Sift
+from skyquilt.features.spread import spread
 from skyquilt.imaging.grey import full_px, shrink, to_grey8
 from skyquilt.matching.mutual import Mutual
 from skyquilt.model.features import DESCRIPTOR_UNIT
@@ -80,7 +81,7 @@ def test_spreading_keeps_the_strongest_of_every_cell():
     rng = np.random.default_rng(0)
     xy = rng.uniform(0, 1, (5000, 2)) ** 3 * (640, 480)  # crowded in one corner
     response = rng.random(5000)
-    keep = _spread(xy, response, (480, 640), 600, 10)
+    keep = spread(xy, response, (480, 640), 600, 10)
     assert len(keep) == 600 == len(set(keep.tolist()))
     cell = (xy / (640, 480) * 10).astype(int) @ (1, 10)
     crowd, kept = np.bincount(cell, minlength=100), np.bincount(cell[keep], minlength=100)
@@ -93,7 +94,7 @@ def test_spreading_keeps_the_strongest_of_every_cell():
         )
         if len(mine) and len(lost):
             assert response[mine].min() >= response[lost].max()
-    assert (_spread(xy[:10], response[:10], (480, 640), 600, 10) == np.arange(10)).all()
+    assert (spread(xy[:10], response[:10], (480, 640), 600, 10) == np.arange(10)).all()
 
 
 @pytest.mark.xfail(

@@ -16,8 +16,8 @@ YAW_DEG = 15.0
 def conflicts(
     photos: Sequence[Photo], priors: Sequence[Prior], alignment: Alignment
 ) -> list[MetadataConflict]:
-    """All contradictions of photos that tie points hold, in order of capture."""
-    held = alignment.held
+    """All contradictions of photos that pixels hold to others, in order of capture."""
+    held = alignment.held or (tuple(sorted(alignment.poses)) if alignment.method == "pose" else ())
     found = [c for i in held for c in _yaw(photos[i], priors[i], alignment, i)]
     if alignment.frame.crs is not None:
         found += _altitudes(photos, priors, alignment, held) + _positions(photos, priors, alignment, held)

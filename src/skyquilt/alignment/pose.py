@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.frames import cam_R_map_from_angles
@@ -28,11 +29,16 @@ class ByMetadata:
 
     height_m: float | None = None
     """Height above ground in m where altitudes do not tell it; None = heights above take-off."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: ClassVar[str] = "pose"
 
-    def __call__(self, photos: Sequence[Photo], frame: MapFrame, priors: Sequence[Prior]) -> Alignment:
+    def __call__(
+        self, photos: Sequence[Photo], frame: MapFrame, priors: Sequence[Prior],
+        heights_m: NDArray[np.float64] | None = None,
+    ) -> Alignment:  # fmt: skip
         """Places all photos that have a position; one without any survives alone in a frame of its own.
+
+        `heights_m` (n,): heights above ground known better than from metadata, NaN where they are not.
 
         Raises:
             AlignmentError: positions or the height above ground are missing.
@@ -44,7 +50,7 @@ class ByMetadata:
                 cam_R_map=cam_R_map_from_angles(0.0), map_C=np.array([0.0, 0.0, self.height_m or 50.0])
             )
         else:
-            heights = self._heights(frame, priors)
+            heights = self._heights(frame, priors, heights_m)
             poses, rejected = self._placed(photos, priors, heights)
         if not poses:
             raise AlignmentError(_nothing_placed(self.name, len(photos), rejected))
@@ -57,8 +63,12 @@ class ByMetadata:
             ties=no_ties(), rejected=rejected,
         )  # fmt: skip
 
-    def _heights(self, frame: MapFrame, priors: Sequence[Prior]) -> np.ndarray:
+    def _heights(
+        self, frame: MapFrame, priors: Sequence[Prior], known: NDArray[np.float64] | None
+    ) -> NDArray[np.float64]:
         """Camera heights (n,) in m above the ground, which is level at z = 0."""
+        if self.height_m is None and known is not None and np.isfinite(known).any():
+            return np.where(np.isfinite(known), known, np.nanmedian(known))
         z = np.array([p.map_C[2] for p in priors])
         if self.height_m is not None:
             return (
@@ -76,7 +86,7 @@ class ByMetadata:
         return np.where(np.isfinite(z), z, np.nanmedian(z) if np.isfinite(z).any() else np.nan)
 
     def _placed(
-        self, photos: Sequence[Photo], priors: Sequence[Prior], heights: np.ndarray
+        self, photos: Sequence[Photo], priors: Sequence[Prior], heights: NDArray[np.float64]
     ) -> tuple[dict[int, Pose], dict[int, str]]:
         poses, rejected = {}, {}
         for i, prior in enumerate(priors):
@@ -90,7 +100,7 @@ class ByMetadata:
                 poses[i] = self._pose(prior, heights, i)
         return poses, rejected
 
-    def _pose(self, prior: Prior, heights: np.ndarray, i: int) -> Pose:
+    def _pose(self, prior: Prior, heights: NDArray[np.float64], i: int) -> Pose:
         R = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
         return Pose(cam_R_map=R, map_C=np.array([prior.map_C[0], prior.map_C[1], heights[i]]))
 
@@ -118,18 +128,31 @@ class ByPose(ByMetadata):
 class ByPosition(ByMetadata):
     """`position`: translations only, one common scale and one survey heading (Y 4.2)."""
 
-    heading_deg: float = 0.0
-    """Grid heading of every photo's image top in degrees clockwise from north."""
+    heading_deg: float | None = None
+    """Grid heading of every photo's image top in degrees clockwise from north; None = the commonest reported one,
+    north where none is reported.
+    """
     name: ClassVar[str] = "position"
 
     def _placed(
-        self, photos: Sequence[Photo], priors: Sequence[Prior], heights: np.ndarray
+        self, photos: Sequence[Photo], priors: Sequence[Prior], heights: NDArray[np.float64]
     ) -> tuple[dict[int, Pose], dict[int, str]]:
         common = float(np.median(heights))
-        R = cam_R_map_from_angles(self.heading_deg)
+        R = cam_R_map_from_angles(self._heading(priors))
         poses = {
             i: Pose(cam_R_map=R, map_C=np.array([p.map_C[0], p.map_C[1], common]))
             for i, p in enumerate(priors)
             if np.isfinite(p.map_C[:2]).all()
         }
         return poses, {i: "it has no position" for i in range(len(photos)) if i not in poses}
+
+    def _heading(self, priors: Sequence[Prior]) -> float:
+        """The survey's heading in degrees: the reported one that most others agree with, and their mean."""
+        if self.heading_deg is not None:
+            return self.heading_deg
+        yaw = np.array([p.yaw_deg for p in priors])
+        unit = np.exp(1j * np.radians(yaw[np.isfinite(yaw)]))
+        if not unit.size:
+            return 0.0
+        near = np.abs(unit[:, None] - unit[None]) < np.radians(20)
+        return float(np.degrees(np.angle(unit[near[near.sum(1).argmax()]].mean())))

@@ -13,7 +13,10 @@ def command(
     photos: Annotated[Path, typer.Argument(help="Folder of photos (subfolders included).")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
     method: Annotated[
-        str, typer.Option(help="How photos are aligned: auto, bundle, pose, position.")
+        str,
+        typer.Option(
+            help="How photos are aligned: auto, bundle, position, pose, image, hybrid, flightline."
+        ),
     ] = "auto",
     gsd: Annotated[
         float | None, typer.Option(help="Ground size of a map pixel in cm.", show_default="the photos' own")
@@ -40,8 +43,8 @@ def command(
         str, typer.Option(help="Heights: ties (tie points alone) or sweep (refined from the pictures).")
     ] = "sweep",
     blend: Annotated[
-        str, typer.Option(help="Where photos meet: feather, first, average, multiband.")
-    ] = "feather",
+        str, typer.Option(help="Where photos meet: auto, feather, first, average, multiband.")
+    ] = "auto",
     feather: Annotated[float, typer.Option(help="Width of feathered seams in map pixels.")] = 6.0,
     balance: Annotated[
         bool, typer.Option("--balance/--no-balance", help="Bring photos to one brightness.")
@@ -51,15 +54,73 @@ def command(
     ] = "auto",
     quality: Annotated[int, typer.Option(help="JPEG quality.")] = 85,
     distortion: Annotated[
-        str, typer.Option(help="Lens terms to calibrate: none, 2, 4, 6 (radial order), 6t (and tangential).")
-    ] = "4",
+        str | None,
+        typer.Option(
+            help="Lens terms to calibrate, or, for methods that do not, to keep of a known calibration: none, 2, 4,"
+            " 6 (radial order), 6t (and tangential).",
+            show_default="4 to calibrate, 6t to keep",
+        ),
+    ] = None,
+    transform: Annotated[
+        str | None,
+        typer.Option(
+            help="How two photos may differ, for method image: translation, similarity, affine, homography.",
+            show_default="similarity",
+        ),
+    ] = None,
+    levelled: Annotated[
+        bool,
+        typer.Option(
+            "--levelled/--no-levelled", help="Register by features of the dominant plane, for method image."
+        ),
+    ] = True,
+    image_search: Annotated[
+        str,
+        typer.Option(
+            help="What method image registers a photo to: chain (the last photo), overview (the whole map so far)."
+        ),
+    ] = "chain",
+    relief: Annotated[
+        float | None,
+        typer.Option(
+            help="Largest height variation on the ground in m, for --levelled.",
+            show_default="a tenth of the height",
+        ),
+    ] = None,
+    alpha: Annotated[
+        float, typer.Option(help="Weight of distances against looks, 0 to 1, for method hybrid.")
+    ] = 0.5,
+    optimiser: Annotated[
+        str,
+        typer.Option(help="How method hybrid searches: anneal (simulated annealing), surfaces (correlation)."),
+    ] = "anneal",
+    seed: Annotated[int, typer.Option(help="Of everything random; equal seeds give equal maps.")] = 0,
+    sequence: Annotated[
+        str,
+        typer.Option(
+            help="Order that methods image, hybrid and flightline take photos in: time, name, or a file of names."
+        ),
+    ] = "time",
+    lines: Annotated[
+        str,
+        typer.Option(
+            help="How method flightline tells lines apart: heading, or distance (as in the paper)."
+        ),
+    ] = "heading",
+    distances: Annotated[
+        Path | None,
+        typer.Option(help="Known distances (CSV: point_a, point_b, metres) by which the map is judged."),
+    ] = None,
     height: Annotated[
         float | None,
-        typer.Option(help="Height above ground in m, for methods pose and position."),
+        typer.Option(help="Height above ground in m, for methods that do not find it."),
     ] = None,
     heading: Annotated[
-        float, typer.Option(help="Heading of all photos in degrees, for method position.")
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            help="Heading of all photos in degrees, for method position.", show_default="the commonest reported"
+        ),
+    ] = None,
     repair: Annotated[
         bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")
     ] = True,
@@ -99,9 +160,10 @@ def command(
         method=method, gsd_cm=gsd, crs=crs, gcp=gcp, geo=geo, cameras=cameras, bounds=parse_bounds(bounds),
         boundary=boundary, surface=surface, blend=blend, feather_px=feather, balance=balance,
         compress=compress, quality=quality,
-        distortion=distortion, height_m=height, heading_deg=heading, repair=repair, features=features,
-        jobs=jobs,
-        memory_gb=memory,
+        distortion=distortion, transform=transform, levelled=levelled, image_search=image_search,
+        relief_m=relief, alpha=alpha, optimiser=optimiser, seed=seed, sequence=sequence, lines=lines,
+        distances=distances, height_m=height, heading_deg=heading, repair=repair, features=features,
+        jobs=jobs, memory_gb=memory,
     )  # fmt: skip
     events = iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
     show(events, mode="quiet" if quiet else "json" if json else "verbose" if verbose else "normal")

@@ -1,12 +1,13 @@
 """SIFT with RootSIFT descriptors, spread over the image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.features.spread import spread
 from skyquilt.imaging.grey import full_px, shrink, to_grey8
 from skyquilt.model.features import DESCRIPTOR_UNIT, Features
 
@@ -29,6 +30,10 @@ class Sift:
         """Features of pixels (H, W[, C]) of a full sensor image."""
         return self.of_shrunken(shrink(image, self.longest)[0], image.shape[:2])
 
+    def counted(self, count: int) -> "Sift":
+        """The same with another number of keypoints at most."""
+        return replace(self, count=count)
+
     def of_shrunken(self, small: NDArray, full: tuple[int, int]) -> Features:
         """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer to."""
         grey = to_grey8(small)
@@ -39,7 +44,7 @@ class Sift:
         points, found = detector.detectAndCompute(grey, None)
         descriptors = np.zeros((0, 128), np.float32) if found is None else np.asarray(found, np.float32)
         xy = np.array([p.pt for p in points], np.float64).reshape(-1, 2)
-        keep = _spread(xy, np.array([p.response for p in points]), grey.shape, self.count, self.cells)
+        keep = spread(xy, np.array([p.response for p in points]), grey.shape, self.count, self.cells)
         scale = full[1] / grey.shape[1]
         size = np.array([p.size for p in points], np.float32)[keep] * scale
         px = full_px(xy[keep], grey.shape, full)
@@ -50,18 +55,3 @@ def _root(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
     """RootSIFT: L1-normalised, then the square root, which has unit length; 8 bits hold it (see Features)."""
     total = np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
     return np.clip(np.rint(DESCRIPTOR_UNIT * np.sqrt(descriptors / total)), 0, 255).astype(np.uint8)
-
-
-def _spread(
-    xy: NDArray, response: NDArray, shape: tuple[int, int], count: int, cells: int
-) -> NDArray[np.int64]:
-    """Indices of `count` points: round after round the strongest left in every cell of the image."""
-    if len(xy) <= count:
-        return np.arange(len(xy))
-    column, row = (xy / (shape[1], shape[0]) * cells).astype(int).clip(0, cells - 1).T
-    cell = row * cells + column
-    order = np.lexsort((-response, cell))
-    starts = np.flatnonzero(np.r_[True, np.diff(cell[order]) != 0])
-    rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
-    best = np.lexsort((-response[order], rank))[:count]
-    return np.sort(order[best])

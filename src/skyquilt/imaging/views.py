@@ -71,6 +71,8 @@ def footprint(camera: Camera, pose: Pose, surface: Surface, *, per_side: int = 8
     rim = np.concatenate(
         [np.c_[s * w, 0 * s], np.c_[0 * s + w, s * h], np.c_[w - s * w, 0 * s + h], np.c_[0 * s, h - s * h]]
     )
+    if pose.cam_H_map is not None:
+        return _planar_footprint(rays(camera, rim), pose.cam_H_map)
     direction = rays(camera, rim) @ pose.cam_R_map
     if (direction[:, 2] > -0.1).any():
         return np.zeros((0, 2))
@@ -79,6 +81,14 @@ def footprint(camera: Camera, pose: Pose, surface: Surface, *, per_side: int = 8
         drop = (surface.at(xy[:, 0], xy[:, 1]) - pose.map_C[2]) / direction[:, 2]
         xy = pose.map_C[:2] + direction[:, :2] * drop[:, None]
     return np.asarray(xy)
+
+
+def _planar_footprint(rim: NDArray, cam_H_map: NDArray) -> NDArray[np.float64]:
+    """Rim (n, 3) of the image plane on the map (n, 2) in m; empty if some of it lies beyond the horizon."""
+    xyw = rim @ np.linalg.inv(cam_H_map).T
+    if (xyw[:, 2] * np.sign(np.median(xyw[:, 2])) <= 1e-9).any():
+        return np.zeros((0, 2))
+    return np.asarray(xyw[:, :2] / xyw[:, 2:])
 
 
 def make_views(alignment: Alignment, surface: Surface) -> list[View]:
@@ -94,7 +104,7 @@ def make_views(alignment: Alignment, surface: Surface) -> list[View]:
 def project_nodes(view: View, x: NDArray, y: NDArray, z: NDArray) -> Nodes:
     """Nodes at map coordinates (r, c): photo pixels and scores."""
     d = np.stack([x, y, z], -1) - view.pose.map_C
-    local = d @ view.pose.cam_R_map.T
+    local = view.pose.to_camera(np.stack([x, y, z], -1))
     depth = np.maximum(local[..., 2], 1e-3)
     plane = local[..., :2] / depth[..., None]
     k = view.camera.vector

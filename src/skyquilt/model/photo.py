@@ -175,3 +175,19 @@ class ControlPoint:
     """Standard deviation of each coordinate in m."""
     check: bool = False
     """True: kept out of the adjustment, used to judge it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class KnownDistance:
+    """A distance measured on the ground, by which maps are judged (Y 6.1)."""
+
+    a: str
+    """Label of one end."""
+    b: str
+    """Label of the other."""
+    metres: float
+    """Length in m."""
+    observations_a: tuple[PointObservation, ...]
+    """Where a was seen."""
+    observations_b: tuple[PointObservation, ...]
+    """Where b was seen."""

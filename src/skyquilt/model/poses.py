@@ -57,9 +57,15 @@ class Pose:
     """(3, 3) rotation from map to camera."""
     map_C: Array
     """(3,) centre of projection in m in the map frame."""
+    cam_H_map: Array | None = None
+    """(3, 3) for methods that place photos in the plane, not in space: takes (x, y, 1) of the map to the
+    undistorted image plane, whatever the height; rotation and centre are then those of the nearest vertical view.
+    """
 
     def to_camera(self, xyz_map: Array) -> Array:
-        """Points (..., 3) in the map frame in camera coordinates."""
+        """Points (..., 3) in the map frame in camera coordinates (for a photo placed in the plane: up to scale)."""
+        if self.cam_H_map is not None:
+            return np.asarray(xyz_map[..., :2] @ self.cam_H_map[:, :2].T + self.cam_H_map[:, 2])
         return np.asarray((xyz_map - self.map_C) @ self.cam_R_map.T)
 
 
@@ -96,6 +102,32 @@ class ControlResidual:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Join:
+    """How a method that adds one photo after the other joined this one to those before it."""
+
+    photo: int
+    """Index of the photo."""
+    onto: int
+    """Index of the photo it was registered to; -1 = the map so far."""
+    matches: int
+    """Putative correspondences, or 0 where pixels were compared."""
+    inliers: int
+    """Those that agree with the transformation."""
+    ste_px2: float
+    """Symmetric transfer error per inlier in px^2 (A 15) of the working image; NaN where pixels were compared."""
+    score: float
+    """Quality of the placement (Y 4.6) where pixels were compared, else NaN."""
+    moved_m: float
+    """Distance of the photo's nadir from its reported position in m; NaN where none is known."""
+    px: Array
+    """(M, 2) inliers before levelling in px of the photo."""
+    d_px: Array
+    """(M, 2) their disparity vectors (Y 4.8) in px of the working image."""
+    levelled: NDArray[np.bool_]
+    """(M,) False for features off the dominant plane, left out (Y 4.9)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Alignment:
     """Poses and calibration of a survey, and how they were found."""
 
@@ -123,6 +155,8 @@ class Alignment:
     """RMS over photos of the position residual of each photo predicted from all the others."""
     notes: tuple[str, ...] = ()
     """Plain sentences worth a reader's attention."""
+    joins: tuple[Join, ...] = ()
+    """Steps of a method that adds one photo after the other, in that order."""
 
     @property
     def held(self) -> tuple[int, ...]:

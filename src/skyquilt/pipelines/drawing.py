@@ -164,13 +164,8 @@ def _check_size(grid: Grid, native: float) -> None:
 def poses_digest(alignment: Alignment) -> str:
     """What of an alignment shapes the map."""
     order = sorted(alignment.poses)
-    stack = [
-        np.concatenate(
-            [alignment.poses[i].cam_R_map.ravel(), alignment.poses[i].map_C, alignment.camera(i).vector]
-        )
-        for i in order
-    ]
-    return digest(order, np.array(stack), alignment.frame)
+    placed = [(alignment.poses[i], alignment.camera(i).vector) for i in order]
+    return digest(order, placed, alignment.frame)
 
 
 def round_gsd(gsd: float) -> float:

@@ -100,7 +100,7 @@ def look(photo: Photo, index: int, cache: PhotoPixels, methods: Methods, store: 
     pixels = cache(index)
     middle, _ = shrink(pixels, PICTURE)
     store.put("pictures", picture_key(photo), picture_of(middle))
-    small, _ = shrink(middle, methods.sift.longest)
+    small, _ = shrink(middle if methods.sift.longest <= PICTURE else pixels, methods.sift.longest)
     thumbnail, _ = shrink(small, THUMBNAIL)
     return Looked(
         features=methods.sift.of_shrunken(small, pixels.shape[:2]), thumbnail=np.ascontiguousarray(thumbnail)

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from skyquilt import __version__
 from skyquilt.alignment.conflicts import conflicts
 from skyquilt.alignment.priors import choose_frame, priors
-from skyquilt.config import Methods, MosaicSettings, methods
+from skyquilt.config import BY_METADATA, IN_SEQUENCE, Methods, MosaicSettings, methods
 from skyquilt.errors import SkyquiltError, UnreadablePhotoError, UsageError
 from skyquilt.model import camera, features, poses, raster, surface
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.model.photo import ControlPoint, Photo, RejectedPhoto, Survey
 from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.photos.pixels import read_color
+from skyquilt.photos.sequence import sequence_of
 from skyquilt.photos.survey import read_survey
 from skyquilt.pipelines import drawing, intake, judging, linking, placing, reporting
 from skyquilt.raster.boundary import read_boundary
@@ -51,7 +52,7 @@ REGISTRY = {
     for c in (
         intake.Looked, features.Features, features.Link, features.RejectedLink, features.Matches,
         camera.Camera,
-        poses.Alignment, poses.MapFrame, poses.Pose, poses.TiePoints, poses.ControlResidual, surface.Surface,
+        poses.Alignment, poses.MapFrame, poses.Pose, poses.TiePoints, poses.ControlResidual, poses.Join, surface.Surface,
         RejectedPhoto, drawing.BlockExtras, raster.Grid,
     )
 }  # fmt: skip
@@ -92,9 +93,11 @@ def iter_mosaic(
     frame = choose_frame(taken.photos, settings.crs, control)
     prior = priors(taken.photos, frame)
     links = yield from clock.stage("links", _links(taken, prior, parts, settings, store, jobs))
-    alignment = yield from clock.stage(
-        "align", placing.place(taken, frame, prior, links, control, parts, settings, store, pictures)
-    )
+    known = placing.Known(
+        intake=taken, frame=frame, priors=prior, links=links, control=control, pictures=pictures,
+        order=sequence_of([p.name for p in taken.photos], settings.sequence),
+    )  # fmt: skip
+    alignment = yield from clock.stage("align", placing.place(known, parts, settings, store))
     yield from (Note(text=n, warning=True) for n in alignment.notes)
     ground = yield from clock.stage(
         "surface", drawing.survey_ground(alignment, pictures, parts, settings, store)
@@ -259,8 +262,10 @@ def _links(
     store: Store,
     jobs: int,
 ) -> Steps[linking.Links]:
-    """Links, unless the method asked for does without."""
-    if settings.method in ("pose", "position") or len(taken.photos) < 2:
+    """Links, unless the method asked for does without: to repair metadata takes links, to trust them none."""
+    alone = settings.method in IN_SEQUENCE or settings.method in BY_METADATA
+    repairs = settings.method in BY_METADATA and settings.repair
+    if (alone and not repairs) or len(taken.photos) < 2:
         return linking.Links(links=(), rejected=())
     return (yield from linking.link_up(taken, prior, parts, store, jobs))
 

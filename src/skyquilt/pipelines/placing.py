@@ -1,13 +1,15 @@
 """Where the photos are: the method asked for, or the one that fits; nobody is left behind silently."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from skyquilt.alignment.control import control_in_frame
-from skyquilt.alignment.pose import reported_camera
-from skyquilt.config import Methods, MosaicSettings
+from skyquilt.alignment.overview import ByOverview
+from skyquilt.alignment.pose import ByMetadata, reported_camera
+from skyquilt.alignment.repair import Repaired, repair
+from skyquilt.config import BY_METADATA, IN_SEQUENCE, Methods, MosaicSettings
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.model.photo import ControlPoint
@@ -35,48 +37,122 @@ def choose_method(asked: str, photos: int, links: int, positions: int) -> tuple[
     )
 
 
-def place(
-    intake: Intake, frame: MapFrame, priors: Sequence[Prior], links: Links, control: Sequence[ControlPoint],
-    methods: Methods, settings: MosaicSettings, store: Store, pictures: Pictures,
-) -> Steps[Alignment]:  # fmt: skip
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Known:
+    """What the methods of alignment may draw on."""
+
+    intake: Intake
+    """Photos and features."""
+    frame: MapFrame
+    """The map's frame."""
+    priors: Sequence[Prior]
+    """What the metadata say."""
+    links: Links
+    """Verified links; none for methods that need none."""
+    control: Sequence[ControlPoint]
+    """Control points."""
+    order: Sequence[int]
+    """Photos in the order they are joined in."""
+    pictures: Pictures
+    """Grey pictures."""
+
+
+def place(known: Known, methods: Methods, settings: MosaicSettings, store: Store) -> Steps[Alignment]:
     """Poses and calibration of the survey."""
-    positions = sum(bool(np.isfinite(p.map_C[:2]).all()) for p in priors)
-    method, why = choose_method(settings.method, len(intake.photos), len(links.links), positions)
+    positions = sum(bool(np.isfinite(p.map_C[:2]).all()) for p in known.priors)
+    photos = known.intake.photos
+    method, why = choose_method(settings.method, len(photos), len(known.links.links), positions)
     yield 0, 1
-    alignment = store.get_or(
-        "alignment", _key(intake, frame, priors, links, control, methods, method),
-        lambda: _align(intake, frame, priors, links, control, methods, method, pictures),
-    )  # fmt: skip
-    alignment = replace(alignment, why=why)
+    align, part = _way(method, methods)
+    repaired = repaired_metadata(known) if method in BY_METADATA and settings.repair else None
+    key = _key(known, methods, (method, part, repaired))
+    alignment = replace(store.get_or("alignment", key, lambda: align(known, methods, repaired)), why=why)
     if method == "bundle":
-        alignment = with_loose_photos(alignment, intake, priors)
+        alignment = with_loose_photos(alignment, known.intake, known.priors)
+    if method in IN_SEQUENCE:
+        alignment = _named(alignment, known)
     yield 1, 1
     return alignment
 
 
-def _key(
-    intake: Intake, frame: MapFrame, priors: Sequence[Prior], links: Links, control: Sequence[ControlPoint],
-    methods: Methods, method: str,
-) -> str:  # fmt: skip
-    photos = [(p.digest, p.name, p.camera_key, p.focal, p.calibration, p.editor) for p in intake.photos]
-    held = [(k.a, k.b, k.index_a, k.index_b) for k in links.links]
-    return digest(photos, frame, list(priors), held, list(control), methods.sift, _of(methods, method))
+def _key(known: Known, methods: Methods, way: object) -> str:
+    photos = [(p.digest, p.name, p.camera_key, p.focal, p.calibration, p.editor) for p in known.intake.photos]
+    held = [(k.a, k.b, k.index_a, k.index_b) for k in known.links.links]
+    return digest(
+        photos, known.frame, list(known.priors), held, list(known.control), methods.sift, list(known.order), way
+    )
 
 
-def _of(methods: Methods, method: str) -> object:
-    return {"bundle": methods.bundle, "pose": methods.by_pose, "position": methods.by_position}[method]
+Align = Callable[[Known, Methods, Repaired | None], Alignment]
 
 
-def _align(
-    intake: Intake, frame: MapFrame, priors: Sequence[Prior], links: Links, control: Sequence[ControlPoint],
-    methods: Methods, method: str, pictures: Pictures,
-) -> Alignment:  # fmt: skip
-    if method == "pose":
-        return methods.by_pose(intake.photos, frame, priors)
-    if method == "position":
-        return methods.by_position(intake.photos, frame, priors)
-    points = control_in_frame(control, intake.photos, frame)
-    return methods.bundle(intake.photos, frame, priors, intake.features, links.links, points, pictures)
+def _way(method: str, methods: Methods) -> tuple[Align, object]:
+    """How a method aligns, and its parameters."""
+    return {
+        "bundle": (_bundle, methods.bundle),
+        "pose": (_pose, methods.by_pose),
+        "position": (_position, methods.by_position),
+        "image": (_image, methods.by_image),
+        "hybrid": (_hybrid, (methods.by_pose, methods.hybrid)),
+        "flightline": (_flightline, methods.by_flightline),
+    }[method]
+
+
+def repaired_metadata(known: Known) -> Repaired | None:
+    """What the metadata say where the pixels of links do not contradict; None without links."""
+    if not known.links.links:
+        return None
+    convergence = known.frame.convergence_deg
+    return repair(known.intake.photos, known.priors, known.intake.features, known.links.links, convergence)
+
+
+def _bundle(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
+    photos = known.intake.photos
+    points = control_in_frame(known.control, photos, known.frame)
+    return methods.bundle(
+        photos, known.frame, known.priors, known.intake.features, known.links.links, points, known.pictures
+    )
+
+
+def _pose(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
+    return _by_metadata(methods.by_pose, known, repaired)
+
+
+def _position(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
+    return _by_metadata(methods.by_position, known, repaired)
+
+
+def _by_metadata(method: ByMetadata, known: Known, repaired: Repaired | None) -> Alignment:
+    if repaired is None:
+        return method(known.intake.photos, known.frame, known.priors)
+    placed = method(known.intake.photos, known.frame, repaired.priors, repaired.heights_m)
+    return replace(placed, notes=(*placed.notes, *repaired.notes))
+
+
+def _image(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
+    photos, features = known.intake.photos, known.intake.features
+    if isinstance(methods.by_image, ByOverview):
+        return methods.by_image(photos, known.frame, known.priors, features, known.order, known.pictures)
+    return methods.by_image(photos, known.frame, known.priors, features, known.order)
+
+
+def _hybrid(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
+    placed = _by_metadata(methods.by_pose, known, repaired)
+    priors = known.priors if repaired is None else repaired.priors
+    return methods.hybrid(placed, known.intake.photos, priors, known.order, known.pictures)
+
+
+def _flightline(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
+    return methods.by_flightline(
+        known.intake.photos, known.frame, known.priors, known.intake.features, known.order
+    )
+
+
+def _named(alignment: Alignment, known: Known) -> Alignment:
+    """With a reason for photos that the sequence does not name."""
+    missing = set(range(len(known.intake.photos))) - set(known.order)
+    reasons = {i: "the sequence does not name it" for i in missing}
+    return replace(alignment, rejected={**alignment.rejected, **reasons})
 
 
 def with_loose_photos(alignment: Alignment, intake: Intake, priors: Sequence[Prior]) -> Alignment:

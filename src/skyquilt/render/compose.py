@@ -105,8 +105,10 @@ class Composer:
         """One photo over a piece."""
         u, v = densify(n.u, h, w), densify(n.v, h, w)
         image = self.pixels(n.view.photo)
-        x0, y0 = max(int(u.min()) - 2, 0), max(int(v.min()) - 2, 0)
-        x1, y1 = int(np.ceil(u.max())) + 3, int(np.ceil(v.max())) + 3
+        # a photo may see a node of the ring around the piece and nothing of the piece itself: a pixel is kept then
+        x0 = min(max(int(u.min()) - 2, 0), image.shape[1] - 1)
+        y0 = min(max(int(v.min()) - 2, 0), image.shape[0] - 1)
+        x1, y1 = max(int(np.ceil(u.max())) + 3, 1), max(int(np.ceil(v.max())) + 3, 1)
         part = image[y0:y1, x0:x1]  # remap works in 16 bits: a cut-out keeps its coordinates small
         warped = cv2.remap(part, u - x0, v - y0, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         warped = warped.reshape(h, w, -1)

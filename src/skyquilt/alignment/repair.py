@@ -1,0 +1,63 @@
+"""Metadata repaired by the pixels, for methods that place photos by metadata."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.conflicts import YAW_DEG
+from skyquilt.alignment.start import find_start
+from skyquilt.geometry.frames import angle_difference_deg
+from skyquilt.model.features import Features, Link
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Prior
+
+SIGMA_YAW_DEG = 3.0
+"""Deviation of a heading found from links: tilts and relief bend similarities a little."""
+SIGMA_HEIGHT = 0.05
+"""Relative deviation of a height found from image scale."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Repaired:
+    """What photos report, corrected where the pixels of their links say otherwise."""
+
+    priors: tuple[Prior, ...]
+    """One per photo."""
+    heights_m: NDArray[np.float64]
+    """(n,) heights above ground from image scale; NaN for photos without links, or where no position gives metres."""
+    notes: tuple[str, ...]
+    """What was corrected, by photo, both values."""
+
+
+def repair(
+    photos: Sequence[Photo], priors: Sequence[Prior], features: Sequence[Features], links: Sequence[Link],
+    convergence_deg: float = 0.0,
+) -> Repaired:  # fmt: skip
+    """Headings that contradict the links replaced, missing ones filled, heights above ground from image scale."""
+    start = find_start(photos, priors, features, links)
+    repaired, notes = list(priors), []
+    heights = np.full(len(photos), np.nan)
+    for i, (a, _) in sorted(start.placed.items()):
+        if start.metric and i in start.georeferenced:
+            heights[i] = abs(a)
+        found = angle_difference_deg(-float(np.degrees(np.angle(a))), 0.0)
+        repaired[i], told = _heading(photos[i], priors[i], found, convergence_deg)
+        notes += told
+    return Repaired(priors=tuple(repaired), heights_m=heights, notes=tuple(notes))
+
+
+def _heading(photo: Photo, prior: Prior, found_deg: float, convergence_deg: float) -> tuple[Prior, list[str]]:
+    """The prior with the heading that the pixels show, where the reported one is missing or contradicts it."""
+    known = np.isfinite(prior.yaw_deg)
+    off = angle_difference_deg(prior.yaw_deg, found_deg) if known else np.nan
+    if known and abs(off) < max(YAW_DEG, 3 * prior.sigma_yaw_deg):
+        return prior, []
+    better = replace(prior, yaw_deg=found_deg, sigma_yaw_deg=SIGMA_YAW_DEG, yaw_source="pixels")
+    if not known:
+        return better, []
+    if abs(abs(off) - 180) < 20 and photo.editor:  # the file was turned upside down, and its axes with it
+        better = replace(better, pitch_deg=-prior.pitch_deg, roll_deg=-prior.roll_deg)
+    said, shows = (angle_difference_deg(y + convergence_deg, 0.0) for y in (prior.yaw_deg, found_deg))
+    return better, [f"{photo.name} reports a heading of {said:.0f} degrees, its pixels show {shows:.0f}."]

@@ -1,0 +1,19 @@
+"""Keypoints spread over the image, so that no corner stays bare."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def spread(
+    xy: NDArray, response: NDArray, shape: tuple[int, ...], count: int, cells: int
+) -> NDArray[np.int64]:
+    """Indices of `count` points: round after round the strongest left in every cell of the image."""
+    if len(xy) <= count:
+        return np.arange(len(xy))
+    column, row = (xy / (shape[1], shape[0]) * cells).astype(int).clip(0, cells - 1).T
+    cell = row * cells + column
+    order = np.lexsort((-response, cell))
+    starts = np.flatnonzero(np.r_[True, np.diff(cell[order]) != 0])
+    rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
+    best = np.lexsort((-response[order], rank))[:count]
+    return np.sort(order[best])

@@ -1,0 +1,91 @@
+"""The least symmetric transfer error: a transformation refined over all of its matches [A (7), (12)]."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skyquilt.geometry.dlt import normalisation
+from skyquilt.geometry.transforms import inverse, symmetric_transfer_errors
+
+Doubles = NDArray[np.float64]
+
+
+def _directions(*places: tuple[tuple[int, int, float], ...]) -> Doubles:
+    """(K, 3, 3): what each parameter of a model adds to its matrix."""
+    G = np.zeros((len(places), 3, 3))
+    for k, place in enumerate(places):
+        for i, j, value in place:
+            G[k, i, j] = value
+    return G
+
+
+_SHIFT = (((0, 2, 1.0),), ((1, 2, 1.0),))
+_LINEAR = (((0, 0, 1.0),), ((0, 1, 1.0),), ((1, 0, 1.0),), ((1, 1, 1.0),))
+_DIRECTIONS = {
+    "translation": _directions(*_SHIFT),
+    "similarity": _directions(*_SHIFT, ((0, 0, 1.0), (1, 1, 1.0)), ((0, 1, -1.0), (1, 0, 1.0))),
+    "affine": _directions(*_SHIFT, *_LINEAR),
+    "homography": _directions(*_SHIFT, *_LINEAR, ((2, 0, 1.0),), ((2, 1, 1.0),)),
+}
+
+
+def refine(model: str, H: Doubles, a: ArrayLike, b: ArrayLike, *, steps: int = 20) -> Doubles:
+    """b_H_a (3, 3) of `model` with a locally least sum of symmetric transfer errors over points a, b (N, 2).
+
+    Levenberg and Marquardt with analytic derivatives, at most `steps` steps, from H, which must be of the model; it is
+    never left for a worse one. The points are moved and scaled, both images by one factor, so that errors keep their
+    ratio.
+    """
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    both = normalisation(np.stack([a, b]), np.ones((2, len(a))))
+    both[:, :2] *= (np.sqrt(both[0, 0, 0] * both[1, 0, 0]) / both[:, 0, 0])[:, None, None]
+    if not np.isfinite(both).all() or not np.isfinite(H).all():
+        return H
+    Ta, Tb = both
+    na, nb = a * Ta[0, 0] + Ta[:2, 2], b * Tb[0, 0] + Tb[:2, 2]
+    start = Tb @ H @ inverse(Ta)
+    if not abs(start[2, 2]) > 1e-9:
+        return H
+    found = _descend(_DIRECTIONS[model], start / start[2, 2], na, nb, steps)
+    refined = inverse(Tb) @ found @ Ta
+    refined = refined / refined[2, 2]
+    better = symmetric_transfer_errors(refined, a, b).sum() <= symmetric_transfer_errors(H, a, b).sum()
+    return np.asarray(refined) if better else H
+
+
+def _descend(G: Doubles, H: Doubles, a: Doubles, b: Doubles, steps: int) -> Doubles:
+    damping, cost = 1e-4, symmetric_transfer_errors(H, a, b).sum()
+    for _ in range(steps):
+        J, r = _linearised(G, H, a, b)
+        JJ, Jr = J.T @ J, J.T @ r
+        if not (np.isfinite(JJ).all() and np.isfinite(Jr).all()):
+            break
+        improved = False
+        while not improved and damping < 1e6:
+            damped = JJ + np.diag(damping * np.diag(JJ) + 1e-12)
+            tried = H + np.tensordot(np.linalg.solve(damped, -Jr), G, 1)
+            new = symmetric_transfer_errors(tried, a, b).sum()
+            improved = bool(new < cost)
+            damping = damping / 10 if improved else damping * 10
+        if not improved:
+            break
+        H, gain, cost = tried, (cost - new) / max(cost, 1e-300), new
+        if gain < 1e-8:
+            break
+    return H
+
+
+def _linearised(G: Doubles, H: Doubles, a: Doubles, b: Doubles) -> tuple[Doubles, Doubles]:
+    """Jacobian (4 N, K) and residuals (4 N,) of both transfers."""
+    M = inverse(H)
+    x, y = (np.column_stack([p, np.ones(len(p))]) for p in (a, b))
+    p, q = x @ H.T, y @ M.T
+    dp = np.tensordot(x, G, (1, 2))  # (N, K, 3)
+    dq = -np.tensordot(q, G, (1, 2)) @ M.T  # the inverse moves by -M G M
+    J, r = [], []
+    for value, derivative, target in ((p, dp, b), (q, dq, a)):
+        with np.errstate(all="ignore"):
+            u = value[:, :2] / value[:, 2:]
+            J.append((derivative[..., :2] - u[:, None] * derivative[..., 2:]) / value[:, None, 2:])
+        r.append(u - target)
+    jacobian = np.concatenate(J).transpose(0, 2, 1).reshape(-1, len(G))
+    return jacobian, np.concatenate(r).ravel()

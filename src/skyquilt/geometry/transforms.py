@@ -1,0 +1,125 @@
+"""Plane transformations between two images, as matrices b_H_a that take a's pixels to b's.
+
+Four models: translation (2 degrees of freedom), similarity (4), affine (6), homography (8). Everything works on
+one set of points as on many at once, because a random search in Python is fast only when it tries hundreds at a time.
+"""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skyquilt.geometry.dlt import homographies
+
+Model = Literal["translation", "similarity", "affine", "homography"]
+Doubles = NDArray[np.float64]
+
+MODELS: tuple[Model, ...] = ("translation", "similarity", "affine", "homography")
+"""From the stiffest to the most flexible."""
+MINIMAL: dict[str, int] = {"translation": 1, "similarity": 2, "affine": 3, "homography": 4}
+"""Fewest correspondences that determine each model."""
+_FLAT = 1e-9
+"""Spread across a line over spread along it (variances) below which points count as one line."""
+
+
+def fit(model: str, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None) -> Doubles | None:
+    """The b_H_a (3, 3) that takes points a (N, 2) to b (N, 2) best, N at least MINIMAL[model].
+
+    Least squares of the distances in b; of a homography the algebraic error of the normalised DLT (Hartley and
+    Zisserman, Multiple View Geometry, 4.1, 4.4). `weights` (N,), not negative, multiply the squares; None is all alike.
+    None where the points do not determine the model (too few, coincident, on one line) or are not finite.
+    """
+    a, b = np.asarray(a, np.float64).reshape(-1, 2), np.asarray(b, np.float64).reshape(-1, 2)
+    if weights is None:
+        weights = np.ones(len(a))
+    weights = np.asarray(weights, np.float64)
+    used = weights > 0
+    a, b, weights = a[used], b[used], weights[used]
+    if len(a) < MINIMAL[model] or not (np.isfinite(a).all() and np.isfinite(b).all()):
+        return None
+    H = fit_many(model, a[None], b[None], weights[None])[0]
+    return H if np.isfinite(H).all() else None
+
+
+def fit_many(model: str, a: Doubles, b: Doubles, weights: Doubles | None = None) -> Doubles:
+    """b_H_a (M, 3, 3) of M sets of points, a and b (M, N, 2), weights (M, N) or None; NaN where undetermined."""
+    if model not in MINIMAL:
+        raise ValueError(f"one of {', '.join(MODELS)} expected, got '{model}'")
+    if a.shape != b.shape or a.ndim != 3 or a.shape[1] < MINIMAL[model]:
+        raise ValueError(f"two equal (M, at least {MINIMAL[model]}, 2) expected, got {a.shape} and {b.shape}")
+    w = np.ones(a.shape[:2]) if weights is None else weights
+    if model == "homography":
+        return homographies(a, b, w)
+    w = w / w.sum(1, keepdims=True)
+    centre_a, centre_b = (w[..., None] * a).sum(1), (w[..., None] * b).sum(1)
+    linear = _LINEAR[model](a - centre_a[:, None], b - centre_b[:, None], w)
+    H = np.zeros((len(a), 3, 3))
+    H[:, :2, :2] = linear
+    H[:, :2, 2] = centre_b - (linear @ centre_a[..., None])[..., 0]
+    H[:, 2, 2] = 1
+    H[~np.isfinite(linear).all((1, 2))] = np.nan
+    return H
+
+
+def _identity(a: Doubles, b: Doubles, w: Doubles) -> Doubles:
+    return np.broadcast_to(np.eye(2), (len(a), 2, 2))
+
+
+def _similarity(a: Doubles, b: Doubles, w: Doubles) -> Doubles:
+    """(M, 2, 2) rotation times scale about the centres, in closed form: sum conj(a) b / sum |a|^2."""
+    za, zb = a[..., 0] + 1j * a[..., 1], b[..., 0] + 1j * b[..., 1]
+    spread = (w * np.abs(za) ** 2).sum(1)
+    with np.errstate(all="ignore"):
+        s = np.where(spread > 0, (w * np.conj(za) * zb).sum(1) / spread, np.nan)
+    s = np.where(np.abs(s) > _FLAT, s, np.nan)  # all of a in one point of b
+    return np.stack([s.real, -s.imag, s.imag, s.real], -1).reshape(-1, 2, 2)
+
+
+def _affine(a: Doubles, b: Doubles, w: Doubles) -> Doubles:
+    """(M, 2, 2) linear part about the centres, from the normal equations."""
+    aw = w[..., None] * a
+    aa, ba = np.swapaxes(aw, 1, 2) @ a, np.swapaxes(b, 1, 2) @ aw
+    determinant = aa[:, 0, 0] * aa[:, 1, 1] - aa[:, 0, 1] ** 2
+    flat = determinant <= _FLAT * (aa[:, 0, 0] + aa[:, 1, 1]) ** 2
+    turned = np.stack([aa[:, 1, 1], -aa[:, 0, 1], -aa[:, 1, 0], aa[:, 0, 0]], -1).reshape(-1, 2, 2)
+    with np.errstate(all="ignore"):
+        linear = ba @ turned / determinant[:, None, None]
+    linear[flat] = np.nan
+    size = np.abs(linear).max((1, 2))
+    linear[~(np.abs(_det2(linear)) > _FLAT * size**2)] = np.nan
+    return linear
+
+
+def _det2(m: Doubles) -> Doubles:
+    return m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
+
+
+_LINEAR = {"translation": _identity, "similarity": _similarity, "affine": _affine}
+
+
+def transfer(H: Doubles, xy: ArrayLike) -> Doubles:
+    """Points (N, 2) through H (..., 3, 3): (..., N, 2). A point on the horizon goes to infinity."""
+    xy = np.asarray(xy, np.float64)
+    p = xy @ np.swapaxes(H[..., :2], -1, -2) + H[..., None, :, 2]
+    with np.errstate(all="ignore"):
+        return np.asarray(p[..., :2] / p[..., 2:])
+
+
+def inverse(H: Doubles) -> Doubles:
+    """Inverses of (..., 3, 3), in closed form; not finite where there is none. Their last element is not made 1."""
+    rows = [np.cross(H[..., i, :], H[..., j, :]) for i, j in ((1, 2), (2, 0), (0, 1))]
+    adjugate = np.stack(rows, -1)
+    with np.errstate(all="ignore"):
+        return np.asarray(adjugate / (H[..., 0, :] * rows[0]).sum(-1)[..., None, None])
+
+
+def symmetric_transfer_errors(H: Doubles, a: ArrayLike, b: ArrayLike) -> Doubles:
+    """(..., N) px^2: d(a, H^-1 b)^2 + d(b, H a)^2 of b_H_a (..., 3, 3) and points (N, 2) [A (8)].
+
+    Infinite where a matrix is NaN or singular, or a point lies on the horizon.
+    """
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    with np.errstate(all="ignore"):
+        there, back = transfer(H, a) - b, transfer(inverse(H), b) - a
+        errors = np.einsum("...i,...i", there, there) + np.einsum("...i,...i", back, back)
+    return np.where(np.isfinite(errors), errors, np.inf)

@@ -1,0 +1,124 @@
+"""Photos warped onto a plane, and the overview that they build up, centre first."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.geometry.camera import distort, monotone_radius, rays
+from skyquilt.model.camera import Camera
+
+CENTRE = 0.5
+"""Side of the central region of a photo that is laid over what is there, over that of the photo (Y 6.1.3)."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Patch:
+    """A photo on a grid of the plane."""
+
+    column: int
+    """First column on the grid."""
+    row: int
+    """First row."""
+    pixels: NDArray[np.float32]
+    """(h, w) grey values."""
+    shown: NDArray[np.bool_]
+    """(h, w) where the photo shows something."""
+    central: NDArray[np.bool_]
+    """(h, w) the central region of the photo."""
+
+
+def to_grid(picture: NDArray[np.uint8], camera: Camera, cam_H_grid: NDArray, *, margin: int = 0) -> Patch | None:
+    """A grey picture (h, w) of a photo of any size on a grid, or None if it sees the horizon or nothing.
+
+    `cam_H_grid` (3, 3) takes (column, row, 1) of the grid to the undistorted image plane (units of the focal length).
+    """
+    rim = _rim(camera, np.linalg.inv(cam_H_grid))
+    if rim is None:
+        return None
+    (c0, r0), (c1, r1) = np.floor(rim.min(0)).astype(int) - margin, np.ceil(rim.max(0)).astype(int) + margin
+    if not 0 < (c1 - c0) * (r1 - r0) < 1e8:
+        return None
+    c, r = np.meshgrid(np.arange(c0, c1 + 1.0), np.arange(r0, r1 + 1.0))
+    local = np.stack([c, r, np.ones_like(c)], -1) @ cam_H_grid.T
+    plane = local[..., :2] / np.where(np.abs(local[..., 2:]) < 1e-9, 1e-9, local[..., 2:])
+    k = camera.vector
+    px = distort(plane, k) * k[0] + k[1:3]
+    real = (plane**2).sum(-1) < monotone_radius(camera) ** 2
+    factor = np.array([picture.shape[1] / camera.width, picture.shape[0] / camera.height])
+    small = np.where(real[..., None], (px + 0.5) * factor - 0.5, -1e4).astype(np.float32)
+    pixels = cv2.remap(picture, small[..., 0], small[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    off = np.abs((px + 0.5) / (camera.width, camera.height) - 0.5)
+    edge = 0.5 - 1.5 / np.array([picture.shape[1], picture.shape[0]])
+    shown = real & (off < edge).all(-1)
+    return Patch(
+        column=int(c0), row=int(r0), pixels=pixels.astype(np.float32), shown=shown,
+        central=shown & (off < CENTRE / 2).all(-1),
+    )  # fmt: skip
+
+
+def _rim(camera: Camera, grid_H_cam: NDArray, per_side: int = 8) -> NDArray[np.float64] | None:
+    """Outline of the photo on the grid (n, 2)."""
+    s = np.linspace(-0.5, 0.5, per_side)
+    square = np.concatenate([np.c_[s, s * 0 - 0.5], np.c_[s, s * 0 + 0.5], np.c_[s * 0 - 0.5, s], np.c_[s * 0 + 0.5, s]])
+    px = square * (camera.width, camera.height) + ((camera.width - 1) / 2, (camera.height - 1) / 2)
+
+
+    xyw = rays(camera, px) @ grid_H_cam.T
+    w = xyw[:, 2] * np.sign(np.median(xyw[:, 2]))
+    if not np.isfinite(xyw).all() or w.min() <= 1e-6 * w.max():
+        return None
+    return np.asarray(xyw[:, :2] / xyw[:, 2:])
+
+
+class Overview:
+    """The map so far, grey, on a grid without end: O_i = Merge(O_(i-1), I'_i) (Y 4.1).
+
+    The central region of a photo is laid over what is there, the rest only where nothing is (Y 6.1.3).
+    """
+
+    def __init__(self) -> None:
+        self.pixels = np.zeros((0, 0), np.float32)
+        self.shown = np.zeros((0, 0), bool)
+        self.row = self.column = 0
+
+    def merge(self, patch: Patch) -> None:
+        """Adds a photo."""
+        h, w = patch.shown.shape
+        self._reach(patch.row, patch.column, patch.row + h, patch.column + w)
+        inner = self._slices(patch.row, patch.column, h, w)
+        laid = patch.central | (patch.shown & ~self.shown[inner])
+        self.pixels[inner][laid] = patch.pixels[laid]
+        self.shown[inner] |= patch.shown
+
+    def window(self, row: int, column: int, height: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Pixels and mask (height, width) of any part of the grid, empty beyond what is there."""
+        pixels, shown = np.zeros((height, width), np.float32), np.zeros((height, width), bool)
+        r0, c0 = max(row, self.row), max(column, self.column)
+        r1 = min(row + height, self.row + self.shown.shape[0])
+        c1 = min(column + width, self.column + self.shown.shape[1])
+        if r1 > r0 and c1 > c0:
+            here = (slice(r0 - row, r1 - row), slice(c0 - column, c1 - column))
+            there = self._slices(r0, c0, r1 - r0, c1 - c0)
+            pixels[here], shown[here] = self.pixels[there], self.shown[there]
+        return pixels, shown
+
+    def _slices(self, row: int, column: int, height: int, width: int) -> tuple[slice, slice]:
+        r, c = row - self.row, column - self.column
+        return slice(r, r + height), slice(c, c + width)
+
+    def _reach(self, r0: int, c0: int, r1: int, c1: int) -> None:
+        """Grows the arrays, generously, so that they hold rows r0 to r1 and columns c0 to c1."""
+        if not self.shown.size:
+            self.row, self.column = r0, c0
+            self.pixels, self.shown = np.zeros((r1 - r0, c1 - c0), np.float32), np.zeros((r1 - r0, c1 - c0), bool)
+            return
+        h, w = self.shown.shape
+        grown = [max(0, self.row - r0), max(0, r1 - self.row - h), max(0, self.column - c0), max(0, c1 - self.column - w)]
+        if not any(grown):
+            return
+        grown = [g + 64 if g else 0 for g in grown]
+        around = ((grown[0], grown[1]), (grown[2], grown[3]))
+        self.pixels, self.shown = np.pad(self.pixels, around), np.pad(self.shown, around)
+        self.row, self.column = self.row - grown[0], self.column - grown[2]

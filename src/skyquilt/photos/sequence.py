@@ -1,0 +1,42 @@
+"""The order in which photos are joined: by time, by name, or as a file says."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from skyquilt.errors import SideFileError
+from skyquilt.photos.side_rows import PhotoNames, sentence_of
+from skyquilt.photos.side_text import read_lines
+
+
+def sequence_of(names: Sequence[str], how: str) -> list[int]:
+    """Indices of photos (names in order of capture) in the order of `how`: `time`, `name`, or a file's path.
+
+    A file has one photo's name a line; photos that it does not name are left out.
+
+    Raises:
+        SideFileError: the file cannot be read, names no photo or an unknown one, or one twice.
+    """
+    if how == "time":
+        return list(range(len(names)))
+    if how == "name":
+        return sorted(range(len(names)), key=lambda i: _natural(names[i]))
+    path = Path(how)
+    wanted = [line for _, line in read_lines(path)]
+    known, index = PhotoNames(names), {name: i for i, name in enumerate(names)}
+    found = [known.find(w) for w in wanted]
+    strangers = [w for w, f in zip(wanted, found, strict=True) if f is None]
+    if strangers or not wanted:
+        what = f"names {sentence_of(strangers)}, which are no photos of the survey" if strangers else "is empty"
+        raise SideFileError(f"{path.name} {what}; expected one photo's name a line.")
+    order = [index[f] for f in found if f is not None]
+    if len(set(order)) < len(order):
+        twice = sorted({names[i] for i in order if order.count(i) > 1})
+        raise SideFileError(f"{path.name} names {sentence_of(twice)} more than once. Take one line out.")
+    return order
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """Names as people count: 2 before 10."""
+    parts = re.split(r"(\d+)", name.lower())
+    return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts if p]
