@@ -1,6 +1,7 @@
 """Names and numbers -> methods: the one place where words on a command line become parts of a story."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,15 +16,22 @@ from skyquilt.alignment.overview import ByOverview
 from skyquilt.alignment.pose import ByPose, ByPosition
 from skyquilt.errors import UsageError
 from skyquilt.features.sift import Sift
+from skyquilt.features.surf import Surf
 from skyquilt.geometry.transforms import Model
 from skyquilt.matching.best import Best
 from skyquilt.matching.mutual import Mutual
+from skyquilt.matching.one_way import OneWay
+from skyquilt.metrics.registration_quality import spread_quality
+from skyquilt.model.registration import Registers
 from skyquilt.pairs.nearest import Nearest
 from skyquilt.pairs.retrieval import Retrieval
 from skyquilt.render.blend import Average, Blend, Feather, First, Multiband
 from skyquilt.render.exposure import Balance
+from skyquilt.spectral.auto import Auto
+from skyquilt.spectral.by_features import BetterByQ, ByFeatures, Outliers, Rfae
 from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints
+from skyquilt.twoview.lmeds import Lmeds
 from skyquilt.twoview.ransac import Ransac
 from skyquilt.twoview.rescued import Rescued
 from skyquilt.twoview.ste import RansacSte
@@ -47,6 +55,10 @@ LEAST_INLIERS = 12
 BLENDS: dict[str, type[Blend]] = {"feather": Feather, "first": First, "average": Average, "multiband": Multiband}
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
+REGISTRATIONS = ("auto", "sift", "surf", "usurf", "rfae", "rfae-sift", "surf+rfae")
+"""Ways to register two pictures of different spectra."""
+INLIERS = 9
+"""Fewest inliers of an accepted registration by the thesis's methods [Y 6.4.1]."""
 DISTORTIONS = ("none", "2", "4", "6", "6t")
 
 
@@ -151,6 +163,42 @@ class MosaicSettings:
         """Names and values as written to run.toml; unset ones left out."""
         table = {f.name: getattr(self, f.name) for f in fields(self)}
         return {k: str(v) if isinstance(v, Path) else v for k, v in table.items() if v is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegisterSettings:
+    """Everything a registration of two pictures can be asked for."""
+
+    method: str = "auto"
+    """One of `REGISTRATIONS`."""
+    use_metadata: bool = True
+    """Whether metadata and places are tried first; what they say is a guess only."""
+
+    def __post_init__(self) -> None:
+        _one_of("--method", self.method, REGISTRATIONS)
+
+
+def registration_method(name: str) -> Registers:
+    """The registration that a word names, with the thesis's parameters [Y 5.2, Fig. 5.8]."""
+    _one_of("--method", name, REGISTRATIONS)
+    surf, sift = Surf(lobe=1, step=1), Sift(levels=43, root=False, longest=1000, count=3000)
+    ways: dict[str, Callable[[], Registers]] = {
+        "auto": Auto,
+        "sift": lambda: ByFeatures(detect=sift, relate=_outliers()),
+        "surf": lambda: ByFeatures(detect=surf, relate=_outliers()),
+        "usurf": lambda: ByFeatures(detect=replace(surf, upright=True), relate=_outliers()),
+        "rfae": lambda: Rfae(detect=surf, relate=_outliers()),
+        "rfae-sift": lambda: Rfae(detect=sift, relate=_outliers()),
+        "surf+rfae": lambda: BetterByQ(methods=(registration_method("surf"), registration_method("rfae"))),
+    }
+    return ways[name]()
+
+
+def _outliers() -> Outliers:
+    return Outliers(
+        match=OneWay(), quality=spread_quality,
+        estimators=(Ransac(model="similarity", minimum=INLIERS), Lmeds(model="similarity", minimum=INLIERS)),
+    )  # fmt: skip
 
 
 def _one_of(option: str, value: str, allowed: Any) -> None:

@@ -7,6 +7,7 @@ import typer
 from skyquilt import __version__
 from skyquilt.cli import inspect as inspect_command
 from skyquilt.cli import mosaic as mosaic_command
+from skyquilt.cli import register as register_command
 from skyquilt.cli import simulate as simulate_command
 
 EXIT_CODES = (
@@ -17,6 +18,7 @@ EXIT_CODES = (
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.command("mosaic", epilog=EXIT_CODES)(mosaic_command.command)
 app.command("inspect", epilog=EXIT_CODES)(inspect_command.command)
+app.command("register", epilog=EXIT_CODES)(register_command.command)
 app.command("simulate", epilog=EXIT_CODES)(simulate_command.command)
 
 

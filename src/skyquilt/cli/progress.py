@@ -2,15 +2,18 @@
 
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from typing import Any
 
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
 
 
-def show(events: Iterable[Event], *, mode: str) -> None:
-    """Consumes a story and tells it: mode `normal`, `verbose`, `quiet` or `json`."""
+def show(events: Iterable[Event], *, mode: str, summary: Callable[[Result], str] | None = None) -> None:
+    """Consumes a story and tells it: mode `normal`, `verbose`, `quiet` or `json`.
+
+    `summary` puts the result in a few lines; that of a mosaic if none is given.
+    """
     if mode == "json":
         for happened in events:
             sys.stdout.write(json.dumps(as_record(happened), default=str) + "\n")
@@ -19,7 +22,7 @@ def show(events: Iterable[Event], *, mode: str) -> None:
         for _ in events:
             pass
     else:
-        _bars(events, verbose=mode == "verbose")
+        _bars(events, summary or mosaic_summary, verbose=mode == "verbose")
 
 
 def as_record(happened: Event) -> dict[str, Any]:
@@ -29,7 +32,7 @@ def as_record(happened: Event) -> dict[str, Any]:
     return {"event": type(happened).__name__, **asdict(happened)}
 
 
-def _bars(events: Iterable[Event], *, verbose: bool) -> None:
+def _bars(events: Iterable[Event], summary: Callable[[Result], str], *, verbose: bool) -> None:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -68,8 +71,8 @@ def times(happened: StageFinished) -> str:
     return f"{happened.stage}: {happened.seconds:.2f} s, {happened.cpu_seconds:.2f} s of CPU{how}"
 
 
-def summary(result: Result) -> str:
-    """The result in a few lines."""
+def mosaic_summary(result: Result) -> str:
+    """A mosaic in a few lines."""
     m = result.metrics
     lines = [
         f"{m['photos_used']} of {m['photos_total']} photos in {len(m['blocks'])} block(s),"

@@ -22,6 +22,10 @@ class Sift:
     """Longest side in px of the image searched; smaller photos are searched as they are."""
     contrast: float = 0.015
     """OpenCV's contrast threshold."""
+    levels: int = 3
+    """Scale levels per octave; the thesis takes 43 between spectra [Y 5.2.1]."""
+    root: bool = True
+    """RootSIFT; False keeps Lowe's descriptors, as the thesis used them."""
     cells: int = 10
     """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare."""
     version: ClassVar[int] = 3
@@ -39,8 +43,9 @@ class Sift:
         grey = to_grey8(small)
         # without precise upscaling OpenCV reports every keypoint a quarter pixel down and to the right
         detector = cv2.SIFT.create(
-            int(1.4 * self.count), contrastThreshold=self.contrast, enable_precise_upscale=True
-        )
+            int(1.4 * self.count), nOctaveLayers=self.levels, contrastThreshold=self.contrast,
+            enable_precise_upscale=True,
+        )  # fmt: skip
         points, found = detector.detectAndCompute(grey, None)
         descriptors = np.zeros((0, 128), np.float32) if found is None else np.asarray(found, np.float32)
         xy = np.array([p.pt for p in points], np.float64).reshape(-1, 2)
@@ -48,10 +53,17 @@ class Sift:
         scale = full[1] / grey.shape[1]
         size = np.array([p.size for p in points], np.float32)[keep] * scale
         px = full_px(xy[keep], grey.shape, full)
-        return Features(px=px, size=size, descriptors=_root(descriptors[keep]), scale=scale)
+        stored = _root(descriptors[keep]) if self.root else _plain(descriptors[keep])
+        return Features(px=px, size=size, descriptors=stored, scale=scale)
 
 
 def _root(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
     """RootSIFT: L1-normalised, then the square root, which has unit length; 8 bits hold it (see Features)."""
     total = np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
     return np.clip(np.rint(DESCRIPTOR_UNIT * np.sqrt(descriptors / total)), 0, 255).astype(np.uint8)
+
+
+def _plain(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Lowe's descriptors at unit length, stored the same way."""
+    length = np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9)
+    return np.clip(np.rint(DESCRIPTOR_UNIT * descriptors / length), 0, 255).astype(np.uint8)

@@ -9,14 +9,15 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from skyquilt.errors import OutputError
+from skyquilt.report import headline
 from skyquilt.report.effort import time_section
 from skyquilt.report.ground import ground_of
-from skyquilt.report.headline import summary, tiles
 from skyquilt.report.input import ReportInput
 from skyquilt.report.layers import layers_of
 from skyquilt.report.mapview import map_view
 from skyquilt.report.numbers import count, items, mapping, plain
 from skyquilt.report.overlap import overlap_section, surface_section
+from skyquilt.report.parts import Section, Tile
 from skyquilt.report.positions import positions_section
 from skyquilt.report.residuals import residuals_section
 from skyquilt.report.seams import seams_section
@@ -53,8 +54,8 @@ def build_report(data: ReportInput) -> str:
     )
     return _template().render(
         data=data,
-        summary=summary(data),
-        tiles=tiles(data),
+        summary=headline.summary(data),
+        tiles=headline.tiles(data),
         attention=attention(data),
         map=map_view(data, ground, layers) if ground and layers else None,
         sections=sections,
@@ -85,7 +86,7 @@ def attention(data: ReportInput) -> tuple[tuple[str, str], ...]:
     found = [(plain(w), "") for w in items(m.get("warnings"))[:20]]
     found += [
         (f"{t.label}: {t.value} {t.unit}".rstrip() + ".", t.anchor)
-        for t in tiles(data)
+        for t in headline.tiles(data)
         if t.verdict == "poor"
     ]
     if n := len(items(m.get("metadata_conflicts"))):
@@ -100,8 +101,19 @@ def tied(words: str) -> str:
     return re.sub(r"(\d) (px|m|cm|s|GB|MB)\b", "\\1\u00a0\\2", words)
 
 
+def plain_page(
+    *, title: str, summary: str, version: str, source: str, sections: tuple[Section, ...],
+    tiles: tuple[Tile, ...] = (),
+) -> str:  # fmt: skip
+    """A page of sections without a map; `source` says where the figures lie. Whole in itself."""
+    return _template("plain.html.j2").render(
+        title=title, summary=summary, version=version, source=source, sections=sections, tiles=tiles,
+        style=_asset("style.css"),
+    )  # fmt: skip
+
+
 @cache
-def _template() -> Template:
+def _template(name: str = "page.html.j2") -> Template:
     environment = Environment(
         loader=FileSystemLoader(HERE),
         autoescape=True,
@@ -110,7 +122,7 @@ def _template() -> Template:
         lstrip_blocks=True,
     )
     environment.filters["tied"] = tied
-    return environment.get_template("page.html.j2")
+    return environment.get_template(name)
 
 
 @cache

@@ -1,0 +1,64 @@
+"""`skyquilt register`: two pictures of different spectra on one another."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from skyquilt.cli.interrupt import ends_at_once
+from skyquilt.errors import UsageError
+
+if TYPE_CHECKING:
+    from skyquilt.model.event import Result
+
+
+def command(
+    a: Annotated[Path, typer.Argument(metavar="A", help="The reference: a photo or a GeoTIFF.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="The picture to lay on it.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
+    method: Annotated[
+        str,
+        typer.Option(
+            help="auto (structure, believed only where independent patches agree), or a published method, which"
+            " believes nine inliers: sift, surf, usurf, rfae, rfae-sift, surf+rfae; or structure."
+        ),
+    ] = "auto",
+    metadata: Annotated[
+        bool,
+        typer.Option(
+            "--use-metadata/--ignore-metadata", help="Try first what metadata and places say beforehand."
+        ),
+    ] = True,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the results of another run in OUTPUT.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
+) -> None:
+    """Register two pictures of different spectra: photos, radiometric photos or maps.
+
+    What cannot be registered with certainty is refused with a reason (exit code 7).
+    """
+    with ends_at_once():
+        from skyquilt.cli.progress import show
+        from skyquilt.config import RegisterSettings
+        from skyquilt.pipelines.register import iter_register
+
+    if quiet and json:
+        raise UsageError("--quiet and --json exclude one another")
+    settings = RegisterSettings(method=method, use_metadata=metadata)
+    events = iter_register(a, b, output, settings, overwrite=overwrite)
+    show(events, mode="quiet" if quiet else "json" if json else "normal", summary=summary)
+
+
+def summary(result: "Result") -> str:
+    """An accepted registration in a few lines."""
+    m = result.metrics
+    return "\n".join(
+        (
+            f"{m['model']}, {m['inliers']} inliers, residual {m['residual_px']} px, Q {m['q']:.2f},"
+            f" {m['cpu_seconds']:.2f} s of CPU",
+            f"B on A: {result.output / 'b_on_a.tif'}",
+            f"report: {result.output / 'report.html'}",
+        )
+    )

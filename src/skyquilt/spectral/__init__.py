@@ -1,0 +1,1 @@
+"""Stage: two pictures of different spectra -> a registration, or a refusal with its reason."""

@@ -1,0 +1,123 @@
+"""What spectra have in common: where edges run, whichever side of them is brighter.
+
+A picture becomes fields of unit-contrast orientation. With g = |g| exp(i t) the gradient, the fields are
+w exp(2 i t) and w exp(4 i t): both are the same for t and t + pi, so a reversed contrast changes nothing; the
+second tells orientations apart more sharply than the first alone. w is the gradient's length over its
+surroundings' RMS, so that faint and strong structure weigh alike.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from skyquilt.model.registration import Matrix
+
+Fields = NDArray
+"""(h, w, 4) of 32-bit numbers, see above."""
+BLUR = 1.0
+"""Standard deviation in px of the smoothing before gradients are taken."""
+SURROUNDINGS = 1 / 16
+"""Standard deviation of the surroundings that contrast is measured against, as a share of the side."""
+FLOOR = 0.3
+"""Share of the median contrast that is added to every contrast: flat areas stay weak."""
+STRONGEST = 2.0
+"""Largest weight: one glaring lamp must not decide."""
+MARGIN = 5
+"""Px: width of the neighbourhood whose pixels must all be picture for a gradient to count."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Orientation:
+    """The fields of one picture at one resolution."""
+
+    fields: Fields
+    """(h, w, 4): real and imaginary parts of w exp(2 i t), then of w exp(4 i t)."""
+    valid: NDArray
+    """(h, w) 1 where a gradient could be taken, else 0."""
+    small_S_full: Matrix
+    """(3, 3) takes full-size pixels to pixels of this resolution."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width in px."""
+        return self.fields.shape[0], self.fields.shape[1]
+
+
+def orientation(grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float) -> Orientation:
+    """Fields of a picture (H, W) shrunken to the area of a square of `side` px (never enlarged)."""
+    height, width = grey.shape
+    factor = max(1.0, np.sqrt(height * width) / side)
+    size = (max(1, round(width / factor)), max(1, round(height / factor)))
+    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    share = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    inner = cv2.erode(
+        (share > 0.99).astype(np.float32), np.ones((MARGIN, MARGIN)),
+        borderType=cv2.BORDER_CONSTANT, borderValue=0,
+    )  # fmt: skip
+    return Orientation(
+        fields=_fields(cv2.GaussianBlur(small, (0, 0), BLUR), inner), valid=inner,
+        small_S_full=_shrinking(size[0] / width, size[1] / height),
+    )  # fmt: skip
+
+
+def _fields(small: NDArray, valid: NDArray) -> Fields:
+    gx, gy = cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1)
+    length = np.hypot(gx, gy)
+    weight = np.minimum(length / _surroundings(length, valid), STRONGEST) * valid
+    unit = (gx + 1j * gy) / np.maximum(length, 1e-6)
+    double = unit * unit
+    first, second = weight * double, weight * double * double
+    return np.stack([first.real, first.imag, second.real, second.imag], -1).astype(np.float32)
+
+
+def _surroundings(length: NDArray, valid: NDArray) -> NDArray[np.float32]:
+    """RMS gradient about each pixel, over valid ones, and the floor."""
+    sigma = np.sqrt(length.size) * SURROUNDINGS
+    share = cv2.GaussianBlur(valid, (0, 0), sigma) + 1e-3
+    rms = np.sqrt(cv2.GaussianBlur(length * length * valid, (0, 0), sigma) / share)
+    inside = rms[valid > 0]
+    return np.asarray(rms + FLOOR * (np.median(inside) if inside.size else 0) + 1e-3 * (rms.max() or 1.0))
+
+
+def _shrinking(x: float, y: float) -> Matrix:
+    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
+
+
+def between(a: Orientation, b: Orientation, b_H_a: Matrix) -> Matrix:
+    """A transform of full-size pixels as one of these two resolutions' pixels."""
+    m = b.small_S_full @ b_H_a @ np.linalg.inv(a.small_S_full)
+    return np.asarray(m / m[2, 2])
+
+
+def full_size(a: Orientation, b: Orientation, small: Matrix) -> Matrix:
+    """The reverse of `between`."""
+    m = np.linalg.inv(b.small_S_full) @ small @ a.small_S_full
+    return np.asarray(m / m[2, 2])
+
+
+def warped(a: Orientation, b_H_a: Matrix, shape: tuple[int, int]) -> tuple[Fields, NDArray]:
+    """a's fields and validity as they would be in b's frame, (h, w, 4) and (h, w); orientations turn along."""
+    size = (shape[1], shape[0])
+    fields = cv2.warpPerspective(a.fields, b_H_a, size)
+    valid = cv2.warpPerspective(a.valid, b_H_a, size)
+    angle = float(np.arctan2(b_H_a[1, 0] - b_H_a[0, 1], b_H_a[0, 0] + b_H_a[1, 1]))
+    return turned(fields, angle), valid
+
+
+def turned(fields: Fields, angle: float) -> Fields:
+    """Fields whose orientations are turned by an angle in radians (x towards y); pixels stay."""
+    out = np.empty_like(fields)
+    for k in (0, 2):
+        c, s = np.float32(np.cos((k + 2) * angle)), np.float32(np.sin((k + 2) * angle))
+        out[..., k] = c * fields[..., k] - s * fields[..., k + 1]
+        out[..., k + 1] = s * fields[..., k] + c * fields[..., k + 1]
+    return out
+
+
+def spectra(fields: Fields, shape: tuple[int, int]) -> NDArray[np.complex64]:
+    """Fourier transforms (2, h, w) of both complex fields, padded to `shape`."""
+    both = np.ascontiguousarray(fields).view(np.complex64)
+    return np.asarray(scipy.fft.fft2(np.moveaxis(both, -1, 0), s=shape, axes=(1, 2)))

@@ -1,0 +1,90 @@
+"""What of a picture can be registered, and whether that is enough."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.model.registration import Picture
+
+SHORTEST = 48
+"""Px of the shorter side below which no patch of a picture could confirm its place."""
+NEAR_END = 4
+"""8-bit levels from black or white within which JPEG leaves a frame's colour."""
+LEAST_FRAME = 0.002
+"""Share of the picture that a frame takes at least; smaller dark spots at the border are picture."""
+LEAST_VALID = 0.1
+"""Share of the picture that must be left."""
+LEAST_RANGE = 3.0
+"""Levels between the 1st and 99th percentile (8 bits; counts of 16) below which there is no contrast."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Usable:
+    """A picture as one band of real numbers."""
+
+    grey: NDArray[np.float32]
+    """(H, W), no gaps: 0 where invalid."""
+    valid: NDArray[np.bool_]
+    """(H, W) where there is a picture."""
+    reason: str = ""
+    """Why nothing can be registered with it; empty if something can."""
+
+    def __bool__(self) -> bool:
+        return not self.reason
+
+
+def usable(picture: Picture) -> Usable:
+    """Brightness and valid part of a picture. A black or white frame, as rotated pictures have, is no
+    picture: its edges would be taken for structure and its shape would betray the rotation.
+    """
+    band = _one_band(picture.values)
+    finite = np.isfinite(band)
+    grey = np.where(finite, band, 0).astype(np.float32)
+    given = finite if picture.valid is None else finite & picture.valid
+    valid = given & ~_frame(grey, given, slack=NEAR_END if picture.values.dtype == np.uint8 else 0)
+    return Usable(grey=grey, valid=valid, reason=_reason(grey, valid))
+
+
+def _one_band(values: NDArray) -> NDArray[np.float32]:
+    if values.ndim == 2:
+        return values.astype(np.float32)
+    if values.shape[2] == 3:
+        return np.asarray(cv2.cvtColor(values.astype(np.float32), cv2.COLOR_RGB2GRAY))
+    return values.mean(2, dtype=np.float32)
+
+
+def _frame(grey: NDArray[np.float32], given: NDArray[np.bool_], slack: float) -> NDArray[np.bool_]:
+    """Regions at the darkest or brightest value that touch the border of what is given."""
+    frame = np.zeros(grey.shape, bool)
+    if not given.any():
+        return frame
+    low, high = float(grey[given].min()), float(grey[given].max())
+    for end in ((grey <= low + slack) & given, (grey >= high - slack) & given):
+        _count, label, stats, _ = cv2.connectedComponentsWithStats(end.astype(np.uint8), connectivity=4)
+        for region in np.unique(np.r_[label[0], label[-1], label[:, 0], label[:, -1]]):
+            if region and stats[region, cv2.CC_STAT_AREA] > LEAST_FRAME * grey.size:
+                frame |= label == region
+    return frame
+
+
+def _reason(grey: NDArray[np.float32], valid: NDArray[np.bool_]) -> str:
+    height, width = grey.shape
+    if min(height, width) < SHORTEST:
+        return f"has only {width} x {height} px, and {SHORTEST} a side are needed"
+    share = float(valid.mean())
+    if share < LEAST_VALID:
+        return (
+            f"is blank or saturated: {1 - share:.0%} of it is black, white or without measurement,"
+            f" and {LEAST_VALID:.0%} must be picture"
+        )
+    low, high = np.percentile(grey[valid], [1, 99])
+    if high - low < LEAST_RANGE * _unit(grey):
+        return f"has no contrast: 98 % of its values lie between {low:g} and {high:g}"
+    return ""
+
+
+def _unit(grey: NDArray[np.float32]) -> float:
+    """1 for levels and counts; a twentieth for measured values of finer steps, such as degrees."""
+    return 1.0 if np.array_equal(grey[::7, ::7], np.rint(grey[::7, ::7])) else 0.05
