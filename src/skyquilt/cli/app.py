@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from skyquilt import __version__
+from skyquilt.cli import calibrate as calibrate_command
 from skyquilt.cli import inspect as inspect_command
 from skyquilt.cli import mosaic as mosaic_command
 from skyquilt.cli import register as register_command
@@ -19,6 +20,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 app.command("mosaic", epilog=EXIT_CODES)(mosaic_command.command)
 app.command("inspect", epilog=EXIT_CODES)(inspect_command.command)
 app.command("register", epilog=EXIT_CODES)(register_command.command)
+app.command("calibrate", epilog=EXIT_CODES)(calibrate_command.command)
 app.command("simulate", epilog=EXIT_CODES)(simulate_command.command)
 
 
