@@ -55,7 +55,10 @@ class Calibrate:
         known = np.isfinite(px[..., 0])
         if self.marks == "centres" and not self.margins:
             known &= board.inner
-        return Sightings(name=view.name, board=points[known], px=px[known])
+        return Sightings(
+            name=view.name, board=points[known], px=px[known],
+            rounding_px=view.rounding_px if self.marks == "centres" else 0.0,
+        )  # fmt: skip
 
     def _reduced(self, seen: Sequence[Sightings], rough: Solution, board: Board) -> Calibration:
         """Fits all parameters, and again without those that are smaller than their tolerance."""
@@ -93,7 +96,7 @@ class Calibrate:
         if self.marks == "corners":
             return list(seen)
         return [
-            replace(s, px=s.px - centroid_bias(camera, pose, s.board, board.square_m))
+            replace(s, px=s.px - centroid_bias(camera, pose, s.board, board.square_m, s.rounding_px))
             for s, pose in zip(seen, poses, strict=True)
         ]
 

@@ -52,13 +52,13 @@ class FindBoard:
             px_H_cell=up @ found.px_H_cell, white_first=found.white_first, contrast=found.contrast,
             texture=found.texture,
         )  # fmt: skip
-        centroids, H = self.measure.centroids(whole, placed, board)
+        centroids, H, rounding = self.measure.centroids(whole, placed, board)
         inner = np.isfinite(centroids[board.inner][:, 0]).mean()
         if inner < 0.5:
             return RejectedView(name=name, reason=f"only {inner:.0%} of its inner squares could be measured")
         return BoardView(
             name=name, width=width, height=height, centroids=centroids, corners=corners(whole, H, board),
-            contrast=found.contrast / max(found.texture, 1e-9), frames=frames,
+            rounding_px=rounding,            contrast=found.contrast / max(found.texture, 1e-9), frames=frames,
         )  # fmt: skip
 
     def _search(self, image: Image, board: Board) -> Placed | Misplaced:

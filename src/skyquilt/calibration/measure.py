@@ -31,23 +31,27 @@ class Measure:
     version: ClassVar[int] = 1
     side_px: float = 100.0
     """Pictures are enlarged until a square has about this side: blobs have whole pixels."""
-    openings: tuple[float, ...] = (0.1, 0.25)
-    """Radii of erosion and dilation in sides of a square; a larger one is tried where squares still cling."""
+    opening: float = 0.25
+    """Radius of erosion and dilation in sides of a square. Corners, where heat and blur make squares cling to one
+    another, are rounded off by it; `square_image` knows that."""
 
-    def centroids(self, image: Image, placed: Placed, board: Board) -> tuple[Array, Array]:
-        """Centroids (rows, columns, 2) in px, NaN where none was measured, and the refined px_H_cell."""
+    def centroids(self, image: Image, placed: Placed, board: Board) -> tuple[Array, Array, float]:
+        """Centroids (rows, columns, 2) in px, NaN where none was measured, the refined px_H_cell, and the radius
+        in px by which corners were rounded off.
+        """
+        rounding = 0.0
         H = placed.px_H_cell
         px = np.full((board.rows, board.columns, 2), np.nan)
         for _ in range(_ROUNDS):
-            px = self._once(image, H, placed.white_first, board)
+            px, rounding = self._once(image, H, placed.white_first, board)
             known = np.isfinite(px[..., 0])
             if known.sum() < _FEWEST:
                 break
             cells = np.argwhere(known)[:, ::-1].astype(np.float64)
             H = cv2.findHomography(cells, px[known], 0)[0]
-        return px, H
+        return px, H, rounding
 
-    def _once(self, image: Image, H: Array, white_first: bool, board: Board) -> Array:
+    def _once(self, image: Image, H: Array, white_first: bool, board: Board) -> tuple[Array, float]:
         area = _areas(H, board)
         side = float(np.sqrt(np.median(area)))
         factor = int(np.clip(round(self.side_px / side), 1, 8))
@@ -57,18 +61,15 @@ class Measure:
         size = np.array([board.columns, board.rows], np.float32)
         near = np.all((cell > -0.5 - _MARGIN) & (cell < size - 0.5 + _MARGIN), -1)
         out = np.full((board.rows, board.columns, 2), np.nan)
-        for opening in self.openings:
-            for white in (True, False):
-                colour = opened(((part > threshold) == white) & near, opening * side * factor)
-                for centre, share in _hulls(colour, px_H_part):
-                    column, row = np.rint(through(np.linalg.inv(H), centre[None])[0]).astype(int)
-                    if not (0 <= column < board.columns and 0 <= row < board.rows):
-                        continue
+        for white in (True, False):
+            colour = opened(((part > threshold) == white) & near, self.opening * side * factor)
+            for centre, size_px in _hulls(colour, px_H_part):
+                column, row = np.rint(through(np.linalg.inv(H), centre[None])[0]).astype(int)
+                if 0 <= column < board.columns and 0 <= row < board.rows:
                     own = ((row + column) % 2 == 0) == (white_first == white)
-                    fits = _AREA[0] < share / area[row, column] < _AREA[1]
-                    if own and fits and np.isnan(out[row, column, 0]):
+                    if own and _AREA[0] < size_px / area[row, column] < _AREA[1]:
                         out[row, column] = centre
-        return out
+        return out, self.opening * side
 
 
 def half_way(image: Image, middle: Image, cell: Image, side: float) -> Image:

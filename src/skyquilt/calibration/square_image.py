@@ -11,23 +11,50 @@ Array = NDArray[np.float64]
 _PER_SIDE = 6
 
 
-def centroid_bias(camera: Camera, pose: BoardPose, centres: Array, side_m: float) -> Array:
+def centroid_bias(
+    camera: Camera, pose: BoardPose, centres: Array, side_m: float, rounding_px: float = 0.0
+) -> Array:
     """Centroid of each square's image less the image of its centre (n, 2) in px.
 
     Squares (n, 3) in m on the board, projected with perspective and distortion; the outline is followed in
-    short straight pieces, so its area and moments are exact for a pinhole and close for a lens.
+    short straight pieces, so its area and moments are exact for a pinhole and close for a lens. `rounding_px`
+    is the radius by which the corners of the images were rounded off.
     """
     t = np.arange(_PER_SIDE) / _PER_SIDE - 0.5
     half = np.full(_PER_SIDE, 0.5)
     x, y = np.r_[t, half, -t, -half] * side_m, np.r_[-half, t, half, -t] * side_m
     outline = centres[:, None] + np.column_stack([x, y, np.zeros_like(x)])
     px = project(camera, pose(outline.reshape(-1, 3))).reshape(len(centres), -1, 2)
-    middle = project(camera, pose(centres))
-    return polygon_centroids(px - middle[:, None])
+    px -= project(camera, pose(centres))[:, None]
+    centroid, area = polygon_centroids(px)
+    if rounding_px <= 0:
+        return centroid
+    lost, where = _rounded_off(px, rounding_px)
+    return (centroid * area[:, None] - (lost[..., None] * where).sum(1)) / (area - lost.sum(1))[:, None]
 
 
-def polygon_centroids(points: Array) -> Array:
-    """Centroids (n, 2) of the areas of polygons (n, k, 2)."""
+def polygon_centroids(points: Array) -> tuple[Array, Array]:
+    """Centroids (n, 2) and areas (n,) of polygons (n, k, 2)."""
     following = np.roll(points, -1, axis=1)
     cross = points[..., 0] * following[..., 1] - points[..., 1] * following[..., 0]
-    return np.asarray(((points + following) * cross[..., None]).sum(1) / (3 * cross.sum(1)[:, None]))
+    twice = cross.sum(1)
+    return ((points + following) * cross[..., None]).sum(1) / (3 * twice[:, None]), np.abs(twice) / 2
+
+
+def _rounded_off(outline: Array, radius: float) -> tuple[Array, Array]:
+    """Area (n, 4) and centroid (n, 4, 2) of what lies between a corner of an outline (n, 4 k, 2) and a disc that
+    touches both of its sides: a kite less a sector.
+    """
+    corner = outline[:, ::_PER_SIDE]
+    one = outline[:, 1::_PER_SIDE] - corner
+    other = np.roll(outline, 1, axis=1)[:, ::_PER_SIDE] - corner
+    one /= np.linalg.norm(one, axis=2, keepdims=True)
+    other /= np.linalg.norm(other, axis=2, keepdims=True)
+    half = np.arccos(np.clip((one * other).sum(2), -1, 1)) / 2
+    kite, sector = radius**2 / np.tan(half), radius**2 * (np.pi / 2 - half)
+    to_kite = radius * (np.cos(half) ** 2 + 1) / (3 * np.sin(half))
+    to_sector = radius / np.sin(half) - 2 * radius * np.cos(half) / (3 * (np.pi / 2 - half))
+    lost = kite - sector
+    inwards = one + other
+    inwards /= np.linalg.norm(inwards, axis=2, keepdims=True)
+    return lost, corner + inwards * ((kite * to_kite - sector * to_sector) / lost)[..., None]
