@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.geometry.camera import project, project_with_derivatives
+from skyquilt.calibration.deviations import sigmas
+from skyquilt.calibration.linearised import linearised
+from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import rotation_from_vector
 from skyquilt.model.calibration import BoardPose, Sightings
 from skyquilt.model.camera import PARAMETERS, Camera
@@ -39,7 +41,7 @@ def solve(
 ) -> Solution:
     """Levenberg and Marquardt over the intrinsics named in `free` and six parameters of each pose.
 
-    The standard deviations are those of the linearised problem with the variance that the residuals show.
+    For the standard deviations see `deviations.sigmas`.
     """
     columns = [PARAMETERS.index(name) for name in free]
     best, damping = _state(views, camera, poses), 1e-3
@@ -59,7 +61,7 @@ def solve(
             damping *= 10
     residuals = tuple(v.px - p for v, p in zip(views, best.predicted, strict=True))
     return Solution(
-        camera=replace(best.camera, sigmas=_sigmas(normal, best.cost, views, columns)),
+        camera=replace(best.camera, sigmas=sigmas(views, best.camera, best.poses, columns)),
         poses=tuple(best.poses),
         residuals=residuals,
     )
@@ -86,14 +88,8 @@ def _normal(views: Sequence[Sightings], state: _State, columns: Sequence[int]) -
     size = own + 6 * len(views)
     normal, gradient = np.zeros((size, size)), np.zeros(size)
     for k, (view, pose) in enumerate(zip(views, state.poses, strict=True)):
-        turned = view.board @ pose.cam_R_board.T
-        vector = np.broadcast_to(state.camera.vector, (len(turned), 8))
-        at = project_with_derivatives(vector, turned + pose.cam_t)
-        spin = np.zeros((len(turned), 3, 3))  # d(turned) by the rotation vector: -[turned]x
-        spin[:, 0, 1], spin[:, 0, 2], spin[:, 1, 2] = turned[:, 2], -turned[:, 1], turned[:, 0]
-        spin -= np.swapaxes(spin, 1, 2)
-        J = np.concatenate([at.d_intrinsics[:, :, columns], at.d_point @ spin, at.d_point], 2)
-        J, r = J.reshape(-1, own + 6), (view.px - at.px).ravel()
+        J, r = linearised(view, state.camera, pose, columns)
+        J, r = J.reshape(-1, own + 6), r.ravel()
         where = np.r_[0:own, own + 6 * k : own + 6 * k + 6]
         normal[np.ix_(where, where)] += J.T @ J
         gradient[where] += J.T @ r
@@ -107,14 +103,3 @@ def _moved(state: _State, step: Array, columns: Sequence[int]) -> tuple[Camera, 
     return replace(state.camera, **changed), [moved(p, s) for p, s in zip(state.poses, rest, strict=True)]
 
 
-def _sigmas(
-    normal: Array, cost: float, views: Sequence[Sightings], columns: Sequence[int]
-) -> tuple[float, ...]:
-    """Standard deviations in the order of `PARAMETERS`; 0 for what was held."""
-    spare = sum(v.px.size for v in views) - len(normal)
-    scale = 1 / np.sqrt(np.diag(normal))  # the parameters' units differ by many powers of ten
-    covariance = np.linalg.pinv(normal * scale * scale[:, None], hermitian=True) * scale * scale[:, None]
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 0) * cost / max(spare, 1))
-    out = np.zeros(len(PARAMETERS))
-    out[list(columns)] = sigma[: len(columns)]
-    return tuple(out.tolist())

@@ -1,0 +1,44 @@
+"""How well a calibration knows its parameters."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.calibration.linearised import linearised
+from skyquilt.model.calibration import BoardPose, Sightings
+from skyquilt.model.camera import PARAMETERS, Camera
+
+Array = NDArray[np.float64]
+
+
+def sigmas(
+    views: Sequence[Sightings], camera: Camera, poses: Sequence[BoardPose], columns: Sequence[int]
+) -> tuple[float, ...]:
+    """Standard deviations in the order of `PARAMETERS`, 0 for what was held (`columns` says what was not).
+
+    The larger of two: that of independent errors with the variance that the residuals show, and one that lets
+    errors repeat in every view at the same mark of the board [the sandwich, clustered by mark]: a board that is
+    not quite flat or evenly heated is wrong in the same way in all views, and more views do not make it right.
+    """
+    own = len(columns)
+    size = own + 6 * len(views)
+    normal, scores, total, count = np.zeros((size, size)), {}, 0.0, 0
+    for k, (view, pose) in enumerate(zip(views, poses, strict=True)):
+        J, r = linearised(view, camera, pose, columns)
+        where = np.r_[0:own, own + 6 * k : own + 6 * k + 6]
+        flat = J.reshape(-1, own + 6)
+        normal[np.ix_(where, where)] += flat.T @ flat
+        total, count = total + float((r * r).sum()), count + r.size
+        for mark, score in zip(map(tuple, np.round(view.board, 6)), np.einsum("nij,ni->nj", J, r), strict=True):
+            scores.setdefault(mark, np.zeros(size))[where] += score
+    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))  # the parameters' units differ by many powers of ten
+    inverse = np.linalg.pinv(normal * scale * scale[:, None], hermitian=True) * scale * scale[:, None]
+    spare = max(count - size, 1)
+    independent = np.diag(inverse)[:own] * total / spare
+    moved = inverse[:own] @ np.array(list(scores.values())).T
+    few = len(scores) / max(len(scores) - own, 1) * (count - 1) / spare
+    repeated = (moved * moved).sum(1) * few
+    out = np.zeros(len(PARAMETERS))
+    out[list(columns)] = np.sqrt(np.maximum(np.maximum(independent, repeated), 0))
+    return tuple(out.tolist())
