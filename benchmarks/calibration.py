@@ -1,8 +1,8 @@
 """Lens calibration: simulated heated sweeps with known truth, weights of the assembly, real thermal boards.
 
-    python benchmarks/calibration.py sweeps [SEEDS]     # five poses of 92 frames each per seed
-    python benchmarks/calibration.py weights            # what powers of 1 / phi do to assembled pictures
-    python benchmarks/calibration.py boards FOLDER COLUMNSxROWS SQUARE   # real frames, as `skyquilt calibrate` sees them
+python benchmarks/calibration.py sweeps [SEEDS]     # five poses of 92 frames each per seed
+python benchmarks/calibration.py weights            # what powers of 1 / phi do to assembled pictures
+python benchmarks/calibration.py boards FOLDER COLUMNSxROWS SQUARE   # real frames, as `skyquilt calibrate` sees them
 """
 
 import sys
@@ -36,13 +36,17 @@ def lens_of(rng):
 
 def lamp_of(rng):
     """A lamp's way over the board, another one for each seed."""
-    return Lamp(lines=int(rng.integers(3, 6)), radius=float(rng.uniform(1.4, 2.0)), rise=float(rng.uniform(4, 8)))
+    return Lamp(
+        lines=int(rng.integers(3, 6)), radius=float(rng.uniform(1.4, 2.0)), rise=float(rng.uniform(4, 8))
+    )
 
 
 def sweeps(seeds):
     """Assembled, found, calibrated, and compared with the truth."""
     inside = narrow = found = 0
-    print("seed  views  truth     from centres            z     dev %  RMS    from corners           z     CPU s")
+    print(
+        "seed  views  truth     from centres            z     dev %  RMS    from corners           z     CPU s"
+    )
     for seed in range(seeds):
         began, rng = time.process_time(), np.random.default_rng([seed, 77])
         lens, lamp = lens_of(rng), lamp_of(rng)
@@ -66,7 +70,9 @@ def sweeps(seeds):
                 narrow += sigma <= 0.02 * got.camera.focal
                 line += f"   {100 * sigma / got.camera.focal:5.2f}  {got.rms_px:.3f}"
         print(f"{line}   {time.process_time() - began:5.1f}", flush=True)
-    print(f"grids found {found} of {5 * seeds}; deviation <= 2 % in {narrow}, truth within two in {inside} of {seeds}")
+    print(
+        f"grids found {found} of {5 * seeds}; deviation <= 2 % in {narrow}, truth within two in {inside} of {seeds}"
+    )
 
 
 def weights():
@@ -92,7 +98,9 @@ def boards(folder, size, square):
     columns, rows = parse_board(size)
     with tempfile.TemporaryDirectory() as out:
         began = time.process_time()
-        m = calibrate(folder, Path(out) / "out", CalibrateSettings(columns=columns, rows=rows, square_m=float(square)))
+        m = calibrate(
+            folder, Path(out) / "out", CalibrateSettings(columns=columns, rows=rows, square_m=float(square))
+        )
         m = m.metrics
     print(f"boards {m['views_used']} of {m['views_used'] + len(m['views_rejected'])} views")
     for marks in ("centres", "corners"):

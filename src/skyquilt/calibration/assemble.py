@@ -46,14 +46,13 @@ class Assemble:
         rows = (np.arange(image.shape[0]) - (side - 1) / 2) / step
         columns = (np.arange(image.shape[1]) - (side - 1) / 2) / step
         x, y = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
-        smooth = cv2.remap(
-            cells.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
+        smooth = cv2.remap(cells.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(smooth + np.float32(1e-6 * max(float(cells.max()), 1e-20)), np.float32)
 
 
 def cell_of(shape: tuple[int, ...], board: Board) -> int:
     """Two squares (the thesis's least width of a cell) of a board that fills the frame, in px: smaller ones
-    make cells that are wider than that."""
+    make cells that are wider than that.
+    """
     short, long = sorted((board.columns, board.rows))
     return max(4, int(2 * min(min(shape[:2]) / short, max(shape[:2]) / long)))

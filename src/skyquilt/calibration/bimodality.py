@@ -28,7 +28,10 @@ def separation(image: NDArray[np.float32], cell_px: int) -> NDArray[np.float64]:
     rows, columns = (max(1, 1 + (size - cell_px + step - 1) // step) for size in image.shape)
     out = np.zeros((rows, columns))
     for i, j in np.ndindex(rows, columns):
-        top, left = min(i * step, max(image.shape[0] - cell_px, 0)), min(j * step, max(image.shape[1] - cell_px, 0))
+        top, left = (
+            min(i * step, max(image.shape[0] - cell_px, 0)),
+            min(j * step, max(image.shape[1] - cell_px, 0)),
+        )
         phi = bimodality(image[top : top + cell_px, left : left + cell_px])
         out[i, j] = 1 / phi if phi > 0 else 0.0
     return out

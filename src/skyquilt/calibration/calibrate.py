@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from skyquilt.model.camera import PARAMETERS, Camera
 Array = NDArray[np.float64]
 _OPTIONAL = (("k3",), ("p1", "p2"), ("k2",), ("k1",))
 """Coefficients in the order in which they are dropped: the highest order first, both tangential ones at once."""
+
+
+_LENGTHS = ("focal", "cx", "cy")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +42,9 @@ class Calibrate:
         Raises `ValueError` where views differ in size or are fewer.
         """
         if len(views) < 2 or len({(v.width, v.height) for v in views}) != 1:
-            raise ValueError(f"two views or more of one size expected, got {[(v.width, v.height) for v in views]}")
+            raise ValueError(
+                f"two views or more of one size expected, got {[(v.width, v.height) for v in views]}"
+            )
         seen = [self.sightings(v, board) for v in views]
         start = start_camera(seen, width=views[0].width, height=views[0].height)
         poses = [start_pose(s, start) for s in seen]
@@ -64,19 +69,22 @@ class Calibrate:
         """Fits all parameters, and again without those that are smaller than their tolerance."""
         free, dropped = list(PARAMETERS), []
         solution, used = self._fit(seen, rough, free, board)
+        full = solution.camera
         for names in _OPTIONAL:
-            found = [(n, getattr(solution.camera, n), self.tolerance * _sigma(solution.camera, n)) for n in names]
+            found = [
+                (n, getattr(solution.camera, n), self.tolerance * _sigma(solution.camera, n)) for n in names
+            ]
             if any(abs(value) >= tolerance for _, value, tolerance in found):
                 if names == ("p1", "p2"):
                     continue  # a radial term may be spare although decentring is not
                 break
             dropped += found
             free = [n for n in free if n not in names]
-            held = replace(solution.camera, **dict.fromkeys(names, 0.0))
+            held = _without(solution.camera, names)
             solution, used = self._fit(seen, replace(solution, camera=held), free, board)
         return Calibration(
-            marks=self.marks, camera=solution.camera, free=tuple(free), dropped=tuple(dropped),
-            sightings=tuple(used), poses=solution.poses, residuals=solution.residuals,
+            marks=self.marks, camera=_widened(solution.camera, full, free), free=tuple(free),
+            dropped=tuple(dropped), sightings=tuple(used), poses=solution.poses, residuals=solution.residuals,
         )  # fmt: skip
 
     def _fit(
@@ -113,6 +121,20 @@ class Calibrate:
 
 def _sigma(camera: Camera, name: str) -> float:
     return camera.sigmas[PARAMETERS.index(name)] if camera.sigmas else 0.0
+
+
+def _without(camera: Camera, names: Sequence[str]) -> Camera:
+    """The camera, some of its coefficients zero."""
+    changed: dict[str, Any] = dict.fromkeys(names, 0.0)
+    return replace(camera, **changed)
+
+
+def _widened(camera: Camera, full: Camera, free: Sequence[str]) -> Camera:
+    """The camera, the deviations of its lengths grown by what dropping coefficients moved: below the tolerance is
+    not zero. Coefficients of other orders are other quantities, whatever their names.
+    """
+    moved = np.where([n in free and n in _LENGTHS for n in PARAMETERS], camera.vector - full.vector, 0.0)
+    return replace(camera, sigmas=tuple(np.hypot(camera.sigmas or np.zeros(len(moved)), moved).tolist()))
 
 
 def strangers(calibration: Calibration, *, times: float = 4.0) -> dict[str, float]:

@@ -30,9 +30,13 @@ def sigmas(
         flat = J.reshape(-1, own + 6)
         normal[np.ix_(where, where)] += flat.T @ flat
         total, count = total + float((r * r).sum()), count + r.size
-        for mark, score in zip(map(tuple, np.round(view.board, 6)), np.einsum("nij,ni->nj", J, r), strict=True):
+        for mark, score in zip(
+            map(tuple, np.round(view.board, 6)), np.einsum("nij,ni->nj", J, r), strict=True
+        ):
             scores.setdefault(mark, np.zeros(size))[where] += score
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))  # the parameters' units differ by many powers of ten
+    scale = 1 / np.sqrt(
+        np.maximum(np.diag(normal), 1e-300)
+    )  # the parameters' units differ by many powers of ten
     inverse = np.linalg.pinv(normal * scale * scale[:, None], hermitian=True) * scale * scale[:, None]
     spare = max(count - size, 1)
     independent = np.diag(inverse)[:own] * total / spare

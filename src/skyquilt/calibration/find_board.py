@@ -37,14 +37,16 @@ class FindBoard:
     measure: Measure = field(default_factory=Measure)
     """Sub-pixel measurement."""
 
-    def __call__(self, name: str, image: NDArray, board: Board, *, frames: int = 1) -> BoardView | RejectedView:
+    def __call__(
+        self, name: str, image: NDArray, board: Board, *, frames: int = 1
+    ) -> BoardView | RejectedView:
         """The board in a frame (H, W) of any type, NaN where nothing was measured."""
         whole = grey_float(image)
         if (reason := blankness(whole)) is not None:
             return RejectedView(name=name, reason=reason)
         small, scale = shrink(whole, self.longest_px)
         found = self._search(small, board)
-        if not found:
+        if isinstance(found, Misplaced):
             return RejectedView(name=name, reason=found.reason)
         height, width = whole.shape
         up = np.array([[scale, 0, (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]])
@@ -78,7 +80,7 @@ class FindBoard:
         short, long = sorted((board.columns, board.rows))
         side = min(min(width, height) / short, max(width, height) / long) / 1.3
         while side >= self.smallest_px:
-            smooth = cv2.GaussianBlur(image, (0, 0), max(0.04 * side, 0.5))
+            smooth: Image = np.asarray(cv2.GaussianBlur(image, (0, 0), max(0.04 * side, 0.5)), np.float32)
             binary = Wellner(window_px=round(2 * side))(smooth)
             for erosion in dict.fromkeys(max(1, round(e * side)) for e in self.erosions):
                 yield blobs(binary, erosion, largest=4 * side * side)

@@ -12,7 +12,9 @@ from skyquilt.model.camera import PARAMETERS, Camera
 Array = NDArray[np.float64]
 
 
-def linearised(view: Sightings, camera: Camera, pose: BoardPose, columns: Sequence[int]) -> tuple[Array, Array]:
+def linearised(
+    view: Sightings, camera: Camera, pose: BoardPose, columns: Sequence[int]
+) -> tuple[Array, Array]:
     """Derivatives (n, 2, columns + 6) of a view's points by intrinsics (columns of `PARAMETERS`) and pose, and
     residuals (n, 2) in px.
     """

@@ -61,9 +61,11 @@ class Measure:
         size = np.array([board.columns, board.rows], np.float32)
         near = np.all((cell > -0.5 - _MARGIN) & (cell < size - 0.5 + _MARGIN), -1)
         out = np.full((board.rows, board.columns, 2), np.nan)
+        above = part - threshold
         for white in (True, False):
-            colour = opened(((part > threshold) == white) & near, self.opening * side * factor)
-            for centre, size_px in _hulls(colour, px_H_part):
+            sign = np.float32(1 if white else -1)
+            blobs = opened((above * sign > 0) & near, self.opening * side * factor)
+            for centre, size_px in _centroids(blobs, coverage(above * sign), px_H_part):
                 column, row = np.rint(through(np.linalg.inv(H), centre[None])[0]).astype(int)
                 if 0 <= column < board.columns and 0 <= row < board.rows:
                     own = ((row + column) % 2 == 0) == (white_first == white)
@@ -99,15 +101,34 @@ def opened(mask: NDArray[np.bool_], radius: float) -> NDArray[np.uint8]:
     return np.asarray(away < radius, np.uint8)
 
 
-def _hulls(blobs: NDArray[np.uint8], px_H_part: Array) -> Iterator[tuple[Array, float]]:
-    """Centroid (2,) in px and area in px^2 of the convex hull of each blob [Suzuki's outlines]."""
+def coverage(above: Image) -> Image:
+    """Share (h, w) of every pixel that is above the threshold, from its value and the slope there."""
+    slope_y, slope_x = np.gradient(above)
+    slope = np.maximum(np.hypot(slope_x, slope_y), 1e-12)
+    return np.asarray(np.clip(0.5 + above / slope, 0, 1), np.float32)
+
+
+def _centroids(
+    blobs: NDArray[np.uint8], covered: Image, px_H_part: Array
+) -> Iterator[tuple[Array, float]]:
+    """Centroid (2,) in px and area in px^2 of each blob within its convex hull [outlines: Suzuki]; pixels on the
+    outline count by their share.
+    """
     scale = float(px_H_part[0, 0])
+    around = np.ones((3, 3), np.uint8)
     for outline in cv2.findContours(blobs, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
-        moments = cv2.moments(cv2.convexHull(outline))
-        if moments["m00"] > 0:
-            centre = np.array([[moments["m10"], moments["m01"]]]) / moments["m00"]
-            # the outline runs through the middles of the outermost pixels
-            yield through(px_H_part, centre)[0], ((np.sqrt(moments["m00"]) + 1) * scale) ** 2
+        x, y, w, h = cv2.boundingRect(outline)
+        box = np.zeros((h + 4, w + 4), np.uint8)
+        cv2.fillConvexPoly(box, cv2.convexHull(outline) - np.array([x - 2, y - 2]), 1)
+        inside, reach = cv2.erode(box, around), cv2.dilate(box, around)
+        top, left = max(y - 2, 0), max(x - 2, 0)
+        part = covered[top : y + h + 2, left : x + w + 2]
+        cut = (slice(top - y + 2, top - y + 2 + part.shape[0]), slice(left - x + 2, left - x + 2 + part.shape[1]))
+        share = np.where(inside[cut] > 0, 1.0, part * reach[cut])
+        total = float(share.sum())
+        if total > 0:
+            middle = [share.sum(0) @ np.arange(share.shape[1]) / total, share.sum(1) @ np.arange(share.shape[0]) / total]
+            yield through(px_H_part, np.array([middle]) + [left, top])[0], total * scale * scale
 
 
 def corners(image: Image, px_H_cell: Array, board: Board) -> Array:
@@ -164,4 +185,6 @@ def _cell_of(shape: tuple[int, ...], px_H_part: Array, px_H_cell: Array) -> Imag
     """(column, row) of the board at every pixel (h, w, 2)."""
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]]
     cell_H_part = np.linalg.inv(px_H_cell) @ px_H_part
-    return np.asarray(through(cell_H_part, np.column_stack([x.ravel(), y.ravel()])).reshape(*shape[:2], 2), np.float32)
+    return np.asarray(
+        through(cell_H_part, np.column_stack([x.ravel(), y.ravel()])).reshape(*shape[:2], 2), np.float32
+    )

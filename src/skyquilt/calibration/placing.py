@@ -19,6 +19,10 @@ _ABOVE_TEXTURE = 2.0
 """Black and white must differ by so many times the spread inside a square."""
 
 
+_INNER = 0.75
+"""From the middle of the outermost square but one to the end of the middle half of the outermost one."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Placed:
     """A board's place in a frame."""
@@ -72,7 +76,8 @@ def place(image: Image, grid: Lattice, board: Board) -> Placed | Misplaced:
 
 def _windows(grid: Lattice, board: Board) -> Iterator[Array]:
     """grid_H_board (3, 3) of every way to lay the board over the grid so that all squares found, or all but
-    an outer row, are covered; four turns each."""
+    an outer row, are covered; four turns each.
+    """
     low, high = grid.cells.min(0), grid.cells.max(0)
     for quarter in range(4):
         turn = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), quarter)
@@ -103,12 +108,14 @@ def _judged(image: Image, grid: Lattice, window: Array, board: Board) -> Placed 
 
 
 def _in_frame(H: Array, board: Board, shape: tuple[int, ...]) -> bool:
-    """Whether all squares lie in the image."""
-    c, r = board.columns - 0.5, board.rows - 0.5
-    outline = through(H, np.array([[-0.5, -0.5], [c, -0.5], [c, r], [-0.5, r]]))
-    depth = np.array([[-0.5, -0.5, 1], [c, -0.5, 1], [c, r, 1], [-0.5, r, 1]]) @ H[2]
+    """Whether the middle halves of all squares lie in the image: a lens bends the outer sides inwards, and the
+    homography does not know that.
+    """
+    c, r = board.columns - _INNER, board.rows - _INNER
+    ends = np.array([[_INNER - 1, _INNER - 1], [c, _INNER - 1], [c, r], [_INNER - 1, r]])
+    outline, depth = through(H, ends), np.column_stack([ends, np.ones(4)]) @ H[2]
     in_front = bool(np.all(depth * depth[0] > 0))
-    return in_front and bool(np.all((outline > -1) & (outline < np.array([shape[1], shape[0]]))))
+    return in_front and bool(np.all((outline > -0.5) & (outline < np.array([shape[1], shape[0]]) - 0.5)))
 
 
 def cell_levels(image: Image, H: Array, board: Board) -> tuple[Array, Array]:

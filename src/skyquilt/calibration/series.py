@@ -27,7 +27,9 @@ class StoodStill:
     def structure(self, image: NDArray) -> Image:
         """A frame's structure of 2 to 8 px, reduced (h, w)."""
         small = shrink(grey_float(image), self.longest_px)[0]
-        return np.asarray(cv2.GaussianBlur(small, (0, 0), 1.2) - cv2.GaussianBlur(small, (0, 0), 4.0), np.float32)
+        return np.asarray(
+            cv2.GaussianBlur(small, (0, 0), 1.2) - cv2.GaussianBlur(small, (0, 0), 4.0), np.float32
+        )
 
     def __call__(self, a: Image, b: Image) -> bool:
         """Of two frames' structures."""

@@ -98,8 +98,9 @@ def _normal(views: Sequence[Sightings], state: _State, columns: Sequence[int]) -
 
 def _moved(state: _State, step: Array, columns: Sequence[int]) -> tuple[Camera, list[BoardPose]]:
     own = len(columns)
-    changed = {PARAMETERS[c]: getattr(state.camera, PARAMETERS[c]) + float(s) for c, s in zip(columns, step, strict=False)}
+    changed = {
+        PARAMETERS[c]: getattr(state.camera, PARAMETERS[c]) + float(s)
+        for c, s in zip(columns, step, strict=False)
+    }
     rest = step[own:].reshape(-1, 6)
     return replace(state.camera, **changed), [moved(p, s) for p, s in zip(state.poses, rest, strict=True)]
-
-

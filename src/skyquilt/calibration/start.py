@@ -21,13 +21,18 @@ def start_camera(views: Sequence[Sightings], *, width: int, height: int) -> Came
     for view in views:
         h = middle @ _homography(view)
         h /= np.linalg.norm(h[:, 0])
-        rows += [h[0, 0] * h[0, 1] + h[1, 0] * h[1, 1], h[0, 0] ** 2 + h[1, 0] ** 2 - h[0, 1] ** 2 - h[1, 1] ** 2]
+        rows += [
+            h[0, 0] * h[0, 1] + h[1, 0] * h[1, 1],
+            h[0, 0] ** 2 + h[1, 0] ** 2 - h[0, 1] ** 2 - h[1, 1] ** 2,
+        ]
         right += [-h[2, 0] * h[2, 1], h[2, 1] ** 2 - h[2, 0] ** 2]
     a, b = np.array(rows), np.array(right)
     inverse = float(a @ b / (a @ a)) if a @ a > 0 else 0.0
     focal = 1 / np.sqrt(inverse) if inverse > 0 else 0.0
     longest = max(width, height)
-    return Camera.ideal(width=width, height=height, focal=focal if 0.2 * longest < focal < 60 * longest else longest)
+    return Camera.ideal(
+        width=width, height=height, focal=focal if 0.2 * longest < focal < 60 * longest else longest
+    )
 
 
 def start_pose(view: Sightings, camera: Camera) -> BoardPose:

@@ -14,7 +14,9 @@ if TYPE_CHECKING:
 
 
 def command(
-    frames: Annotated[Path, typer.Argument(help="Folder of frames, thermal or visible (subfolders included).")],
+    frames: Annotated[
+        Path, typer.Argument(help="Folder of frames, thermal or visible (subfolders included).")
+    ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
     board: Annotated[str, typer.Option(help="Squares (not corners) of the board, such as 7x6.")],
     square: Annotated[float, typer.Option(help="Side of a square in m.")],
@@ -67,7 +69,9 @@ def summary(result: "Result") -> str:
     m = result.metrics
     found, held = m["centres"], m["centres"]["held_out_px"]["centres"]
     values = found["parameters"]
-    terms = [f"{n} {values[n]['value']:+.4f} ± {values[n]['sigma']:.4f}" for n in values if values[n]["free"]][3:]
+    terms = [
+        f"{n} {values[n]['value']:+.4f} ± {values[n]['sigma']:.4f}" for n in values if values[n]["free"]
+    ][3:]
     return "\n".join(
         (
             f"{m['views_used']} views ({m['frames']} frames), {found['points']} centres of squares",

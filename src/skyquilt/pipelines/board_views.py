@@ -84,13 +84,16 @@ def look(photos: Sequence[Photo], board: Board, find: FindBoard, series: str, jo
 
 def grouped(photos: Sequence[Photo], series: str) -> tuple[list[list[Photo]], list[RejectedPhoto]]:
     """Frames by pose; what cannot be read any more is left out."""
-    ordered = sorted(photos, key=lambda p: (_folder(p), p.time.replace(tzinfo=None).isoformat() if p.time else "", p.name))
+    ordered = sorted(
+        photos, key=lambda p: (_folder(p), p.time.replace(tzinfo=None).isoformat() if p.time else "", p.name)
+    )
     folders = [list(g) for _, g in groupby(ordered, key=_folder)]
     if series == "folders":
         return folders, []
     if series == "views":
         return [[p] for p in ordered], []
-    poses, unreadable = [], []
+    poses: list[list[Photo]] = []
+    unreadable: list[RejectedPhoto] = []
     for folder in folders:
         kept, structures = _structures(folder, unreadable)
         parts = runs(structures, StoodStill())
@@ -100,7 +103,9 @@ def grouped(photos: Sequence[Photo], series: str) -> tuple[list[list[Photo]], li
     return poses, unreadable
 
 
-def _structures(folder: Sequence[Photo], unreadable: list[RejectedPhoto]) -> tuple[list[Photo], list[NDArray]]:
+def _structures(
+    folder: Sequence[Photo], unreadable: list[RejectedPhoto]
+) -> tuple[list[Photo], list[NDArray]]:
     still, kept, structures = StoodStill(), [], []
     for photo in folder:
         try:
@@ -115,7 +120,9 @@ def _folder(photo: Photo) -> str:
     return photo.name.rpartition("/")[0]
 
 
-def _view(pose: Sequence[Photo], board: Board, find: FindBoard) -> tuple[BoardView | RejectedView, NDArray | None]:
+def _view(
+    pose: Sequence[Photo], board: Board, find: FindBoard
+) -> tuple[BoardView | RejectedView, NDArray | None]:
     """The board in one pose: in the frame, or in what its frames are assembled to."""
     name = pose[0].name if len(pose) == 1 else f"{pose[0].name} and {len(pose) - 1} more"
     try:

@@ -1,6 +1,6 @@
 """The story of a lens: frames of a chess-board become a calibrated camera.
 
-    read -> boards -> calibrate -> judge -> report
+read -> boards -> calibrate -> judge -> report
 """
 
 import os
@@ -46,10 +46,12 @@ class CalibrateSettings:
     def __post_init__(self) -> None:
         if self.series not in SERIES:
             raise UsageError(f"--series {self.series!r} is not one of {', '.join(SERIES)}")
-        if not (3 <= min(self.columns, self.rows) and max(self.columns, self.rows) <= 100):
+        if not (min(self.columns, self.rows) >= 3 and max(self.columns, self.rows) <= 100):
             raise UsageError(f"--board {self.columns}x{self.rows}: 3 to 100 squares a side are expected")
         if not 1e-4 <= self.square_m <= 100:
-            raise UsageError(f"--square {self.square_m:g}: the side of a square in m, 0.0001 to 100, is expected")
+            raise UsageError(
+                f"--square {self.square_m:g}: the side of a square in m, 0.0001 to 100, is expected"
+            )
 
     @property
     def board(self) -> Board:
@@ -68,18 +70,27 @@ def iter_calibrate(
     """
     frames, output, began = Path(frames), Path(output), Clock.now()
     if frames.is_dir() and frames.resolve() == output.resolve():
-        raise UsageError(f"{output} holds the frames; choose another folder, such as {output / 'calibration'}")
+        raise UsageError(
+            f"{output} holds the frames; choose another folder, such as {output / 'calibration'}"
+        )
     survey = read_survey(frames)
     one_camera(survey.photos)
     claim(output, calibrate_files.CONTRACT, overwrite=overwrite)
     clock = Clock(store=Store(folder=output, registry={}), began=began)
     board, jobs = settings.board, settings.jobs or os.cpu_count() or 1
     seen = yield from clock.stage("boards", look(survey.photos, board, FindBoard(), settings.series, jobs))
-    seen = replace(seen, rejected=(*(RejectedView(name=r.name, reason=r.reason) for r in survey.rejected), *seen.rejected))
+    seen = replace(
+        seen,
+        rejected=(*(RejectedView(name=r.name, reason=r.reason) for r in survey.rejected), *seen.rejected),
+    )
     _enough(seen)
-    yield Note(text=f"the board was found in {len(seen.views)} of {len(seen.views) + len(seen.rejected)} views")
+    yield Note(
+        text=f"the board was found in {len(seen.views)} of {len(seen.views) + len(seen.rejected)} views"
+    )
     centres, corners = Calibrate(margins=settings.margins), Calibrate(marks="corners")
-    seen, by_centres, by_corners = yield from clock.stage("calibrate", _calibrated(seen, board, centres, corners))
+    seen, by_centres, by_corners = yield from clock.stage(
+        "calibrate", _calibrated(seen, board, centres, corners)
+    )
     yield from (Note(text=f"{r.name} was left out: {r.reason}") for r in seen.rejected)
     _determined(by_centres)
     judged = yield from clock.stage(
@@ -114,7 +125,9 @@ def _calibrated(
     odd = strangers(by_centres)
     if odd:
         reasons = [
-            RejectedView(name=n, reason=f"its squares lie {e:.1f} px (RMS) off, far more than those of the other views")
+            RejectedView(
+                name=n, reason=f"its squares lie {e:.1f} px (RMS) off, far more than those of the other views"
+            )
             for n, e in odd.items()
         ]
         seen = replace(

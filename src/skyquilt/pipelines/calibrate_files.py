@@ -119,9 +119,14 @@ def _tile(view: BoardView, pictures: Mapping[str, NDArray]) -> NDArray[np.uint8]
         x, y = (view.centroids[row, column] + 0.5) * scale - 0.5
         if not np.isfinite(x):
             continue
-        at, colour = (round(x * 16), round(y * 16)), (230, 60, 40) if (row + column) % 2 == 0 else (40, 190, 90)
+        at, colour = (
+            (round(x * 16), round(y * 16)),
+            (230, 60, 40) if (row + column) % 2 == 0 else (40, 190, 90),
+        )
         cv2.circle(tile, at, 28, colour, -1, cv2.LINE_AA, 4)
         if row == column == 0:
             cv2.circle(tile, at, 90, (255, 220, 40), 1, cv2.LINE_AA, 4)
     label = view.name.encode("ascii", "replace").decode()[:44]
-    return np.asarray(cv2.putText(tile, label, (5, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 220, 40), 1, cv2.LINE_AA))
+    return np.asarray(
+        cv2.putText(tile, label, (5, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 220, 40), 1, cv2.LINE_AA)
+    )

@@ -1,6 +1,6 @@
 """How good a calibration is: on frames kept out, against corners, and by what undistortion does to registration."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -13,7 +13,7 @@ from skyquilt.calibration.held_out import HeldOut, error_px, hold_out
 from skyquilt.geometry.camera import undistort
 from skyquilt.metrics.registration_quality import mean_squared_error
 from skyquilt.model.board import Board, BoardView
-from skyquilt.model.calibration import Calibration
+from skyquilt.model.calibration import Calibration, Marks
 from skyquilt.model.camera import Camera
 from skyquilt.run.clock import Steps
 
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 class Judged:
     """Figures of both calibrations."""
 
-    held_out_px: dict[str, dict[str, float]]
+    held_out_px: Mapping[Marks, Mapping[Marks, float]]
     """Calibrated from -> judged by -> RMS error in px of the views kept out."""
     pairs: int
     """Pairs of views registered by a homography."""
@@ -42,13 +42,17 @@ def judge(
 ) -> Steps[Judged]:  # fmt: skip
     """Of the calibrations from centres and from corners; with three views, each is judged by the other two."""
     yield 0, 3
-    held = {}
+    held: dict[Marks, HeldOut] = {}
     for done, way in enumerate(ways):
         held[way.marks] = hold_out(way, views, board)
         yield done + 1, 3
-    errors = {marks: {way.marks: error_px(h, way, views, board) for way in ways} for marks, h in held.items()}
+    errors: dict[Marks, Mapping[Marks, float]] = {
+        marks: {way.marks: error_px(h, way, views, board) for way in ways} for marks, h in held.items()
+    }
     pairs = _pairs(held["centres"])
-    errors_of = [_registered(views[a], views[b], camera) for camera, a, b in pairs or _all(len(views), found[0].camera)]
+    errors_of = [
+        _registered(views[a], views[b], camera) for camera, a, b in pairs or _all(len(views), found[0].camera)
+    ]
     raw, undistorted = np.array(errors_of).mean(0)
     yield 3, 3
     return Judged(

@@ -20,7 +20,7 @@ _SIDE = 340.0
 _STYLE = (
     ".grid{stroke:#ddd}.axis{stroke:#999}.tick,.name{font:12px sans-serif;fill:#444}.mid{text-anchor:middle}"
     ".end{text-anchor:end}.cloud{stroke:#1f6f8b;stroke-width:3;stroke-linecap:round;fill:none;opacity:.55}"
-    ".vectors{stroke:#1f6f8b;stroke-width:1.2;fill:none}.nodes{stroke:#b8602a;stroke-width:4;stroke-linecap:round}"
+    ".vectors{stroke:#1f6f8b;stroke-width:1.2;fill:none}"
     ".marker{fill:none;stroke:#b8602a;stroke-width:1.5}"
 )
 _WORDS = {"centres": "centres of squares", "corners": "corners"}
@@ -126,7 +126,11 @@ def _parameters(data: CalibrationInput, found: Calibration) -> Table:
             words = [significant(v, 4) if decimals is None else fixed(v, decimals) for v in values]
             return words[0] if len(words) == 1 else f"({', '.join(words)})"
 
-        return name, shown([getattr(camera, k) for k in keys]), "\u00b1 " + shown([found.sigma(k) for k in keys])
+        return (
+            name,
+            shown([getattr(camera, k) for k in keys]),
+            "\u00b1 " + shown([found.sigma(k) for k in keys]),
+        )
 
     return Table(
         title=f"Calibration from {_WORDS[found.marks]}", head=("", "Value", "Deviation"), numeric="tnn",
@@ -175,7 +179,7 @@ def _pattern(data: CalibrationInput, found: Calibration) -> Figure:
     tails, tips = axes.points(nodes), axes.points(nodes + scale * mean)
     title = f"Mean error over the pattern, from {_WORDS[found.marks]}"
     svg = drawing(
-        [axes.grid("squares", "squares"), path(dots(tails), "nodes"), path(arrows(tails, tips, longest=7.0), "vectors")],
+        [axes.grid("squares", "squares"), path(dots(tails), "cloud"), path(arrows(tails, tips, longest=7.0), "vectors")],
         title, axes.width, axes.height,
     )  # fmt: skip
     return Figure(
@@ -201,12 +205,18 @@ def _chart(data: CalibrationInput, found: Calibration) -> Figure:
     svg = drawing([axes.grid("x, px", "y, px"), cloud, circle], title, axes.width, axes.height)
     outside = int((~inside).sum())
     caption = f"{len(error)} points, the circle is the RMS of {fixed(found.rms_px, 3)} px."
-    return Figure(svg=svg, title=title, caption=caption + (f" {outside} further out not drawn." if outside else ""))
+    return Figure(
+        svg=svg, title=title, caption=caption + (f" {outside} further out not drawn." if outside else "")
+    )
 
 
 def _registration(data: CalibrationInput) -> Sentences:
     r = data.figures["registration"]
-    how = "which had no part in the camera" if r["pairs_unseen_by_the_camera"] else "with the camera from all views"
+    how = (
+        "which had no part in the camera"
+        if r["pairs_unseen_by_the_camera"]
+        else "with the camera from all views"
+    )
     return Sentences(
         items=(
             f"{r['pairs']} pairs of views were registered by a homography through the board's corners, {how}: a board is"

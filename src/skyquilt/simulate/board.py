@@ -85,7 +85,13 @@ def five_poses(lens: Lens, board: Chessboard, rng: np.random.Generator) -> list[
     """Five tilted poses in which the whole board is in the picture."""
     wide = max(board.columns / lens.width, board.rows / lens.height) * board.square * lens.focal
     poses = []
-    for angle_x, angle_y, x, y in ((32, 0, 0, 0), (-32, 0, 0, 0), (0, 32, 0, 0), (0, -32, 0, 0), (22, 22, 0, 0)):
+    for angle_x, angle_y, x, y in (
+        (32, 0, 0, 0),
+        (-32, 0, 0, 0),
+        (0, 32, 0, 0),
+        (0, -32, 0, 0),
+        (22, 22, 0, 0),
+    ):
         jitter = rng.normal(0, 4, 3)
         distance = wide * rng.uniform(1.35, 1.5)
         at = (distance * (x + rng.normal(0, 0.02)), distance * (y + rng.normal(0, 0.02)), distance)
@@ -104,8 +110,12 @@ def sweep(
     size = np.array(black.shape) * _cell(board)
     for number in range(lamp.frames):
         at_x, at_y = _lamp_at(number / (lamp.frames - 1), lamp, size)
-        off = ((x * _cell(board) - at_x) ** 2 + (y * _cell(board) - at_y) ** 2) / (lamp.radius * board.square) ** 2
-        gain = gaussian_filter(gain * (1 - lamp.cooling) + lamp.rise * lamp.cooling * absorbs * np.exp(-off), leak)
+        off = ((x * _cell(board) - at_x) ** 2 + (y * _cell(board) - at_y) ** 2) / (
+            lamp.radius * board.square
+        ) ** 2
+        gain = gaussian_filter(
+            gain * (1 - lamp.cooling) + lamp.rise * lamp.cooling * absorbs * np.exp(-off), leak
+        )
         yield _frame(295.0 + gain, where, sensor, rng, 295.0)
 
 
@@ -131,7 +141,8 @@ def _ink(board: Chessboard) -> Floats:
     """1 for black, 0 for white, on a raster over the board and its rim; shares where an edge crosses a cell."""
     cell, fine = _cell(board), 8
     x, y = (
-        (np.arange(round((n * board.square + 2 * board.margin) / cell) * fine) + 0.5) * cell / fine - board.margin
+        (np.arange(round((n * board.square + 2 * board.margin) / cell) * fine) + 0.5) * cell / fine
+        - board.margin
         for n in (board.columns, board.rows)
     )
     i, j = np.floor(x / board.square).astype(int), np.floor(y / board.square).astype(int)
@@ -144,7 +155,10 @@ def _rays_on_board(lens: Lens, board: Chessboard, pose: BoardPose) -> Floats:
     """Column and row (height, width, 2, finer by `_OVER`) of the board's raster that every ray meets; far outside
     where it misses.
     """
-    fine = (np.arange(lens.width * _OVER) + 0.5) / _OVER - 0.5, (np.arange(lens.height * _OVER) + 0.5) / _OVER - 0.5
+    fine = (
+        (np.arange(lens.width * _OVER) + 0.5) / _OVER - 0.5,
+        (np.arange(lens.height * _OVER) + 0.5) / _OVER - 0.5,
+    )
     xx, yy = np.meshgrid((fine[0] - lens.cx) / lens.focal, (fine[1] - lens.cy) / lens.focal)
     x, y = lens.undistort(xx, yy)
     normal = pose.rotation[:, 2]
@@ -168,9 +182,7 @@ def _frame(
 ) -> Floats:
     """What the sensor makes of a board's temperatures and of those behind it."""
     height, width = where.shape[0] // _OVER, where.shape[1] // _OVER
-    seen = cv2.remap(
-        board, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    seen = cv2.remap(board, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     outer = np.array([board.shape[1], board.shape[0]]) - 0.5
     mask = np.all((where > -0.5) & (where < outer), -1).astype(np.float32)
     size = (width, height)
