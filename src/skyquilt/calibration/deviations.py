@@ -23,7 +23,8 @@ def sigmas(
     """
     own = len(columns)
     size = own + 6 * len(views)
-    normal, scores, total, count = np.zeros((size, size)), {}, 0.0, 0
+    normal, total, count = np.zeros((size, size)), 0.0, 0
+    scores: dict[tuple[float, ...], Array] = {}
     for k, (view, pose) in enumerate(zip(views, poses, strict=True)):
         J, r = linearised(view, camera, pose, columns)
         where = np.r_[0:own, own + 6 * k : own + 6 * k + 6]

@@ -95,4 +95,6 @@ def _fitted(found: Blobs, cells: dict[int, tuple[int, int]]) -> Lattice | None:
         return None
     inside = kept[:, 0] > 0
     even = (grid[inside].sum(1) % 2 == 0) == found.white[index[inside]]
-    return Lattice(px_H_grid=H, cells=grid[inside], white_even=bool(even.mean() > 0.5))
+    return Lattice(
+        px_H_grid=np.asarray(H, np.float64), cells=grid[inside], white_even=bool(even.mean() > 0.5)
+    )

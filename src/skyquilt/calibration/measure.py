@@ -48,7 +48,7 @@ class Measure:
             if known.sum() < _FEWEST:
                 break
             cells = np.argwhere(known)[:, ::-1].astype(np.float64)
-            H = cv2.findHomography(cells, px[known], 0)[0]
+            H = np.asarray(cv2.findHomography(cells, px[known], 0)[0], np.float64)
         return px, H, rounding
 
     def _once(self, image: Image, H: Array, white_first: bool, board: Board) -> tuple[Array, float]:
@@ -66,7 +66,7 @@ class Measure:
             sign = np.float32(1 if white else -1)
             blobs = opened((above * sign > 0) & near, self.opening * side * factor)
             for centre, size_px in _centroids(blobs, coverage(above * sign), px_H_part):
-                column, row = np.rint(through(np.linalg.inv(H), centre[None])[0]).astype(int)
+                column, row = np.rint(through(np.asarray(np.linalg.inv(H)), centre[None])[0]).astype(int)
                 if 0 <= column < board.columns and 0 <= row < board.rows:
                     own = ((row + column) % 2 == 0) == (white_first == white)
                     if own and _AREA[0] < size_px / area[row, column] < _AREA[1]:
@@ -81,7 +81,7 @@ def half_way(image: Image, middle: Image, cell: Image, side: float) -> Image:
     `cell` (h, w, 2) says which square a pixel is of, `side` is that of a square in px.
     """
     whole = cv2.remap(middle, cell[..., 0], cell[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    smooth = cv2.GaussianBlur(image, (0, 0), _SMOOTH * side)
+    smooth: Image = np.asarray(cv2.GaussianBlur(image, (0, 0), _SMOOTH * side), np.float32)
     low, high = _extremes(smooth, _BESIDE * side)
     darkest, brightest = _extremes(smooth, _AROUND * side)
     at_edge = high - low > _STEP * (brightest - darkest)
@@ -91,7 +91,7 @@ def half_way(image: Image, middle: Image, cell: Image, side: float) -> Image:
 def _extremes(image: Image, radius: float) -> tuple[Image, Image]:
     """Least and largest value around every pixel (h, w)."""
     kernel = np.ones((2 * max(1, round(radius)) + 1,) * 2, np.uint8)
-    return cv2.erode(image, kernel), cv2.dilate(image, kernel)
+    return np.asarray(cv2.erode(image, kernel), np.float32), np.asarray(cv2.dilate(image, kernel), np.float32)
 
 
 def opened(mask: NDArray[np.bool_], radius: float) -> NDArray[np.uint8]:
@@ -108,9 +108,7 @@ def coverage(above: Image) -> Image:
     return np.asarray(np.clip(0.5 + above / slope, 0, 1), np.float32)
 
 
-def _centroids(
-    blobs: NDArray[np.uint8], covered: Image, px_H_part: Array
-) -> Iterator[tuple[Array, float]]:
+def _centroids(blobs: NDArray[np.uint8], covered: Image, px_H_part: Array) -> Iterator[tuple[Array, float]]:
     """Centroid (2,) in px and area in px^2 of each blob within its convex hull [outlines: Suzuki]; pixels on the
     outline count by their share.
     """
@@ -123,16 +121,24 @@ def _centroids(
         inside, reach = cv2.erode(box, around), cv2.dilate(box, around)
         top, left = max(y - 2, 0), max(x - 2, 0)
         part = covered[top : y + h + 2, left : x + w + 2]
-        cut = (slice(top - y + 2, top - y + 2 + part.shape[0]), slice(left - x + 2, left - x + 2 + part.shape[1]))
+        cut = (
+            slice(top - y + 2, top - y + 2 + part.shape[0]),
+            slice(left - x + 2, left - x + 2 + part.shape[1]),
+        )
         share = np.where(inside[cut] > 0, 1.0, part * reach[cut])
         total = float(share.sum())
         if total > 0:
-            middle = [share.sum(0) @ np.arange(share.shape[1]) / total, share.sum(1) @ np.arange(share.shape[0]) / total]
-            yield through(px_H_part, np.array([middle]) + [left, top])[0], total * scale * scale
+            middle = [
+                share.sum(0) @ np.arange(share.shape[1]) / total,
+                share.sum(1) @ np.arange(share.shape[0]) / total,
+            ]
+            yield through(px_H_part, np.array([middle]) + np.array([left, top]))[0], total * scale * scale
 
 
 def corners(image: Image, px_H_cell: Array, board: Board) -> Array:
-    """Inner corners (rows - 1, columns - 1, 2) in px by the gradients around them [Forstner]; NaN where they ran away."""
+    """Inner corners (rows - 1, columns - 1, 2) in px by the gradients around them [Forstner]; NaN where
+    they ran away.
+    """
     y, x = np.mgrid[0 : board.rows - 1, 0 : board.columns - 1] + 0.5
     guess = through(px_H_cell, np.column_stack([x.ravel(), y.ravel()]))
     side = float(np.sqrt(np.median(_areas(px_H_cell, board))))
@@ -176,7 +182,8 @@ def _enlarged(image: Image, H: Array, board: Board, factor: int) -> tuple[Image,
     x1, y1 = np.minimum(np.ceil(outline.max(0)).astype(int) + 1, [image.shape[1], image.shape[0]])
     part = image[y0:y1, x0:x1]
     if factor > 1:
-        part = cv2.resize(part, None, fx=factor, fy=factor, interpolation=cv2.INTER_LINEAR)
+        size = (part.shape[1] * factor, part.shape[0] * factor)
+        part = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_LINEAR), np.float32)
     offset = (1 / factor - 1) / 2
     return part, np.array([[1 / factor, 0, x0 + offset], [0, 1 / factor, y0 + offset], [0, 0, 1]])
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +48,7 @@ def solve(
     best, damping = _state(views, camera, poses), 1e-3
     normal, gradient = _normal(views, best, columns)
     for _ in range(_ROUNDS):
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+        step = np.asarray(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient), np.float64)
         tried = _state(views, *_moved(best, step, columns))
         if tried.cost < best.cost:
             gain = 1 - tried.cost / best.cost
@@ -98,9 +99,8 @@ def _normal(views: Sequence[Sightings], state: _State, columns: Sequence[int]) -
 
 def _moved(state: _State, step: Array, columns: Sequence[int]) -> tuple[Camera, list[BoardPose]]:
     own = len(columns)
-    changed = {
-        PARAMETERS[c]: getattr(state.camera, PARAMETERS[c]) + float(s)
-        for c, s in zip(columns, step, strict=False)
-    }
+    vector = state.camera.vector
+    vector[list(columns)] += step[:own]
+    changed: dict[str, Any] = dict(zip(PARAMETERS, vector.tolist(), strict=True))
     rest = step[own:].reshape(-1, 6)
     return replace(state.camera, **changed), [moved(p, s) for p, s in zip(state.poses, rest, strict=True)]

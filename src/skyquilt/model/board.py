@@ -42,7 +42,7 @@ class Board:
         inside[1:-1, 1:-1] = True
         return inside
 
-    def _points(self, x: Array, y: Array) -> Array:
+    def _points(self, x: NDArray, y: NDArray) -> Array:
         xx, yy = np.meshgrid(x, y)
         return np.stack([xx, yy, np.zeros_like(xx)], -1) * self.square_m
 

@@ -84,9 +84,7 @@ def look(photos: Sequence[Photo], board: Board, find: FindBoard, series: str, jo
 
 def grouped(photos: Sequence[Photo], series: str) -> tuple[list[list[Photo]], list[RejectedPhoto]]:
     """Frames by pose; what cannot be read any more is left out."""
-    ordered = sorted(
-        photos, key=lambda p: (_folder(p), p.time.replace(tzinfo=None).isoformat() if p.time else "", p.name)
-    )
+    ordered = sorted(photos, key=_folder)  # stable: in order of capture inside a folder
     folders = [list(g) for _, g in groupby(ordered, key=_folder)]
     if series == "folders":
         return folders, []
@@ -126,10 +124,8 @@ def _view(
     """The board in one pose: in the frame, or in what its frames are assembled to."""
     name = pose[0].name if len(pose) == 1 else f"{pose[0].name} and {len(pose) - 1} more"
     try:
-        if len(pose) < _SWEEP:
-            picture = grey_float(read_color(pose[len(pose) // 2]))
-        else:
-            picture = Assemble()(_read(pose), board)
+        alone = len(pose) < _SWEEP
+        picture = grey_float(read_color(pose[0])) if alone else Assemble()(_read(pose), board)
     except UnreadablePhotoError as error:
         return RejectedView(name=name, reason=str(error)), None
     return find(name, picture, board, frames=len(pose)), picture

@@ -79,10 +79,8 @@ def iter_calibrate(
     clock = Clock(store=Store(folder=output, registry={}), began=began)
     board, jobs = settings.board, settings.jobs or os.cpu_count() or 1
     seen = yield from clock.stage("boards", look(survey.photos, board, FindBoard(), settings.series, jobs))
-    seen = replace(
-        seen,
-        rejected=(*(RejectedView(name=r.name, reason=r.reason) for r in survey.rejected), *seen.rejected),
-    )
+    unread = (RejectedView(name=r.name, reason=r.reason) for r in survey.rejected)
+    seen = replace(seen, rejected=(*unread, *seen.rejected))
     _enough(seen)
     yield Note(
         text=f"the board was found in {len(seen.views)} of {len(seen.views) + len(seen.rejected)} views"

@@ -95,7 +95,8 @@ def _tiles(data: CalibrationInput) -> tuple[Tile, ...]:
     gain = m["registration"]["reduction_percent"]
     return (
         Tile(
-            label="Focal length", value=f"{fixed(found.camera.focal, 1)} \u00b1 {fixed(found.sigma('focal'), 1)}", unit="px",
+            label="Focal length", unit="px",
+            value=f"{fixed(found.camera.focal, 1)} \u00b1 {fixed(found.sigma('focal'), 1)}",
             verdict="good" if share < 1 else "fair" if share < 2 else "poor",
             says=f"Deviation {fixed(share, 2)} %; below 1 % is good, above 2 % more tilted views are needed.",
         ),
@@ -178,8 +179,9 @@ def _pattern(data: CalibrationInput, found: Calibration) -> Figure:
     )  # fmt: skip
     tails, tips = axes.points(nodes), axes.points(nodes + scale * mean)
     title = f"Mean error over the pattern, from {_WORDS[found.marks]}"
+    errors = path(arrows(tails, tips, longest=7.0), "vectors")
     svg = drawing(
-        [axes.grid("squares", "squares"), path(dots(tails), "cloud"), path(arrows(tails, tips, longest=7.0), "vectors")],
+        [axes.grid("squares", "squares"), path(dots(tails), "cloud"), errors],
         title, axes.width, axes.height,
     )  # fmt: skip
     return Figure(
@@ -219,8 +221,8 @@ def _registration(data: CalibrationInput) -> Sentences:
     )
     return Sentences(
         items=(
-            f"{r['pairs']} pairs of views were registered by a homography through the board's corners, {how}: a board is"
-            " flat, so all that is left is distortion and noise.",
+            f"{r['pairs']} pairs of views were registered by a homography through the board's corners, {how}: a board"
+            " is flat, so all that is left is distortion and noise.",
             f"Mean squared error (6.2): {fixed(r['mse_raw_px2'], 3)} px\u00b2 raw, {fixed(r['mse_undistorted_px2'], 3)}"
             f" px\u00b2 undistorted ({fixed(-r['reduction_percent'], 1, sign=True)} %).",
         )
