@@ -29,8 +29,6 @@ class Calibrate:
     version: ClassVar[int] = 1
     marks: Marks = "centres"
     """What is sighted."""
-    margins: bool = False
-    """Whether squares at the board's margin count: what lies beside them may be anything."""
     tolerance: float = 3.0
     """A coefficient's tolerance in standard deviations, as in the toolbox that the thesis used."""
     rounds: int = 3
@@ -58,11 +56,11 @@ class Calibrate:
             (board.corners, view.corners) if self.marks == "corners" else (board.centres, view.centroids)
         )
         known = np.isfinite(px[..., 0])
-        if self.marks == "centres" and not self.margins:
-            known &= board.inner
+        if self.marks == "centres":
+            known &= board.inner  # what lies beside the others may be anything [Y 5.1.3]
         return Sightings(
             name=view.name, board=points[known], px=px[known],
-            rounding_px=view.rounding_px if self.marks == "centres" else 0.0,
+            rounding_px=view.rounding_px[known] if self.marks == "centres" else 0.0,
         )  # fmt: skip
 
     def _reduced(self, seen: Sequence[Sightings], rough: Solution, board: Board) -> Calibration:

@@ -10,6 +10,7 @@ from skyquilt.model.calibration import BoardPose, Sightings
 from skyquilt.model.camera import PARAMETERS, Camera
 
 Array = NDArray[np.float64]
+_FEWEST = 4
 
 
 def sigmas(
@@ -17,9 +18,10 @@ def sigmas(
 ) -> tuple[float, ...]:
     """Standard deviations in the order of `PARAMETERS`, 0 for what was held (`columns` says what was not).
 
-    The larger of two: that of independent errors with the variance that the residuals show, and one that lets
-    errors repeat in every view at the same mark of the board [the sandwich, clustered by mark]: a board that is
-    not quite flat or evenly heated is wrong in the same way in all views, and more views do not make it right.
+    The largest of three: that of independent errors with the variance that the residuals show; one that lets
+    errors repeat in every view at the same mark of the board [the sandwich, clustered by mark], because a board
+    that is not quite flat or evenly heated is wrong in the same way in all views, and more views do not make it
+    right; and the jackknife over views, because errors of neighbouring squares of one view are akin.
     """
     own = len(columns)
     size = own + 6 * len(views)
@@ -45,5 +47,32 @@ def sigmas(
     few = len(scores) / max(len(scores) - own, 1) * (count - 1) / spare
     repeated = (moved * moved).sum(1) * few
     out = np.zeros(len(PARAMETERS))
-    out[list(columns)] = np.sqrt(np.maximum(np.maximum(independent, repeated), 0))
+    by_view = _jackknife(views, camera, poses, columns)
+    out[list(columns)] = np.sqrt(np.maximum.reduce([independent, repeated, by_view, np.zeros(own)]))
     return tuple(out.tolist())
+
+
+def _jackknife(
+    views: Sequence[Sightings], camera: Camera, poses: Sequence[BoardPose], columns: Sequence[int]
+) -> Array:
+    """Variances of the intrinsics from what leaving out one view after the other moves, to first order; zero for
+    fewer than four views.
+    """
+    own = len(columns)
+    if len(views) < _FEWEST or not own:
+        return np.zeros(own)
+    normals, scores = [], []
+    for view, pose in zip(views, poses, strict=True):
+        J, r = linearised(view, camera, pose, columns)
+        flat, e = J.reshape(-1, own + 6), r.ravel()
+        to_pose = np.linalg.lstsq(flat[:, own:], np.column_stack([flat[:, :own], e]), rcond=None)[0]
+        free = flat[:, :own] - flat[:, own:] @ to_pose[:, :own]  # what the pose cannot take up
+        normals.append(free.T @ free)
+        scores.append(free.T @ (e - flat[:, own:] @ to_pose[:, own]))
+    whole = np.sum(normals, 0)
+    scale = 1 / np.sqrt(np.maximum(np.diag(whole), 1e-300))
+    moved = []
+    for normal, score in zip(normals, scores, strict=True):
+        rest = (whole - normal) * scale * scale[:, None]
+        moved.append(np.linalg.pinv(rest, hermitian=True) @ (score * scale) * scale)
+    return np.asarray((np.array(moved) ** 2).sum(0) * (len(views) - 1) / len(views))

@@ -15,8 +15,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 _ROUNDS = 2
 _FEWEST = 6
-_AREA = (0.5, 1.5)
-_SMOOTH, _BESIDE, _AROUND = 0.03, 0.2, 0.6
+_AREA = (0.6, 1.45)
+_SMOOTH, _BESIDE, _AROUND = 0.03, 0.12, 0.6
 """Radii in sides of a square: of smoothing, of what lies beside an edge, of what surely holds black and white."""
 _STEP = 0.6
 """Share of the contrast around that an edge must have."""
@@ -31,17 +31,16 @@ class Measure:
     version: ClassVar[int] = 1
     side_px: float = 100.0
     """Pictures are enlarged until a square has about this side: blobs have whole pixels."""
-    opening: float = 0.25
-    """Radius of erosion and dilation in sides of a square. Corners, where heat and blur make squares cling to one
-    another, are rounded off by it; `square_image` knows that."""
+    openings: tuple[float, ...] = (0.12, 0.25)
+    """Radii of erosion and dilation in sides of a square: the larger one for squares that still cling to others
+    at their corners, by heat or blur. Corners are rounded off by it; `square_image` knows that."""
 
-    def centroids(self, image: Image, placed: Placed, board: Board) -> tuple[Array, Array, float]:
-        """Centroids (rows, columns, 2) in px, NaN where none was measured, the refined px_H_cell, and the radius
-        in px by which corners were rounded off.
+    def centroids(self, image: Image, placed: Placed, board: Board) -> tuple[Array, Array, Array]:
+        """Centroids (rows, columns, 2) in px, NaN where none was measured, the refined px_H_cell, and the radii
+        (rows, columns) in px by which corners were rounded off.
         """
-        rounding = 0.0
         H = placed.px_H_cell
-        px = np.full((board.rows, board.columns, 2), np.nan)
+        px, rounding = np.full((board.rows, board.columns, 2), np.nan), np.zeros((board.rows, board.columns))
         for _ in range(_ROUNDS):
             px, rounding = self._once(image, H, placed.white_first, board)
             known = np.isfinite(px[..., 0])
@@ -51,7 +50,7 @@ class Measure:
             H = np.asarray(cv2.findHomography(cells, px[known], 0)[0], np.float64)
         return px, H, rounding
 
-    def _once(self, image: Image, H: Array, white_first: bool, board: Board) -> tuple[Array, float]:
+    def _once(self, image: Image, H: Array, white_first: bool, board: Board) -> tuple[Array, Array]:
         area = _areas(H, board)
         side = float(np.sqrt(np.median(area)))
         factor = int(np.clip(round(self.side_px / side), 1, 8))
@@ -61,17 +60,23 @@ class Measure:
         size = np.array([board.columns, board.rows], np.float32)
         near = np.all((cell > -0.5 - _MARGIN) & (cell < size - 0.5 + _MARGIN), -1)
         out = np.full((board.rows, board.columns, 2), np.nan)
-        above = part - threshold
-        for white in (True, False):
-            sign = np.float32(1 if white else -1)
-            blobs = opened((above * sign > 0) & near, self.opening * side * factor)
-            for centre, size_px in _centroids(blobs, coverage(above * sign), px_H_part):
-                column, row = np.rint(through(np.asarray(np.linalg.inv(H)), centre[None])[0]).astype(int)
-                if 0 <= column < board.columns and 0 <= row < board.rows:
-                    own = ((row + column) % 2 == 0) == (white_first == white)
-                    if own and _AREA[0] < size_px / area[row, column] < _AREA[1]:
-                        out[row, column] = centre
-        return out, self.opening * side
+        above, rounding = part - threshold, np.zeros((board.rows, board.columns))
+        cell_H_px = np.asarray(np.linalg.inv(H))
+        for opening in self.openings:
+            for white in (True, False):
+                sign = np.float32(1 if white else -1)
+                blobs = opened((above * sign > 0) & near, opening * side * factor)
+                for centre, size_px in _centroids(blobs, coverage(above * sign), px_H_part):
+                    column, row = np.rint(through(cell_H_px, centre[None])[0]).astype(int)
+                    if (
+                        0 <= column < board.columns
+                        and 0 <= row < board.rows
+                        and np.isnan(out[row, column, 0])
+                    ):
+                        own = ((row + column) % 2 == 0) == (white_first == white)
+                        if own and _AREA[0] < size_px / area[row, column] < _AREA[1]:
+                            out[row, column], rounding[row, column] = centre, opening * side
+        return out, rounding
 
 
 def half_way(image: Image, middle: Image, cell: Image, side: float) -> Image:

@@ -63,10 +63,11 @@ def place(image: Image, grid: Lattice, board: Board) -> Placed | Misplaced:
     seen, asked = np.ptp(grid.cells, 0) + 1, f"{board.columns} x {board.rows}"
     if len(good) > 1:
         why = f"the pattern goes on beyond {asked} squares (squares are counted, not corners)"
-    elif not inside:
-        why = f"{seen[0]} x {seen[1]} squares were found; the rest of {asked} would lie outside the frame"
     else:
         why = f"{seen[0]} x {seen[1]} squares were found where {asked} are expected"
+        whole = [w for w in windows if _covers(w, grid, board)]
+        if any(not _in_frame(grid.px_H_grid @ w, board, image.shape) for w in whole):
+            why += "; the others are covered or outside the frame"
     if len(good) != 1:
         return Misplaced(reason=why, squares=len(grid.cells))
     (rectangle,) = (r for r, f in fits.items() if f)
@@ -94,6 +95,13 @@ def _place_of(window: Array, board: Board) -> tuple[float, ...]:
     """The rectangle that a window covers, whatever its turn."""
     ends = through(window, np.array([[0.0, 0.0], [board.columns - 1.0, board.rows - 1.0]]))
     return (*np.rint(ends.min(0)).tolist(), *np.rint(ends.max(0)).tolist())
+
+
+def _covers(window: Array, grid: Lattice, board: Board) -> bool:
+    """Whether a window holds all squares found."""
+    x0, y0, x1, y1 = _place_of(window, board)
+    low, high = grid.cells.min(0), grid.cells.max(0)
+    return bool(x0 <= low[0] and y0 <= low[1] and x1 >= high[0] and y1 >= high[1])
 
 
 def _judged(image: Image, grid: Lattice, window: Array, board: Board) -> Placed | None:

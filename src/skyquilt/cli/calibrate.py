@@ -27,9 +27,6 @@ def command(
             " between which the camera stood still), folders (each folder is a pose), views (never)."
         ),
     ] = "auto",
-    margins: Annotated[
-        bool, typer.Option("--margins/--no-margins", help="Use the squares at the board's margin too.")
-    ] = False,
     jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.", min=0)] = 0,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace the results of another run in OUTPUT.")
@@ -45,9 +42,7 @@ def command(
     if quiet and json:
         raise UsageError("--quiet and --json exclude one another")
     columns, rows = parse_board(board)
-    settings = CalibrateSettings(
-        columns=columns, rows=rows, square_m=square, series=series, margins=margins, jobs=jobs
-    )
+    settings = CalibrateSettings(columns=columns, rows=rows, square_m=square, series=series, jobs=jobs)
     events = iter_calibrate(frames, output, settings, overwrite=overwrite)
     show(events, mode="quiet" if quiet else "json" if json else "normal", summary=summary)
 

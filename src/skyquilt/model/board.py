@@ -62,8 +62,9 @@ class BoardView:
     a square could not be measured."""
     corners: Array
     """Inner corners (rows - 1, columns - 1, 2) in px."""
-    rounding_px: float
-    """Radius by which the corners of the squares' images were rounded off before their centroids were taken."""
+    rounding_px: Array
+    """Radii (rows, columns) by which the corners of the squares' images were rounded off before their centroids
+    were taken."""
     contrast: float
     """White less black squares, in units of the frame's own noise."""
     frames: int = 1

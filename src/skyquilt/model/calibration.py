@@ -37,8 +37,8 @@ class Sightings:
     """(n, 3) in m, frame *board*."""
     px: Array
     """(n, 2) in px."""
-    rounding_px: float = 0.0
-    """As in `BoardView`; 0 for corners."""
+    rounding_px: Array | float = 0.0
+    """(n,) as in `BoardView`; 0 for corners."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

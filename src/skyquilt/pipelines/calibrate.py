@@ -38,8 +38,6 @@ class CalibrateSettings:
     """Side of a square in m."""
     series: str = "auto"
     """One of `SERIES`."""
-    margins: bool = False
-    """Whether the squares at the margin count too."""
     jobs: int = 0
     """Threads; 0 = all processors."""
 
@@ -85,7 +83,7 @@ def iter_calibrate(
     yield Note(
         text=f"the board was found in {len(seen.views)} of {len(seen.views) + len(seen.rejected)} views"
     )
-    centres, corners = Calibrate(margins=settings.margins), Calibrate(marks="corners")
+    centres, corners = Calibrate(), Calibrate(marks="corners")
     seen, by_centres, by_corners = yield from clock.stage(
         "calibrate", _calibrated(seen, board, centres, corners)
     )
