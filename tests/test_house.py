@@ -101,7 +101,7 @@ def test_the_readme_states_the_defaults():
     rows = dict(re.findall(r"^\| `(--[\w-]+)`[^|]*\|.*\| *([^|]*?) *\|$", readme, re.M))
     for name, parameter in inspect.signature(command).parameters.items():
         if isinstance(parameter.default, (int, float, str)) and not isinstance(parameter.default, bool):
-            stated = rows["--" + name].strip("`")
+            stated = rows["--" + name.replace("_", "-")].strip("`")
             assert stated == (
                 "all processors" if name == "jobs" else str(parameter.default).removesuffix(".0")
             ), name

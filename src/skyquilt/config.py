@@ -31,6 +31,7 @@ from skyquilt.spectral.auto import Auto
 from skyquilt.spectral.by_features import BetterByQ, ByFeatures, Outliers, Rfae
 from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints
+from skyquilt.twoview.levelled import Level
 from skyquilt.twoview.lmeds import Lmeds
 from skyquilt.twoview.ransac import Ransac
 from skyquilt.twoview.rescued import Rescued
@@ -52,11 +53,18 @@ SECOND_PX2 = 12.0
 """STE of an inlier, px^2 at 1500 px, where the threshold by deviations fails: 5.99 times one px, both ways."""
 LEAST_INLIERS = 12
 """Matches that must agree before two photos count as registered."""
-BLENDS: dict[str, type[Blend]] = {"feather": Feather, "first": First, "average": Average, "multiband": Multiband}
+BLENDS: dict[str, type[Blend]] = {
+    "feather": Feather,
+    "first": First,
+    "average": Average,
+    "multiband": Multiband,
+}
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
 REGISTRATIONS = ("auto", "sift", "surf", "usurf", "rfae", "rfae-sift", "surf+rfae")
 """Ways to register two pictures of different spectra."""
+SAMPLES = 1000
+"""Most samples drawn for a similarity: enough for 7 % of right matches."""
 INLIERS = 9
 """Fewest inliers of an accepted registration by the thesis's methods [Y 6.4.1]."""
 DISTORTIONS = ("none", "2", "4", "6", "6t")
@@ -108,7 +116,7 @@ class MosaicSettings:
     """Largest height variation on the ground in m; None = a tenth of the flying height."""
     alpha: float = 0.5
     """Weight of distances against looks in lambda (Y 4.6), for method `hybrid`."""
-    optimiser: str = "anneal"
+    optimiser: str = "surfaces"
     """One of `OPTIMISERS`: how `hybrid` maximises lambda."""
     seed: int = 0
     """Of everything random in methods `image`, `hybrid`, `flightline`."""
@@ -197,7 +205,10 @@ def registration_method(name: str) -> Registers:
 def _outliers() -> Outliers:
     return Outliers(
         match=OneWay(), quality=spread_quality,
-        estimators=(Ransac(model="similarity", minimum=INLIERS), Lmeds(model="similarity", minimum=INLIERS)),
+        estimators=(
+            Ransac(model="similarity", minimum=INLIERS, max_iterations=SAMPLES),
+            Lmeds(model="similarity", minimum=INLIERS, max_iterations=SAMPLES),
+        ),
     )  # fmt: skip
 
 
@@ -247,7 +258,11 @@ def methods(settings: MosaicSettings) -> Methods:
     flightline = settings.method == "flightline"
     blend = ("average" if flightline else "feather") if settings.blend == "auto" else settings.blend
     # the thresholds of flight lines are meant for pictures of 1500 px
-    sift = Sift(count=max(settings.features, 4000), longest=1500) if flightline else Sift(count=settings.features)
+    sift = (
+        Sift(count=max(settings.features, 4000), longest=1500)
+        if flightline
+        else Sift(count=settings.features)
+    )
     return Methods(
         sift=sift, nearest=Nearest(), retrieval=Retrieval(), mutual=Mutual(),
         verify=Verify(),
@@ -265,13 +280,13 @@ def _by_image(settings: MosaicSettings) -> Chain | ByOverview:
     order, height = settings.distortion or "6t", settings.height_m
     if settings.image_search == "overview":
         estimate = Ransac(model=model, threshold_px=3.0, minimum=LEAST_INLIERS, seed=settings.seed)
-        level = None
+        level = Level(relief_m=settings.relief_m, height_m=height, width=640) if settings.levelled else None
         return ByOverview(
             detect=Sift(longest=1_000_000), match=Mutual(), estimate=estimate, level=level, distortion=order,
             height_m=height,
         )  # fmt: skip
     estimate = Ransac(model=model, threshold_px=6.0, minimum=LEAST_INLIERS, seed=settings.seed)
-    level = None
+    level = Level(relief_m=settings.relief_m, height_m=height) if settings.levelled else None
     return Chain(match=Mutual(), estimate=estimate, level=level, distortion=order, height_m=height)
 
 

@@ -113,7 +113,7 @@ def test_an_initial_lobe_of_one_finds_smaller_blobs():
     plain = blobs(image, octaves=1, lobe=3, step=1, threshold=50)
     missed = np.linalg.norm(plain.xy[:, None] - dots, axis=-1).min(0, initial=99) > 1
     assert missed.mean() > 0.9
-    assert len(blobs(image, octaves=1, lobe=1, step=4, threshold=50).xy) < len(small.xy)
+    assert len(blobs(image, octaves=1, lobe=1, step=3, threshold=50).xy) < len(small.xy)
 
 
 def scores(method, picture, angle, scale, blur=0.0):
@@ -209,7 +209,7 @@ def test_no_slower_than_twice_opencvs_sift(picture):
     large = np.clip(texture(750, 1000, seed=5), 0, 255).astype(np.uint8)
     detector, ours = cv2.SIFT.create(1000), Surf(count=1000)
     times = []
-    for _ in range(5):
+    for _ in range(4):
         t = [time.process_time()]
         detector.detectAndCompute(large, None)
         t.append(time.process_time())

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -50,7 +51,11 @@ class ByFlightline:
             AlignmentError: no positions, fewer than two lines, or (by distance) lines that run back on themselves.
         """
         xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
-        lost = {i: "it has no position, and method flightline needs one" for i in order if not np.isfinite(xy[i]).all()}
+        lost = {
+            i: "it has no position, and method flightline needs one"
+            for i in order
+            if not np.isfinite(xy[i]).all()
+        }
         order = [i for i in order if i not in lost]
         lines, notes = self._lines(order, xy, photos)
         cameras = {p.camera_key: of_order(reported_camera(p), self.distortion) for p in photos}
@@ -60,13 +65,23 @@ class ByFlightline:
         whole = work.joined(strips, pairs_across(xy, [list(s) for s in strips]))
         poses, lost_too = _on_map(whole, xy, lens)
         alone = [i for s in strips for i in s if i not in whole]
-        lost |= {i: "nothing links its flight line to the others" for i in alone} | lost_too
+        lost |= dict.fromkeys(alone, "nothing links its flight line to the others") | lost_too
         placed = plane_alignment(
-            self.name, frame, photos, poses, True, cameras, [{i: np.eye(3) for i in poses}], work.joins, work.notes
+            self.name,
+            frame,
+            photos,
+            poses,
+            True,
+            cameras,
+            [{i: np.eye(3) for i in poses}],
+            work.joins,
+            work.notes,
         )
         return Alignment(**{**vars(placed), "rejected": lost})
 
-    def _lines(self, order: list[int], xy: Array, photos: Sequence[Photo]) -> tuple[list[list[int]], list[str]]:
+    def _lines(
+        self, order: list[int], xy: Array, photos: Sequence[Photo]
+    ) -> tuple[list[list[int]], list[str]]:
         """Lines of two or more photos (indices), and what to say about them."""
         if len(order) < 4:
             raise AlignmentError(
@@ -90,7 +105,9 @@ class ByFlightline:
             )
         single = [photos[line[0]].name for line in lines if len(line) == 1]
         notes = [f"{len(whole)} flight lines: {', '.join(str(len(line)) for line in whole)} photos."]
-        notes += [f"between flight lines, each taken as a line of its own: {', '.join(single)}."] if single else []
+        notes += (
+            [f"between flight lines, each taken as a line of its own: {', '.join(single)}."] if single else []
+        )
         return lines, notes
 
 
@@ -111,11 +128,13 @@ class _Work:
         """Mosaics of a line, one where nothing breaks it: plane_H_work (3, 3) of each photo's working image."""
         strips: list[list[int]] = [[line[0]]]
         step: dict[int, Array] = {}  # photo -> before_H_photo
-        for before, photo in zip(line[:-1], line[1:], strict=True):
+        for before, photo in pairwise(line):
             found = self._pair(photo, before)
             if isinstance(found, NoEstimate):
                 names = self.photos[photo].name, self.photos[before].name
-                self.notes.append(f"the flight line breaks between {names[1]} and {names[0]} ({found.reason}).")
+                self.notes.append(
+                    f"the flight line breaks between {names[1]} and {names[0]} ({found.reason})."
+                )
                 strips.append([photo])
             else:
                 step[photo] = found
@@ -141,7 +160,9 @@ class _Work:
         )  # fmt: skip
         return found.b_H_a
 
-    def joined(self, strips: Sequence[dict[int, Array]], pairs: Sequence[tuple[int, int]]) -> dict[int, Array]:
+    def joined(
+        self, strips: Sequence[dict[int, Array]], pairs: Sequence[tuple[int, int]]
+    ) -> dict[int, Array]:
         """All strips in the plane of the middle one: plane_H_work per photo; strips that nothing links are left out."""
         strip_of = {i: k for k, s in enumerate(strips) for i in s}
         matched: dict[tuple[int, int], list[tuple[Array, Array]]] = {}
@@ -160,7 +181,9 @@ class _Work:
             waiting.remove(placed)
         for k in waiting:
             first, last = self.photos[min(strips[k])].name, self.photos[max(strips[k])].name
-            self.notes.append(f"nothing links the flight line {first} to {last} to the others; it is left out.")
+            self.notes.append(
+                f"nothing links the flight line {first} to {last} to the others; it is left out."
+            )
         return {i: H @ strips[k][i] for k, H in whole.items() for i in strips[k]}
 
     def _attach(
@@ -176,7 +199,9 @@ class _Work:
         if not a:
             return False
         found = self.method.estimate(np.concatenate(a), np.concatenate(b))
-        if isinstance(found, NoEstimate) or implausible(found.b_H_a, np.concatenate(a)[found.inliers].mean(0)):
+        if isinstance(found, NoEstimate) or implausible(
+            found.b_H_a, np.concatenate(a)[found.inliers].mean(0)
+        ):
             return False
         whole[k] = found.b_H_a
         return True
@@ -219,7 +244,8 @@ def _on_map(
     map_H_plane = fit("affine", middle, xy[used])
     if map_H_plane is None:
         raise AlignmentError(
-            "the positions of the photos lie on one line, so that no regression can place the mosaic; use --method image"
+            "the positions of the photos lie on one line, so that no regression can place the mosaic;"
+            " use --method image"
         )
     poses, lost = {}, {}
     for i in used:

@@ -25,30 +25,44 @@ LARGEST_SCALE = 1.7
 class Matcher(Protocol):
     """Putative matches of two photos."""
 
-    def __call__(self, a: Features, b: Features) -> Matches: ...
+    def __call__(self, a: Features, b: Features) -> Matches:
+        """Matches of a and b."""
+        ...
 
 
 class Estimator(Protocol):
     """A transformation from matches (N, 2) px."""
 
-    def __call__(self, a: Array, b: Array) -> Estimate | NoEstimate: ...
+    def __call__(self, a: Array, b: Array) -> Estimate | NoEstimate:
+        """b_H_a, or why there is none."""
+        ...
 
 
 class Leveller(Protocol):
     """The same transformation from features on the dominant plane (Y 4.2.2)."""
 
-    def __call__(self, a: Array, b: Array, estimate: Estimate) -> "Levelled": ...
+    def __call__(self, a: Array, b: Array, estimate: Estimate) -> "Levelled":
+        """b_H_a from levelled features."""
+        ...
 
 
 class Levelled(Protocol):
     """What levelling gives."""
 
     @property
-    def estimate(self) -> Estimate: ...
+    def estimate(self) -> Estimate:
+        """The transformation."""
+        ...
+
     @property
-    def d_px(self) -> Array: ...
+    def d_px(self) -> Array:
+        """(M, 2) disparity vectors of the first inliers."""
+        ...
+
     @property
-    def level(self) -> NDArray[np.bool_]: ...
+    def level(self) -> NDArray[np.bool_]:
+        """(M,) those on the dominant plane."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +104,9 @@ class Chain:
                 pieces.append({photo: np.eye(3)})
             last = photo
         laid = lay([Piece(plane_H_cam=p) for p in pieces], priors, self.height_m)
-        return plane_alignment(self.name, frame, photos, laid.poses, laid.metric, cameras, pieces, joins, notes)
+        return plane_alignment(
+            self.name, frame, photos, laid.poses, laid.metric, cameras, pieces, joins, notes
+        )
 
     def _join(
         self, photo: int, onto: int, lens: Sequence[Camera], features: Sequence[Features]

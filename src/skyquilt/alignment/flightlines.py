@@ -37,7 +37,7 @@ def shooting_distances(xy: Array) -> Shooting:
     """The histogram of distances of photos (n, 2) m in order of capture (A 2.1)."""
     d = np.linalg.norm(np.diff(xy, axis=0), axis=1)
     width = float(d.max() - d.min()) / BINS
-    if width == 0:
+    if width < 1e-6 * d.max():  # one distance, but for rounding: no histogram
         return Shooting(distance_m=d, commonest_m=float(d[0]), width_m=0.0)
     count, edges = np.histogram(d, bins=BINS)
     k = int(np.argmax(count))
@@ -69,7 +69,9 @@ def by_heading(xy: Array) -> list[list[int]]:
         within = low - 1e-9 <= shooting.distance_m[k] <= high + 1e-9
         if len(line) > 1 and within:
             course = xy[line[-1]] - xy[line[max(0, len(line) - 4)]]
-            within = float(course @ s) > np.cos(np.radians(TURN_DEG)) * np.linalg.norm(course) * np.linalg.norm(s)
+            within = float(course @ s) > np.cos(np.radians(TURN_DEG)) * np.linalg.norm(
+                course
+            ) * np.linalg.norm(s)
         if within:
             line.append(k + 1)
         else:
@@ -99,11 +101,12 @@ def pairs_across(xy: Array, lines: Sequence[Sequence[int]]) -> list[tuple[int, i
         triangles = used[Delaunay(xy[used]).simplices]
     except QhullError:
         return []
-    kept, gone = set(), set()
+    kept: set[tuple[int, ...]] = set()
+    gone: set[tuple[int, ...]] = set()
     for triangle in triangles:
         edges = {tuple(sorted((int(triangle[a]), int(triangle[b])))) for a, b in ((0, 1), (1, 2), (0, 2))}
         (gone if _obtuse(xy[triangle]) else kept).update(edges)
-    return sorted((i, j) for i, j in kept - gone if line_of[i] != line_of[j])
+    return sorted((e[0], e[1]) for e in kept - gone if line_of[e[0]] != line_of[e[1]])
 
 
 def _obtuse(corners: Array) -> bool:

@@ -13,7 +13,7 @@ from skyquilt.alignment.planar import map_H_cam_of
 from skyquilt.geometry.frames import rotation_from_vector
 from skyquilt.imaging.plane import Overview, Patch, to_grid
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Alignment, Join, MapFrame, Pose, Prior
+from skyquilt.model.poses import Alignment, Join, Pose, Prior
 
 Array = NDArray[np.float64]
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
@@ -32,7 +32,7 @@ class Hybrid:
     """Weight of distances against looks."""
     across: int = 400
     """Width in px of a photo on the finest level (the thesis's scale)."""
-    deviations: float = 2.5
+    deviations: float = 2.0
     """Standard deviations of position, tilt and heading that the search reaches out to."""
     seed: int = 0
     """Of the annealing."""
@@ -71,10 +71,14 @@ class Hybrid:
 
     def _gsd(self, placed: Alignment) -> float:
         """Ground size in m of the overview's pixels: photos `across` px wide."""
-        sizes = [p.map_C[2] * placed.camera(i).width / placed.camera(i).focal for i, p in placed.poses.items()]
+        sizes = [
+            p.map_C[2] * placed.camera(i).width / placed.camera(i).focal for i, p in placed.poses.items()
+        ]
         return float(np.median(sizes)) / self.across
 
-    def _patch(self, photo: int, pose: Pose, placed: Alignment, gsd: float, grey: GreyPicture) -> Patch | None:
+    def _patch(
+        self, photo: int, pose: Pose, placed: Alignment, gsd: float, grey: GreyPicture
+    ) -> Patch | None:
         """The photo on the overview's grid (column = east / gsd, row = -north / gsd)."""
         camera = placed.camera(photo)
         cam_H_grid = np.linalg.inv(map_H_cam_of(pose)) @ np.diag([gsd, -gsd, 1.0])
@@ -121,5 +125,3 @@ def turned(pose: Pose, move: Array) -> Pose:
     """The pose moved east and north in m and turned clockwise in degrees about the vertical."""
     turn = rotation_from_vector(np.array([0.0, 0.0, -np.radians(move[2])]))
     return Pose(cam_R_map=pose.cam_R_map @ turn.T, map_C=pose.map_C + np.array([move[0], move[1], 0.0]))
-
-

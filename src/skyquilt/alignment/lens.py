@@ -47,7 +47,11 @@ def working_K(camera: Camera) -> Array:
     """(3, 3) from the undistorted image plane (units of the focal length) to the working image, in px."""
     scale = min(1.0, WORKING_WIDTH / camera.width)
     return np.array(
-        [[camera.focal * scale, 0, camera.cx * scale], [0, camera.focal * scale, camera.cy * scale], [0, 0, 1]]
+        [
+            [camera.focal * scale, 0, camera.cx * scale],
+            [0, camera.focal * scale, camera.cy * scale],
+            [0, 0, 1],
+        ]
     )
 
 

@@ -1,4 +1,4 @@
-"""What `hybrid` maximises: lambda = alpha lambda_spat + (1 - alpha) lambda_corr of one photo on the map so far (Y 4.6)."""
+"""What `hybrid` maximises: lambda = alpha lambda_spat + (1 - alpha) lambda_corr of a photo on the map (Y 4.6)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class Distances:
     """(n,) 1, or 0 where the distance is too short to be compared relatively."""
 
     def quality(self, nadir: Array) -> Array:
-        """lambda_spat (6.1) (...,) of nadirs (..., 2) in m: mean of 1 / (1 + |relative error|); 1 without neighbours."""
+        """lambda_spat (6.1) of nadirs (..., 2) in m: mean of 1 / (1 + |relative error|); 1 without neighbours."""
         if not self.weight.any():
             return np.ones(np.shape(nadir)[:-1])
         d = np.linalg.norm(np.asarray(nadir)[..., None, :] - self.placed, axis=-1)
@@ -56,7 +56,7 @@ class Level:
     """(2,) column and row of the patch's first pixel in the window, at the metadata's place."""
 
     def correlation(self, move: Array) -> float:
-        """CC (6.1) of photo and map in their overlap for a move (east m, north m, clockwise degrees); NaN without one."""
+        """CC (6.1) of photo and map in their overlap for a move (east m, north m, degrees); NaN without one."""
         place = self._placement(move)
         h, w = self.window.shape
         warped = cv2.warpAffine(self.patch, place, (w, h), flags=cv2.INTER_LINEAR)
@@ -124,7 +124,9 @@ def pyramid(patch: Patch, overview: Overview, gsd: float, reach_m: float, nadir_
     return levels
 
 
-def _halved(pixels: NDArray[np.float32], seen: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _halved(
+    pixels: NDArray[np.float32], seen: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Area averages of 2 x 2 pixels, of what is seen only."""
     size = (-(-pixels.shape[1] // 2), -(-pixels.shape[0] // 2))
     even = [(0, s % 2) for s in pixels.shape]

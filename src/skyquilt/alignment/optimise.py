@@ -27,7 +27,9 @@ class Best:
 class Optimiser(Protocol):
     """Maximises an objective within a reach in m and a turn in degrees."""
 
-    def __call__(self, objective: Objective, reach_m: float, turn_deg: float, seed: int) -> Best: ...
+    def __call__(self, objective: Objective, reach_m: float, turn_deg: float, seed: int) -> Best:
+        """The best move."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +55,8 @@ class Anneal:
         for level in reversed(range(len(objective.levels))):
             scale = objective.levels[level]
             coarsest = level == len(objective.levels) - 1
-            slack = np.array([4 * scale.gsd, 4 * scale.gsd, np.degrees(8 * scale.gsd / (size * objective.levels[0].gsd))])
+            turn = np.degrees(8 * scale.gsd / (size * objective.levels[0].gsd))
+            slack = np.array([4 * scale.gsd, 4 * scale.gsd, turn])
             spread = np.array([reach_m, reach_m, turn_deg]) if coarsest else slack
             floor = np.array([scale.gsd / 2, scale.gsd / 2, slack[2] / 8])
             heat = self.hot if coarsest else self.hot / 10
@@ -102,9 +105,9 @@ class Surfaces:
         """The best move; nothing here is random."""
         coarse = len(objective.levels) - 1
         turns = np.linspace(-turn_deg, turn_deg, 2 * int(np.ceil(turn_deg / self.turn_step_deg)) + 1)
-        moves = [m for t in turns for m in self._peaks(objective, coarse, float(t), reach_m)]
-        spent = len(moves)
-        moves = [m for _, m in sorted(moves, key=lambda found: -found[0])[: self.keep]]
+        peaks = [self._peak(objective, coarse, float(t), reach_m) for t in turns]
+        spent = len(peaks)
+        moves = [m for _, m in sorted(peaks, key=lambda found: -found[0])[: self.keep]]
         size = max(objective.levels[0].patch.shape) * objective.levels[0].gsd
         climbed: list[tuple[float, Array]] = []
         for level in reversed(range(len(objective.levels))):
@@ -117,10 +120,10 @@ class Surfaces:
                 spent += n
             climbed.sort(key=lambda c: -c[0])
             moves = [m for _, m in climbed[: max(1, self.keep - (coarse - level) - 1)]]
-        value, move = climbed[0]
-        return Best(move=move, quality=value, evaluations=spent)
+        value, best = climbed[0]
+        return Best(move=best, quality=value, evaluations=spent)
 
-    def _peaks(self, objective: Objective, level: int, turn: float, reach_m: float) -> list[tuple[float, Array]]:
+    def _peak(self, objective: Objective, level: int, turn: float, reach_m: float) -> tuple[float, Array]:
         """The best shift for one turn on the coarsest level: (lambda, move)."""
         here = objective.levels[level]
         cc, columns, rows = masked_correlation(here, turn, reach_m)
@@ -130,7 +133,7 @@ class Surfaces:
         value = objective.alpha * spat + (1 - objective.alpha) * looks
         value[np.hypot(east, north) > reach_m] = -1
         k = int(np.argmax(value))
-        return [(float(value.flat[k]), np.array([east.flat[k], north.flat[k], turn]))]
+        return float(value.flat[k]), np.array([east.flat[k], north.flat[k], turn])
 
 
 def _climb(
@@ -140,7 +143,8 @@ def _climb(
     value, spent = objective(move, level), 1
     for scale in (1.0, 0.4, 0.15):
         for _ in range(12):
-            tried = [(objective(m, level), k, m) for k, m in enumerate(_around(move, step * scale)) if _within(m, limits)]
+            near = [m for m in _around(move, step * scale) if _within(m, limits)]
+            tried = [(objective(m, level), k, m) for k, m in enumerate(near)]
             spent += len(tried)
             best = max(tried, default=None, key=lambda t: t[:2])
             if best is None or best[0] <= value:

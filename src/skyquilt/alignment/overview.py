@@ -31,7 +31,9 @@ RIM_PX = 12
 class Detector(Protocol):
     """Features of a picture."""
 
-    def __call__(self, image: NDArray) -> Features: ...
+    def __call__(self, image: NDArray) -> Features:
+        """Keypoints and descriptors."""
+        ...
 
     def counted(self, count: int) -> "Detector":
         """The same with another number of keypoints at most."""
@@ -69,6 +71,7 @@ class ByOverview:
         cameras = {p.camera_key: of_order(reported_camera(p), self.distortion) for p in photos}
         pieces: list[dict[int, Array]] = []
         joins, notes = [], []
+        overview, K = Overview(), np.eye(3)
         for photo in order:
             camera = cameras[photos[photo].camera_key]
             joined = self._join(photo, camera, overview, features[photo], K) if pieces else None
@@ -77,7 +80,10 @@ class ByOverview:
                 joins.append(join)
             else:
                 if joined is not None:
-                    notes.append(f"{photos[photo].name} does not match the map so far ({joined.reason}): a new piece begins.")
+                    name = photos[photo].name
+                    notes.append(
+                        f"{name} does not match the map so far ({joined.reason}): a new piece begins."
+                    )
                 overview, K = Overview(), self._grid(camera)
                 pieces.append({})
                 grid_H_cam = K
@@ -86,7 +92,9 @@ class ByOverview:
                 overview.merge(patch)
             pieces[-1][photo] = np.linalg.inv(K) @ grid_H_cam
         laid = lay([Piece(plane_H_cam=p) for p in pieces], priors, self.height_m)
-        return plane_alignment(self.name, frame, photos, laid.poses, laid.metric, cameras, pieces, joins, notes)
+        return plane_alignment(
+            self.name, frame, photos, laid.poses, laid.metric, cameras, pieces, joins, notes
+        )
 
     def _grid(self, camera: Camera) -> Array:
         """grid_H_cam (3, 3) of a piece's first photo."""
@@ -121,7 +129,9 @@ class ByOverview:
         """Features of the overview, those at its rim left out."""
         area = overview.shown.sum() / (0.6 * self.longest**2)
         found = self.detect.counted(int(self.per_photo * max(1.0, area)))(overview.pixels.astype(np.uint8))
-        inside = cv2.erode(overview.shown.astype(np.uint8), np.ones((2 * RIM_PX + 1,) * 2, np.uint8), borderValue=0)
+        inside = cv2.erode(
+            overview.shown.astype(np.uint8), np.ones((2 * RIM_PX + 1,) * 2, np.uint8), borderValue=0
+        )
         at = np.rint(found.px).astype(int).T
         keep = inside[at[1].clip(0, inside.shape[0] - 1), at[0].clip(0, inside.shape[1] - 1)] > 0
         return Features(

@@ -77,8 +77,8 @@ class ByMetadata:
                 else np.full(len(z), self.height_m)
             )
         if frame.vertical_datum != "takeoff":
-            known = frame.vertical_datum != "unknown"
-            given = f"heights above {frame.vertical_datum.replace('_', ' ')}" if known else "no heights"
+            told = frame.vertical_datum != "unknown"
+            given = f"heights above {frame.vertical_datum.replace('_', ' ')}" if told else "no heights"
             raise AlignmentError(
                 f"method {self.name} needs heights above ground, and the photos give {given};"
                 " add --height METRES"

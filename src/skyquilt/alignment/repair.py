@@ -35,7 +35,10 @@ def repair(
     photos: Sequence[Photo], priors: Sequence[Prior], features: Sequence[Features], links: Sequence[Link],
     convergence_deg: float = 0.0,
 ) -> Repaired:  # fmt: skip
-    """Headings that contradict the links replaced, missing ones filled, heights above ground from image scale."""
+    """Headings that contradict the links replaced, missing ones filled, heights above ground from image scale.
+
+    Positions stay, with the scatter that their block shows where it is worse than stated.
+    """
     start = find_start(photos, priors, features, links)
     repaired, notes = list(priors), []
     heights = np.full(len(photos), np.nan)
@@ -45,6 +48,9 @@ def repair(
         found = angle_difference_deg(-float(np.degrees(np.angle(a))), 0.0)
         repaired[i], told = _heading(photos[i], priors[i], found, convergence_deg)
         notes += told
+        spread = start.sigma_xy.get(i, 0.0)
+        if spread > repaired[i].sigma_C[0]:
+            repaired[i] = replace(repaired[i], sigma_C=np.array([spread, spread, priors[i].sigma_C[2]]))
     return Repaired(priors=tuple(repaired), heights_m=heights, notes=tuple(notes))
 
 

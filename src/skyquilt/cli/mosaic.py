@@ -14,9 +14,7 @@ def command(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
     method: Annotated[
         str,
-        typer.Option(
-            help="How photos are aligned: auto, bundle, position, pose, image, hybrid, flightline."
-        ),
+        typer.Option(help="How photos are aligned: auto, bundle, position, pose, image, hybrid, flightline."),
     ] = "auto",
     gsd: Annotated[
         float | None, typer.Option(help="Ground size of a map pixel in cm.", show_default="the photos' own")
@@ -92,8 +90,10 @@ def command(
     ] = 0.5,
     optimiser: Annotated[
         str,
-        typer.Option(help="How method hybrid searches: anneal (simulated annealing), surfaces (correlation)."),
-    ] = "anneal",
+        typer.Option(
+            help="How method hybrid searches: surfaces (correlation), anneal (simulated annealing)."
+        ),
+    ] = "surfaces",
     seed: Annotated[int, typer.Option(help="Of everything random; equal seeds give equal maps.")] = 0,
     sequence: Annotated[
         str,
@@ -103,9 +103,7 @@ def command(
     ] = "time",
     lines: Annotated[
         str,
-        typer.Option(
-            help="How method flightline tells lines apart: heading, or distance (as in the paper)."
-        ),
+        typer.Option(help="How method flightline tells lines apart: heading, or distance (as in the paper)."),
     ] = "heading",
     distances: Annotated[
         Path | None,
@@ -118,7 +116,8 @@ def command(
     heading: Annotated[
         float | None,
         typer.Option(
-            help="Heading of all photos in degrees, for method position.", show_default="the commonest reported"
+            help="Heading of all photos in degrees, for method position.",
+            show_default="the commonest reported",
         ),
     ] = None,
     repair: Annotated[

@@ -7,8 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.geometry.camera import distort, monotone_radius, rays
+from skyquilt.imaging.views import View, project_nodes
 from skyquilt.model.camera import Camera
+from skyquilt.model.surface import Surface
 
+NODES = 4
+"""Pixels between the points at which a view is projected exactly."""
 CENTRE = 0.5
 """Side of the central region of a photo that is laid over what is there, over that of the photo (Y 6.1.3)."""
 
@@ -29,7 +33,9 @@ class Patch:
     """(h, w) the central region of the photo."""
 
 
-def to_grid(picture: NDArray[np.uint8], camera: Camera, cam_H_grid: NDArray, *, margin: int = 0) -> Patch | None:
+def to_grid(
+    picture: NDArray[np.uint8], camera: Camera, cam_H_grid: NDArray, *, margin: int = 0
+) -> Patch | None:
     """A grey picture (h, w) of a photo of any size on a grid, or None if it sees the horizon or nothing.
 
     `cam_H_grid` (3, 3) takes (column, row, 1) of the grid to the undistorted image plane (units of the focal length).
@@ -48,7 +54,9 @@ def to_grid(picture: NDArray[np.uint8], camera: Camera, cam_H_grid: NDArray, *, 
     real = (plane**2).sum(-1) < monotone_radius(camera) ** 2
     factor = np.array([picture.shape[1] / camera.width, picture.shape[0] / camera.height])
     small = np.where(real[..., None], (px + 0.5) * factor - 0.5, -1e4).astype(np.float32)
-    pixels = cv2.remap(picture, small[..., 0], small[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    pixels = cv2.remap(
+        picture, small[..., 0], small[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     off = np.abs((px + 0.5) / (camera.width, camera.height) - 0.5)
     edge = 0.5 - 1.5 / np.array([picture.shape[1], picture.shape[0]])
     shown = real & (off < edge).all(-1)
@@ -58,12 +66,46 @@ def to_grid(picture: NDArray[np.uint8], camera: Camera, cam_H_grid: NDArray, *, 
     )  # fmt: skip
 
 
+def view_patch(picture: NDArray[np.uint8], view: View, surface: Surface, gsd: float) -> Patch | None:
+    """A grey picture (h, w) of a placed photo, of any size, orthorectified; column = east / gsd, row = -north / gsd.
+
+    Projected exactly at every `NODES`-th pixel and interpolated between.
+    """
+    (west, south), (east, north) = view.footprint.min(0), view.footprint.max(0)
+    c0, r0 = int(np.floor(west / gsd)), int(np.floor(-north / gsd))
+    columns, rows = (int(np.ceil(e / gsd / NODES)) + 1 for e in (east - west, north - south))
+    x = (c0 + NODES * (np.arange(-1, columns + 1) + 0.5) - 0.5) * gsd
+    y = -(r0 + NODES * (np.arange(-1, rows + 1) + 0.5) - 0.5) * gsd
+    gx, gy = np.meshgrid(x, y)
+    nodes = project_nodes(view, gx, gy, surface.at(gx, gy))
+    if not nodes.seen.any():
+        return None
+    size = ((columns + 2) * NODES, (rows + 2) * NODES)
+    inner = slice(NODES, -NODES)
+    u, v, real = (
+        cv2.resize(m, size, interpolation=cv2.INTER_LINEAR)[inner, inner]
+        for m in (nodes.u, nodes.v, nodes.real.astype(np.float32))
+    )
+    camera = view.camera
+    across, down = picture.shape[1] / camera.width, picture.shape[0] / camera.height
+    pixels = cv2.remap(
+        picture, (u + 0.5) * np.float32(across) - 0.5, (v + 0.5) * np.float32(down) - 0.5, cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    off_u, off_v = np.abs((u + 0.5) / camera.width - 0.5), np.abs((v + 0.5) / camera.height - 0.5)
+    shown = (real > 0.999) & (off_u < 0.5 - 1.5 / picture.shape[1]) & (off_v < 0.5 - 1.5 / picture.shape[0])
+    return Patch(
+        column=c0, row=r0, pixels=pixels.astype(np.float32), shown=shown,
+        central=shown & (off_u < CENTRE / 2) & (off_v < CENTRE / 2),
+    )  # fmt: skip
+
+
 def _rim(camera: Camera, grid_H_cam: NDArray, per_side: int = 8) -> NDArray[np.float64] | None:
     """Outline of the photo on the grid (n, 2)."""
     s = np.linspace(-0.5, 0.5, per_side)
-    square = np.concatenate([np.c_[s, s * 0 - 0.5], np.c_[s, s * 0 + 0.5], np.c_[s * 0 - 0.5, s], np.c_[s * 0 + 0.5, s]])
+    o = s * 0 + 0.5
+    square = np.concatenate([np.c_[s, -o], np.c_[s, o], np.c_[-o, s], np.c_[o, s]])
     px = square * (camera.width, camera.height) + ((camera.width - 1) / 2, (camera.height - 1) / 2)
-
 
     xyw = rays(camera, px) @ grid_H_cam.T
     w = xyw[:, 2] * np.sign(np.median(xyw[:, 2]))
@@ -92,7 +134,9 @@ class Overview:
         self.pixels[inner][laid] = patch.pixels[laid]
         self.shown[inner] |= patch.shown
 
-    def window(self, row: int, column: int, height: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def window(
+        self, row: int, column: int, height: int, width: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Pixels and mask (height, width) of any part of the grid, empty beyond what is there."""
         pixels, shown = np.zeros((height, width), np.float32), np.zeros((height, width), bool)
         r0, c0 = max(row, self.row), max(column, self.column)
@@ -112,10 +156,14 @@ class Overview:
         """Grows the arrays, generously, so that they hold rows r0 to r1 and columns c0 to c1."""
         if not self.shown.size:
             self.row, self.column = r0, c0
-            self.pixels, self.shown = np.zeros((r1 - r0, c1 - c0), np.float32), np.zeros((r1 - r0, c1 - c0), bool)
+            self.pixels, self.shown = (
+                np.zeros((r1 - r0, c1 - c0), np.float32),
+                np.zeros((r1 - r0, c1 - c0), bool),
+            )
             return
         h, w = self.shown.shape
-        grown = [max(0, self.row - r0), max(0, r1 - self.row - h), max(0, self.column - c0), max(0, c1 - self.column - w)]
+        over = (self.row - r0, r1 - self.row - h, self.column - c0, c1 - self.column - w)
+        grown = [max(0, o) for o in over]
         if not any(grown):
             return
         grown = [g + 64 if g else 0 for g in grown]

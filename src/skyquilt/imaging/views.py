@@ -76,11 +76,7 @@ def footprint(camera: Camera, pose: Pose, surface: Surface, *, per_side: int = 8
     direction = rays(camera, rim) @ pose.cam_R_map
     if (direction[:, 2] > -0.1).any():
         return np.zeros((0, 2))
-    xy = np.repeat(pose.map_C[None, :2], len(rim), 0)
-    for _ in range(6):
-        drop = (surface.at(xy[:, 0], xy[:, 1]) - pose.map_C[2]) / direction[:, 2]
-        xy = pose.map_C[:2] + direction[:, :2] * drop[:, None]
-    return np.asarray(xy)
+    return _meet(pose, direction, surface)
 
 
 def _planar_footprint(rim: NDArray, cam_H_map: NDArray) -> NDArray[np.float64]:
@@ -167,6 +163,26 @@ def densify(values: NDArray[np.float32], height: int, width: int) -> NDArray[np.
     r, c = values.shape[:2]
     whole = cv2.resize(values, (c * STEP, r * STEP), interpolation=cv2.INTER_LINEAR)
     return np.asarray(whole[STEP : STEP + height, STEP : STEP + width])
+
+
+def on_ground(view: View, px: NDArray, surface: Surface) -> NDArray[np.float64]:
+    """Where pixels (n, 2) of a placed photo lie on the surface: (n, 3) in m (map frame)."""
+    ray, pose = rays(view.camera, np.asarray(px, np.float64).reshape(-1, 2)), view.pose
+    if pose.cam_H_map is not None:
+        xyw = ray @ np.linalg.inv(pose.cam_H_map).T
+        xy = xyw[:, :2] / xyw[:, 2:]
+    else:
+        xy = _meet(pose, ray @ pose.cam_R_map, surface)
+    return np.column_stack([xy, surface.at(xy[:, 0], xy[:, 1])])
+
+
+def _meet(pose: Pose, direction: NDArray, surface: Surface) -> NDArray[np.float64]:
+    """Where rays from a pose, directions (n, 3) in the map frame, meet the surface: (n, 2) in m."""
+    xy = np.repeat(pose.map_C[None, :2], len(direction), 0)
+    for _ in range(6):
+        drop = (surface.at(xy[:, 0], xy[:, 1]) - pose.map_C[2]) / direction[:, 2]
+        xy = pose.map_C[:2] + direction[:, :2] * drop[:, None]
+    return np.asarray(xy)
 
 
 def native_gsd(views: Sequence[View], surface: Surface) -> float:

@@ -45,3 +45,21 @@ class NoEstimate:
 
     def __bool__(self) -> bool:
         return False
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Registration:
+    """A transformation that the pixels themselves agree on."""
+
+    model: str
+    """`translation`, `similarity`, `euclidean`, `affine` or `homography`."""
+    b_H_a: NDArray[np.float64]
+    """(3, 3) takes a's pixels to b's; last element 1."""
+    score: float
+    """What was maximised, where it is highest: a correlation (at most 1), normalised mutual information, or the
+    response of a phase correlation.
+    """
+    overlap: float
+    """Share of a's pixels that lie on b."""
+    method: str
+    """`NCC`, `phase`, `ECC` or `MI`."""

@@ -1,8 +1,8 @@
 """Known distances on the ground: a CSV with the header `point_a,point_b,metres`.
 
-Where the points are seen is told in one of three ways: by further columns `px_a,py_a,image_a,px_b,py_b,image_b`, several
-rows for several sightings; by writing a point as `px py image`; or by the names of points in gcp_list.txt. Pixels have
-their centres at integers, as there.
+Where the points are seen is told in one of three ways: by further columns `px_a,py_a,image_a,px_b,py_b,image_b`,
+several rows for several sightings; by writing a point as `px py image`; or by the names of points in gcp_list.txt.
+Pixels have their centres at integers, as there.
 """
 
 import csv
@@ -36,9 +36,13 @@ def read_distances(
         ends = tuple(_label(row[f"point_{e}"]) for e in _ENDS)
         metres = finite(number(row["metres"]))
         if metres is None or metres <= 0:
-            raise SideFileError(f"{place}: expected a length in m above 0, found '{row['metres']}'. Correct that cell.")
+            raise SideFileError(
+                f"{place}: expected a length in m above 0, found '{row['metres']}'. Correct that cell."
+            )
         if lengths.setdefault((ends[0], ends[1]), metres) != metres:
-            raise SideFileError(f"{place}: {ends[0]} to {ends[1]} has two different lengths. Correct one of its rows.")
+            raise SideFileError(
+                f"{place}: {ends[0]} to {ends[1]} has two different lengths. Correct one of its rows."
+            )
         for end, label in zip(_ENDS, ends, strict=True):
             for seen in _observations(row, end, label, known, place):
                 photo = names.find(seen.photo)

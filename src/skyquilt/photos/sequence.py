@@ -27,7 +27,9 @@ def sequence_of(names: Sequence[str], how: str) -> list[int]:
     found = [known.find(w) for w in wanted]
     strangers = [w for w, f in zip(wanted, found, strict=True) if f is None]
     if strangers or not wanted:
-        what = f"names {sentence_of(strangers)}, which are no photos of the survey" if strangers else "is empty"
+        what = (
+            f"names {sentence_of(strangers)}, which are no photos of the survey" if strangers else "is empty"
+        )
         raise SideFileError(f"{path.name} {what}; expected one photo's name a line.")
     order = [index[f] for f in found if f is not None]
     if len(set(order)) < len(order):

@@ -23,12 +23,13 @@ from skyquilt.config import BY_METADATA, IN_SEQUENCE, Methods, MosaicSettings, m
 from skyquilt.errors import SkyquiltError, UnreadablePhotoError, UsageError
 from skyquilt.model import camera, features, poses, raster, surface
 from skyquilt.model.event import Event, Note, Result
-from skyquilt.model.photo import ControlPoint, Photo, RejectedPhoto, Survey
+from skyquilt.model.photo import ControlPoint, KnownDistance, Photo, RejectedPhoto, Survey
+from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.sequence import sequence_of
 from skyquilt.photos.survey import read_survey
-from skyquilt.pipelines import drawing, intake, judging, linking, placing, reporting
+from skyquilt.pipelines import drawing, intake, judging, linking, placing, quality, reporting
 from skyquilt.raster.boundary import read_boundary
 from skyquilt.run.clock import Clock, Steps
 from skyquilt.run.folder import STATE, RunFolder, open_run
@@ -36,6 +37,7 @@ from skyquilt.run.pixel_cache import PixelCache
 from skyquilt.run.store import Store, digest
 
 T = TypeVar("T")
+U = TypeVar("U")
 STAGES = ("read", "features", "links", "align", "surface", "balance", "mosaic", "measure", "report")
 """Stages in order."""
 ARTEFACTS = {
@@ -52,7 +54,8 @@ REGISTRY = {
     for c in (
         intake.Looked, features.Features, features.Link, features.RejectedLink, features.Matches,
         camera.Camera,
-        poses.Alignment, poses.MapFrame, poses.Pose, poses.TiePoints, poses.ControlResidual, poses.Join, surface.Surface,
+        poses.Alignment, poses.MapFrame, poses.Pose, poses.TiePoints, poses.ControlResidual, poses.Join,
+        surface.Surface,
         RejectedPhoto, drawing.BlockExtras, raster.Grid,
     )
 }  # fmt: skip
@@ -73,6 +76,8 @@ def iter_mosaic(
     parts, jobs = methods(settings), settings.jobs or os.cpu_count() or 1
     _apart(folder, output)
     survey, control = _read(folder, settings)
+    distances = _known_distances(survey, control, settings)
+    in_order = _in_sequence(survey.photos, settings)
     run_id = run_key(survey, control, settings, parts)
     run = open_run(output, run_id, overwrite=overwrite, again=rerun_from is not None)
     store = Store(folder=run.store, registry=REGISTRY)
@@ -95,7 +100,7 @@ def iter_mosaic(
     links = yield from clock.stage("links", _links(taken, prior, parts, settings, store, jobs))
     known = placing.Known(
         intake=taken, frame=frame, priors=prior, links=links, control=control, pictures=pictures,
-        order=sequence_of([p.name for p in taken.photos], settings.sequence),
+        order=[i for _, i in sorted((in_order[p.name], i) for i, p in enumerate(taken.photos) if p.name in in_order)],
     )  # fmt: skip
     alignment = yield from clock.stage("align", placing.place(known, parts, settings, store))
     yield from (Note(text=n, warning=True) for n in alignment.notes)
@@ -117,13 +122,18 @@ def iter_mosaic(
     drawn = yield from clock.stage(
         "mosaic", drawing.draw(run.path, compose, alignment, settings, store, key, unit, jobs)
     )
-    seams = yield from clock.stage("measure", reporting.seams(compose, drawn, ground))
+    judging_it = quality.judge(
+        taken, alignment, prior, ground, pictures, distances, settings.alpha, known.order
+    )
+    seams, judged = yield from clock.stage(
+        "measure", _both(reporting.seams(compose, drawn, ground), judging_it), keeps=False
+    )
     rejected = [*survey.rejected, *taken.rejected, *_unplaced(taken, alignment)]
     figures = judging.figures(
         photos=taken.photos, total=len(survey.photos) + len(survey.rejected), rejected=rejected, priors=prior,
         links=links, alignment=alignment, ground=ground, drawn=drawn, seams=seams.figures,
         conflicts=conflicts(taken.photos, prior, alignment), notes=[*survey.notes, *alignment.notes],
-    )  # fmt: skip
+    ) | {"quality": judged.figures}  # fmt: skip
     finish = reporting.finish(
         run.path, taken, prior, alignment, ground, drawn, seams, figures, settings, clock, folder
     )
@@ -167,6 +177,21 @@ def _with_control(
     return replace(survey, notes=(*survey.notes, *notes)), control
 
 
+def _in_sequence(photos: Sequence[Photo], settings: MosaicSettings) -> dict[str, int]:
+    """Place in the sequence by the photo's name."""
+    names = [p.name for p in photos]
+    return {names[i]: k for k, i in enumerate(sequence_of(names, settings.sequence))}
+
+
+def _known_distances(
+    survey: Survey, control: Sequence[ControlPoint], settings: MosaicSettings
+) -> tuple[KnownDistance, ...]:
+    """Distances to judge the map by; none asked for, none there."""
+    if settings.distances is None:
+        return ()
+    return read_distances(settings.distances, [p.name for p in survey.photos], control)
+
+
 def _apart(folder: Path | Sequence[Path], output: Path) -> None:
     """Refuses the folder of photos as output: a second run would take its own map for a photo."""
     if isinstance(folder, Path) and folder.is_dir() and folder.resolve() == output.resolve():
@@ -196,7 +221,8 @@ def run_key(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSet
     settings that shape results.
     """
     shaping = {k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb")}
-    side = [p.read_bytes().hex() for p in (settings.boundary,) if p is not None and p.is_file()]
+    files = (settings.boundary, settings.distances, Path(settings.sequence))
+    side = [p.read_bytes().hex() for p in files if p is not None and p.is_file()]
     photos = [(p.name, p.digest, p.position, p.attitude, p.focal, p.calibration) for p in survey.photos]
     return digest(photos, list(control), shaping, side, parts, __version__)
 
@@ -276,6 +302,11 @@ def _at_once(work: Callable[[], T]) -> Steps[T]:
     result = work()
     yield 1, 1
     return result
+
+
+def _both(first: Steps[T], second: Steps[U]) -> Steps[tuple[T, U]]:
+    """Two works as one stage."""
+    return (yield from first), (yield from second)
 
 
 def _unplaced(taken: intake.Intake, alignment: poses.Alignment) -> list[RejectedPhoto]:

@@ -18,6 +18,7 @@ from skyquilt.pipelines.intake import Intake, Pictures
 from skyquilt.pipelines.linking import Links
 from skyquilt.run.clock import Steps
 from skyquilt.run.store import Store, digest
+from skyquilt.twoview.levelled import Level
 
 
 def choose_method(asked: str, photos: int, links: int, positions: int) -> tuple[str, str]:
@@ -79,7 +80,14 @@ def _key(known: Known, methods: Methods, way: object) -> str:
     photos = [(p.digest, p.name, p.camera_key, p.focal, p.calibration, p.editor) for p in known.intake.photos]
     held = [(k.a, k.b, k.index_a, k.index_b) for k in known.links.links]
     return digest(
-        photos, known.frame, list(known.priors), held, list(known.control), methods.sift, list(known.order), way
+        photos,
+        known.frame,
+        list(known.priors),
+        held,
+        list(known.control),
+        methods.sift,
+        list(known.order),
+        way,
     )
 
 
@@ -130,10 +138,20 @@ def _by_metadata(method: ByMetadata, known: Known, repaired: Repaired | None) ->
 
 
 def _image(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
-    photos, features = known.intake.photos, known.intake.features
-    if isinstance(methods.by_image, ByOverview):
-        return methods.by_image(photos, known.frame, known.priors, features, known.order, known.pictures)
-    return methods.by_image(photos, known.frame, known.priors, features, known.order)
+    photos, features, method = known.intake.photos, known.intake.features, methods.by_image
+    if isinstance(method.level, Level) and method.level.height_m is None:
+        method = replace(method, level=replace(method.level, height_m=_least_height(known)))
+    if isinstance(method, ByOverview):
+        return method(photos, known.frame, known.priors, features, known.order, known.pictures)
+    return method(photos, known.frame, known.priors, features, known.order)
+
+
+def _least_height(known: Known) -> float | None:
+    """Least height above take-off in m, which stands for that above ground in (4.9); None where none is reported."""
+    heights = np.array([p.map_C[2] for p in known.priors])
+    known_heights = heights[np.isfinite(heights) & (heights > 1)]
+    takeoff = known.frame.vertical_datum == "takeoff"
+    return float(known_heights.min()) if takeoff and len(known_heights) else None
 
 
 def _hybrid(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
@@ -151,7 +169,7 @@ def _flightline(known: Known, methods: Methods, repaired: Repaired | None) -> Al
 def _named(alignment: Alignment, known: Known) -> Alignment:
     """With a reason for photos that the sequence does not name."""
     missing = set(range(len(known.intake.photos))) - set(known.order)
-    reasons = {i: "the sequence does not name it" for i in missing}
+    reasons = dict.fromkeys(missing, "the sequence does not name it")
     return replace(alignment, rejected={**alignment.rejected, **reasons})
 
 

@@ -20,10 +20,15 @@ from skyquilt.pipelines.intake import Intake
 from skyquilt.raster.atomic import write_text
 from skyquilt.render.compose import Composer
 from skyquilt.render.patches import grey_pairs
-from skyquilt.report.input import CameraResiduals, ReportInput, SeamMark, Shot
+from skyquilt.report.input import CameraResiduals, DepthPicture, ReportInput, SeamMark, Shot
 from skyquilt.report.page import write_report
 from skyquilt.run.clock import Clock, Steps, peak_memory_mb
+from skyquilt.twoview.levelled import depth_map
 
+DEPTHS, DEPTH_WIDTH = 4, 420
+"""Depth maps shown, and their width in px."""
+LEAST_DISPARITIES = 12
+"""Disparities that make a depth map."""
 SEAM_POINTS = 300
 """Points at which seams are measured."""
 
@@ -129,8 +134,28 @@ def report_input(
             )
             for s in seen.report.samples
         ],
+        depths=_depths(taken, alignment),
         settings=settings.as_table(), title=Path(title).name, version=__version__,
     )  # fmt: skip
+
+
+def _depths(taken: Intake, alignment: Alignment) -> list[DepthPicture]:
+    """False-colour depth maps (Y 4.8) of a few registrations, spread over the survey."""
+    told = [j for j in alignment.joins if len(j.px) >= LEAST_DISPARITIES]
+    chosen = (
+        [told[k] for k in sorted({round(i) for i in np.linspace(0, len(told) - 1, DEPTHS)})] if told else []
+    )
+    pictures = []
+    for join in chosen:
+        photo = taken.photos[join.photo]
+        scale = DEPTH_WIDTH / photo.width
+        shape = (max(1, round(photo.height * scale)), DEPTH_WIDTH)
+        field = depth_map((join.px + 0.5) * scale - 0.5, join.d_px, shape)
+        pictures.append(
+            DepthPicture(name=photo.name, pixels=np.rint(255 * field).astype(np.uint8), features=len(join.px),
+                         removed=int((~join.levelled).sum()))
+        )  # fmt: skip
+    return pictures
 
 
 def _shots(taken: Intake, priors: Sequence[Prior], alignment: Alignment, ground: Ground) -> list[Shot]:

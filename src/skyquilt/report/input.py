@@ -57,6 +57,20 @@ class SeamMark:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class DepthPicture:
+    """Disparities of one registration in false colour."""
+
+    name: str
+    """The photo registered."""
+    pixels: NDArray
+    """(h, w, 3) uint8."""
+    features: int
+    """Inliers it was made from."""
+    removed: int
+    """Those left out as not on the dominant plane."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ReportInput:
     """Everything the page shows. What is absent is left out, with a sentence why."""
 
@@ -88,6 +102,8 @@ class ReportInput:
     """Reprojection residuals by camera."""
     seams: Sequence[SeamMark] = ()
     """Samples along the seams."""
+    depths: Sequence[DepthPicture] = ()
+    """Depth maps of registrations; a few, of methods that have them."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """The resolved settings, nested as they are."""
     title: str = "Survey"

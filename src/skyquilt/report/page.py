@@ -19,6 +19,7 @@ from skyquilt.report.numbers import count, items, mapping, plain
 from skyquilt.report.overlap import overlap_section, surface_section
 from skyquilt.report.parts import Section, Tile
 from skyquilt.report.positions import positions_section
+from skyquilt.report.quality import quality_section
 from skyquilt.report.residuals import residuals_section
 from skyquilt.report.seams import seams_section
 from skyquilt.report.tables import (
@@ -44,6 +45,7 @@ def build_report(data: ReportInput) -> str:
         residuals_section(data),
         seams_section(data, ground, named),
         surface_section(data, ground, named),
+        quality_section(data),
         calibration_section(data),
         control_section(data),
         conflicts_section(data),
@@ -66,7 +68,12 @@ def build_report(data: ReportInput) -> str:
 
 def write_report(path: Path, data: ReportInput) -> None:
     """Build the page and put it at `path`, whole or not at all; `OutputError` if it cannot be written."""
-    path, page = Path(path), build_report(data)
+    write_page(path, build_report(data))
+
+
+def write_page(path: Path, page: str) -> None:
+    """Put a page at `path`, whole or not at all; `OutputError` if it cannot be written."""
+    path = Path(path)
     partial = path.with_name(path.name + ".partial")
     try:
         partial.write_text(page, encoding="utf-8")

@@ -49,8 +49,8 @@ class Clock:
         """Notes a stage's time from an earlier `now`."""
         self.seconds[stage] = round(time.perf_counter() - since[0], 3)
 
-    def stage(self, name: str, work: Steps[T]) -> Generator[Event, None, T]:
-        """Runs a stage's steps as events and returns its result."""
+    def stage(self, name: str, work: Steps[T], *, keeps: bool = True) -> Generator[Event, None, T]:
+        """Runs a stage's steps as events and returns its result; `keeps` is False for one that stores none."""
         begun, hits, misses = self.now(), self.store.hits, self.store.misses
         yield StageStarted(stage=name, total=0)
         try:
@@ -68,7 +68,7 @@ class Clock:
         self.lap(name, begun)
         yield StageFinished(
             stage=name, seconds=self.seconds[name], cpu_seconds=round(cpu_seconds() - begun[1], 3),
-            reused=self.store.misses == misses and self.store.hits > hits,
+            reused=keeps and self.store.misses == misses and self.store.hits > hits,
         )  # fmt: skip
         return result
 

@@ -1,0 +1,51 @@
+"""`skyquilt spectral-bench`: methods of registration on pairs whose truth is known."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from skyquilt.cli.interrupt import ends_at_once
+from skyquilt.errors import UsageError
+
+if TYPE_CHECKING:
+    from skyquilt.model.event import Result
+
+
+def command(
+    pairs: Annotated[
+        Path,
+        typer.Argument(
+            metavar="PAIRS.csv", help="Pairs: class, source, a, b, tolerance_px, h11 to h33 (b_H_a)."
+        ),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
+    method: Annotated[
+        str, typer.Option(help="Methods, separated by commas.")
+    ] = "auto,sift,surf,usurf,rfae,surf+rfae",
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the results of another run in OUTPUT.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
+) -> None:
+    """Register every pair of a list by every method, and compare with the truth.
+
+    Success ratio and mean Q per class and method are the thesis's Tables 6.4 and 6.5.
+    """
+    with ends_at_once():
+        from skyquilt.cli.progress import show
+        from skyquilt.pipelines.spectral_bench import iter_spectral_bench
+
+    if quiet and json:
+        raise UsageError("--quiet and --json exclude one another")
+    asked = tuple(dict.fromkeys(word.strip() for word in method.split(",") if word.strip()))
+    if not asked:
+        raise UsageError("--method names no method; give at least one, such as auto")
+    events = iter_spectral_bench(pairs, output, asked, overwrite=overwrite)
+    show(events, mode="quiet" if quiet else "json" if json else "normal", summary=summary)
+
+
+def summary(result: "Result") -> str:
+    """Where the results lie."""
+    return f"rows:   {result.output / 'bench.json'}\nreport: {result.output / 'report.html'}"

@@ -1,0 +1,49 @@
+"""`skyquilt strip-test`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from skyquilt.cli.interrupt import ends_at_once
+from skyquilt.errors import UsageError
+
+if TYPE_CHECKING:
+    from skyquilt.model.event import Result
+
+
+def command(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for strip.json and report.html.")],
+    photos: Annotated[int, typer.Option(help="Along the strip.")] = 21,
+    overlap: Annotated[float, typer.Option(help="From photo to photo, percent.")] = 70,
+    height: Annotated[float, typer.Option(help="Flight height above the boards, m.")] = 30,
+    relief: Annotated[float, typer.Option(help="Height of the highest thing on the boards, m.")] = 1.2,
+    tilt: Annotated[float, typer.Option(help="Standard deviation of pitch and roll, degrees.")] = 0.3,
+    noise: Annotated[float, typer.Option(help="Standard deviation of a sighting, px.")] = 0.3,
+    flights: Annotated[int, typer.Option(help="Strips flown with different seeds; curves are medians.")] = 5,
+    seed: Annotated[int, typer.Option(help="Equal seeds give equal results.")] = 1,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a former result in OUTPUT.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
+) -> None:
+    """How true to shape a strip of photos stays: eta under seven lens models, features and transformations."""
+    with ends_at_once():
+        from skyquilt.cli.progress import show
+        from skyquilt.pipelines.strip_test import iter_strip_test
+        from skyquilt.simulate import StripSettings
+
+    if quiet and json:
+        raise UsageError("--quiet and --json exclude one another")
+    settings = StripSettings(
+        photos=photos, overlap=overlap / 100, height=height, relief=relief, tilt=tilt, noise=noise, seed=seed
+    )
+    events = iter_strip_test(output, settings, flights=flights, overwrite=overwrite)
+    show(events, mode="quiet" if quiet else "json" if json else "normal", summary=_summary)
+
+
+def _summary(result: "Result") -> str:
+    """The ends of the curves in a few lines."""
+    lines = [f"{v['name']:36} eta at the end {v['eta'][-1]:.3f}" for v in result.metrics["variants"]]
+    return "\n".join([*lines, f"report: {result.output / 'report.html'}"])

@@ -1,0 +1,55 @@
+"""Shifts, rotations and scales from phases: Kuglin and Hines (1975), Reddy and Chatterji (1996)."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_LOWEST = 0.03
+"""Share of the spectrum's radius, next to its middle, that says nothing about rotation: shading and window."""
+
+
+def phase_shift(a: NDArray, b: NDArray) -> tuple[float, float, float]:
+    """(dx, dy, response): b(x + dx, y + dy) shows what a(x, y) shows; response 0 to 1, the peak's share of the energy.
+
+    Both (H, W), equal shapes; shifts up to half of the size.
+    """
+    if a.shape != b.shape:
+        raise ValueError(f"equal shapes expected, got {a.shape} and {b.shape}")
+    first, second = (np.asarray(p, np.float32) - np.float32(np.mean(p)) for p in (a, b))
+    (dx, dy), response = cv2.phaseCorrelate(first, second, _window(a.shape))
+    return float(dx), float(dy), float(response)
+
+
+def rotation_and_scale(a: NDArray, b: NDArray) -> tuple[float, float, float]:
+    """(degrees, scale, response) of b against a from the log-polar amplitudes of both spectra.
+
+    b's content is a's turned by `degrees` from x towards y and magnified by `scale`; a turn by 180 degrees more fits
+    as well.
+    """
+    size = 256
+    radius = min(a.shape) / 2
+    logs = []
+    for p in (a, b):
+        amplitude = np.abs(np.fft.fftshift(np.fft.fft2((p - np.mean(p)) * _window(p.shape))))
+        square = cv2.resize(np.log1p(amplitude).astype(np.float32), (2 * int(radius),) * 2)
+        square = np.asarray(square * _highpass(square.shape[0]), np.float32)
+        flags = cv2.WARP_POLAR_LOG | cv2.INTER_LINEAR
+        logs.append(cv2.warpPolar(square, (size, 2 * size), (radius, radius), radius, flags)[:size])
+    window = np.ones((size, 1), np.float32) @ cv2.createHanningWindow((size, 4), cv2.CV_32F)[1:2]
+    logs = [(p - p.mean()) * window for p in logs]
+    (along, around), response = cv2.phaseCorrelate(*logs)
+    # a magnified picture has a shrunken spectrum
+    scale = float(np.exp(-along * np.log(radius) / size))
+    return (float(around) * 180 / size + 90) % 180 - 90, scale, float(response)
+
+
+def _window(shape: tuple[int, ...]) -> NDArray[np.float32]:
+    return np.asarray(cv2.createHanningWindow((shape[1], shape[0]), cv2.CV_32F), np.float32)
+
+
+def _highpass(size: int) -> NDArray[np.float32]:
+    """Rises from the middle of a spectrum (Reddy and Chatterji, (12)); nothing below _LOWEST and beyond the circle."""
+    f = (np.arange(size) - size / 2) / size
+    x = np.cos(np.pi * f)[:, None] * np.cos(np.pi * f)
+    far = np.hypot(f[:, None], f)
+    return ((1 - x) * (2 - x) * ((far > _LOWEST / 2) & (far < 0.5))).astype(np.float32)

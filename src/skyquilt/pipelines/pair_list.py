@@ -1,0 +1,67 @@
+"""Lists of picture pairs with their truth (pairs.csv)."""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from skyquilt.errors import SideFileError
+from skyquilt.model.registration import Matrix
+
+COLUMNS = ("class", "source", "a", "b", "tolerance_px", *(f"h{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)))
+"""Columns that must be there, in any order."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pair:
+    """Two pictures whose registration is known."""
+
+    kind: str
+    """Class of the pair."""
+    source: str
+    """Where it comes from, in words of the list."""
+    a: Path
+    """The reference."""
+    b: Path
+    """The other picture."""
+    tolerance_px: float
+    """RMS error in px of b below which a registration is right."""
+    b_H_a: Matrix
+    """(3, 3) the truth."""
+
+
+def read_pairs(path: Path) -> tuple[Pair, ...]:
+    """The pairs of a CSV file; pictures are named from its folder.
+
+    Raises:
+        SideFileError: it cannot be read, lacks columns, or holds a number that is none.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise SideFileError(f"{path} cannot be read as a list of pairs: {error}") from error
+    reader = csv.DictReader(text.splitlines())
+    missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
+    if missing:
+        raise SideFileError(f"{path.name} lacks the columns {', '.join(missing)}; see docs/methods.md")
+    pairs = tuple(_pair(row, number, path) for number, row in enumerate(reader, 2))
+    if not pairs:
+        raise SideFileError(f"{path.name} names no pairs; one line each is expected below the head")
+    return pairs
+
+
+def _pair(row: dict[str, str], number: int, path: Path) -> Pair:
+    try:
+        matrix = np.array([[float(row[f"h{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)])
+        tolerance = float(row["tolerance_px"])
+    except (TypeError, ValueError) as error:
+        raise SideFileError(f"{path.name}, line {number}: a number is expected ({error})") from error
+    if not (np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 1e-12 and tolerance > 0):
+        raise SideFileError(
+            f"{path.name}, line {number}: h11 to h33 are no transform, or the tolerance is not > 0"
+        )
+    return Pair(
+        kind=row["class"], source=row["source"], a=path.parent / row["a"], b=path.parent / row["b"],
+        tolerance_px=tolerance, b_H_a=matrix,
+    )  # fmt: skip
