@@ -79,8 +79,9 @@ def _reduced(source: Source) -> tuple[NDArray[np.uint8], Matrix]:
     factor = min(1.0, LONGEST_SHOWN / max(grey.shape))
     size = (round(grey.shape[1] * factor), round(grey.shape[0] * factor))
     small = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
-    x, y = size[0] / source.width, size[1] / source.height
-    return small, np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
+    x, y = size[0] / grey.shape[1], size[1] / grey.shape[0]
+    shrinking = np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
+    return small, shrinking @ np.linalg.inv(source.full_S_picture)
 
 
 def _apply(matrix: NDArray, px: NDArray) -> NDArray:
