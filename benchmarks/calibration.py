@@ -15,6 +15,7 @@ import numpy as np
 
 from skyquilt.calibration.assemble import Assemble
 from skyquilt.calibration.calibrate import Calibrate
+from skyquilt.calibration.disagreement import widened
 from skyquilt.calibration.find_board import FindBoard
 from skyquilt.cli.calibrate import parse_board
 from skyquilt.model.board import Board
@@ -60,8 +61,8 @@ def sweeps(seeds):
                 print(f"      {view.name}: {view.reason}")
         found += len(views)
         line = f"{seed:4d}  {len(views)}/5    {lens.focal:6.1f}"
-        for marks in ("centres", "corners"):
-            got = Calibrate(marks=marks)(views, BOARD)
+        both = [Calibrate(marks=marks)(views, BOARD) for marks in ("centres", "corners")]
+        for marks, got in zip(("centres", "corners"), (widened(*both), widened(*both[::-1])), strict=True):
             sigma = got.sigma("focal")
             z = (got.camera.focal - lens.focal) / sigma
             line += f"   {got.camera.focal:7.2f} ± {sigma:5.2f}   {z:6.2f}"

@@ -124,6 +124,17 @@ def command(
         bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")
     ] = True,
     features: Annotated[int, typer.Option(help="Features per photo.")] = 1500,
+    thermal: Annotated[
+        Path | None,
+        typer.Option(help="Folder of thermal photos: their map is laid on the visual one as thermal.tif."),
+    ] = None,
+    thermal_route: Annotated[
+        str,
+        typer.Option(
+            help="How the thermal map finds its place: maps (the pictures of both), heights (the surfaces under"
+            " them), positions (GPS alone), auto (the first that can be believed)."
+        ),
+    ] = "auto",
     jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.")] = 0,
     memory: Annotated[
         float | None, typer.Option(help="Memory to stay within, in GB.", show_default="1.2")
@@ -164,7 +175,14 @@ def command(
         distances=distances, height_m=height, heading_deg=heading, repair=repair, features=features,
         jobs=jobs, memory_gb=memory,
     )  # fmt: skip
-    events = iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
+    if thermal is None:
+        events = iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
+    else:
+        from skyquilt.pipelines.thermal import iter_thermal
+
+        events = iter_thermal(
+            photos, thermal, output, settings, route=thermal_route, overwrite=overwrite, rerun_from=rerun_from
+        )
     show(events, mode="quiet" if quiet else "json" if json else "verbose" if verbose else "normal")
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from skyquilt.calibration.calibrate import Calibrate, strangers
+from skyquilt.calibration.disagreement import widened
 from skyquilt.calibration.find_board import FindBoard
 from skyquilt.errors import RefusedError, UsageError
 from skyquilt.model.board import Board, RejectedView
@@ -134,7 +135,7 @@ def _calibrated(
     yield 1, 2
     by_corners = corners(seen.views, board)
     yield 2, 2
-    return seen, by_centres, by_corners
+    return seen, widened(by_centres, by_corners), widened(by_corners, by_centres)
 
 
 def _enough(seen: Seen) -> None:
