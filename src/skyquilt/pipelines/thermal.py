@@ -27,9 +27,15 @@ from skyquilt.pipelines.pictures import Source, guess_of, open_picture
 from skyquilt.pipelines.register_files import overlays, resample_onto
 from skyquilt.pipelines.thermal_files import write_figures, write_overlays
 from skyquilt.run.clock import Clock
+from skyquilt.spectral.orientation import between, full_size, orientation
+from skyquilt.spectral.sharpen import Sharpen
+from skyquilt.spectral.usable import both_usable
 
 ROUTES = ("auto", "maps", "heights", "positions")
 """How the thermal map finds its place: by pictures, then heights; by one of them; or by its positions alone."""
+FINE = 700.0
+"""Side in px of the square whose area the maps have when the join is sharpened: finer detail is shadows, which have
+moved between two flights, and the join would follow them."""
 FOLDER = "thermal"
 """Folder of the thermal run, below the visual one's."""
 
@@ -63,13 +69,17 @@ def iter_thermal(
         raise UsageError(f"--thermal-route {route!r} is not one of {', '.join(ROUTES)}")
     if not Path(thermal).is_dir():
         raise UsageError(f"--thermal {thermal} is no folder; give the folder of the thermal photos")
-    visual = yield from _told(iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from))
+    visual = yield from _told(
+        iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
+    )
     own = replace(
         settings, gcp=None, geo=None, cameras=None, bounds=None, boundary=None, gsd_cm=None,
         crs=visual.metrics["crs"] or settings.crs, compress="auto",
     )  # fmt: skip
     yield Note(text="the thermal photos become a map of their own, then it is laid on the visual one")
-    heat = yield from _told(iter_mosaic(thermal, output / FOLDER, own, overwrite=overwrite, rerun_from=rerun_from))
+    heat = yield from _told(
+        iter_mosaic(thermal, output / FOLDER, own, overwrite=overwrite, rerun_from=rerun_from)
+    )
     began = Clock.now()
     yield StageStarted(stage="join", total=0)
     a, b = (_opened(result.output / "mosaic.tif") for result in (visual, heat))
@@ -81,9 +91,14 @@ def iter_thermal(
     write_figures(output, visual.metrics, figures)
     now = Clock.now()
     yield StageFinished(
-        stage="join", seconds=round(now[0] - began[0], 3), cpu_seconds=round(now[1] - began[1], 3), reused=False
+        stage="join",
+        seconds=round(now[0] - began[0], 3),
+        cpu_seconds=round(now[1] - began[1], 3),
+        reused=False,
     )
-    yield from (Note(text=f"registration by {name} was refused: {why}", warning=True) for name, why in joined.refused)
+    yield from (
+        Note(text=f"registration by {name} was refused: {why}", warning=True) for name, why in joined.refused
+    )
     yield Result(output=output, metrics={**visual.metrics, **figures})
 
 
@@ -108,7 +123,9 @@ def join(a: Source, b: Source, surfaces: tuple[Path, Path], route: str) -> Joine
     """
     guess = guess_of(a, b)
     if guess is None and route == "positions":
-        raise RefusedError("the two maps have no common place: one of them is not georeferenced; use --thermal-route maps")
+        raise RefusedError(
+            "the two maps have no common place: one of them is not georeferenced; use --thermal-route maps"
+        )
     refused: list[tuple[str, str]] = []
     for name in ("maps", "heights") if route == "auto" else (route,):
         if name == "positions":
@@ -119,7 +136,9 @@ def join(a: Source, b: Source, surfaces: tuple[Path, Path], route: str) -> Joine
         refused.append((name, outcome.reason))
     if guess is None or route not in ("auto", "positions"):
         told = "; ".join(f"by {name}: {why}" for name, why in refused)
-        raise RefusedError(f"the thermal map cannot be laid on the visual one ({told}); both maps are in the output")
+        raise RefusedError(
+            f"the thermal map cannot be laid on the visual one ({told}); both maps are in the output"
+        )
     full = b.full_S_picture @ guess.b_H_a @ np.linalg.inv(a.full_S_picture)
     return Joined(route="positions", thermal_H_visual=full / full[2, 2], outcome=None, refused=tuple(refused))
 
@@ -159,10 +178,27 @@ def _registered(
     outcome = registration_method("auto")(one, other, guess)
     if isinstance(outcome, RefusedRegistration):
         return outcome
+    outcome = _sharpened(one, other, outcome)
     full_a, full_b = a.full_S_picture, b.full_S_picture
     matrix = full_b @ outcome.b_H_a @ np.linalg.inv(full_a)
-    moved_a, moved_b = (px @ S[:2, :2].T + S[:2, 2] for px, S in ((outcome.px_a, full_a), (outcome.px_b, full_b)))
+    moved_a, moved_b = (
+        px @ S[:2, :2].T + S[:2, 2] for px, S in ((outcome.px_a, full_a), (outcome.px_b, full_b))
+    )
     return replace(outcome, b_H_a=matrix / matrix[2, 2], px_a=moved_a, px_b=moved_b)
+
+
+def _sharpened(a: Picture, b: Picture, outcome: Registration) -> Registration:
+    """A believed registration with the freedom that two adjusted blocks have between them: their positions may tilt
+    and stretch one against the other by some pixels, which a similarity cannot follow.
+    """
+    pair = both_usable(a, b)
+    if isinstance(pair, RefusedRegistration):
+        return outcome
+    fields = [orientation(p.grey, p.valid, FINE) for p in pair]
+    small = between(fields[0], fields[1], outcome.b_H_a)
+    rigid = Sharpen(freedom="similarity")(fields[0], fields[1], small)
+    free = Sharpen(freedom="affine", steps=12)(fields[0], fields[1], rigid.b_H_a)
+    return replace(outcome, model="affine", b_H_a=full_size(fields[0], fields[1], free.b_H_a))
 
 
 def _opened(path: Path) -> Source:
