@@ -151,24 +151,41 @@ def _by_heights(
     a: Source, b: Source, surfaces: tuple[Path, Path], guess: Guess | None
 ) -> Registration | RefusedRegistration:
     """Both surfaces as pictures on the grids of their maps [Y 5.8]."""
-    pictures = [heights_on(one, path) for one, path in zip((a, b), surfaces, strict=True)]
-    return _registered(a, b, pictures[0], pictures[1], guess)
+    one, other = (heights_on(source, path) for source, path in zip((a, b), surfaces, strict=True))
+    return _registered(a, b, one, other, guess)
 
 
 def heights_on(source: Source, surface: Path) -> Picture:
     """The heights of a run on the grid of its map's picture, the general slope taken away: what stands out of the
     ground is what both surfaces share, whatever their heights count from.
     """
-    ground = _opened(surface).picture.values.astype(np.float32)
+    ground = _opened(surface)
     rows, columns = source.picture.shape
     seen = source.picture.valid
-    fine = cv2.resize(ground, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    fine = _sampled(ground, source)
     valid = np.isfinite(fine) if seen is None else seen & np.isfinite(fine)
     y, x = np.mgrid[0:rows, 0:columns]
     basis = np.stack([np.ones(valid.sum()), x[valid], y[valid]], 1)
     plane, *_ = np.linalg.lstsq(basis[::97], fine[valid][::97], rcond=None)
     flat = np.where(valid, fine - (plane[0] + plane[1] * x + plane[2] * y), np.nan)
     return Picture(values=np.asarray(flat, np.float32), valid=valid)
+
+
+def _sampled(ground: Source, source: Source) -> NDArray[np.float32]:
+    """The heights at the pixels (h, w) of a map's picture: both rasters are north up, their grids are not the same."""
+    assert ground.place is not None and source.place is not None
+    g, s, full = ground.place.affine, source.place.affine, source.full_S_picture
+    rows, columns = source.picture.shape
+    x = s[2] + s[0] * (full[0, 0] * np.arange(columns) + full[0, 2] + 0.5)
+    y = s[5] + s[4] * (full[1, 1] * np.arange(rows) + full[1, 2] + 0.5)
+    column, row = np.meshgrid((x - g[2]) / g[0] - 0.5, (y - g[5]) / g[4] - 0.5)
+    values = ground.picture.values.astype(np.float32)
+    return np.asarray(
+        cv2.remap(
+            values, column.astype(np.float32), row.astype(np.float32), cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+    )  # fmt: skip
 
 
 def _registered(
