@@ -159,6 +159,9 @@ class MosaicSettings:
         ):  # fmt: skip
             if value is not None and not low <= value <= high:
                 raise UsageError(f"{name} {value} lies outside {low} to {high}")
+        for name, given in (("--transform", self.transform), ("--relief", self.relief_m)):
+            if given is not None and self.method != "image":
+                raise UsageError(f"{name} is for --method image, and the method here is {self.method}")
         if self.bounds and not (
             np.isfinite(self.bounds).all()
             and self.bounds[0] < self.bounds[2]
