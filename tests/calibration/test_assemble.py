@@ -47,6 +47,7 @@ def few(pose, rng, frames=24):
     return list(sweep(LENS, CHESS, pose, Lamp(frames=frames, cooling=0.35), Sensor(), rng))
 
 
+@pytest.mark.slow
 def test_a_sweep_shows_the_whole_board_though_no_frame_does():
     rng = np.random.default_rng(4)
     frames = few(poses()[0], rng)
@@ -57,6 +58,7 @@ def test_a_sweep_shows_the_whole_board_though_no_frame_does():
     assert not as_printed or as_printed.contrast < 0.7 * assembled.contrast
 
 
+@pytest.mark.slow
 def test_frames_of_one_pose_are_told_from_those_of_another():
     rng = np.random.default_rng(6)
     every = [f for p in poses()[:2] for f in few(p, rng, frames=16)]

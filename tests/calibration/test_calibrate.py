@@ -82,6 +82,7 @@ def test_small_coefficients_are_dropped_and_large_ones_stay():
     assert {"p1", "p2"} <= set(kept.free)
 
 
+@pytest.mark.slow
 def test_deviations_are_neither_too_small_nor_too_large():
     z = []
     for seed in range(8):
@@ -92,6 +93,7 @@ def test_deviations_are_neither_too_small_nor_too_large():
     assert np.mean(np.abs(z) < 2) > 0.9
 
 
+@pytest.mark.slow
 def test_errors_that_repeat_at_a_mark_are_not_averaged_away():
     """A board drawn 0.3 mm wrong is as wrong in 20 views as in five: its deviation must not shrink like noise."""
     rng = np.random.default_rng(5)
@@ -114,6 +116,7 @@ def test_a_view_of_another_board_is_a_stranger():
     assert strangers(Calibrate()(seen, BOARD)) == {}
 
 
+@pytest.mark.slow
 def test_views_kept_out_show_what_noise_there_is():
     seen = views(count=10, noise=0.2)
     way = Calibrate()

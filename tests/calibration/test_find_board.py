@@ -21,6 +21,7 @@ def test_a_tilted_board_before_clutter_is_found_and_counted_right(number):
     assert off.mean() > 0.3  # so a result that hits the centres would be wrong
 
 
+@pytest.mark.slow
 def test_the_board_is_counted_clockwise_never_mirrored():
     for spin in (0, 130, 250):
         view = FindBoard()("", frame(frontal(spin=spin, shift=(0, 0, 1.9))), BOARD)
@@ -30,6 +31,7 @@ def test_the_board_is_counted_clockwise_never_mirrored():
         assert x[0] * y[1] - x[1] * y[0] > 0
 
 
+@pytest.mark.slow
 def test_16_bit_counts_and_gaps_make_no_difference():
     image = frame(poses()[0])
     counts = np.round(image * 100).astype(np.uint16)

@@ -84,6 +84,7 @@ def test_too_few_views_are_refused_with_the_reasons(tmp_path):
     assert "half.tif: 6 x 6 squares were found" in str(refused.value)
 
 
+@pytest.mark.slow
 def test_boards_that_are_never_tilted_are_refused(tmp_path):
     for k in range(3):
         pose = tilted(0, 0, 8 * k, (0.02 * k, 0, 1.7))
