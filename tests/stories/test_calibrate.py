@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -111,9 +112,7 @@ def test_no_frames_and_wrong_words(tmp_path):
 @pytest.mark.real
 @pytest.mark.slow
 def test_the_real_thermal_board(tmp_path):
-    from tests.stories.conftest import ROOT
-
-    data = ROOT.parent / "shared" / "data" / "thermal-board"
+    data = Path(__file__).resolve().parents[3] / "shared" / "data" / "thermal-board"
     if not data.is_dir():
         pytest.skip("the thermal board is not beside this checkout")
     m = calibrate(data, tmp_path / "out", SETTINGS).metrics
