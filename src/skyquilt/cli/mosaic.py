@@ -1,12 +1,15 @@
 """`skyquilt mosaic`: a folder of photos to a georeferenced orthomosaic."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
 from skyquilt.errors import UsageError
+
+if TYPE_CHECKING:
+    from skyquilt.model.event import Result
 
 
 def command(
@@ -183,7 +186,26 @@ def command(
         events = iter_thermal(
             photos, thermal, output, settings, route=thermal_route, overwrite=overwrite, rerun_from=rerun_from
         )
-    show(events, mode="quiet" if quiet else "json" if json else "verbose" if verbose else "normal")
+    show(
+        events, mode="quiet" if quiet else "json" if json else "verbose" if verbose else "normal",
+        summary=None if thermal is None else with_thermal,
+    )  # fmt: skip
+
+
+def with_thermal(result: "Result") -> str:
+    """A mosaic in a few lines, and how the thermal map lies on it."""
+    from skyquilt.cli.progress import mosaic_summary
+
+    t = result.metrics["thermal"]
+    how = (
+        "its own positions alone"
+        if t["route"] == "positions"
+        else f"{t['route']}, {t['inliers']} places agree"
+    )
+    return (
+        f"{mosaic_summary(result)}\nthermal: {result.output / 'thermal.tif'} ({t['photos_used']} of"
+        f" {t['photos_total']} photos, placed by {how})"
+    )
 
 
 def parse_bounds(text: str | None) -> tuple[float, float, float, float] | None:
