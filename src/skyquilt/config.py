@@ -29,6 +29,7 @@ from skyquilt.render.blend import Average, Blend, Feather, First, Multiband
 from skyquilt.render.exposure import Balance
 from skyquilt.spectral.auto import Auto
 from skyquilt.spectral.by_features import BetterByQ, ByFeatures, Outliers, Rfae
+from skyquilt.spectral.structure import Structure, StructureMatches
 from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints
 from skyquilt.twoview.levelled import Level
@@ -61,7 +62,7 @@ BLENDS: dict[str, type[Blend]] = {
 }
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
-REGISTRATIONS = ("auto", "sift", "surf", "usurf", "rfae", "rfae-sift", "surf+rfae")
+REGISTRATIONS = ("auto", "sift", "surf", "usurf", "rfae", "rfae-sift", "surf+rfae", "structure")
 """Ways to register two pictures of different spectra."""
 SAMPLES = 1000
 """Most samples drawn for a similarity: enough for 7 % of right matches."""
@@ -199,13 +200,17 @@ def registration_method(name: str) -> Registers:
     """The registration that a word names, with the thesis's parameters [Y 5.2, Fig. 5.8]."""
     _one_of("--method", name, REGISTRATIONS)
     surf, sift = Surf(lobe=1, step=1), Sift(levels=43, root=False, longest=1000, count=3000)
+    structure = StructureMatches(
+        estimate=Ransac(model="similarity", minimum=INLIERS, threshold_px=4.0, max_iterations=5 * SAMPLES)
+    )
     ways: dict[str, Callable[[], Registers]] = {
-        "auto": Auto,
+        "auto": lambda: Auto(propose=structure),
         "sift": lambda: ByFeatures(detect=sift, relate=_outliers()),
         "surf": lambda: ByFeatures(detect=surf, relate=_outliers()),
         "usurf": lambda: ByFeatures(detect=replace(surf, upright=True), relate=_outliers()),
         "rfae": lambda: Rfae(detect=surf, relate=_outliers()),
         "rfae-sift": lambda: Rfae(detect=sift, relate=_outliers()),
+        "structure": lambda: Structure(propose=structure),
         "surf+rfae": lambda: BetterByQ(methods=(registration_method("surf"), registration_method("rfae"))),
     }
     return ways[name]()

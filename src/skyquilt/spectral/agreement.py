@@ -80,10 +80,10 @@ class Agree:
                     continue
                 around = padded[top : top + side + 2 * reach, left : left + side + 2 * reach]
                 score = _scores(around, target[part] * both[part][..., None])
-                y, x = divmod(int(score.argmax()), score.shape[1])
+                x, y = _summit(score)
                 yield (
                     self._rank(score), left + (side - 1) / 2, top + (side - 1) / 2,
-                    float(reach - x), float(reach - y),
+                    reach - x, reach - y,
                 )  # fmt: skip
 
     def _rank(self, score: NDArray) -> float:
@@ -109,6 +109,23 @@ def _scores(around: Fields, patch: Fields) -> NDArray[np.float32]:
         product += cv2.matchTemplate(one, np.ascontiguousarray(patch[..., k]), cv2.TM_CCORR)
     own = float((patch * patch).sum())
     return np.asarray(product / np.sqrt(np.asarray(energy)[:rows, :columns] * own + 1e-6), np.float32)
+
+
+def _summit(score: NDArray[np.float32]) -> tuple[float, float]:
+    """Column and row of the highest place, between pixels by a parabola along each axis."""
+    row, column = divmod(int(score.argmax()), score.shape[1])
+    return (
+        column + _between(score[row, max(column - 1, 0) : column + 2]),
+        row + _between(score[max(row - 1, 0) : row + 2, column]),
+    )
+
+
+def _between(three: NDArray[np.float32]) -> float:
+    """Where a parabola through three values is highest, from the middle one; 0 at the border."""
+    if len(three) < 3:
+        return 0.0
+    bend = float(three[0] - 2 * three[1] + three[2])
+    return float(three[0] - three[2]) / (2 * bend) if bend < -1e-9 else 0.0
 
 
 def _fisher(ranks: NDArray[np.float64]) -> float:
