@@ -108,7 +108,9 @@ class MosaicSettings:
     do not calibrate, the order fitted to a calibration that photos bring along (None = 6t; `flightline` none).
     """
     transform: str | None = None
-    """One of `TRANSFORMS`: how two photos may differ, for method `image`; None = similarity."""
+    """One of `TRANSFORMS`: how two photos may differ, for methods `image` (None = similarity) and `flightline` (None =
+    homography).
+    """
     levelled: bool = True
     """Method `image` registers by features of the dominant plane only."""
     image_search: str = "chain"
@@ -159,9 +161,13 @@ class MosaicSettings:
         ):  # fmt: skip
             if value is not None and not low <= value <= high:
                 raise UsageError(f"{name} {value} lies outside {low} to {high}")
-        for name, given in (("--transform", self.transform), ("--relief", self.relief_m)):
-            if given is not None and self.method != "image":
-                raise UsageError(f"{name} is for --method image, and the method here is {self.method}")
+        for name, given, used_by in (
+            ("--transform", self.transform, ("image", "flightline")), ("--relief", self.relief_m, ("image",)),
+        ):  # fmt: skip
+            if given is not None and self.method not in used_by:
+                raise UsageError(
+                    f"{name} is for --method {' or '.join(used_by)}; the method here is {self.method}"
+                )
         if self.bounds and not (
             np.isfinite(self.bounds).all()
             and self.bounds[0] < self.bounds[2]
@@ -304,9 +310,10 @@ def _hybrid(settings: MosaicSettings) -> Hybrid:
 
 
 def _by_flightline(settings: MosaicSettings) -> ByFlightline:
+    model = cast(Model, settings.transform or "homography")
     estimate = Rescued(
-        first=RansacSte(seed=settings.seed),
-        second=RansacSte(threshold_px2=SECOND_PX2, minimum=LEAST_INLIERS, seed=settings.seed),
+        first=RansacSte(model=model, seed=settings.seed),
+        second=RansacSte(model=model, threshold_px2=SECOND_PX2, minimum=LEAST_INLIERS, seed=settings.seed),
     )
     return ByFlightline(
         within=Best(count=150, ratio=VLFEAT), across=Best(count=50, ratio=VLFEAT), estimate=estimate,

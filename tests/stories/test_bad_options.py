@@ -29,7 +29,10 @@ pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning", "error::scipy.l
         (("--alpha", "nan"), ("--alpha",)),
         (("--method", "image", "--relief", "-1"), ("--relief", "outside")),
         (("--relief", "3"), ("--relief is for --method image", "auto")),
-        (("--method", "pose", "--transform", "affine"), ("--transform is for --method image", "pose")),
+        (
+            ("--method", "pose", "--transform", "affine"),
+            ("--transform is for --method image or flightline", "pose"),
+        ),
         (("--seed", "-1"), ("--seed", "outside")),
         (("--blend", "soft"), ("--blend 'soft'", "feather", "multiband")),
         (("--compress", "zip"), ("--compress 'zip'", "jpeg", "zstd")),

@@ -33,12 +33,12 @@ class ByFlightline:
     across: Matcher
     """Matches between lines: the 50 best of every pair."""
     estimate: Estimator
-    """RANSAC by the symmetric transfer error per inlier."""
+    """RANSAC by the symmetric transfer error per inlier; A's transformation is the homography."""
     split: Literal["heading", "distance"] = "heading"
     """How lines are told apart: `distance` is A's; `heading` also ends a line where the course turns."""
     distortion: str = "none"
     """Order of the lens model; A corrects none."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: ClassVar[str] = "flightline"
 
     def __call__(
