@@ -262,7 +262,7 @@ def test_help_names_every_method():
     from typer.testing import CliRunner
 
     from skyquilt.cli.app import app
-    from skyquilt.config import REGISTRATIONS
+    from skyquilt.config_register import REGISTRATIONS
 
     told = CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(app, ["register", "--help"]).output
     assert [name for name in REGISTRATIONS if name not in told] == []

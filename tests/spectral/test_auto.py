@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from skyquilt.config import registration_method
+from skyquilt.config_register import registration_method
 from skyquilt.model.estimate import NoEstimate
 from skyquilt.model.registration import Guess, Picture, RefusedRegistration
 from skyquilt.spectral.structure import StructureMatches

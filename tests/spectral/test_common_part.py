@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from skyquilt.config import registration_method
+from skyquilt.config_register import registration_method
 from skyquilt.model.registration import Guess, Picture
 from skyquilt.spectral.common_part import common_part
 from tests.spectral.scenes import layout, spectrum, turned
