@@ -278,9 +278,7 @@ def test_metrics_hold_every_figure_of_the_contract(finished):
     assert {"mean", "rms"} <= set(m["reprojection_error_px"])
     assert {"median", "p95", "measured", "attempted"} <= set(m["seam_disparity_px"])
     assert m["seconds"]["total"] >= 0.9 * sum(v for k, v in m["seconds"].items() if k != "total") > 0
-    assert (
-        m["cpu_seconds"] > 0 and m["peak_memory_mb", "cpu_seconds_of_stage", "peak_memory_mb_of_stage"] > 50
-    )
+    assert m["cpu_seconds"] > 0 and m["peak_memory_mb"] > 50
     json.dumps(m, allow_nan=False)
 
 

@@ -132,7 +132,7 @@ def metrics(n):
         ],
         "seconds": {"photos": 0.1, "features": 4.6, "render": 5.1, "total": 11.0},
         "cpu_seconds": 12.0,
-        "peak_memory_mb", "cpu_seconds_of_stage", "peak_memory_mb_of_stage": 812.0,
+        "peak_memory_mb": 812.0,
         "control": [
             {
                 "name": "g1",

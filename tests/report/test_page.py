@@ -170,7 +170,7 @@ def test_figures_that_are_no_numbers_are_left_out():
         "metadata_conflicts": [None, {}],
         "seconds": {"total": nan, "a": nan},
         "cpu_seconds": "?",
-        "peak_memory_mb", "cpu_seconds_of_stage", "peak_memory_mb_of_stage": nan,
+        "peak_memory_mb": nan,
         "cameras": {"a": {"focal": {"value": nan}}},
         "control": [{"name": "x", "dx_m": nan}],
         "notes": None,
