@@ -179,9 +179,7 @@ def _guess(
 
     def near(x: tuple[complex, complex, float, tuple[int, int]]) -> list[int]:
         limit = DISAGREE * abs(x[0])
-        return [
-            n for n, y in enumerate(found) if abs(x[1] - y[1]) < limit and abs(x[0] - y[0]) < 2 * limit
-        ]
+        return [n for n, y in enumerate(found) if abs(x[1] - y[1]) < limit and abs(x[0] - y[0]) < 2 * limit]
 
     group = max((near(x) for x in found), key=lambda g: sum(found[n][2] for n in g))
     weight = np.array([found[n][2] for n in group])
@@ -216,9 +214,5 @@ def _setup(window: Window, plane: Mapping[int, tuple[complex, complex]], links: 
     for row, key in enumerate(setup.camera_keys):
         if key in window.cameras:
             K0[row] = window.cameras[key].vector
-    base = replace(
-        base, R0=R0, C0=C0, sigma_R=sigma_R, sigma_C=sigma_C, K0=K0, free=np.zeros_like(base.free)
-    )
-    return replace(
-        setup, base=base, start_R=R, start_C=C, turned=turned, z_ground=window.ground
-    )
+    base = replace(base, R0=R0, C0=C0, sigma_R=sigma_R, sigma_C=sigma_C, K0=K0, free=np.zeros_like(base.free))
+    return replace(setup, base=base, start_R=R, start_C=C, turned=turned, z_ground=window.ground)

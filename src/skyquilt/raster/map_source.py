@@ -106,7 +106,9 @@ class TileSource:
         for (r, c), tile in found.items():
             at = (slice(r * SIDE, (r + 1) * SIDE), slice(c * SIDE, (c + 1) * SIDE))
             pixels[at], shown[at] = tile.pixels, tile.shown
-        return Part(pixels=pixels, shown=shown, west=c0 * size + x, north=-r0 * size + y, gsd=self.gsd * 2**level)
+        return Part(
+            pixels=pixels, shown=shown, west=c0 * size + x, north=-r0 * size + y, gsd=self.gsd * 2**level
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -155,7 +157,9 @@ class FileSource:
             window = from_bounds(west, south, west + w * step, north, raster.transform)
             window = from_bounds(west, north - h * step, west + w * step, north, raster.transform)
             bands = list(range(1, int(str(self._open()["bands"])) + 1))
-            pixels = raster.read(bands, window=window, out_shape=(len(bands), h, w), boundless=True, fill_value=0)
+            pixels = raster.read(
+                bands, window=window, out_shape=(len(bands), h, w), boundless=True, fill_value=0
+            )
             mask = raster.dataset_mask(window=window, out_shape=(h, w), boundless=True) > 0
         moved = np.ascontiguousarray(np.moveaxis(pixels, 0, -1))
         if moved.dtype.kind == "f":
@@ -171,7 +175,12 @@ def between(source: str, target: str) -> Transformer:
 
 
 def picture(
-    source: MapSource, crs: str, bounds: Bounds, width: int, height: int, scale: tuple[float, float] | None = None
+    source: MapSource,
+    crs: str,
+    bounds: Bounds,
+    width: int,
+    height: int,
+    scale: tuple[float, float] | None = None,
 ) -> NDArray[np.uint8] | None:
     """RGBA (height, width, 4) of bounds in any projection; None where the map has nothing.
 
@@ -186,7 +195,12 @@ def picture(
     extent = source.bounds()
     if extent is None or not np.isfinite(mx).all() or not np.isfinite(my).all():
         return None
-    box = (max(mx.min(), extent[0]), max(my.min(), extent[1]), min(mx.max(), extent[2]), min(my.max(), extent[3]))
+    box = (
+        max(mx.min(), extent[0]),
+        max(my.min(), extent[1]),
+        min(mx.max(), extent[2]),
+        min(my.max(), extent[3]),
+    )
     if box[0] >= box[2] or box[1] >= box[3]:
         return None
     gsd = float(np.median(np.hypot(np.diff(mx, axis=1), np.diff(my, axis=1)))) / NODES

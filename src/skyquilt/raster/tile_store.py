@@ -50,13 +50,17 @@ class Address:
     def children(self) -> list["Address"]:
         """The four tiles below, row by row."""
         return [
-            Address(self.layer, self.level - 1, 2 * self.row + r, 2 * self.col + c) for r in (0, 1) for c in (0, 1)
+            Address(self.layer, self.level - 1, 2 * self.row + r, 2 * self.col + c)
+            for r in (0, 1)
+            for c in (0, 1)
         ]
 
     def grid(self, gsd: float) -> Grid:
         """Its pixels; `gsd` in m is that of level 0."""
         size = gsd * 2**self.level
-        return Grid(west=self.col * SIDE * size, north=-self.row * SIDE * size, gsd=size, width=SIDE, height=SIDE)
+        return Grid(
+            west=self.col * SIDE * size, north=-self.row * SIDE * size, gsd=size, width=SIDE, height=SIDE
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,7 +107,9 @@ class TileStore:
         self._kept: OrderedDict[Address, tuple[int, Tile]] = OrderedDict()
         try:
             uri = f"{self.path.absolute().as_uri()}?mode={'rwc' if write else 'ro'}"
-            self._db = sqlite3.connect(uri, uri=True, timeout=30, check_same_thread=False, isolation_level=None)
+            self._db = sqlite3.connect(
+                uri, uri=True, timeout=30, check_same_thread=False, isolation_level=None
+            )
             if write:
                 self._db.execute("pragma journal_mode=wal")
                 self._db.execute("pragma synchronous=full")
@@ -196,7 +202,9 @@ class TileStore:
     def addresses(self, layer: str, level: int) -> list[Address]:
         """All tiles of a level."""
         with self._lock:
-            found = self._db.execute("select row, col from tile where layer=? and level=?", (layer, level)).fetchall()
+            found = self._db.execute(
+                "select row, col from tile where layer=? and level=?", (layer, level)
+            ).fetchall()
         return [Address(layer, level, int(r), int(c)) for r, c in found]
 
     def layers(self) -> list[str]:

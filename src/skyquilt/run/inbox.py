@@ -15,7 +15,13 @@ from pathlib import Path
 from skyquilt.errors import OutputError
 from skyquilt.run.ledger import Ledger
 
-ENDINGS = {b"\xff\xd8\xff": ".jpg", b"II*\x00": ".tif", b"MM\x00*": ".tif", b"II+\x00": ".tif", b"\x89PNG": ".png"}
+ENDINGS = {
+    b"\xff\xd8\xff": ".jpg",
+    b"II*\x00": ".tif",
+    b"MM\x00*": ".tif",
+    b"II+\x00": ".tif",
+    b"\x89PNG": ".png",
+}
 """First bytes of files that may be photos."""
 BLOCK = 1 << 20
 
@@ -116,5 +122,7 @@ def _gone(path: Path) -> None:
 
 def _refusal(folder: Path, error: OSError) -> OutputError:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return OutputError(f"the disk is full: {folder} cannot take another photo. Make room and send it again")
+        return OutputError(
+            f"the disk is full: {folder} cannot take another photo. Make room and send it again"
+        )
     return OutputError(f"cannot write to {folder}: {error.strerror or error}")

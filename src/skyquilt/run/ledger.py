@@ -103,7 +103,9 @@ class Ledger:
             self.db.executescript(TABLES)
         found = self.meta("format", FORMAT if write else None)
         if found != FORMAT:
-            raise OutputError(f"{self.path} has format {found}, this version reads {FORMAT}; choose another folder")
+            raise OutputError(
+                f"{self.path} has format {found}, this version reads {FORMAT}; choose another folder"
+            )
         if write and self.meta("began") is None:
             with self.change():
                 self.put_meta("format", FORMAT)
@@ -143,11 +145,15 @@ class Ledger:
     def tell(self, kind: str, body: dict[str, Any]) -> None:
         """Appends to what viewers follow."""
         with self.change() as db:
-            db.execute("insert into event(at, kind, body) values (?, ?, ?)", (time.time(), kind, json.dumps(body)))
+            db.execute(
+                "insert into event(at, kind, body) values (?, ?, ?)", (time.time(), kind, json.dumps(body))
+            )
 
     def told(self, after: int, limit: int = 500) -> list[tuple[int, str, str]]:
         """(number, kind, JSON) of events after a number."""
-        found = self.rows("select seq, kind, body from event where seq > ? order by seq limit ?", after, limit)
+        found = self.rows(
+            "select seq, kind, body from event where seq > ? order by seq limit ?", after, limit
+        )
         return [(int(n), str(k), str(b)) for n, k, b in found]
 
     def last_event(self) -> int:
@@ -159,7 +165,8 @@ class Ledger:
         """Writes down a file that takes no part, and tells it."""
         with self.change() as db:
             db.execute(
-                "insert into refused(name, source, reason, at) values (?, ?, ?, ?)", (name, source, reason, time.time())
+                "insert into refused(name, source, reason, at) values (?, ?, ?, ?)",
+                (name, source, reason, time.time()),
             )
             self.tell("refused", {"name": name, "source": source, "reason": reason})
 

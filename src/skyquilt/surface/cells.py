@@ -38,7 +38,9 @@ class HeightCells:
     def median(self, bounds: Iterable[float]) -> float | None:
         """Median height inside bounds (west, south, east, north) in m; None where no point is."""
         c0, r0, c1, r1 = self._reach(bounds)
-        found = [z for c in range(c0, c1 + 1) for r in range(r0, r1 + 1) if (z := self.z.get((c, r))) is not None]
+        found = [
+            z for c in range(c0, c1 + 1) for r in range(r0, r1 + 1) if (z := self.z.get((c, r))) is not None
+        ]
         return float(np.median(found)) if found else None
 
     def _reach(self, bounds: Iterable[float]) -> tuple[int, int, int, int]:

@@ -86,7 +86,9 @@ class Site:
         if name is None and known:
             return next(iter(known))
         if name not in known:
-            raise HTTPException(404, f"there is no layer {str(name)[:60]!r}; there are {', '.join(known) or 'none yet'}")
+            raise HTTPException(
+                404, f"there is no layer {str(name)[:60]!r}; there are {', '.join(known) or 'none yet'}"
+            )
         return str(name)
 
     def tilejson(self, request: Request, layer: str | None = None) -> dict[str, Any]:
@@ -113,7 +115,10 @@ class Site:
                 return self._map(query, version)
             if what == "getfeatureinfo":
                 return self._feature_info(query)
-            raise WmsError(f"REQUEST {what[:40]!r} is none of GetCapabilities, GetMap, GetFeatureInfo", "OperationNotSupported")
+            raise WmsError(
+                f"REQUEST {what[:40]!r} is none of GetCapabilities, GetMap, GetFeatureInfo",
+                "OperationNotSupported",
+            )
         except WmsError as error:
             kind = "application/vnd.ogc.se_xml" if version.startswith("1.1") else "text/xml"
             return Response(refusal(error, version), media_type=kind, status_code=400)
@@ -141,7 +146,10 @@ class Site:
         except ValueError as error:
             raise WmsError("I and J are whole numbers", "InvalidPoint") from error
         west, south, east, north = want.bounds
-        x, y = west + (i + 0.5) / want.width * (east - west), north - (j + 0.5) / want.height * (north - south)
+        x, y = (
+            west + (i + 0.5) / want.width * (east - west),
+            north - (j + 0.5) / want.height * (north - south),
+        )
         lon, lat = between(want.crs, "EPSG:4326").transform(x, y) if want.crs != "EPSG:4326" else (x, y)
         found = [p.record for p in covering(self.survey.photos(), lon, lat)]
         return JSONResponse({"lon": lon, "lat": lat, "photos": found})
@@ -160,11 +168,20 @@ class Site:
         extent = source.bounds()
         if extent is None:
             raise HTTPException(404, "the map is empty")
-        bounds = (max(bounds[0], extent[0]), max(bounds[1], extent[1]), min(bounds[2], extent[2]), min(bounds[3], extent[3]))
+        bounds = (
+            max(bounds[0], extent[0]),
+            max(bounds[1], extent[1]),
+            min(bounds[2], extent[2]),
+            min(bounds[3], extent[3]),
+        )
         handle, path = tempfile.mkstemp(suffix=".tif")
         os.close(handle)
         gone = BackgroundTask(Path(path).unlink, missing_ok=True)
-        done = None if bounds[0] >= bounds[2] or bounds[1] >= bounds[3] else write_cog(source, bounds, Path(path), 0.0)
+        done = (
+            None
+            if bounds[0] >= bounds[2] or bounds[1] >= bounds[3]
+            else write_cog(source, bounds, Path(path), 0.0)
+        )
         if done is None:
             Path(path).unlink(missing_ok=True)
             raise HTTPException(404, "the map has nothing there")
@@ -172,7 +189,9 @@ class Site:
 
     # -- photos -----------------------------------------------------------------------------------------------
 
-    def photos(self, lon: Degrees | None = None, lat: Annotated[float | None, Query(ge=-90, le=90)] = None) -> dict[str, Any]:
+    def photos(
+        self, lon: Degrees | None = None, lat: Annotated[float | None, Query(ge=-90, le=90)] = None
+    ) -> dict[str, Any]:
         """All photos; with `lon` and `lat` in degrees those that cover the point, the most vertical first."""
         everything = self.survey.photos()
         if lon is not None and lat is not None:
@@ -195,7 +214,9 @@ class Site:
         found = self._known(number)
         if found.path is None or not found.path.is_file():
             raise HTTPException(404, "its file is no longer where it was")
-        kind = {".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".png": "image/png"}.get(found.path.suffix.lower(), "image/tiff")
+        kind = {".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".png": "image/png"}.get(
+            found.path.suffix.lower(), "image/tiff"
+        )
         return FileResponse(found.path, media_type=kind, headers={"Content-Disposition": "inline"})
 
     async def upload(self, request: Request, name: str = "photo", source: str = "upload") -> JSONResponse:
@@ -223,9 +244,13 @@ class Site:
         try:
             held = uploads.begin(shown_name(name), shown_name(source), size)
         except OSError as error:
-            raise HTTPException(507, f"the server's disk cannot take it ({error.strerror}); send it again later") from error
+            raise HTTPException(
+                507, f"the server's disk cannot take it ({error.strerror}); send it again later"
+            ) from error
         if held is None:
-            raise HTTPException(429, "too many uploads are under way; wait for some to end", {"Retry-After": "5"})
+            raise HTTPException(
+                429, "too many uploads are under way; wait for some to end", {"Retry-After": "5"}
+            )
         return held
 
     async def _received(self, request: Request, number: str, most: int) -> int:
@@ -239,7 +264,9 @@ class Site:
                         raise HTTPException(413, f"a photo may have {most} bytes, this one has more")
                     file.write(block)
         except OSError as error:
-            raise HTTPException(507, f"the server's disk cannot take it ({error.strerror}); send it again later") from error
+            raise HTTPException(
+                507, f"the server's disk cannot take it ({error.strerror}); send it again later"
+            ) from error
         return size
 
     def _handed_in(self, intake: Intake, number: str, name: str, source: str) -> JSONResponse:
@@ -254,7 +281,9 @@ class Site:
         said = {"id": done.id, "name": done.name, "state": "duplicate" if done.duplicate else "received"}
         return JSONResponse(said, 200 if done.duplicate else 201)
 
-    def upload_begin(self, request: Request, name: str, size: Annotated[int, Query(ge=1)], source: str = "upload") -> JSONResponse:
+    def upload_begin(
+        self, request: Request, name: str, size: Annotated[int, Query(ge=1)], source: str = "upload"
+    ) -> JSONResponse:
         """Begins a resumable upload of `size` bytes; its parts go to /photos/uploads/{id}."""
         intake, uploads = self._writing(request)
         if size > intake.inbox.most_bytes:
@@ -277,7 +306,9 @@ class Site:
         if held is None:
             raise HTTPException(404, "there is no such upload")
         if request.headers.get("upload-offset") != str(held.offset):
-            raise HTTPException(409, f"Upload-Offset is {held.offset} here", {"Upload-Offset": str(held.offset)})
+            raise HTTPException(
+                409, f"Upload-Offset is {held.offset} here", {"Upload-Offset": str(held.offset)}
+            )
         offset = held.offset
         try:
             async for block in request.stream():
@@ -285,7 +316,9 @@ class Site:
                     raise HTTPException(413, f"the upload was announced with {held.size} bytes")
                 offset = await run_in_threadpool(uploads.append, held, block) if block else offset
         except OSError as error:
-            raise HTTPException(507, f"the server's disk is full ({error.strerror}); send the rest later") from error
+            raise HTTPException(
+                507, f"the server's disk is full ({error.strerror}); send the rest later"
+            ) from error
         if offset < held.size:
             return JSONResponse({"id": number, "offset": offset}, 200, {"Upload-Offset": str(offset)})
         answer = await run_in_threadpool(self._handed_in, intake, number, held.name, held.source)
@@ -298,7 +331,11 @@ class Site:
             raise HTTPException(405, "this survey is only looked at; 'skyquilt live' takes photos and layers")
         given = request.headers.get("authorization") or request.headers.get("x-token")
         if not self.guard.admits(given):
-            raise HTTPException(401, "writing needs the token that the server was started with", {"WWW-Authenticate": "Bearer"})
+            raise HTTPException(
+                401,
+                "writing needs the token that the server was started with",
+                {"WWW-Authenticate": "Bearer"},
+            )
         origin = request.headers.get("origin")
         if origin is not None and origin.split("://")[-1] != request.headers.get("host", ""):
             raise HTTPException(403, "pages of other sites may not write here")
@@ -333,7 +370,9 @@ class Site:
                 raise HTTPException(413, f"a layer may have {self.guard.most_layer_bytes} bytes")
         try:
             layer = await run_in_threadpool(checked, data)
-            stored = await run_in_threadpool(put_layer, self.writer.ledger, shown_name(name), layer, self.guard.most_layers)
+            stored = await run_in_threadpool(
+                put_layer, self.writer.ledger, shown_name(name), layer, self.guard.most_layers
+            )
         except LayerError as error:
             raise HTTPException(422, f"this is no layer: {error}") from error
         except OutputError as error:
@@ -417,5 +456,3 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         app.add_api_route(path, work, **options)  # type: ignore[arg-type]
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     return app
-
-

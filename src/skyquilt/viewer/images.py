@@ -76,7 +76,11 @@ class Images:
         if known is not None and version - known[0] < 50:
             return known[1]
         bounds = source.bounds()
-        part = None if bounds is None else source.part(bounds, max(bounds[2] - bounds[0], bounds[3] - bounds[1]) / 512)
+        part = (
+            None
+            if bounds is None
+            else source.part(bounds, max(bounds[2] - bounds[0], bounds[3] - bounds[1]) / 512)
+        )
         if part is None or part.pixels.dtype == np.uint8 or not part.shown.any():
             return None
         low, high = np.percentile(part.pixels[..., 0][part.shown], [2, 98])
@@ -99,7 +103,11 @@ class Images:
         box = said["bounds"]
         assert isinstance(box, list)
         west, south, east, north = between("EPSG:4326", "EPSG:3857").transform_bounds(*box)
-        for key in [k for k in self._kept if k[0] == said["layer"] and _meets(mercator(*k[1:]), (west, south, east, north))]:
+        for key in [
+            k
+            for k in self._kept
+            if k[0] == said["layer"] and _meets(mercator(*k[1:]), (west, south, east, north))
+        ]:
             del self._kept[key]
 
 

@@ -35,7 +35,9 @@ def checked(data: bytes) -> dict[str, Any]:
         found = {"type": "FeatureCollection", "features": [found]}
     features = found.get("features")
     if found.get("type") != "FeatureCollection" or not isinstance(features, list):
-        raise LayerError(f"it is of type {str(kind)[:40]!r}; a FeatureCollection, a Feature or a geometry is needed")
+        raise LayerError(
+            f"it is of type {str(kind)[:40]!r}; a FeatureCollection, a Feature or a geometry is needed"
+        )
     return {"type": "FeatureCollection", "features": [_feature(f, k) for k, f in enumerate(features)]}
 
 
@@ -60,7 +62,9 @@ def _places(value: Any, k: int, depth: int) -> None:
         raise LayerError(f"feature {k} has broken coordinates")
     if all(isinstance(v, int | float) and not isinstance(v, bool) for v in value):
         if len(value) < 2 or abs(value[0]) > 180 or abs(value[1]) > 90:
-            raise LayerError(f"feature {k} has {str(value)[:60]}, which is no longitude and latitude in degrees")
+            raise LayerError(
+                f"feature {k} has {str(value)[:60]}, which is no longitude and latitude in degrees"
+            )
         return
     for inner in value:
         _places(inner, k, depth + 1)

@@ -10,6 +10,7 @@ import numpy as np
 
 from skyquilt.errors import UsageError
 from skyquilt.raster.map_source import FileSource, MapSource, TileSource, between
+from skyquilt.raster.read_map import open_map
 from skyquilt.raster.tile_store import TileStore
 from skyquilt.run.ledger import NAME, Ledger
 
@@ -53,19 +54,32 @@ class Survey(Protocol):
         """A number that grows with every change."""
 
 
-def open_survey(folder: Path) -> "LiveSurvey | FinishedSurvey":
+def open_survey(folder: Path, base: Path | None = None) -> "LiveSurvey | FinishedSurvey":
     """The survey in a folder.
 
     Raises:
         UsageError: it holds none.
     """
     if (folder / NAME).is_file():
-        return LiveSurvey(folder)
+        return LiveSurvey(folder, base=base)
     if (folder / "mosaic.tif").is_file():
-        return FinishedSurvey(folder)
+        return FinishedSurvey(folder, base=base)
     raise UsageError(
         f"{folder} holds neither a live survey ({NAME}) nor a finished run (mosaic.tif); name the folder given to -o"
     )
+
+
+def base_map(path: Path | None) -> dict[str, MapSource]:
+    """An older orthophoto as a layer; none where none is given.
+
+    Raises:
+        UsageError: it is no georeferenced raster.
+    """
+    if path is None:
+        return {}
+    if open_map(path) is None or not FileSource(path=path).crs:
+        raise UsageError(f"--base {path} is no georeferenced map that GDAL reads")
+    return {"base": FileSource(path=path)}
 
 
 class LiveSurvey:
@@ -73,8 +87,13 @@ class LiveSurvey:
 
     growing = True
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, *, base: Path | None = None) -> None:
+        """Opens it for reading; `base` is an older orthophoto.
+
+        Raises:
+            OutputError: it cannot be read. UsageError: `base` is no map.
+        """
+        self.folder, self.base = folder, base_map(base)
         self.ledger = Ledger(folder, write=False)
         self.tiles = TileStore(folder / TILES, write=False)
 
@@ -85,11 +104,13 @@ class LiveSurvey:
         if frame and gsd:
             x, y = frame["origin"]
             for layer in sorted(self.tiles.layers(), key=lambda n: (not n.startswith("visible"), n)):
-                found[layer] = TileSource(tiles=self.tiles, layer=layer, crs=frame["crs"], origin=(x, y), gsd=gsd)
+                found[layer] = TileSource(
+                    tiles=self.tiles, layer=layer, crs=frame["crs"], origin=(x, y), gsd=gsd
+                )
         final = self.folder / FINISHED / "mosaic.tif"
         if final.is_file():
             found["finished"] = FileSource(path=final)
-        return found
+        return found | self.base
 
     def photos(self) -> list[Shown]:
         """All accepted photos."""
@@ -126,8 +147,13 @@ class FinishedSurvey:
 
     growing = False
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, *, base: Path | None = None) -> None:
+        """Reads what the run wrote.
+
+        Raises:
+            UsageError: it is not georeferenced, or `base` is no map.
+        """
+        self.folder, self.base = folder, base_map(base)
         self._photos: list[Shown] = []
         self._source = FileSource(path=folder / "mosaic.tif")
         if not self._source.crs:
@@ -156,7 +182,7 @@ class FinishedSurvey:
 
     def layers(self) -> dict[str, MapSource]:
         """The mosaic."""
-        return {"mosaic": self._source}
+        return {"mosaic": self._source, **self.base}
 
     def photos(self) -> list[Shown]:
         """All placed photos."""
@@ -172,7 +198,10 @@ class FinishedSurvey:
             metrics = json.loads((self.folder / "metrics.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return []
-        return [{"name": n, "reason": r, "state": "refused"} for n, r in metrics.get("photos_rejected", {}).items()]
+        return [
+            {"name": n, "reason": r, "state": "refused"}
+            for n, r in metrics.get("photos_rejected", {}).items()
+        ]
 
     def version(self) -> int:
         """It does not change."""

@@ -60,7 +60,9 @@ class Uploads:
             offset = self.path(number).stat().st_size
         except (OSError, ValueError):
             return None
-        return Upload(id=number, name=record["name"], source=record["source"], size=record["size"], offset=offset)
+        return Upload(
+            id=number, name=record["name"], source=record["source"], size=record["size"], offset=offset
+        )
 
     def path(self, number: str) -> Path:
         """Where its bytes lie."""

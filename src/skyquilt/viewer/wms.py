@@ -61,10 +61,15 @@ def map_request(query: Mapping[str, str], known: Mapping[str, MapSource]) -> Map
         raise WmsError("LAYERS is missing", "LayerNotDefined")
     for name in layers:
         if name not in known:
-            raise WmsError(f"there is no layer {name!r}; there are {', '.join(known) or 'none yet'}", "LayerNotDefined")
+            raise WmsError(
+                f"there is no layer {name!r}; there are {', '.join(known) or 'none yet'}", "LayerNotDefined"
+            )
     crs = query.get("CRS") or query.get("SRS") or ""
     if crs not in supported(known):
-        raise WmsError(f"CRS {crs!r} is none of {', '.join(supported(known))}", "InvalidCRS" if version == "1.3.0" else "InvalidSRS")
+        raise WmsError(
+            f"CRS {crs!r} is none of {', '.join(supported(known))}",
+            "InvalidCRS" if version == "1.3.0" else "InvalidSRS",
+        )
     width, height = (_whole(query, n) for n in ("WIDTH", "HEIGHT"))
     form = query.get("FORMAT", "image/png").split(";")[0]
     if form not in FORMATS:
@@ -161,7 +166,11 @@ def _layer(name: str, source: MapSource, known: Mapping[str, MapSource], *, old:
 def refusal(error: WmsError, version: str) -> str:
     """An error as the standard writes it."""
     old = version.startswith("1.1")
-    head = '<ServiceExceptionReport version="1.1.1">' if old else '<ServiceExceptionReport version="1.3.0" xmlns="http://www.opengis.net/ogc">'
+    head = (
+        '<ServiceExceptionReport version="1.1.1">'
+        if old
+        else '<ServiceExceptionReport version="1.3.0" xmlns="http://www.opengis.net/ogc">'
+    )
     return (
         f'<?xml version="1.0" encoding="UTF-8"?>\n{head}<ServiceException code="{error.code}">{escape(str(error))}'
         "</ServiceException></ServiceExceptionReport>"

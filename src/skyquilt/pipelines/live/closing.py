@@ -88,7 +88,9 @@ def close(job: Job) -> Closed:
         features = [_features(p, store, job.methods) for p in job.photos]
         return _part(job, links, features) if job.held else _whole(job, links, features, store)
     except (AlignmentError, SkyquiltError, np.linalg.LinAlgError, ValueError) as error:
-        return Closed(ids=job.ids, poses={}, cameras={}, camera_of={}, xyz=np.zeros((0, 3)), problem=str(error))
+        return Closed(
+            ids=job.ids, poses={}, cameras={}, camera_of={}, xyz=np.zeros((0, 3)), problem=str(error)
+        )
 
 
 def _features(photo: Photo, store: Store, methods: Methods) -> Features:
@@ -103,7 +105,9 @@ def _links(job: Job, ledger: Ledger) -> list[Link]:
     where = {i: k for k, i in enumerate(job.ids)}
     links = []
     for i in job.ids:
-        for a, b, body in ledger.rows("select a, b, body from link where a = ? and body is not null order by b", i):
+        for a, b, body in ledger.rows(
+            "select a, b, body from link where a = ? and body is not null order by b", i
+        ):
             if b in where:
                 d = decode(body, {})
                 links.append(

@@ -47,7 +47,9 @@ def layer_of(member: Member) -> str:
 class Canvas:
     """Which photos see which tile, and the tiles themselves."""
 
-    def __init__(self, tiles: TileStore, heights: HeightCells, full: PixelCache, members: dict[int, Member]) -> None:
+    def __init__(
+        self, tiles: TileStore, heights: HeightCells, full: PixelCache, members: dict[int, Member]
+    ) -> None:
         self.tiles, self.heights, self.full, self.members = tiles, heights, full, members
         self.gsd = 0.0
         self.ground = 0.0
@@ -117,7 +119,11 @@ class Canvas:
     def _view(self, member: Member, camera: Camera, pose: Pose) -> View | None:
         longest = self._longest(member)
         scale = longest / max(camera.width, camera.height)
-        w, h = (round(camera.width * scale), round(camera.height * scale)) if scale < 1 else (camera.width, camera.height)
+        w, h = (
+            (round(camera.width * scale), round(camera.height * scale))
+            if scale < 1
+            else (camera.width, camera.height)
+        )
         scale = w / camera.width
         small = replace(
             camera, width=w, height=h, focal=camera.focal * scale, cx=(camera.cx + 0.5) * scale - 0.5,
@@ -147,8 +153,10 @@ class Canvas:
         camera = member.photo
         above = max(float(drawn.map_C[2]) - self.ground, 1.0)
         shift = np.abs(member.pose.map_C - drawn.map_C).max()
-        turn = np.abs(member.pose.cam_R_map - drawn.cam_R_map).max() * above * (
-            1 + camera.width / 2 / camera.focal.px
+        turn = (
+            np.abs(member.pose.cam_R_map - drawn.cam_R_map).max()
+            * above
+            * (1 + camera.width / 2 / camera.focal.px)
         )
         return bool(max(shift, turn) > LEAST_MOVE * self.gsd)
 

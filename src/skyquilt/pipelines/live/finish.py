@@ -26,7 +26,9 @@ def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
     """
     ledger = Ledger(folder, write=False)
     try:
-        rows = ledger.rows("select id, name, file from photo where state not in ('superseded', 'refused') order by id")
+        rows = ledger.rows(
+            "select id, name, file from photo where state not in ('superseded', 'refused') order by id"
+        )
     finally:
         ledger.close()
     if not rows:

@@ -71,7 +71,9 @@ class Intake:
             return self.refuse(name, source, f"this map takes {self.settings.most_photos} photos at most")
         arrived = self.inbox.bring(blocks)
         if arrived is None:
-            return self.refuse(name, source, "it is neither JPEG, TIFF nor PNG inside, whatever its name says")
+            return self.refuse(
+                name, source, "it is neither JPEG, TIFF nor PNG inside, whatever its name says"
+            )
         return self._enter(arrived, name, source)
 
     def take_file(self, path: Path, source: str) -> Accepted | Refused:

@@ -97,7 +97,9 @@ class Placing:
             z = self.ground_at(prior.map_C) + NOMINAL_M
         elif datum == "takeoff" and z < 3:
             z = self.ground_at(prior.map_C) + NOMINAL_M
-        R = cam_R_map_from_angles(yaw, 0.0 if abs(turn) > 90 else prior.pitch_deg, 0.0 if abs(turn) > 90 else prior.roll_deg)
+        R = cam_R_map_from_angles(
+            yaw, 0.0 if abs(turn) > 90 else prior.pitch_deg, 0.0 if abs(turn) > 90 else prior.roll_deg
+        )
         return Pose(cam_R_map=R, map_C=np.array([prior.map_C[0], prior.map_C[1], z]))
 
     def _corrections(self, member: Member) -> tuple[float, float]:
@@ -120,7 +122,9 @@ class Placing:
         assert member.prior is not None
         yaw, _, _ = angles_from_cam_R_map(member.pose.cam_R_map)
         off = member.pose.map_C - member.prior.map_C
-        turn = angle_difference_deg(member.prior.yaw_deg, yaw) if np.isfinite(member.prior.yaw_deg) else np.nan
+        turn = (
+            angle_difference_deg(member.prior.yaw_deg, yaw) if np.isfinite(member.prior.yaw_deg) else np.nan
+        )
         lift = float(off[2]) if np.isfinite(off[2]) else float(member.pose.map_C[2])
         self._recent[f"{member.source}|{member.photo.camera_key}"].append((turn, lift))
         if np.isfinite(off[:2]).all():
@@ -130,7 +134,9 @@ class Placing:
         """Height of the ground near a place in m."""
         reach = 60.0
         x, y = float(xyz[0]), float(xyz[1])
-        near = self.heights.median((x - reach, y - reach, x + reach, y + reach)) if np.isfinite(x + y) else None
+        near = (
+            self.heights.median((x - reach, y - reach, x + reach, y + reach)) if np.isfinite(x + y) else None
+        )
         return near if near is not None else float(self.members.ledger.meta("ground", 0.0))
 
     # -- neighbours -------------------------------------------------------------------------------------------
@@ -172,7 +178,12 @@ class Placing:
         found = []
         for i in near:
             other = self.members.by_id[i]
-            if i == member.id or other.photo.band != photo.band or other.pose is None or other.state == "superseded":
+            if (
+                i == member.id
+                or other.photo.band != photo.band
+                or other.pose is None
+                or other.state == "superseded"
+            ):
                 continue
             apart = float(np.hypot(*(self.aim(other, other.pose) - at)))
             if apart <= reach:
@@ -183,7 +194,12 @@ class Placing:
         found = []
         for i in reversed(self.members.by_id):
             other = self.members.by_id[i]
-            if other.tried and other.pose is not None and other.photo.band == member.photo.band and i != member.id:
+            if (
+                other.tried
+                and other.pose is not None
+                and other.photo.band == member.photo.band
+                and i != member.id
+            ):
                 found.append((other.source != member.source, i))
             if len(found) >= most:
                 break
@@ -284,24 +300,32 @@ class Placing:
         direct = sorted({a for a, _ in good if self.members.by_id[a].pose is not None})
         by_strength = sorted(direct, key=lambda a: -len(good[a, member.id]))
         moving = set(by_strength[:MOVING]) if self.settings.reposition else set()
-        ring = {j for i in moving for j in self.members.by_id[i].links if self.members.by_id[j].pose is not None}
+        ring = {
+            j for i in moving for j in self.members.by_id[i].links if self.members.by_id[j].pose is not None
+        }
         ring -= {member.id, *direct}
         kept = sorted(ring, key=lambda j: -len(self.members.by_id[j].links & moving))[:RING]
         ids = sorted({member.id, *direct, *kept})
         done = self._windowed(member, ids, frozenset(ids) - moving - {member.id}, good)
         if not isinstance(done, Settled):
-            return Change(moved={}, cameras={}, camera_of={}, links=links, xyz=np.zeros((0, 3)), reason=done.reason)
+            return Change(
+                moved={}, cameras={}, camera_of={}, links=links, xyz=np.zeros((0, 3)), reason=done.reason
+            )
         for key in done.dropped:
             links[ids[key[0]], ids[key[1]]] = None
         moved = {ids[k]: p for k, p in done.poses.items()}
         camera_of = {i: self.members.by_id[i].camera for i in moved} | {member.id: done.camera}
         return Change(moved=moved, cameras={}, camera_of=camera_of, links=links, xyz=done.xyz)
 
-    def _windowed(self, member: Member, ids: Sequence[int], held: frozenset[int], good: dict[tuple[int, int], Link]):  # type: ignore[no-untyped-def] # noqa: ANN202
+    def _windowed(
+        self, member: Member, ids: Sequence[int], held: frozenset[int], good: dict[tuple[int, int], Link]
+    ):  # type: ignore[no-untyped-def] # noqa: ANN202
         window = self.window(member, ids, held, list(good.values()))
         return self.settle(window)
 
-    def window(self, member: Member, ids: Sequence[int], held: frozenset[int], more: Sequence[Link]) -> Window:
+    def window(
+        self, member: Member, ids: Sequence[int], held: frozenset[int], more: Sequence[Link]
+    ) -> Window:
         """A window of these photos; `more` links than those written down."""
         where = {i: k for k, i in enumerate(ids)}
         members = [self.members.by_id[i] for i in ids]
@@ -310,10 +334,18 @@ class Placing:
         placed = {where[m.id]: m.pose for m in members if m.pose is not None and m.id != member.id}
         cameras: dict[str, Camera] = {}
         for m in members:
-            cameras[m.photo.camera_key] = self.members.cameras.get(m.photo.camera_key) or self.members.camera(m)
+            cameras[m.photo.camera_key] = self.members.cameras.get(m.photo.camera_key) or self.members.camera(
+                m
+            )
             if m.camera:
                 cameras[m.camera] = self.members.camera(m)
-        at = member.pose.map_C if member.pose is not None else members[0].pose.map_C if members[0].pose else np.zeros(3)
+        at = (
+            member.pose.map_C
+            if member.pose is not None
+            else members[0].pose.map_C
+            if members[0].pose
+            else np.zeros(3)
+        )
         return Window(
             photos=[m.photo for m in members], priors=[m.prior for m in members if m.prior is not None],
             features=[self.features(i) for i in ids], links=[_renumbered(k, where) for k in links], poses=placed,
@@ -339,6 +371,6 @@ def link_bytes(link: Link) -> bytes:
 def link_from(body: bytes) -> Link:
     """The link of such bytes."""
     d = decode(body, {})
-    return Link(a=d["a"], b=d["b"], index_a=d["ia"].astype(np.int64), index_b=d["ib"].astype(np.int64), b_S_a=d["s"])
-
-
+    return Link(
+        a=d["a"], b=d["b"], index_a=d["ia"].astype(np.int64), index_b=d["ib"].astype(np.int64), b_S_a=d["s"]
+    )

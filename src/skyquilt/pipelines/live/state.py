@@ -76,7 +76,9 @@ class Members:
     def take_up(self) -> list[Member]:
         """Photos that were accepted since the last look, in order."""
         last = max(self.by_id, default=0)
-        query = "select id, name, source, file, state, pose, camera, about from photo where id > ? order by id"
+        query = (
+            "select id, name, source, file, state, pose, camera, about from photo where id > ? order by id"
+        )
         new = []
         for number, name, source, file, state, pose, camera, about in self.ledger.rows(query, last):
             photo = read_photo(self.inbox.folder / file, name=name)

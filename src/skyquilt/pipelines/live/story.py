@@ -96,14 +96,14 @@ class LiveMap:
         self.full = PixelCache(read=self._pixels, budget_bytes=FULL_BYTES)
         self.heights = HeightCells(cell=float(self.ledger.meta("cell", 2.0)))
         self.heights.z = {(int(c), int(r)): float(z) for c, r, z in self.ledger.rows("select * from height")}
-        self.placing = Placing(
-            self.members, self.heights, self.methods, self.store, self.settings, self.full
-        )
+        self.placing = Placing(self.members, self.heights, self.methods, self.store, self.settings, self.full)
         self.canvas = Canvas(self.tiles, self.heights, self.full, self.members.by_id)
         self.closing = Closing()
         self._received: deque[Member] = deque(m for m in self.members.by_id.values() if m.state == "received")
         self._untried: deque[Member] = deque()
-        self._lost: list[Member] = [m for m in self.members.by_id.values() if m.state == "waiting" and m.tried]
+        self._lost: list[Member] = [
+            m for m in self.members.by_id.values() if m.state == "waiting" and m.tried
+        ]
         self._urgent: dict[Address, None] = {}
         self._dirty: dict[Address, None] = {}
         self._later: dict[Address, None] = {}
@@ -133,7 +133,10 @@ class LiveMap:
         """After a restart: what is drawn stays, what moved since is drawn."""
         self.canvas.gsd = float(self.ledger.meta("gsd", 0.0))
         self.canvas.ground = float(self.ledger.meta("ground", 0.0))
-        drawn = {int(i): json.loads(d) for i, d in self.ledger.rows("select id, footprint from photo where footprint != ''")}
+        drawn = {
+            int(i): json.loads(d)
+            for i, d in self.ledger.rows("select id, footprint from photo where footprint != ''")
+        }
         for member in self.members.by_id.values():
             if member.state in ("placed", "waiting") and not member.tried:
                 self._untried.append(member)
@@ -210,9 +213,15 @@ class LiveMap:
         number = member.id
         if self.placing.frame_from(member) and self.canvas.gsd == 0:
             self._begin(member)
-        about = json.loads(str((self.ledger.row("select about from photo where id = ?", number) or ("{}",))[0] or "{}"))
-        preview = next((self.members.by_id[i] for i in about.get("preview", ()) if i in self.members.by_id), None)
-        pose = preview.pose if preview is not None and preview.pose is not None else self.placing.first(member)
+        about = json.loads(
+            str((self.ledger.row("select about from photo where id = ?", number) or ("{}",))[0] or "{}")
+        )
+        preview = next(
+            (self.members.by_id[i] for i in about.get("preview", ()) if i in self.members.by_id), None
+        )
+        pose = (
+            preview.pose if preview is not None and preview.pose is not None else self.placing.first(member)
+        )
         try:
             self.full(number)
         except UnreadablePhotoError as error:
@@ -223,7 +232,9 @@ class LiveMap:
             if preview is not None:
                 preview.state = "superseded"
                 self.members.save(preview)
-                self.ledger.tell("photo", {"id": preview.id, "name": preview.photo.name, "state": "superseded"})
+                self.ledger.tell(
+                    "photo", {"id": preview.id, "name": preview.photo.name, "state": "superseded"}
+                )
             self._tell(member)
         if preview is not None:
             self._dirty.update(dict.fromkeys(self.canvas.remove(preview.id)))
@@ -284,7 +295,9 @@ class LiveMap:
             self.members.joined(a, b)
         touched = self.heights.add(change.xyz)
         with self.ledger.change() as db:
-            self.ledger.put_links([(a, b, None if k is None else link_bytes(k)) for (a, b), k in change.links.items()])
+            self.ledger.put_links(
+                [(a, b, None if k is None else link_bytes(k)) for (a, b), k in change.links.items()]
+            )
             self.members.save_cameras(change.cameras)
             member.tried = True
             self._moved(change.moved, change.camera_of)
@@ -312,9 +325,11 @@ class LiveMap:
             other.pose, other.camera = pose, camera_of.get(i, other.camera)
             if other.state != "superseded":
                 other.state = "refined"
-            self.members.save(other)
+            self.members.save(other, reason="")
             self.placing.indexed(other)
-            if other.state == "refined" and (i not in self._drawn or self.canvas.moved(other, self._drawn[i])):
+            if other.state == "refined" and (
+                i not in self._drawn or self.canvas.moved(other, self._drawn[i])
+            ):
                 self._show(other)
 
     def _distance(self, member: Member, change: Change) -> int:
@@ -471,7 +486,13 @@ class LiveMap:
         steps = {i: p.map_C - self.members.by_id[i].pose.map_C for i, p in done.poses.items()
                  if self.members.by_id[i].pose is not None}  # type: ignore[union-attr]  # fmt: skip
         block = self.members.block(next(iter(done.poses)))
-        since = [] if len(done.ids) < len(done.poses) else sorted(block - set(done.ids)) if len(block) <= CLOSING else []
+        since = (
+            []
+            if len(done.ids) < len(done.poses)
+            else sorted(block - set(done.ids))
+            if len(block) <= CLOSING
+            else []
+        )
         touched = self.heights.add(done.xyz, anew=True)
         with self.ledger.change() as db:
             self.members.save_cameras(done.cameras)
@@ -479,7 +500,8 @@ class LiveMap:
             for i in since:
                 self._follow(self.members.by_id[i], steps)
             db.executemany(
-                "insert or replace into height values (?, ?, ?)", [(c, r, self.heights.z[c, r]) for c, r in sorted(touched)]
+                "insert or replace into height values (?, ?, ?)",
+                [(c, r, self.heights.z[c, r]) for c, r in sorted(touched)],
             )
             if len(done.xyz) and done.cameras:
                 self.ledger.put_meta("ground", float(np.median(done.xyz[:, 2])))

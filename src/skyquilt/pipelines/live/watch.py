@@ -45,7 +45,9 @@ class Watch:
 
     def __post_init__(self) -> None:
         if not self.folder.is_dir():
-            raise UsageError(f"{self.folder} is no folder; make it, or name the one that photos are copied into")
+            raise UsageError(
+                f"{self.folder} is no folder; make it, or name the one that photos are copied into"
+            )
         known = self.intake.ledger.rows("select path, size, mtime from seen")
         self._seen = {str(p): (int(s), int(m)) for p, s, m in known}
 
