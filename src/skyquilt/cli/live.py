@@ -59,6 +59,7 @@ def command(
         from skyquilt.pipelines.live.settings import LiveSettings
         from skyquilt.pipelines.live.story import LiveMap
         from skyquilt.viewer.guard import Guard
+        from skyquilt.viewer.publishing import Publishing
         from skyquilt.viewer.serving import Serving
         from skyquilt.viewer.survey import LiveSurvey
     settings = LiveSettings(
@@ -69,7 +70,10 @@ def command(
     live = LiveMap(output, settings)
     try:
         survey = LiveSurvey(output, base=base)
-        with Serving(survey=survey, guard=guard, folder=output, writer=live, port=port) as serving:
+        with (
+            Serving(survey=survey, guard=guard, folder=output, writer=live, port=port) as serving,
+            Publishing(LiveSurvey(output), output),
+        ):
             events = iter_live(inbox, live, finish=finish)
             show_live(events, serving.url, mode="quiet" if quiet else "json" if json else "normal")
     finally:

@@ -223,7 +223,7 @@ def picture(
 def _dense(nodes: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
     """Nodes at every NODES-th pixel, the first one at -NODES, interpolated at all pixels."""
     c, r = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    return cv2.remap(nodes, c / NODES + 1, r / NODES + 1, cv2.INTER_LINEAR)
+    return np.asarray(cv2.remap(nodes, c / NODES + 1, r / NODES + 1, cv2.INTER_LINEAR), np.float32)
 
 
 def coloured(pixels: NDArray, scale: Sequence[float] | None = None) -> NDArray[np.uint8]:

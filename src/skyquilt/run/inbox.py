@@ -14,6 +14,7 @@ from pathlib import Path
 
 from skyquilt.errors import OutputError
 from skyquilt.run.ledger import Ledger
+from skyquilt.run.write_points import reached
 
 ENDINGS = {
     b"\xff\xd8\xff": ".jpg",
@@ -78,12 +79,14 @@ class Inbox:
                     file.write(block)
                 file.flush()
                 os.fsync(file.fileno())
+            reached("photo file synced")
             if ending is None:
                 partial.unlink()
                 return None
             path = self.folder / (digest.hexdigest() + ending)
             partial.replace(path)
             synced(self.folder)
+            reached("photo file named")
         except OSError as error:
             _gone(partial)
             raise _refusal(self.folder, error) from error

@@ -220,7 +220,7 @@ class Site:
         return FileResponse(found.path, media_type=kind, headers={"Content-Disposition": "inline"})
 
     async def upload(self, request: Request, name: str = "photo", source: str = "upload") -> JSONResponse:
-        """Takes a photo (the request's body). It answers when the photo is safe: 201, 200 for a duplicate, 422 refused."""
+        """Takes a photo (the body). It answers when the photo is safe: 201, 200 for a duplicate, 422 refused."""
         intake, uploads = self._writing(request)
         held = self._begun(uploads, name, source, self._length(request))
         try:
@@ -398,7 +398,7 @@ class Site:
         return {"state": "asked"}
 
     async def events(self, request: Request, after: int | None = None) -> StreamingResponse:
-        """Server-sent events: photo, tiles, layer, note, refused, finish. `Last-Event-ID` or `after` take up where one was."""
+        """Server-sent events: photo, tiles, layer, note, refused, finish; `Last-Event-ID` or `after` take them up."""
         said = request.headers.get("last-event-id", "")
         start = int(said) if said.isdigit() else after if after is not None else self.survey.version()
         return StreamingResponse(
@@ -444,7 +444,8 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         ("/tiles.json", site.tilejson, get), ("/wms", site.wms, {**get, "response_class": Response}),
         ("/export", site.export, {**get, "response_class": FileResponse}),
         ("/photos", site.photos, get), ("/photos", site.upload, post),
-        ("/photos/uploads", site.upload_begin, post), ("/photos/uploads/{number}", site.upload_state, {"methods": ["HEAD"]}),
+        ("/photos/uploads", site.upload_begin, post),
+        ("/photos/uploads/{number}", site.upload_state, {"methods": ["HEAD"]}),
         ("/photos/uploads/{number}", site.upload_part, {"methods": ["PATCH"]}),
         ("/photos/{number}", site.photo, get),
         ("/photos/{number}/file", site.photo_file, {**get, "response_class": FileResponse}),
@@ -453,6 +454,6 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         ("/layers/{name}", site.layer_delete, {"methods": ["DELETE"]}),
         ("/events", site.events, {**get, "response_class": StreamingResponse}), ("/finish", site.finish, post),
     ):  # fmt: skip
-        app.add_api_route(path, work, **options)  # type: ignore[arg-type]
+        app.add_api_route(path, work, **options)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     return app

@@ -120,7 +120,8 @@ def capabilities(known: Mapping[str, MapSource], url: str, version: str) -> str:
     crs_tag = "SRS" if old else "CRS"
     layers = "".join(_layer(n, s, known, old=old) for n, s in known.items())
     crs = "".join(f"<{crs_tag}>{c}</{crs_tag}>" for c in supported(known) if not (old and c == "CRS:84"))
-    online = f'<OnlineResource xmlns:xlink="http://www.w3.org/1999/xlink" xlink:type="simple" xlink:href="{escape(url, {chr(34): "&quot;"})}"/>'
+    href = escape(url, {chr(34): "&quot;"})
+    online = f'<OnlineResource xmlns:xlink="http://www.w3.org/1999/xlink" xlink:type="simple" xlink:href="{href}"/>'
     get = f"<DCPType><HTTP><Get>{online}</Get></HTTP></DCPType>"
     kind = "application/vnd.ogc.wms_xml" if old else "text/xml"
     formats = "".join(f"<Format>{f}</Format>" for f in FORMATS)
@@ -133,7 +134,8 @@ def capabilities(known: Mapping[str, MapSource], url: str, version: str) -> str:
         '<?xml version="1.0" encoding="UTF-8"?>\n' + root
         + f"<Service><Name>{'OGC:WMS' if old else 'WMS'}</Name><Title>Skyquilt</Title>{online}</Service>"
         + f"<Capability><Request><GetCapabilities><Format>{kind}</Format>{get}</GetCapabilities>"
-        + f"<GetMap>{formats}{get}</GetMap><GetFeatureInfo><Format>application/json</Format>{get}</GetFeatureInfo></Request>"
+        + f"<GetMap>{formats}{get}</GetMap>"
+        + f"<GetFeatureInfo><Format>application/json</Format>{get}</GetFeatureInfo></Request>"
         + f"<Exception><Format>{'application/vnd.ogc.se_xml' if old else 'XML'}</Format></Exception>"
         + f"<Layer><Title>Skyquilt</Title>{crs}{layers}</Layer></Capability>" + end
     )  # fmt: skip

@@ -22,6 +22,7 @@ from skyquilt.render.compose import Composer
 from skyquilt.render.newest import Newest
 from skyquilt.run.executor import in_order
 from skyquilt.run.pixel_cache import PixelCache
+from skyquilt.run.write_points import reached
 from skyquilt.surface.cells import HeightCells
 
 NEWEST = "-newest"
@@ -169,13 +170,14 @@ class Canvas:
         return sorted(set(found))
 
     def draw(self, dirty: Sequence[Address], rule: str = "") -> list[Address]:
-        """Draws tiles of level 0 (addresses of the plain layer); returns those written. `finish` does the coarser ones."""
+        """Draws tiles of level 0 (addresses of the plain layer); returns those written; `finish` does the others."""
         tiles = in_order(lambda a: self._tile(a, RULES[rule]), dirty, jobs=THREADS)
         done = [(replace(a, layer=a.layer + rule), t) for a, t in zip(dirty, tiles, strict=True)]
         fresh = [(a, t) for a, t in done if t is not None]
         emptied = [(a, self._empty(a.layer)) for a, t in done if t is None and self.tiles.version(a) > 0]
         written = [*fresh, *emptied]
         self.tiles.put(written)
+        reached("tiles written")
         self._raised.update(a for a, _ in written)
         return [a for a, _ in written]
 

@@ -15,6 +15,7 @@ from skyquilt.photos.read import read_photo
 from skyquilt.pipelines.live.settings import LiveSettings
 from skyquilt.run.inbox import Arrived, Inbox
 from skyquilt.run.ledger import Ledger
+from skyquilt.run.write_points import reached
 
 MOST_PIXELS = 400_000_000
 """Larger pictures are refused before they are decoded."""
@@ -128,6 +129,7 @@ class Intake:
             number = int(cursor.lastrowid or 0)
             said = {"id": number, "name": name, "source": source, "state": "received"}
             self.ledger.tell("photo", said)
+        reached("photo row committed")
         return Accepted(id=number, name=name)
 
 

@@ -93,9 +93,7 @@ class Placing:
         z = prior.map_C[2]
         if np.isfinite(lift):
             z = z + lift if np.isfinite(z) else lift
-        elif not np.isfinite(z):
-            z = self.ground_at(prior.map_C) + NOMINAL_M
-        elif datum == "takeoff" and z < 3:
+        elif not np.isfinite(z) or (datum == "takeoff" and z < 3):
             z = self.ground_at(prior.map_C) + NOMINAL_M
         R = cam_R_map_from_angles(
             yaw, 0.0 if abs(turn) > 90 else prior.pitch_deg, 0.0 if abs(turn) > 90 else prior.roll_deg
@@ -164,7 +162,7 @@ class Placing:
         return np.asarray(pose.map_C[:2] + ray[:2] * drop)
 
     def neighbours(self, member: Member, pose: Pose | None, most: int = NEIGHBOURS) -> list[int]:
-        """Photos of the same spectrum, compared before, nearest first; the latest ones where nothing tells the place."""
+        """Photos of the same spectrum, compared before, nearest first; the latest where nothing tells the place."""
         if pose is None:
             return self._latest(member, most)
         photo = member.photo
@@ -306,7 +304,8 @@ class Placing:
         ring -= {member.id, *direct}
         kept = sorted(ring, key=lambda j: -len(self.members.by_id[j].links & moving))[:RING]
         ids = sorted({member.id, *direct, *kept})
-        done = self._windowed(member, ids, frozenset(ids) - moving - {member.id}, good)
+        held = frozenset(ids) - moving - {member.id}
+        done = self.settle(self.window(member, ids, held, list(good.values())))
         if not isinstance(done, Settled):
             return Change(
                 moved={}, cameras={}, camera_of={}, links=links, xyz=np.zeros((0, 3)), reason=done.reason
@@ -316,12 +315,6 @@ class Placing:
         moved = {ids[k]: p for k, p in done.poses.items()}
         camera_of = {i: self.members.by_id[i].camera for i in moved} | {member.id: done.camera}
         return Change(moved=moved, cameras={}, camera_of=camera_of, links=links, xyz=done.xyz)
-
-    def _windowed(
-        self, member: Member, ids: Sequence[int], held: frozenset[int], good: dict[tuple[int, int], Link]
-    ):  # type: ignore[no-untyped-def] # noqa: ANN202
-        window = self.window(member, ids, held, list(good.values()))
-        return self.settle(window)
 
     def window(
         self, member: Member, ids: Sequence[int], held: frozenset[int], more: Sequence[Link]

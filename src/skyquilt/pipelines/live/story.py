@@ -34,6 +34,7 @@ from skyquilt.run.inbox import Inbox
 from skyquilt.run.ledger import Ledger
 from skyquilt.run.pixel_cache import PixelCache
 from skyquilt.run.store import Store
+from skyquilt.run.write_points import reached
 from skyquilt.surface.cells import HeightCells
 
 PHOTOS, TILES, FINISHED = "photos", "tiles.db", "finished"
@@ -236,6 +237,7 @@ class LiveMap:
                     "photo", {"id": preview.id, "name": preview.photo.name, "state": "superseded"}
                 )
             self._tell(member)
+        reached("photo placed")
         if preview is not None:
             self._dirty.update(dict.fromkeys(self.canvas.remove(preview.id)))
         self._received.popleft()
@@ -308,6 +310,7 @@ class LiveMap:
             if change.cameras and len(change.xyz):
                 self.ledger.put_meta("ground", float(np.median(change.xyz[:, 2])))
             self._tell(member, reason=change.reason)
+        reached("photo refined")
         self.canvas.ground = float(self.ledger.meta("ground", 0.0))
         if member.state == "refined":
             self.placing.learn(member)
@@ -385,6 +388,7 @@ class LiveMap:
             for i in shown:
                 self._drawn_now(self.members.by_id[i])
             self._tell_tiles(self._fresh.pop(rule, []), rule)
+        reached("drawing told")
         self._to_draw.difference_update(shown)
         return raised
 
@@ -483,8 +487,8 @@ class LiveMap:
         """New poses of a whole block; what was placed since follows its neighbours and is settled again."""
         if not done.poses:
             return Update(what="noted", text=f"a block could not be adjusted as a whole: {done.problem}")
-        steps = {i: p.map_C - self.members.by_id[i].pose.map_C for i, p in done.poses.items()
-                 if self.members.by_id[i].pose is not None}  # type: ignore[union-attr]  # fmt: skip
+        before = {i: self.members.by_id[i].pose for i in done.poses}
+        steps = {i: p.map_C - old.map_C for i, p in done.poses.items() if (old := before[i]) is not None}
         block = self.members.block(next(iter(done.poses)))
         since = (
             []
@@ -507,6 +511,7 @@ class LiveMap:
                 self.ledger.put_meta("ground", float(np.median(done.xyz[:, 2])))
             text = f"{len(done.poses)} photos were adjusted together"
             self.ledger.tell("note", {"text": text})
+        reached("block closed")
         self.canvas.ground = float(self.ledger.meta("ground", 0.0))
         if done.cameras:  # heights and calibrations changed: all of the block looks different
             for i in done.poses:

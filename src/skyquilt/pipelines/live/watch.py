@@ -11,6 +11,7 @@ from skyquilt.model.photo import RejectedPhoto
 from skyquilt.photos.read import read_photo
 from skyquilt.pipelines.live.intake import Accepted, Intake, Refused
 from skyquilt.run.inbox import ending_of
+from skyquilt.run.write_points import reached
 
 ENDINGS = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
 PARTIAL = (".part", ".partial", ".tmp", ".crdownload", ".filepart")
@@ -85,6 +86,7 @@ class Watch:
         self._seen[key] = known.stamp
         with self.intake.ledger.change() as db:
             db.execute("insert or replace into seen values (?, ?, ?)", (key, *known.stamp))
+        reached("folder seen")
         return done
 
     def _files(self) -> Iterator[tuple[Path, tuple[int, int]]]:
