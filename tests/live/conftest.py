@@ -92,7 +92,11 @@ class Served:
 
 @contextmanager
 def served(
-    folder: Path, settings: LiveSettings | None = None, guard: Guard | None = None, inbox: Path | None = None, port: int = 0
+    folder: Path,
+    settings: LiveSettings | None = None,
+    guard: Guard | None = None,
+    inbox: Path | None = None,
+    port: int = 0,
 ) -> Iterator[Served]:
     """A live map with its server and its mapping thread; all end with the block."""
     live = LiveMap(folder, settings)

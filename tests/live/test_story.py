@@ -44,7 +44,9 @@ def test_two_drones_a_yaw_lie_losses_and_disorder_make_one_coherent_map(drones, 
     assert (rms[:2] > 1e-4).all()
     assert (rms[:2] < 0.8).all()
     turns = [
-        angle_difference_deg(*(angles_from_cam_R_map(R)[0] for R in (m.pose.cam_R_map, drones.rotation(m.photo.name))))
+        angle_difference_deg(
+            *(angles_from_cam_R_map(R)[0] for R in (m.pose.cam_R_map, drones.rotation(m.photo.name)))
+        )
         for m in live.members.on_map()
     ]
     assert np.abs(turns).max() < 1.5
@@ -60,12 +62,18 @@ def small(flight, tmp_path_factory):
 
 def test_the_map_shows_the_truth(small, flight):
     frame = small.members.frame
-    source = TileSource(tiles=small.tiles, layer="visible", crs=frame.crs, origin=frame.origin, gsd=small.canvas.gsd)
+    source = TileSource(
+        tiles=small.tiles, layer="visible", crs=frame.crs, origin=frame.origin, gsd=small.canvas.gsd
+    )
     part = source.part(source.bounds(), small.canvas.gsd)
     with rasterio.open(flight.folder / "truth" / "truth_ortho.tif") as truth:
         assert truth.crs.to_string() == frame.crs
         shift = np.median(
-            [m.pose.map_C[:2] + frame.origin - flight.centre(m.photo.name)[:2] for m in small.members.on_map()], axis=0
+            [
+                m.pose.map_C[:2] + frame.origin - flight.centre(m.photo.name)[:2]
+                for m in small.members.on_map()
+            ],
+            axis=0,
         )
         rows, columns = np.nonzero(part.shown)
         chosen = np.random.default_rng(0).choice(len(rows), 4000)
@@ -185,5 +193,3 @@ def test_replays_lose_and_reorder_as_asked(flight, tmp_path):
     assert 0.2 < time.monotonic() - began < 3
     assert sorted(s.name for s in done) == sorted(p.name for p in flight.photos)
     assert len(list(inbox.rglob("*.jpg"))) == len(flight.photos)
-
-
