@@ -1,5 +1,6 @@
 """The server as other programs use it, and as those use it who mean no good."""
 
+import http.client
 import json
 import re
 import sqlite3
@@ -206,7 +207,7 @@ def png_that_claims(width, height):
         ("text.jpg", b"hello", "neither"),
         ("page.jpg", b"<html><script>alert(1)</script></html>", "neither"),
         ("cut.jpg", None, "cut off"),
-        ("bomb.png", png_that_claims(60000, 60000), "megapixels"),
+        ("bomb.png", png_that_claims(60000, 60000), "bomb"),
         ("tiny.png", png_that_claims(3, 3), "px"),
     ],
 )
@@ -300,19 +301,25 @@ def test_layers_come_and_go(site):
 
 def test_a_flood_of_tiny_requests_is_answered_and_nothing_is_lost(site):
     before = site.states()
+    refused = site.web.get("/info").json()["counts"]["refused"]
     bad = [b"", b"\xff\xd8\xff", b"\xff\xd8\xff\xd9", b"II*\x00"]
-    codes = {site.web.post("/photos", content=bad[k % 4]).status_code for k in range(400)}
+    codes = {site.web.post("/photos", content=bad[k % 4]).status_code for k in range(200)}
     assert codes == {422}
     assert {k: v for k, v in site.states().items() if k in before} == before
-    assert site.web.get("/info").json()["counts"]["refused"] >= 400
+    assert site.web.get("/info").json()["counts"]["refused"] == refused + 200
 
 
 @pytest.mark.slow
 def test_ten_thousand_tiny_requests(site):
     before = site.states()
-    with httpx.Client(base_url=site.url, timeout=60) as web:
-        codes = {web.get(f"/photos/{k}").status_code if k % 2 else web.post("/layers", params={"name": "n"}, content=b"").status_code
-                 for k in range(100, 10100)}  # fmt: skip
+    web = http.client.HTTPConnection("127.0.0.1", int(site.url.rsplit(":", 1)[1].strip("/")), timeout=30)
+    codes = set()
+    for k in range(10_000):
+        web.request(*(("GET", f"/photos/{k + 100}") if k % 2 else ("POST", "/layers?name=n", b"")))
+        with web.getresponse() as answer:
+            answer.read()
+            codes.add(answer.status)
+    web.close()
     assert codes == {404, 422}
     assert site.states() == before
 

@@ -69,14 +69,12 @@ class TileSource:
     """Pixels of level 0 in m."""
 
     def bounds(self) -> Bounds | None:
-        """Extent of all tiles of a middle level."""
-        found = self.tiles.addresses(self.layer, 2)
-        if not found:
+        """Extent of what the layer shows."""
+        found = self.tiles.extent(self.layer, self.gsd)
+        if found is None:
             return None
-        boxes = np.array([a.grid(self.gsd).bounds for a in found])
-        low, high = boxes[:, :2].min(0), boxes[:, 2:].max(0)
         x, y = self.origin
-        return float(low[0] + x), float(low[1] + y), float(high[0] + x), float(high[1] + y)
+        return found[0] + x, found[1] + y, found[2] + x, found[3] + y
 
     def part(self, bounds: Bounds, gsd: float) -> Part | None:
         """The level that is just finer than asked for, joined."""

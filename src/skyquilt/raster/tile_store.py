@@ -104,6 +104,7 @@ class TileStore:
             OutputError: it cannot be opened.
         """
         self.path, self._lock = Path(path), threading.RLock()
+        self._extents: dict[str, tuple[tuple[int, int], tuple[float, float, float, float] | None]] = {}
         self._kept: OrderedDict[Address, tuple[int, Tile]] = OrderedDict()
         try:
             uri = f"{self.path.absolute().as_uri()}?mode={'rwc' if write else 'ro'}"
@@ -213,6 +214,36 @@ class TileStore:
             top = LEVELS - 1
             found = self._db.execute("select distinct layer from tile where level=?", (top,)).fetchall()
         return sorted(str(n) for (n,) in found)
+
+    def extent(self, layer: str, gsd: float) -> tuple[float, float, float, float] | None:
+        """West, south, east, north in m (map frame) of what a layer shows, to a few of its pixels; None if nothing."""
+        with self._lock:
+            stamp = (int(self._db.execute("pragma data_version").fetchone()[0]), self._db.total_changes)
+            known = self._extents.get(layer)
+        if known is not None and known[0] == stamp:
+            return known[1]
+        found = self._extent(layer, gsd)
+        self._extents[layer] = (stamp, found)
+        return found
+
+    def _extent(self, layer: str, gsd: float) -> tuple[float, float, float, float] | None:
+        """From the finest level that has only a handful of tiles."""
+        level = LEVELS - 1
+        while level > 0 and len(self.addresses(layer, level - 1)) <= 6:
+            level -= 1
+        boxes = []
+        for address in self.addresses(layer, level):
+            tile = self.get(address)
+            if tile is None or not tile.shown.any():
+                continue
+            grid = address.grid(gsd)
+            rows, columns = np.flatnonzero(tile.shown.any(1)), np.flatnonzero(tile.shown.any(0))
+            boxes.append((grid.west + columns[0] * grid.gsd, grid.north - (rows[-1] + 1) * grid.gsd,
+                          grid.west + (columns[-1] + 1) * grid.gsd, grid.north - rows[0] * grid.gsd))  # fmt: skip
+        if not boxes:
+            return None
+        low, high = np.min(boxes, axis=0), np.max(boxes, axis=0)
+        return float(low[0]), float(low[1]), float(high[2]), float(high[3])
 
     def close(self) -> None:
         """Closes the file."""

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 from skyquilt.errors import OutputError
@@ -63,15 +64,16 @@ class Inbox:
         Raises:
             OutputError: the disk is full, or the file is larger than allowed.
         """
+        rest = iter(blocks)
+        first = next(rest, b"")
+        ending = ending_of(first)
+        if ending is None:
+            return None
         partial = self.folder / f"{time.monotonic_ns():x}-{os.getpid()}.partial"
-        digest, size, ending = hashlib.blake2b(digest_size=16), 0, None
+        digest, size = hashlib.blake2b(digest_size=16), 0
         try:
             with partial.open("wb") as file:
-                for block in blocks:
-                    if not size:
-                        ending = ending_of(block)
-                        if ending is None:
-                            break
+                for block in chain((first,), rest):
                     size += len(block)
                     if size > self.most_bytes:
                         raise OutputError(f"a photo may have {self.most_bytes} bytes, this one has more")
@@ -80,9 +82,6 @@ class Inbox:
                 file.flush()
                 os.fsync(file.fileno())
             reached("photo file synced")
-            if ending is None:
-                partial.unlink()
-                return None
             path = self.folder / (digest.hexdigest() + ending)
             partial.replace(path)
             synced(self.folder)

@@ -14,6 +14,8 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.background import BackgroundTask
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from skyquilt import __version__
 from skyquilt.errors import OutputError
@@ -428,15 +430,6 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
                   description="A map that grows while drones fly: tiles, WMS, photos, layers, news.")  # fmt: skip
     site = Site(survey, guard, writer, folder)
 
-    @app.middleware("http")
-    async def guarded(request: Request, call_next: Any) -> Response:
-        if not guard.knows(request.headers.get("host", "")):
-            return JSONResponse({"detail": "this server answers to localhost only"}, 421)
-        answer: Response = await call_next(request)
-        for name, value in HEADERS.items():
-            answer.headers.setdefault(name, value)
-        return answer
-
     get, post = {"methods": ["GET"]}, {"methods": ["POST"]}
     for path, work, options in (
         ("/", site.page, {**get, "include_in_schema": False}), ("/info", site.info, get),
@@ -456,4 +449,31 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
     ):  # fmt: skip
         app.add_api_route(path, work, **options)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    app.add_middleware(Guarded, guard=guard)
     return app
+
+
+class Guarded:
+    """Every request is meant for this server, every answer carries the headers."""
+
+    def __init__(self, app: ASGIApp, guard: Guard) -> None:
+        self.app, self.guard = app, guard
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        if self.guard.knows(Headers(scope=scope).get("host", "")):
+            await self.app(scope, receive, with_headers)
+            return
+        refused = JSONResponse({"detail": "this server answers to localhost only"}, 421)
+        await refused(scope, receive, with_headers)
