@@ -59,8 +59,8 @@ def test_killed_at_every_write_point_in_one_survey(photos, undisturbed, tmp_path
     killed = 0
     for k, point in enumerate([*PASSED, "torn"]):
         done = replay(tmp_path / "out", photos, point, 1 + k % 2)
-        killed += done.returncode == -9
-        assert done.returncode in (-9, 0), done.stderr
+        killed += done.returncode < 0
+        assert done.returncode in (-9, -14, 0), done.stderr
     assert killed >= len(PASSED) // 2  # later points of an early photo are not passed again
     same(replay(tmp_path / "out", photos), undisturbed)
     assert not list((tmp_path / "out").rglob("*.partial"))
@@ -72,8 +72,8 @@ def test_killed_at_random_moments(photos, undisturbed, tmp_path):
     killed = 0
     for _ in range(KILLS):
         done = replay(tmp_path / "out", photos, "time", int(rng.uniform(400, 4000)))
-        killed += done.returncode == -9
-        assert done.returncode in (-9, 0), done.stderr
+        killed += done.returncode < 0
+        assert done.returncode in (-9, -14, 0), done.stderr
     assert killed >= 1
     same(replay(tmp_path / "out", photos), undisturbed)
 

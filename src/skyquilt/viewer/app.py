@@ -5,6 +5,7 @@ business.
 import asyncio
 import os
 import tempfile
+import threading
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Annotated, Any, Protocol
@@ -51,6 +52,7 @@ class Site:
     def __init__(self, survey: Survey, guard: Guard, writer: Writer | None, folder: Path) -> None:
         self.survey, self.guard, self.writer, self.folder = survey, guard, writer, folder
         self.images = Images(survey)
+        self.ending = threading.Event()
         self.uploads = Uploads(folder / "uploads", most=guard.most_uploads) if writer is not None else None
 
     # -- maps -------------------------------------------------------------------------------------------------
@@ -411,7 +413,7 @@ class Site:
     async def _news(self, request: Request, last: int) -> AsyncIterator[str]:
         yield f": skyquilt {__version__}\nretry: 1000\n\n"
         quiet = 0.0
-        while not await request.is_disconnected():
+        while not self.ending.is_set() and not await request.is_disconnected():
             told = self.survey.ledger.told(last) if isinstance(self.survey, LiveSurvey) else []
             for number, kind, body in told:
                 yield f"id: {number}\nevent: {kind}\ndata: {body}\n\n"
@@ -429,6 +431,7 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
     app = FastAPI(title="Skyquilt", version=__version__, docs_url=None, redoc_url=None,
                   description="A map that grows while drones fly: tiles, WMS, photos, layers, news.")  # fmt: skip
     site = Site(survey, guard, writer, folder)
+    app.state.ending = site.ending
 
     get, post = {"methods": ["GET"]}, {"methods": ["POST"]}
     for path, work, options in (

