@@ -34,6 +34,7 @@ from skyquilt.pipelines.depth_files import (
     false_colour,
     field_name,
     field_picture,
+    former_fields,
     write_depth,
     write_png,
 )
@@ -100,7 +101,10 @@ def iter_depth(
         raise UsageError("depth takes two photos at least, and here is one; give its neighbour too")
     if route == "auto":
         route = "pair" if len(survey.photos) == 2 else "reconstruction"
+    former = former_fields(output)
     claim(output, FILES, overwrite=overwrite)
+    for path in former:
+        path.unlink(missing_ok=True)
     clock = Clock(store=Store(folder=output / STATE / "store", registry=REGISTRY), began=began)
     yield from (Note(text=n) for n in survey.notes)
     scene, depth = yield from _by_route(route, survey, settings, relief_m, clock)
@@ -238,6 +242,7 @@ def _record(
     pairs = [
         {
             "a": photos[f.a].name, "b": photos[f.b].name, "points": len(f.px), "level": f.level,
+            "field": field_name(photos[f.a], photos[f.b]),
             "baseline_m": round(f.baseline_m, 3), "height_m": round(f.height_m, 3),
             "largest_disparity_px": round(float(np.linalg.norm(f.d_px, axis=1).max()), 2),
         }

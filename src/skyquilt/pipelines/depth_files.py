@@ -1,5 +1,6 @@
 """What `depth` leaves behind: a raster on the map grid, pictures, figures and a page."""
 
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -90,6 +91,15 @@ def field_picture(field: PairField, photo: Photo) -> NDArray[np.uint8]:
 def field_name(a: Photo, b: Photo) -> str:
     """File of a pair's picture, below PAIRS."""
     return "__".join(Path(p.name).with_suffix("").as_posix().replace("/", "_") for p in (a, b)) + ".png"
+
+
+def former_fields(output: Path) -> list[Path]:
+    """Pictures of pairs that a former run left in the folder, as its depth.json names them."""
+    try:
+        pairs = json.loads((output / "depth.json").read_text(encoding="utf-8"))["pairs"]
+        return [output / PAIRS / Path(str(p["field"])).name for p in pairs]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
 
 
 def write_png(path: Path, picture: NDArray[np.uint8]) -> None:

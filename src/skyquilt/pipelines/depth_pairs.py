@@ -79,7 +79,9 @@ def pair_field(
         return NoField(a=link.a, b=link.b, reason=f"its baseline of {baseline:.2f} m is too short")
     unit = b.camera.focal * WORKING_WIDTH / b.camera.width
     u = [r[:, :2] / r[:, 2:] * unit for r in (rays(v.camera, p) for v, p in zip(views, px, strict=True))]
-    found = Ransac(model="homography", threshold_px=threshold_px(relief_m, height), minimum=LEAST_POINTS)(u[0], u[1])
+    found = Ransac(model="homography", threshold_px=threshold_px(relief_m, height), minimum=LEAST_POINTS)(
+        u[0], u[1]
+    )
     if isinstance(found, NoEstimate):
         return NoField(a=link.a, b=link.b, reason=f"no dominant plane: {found.reason}")
     everything = replace(found, inliers=np.ones(len(u[0]), bool))

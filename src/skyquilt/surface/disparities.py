@@ -10,20 +10,22 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix, diags, hstack
+from scipy.sparse.linalg import lsmr
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
 class OnePlane:
-    """Alternates between the mean of all pairs in each cell and each pair's plane towards it."""
+    """Least squares for the height of each cell of the ground and a plane for each pair, outliers down-weighted."""
 
     cells: int = 60
     """Cells along the longer side."""
-    rounds: int = 40
-    """Of the alternation."""
-    damping: float = 0.02
-    """Pull of each pair's plane towards none, as a share of its own points: what nothing else ties down stays."""
+    damping: float = 1e-3
+    """Pull of planes and heights towards zero: what nothing ties down stays."""
+    rounds: int = 4
+    """Of reweighting (Cauchy's function)."""
     version: ClassVar[int] = 1
 
     def __call__(self, fields: Sequence[Array]) -> Array:
@@ -32,32 +34,25 @@ class OnePlane:
         owner = np.repeat(np.arange(len(fields)), [len(f) for f in fields])
         middle, extent = xyz[:, :2].mean(0), max(float(np.ptp(xyz[:, :2], axis=0).max()), 1e-9)
         terms = np.c_[np.ones(len(xyz)), (xyz[:, :2] - middle) / extent]
-        place = np.floor((xyz[:, :2] - xyz[:, :2].min(0)) / extent * self.cells).astype(np.int64)
-        _, cell = np.unique(place @ [self.cells + 1, 1], return_inverse=True)
         z = xyz[:, 2].copy()
-        for _ in range(self.rounds if len(fields) > 1 else 0):
-            z += self._towards(_smoothed(z, cell) - z, terms, owner)
+        if len(fields) > 1:
+            place = np.floor((xyz[:, :2] - xyz[:, :2].min(0)) / extent * self.cells).astype(np.int64)
+            _, cell = np.unique(place @ [self.cells + 1, 1], return_inverse=True)
+            z += self._planes(z, terms, owner, cell)
         z -= terms @ np.linalg.lstsq(terms, z, rcond=None)[0]
         return np.c_[xyz[:, :2], z]
 
-    def _towards(self, lacking: Array, terms: Array, owner: NDArray[np.int64]) -> Array:
-        """Each pair's plane through what it lacks, at its points."""
-        change = np.zeros(len(lacking))
-        for k in range(int(owner.max()) + 1):
-            mine = owner == k
-            own = terms[mine].copy()
-            own[:, 1:] -= own[:, 1:].mean(0)
-            pull = self.damping * np.diag((own**2).sum(0))
-            change[mine] = own @ np.linalg.solve(
-                own.T @ own + pull + 1e-12 * np.eye(3), own.T @ lacking[mine]
-            )
-        return change
-
-
-def _smoothed(z: Array, cell: NDArray[np.int64]) -> Array:
-    """The mean of each point's cell, twice: outliers count little the second time."""
-    number = np.bincount(cell)
-    mean = np.bincount(cell, z) / number
-    spread = 1.48 * float(np.median(np.abs(z - mean[cell]))) + 1e-9
-    weight = 1 / (1 + ((z - mean[cell]) / spread) ** 2)
-    return np.asarray((np.bincount(cell, z * weight) / np.bincount(cell, weight))[cell])
+    def _planes(self, z: Array, terms: Array, owner: NDArray[np.int64], cell: NDArray[np.int64]) -> Array:
+        """Each pair's plane at its points (n,)."""
+        row = np.arange(len(z))
+        column = 3 * owner[:, None] + np.arange(3)
+        planes = csr_matrix((terms.ravel(), (np.repeat(row, 3), column.ravel())))
+        both = hstack([planes, -csr_matrix((np.ones(len(z)), (row, cell)))]).tocsr()
+        weight, change = np.ones(len(z)), np.zeros(len(z))
+        for _ in range(self.rounds):
+            root = np.sqrt(weight)
+            solved = lsmr(diags(root) @ both, -z * root, damp=self.damping, maxiter=2000)[0]
+            change = planes @ solved[: planes.shape[1]]
+            lacking = z + both @ solved
+            weight = 1 / (1 + (lacking / (1.48 * np.median(np.abs(lacking)) + 1e-9)) ** 2)
+        return np.asarray(change)
