@@ -8,7 +8,6 @@ The photos are placed as `mosaic` places them, so depth.tif has the place of its
 """
 
 import json
-import os
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,16 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt import __version__
-from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.config import Methods, MosaicSettings, methods
 from skyquilt.errors import RefusedError, UsageError
 from skyquilt.model.event import Event, Note, Result
-from skyquilt.model.photo import Photo, Survey
-from skyquilt.model.poses import Alignment
+from skyquilt.model.photo import Survey
 from skyquilt.model.surface import Surface
-from skyquilt.photos.pixels import read_color
 from skyquilt.photos.survey import read_survey
-from skyquilt.pipelines import drawing, intake, linking, placing
 from skyquilt.pipelines.depth_files import (
     FILES,
     PAIRS,
@@ -39,32 +34,18 @@ from skyquilt.pipelines.depth_files import (
     write_png,
 )
 from skyquilt.pipelines.depth_pairs import NoField, PairField, pair_field
-from skyquilt.pipelines.mosaic import REGISTRY, pixel_budget, replace_read
+from skyquilt.pipelines.mosaic import REGISTRY
+from skyquilt.pipelines.scene import Scene, scene_of
 from skyquilt.raster.atomic import write_text
 from skyquilt.report.depth import depth_page
 from skyquilt.run.claim import claim
 from skyquilt.run.clock import Clock, Steps
 from skyquilt.run.folder import STATE
-from skyquilt.run.pixel_cache import PixelCache
 from skyquilt.run.store import Store
 from skyquilt.surface.disparities import OnePlane
 
 ROUTES = ("auto", "pair", "disparities", "reconstruction")
 """auto: pair for two photos, reconstruction for more."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
-    """Placed photos and the ground that their tie points know."""
-
-    taken: intake.Intake
-    """Photos and features."""
-    links: linking.Links
-    """Which of them show the same."""
-    alignment: Alignment
-    """Their poses."""
-    ground: drawing.Ground
-    """Heights, views and the map's grid."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -134,7 +115,7 @@ def _by_route(
 ) -> Generator[Event, None, tuple[Scene, Depth]]:
     parts = methods(settings)
     if route == "reconstruction":
-        scene = yield from _scene(survey.photos, settings, parts, clock)
+        scene = yield from scene_of(survey.photos, settings, parts, clock)
         if not len(scene.alignment.ties.xyz):
             raise RefusedError(
                 "no tie points: the photos do not overlap recognisably, so nothing tells heights"
@@ -142,13 +123,13 @@ def _by_route(
         return scene, Depth(surface=scene.ground.surface)
     parts = replace(parts, sweep=None)
     if route == "disparities":
-        scene = yield from _scene(survey.photos, settings, parts, clock)
+        scene = yield from scene_of(survey.photos, settings, parts, clock)
         return scene, (
             yield from clock.stage("disparities", _disparities(scene, parts, relief_m), keeps=False)
         )
     why = ""
     for k in range(len(survey.photos) - 1):
-        scene = yield from _scene(survey.photos[k : k + 2], settings, parts, clock)
+        scene = yield from scene_of(survey.photos[k : k + 2], settings, parts, clock)
         found = yield from clock.stage(
             "disparities", _disparities(scene, parts, relief_m, refuse=False), keeps=False
         )
@@ -156,32 +137,6 @@ def _by_route(
             return scene, found
         why = why or (found.without[0].reason if found.without else "they do not match")
     raise RefusedError(f"no two photos in sequence tell a height; of the first two: {why}")
-
-
-def _scene(
-    photos: Sequence[Photo], settings: MosaicSettings, parts: Methods, clock: Clock
-) -> Generator[Event, None, Scene]:
-    """The chapters of `iter_mosaic` up to the surface."""
-    jobs, store = settings.jobs or os.cpu_count() or 1, clock.store
-    cache = PixelCache(read=lambda i: read_color(photos[i]), budget_bytes=pixel_budget(settings))
-    taken = yield from clock.stage("features", intake.take_in(photos, cache, parts, store, jobs))
-    taken = drawing.single_kind(taken)
-    where = {p.name: i for i, p in enumerate(photos)}
-    cache = replace_read(cache, [where[p.name] for p in taken.photos])
-    pictures = intake.Pictures(taken.photos, cache, store)
-    frame = choose_frame(taken.photos, settings.crs, ())
-    prior = priors(taken.photos, frame)
-    links = yield from clock.stage("links", linking.link_up(taken, prior, parts, store, jobs))
-    known = placing.Known(
-        intake=taken, frame=frame, priors=prior, links=links, control=(), pictures=pictures,
-        order=range(len(taken.photos)),
-    )  # fmt: skip
-    alignment = yield from clock.stage("align", placing.place(known, parts, settings, store))
-    yield from (Note(text=n, warning=True) for n in alignment.notes)
-    ground = yield from clock.stage(
-        "surface", drawing.survey_ground(alignment, pictures, parts, settings, store)
-    )
-    return Scene(taken=taken, links=links, alignment=alignment, ground=ground)
 
 
 def _disparities(
