@@ -12,7 +12,9 @@ NOON = datetime(2024, 6, 1, 12)
 def photo(name, seconds=None, east_m=None):
     position = None
     if east_m is not None:
-        position = GeoPosition(latitude_deg=0, longitude_deg=east_m / 111319.5, altitude_m=50, datum="takeoff")
+        position = GeoPosition(
+            latitude_deg=0, longitude_deg=east_m / 111319.5, altitude_m=50, datum="takeoff"
+        )
     return Photo(
         name=name, path=Path(name), digest=name, width=640, height=512, channels=1, dtype="uint8", band="visible",
         camera_key="c", focal=Focal(px=700, sigma_px=70, source="guess"), position=position, attitude=None,

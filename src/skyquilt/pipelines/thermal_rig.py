@@ -92,7 +92,9 @@ def _registered(scene: Scene, index: int, thermal: Photo) -> RigPair | None:
     outcome = outcome_of(a, b, "auto", guess_of(a, b))
     if not isinstance(outcome, Registration):
         return None
-    x, y = np.meshgrid(*(np.linspace(0.05, 0.95, _GRID, dtype=np.float64) * size for size in (b.width, b.height)))
+    x, y = np.meshgrid(
+        *(np.linspace(0.05, 0.95, _GRID, dtype=np.float64) * size for size in (b.width, b.height))
+    )
     px_b = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
     px_a = transfer(np.asarray(np.linalg.inv(outcome.b_H_a), np.float64), px_b)
     inside = ((px_a > 0) & (px_a < [a.width - 1, a.height - 1])).all(1)
