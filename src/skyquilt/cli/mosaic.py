@@ -134,8 +134,9 @@ def command(
     thermal_route: Annotated[
         str,
         typer.Option(
-            help="How the thermal map finds its place: maps (the pictures of both), heights (the surfaces under"
-            " them), positions (GPS alone), auto (the first that can be believed)."
+            help="How the thermal map finds its place: rig (both cameras on one drone: on the visual poses), maps (the"
+            " pictures of both), heights (the surfaces under them), positions (GPS alone), auto (the first that can be"
+            " believed)."
         ),
     ] = "auto",
     jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.")] = 0,
@@ -200,7 +201,7 @@ def with_thermal(result: "Result") -> str:
     how = (
         "its own positions alone"
         if t["route"] == "positions"
-        else f"{t['route']}, {t['inliers']} places agree"
+        else f"{t['route']}, {t['inliers']} {'pairs' if t['route'] == 'rig' else 'places'} agree"
     )
     return (
         f"{mosaic_summary(result)}\nthermal: {result.output / 'thermal.tif'} ({t['photos_used']} of"

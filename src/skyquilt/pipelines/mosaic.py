@@ -160,14 +160,15 @@ def mosaic(
 def _read(folder: Path | Sequence[Path], settings: MosaicSettings) -> tuple[Survey, tuple[ControlPoint, ...]]:
     """Metadata and side files; a gcp_list.txt beside the photos is used unasked."""
     survey = read_survey(folder, geo=settings.geo, cameras=settings.cameras)
-    survey, control = _with_control(survey, folder, settings)
+    survey, control = with_control(survey, folder, settings)
     _checked(survey, control, settings)
     return survey, control
 
 
-def _with_control(
+def with_control(
     survey: Survey, folder: Path | Sequence[Path], settings: MosaicSettings
 ) -> tuple[Survey, tuple[ControlPoint, ...]]:
+    """The survey with notes on its control points, and those."""
     gcp = settings.gcp
     if gcp is None and isinstance(folder, Path) and (folder / "gcp_list.txt").is_file():
         gcp = folder / "gcp_list.txt"

@@ -1,11 +1,13 @@
 """The story of two spectra: a visual map, and the thermal map on its grid.
 
     visual mosaic -> thermal mosaic -> registration of the two -> thermal.tif on the visual grid
+    visual mosaic -> photos taken together -> their cameras' rotation -> thermal.tif on the visual poses
 
-Both flights become maps by themselves, each by its own adjustment. What their positions leave open, a few metres, the
-registration of the finished maps closes [Yahyanejad 2013, 5.2.3]: of the pictures, or of the heights under them, which
-look alike in every spectrum, by day and night, in summer and winter (5.8). Where neither is to be believed, the
-thermal map lies where its own positions put it, and says so.
+Where one drone took both, by times or names, the cameras' rotation is found once, and the thermal photos are drawn
+where the visual ones were. Otherwise both flights become maps by themselves, each by its own adjustment. What their
+positions leave open, a few metres, the registration of the finished maps closes [Yahyanejad 2013, 5.2.3]: of the
+pictures, or of the heights under them, which look alike in every spectrum, by day and night, in summer and winter
+(5.8). Where neither is to be believed, the thermal map lies where its own positions put it, and says so.
 """
 
 from collections.abc import Generator, Iterator
@@ -17,23 +19,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.config import MosaicSettings
+from skyquilt.config import MosaicSettings, methods
 from skyquilt.config_register import registration_method
 from skyquilt.errors import RefusedError, UsageError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarted
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registration
+from skyquilt.photos.survey import read_survey
+from skyquilt.photos.together import taken_together
 from skyquilt.pipelines.mosaic import iter_mosaic
 from skyquilt.pipelines.pictures import Source, guess_of, open_picture
 from skyquilt.pipelines.register_files import overlays, resample_onto
+from skyquilt.pipelines.scene import scene_of_run
 from skyquilt.pipelines.thermal_files import write_figures, write_overlays
+from skyquilt.pipelines.thermal_rig import draw_rigged, rig_figures, rigged
 from skyquilt.run.clock import Clock
 from skyquilt.spectral.orientation import between, full_size, orientation
 from skyquilt.spectral.sharpen import Sharpen
 from skyquilt.spectral.usable import both_usable
 
-ROUTES = ("auto", "maps", "heights", "positions")
-"""How the thermal map finds its place: by pictures, then heights; by one of them; or by its positions alone."""
+ROUTES = ("auto", "rig", "maps", "heights", "positions")
+"""How the thermal map finds its place: by the rig where one drone took both, by pictures, by heights, or by its
+positions alone; auto takes the first of these that can be believed.
+"""
 FINE = 700.0
 """Side in px of the square whose area the maps have when the join is sharpened: finer detail is shadows, which have
 moved between two flights, and the join would follow them."""
@@ -73,6 +81,20 @@ def iter_thermal(
     visual = yield from _told(
         iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
     )
+    refused: tuple[tuple[str, str], ...] = ()
+    if route in ("auto", "rig"):
+        began = Clock.now()
+        yield StageStarted(stage="rig", total=0)
+        result = _by_rig(photos, thermal, visual, settings)
+        yield _finished("rig", began)
+        if isinstance(result, Result):
+            yield result
+            return
+        if route == "rig":
+            raise RefusedError(
+                f"the thermal photos cannot be laid on the visual poses: {result.reason}; use --thermal-route auto"
+            )
+        refused = (("rig", result.reason),)
     own = replace(
         settings, gcp=None, geo=None, cameras=None, bounds=None, boundary=None, gsd_cm=None,
         crs=visual.metrics["crs"] or settings.crs, compress="auto",
@@ -85,22 +107,50 @@ def iter_thermal(
     yield StageStarted(stage="join", total=0)
     a, b = (_opened(result.output / "mosaic.tif") for result in (visual, heat))
     joined = join(a, b, (visual.output / "surface.tif", heat.output / "surface.tif"), route)
+    joined = replace(joined, refused=(*refused, *joined.refused))
     resample_onto(output / "thermal.tif", a, b, joined.thermal_H_visual)
     shown = replace_transform(joined)
     write_overlays(output, overlays(a, b, shown))
     figures = {"thermal": _figures(joined, heat, b)}
     write_figures(output, visual.metrics, figures)
-    now = Clock.now()
-    yield StageFinished(
-        stage="join",
-        seconds=round(now[0] - began[0], 3),
-        cpu_seconds=round(now[1] - began[1], 3),
-        reused=False,
-    )
+    yield _finished("join", began)
     yield from (
         Note(text=f"registration by {name} was refused: {why}", warning=True) for name, why in joined.refused
     )
     yield Result(output=output, metrics={**visual.metrics, **figures})
+
+
+def _finished(stage: str, began: tuple[float, float]) -> StageFinished:
+    now = Clock.now()
+    return StageFinished(
+        stage=stage,
+        seconds=round(now[0] - began[0], 3),
+        cpu_seconds=round(now[1] - began[1], 3),
+        reused=False,
+    )
+
+
+def _by_rig(
+    photos: Path | str, thermal: Path | str, visual: Result, settings: MosaicSettings
+) -> Result | RefusedRegistration:
+    """thermal.tif from the visual poses, where one drone took both, or why not."""
+    survey = read_survey(Path(thermal))
+    if not taken_together(read_survey(Path(photos), geo=settings.geo).photos, survey.photos):
+        return RefusedRegistration(
+            reason="no thermal photo was taken together with a visual one, by time or name"
+        )
+    scene = scene_of_run(photos, visual, settings)
+    found = rigged(scene, survey.photos)
+    if isinstance(found, RefusedRegistration):
+        return found
+    output = visual.output
+    draw_rigged(output / "thermal.tif", found, scene, methods(settings).blend)
+    none = np.zeros((0, 2))
+    same = Registration(model="identity", b_H_a=np.eye(3), px_a=none, px_b=none)
+    write_overlays(output, overlays(_opened(output / "mosaic.tif"), _opened(output / "thermal.tif"), same))
+    figures = {"thermal": rig_figures(found, len(survey.photos) + len(survey.rejected))}
+    write_figures(output, visual.metrics, figures)
+    return Result(output=output, metrics={**visual.metrics, **figures})
 
 
 def _told(events: Iterator[Event]) -> Generator[Event, None, Result]:

@@ -1,0 +1,65 @@
+"""Which photos of two cameras were taken together, by their times or their names."""
+
+import re
+from collections.abc import Sequence
+from pathlib import PurePosixPath
+
+import numpy as np
+
+from skyquilt.model.photo import Photo
+
+SECONDS = 0.75
+"""Longest time between two shots of one release."""
+CONTRADICTION_S = 5.0
+"""Time between shots of equal names from which these are chance: stamps of whole seconds, cameras that write late."""
+APART_M = 5.0
+"""Distance of reported positions from which two photos are not of one drone."""
+_EARTH_M = 6371008.8
+
+
+def taken_together(a: Sequence[Photo], b: Sequence[Photo]) -> list[tuple[int, int]]:
+    """Pairs (index of a, index of b), each photo in one at most, by ascending index of b.
+
+    By equal numbers in the names, where neither times nor positions contradict; for photos that have no partner by
+    name, by the nearest time.
+    """
+    named: dict[tuple[str, ...], list[int]] = {}
+    for i, photo in enumerate(a):
+        named.setdefault(_numbers(photo), []).append(i)
+    found: dict[int, int] = {}
+    for j, photo in enumerate(b):
+        same = named.get(_numbers(photo), []) if _numbers(photo) else []
+        if len(same) == 1 and same[0] not in found.values() and _possible(a[same[0]], photo):
+            found[j] = same[0]
+    left = [i for i in range(len(a)) if i not in found.values()]
+    for j, photo in enumerate(b):
+        gaps = [(gap, i) for i in left if (gap := _gap_s(a[i], photo)) is not None]
+        if j in found or not gaps or min(gaps)[0] > SECONDS or not _possible(a[min(gaps)[1]], photo):
+            continue
+        found[j] = min(gaps)[1]
+        left.remove(found[j])
+    return [(found[j], j) for j in sorted(found)]
+
+
+def _numbers(photo: Photo) -> tuple[str, ...]:
+    return tuple(re.findall(r"\d+", PurePosixPath(photo.name).stem))
+
+
+def _gap_s(a: Photo, b: Photo) -> float | None:
+    if a.time is None or b.time is None or (a.time.tzinfo is None) != (b.time.tzinfo is None):
+        return None
+    return abs((a.time - b.time).total_seconds())
+
+
+def _possible(a: Photo, b: Photo) -> bool:
+    """Whether nothing contradicts that both were taken at one moment from one place."""
+    gap = _gap_s(a, b)
+    if gap is not None and gap > CONTRADICTION_S:
+        return False
+    if a.position is None or b.position is None:
+        return True
+    north = np.radians(a.position.latitude_deg - b.position.latitude_deg)
+    east = np.radians(a.position.longitude_deg - b.position.longitude_deg) * np.cos(
+        np.radians(a.position.latitude_deg)
+    )
+    return bool(np.hypot(north, east) * _EARTH_M < APART_M)

@@ -1,0 +1,90 @@
+"""Depth maps of a simulated flight against the heights it was flown over."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+from rasterio.warp import Resampling, reproject
+
+from skyquilt.config import MosaicSettings
+from skyquilt.errors import OutputError, RefusedError, UsageError
+from skyquilt.pipelines.depth import depth, iter_depth
+
+SETTINGS = MosaicSettings(gsd_cm=25, features=3000, jobs=2)
+
+
+def against_truth(output, flight):
+    """Correlation with the true heights and the slope of the found ones over them, both without a general slope, where
+    they fit best within 3 m: photos are placed by positions that are off by as much.
+    """
+    truth_file = flight / "truth" / "truth_surface.tif"
+    with rasterio.open(output / "depth.tif") as found, rasterio.open(truth_file) as truth:
+        z, true = found.read(1), np.full(found.shape, np.nan, np.float32)
+        reproject(
+            rasterio.band(truth, 1), true, dst_transform=found.transform, dst_crs=found.crs, dst_nodata=np.nan,
+            resampling=Resampling.average,
+        )  # fmt: skip
+    near = range(-12, 13, 2)  # px of 25 cm
+    tried = [agreement(z, np.roll(true, (dy, dx), (0, 1))) for dy in near for dx in near]
+    return (*max(tried), np.isfinite(z).mean())
+
+
+def agreement(z, true):
+    known = np.isfinite(z) & np.isfinite(true)
+    row, column = np.nonzero(known)
+    terms = np.c_[np.ones(len(row)), row, column][::7]
+    a, b = z[known][::7], true[known][::7]
+    a, b = (v - terms @ np.linalg.lstsq(terms, v, rcond=None)[0] for v in (a, b))
+    return np.corrcoef(a, b)[0, 1], (a @ b) / (b @ b)
+
+
+@pytest.mark.parametrize("route", ["disparities", "reconstruction"])
+def test_a_survey_shows_its_heights(flight, finished, tmp_path, route):
+    result = depth(flight / "photos", tmp_path / "out", SETTINGS, route=route)
+    r, slope, share = against_truth(tmp_path / "out", flight)
+    assert r > 0.72 and 0.65 < slope < 1.1 and share > 0.4
+    assert result.metrics["route"] == route and result.metrics["unit"] == "m"
+    with (
+        rasterio.open(tmp_path / "out" / "depth.tif") as found,
+        rasterio.open(finished.output / "mosaic.tif") as m,
+    ):
+        assert found.crs == m.crs and found.units == ("m",) and found.tags()["ROUTE"] == route
+        assert (
+            np.abs(np.array(found.bounds) - np.array(m.bounds)).max() < 4
+        )  # positions alone against control points
+    picture = cv2.imread(str(tmp_path / "out" / "depth.png"), cv2.IMREAD_UNCHANGED)
+    assert picture.shape[2] == 4 and 0.3 < (picture[..., 3] > 0).mean() < 1
+    assert "<img" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_two_photos_show_their_heights_and_their_field(flight, tmp_path):
+    photos = sorted((flight / "photos").glob("*.jpg"))[3:5]
+    result = depth(photos, tmp_path / "out", SETTINGS)
+    r, slope, _ = against_truth(tmp_path / "out", flight)
+    assert result.metrics["route"] == "pair" and r > 0.6 and 0.5 < slope < 1.1
+    (pair,) = json.loads((tmp_path / "out" / "depth.json").read_text())["pairs"]
+    field = cv2.imread(str(tmp_path / "out" / "pairs" / pair["field"]))
+    assert field.shape == (562, 750, 3) and field.std() > 5
+    others = sorted((flight / "photos").glob("*.jpg"))[4:6]
+    depth(others, tmp_path / "out", SETTINGS, overwrite=True)
+    (left,) = (tmp_path / "out" / "pairs").iterdir()
+    assert left.name != pair["field"]  # nothing of the former run stays
+
+
+def test_what_tells_no_height_is_refused(flight, tmp_path):
+    one, *_, last = sorted((flight / "photos").glob("*.jpg"))
+    with pytest.raises(UsageError, match="two photos at least"):
+        list(iter_depth([one], tmp_path / "a"))
+    with pytest.raises(UsageError, match="--route 'guess'"):
+        list(iter_depth([one, last], tmp_path / "a", route="guess"))
+    far = sorted((flight / "photos").glob("*.jpg"))
+    noise = np.random.default_rng(0).integers(0, 255, (600, 800, 3), np.uint8)
+    cv2.imwrite(str(tmp_path / "noise.jpg"), noise)
+    with pytest.raises(RefusedError, match="of the first two: they do not match"):
+        depth([far[0], tmp_path / "noise.jpg"], tmp_path / "b", SETTINGS)
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c" / "mine.txt").write_text("mine")
+    with pytest.raises(OutputError, match="already holds files"):
+        depth(far[:2], tmp_path / "c", SETTINGS)

@@ -1,0 +1,87 @@
+"""One drone, two cameras: thermal frames cut from simulated visual ones through a known rotation."""
+
+import cv2
+import numpy as np
+import pytest
+import rasterio
+
+from skyquilt.config import MosaicSettings
+from skyquilt.errors import RefusedError
+from skyquilt.geometry.camera import project, rays
+from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.geometry.rotations import angle_deg
+from skyquilt.model.camera import Camera
+from skyquilt.model.event import Result
+from skyquilt.pipelines.thermal import iter_thermal
+
+HEAT = Camera.ideal(width=320, height=256, focal=400.0)
+TURN = cam_R_map_from_angles(2.0, 1.0, -1.5) @ cam_R_map_from_angles(0, 0, 0).T
+"""thermal_R_visual."""
+SETTINGS = MosaicSettings(gsd_cm=15, jobs=2)
+
+
+def heat_of(path, lens):
+    """A frame in degrees Celsius: the brightness, reversed and rounded off, as the turned camera sees it."""
+    grey = cv2.GaussianBlur(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), (0, 0), 1.0)
+    x, y = np.meshgrid(np.arange(HEAT.width, dtype=float), np.arange(HEAT.height, dtype=float))
+    px = project(lens, rays(HEAT, np.c_[x.ravel(), y.ravel()]) @ TURN).astype(np.float32)
+    u, v = px.reshape(*x.shape, 2).transpose(2, 0, 1)
+    seen = cv2.remap(grey, np.ascontiguousarray(u), np.ascontiguousarray(v), cv2.INTER_LINEAR)
+    return (40 - 0.1 * seen.astype(np.float32)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def frames(flight, finished, tmp_path_factory):
+    """Frames named like the photos they were taken with, but without any metadata."""
+    folder = tmp_path_factory.mktemp("heat")
+    table = finished.json("reconstruction.json")[0]
+    (lens,) = table["cameras"].values()
+    longest = max(lens["width"], lens["height"])
+    for path in sorted((flight / "photos").glob("*.jpg")):
+        k = [float(lens.get(n, 0)) for n in ("k1", "k2", "k3", "p1", "p2")]
+        camera = Camera(
+            width=lens["width"], height=lens["height"], focal=lens.get("focal_x", lens.get("focal")) * longest,
+            cx=lens.get("c_x", 0) * longest + (lens["width"] - 1) / 2,
+            cy=lens.get("c_y", 0) * longest + (lens["height"] - 1) / 2, **dict(zip(("k1", "k2", "k3", "p1", "p2"), k, strict=False)),
+        )  # fmt: skip
+        target = folder / f"heat_{path.stem.split('_')[-1]}.tif"
+        cv2.imwrite(str(target), heat_of(path, camera))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def output(tmp_path_factory):
+    """The visual map is made once."""
+    return tmp_path_factory.mktemp("rig") / "out"
+
+
+def test_the_rig_is_found_and_drawn_on_the_visual_poses(flight, frames, output):
+    *_, last = iter_thermal(flight / "photos", frames, output, SETTINGS)
+    assert isinstance(last, Result)
+    told = last.metrics["thermal"]
+    assert told["route"] == "rig" and told["photos_used"] == 9
+    assert angle_deg(np.array(told["thermal_R_visual"]), TURN) < 0.05
+    assert told["evidence"]["focal_px"] == pytest.approx(HEAT.focal, rel=0.01)
+    assert not (output / "thermal").exists()  # no map of its own was needed
+    with rasterio.open(output / "thermal.tif") as out, rasterio.open(output / "mosaic.tif") as m:
+        assert (out.transform, out.shape, out.crs) == (m.transform, m.shape, m.crs)
+        heat, grey = out.read(1), m.read().mean(0)
+        known = np.isfinite(heat) & (m.dataset_mask() > 0)
+    assert known.mean() > 0.2
+    grey = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1)
+    places = {
+        (dx, dy): np.corrcoef(heat[known], np.roll(grey, (dy, dx), (0, 1))[known])[0, 1]
+        for dx in (-2, 0, 2)
+        for dy in (-2, 0, 2)
+    }
+    assert min(places, key=places.get) == (0, 0) and places[0, 0] < -0.8
+
+
+def test_frames_of_other_ground_are_refused(flight, frames, output, tmp_path):
+    (tmp_path / "wrong").mkdir()
+    rng = np.random.default_rng(0)
+    for path in sorted(frames.glob("*.tif"))[:4]:
+        noise = cv2.GaussianBlur(rng.normal(20, 5, (256, 320)).astype(np.float32), (0, 0), 3)
+        cv2.imwrite(str(tmp_path / "wrong" / path.name), noise)
+    with pytest.raises(RefusedError, match="0 pairs taken together could be registered"):
+        list(iter_thermal(flight / "photos", tmp_path / "wrong", output, SETTINGS, route="rig"))

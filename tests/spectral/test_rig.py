@@ -1,0 +1,63 @@
+"""The rig from exact directions, with noise, wrong pairs and a wrong focal length."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skyquilt.geometry.camera import project, rays
+from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.geometry.rotations import angle_deg, median_rotation
+from skyquilt.model.camera import Camera
+from skyquilt.spectral.rig import FindRig, RigPair
+
+A = Camera(width=4000, height=3000, focal=3000.0, cx=2010.0, cy=1490.0, k1=-0.05)
+B = Camera(width=640, height=512, focal=760.0, cx=321.0, cy=257.0, k1=-0.2, k2=0.05)
+
+
+def turned(yaw, pitch, roll):
+    """A camera turned against one that looks straight down."""
+    return cam_R_map_from_angles(yaw, pitch, roll) @ cam_R_map_from_angles(0, 0, 0).T
+
+
+TRUE = turned(3.0, 1.5, -2.0)
+
+
+def pairs(rng, number, wrong=0):
+    found = []
+    for k in range(number):
+        px_b = rng.uniform([20, 20], [620, 490], (30, 2))
+        b_R_a = turned(20, 9, 5) if k < wrong else TRUE
+        px_a = project(A, rays(B, px_b) @ b_R_a)
+        found.append(RigPair(px_a=px_a + rng.normal(0, 4, px_a.shape), px_b=px_b, camera_a=A))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_rotation_is_found_though_pairs_are_wrong(seed):
+    rig = FindRig(free=0)(pairs(np.random.default_rng(seed), 9, wrong=3), B)
+    assert angle_deg(rig.b_R_a, TRUE) < 0.03 and (rig.pairs, rig.agreeing) == (9, 6)
+    assert rig.camera_b == B
+
+
+def test_a_free_focal_length_is_found():
+    rig = FindRig(free=0.2)(pairs(np.random.default_rng(4), 8), replace(B, focal=690.0))
+    assert rig.camera_b.focal == pytest.approx(760, rel=0.005)
+    assert angle_deg(rig.b_R_a, TRUE) < 0.03
+
+
+def test_too_few_and_quarrelling_pairs_are_refused():
+    rng = np.random.default_rng(5)
+    assert not FindRig()(pairs(rng, 2), B) and "3 are needed" in FindRig()(pairs(rng, 2), B).reason
+    apart = [
+        replace(p, px_a=project(A, rays(B, p.px_b) @ turned(0, 3 * k, -2 * k)))
+        for k, p in enumerate(pairs(rng, 6), 1)
+    ]
+    assert "agree on one rotation" in FindRig(free=0)(apart, B).reason
+
+
+def test_the_median_of_rotations_bears_outliers():
+    rng = np.random.default_rng(6)
+    near = [cam_R_map_from_angles(*(np.array([10, 2, -1]) + rng.normal(0, 0.1, 3))) for _ in range(8)]
+    far = [cam_R_map_from_angles(*rng.uniform(-90, 90, 3)) for _ in range(5)]
+    assert angle_deg(median_rotation(near + far), cam_R_map_from_angles(10, 2, -1)) < 0.15
