@@ -305,7 +305,8 @@ def test_a_flood_of_tiny_requests_is_answered_and_nothing_is_lost(site):
     bad = [b"", b"\xff\xd8\xff", b"\xff\xd8\xff\xd9", b"II*\x00"]
     codes = {site.web.post("/photos", content=bad[k % 4]).status_code for k in range(200)}
     assert codes == {422}
-    assert {k: v for k, v in site.states().items() if k in before} == before
+    after = site.states()  # what was placed may be refined meanwhile, and nothing else may happen to it
+    assert all(after[k] == v or (v, after[k]) == ("placed", "refined") for k, v in before.items())
     assert site.web.get("/info").json()["counts"]["refused"] == refused + 200
 
 

@@ -169,6 +169,7 @@ def test_a_photo_without_position_waits_and_is_placed_by_its_links(flight, tmp_p
     live.close()
 
 
+@pytest.mark.slow
 def test_equal_photos_in_equal_order_give_equal_poses(flight, tmp_path):
     one, other = (
         mapped(tmp_path / name, flight.photos, deterministic=True, features=600) for name in ("a", "b")

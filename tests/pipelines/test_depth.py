@@ -40,6 +40,7 @@ def agreement(z, true):
     return np.corrcoef(a, b)[0, 1], (a @ b) / (b @ b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("route", ["disparities", "reconstruction"])
 def test_a_survey_shows_its_heights(flight, finished, tmp_path, route):
     result = depth(flight / "photos", tmp_path / "out", SETTINGS, route=route)

@@ -25,6 +25,7 @@ def ends(folder):
     return [float(np.median(v["eta_end"])) for v in found["variants"]], found
 
 
+@pytest.mark.slow
 def test_the_order_of_the_thesis(finished):
     folder, events = finished
     (none, two, four, six, tangential, flat, similarity), found = ends(folder)
@@ -39,6 +40,7 @@ def test_the_order_of_the_thesis(finished):
     assert [e.done for e in events if isinstance(e, StageProgress)] == list(range(1, 8))
 
 
+@pytest.mark.slow
 def test_the_page_is_whole(finished):
     page = (finished[0] / "report.html").read_text()
     assert "map" not in re.findall(r'<section id="(\w+)"', page)
@@ -69,6 +71,7 @@ def test_equal_seeds_give_equal_results(tmp_path):
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_refusals(tmp_path, finished):
     with pytest.raises(OutputError, match=r"already holds strip.json; add --overwrite"):
         next(iter_strip_test(finished[0], flights=1))

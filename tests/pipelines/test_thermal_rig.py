@@ -55,6 +55,7 @@ def output(tmp_path_factory):
     return tmp_path_factory.mktemp("rig") / "out"
 
 
+@pytest.mark.slow
 def test_the_rig_is_found_and_drawn_on_the_visual_poses(flight, frames, output):
     *_, last = iter_thermal(flight / "photos", frames, output, SETTINGS)
     assert isinstance(last, Result)
@@ -77,6 +78,7 @@ def test_the_rig_is_found_and_drawn_on_the_visual_poses(flight, frames, output):
     assert min(places, key=places.get) == (0, 0) and places[0, 0] < -0.8
 
 
+@pytest.mark.slow
 def test_frames_of_other_ground_are_refused(flight, frames, output, tmp_path):
     (tmp_path / "wrong").mkdir()
     rng = np.random.default_rng(0)

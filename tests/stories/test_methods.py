@@ -39,7 +39,7 @@ def solved(told):
     return {s["properties"]["filename"]: np.array(s["properties"]["translation"]) for s in shots}
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", [*METHODS[:4], pytest.param("flightline", marks=pytest.mark.slow)])
 def test_every_method_makes_a_map(mosaic, lines, method):
     told = mosaic(lines / "photos", "--method", method).made()
     m, q = told.metrics, told.metrics["quality"]
