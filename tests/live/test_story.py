@@ -9,10 +9,10 @@ import rasterio
 
 from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
 from skyquilt.metrics.correlation import correlation
+from skyquilt.photos.survey import read_survey
 from skyquilt.pipelines.live.flying import FlySettings, fly, order_of, preview_of
 from skyquilt.pipelines.live.settings import LiveSettings
 from skyquilt.pipelines.live.story import LiveMap
-from skyquilt.photos.survey import read_survey
 from skyquilt.raster.map_source import TileSource
 from tests.live.conftest import offsets
 from tests.stories.conftest import relabel

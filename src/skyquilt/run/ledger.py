@@ -123,7 +123,7 @@ class Ledger:
 
     @contextmanager
     def lightly(self) -> Iterator[None]:
-        """Changes that a power cut, though no kill, may undo: nothing is promised to anybody, so nobody waits for them."""
+        """Changes that a power cut, though no kill, may undo: nothing is promised, so nobody waits for them."""
         with self.lock:
             light = not self.db.in_transaction
             if light:
