@@ -104,7 +104,7 @@ def fly(
                 size=np.ones(len(inside), np.float32),
                 scale=1.0,
                 descriptors=np.clip(np.rint(400 * found), 0, 255).astype(np.uint8),
-            )  # fmt: skip
+            )
         )
     return flight
 

@@ -89,3 +89,14 @@ def test_a_line_that_nothing_links_is_left_out_by_name():
     assert set(found.rejected) == {10, 11, 12, 13, 14} and any(
         "P010.jpg to P014.jpg" in n for n in found.notes
     )
+
+
+def test_lines_around_a_field_are_joined_at_its_corners():
+    sides = [
+        line(6, 20.0), line(5, 20.0, start=(20.0, 100.0), heading=90.0),
+        line(5, 20.0, start=(100.0, 80.0), heading=180.0), line(4, 20.0, start=(80.0, 0.0), heading=270.0),
+    ]  # fmt: skip
+    flight = fly(np.concatenate(sides), gps=0.5, points=6000)
+    found = run(flight)
+    assert len(found.poses) == 20 and not found.rejected
+    assert ground_error(flight, found, free=False) < 1.5

@@ -1,6 +1,6 @@
 """`image`: the chain and the overview, on flights of known truth."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -131,7 +131,7 @@ class Counting:
     """SIFT that remembers how large the overviews were."""
 
     sizes: list
-    sift: Sift = Sift(longest=10**6)
+    sift: Sift = field(default_factory=lambda: Sift(longest=10**6))
 
     def __call__(self, image):
         self.sizes.append(image.size)

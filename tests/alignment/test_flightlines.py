@@ -44,14 +44,13 @@ def test_surveys_of_the_papers_size_fall_into_their_lines(count, lines, heading)
 def test_lines_as_far_apart_as_photos_are_told_by_heading_only():
     xy = lawn(4, 6, step=25.0, apart=25.0) + np.random.default_rng(2).normal(0, 0.3, (24, 2))
     assert sizes(by_heading(xy)) == [6, 6, 6, 6]
-    (whole,) = by_distance(xy)
-    assert reversals(xy, whole) >= 0 and len(whole) == 24
+    assert sizes(by_distance(xy)) != [6, 6, 6, 6]
 
 
 def test_a_line_that_turns_back_is_noticed():
     there = line(6, 20.0)
     xy = np.concatenate([there, there[::-1] + (1.0, 5.0)])
-    assert reversals(xy, range(12)) == 2 - 1 or reversals(xy, range(12)) == 1
+    assert reversals(xy, range(12)) == 1
     assert reversals(there, range(6)) == 0
 
 

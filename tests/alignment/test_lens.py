@@ -1,6 +1,7 @@
 """Lens models of lower order, each fitted by itself."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -38,7 +39,7 @@ def test_the_full_order_is_the_calibration_itself():
 
 def test_every_order_fits_better_than_the_one_before():
     errors = [misfit(of_order(TRUE, o)) for o in ORDERS]
-    assert all(a > 1.001 * b for a, b in zip(errors[:-1], errors[1:], strict=True))
+    assert all(a > 1.001 * b for a, b in pairwise(errors))
 
 
 @pytest.mark.parametrize(("order", "left"), [("2", ("k2", "k3", "p1", "p2")), ("4", ("k3", "p1", "p2"))])

@@ -377,7 +377,11 @@ def test_negative_heights(mosaic, photos):
 def test_negative_heights_by_pose(mosaic, photos):
     for path in named(photos):
         relabel(path, heights=-200.0)
-    mosaic(photos, "--method", "pose").refused(4, "--height")
+    mosaic(photos, "--method", "pose", "--trust-metadata").refused(4, "--height")
+    told = mosaic(
+        photos, "--method", "pose", output=photos.parent / "two"
+    ).made()  # image scale and positions tell the height
+    assert told.metrics["photos_used"] == 9
 
 
 @pytest.mark.slow
@@ -393,7 +397,7 @@ def test_heights_missing(mosaic, photos):
 def test_heights_missing_by_pose(mosaic, photos):
     for path in named(photos):
         relabel(path, drop=["altitude"])
-    mosaic(photos, "--method", "pose").refused(4, "--height")
+    mosaic(photos, "--method", "pose", "--trust-metadata").refused(4, "--height")
     mosaic(photos, "--method", "pose", "--height", "60", output=photos.parent / "two").made()
 
 

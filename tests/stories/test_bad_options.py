@@ -16,7 +16,24 @@ pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning", "error::scipy.l
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--method", "magic"), ("--method 'magic'", "auto, bundle, pose, position")),
+        (
+            ("--method", "magic"),
+            ("--method 'magic'", "auto, bundle, position, pose, image, hybrid, flightline"),
+        ),
+        (("--transform", "shear"), ("--transform 'shear'", "translation, similarity, affine, homography")),
+        (("--image-search", "all"), ("--image-search 'all'", "chain, overview")),
+        (("--optimiser", "luck"), ("--optimiser 'luck'", "anneal, surfaces")),
+        (("--lines", "eye"), ("--lines 'eye'", "heading, distance")),
+        (("--alpha", "1.5"), ("--alpha 1.5", "outside 0 to 1")),
+        (("--alpha", "-0.1"), ("--alpha -0.1", "outside 0 to 1")),
+        (("--alpha", "nan"), ("--alpha",)),
+        (("--method", "image", "--relief", "-1"), ("--relief", "outside")),
+        (("--relief", "3"), ("--relief is for --method image", "auto")),
+        (
+            ("--method", "pose", "--transform", "affine"),
+            ("--transform is for --method image or flightline", "pose"),
+        ),
+        (("--seed", "-1"), ("--seed", "outside")),
         (("--blend", "soft"), ("--blend 'soft'", "feather", "multiband")),
         (("--compress", "zip"), ("--compress 'zip'", "jpeg", "zstd")),
         (("--surface", "lidar"), ("--surface", "sweep, ties")),

@@ -33,12 +33,12 @@ class ByFlightline:
     across: Matcher
     """Matches between lines: the 50 best of every pair."""
     estimate: Estimator
-    """RANSAC by the symmetric transfer error per inlier."""
+    """RANSAC by the symmetric transfer error per inlier; A's transformation is the homography."""
     split: Literal["heading", "distance"] = "heading"
     """How lines are told apart: `distance` is A's; `heading` also ends a line where the course turns."""
     distortion: str = "none"
     """Order of the lens model; A corrects none."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: ClassVar[str] = "flightline"
 
     def __call__(
@@ -62,7 +62,7 @@ class ByFlightline:
         lens = [cameras[p.camera_key] for p in photos]
         work = _Work(method=self, photos=photos, lens=lens, features=features, notes=notes)
         strips = [s for line in lines for s in work.strips(line)]
-        whole = work.joined(strips, pairs_across(xy, [list(s) for s in strips]))
+        whole = work.joined(strips, self._pairs(order, xy, strips))
         poses, lost_too = _on_map(whole, xy, lens)
         alone = [i for s in strips for i in s if i not in whole]
         lost |= dict.fromkeys(alone, "nothing links its flight line to the others") | lost_too
@@ -78,6 +78,20 @@ class ByFlightline:
             work.notes,
         )
         return Alignment(**{**vars(placed), "rejected": lost})
+
+    def _pairs(
+        self, order: Sequence[int], xy: Array, strips: Sequence[dict[int, Array]]
+    ) -> list[tuple[int, int]]:
+        """Photos of different strips that may share ground: A's, and by heading also those on both sides of a turn.
+
+        Lines that only meet at their ends, around a field, have no triangles between them but obtuse ones.
+        """
+        pairs = pairs_across(xy, [list(s) for s in strips])
+        if self.split == "distance":
+            return pairs
+        strip_of = {i: k for k, s in enumerate(strips) for i in s}
+        turns = [(min(i, j), max(i, j)) for i, j in pairwise(order) if strip_of[i] != strip_of[j]]
+        return sorted({*pairs, *turns})
 
     def _lines(
         self, order: list[int], xy: Array, photos: Sequence[Photo]

@@ -55,20 +55,22 @@ def by_distance(xy: Array) -> list[list[int]]:
 
 
 def by_heading(xy: Array) -> list[list[int]]:
-    """Lines where the course, too, must stay within 45 degrees of the line's: an extension of the method.
+    """Lines where the course must stay within 45 degrees of the line's: an extension of the method.
 
-    A step belongs to a line when its distance is in range and it runs along the line so far. At a turn, the photo
-    that ends one line does not begin the next: that one begins with the step's end.
+    A step belongs to a line when it is not longer than A's range allows and runs along the line so far. That it is
+    not shorter either is not asked: positions err by metres, and a step back shows in the course. At a turn, the
+    photo that ends one line does not begin the next: that one begins with the step's end.
     """
     shooting = shooting_distances(xy)
-    low, high = shooting.range_m
+    # where all distances are alike, their range is no wider than the noise of positions
+    high = max(shooting.range_m[1], 1.5 * shooting.commonest_m)
     step = np.diff(xy, axis=0)
     lines: list[list[int]] = [[0]]
     for k, s in enumerate(step):
         line = lines[-1]
-        within = low - 1e-9 <= shooting.distance_m[k] <= high + 1e-9
+        within = bool(shooting.distance_m[k] <= high + 1e-9)
         if len(line) > 1 and within:
-            course = xy[line[-1]] - xy[line[max(0, len(line) - 4)]]
+            course = xy[line[-1]] - xy[line[max(0, len(line) - 7)]]
             within = float(course @ s) > np.cos(np.radians(TURN_DEG)) * np.linalg.norm(
                 course
             ) * np.linalg.norm(s)

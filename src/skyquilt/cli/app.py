@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from skyquilt import __version__
+from skyquilt.cli import calibrate as calibrate_command
 from skyquilt.cli import compare as compare_command
 from skyquilt.cli import fly as fly_command
 from skyquilt.cli import inspect as inspect_command
@@ -29,6 +30,7 @@ app.command("view", epilog=EXIT_CODES)(view_command.command)
 app.command("fly", epilog=EXIT_CODES)(fly_command.command)
 app.command("inspect", epilog=EXIT_CODES)(inspect_command.command)
 app.command("register", epilog=EXIT_CODES)(register_command.command)
+app.command("calibrate", epilog=EXIT_CODES)(calibrate_command.command)
 app.command("spectral-bench", epilog=EXIT_CODES)(spectral_bench_command.command)
 app.command("simulate", epilog=EXIT_CODES)(simulate_command.command)
 app.command("strip-test", epilog=EXIT_CODES)(strip_test_command.command)

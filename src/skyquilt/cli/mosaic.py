@@ -1,12 +1,15 @@
 """`skyquilt mosaic`: a folder of photos to a georeferenced orthomosaic."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
 from skyquilt.errors import UsageError
+
+if TYPE_CHECKING:
+    from skyquilt.model.event import Result
 
 
 def command(
@@ -62,8 +65,8 @@ def command(
     transform: Annotated[
         str | None,
         typer.Option(
-            help="How two photos may differ, for method image: translation, similarity, affine, homography.",
-            show_default="similarity",
+            help="How two photos may differ: translation, similarity, affine, homography.",
+            show_default="similarity for image, homography for flightline",
         ),
     ] = None,
     levelled: Annotated[
@@ -124,6 +127,17 @@ def command(
         bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")
     ] = True,
     features: Annotated[int, typer.Option(help="Features per photo.")] = 1500,
+    thermal: Annotated[
+        Path | None,
+        typer.Option(help="Folder of thermal photos: their map is laid on the visual one as thermal.tif."),
+    ] = None,
+    thermal_route: Annotated[
+        str,
+        typer.Option(
+            help="How the thermal map finds its place: maps (the pictures of both), heights (the surfaces under"
+            " them), positions (GPS alone), auto (the first that can be believed)."
+        ),
+    ] = "auto",
     jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.")] = 0,
     memory: Annotated[
         float | None, typer.Option(help="Memory to stay within, in GB.", show_default="1.2")
@@ -164,8 +178,34 @@ def command(
         distances=distances, height_m=height, heading_deg=heading, repair=repair, features=features,
         jobs=jobs, memory_gb=memory,
     )  # fmt: skip
-    events = iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
-    show(events, mode="quiet" if quiet else "json" if json else "verbose" if verbose else "normal")
+    if thermal is None:
+        events = iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
+    else:
+        from skyquilt.pipelines.thermal import iter_thermal
+
+        events = iter_thermal(
+            photos, thermal, output, settings, route=thermal_route, overwrite=overwrite, rerun_from=rerun_from
+        )
+    show(
+        events, mode="quiet" if quiet else "json" if json else "verbose" if verbose else "normal",
+        summary=None if thermal is None else with_thermal,
+    )  # fmt: skip
+
+
+def with_thermal(result: "Result") -> str:
+    """A mosaic in a few lines, and how the thermal map lies on it."""
+    from skyquilt.cli.progress import mosaic_summary
+
+    t = result.metrics["thermal"]
+    how = (
+        "its own positions alone"
+        if t["route"] == "positions"
+        else f"{t['route']}, {t['inliers']} places agree"
+    )
+    return (
+        f"{mosaic_summary(result)}\nthermal: {result.output / 'thermal.tif'} ({t['photos_used']} of"
+        f" {t['photos_total']} photos, placed by {how})"
+    )
 
 
 def parse_bounds(text: str | None) -> tuple[float, float, float, float] | None:

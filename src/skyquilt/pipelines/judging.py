@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -112,6 +113,7 @@ def figures(
         "vertical_datum": alignment.frame.vertical_datum,
         "size_px": [ground.grid.width, ground.grid.height],
         "area_m2": _round(float(seen.sum()) * cell, 1),
+        **_holes(seen, cell),
         "views_per_cell_mean": _round(float(drawn.views[seen].mean()) if seen.any() else None, 2),
         **alignment_figures(alignment, priors),
         "links": len(links.links),
@@ -121,6 +123,16 @@ def figures(
         "cameras": camera_figures(photos, alignment),
         "notes": list(notes),
     }  # fmt: skip
+
+
+def _holes(seen: NDArray[np.bool_], cell_m2: float) -> dict[str, float]:
+    """Places inside the map that no photo shows: how many, and their area in m2."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        np.pad(~seen, 1, constant_values=True).astype(np.uint8), connectivity=4
+    )
+    outside = labels[0, 0]
+    sizes = [int(stats[k, cv2.CC_STAT_AREA]) for k in range(1, count) if k != outside]
+    return {"holes": len(sizes), "holes_m2": round(sum(sizes) * cell_m2, 1)}
 
 
 def _reasons(reasons: Sequence[str]) -> dict[str, int]:

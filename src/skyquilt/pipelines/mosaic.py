@@ -77,6 +77,7 @@ def iter_mosaic(
     _apart(folder, output)
     survey, control = _read(folder, settings)
     distances = _known_distances(survey, control, settings)
+    in_order = _in_sequence(survey.photos, settings)
     run_id = run_key(survey, control, settings, parts)
     run = open_run(output, run_id, overwrite=overwrite, again=rerun_from is not None)
     store = Store(folder=run.store, registry=REGISTRY)
@@ -99,7 +100,7 @@ def iter_mosaic(
     links = yield from clock.stage("links", _links(taken, prior, parts, settings, store, jobs))
     known = placing.Known(
         intake=taken, frame=frame, priors=prior, links=links, control=control, pictures=pictures,
-        order=sequence_of([p.name for p in taken.photos], settings.sequence),
+        order=[i for _, i in sorted((in_order[p.name], i) for i, p in enumerate(taken.photos) if p.name in in_order)],
     )  # fmt: skip
     alignment = yield from clock.stage("align", placing.place(known, parts, settings, store))
     yield from (Note(text=n, warning=True) for n in alignment.notes)
@@ -125,7 +126,7 @@ def iter_mosaic(
         taken, alignment, prior, ground, pictures, distances, settings.alpha, known.order
     )
     seams, judged = yield from clock.stage(
-        "measure", _both(reporting.seams(compose, drawn, ground), judging_it)
+        "measure", _both(reporting.seams(compose, drawn, ground), judging_it), keeps=False
     )
     rejected = [*survey.rejected, *taken.rejected, *_unplaced(taken, alignment)]
     figures = judging.figures(
@@ -174,6 +175,12 @@ def _with_control(
         return survey, ()
     control, notes = read_gcp_list(gcp, [p.name for p in survey.photos])
     return replace(survey, notes=(*survey.notes, *notes)), control
+
+
+def _in_sequence(photos: Sequence[Photo], settings: MosaicSettings) -> dict[str, int]:
+    """Place in the sequence by the photo's name."""
+    names = [p.name for p in photos]
+    return {names[i]: k for k, i in enumerate(sequence_of(names, settings.sequence))}
 
 
 def _known_distances(

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,8 +16,8 @@ from skyquilt.photos.read import read_photo
 from skyquilt.raster.read_map import MapFile, open_map, read_reduced, read_window
 from skyquilt.spectral.metadata import from_metadata
 
-LONGEST_MAP = 2048
-"""Px of a map's longer side at which it is registered; it is resampled at its full size."""
+LONGEST = 2048
+"""Px of the longer side at which a photo or map is registered at most; it is resampled at its full size."""
 Window = Callable[[int, int, int, int], tuple[NDArray, NDArray[np.bool_]]]
 
 
@@ -31,7 +32,9 @@ class Source:
     width: int
     """Columns at full size."""
     picture: Picture
-    """What is registered; smaller than the file where that is a large map."""
+    """What is registered; smaller than the file where that is large."""
+    reduction: tuple[float, float]
+    """Px of the file per px of the picture, along x and y."""
     window: Window
     """(row, column, height, width) -> pixels and validity at full size."""
     photo: Photo | None = None
@@ -42,8 +45,7 @@ class Source:
     @property
     def full_S_picture(self) -> Matrix:
         """(3, 3) takes the picture's pixels to those of the file."""
-        rows, columns = self.picture.shape
-        x, y = self.width / columns, self.height / rows
+        x, y = self.reduction
         return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
 
     @property
@@ -80,22 +82,27 @@ def _of_photo(photo: Photo) -> Source:
         values = values[..., :3] if values.shape[2] > 3 else values[..., 0]
     values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
     valid = np.isfinite(values if values.ndim == 2 else values.sum(2, dtype=np.float32))
+    factor = min(1.0, LONGEST / max(values.shape[:2]))
+    small = values
+    if factor < 1:  # both axes alike, so that a similarity stays one
+        small = np.asarray(cv2.resize(values, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
 
     def window(row: int, column: int, height: int, width: int) -> tuple[NDArray, NDArray[np.bool_]]:
         part = (slice(row, row + height), slice(column, column + width))
         return values[part], valid[part]
 
     return Source(
-        path=photo.path, height=values.shape[0], width=values.shape[1], picture=Picture(values=values),
-        window=window, photo=photo,
+        path=photo.path, height=values.shape[0], width=values.shape[1], picture=Picture(values=small),
+        reduction=(1 / factor, 1 / factor), window=window, photo=photo,
     )  # fmt: skip
 
 
 def _of_map(place: MapFile) -> Source:
-    values, valid = read_reduced(place, LONGEST_MAP)
+    values, valid = read_reduced(place, LONGEST)
     return Source(
         path=place.path, height=place.height, width=place.width, place=place,
         picture=Picture(values=values, valid=valid),
+        reduction=(place.width / values.shape[1], place.height / values.shape[0]),
         window=lambda row, column, height, width: read_window(place, row, column, height, width),
     )  # fmt: skip
 

@@ -28,7 +28,7 @@ _MARGIN = 2
 
 def draw(output: Path, a: Source, b: Source, outcome: Registration) -> None:
     """Writes B on A's grid at full size, B's own pixels with their place, and the pictures."""
-    _resampled(output / "b_on_a.tif", a, b, outcome.b_H_a)
+    resample_onto(output / "b_on_a.tif", a, b, outcome.b_H_a)
     if not (b.photo and b.photo.unit):  # a virtual raster would show a radiometric photo's palette
         write_text(output / "b.vrt", _vrt(a, b, outcome.b_H_a))
     for name, picture in zip(OVERLAYS, overlays(a, b, outcome), strict=True):
@@ -79,8 +79,9 @@ def _reduced(source: Source) -> tuple[NDArray[np.uint8], Matrix]:
     factor = min(1.0, LONGEST_SHOWN / max(grey.shape))
     size = (round(grey.shape[1] * factor), round(grey.shape[0] * factor))
     small = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
-    x, y = size[0] / source.width, size[1] / source.height
-    return small, np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
+    x, y = size[0] / grey.shape[1], size[1] / grey.shape[0]
+    shrinking = np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
+    return small, shrinking @ np.linalg.inv(source.full_S_picture)
 
 
 def _apply(matrix: NDArray, px: NDArray) -> NDArray:
@@ -88,7 +89,7 @@ def _apply(matrix: NDArray, px: NDArray) -> NDArray:
     return np.asarray(moved[:, :2] / moved[:, 2:])
 
 
-def _resampled(path: Path, a: Source, b: Source, b_H_a: Matrix) -> None:
+def resample_onto(path: Path, a: Source, b: Source, b_H_a: Matrix) -> None:
     """B's values on A's pixels, bilinear, in pieces; A's place where it has one, else A's pixels."""
     sample = b.picture.values
     kind = sample.dtype.name if sample.dtype.name in ("uint8", "uint16") else "float32"

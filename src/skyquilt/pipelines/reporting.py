@@ -189,5 +189,7 @@ def _times(clock: Clock) -> dict[str, Any]:
     return {
         "seconds": {**clock.seconds, "total": round(clock.total(), 3)},
         "cpu_seconds": round(clock.cpu_total(), 3),
+        "cpu_seconds_of_stage": dict(clock.cpu),
+        "peak_memory_mb_of_stage": dict(clock.peak_mb),
         "peak_memory_mb": None if memory is None else round(memory, 1),
     }

@@ -39,6 +39,10 @@ class Clock:
     """When the run began: wall clock and CPU time in s, as `now` gives them."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall-clock time per stage in s."""
+    cpu: dict[str, float] = field(default_factory=dict)
+    """CPU time per stage in s."""
+    peak_mb: dict[str, float] = field(default_factory=dict)
+    """Largest resident memory up to the end of each stage in MB; empty on systems that do not tell."""
 
     @staticmethod
     def now() -> tuple[float, float]:
@@ -48,9 +52,12 @@ class Clock:
     def lap(self, stage: str, since: tuple[float, float]) -> None:
         """Notes a stage's time from an earlier `now`."""
         self.seconds[stage] = round(time.perf_counter() - since[0], 3)
+        self.cpu[stage] = round(cpu_seconds() - since[1], 3)
+        if (peak := peak_memory_mb()) is not None:
+            self.peak_mb[stage] = round(peak, 1)
 
-    def stage(self, name: str, work: Steps[T]) -> Generator[Event, None, T]:
-        """Runs a stage's steps as events and returns its result."""
+    def stage(self, name: str, work: Steps[T], *, keeps: bool = True) -> Generator[Event, None, T]:
+        """Runs a stage's steps as events and returns its result; `keeps` is False for one that stores none."""
         begun, hits, misses = self.now(), self.store.hits, self.store.misses
         yield StageStarted(stage=name, total=0)
         try:
@@ -68,7 +75,7 @@ class Clock:
         self.lap(name, begun)
         yield StageFinished(
             stage=name, seconds=self.seconds[name], cpu_seconds=round(cpu_seconds() - begun[1], 3),
-            reused=self.store.misses == misses and self.store.hits > hits,
+            reused=keeps and self.store.misses == misses and self.store.hits > hits,
         )  # fmt: skip
         return result
 

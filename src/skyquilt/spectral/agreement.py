@@ -14,7 +14,7 @@ from typing import ClassVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import gammaln, logsumexp
 
 from skyquilt.model.registration import Matrix
 from skyquilt.spectral.orientation import Fields, Orientation, warped
@@ -80,10 +80,10 @@ class Agree:
                     continue
                 around = padded[top : top + side + 2 * reach, left : left + side + 2 * reach]
                 score = _scores(around, target[part] * both[part][..., None])
-                y, x = divmod(int(score.argmax()), score.shape[1])
+                x, y = _summit(score)
                 yield (
                     self._rank(score), left + (side - 1) / 2, top + (side - 1) / 2,
-                    float(reach - x), float(reach - y),
+                    reach - x, reach - y,
                 )  # fmt: skip
 
     def _rank(self, score: NDArray) -> float:
@@ -111,8 +111,29 @@ def _scores(around: Fields, patch: Fields) -> NDArray[np.float32]:
     return np.asarray(product / np.sqrt(np.asarray(energy)[:rows, :columns] * own + 1e-6), np.float32)
 
 
+def _summit(score: NDArray[np.float32]) -> tuple[float, float]:
+    """Column and row of the highest place, between pixels by a parabola along each axis."""
+    row, column = divmod(int(score.argmax()), score.shape[1])
+    return (
+        column + _between(score[row, max(column - 1, 0) : column + 2]),
+        row + _between(score[max(row - 1, 0) : row + 2, column]),
+    )
+
+
+def _between(three: NDArray[np.float32]) -> float:
+    """Where a parabola through three values is highest, from the middle one; 0 at the border."""
+    if len(three) < 3:
+        return 0.0
+    bend = float(three[0] - 2 * three[1] + three[2])
+    return float(three[0] - three[2]) / (2 * bend) if bend < -1e-9 else 0.0
+
+
 def _fisher(ranks: NDArray[np.float64]) -> float:
-    """-log10 of the p-value of independent uniform ranks being this small together; 0 without any."""
+    """-log10 of the p-value of independent uniform ranks being this small together; 0 without any.
+
+    -2 sum of logs is chi-squared with 2 n degrees of freedom, whose tail is a sum of n terms of Poisson's.
+    """
     if not len(ranks):
         return 0.0
-    return float(-chi2.logsf(-2 * np.log(ranks).sum(), 2 * len(ranks)) / np.log(10))
+    half, k = -float(np.log(ranks).sum()), np.arange(len(ranks))
+    return float((half - logsumexp(k * np.log(half) - gammaln(k + 1))) / np.log(10)) if half > 0 else 0.0

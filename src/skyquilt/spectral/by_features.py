@@ -14,7 +14,7 @@ from skyquilt.model.estimate import Estimate, NoEstimate
 from skyquilt.model.features import Features, Matches
 from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registers, Registration
 from skyquilt.spectral.edges import THRESHOLDS, binary_edges, gradient_magnitude
-from skyquilt.spectral.usable import usable
+from skyquilt.spectral.usable import both_usable
 
 Outcome = Registration | RefusedRegistration
 Detector = Callable[[NDArray], Features]
@@ -76,7 +76,7 @@ class ByFeatures:
 
     def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
         """The registration of b to a; a guess is not used."""
-        if refused := unusable(a, b):
+        if isinstance(refused := both_usable(a, b), RefusedRegistration):
             return refused
         return self.relate(self.detect(a.values), self.detect(b.values), a.shape)
 
@@ -97,7 +97,7 @@ class Rfae:
 
     def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
         """The registration of b to a; a guess is not used."""
-        if refused := unusable(a, b):
+        if isinstance(refused := both_usable(a, b), RefusedRegistration):
             return refused
         in_a, in_b = self._features(a), self._features(b)
         return best([self.relate(fa, fb, a.shape) for fa in in_a for fb in in_b])
@@ -126,11 +126,3 @@ def best(outcomes: Sequence[Outcome]) -> Outcome:
     if accepted:
         return max(accepted, key=lambda o: o.q)
     return max(outcomes, key=lambda o: o.evidence.get("matches", 0.0))
-
-
-def unusable(a: Picture, b: Picture) -> RefusedRegistration | None:
-    """The refusal of pictures that show nothing."""
-    for name, picture in (("A", a), ("B", b)):
-        if not (found := usable(picture)):
-            return RefusedRegistration(reason=f"picture {name} {found.reason}")
-    return None

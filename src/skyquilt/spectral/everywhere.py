@@ -35,7 +35,7 @@ class Everywhere:
     """Largest one."""
     overlap: float = 0.4
     """Least overlap as a share of the smaller picture's valid area."""
-    per_turn: int = 3
+    per_turn: int = 2
     """Peaks kept of each rotation and scale."""
     version: ClassVar[int] = 1
 
@@ -75,7 +75,7 @@ class _Plane:
 
     @classmethod
     def of(cls, a: Orientation, b: Orientation) -> "_Plane":
-        reach = max(b.shape) + 0.6 * np.hypot(*a.shape)
+        reach = max(b.shape) + 0.35 * np.hypot(*a.shape)
         unit = 2 * _COARSE
         side = unit * scipy.fft.next_fast_len(int(np.ceil(reach / unit)))
         fields = np.conj(spectra(b.fields, (side, side)))

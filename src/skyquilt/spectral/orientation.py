@@ -48,18 +48,13 @@ class Orientation:
 
 def orientation(grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float) -> Orientation:
     """Fields of a picture (H, W) shrunken to the area of a square of `side` px (never enlarged)."""
-    height, width = grey.shape
-    factor = max(1.0, np.sqrt(height * width) / side)
-    size = (max(1, round(width / factor)), max(1, round(height / factor)))
-    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    share = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    small, whole, small_S_full = shrunken(grey, valid, side)
     inner = cv2.erode(
-        (share > 0.99).astype(np.float32), np.ones((MARGIN, MARGIN)),
-        borderType=cv2.BORDER_CONSTANT, borderValue=0,
-    )  # fmt: skip
+        whole.astype(np.float32), np.ones((MARGIN, MARGIN)), borderType=cv2.BORDER_CONSTANT, borderValue=0
+    )
     return Orientation(
         fields=_fields(cv2.GaussianBlur(small, (0, 0), BLUR), inner), valid=inner,
-        small_S_full=_shrinking(size[0] / width, size[1] / height),
+        small_S_full=small_S_full,
     )  # fmt: skip
 
 
@@ -82,8 +77,19 @@ def _surroundings(length: NDArray, valid: NDArray) -> NDArray[np.float32]:
     return np.asarray(rms + FLOOR * (np.median(inside) if inside.size else 0) + 1e-3 * (rms.max() or 1.0))
 
 
-def _shrinking(x: float, y: float) -> Matrix:
-    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
+def shrunken(
+    grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float
+) -> tuple[NDArray, NDArray[np.bool_], Matrix]:
+    """A picture and its validity (H, W) averaged down to the area of a square of `side` px (never enlarged), and the
+    (3, 3) that takes its pixels there. Both axes shrink alike, so a similarity stays one.
+    """
+    factor = min(1.0, side / float(np.sqrt(grey.size)))
+    small, share = (
+        np.asarray(cv2.resize(one, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
+        for one in (grey, valid.astype(np.float32))
+    )
+    off = (factor - 1) / 2
+    return small, share > 0.99, np.array([[factor, 0, off], [0, factor, off], [0, 0, 1.0]])
 
 
 def between(a: Orientation, b: Orientation, b_H_a: Matrix) -> Matrix:
@@ -109,12 +115,9 @@ def warped(a: Orientation, b_H_a: Matrix, shape: tuple[int, int]) -> tuple[Field
 
 def turned(fields: Fields, angle: float) -> Fields:
     """Fields whose orientations are turned by an angle in radians (x towards y); pixels stay."""
-    out = np.empty_like(fields)
-    for k in (0, 2):
-        c, s = np.float32(np.cos((k + 2) * angle)), np.float32(np.sin((k + 2) * angle))
-        out[..., k] = c * fields[..., k] - s * fields[..., k + 1]
-        out[..., k + 1] = s * fields[..., k] + c * fields[..., k + 1]
-    return out
+    turn = np.exp(np.array([2j, 4j]) * angle).astype(np.complex64)
+    out = np.ascontiguousarray(fields).view(np.complex64) * turn
+    return out.view(np.float32)
 
 
 def spectra(fields: Fields, shape: tuple[int, int]) -> NDArray[np.complex64]:

@@ -20,6 +20,7 @@ _LARGEST_GAIN = 20.0
 """Of the step's own scaling, which is unbounded where there is no correlation."""
 _STILL = 0.02
 """Px below which a step ends the search."""
+_PARAMETERS = {"similarity": 4, "affine": 6, "homography": 8}
 _LEAST = 50
 """Px of overlap below which there is nothing to fit."""
 
@@ -67,7 +68,7 @@ class Sharpen:
                     break
             else:
                 break
-            if np.abs(change[:2]).max() < _STILL:
+            if np.abs(change).max() < _STILL:
                 break
         return best
 
@@ -98,16 +99,21 @@ class _Frame:
         unit = max(shape) / 2
         y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
         return cls(
-            x=(x - np.float32(cx)) / np.float32(unit), y=(y - np.float32(cy)) / np.float32(unit), unit=unit,
+            x=(x - np.float32(cx)) / np.float32(unit), y=(y - np.float32(cy)) / np.float32(unit),
+            unit=unit,
             centre=np.array([[1, 0, cx], [0, 1, cy], [0, 0, 1.0]]),
         )  # fmt: skip
 
     def applied(self, p: NDArray[np.float64], freedom: Freedom) -> Matrix:
-        """A small transform of b's frame from its parameters."""
+        """A small transform of b's frame from its parameters: px of movement, at the middle or at the unit."""
+        q = np.zeros(6)
         if freedom == "similarity":
-            p = np.array([p[0], p[1], p[2], -p[3], p[3], p[2]])
-        perspective = -p[6:8] / self.unit if freedom == "homography" else np.zeros(2)
-        small = np.array([[1 + p[2], p[3], p[0]], [p[4], 1 + p[5], p[1]], [*perspective, 1.0]])
+            q[:4] = np.array([p[2], -p[3], p[3], p[2]]) / self.unit
+        else:
+            q[:4] = p[2:6] / self.unit
+        if freedom == "homography":
+            q[4:] = -p[6:8] / self.unit**2
+        small = np.array([[1 + q[0], q[1], p[0]], [q[2], 1 + q[3], p[1]], [q[4], q[5], 1.0]])
         return np.asarray(self.centre @ small @ np.linalg.inv(self.centre))
 
 
@@ -125,8 +131,8 @@ def _change(
     Jw, Jb = (J @ w).astype(np.float64), (J @ target).astype(np.float64)
     projected = np.linalg.solve(H, Jw)
     own, cross = float(w @ w) - Jw @ projected, float(target @ w) - Jb @ projected
-    if cross <= 0:
-        own, cross = own, float(target @ w)
+    if cross <= 0:  # the shift alone explains all: Evangelidis and Psarakis's second case, simplified
+        cross = float(target @ w)
     if cross <= 0:
         return None
     return np.asarray(np.linalg.solve(H, min(own / cross, _LARGEST_GAIN) * Jb - Jw))
@@ -137,20 +143,21 @@ def _derivatives(
 ) -> NDArray[np.float32]:
     """Derivatives (parameters, 4 n) of the warped fields at n pixels."""
     gx, gy = np.zeros_like(fields), np.zeros_like(fields)
-    gx[:, 1:-1] = (fields[:, 2:] - fields[:, :-2]) / 2
-    gy[1:-1] = (fields[2:] - fields[:-2]) / 2
-    gx, gy, w = gx[inside], gy[inside], fields[inside]
+    np.subtract(fields[:, 2:], fields[:, :-2], out=gx[:, 1:-1])
+    np.subtract(fields[2:], fields[:-2], out=gy[1:-1])
+    gx, gy, w = gx[inside] / 2, gy[inside] / 2, fields[inside]
     x, y = frame.x[inside][:, None], frame.y[inside][:, None]
-    unit = np.float32(frame.unit)
-    turn = 2 * np.stack([-w[:, 1], w[:, 0], -2 * w[:, 3], 2 * w[:, 2]], -1)
-    along = unit * (gx * x + gy * y)
+    # by what an orientation's own turning changes the fields, per px of movement at the unit's distance
+    turn = np.stack([-w[:, 1], w[:, 0], -2 * w[:, 3], 2 * w[:, 2]], -1) / np.float32(frame.unit)
+    J = np.empty((_PARAMETERS[freedom], *w.shape), np.float32)
+    np.negative(gx, out=J[0])
+    np.negative(gy, out=J[1])
     if freedom == "similarity":
-        columns = [-gx, -gy, -along, -unit * (gy * x - gx * y) + turn]
-    else:
-        columns = [
-            -gx, -gy, -unit * gx * x, -unit * gx * y - turn / 2, -unit * gy * x + turn / 2, -unit * gy * y
-        ]  # fmt: skip
+        J[2] = J[0] * x + J[1] * y
+        J[3] = J[1] * x - J[0] * y + 2 * turn
+        return J.reshape(4, -1)
+    J[2], J[3], J[4], J[5] = J[0] * x, J[0] * y - turn, J[1] * x + turn, J[1] * y
     if freedom == "homography":
-        columns += [-along * x, -along * y]
-    # parameters beyond the shift count px at the unit's distance, so their columns shrink by the unit
-    return np.stack([c.ravel() for c in columns])
+        along = J[0] * x + J[1] * y
+        J[6], J[7] = along * x, along * y
+    return J.reshape(len(J), -1)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.model.registration import Picture
+from skyquilt.model.registration import Picture, RefusedRegistration
 
 SHORTEST = 48
 """Px of the shorter side below which no patch of a picture could confirm its place."""
@@ -88,3 +88,12 @@ def _reason(grey: NDArray[np.float32], valid: NDArray[np.bool_]) -> str:
 def _unit(grey: NDArray[np.float32]) -> float:
     """1 for levels and counts; a twentieth for measured values of finer steps, such as degrees."""
     return 1.0 if np.array_equal(grey[::7, ::7], np.rint(grey[::7, ::7])) else 0.05
+
+
+def both_usable(a: Picture, b: Picture) -> tuple[Usable, Usable] | RefusedRegistration:
+    """Both pictures, or the refusal of the first that shows nothing."""
+    pair = usable(a), usable(b)
+    for name, one in zip("AB", pair, strict=True):
+        if not one:
+            return RefusedRegistration(reason=f"picture {name} {one.reason}")
+    return pair

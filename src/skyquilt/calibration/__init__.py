@@ -1,0 +1,1 @@
+"""Frames of a chess-board -> Camera [Yahyanejad 2013, 5.1, 6.3]."""

@@ -1,0 +1,78 @@
+"""How well a calibration knows its parameters."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.calibration.linearised import linearised
+from skyquilt.model.calibration import BoardPose, Sightings
+from skyquilt.model.camera import PARAMETERS, Camera
+
+Array = NDArray[np.float64]
+_FEWEST = 4
+
+
+def sigmas(
+    views: Sequence[Sightings], camera: Camera, poses: Sequence[BoardPose], columns: Sequence[int]
+) -> tuple[float, ...]:
+    """Standard deviations in the order of `PARAMETERS`, 0 for what was held (`columns` says what was not).
+
+    The largest of three: that of independent errors with the variance that the residuals show; one that lets
+    errors repeat in every view at the same mark of the board [the sandwich, clustered by mark], because a board
+    that is not quite flat or evenly heated is wrong in the same way in all views, and more views do not make it
+    right; and the jackknife over views, because errors of neighbouring squares of one view are akin.
+    """
+    own = len(columns)
+    size = own + 6 * len(views)
+    normal, total, count = np.zeros((size, size)), 0.0, 0
+    scores: dict[tuple[float, ...], Array] = {}
+    for k, (view, pose) in enumerate(zip(views, poses, strict=True)):
+        J, r = linearised(view, camera, pose, columns)
+        where = np.r_[0:own, own + 6 * k : own + 6 * k + 6]
+        flat = J.reshape(-1, own + 6)
+        normal[np.ix_(where, where)] += flat.T @ flat
+        total, count = total + float((r * r).sum()), count + r.size
+        for mark, score in zip(
+            map(tuple, np.round(view.board, 6)), np.einsum("nij,ni->nj", J, r), strict=True
+        ):
+            scores.setdefault(mark, np.zeros(size))[where] += score
+    scale = 1 / np.sqrt(
+        np.maximum(np.diag(normal), 1e-300)
+    )  # the parameters' units differ by many powers of ten
+    inverse = np.linalg.pinv(normal * scale * scale[:, None], hermitian=True) * scale * scale[:, None]
+    spare = max(count - size, 1)
+    independent = np.diag(inverse)[:own] * total / spare
+    moved = inverse[:own] @ np.array(list(scores.values())).T
+    few = len(scores) / max(len(scores) - own, 1) * (count - 1) / spare
+    repeated = (moved * moved).sum(1) * few
+    out = np.zeros(len(PARAMETERS))
+    by_view = _jackknife(views, camera, poses, columns)
+    out[list(columns)] = np.sqrt(np.maximum.reduce([independent, repeated, by_view, np.zeros(own)]))
+    return tuple(out.tolist())
+
+
+def _jackknife(
+    views: Sequence[Sightings], camera: Camera, poses: Sequence[BoardPose], columns: Sequence[int]
+) -> Array:
+    """Variances of the intrinsics from what leaving out one view after the other moves, to first order; zero for
+    fewer than four views.
+    """
+    own = len(columns)
+    if len(views) < _FEWEST or not own:
+        return np.zeros(own)
+    normals, scores = [], []
+    for view, pose in zip(views, poses, strict=True):
+        J, r = linearised(view, camera, pose, columns)
+        flat, e = J.reshape(-1, own + 6), r.ravel()
+        to_pose = np.linalg.lstsq(flat[:, own:], np.column_stack([flat[:, :own], e]), rcond=None)[0]
+        free = flat[:, :own] - flat[:, own:] @ to_pose[:, :own]  # what the pose cannot take up
+        normals.append(free.T @ free)
+        scores.append(free.T @ (e - flat[:, own:] @ to_pose[:, own]))
+    whole = np.sum(normals, 0)
+    scale = 1 / np.sqrt(np.maximum(np.diag(whole), 1e-300))
+    moved = []
+    for normal, score in zip(normals, scores, strict=True):
+        rest = (whole - normal) * scale * scale[:, None]
+        moved.append(np.linalg.pinv(rest, hermitian=True) @ (score * scale) * scale)
+    return np.asarray((np.array(moved) ** 2).sum(0) * (len(views) - 1) / len(views))

@@ -1,0 +1,81 @@
+"""`skyquilt calibrate`: frames of a chess-board to a calibrated camera."""
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from skyquilt.cli.interrupt import ends_at_once
+from skyquilt.errors import UsageError
+
+if TYPE_CHECKING:
+    from skyquilt.model.event import Result
+
+
+def command(
+    frames: Annotated[
+        Path, typer.Argument(help="Folder of frames, thermal or visible (subfolders included).")
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
+    board: Annotated[str, typer.Option(help="Squares (not corners) of the board, such as 7x6.")],
+    square: Annotated[float, typer.Option(help="Side of a square in m.")],
+    series: Annotated[
+        str,
+        typer.Option(
+            help="Frames of one pose, as when a lamp heats the board part by part, make one picture: auto (frames"
+            " between which the camera stood still), folders (each folder is a pose), views (never)."
+        ),
+    ] = "auto",
+    jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.", min=0)] = 0,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the results of another run in OUTPUT.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
+) -> None:
+    """Calibrate a lens from views of a chess-board; writes cameras.json as `mosaic --cameras` reads it."""
+    with ends_at_once():
+        from skyquilt.cli.progress import show
+        from skyquilt.pipelines.calibrate import CalibrateSettings, iter_calibrate
+
+    if quiet and json:
+        raise UsageError("--quiet and --json exclude one another")
+    columns, rows = parse_board(board)
+    settings = CalibrateSettings(columns=columns, rows=rows, square_m=square, series=series, jobs=jobs)
+    events = iter_calibrate(frames, output, settings, overwrite=overwrite)
+    show(events, mode="quiet" if quiet else "json" if json else "normal", summary=summary)
+
+
+def parse_board(text: str) -> tuple[int, int]:
+    """Columns and rows of squares.
+
+    Raises:
+        UsageError: it is not two numbers with an x between.
+    """
+    found = re.fullmatch(r"\s*(\d{1,3})\s*[xX×]\s*(\d{1,3})\s*", text)
+    if not found:
+        raise UsageError(f"--board is columns x rows in squares, such as 7x6; got {text!r}")
+    return int(found[1]), int(found[2])
+
+
+def summary(result: "Result") -> str:
+    """A calibration in a few lines."""
+    m = result.metrics
+    found, held = m["centres"], m["centres"]["held_out_px"]["centres"]
+    values = found["parameters"]
+    terms = [
+        f"{n} {values[n]['value']:+.4f} ± {values[n]['sigma']:.4f}" for n in values if values[n]["free"]
+    ][3:]
+    return "\n".join(
+        (
+            f"{m['views_used']} views ({m['frames']} frames), {found['points']} centres of squares",
+            f"focal length {values['focal']['value']:.2f} ± {values['focal']['sigma']:.2f} px, principal point"
+            f" ({values['cx']['value']:.1f}, {values['cy']['value']:.1f}), {', '.join(terms) or 'no distortion'}",
+            f"reprojection error {found['rms_px']:.3f} px (RMS), {held:.3f} px on views kept out;"
+            f" from corners {m['corners']['rms_px']:.3f} and {m['corners']['held_out_px']['corners']:.3f} px",
+            *(f"left out: {name}: {reason}" for name, reason in list(m["views_rejected"].items())[:10]),
+            f"camera: {result.output / 'cameras.json'}",
+            f"report: {result.output / 'report.html'}",
+        )
+    )
