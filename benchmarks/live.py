@@ -116,7 +116,8 @@ def seams(survey: Path, gsd: float) -> None:
     alignment = Alignment(
         method="live", why="", frame=live.members.frame,
         poses={k: m.pose for k, m in enumerate(members)},
-        cameras={m.camera: live.members.camera(m) for m in members}, camera_of={k: m.camera for k, m in enumerate(members)},
+        cameras={m.camera: live.members.camera(m) for m in members},
+        camera_of={k: m.camera for k, m in enumerate(members)},
         blocks=(tuple(range(len(members))),), ties=no_ties(),
     )  # fmt: skip
     rough = make_views(alignment, live.canvas.surface((-1, -1, 1, 1)))

@@ -127,9 +127,10 @@ def _links(job: Job, ledger: Ledger) -> list[Link]:
 def _whole(job: Job, links: Sequence[Link], features: Sequence[Features], store: Store) -> Closed:
     pictures = Pictures(job.photos, lambda i: read_color(job.photos[i]), store)
     done = Bundle()(job.photos, job.frame, job.priors, features, links, (), pictures)
+    xyz = _swept(done, pictures, job, store) if job.sweep else done.ties.xyz
     return Closed(
         ids=job.ids, poses={job.ids[k]: p for k, p in done.poses.items()}, cameras=dict(done.cameras),
-        camera_of={job.ids[k]: done.camera_of[k] for k in done.poses}, xyz=_swept(done, pictures, job, store) if job.sweep else done.ties.xyz,
+        camera_of={job.ids[k]: done.camera_of[k] for k in done.poses}, xyz=xyz,
     )  # fmt: skip
 
 
