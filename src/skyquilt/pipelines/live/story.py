@@ -264,7 +264,7 @@ class LiveMap:
         gsd = self.settings.gsd_cm / 100 if self.settings.gsd_cm else round_gsd(3 * above / photo.focal.px)
         ground = 0.0 if self.members.frame.vertical_datum == "takeoff" else float(prior.map_C[2]) - above
         ground = ground if np.isfinite(ground) else 0.0
-        self.canvas.gsd, self.canvas.ground, self.heights.cell = gsd, ground, max(0.02 * above, 4 * gsd)
+        self.canvas.gsd, self.canvas.ground, self.heights.cell = gsd, ground, max(0.04 * above, 4 * gsd)
         with self.ledger.change():
             self.ledger.put_meta("frame", asdict(self.members.frame))
             self.ledger.put_meta("gsd", gsd)
