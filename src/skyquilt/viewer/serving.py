@@ -31,6 +31,7 @@ def bound(host: str, port: int) -> socket.socket:
         raise UsageError(
             f"cannot listen on {host}:{port} ({error.strerror}); choose another --port or --host"
         ) from error
+    listening.listen(512)  # who comes before the server is up waits a moment
     return listening
 
 

@@ -4,24 +4,29 @@ The foreground goes on meanwhile; what it has placed since follows its neighbour
 """
 
 import multiprocessing
+import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.incremental import Incremental, Settled, Window
-from skyquilt.config import Methods
+from skyquilt.config import Methods, MosaicSettings
 from skyquilt.errors import AlignmentError, SkyquiltError
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import MapFrame, Pose, Prior
+from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior
+from skyquilt.model.surface import Surface
 from skyquilt.photos.pixels import read_color
+from skyquilt.pipelines.drawing import Ground, survey_ground
 from skyquilt.pipelines.intake import THUMBNAIL, Looked, Pictures
 from skyquilt.run.codec import decode
 from skyquilt.run.ledger import Ledger
@@ -56,6 +61,8 @@ class Job:
     """The store's folder."""
     methods: Methods
     """How features were found."""
+    sweep: bool
+    """Whether heights are swept from the pictures too, as the batch story does it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,7 +91,7 @@ def close(job: Job) -> Closed:
             links = _links(job, ledger)
         finally:
             ledger.close()
-        store = Store(folder=job.store, registry={c.__name__: c for c in (Looked, Features)})
+        store = Store(folder=job.store, registry={c.__name__: c for c in (Looked, Features, Surface)})
         features = [_features(p, store, job.methods) for p in job.photos]
         return _part(job, links, features) if job.held else _whole(job, links, features, store)
     except (AlignmentError, SkyquiltError, np.linalg.LinAlgError, ValueError) as error:
@@ -120,10 +127,36 @@ def _links(job: Job, ledger: Ledger) -> list[Link]:
 def _whole(job: Job, links: Sequence[Link], features: Sequence[Features], store: Store) -> Closed:
     pictures = Pictures(job.photos, lambda i: read_color(job.photos[i]), store)
     done = Bundle()(job.photos, job.frame, job.priors, features, links, (), pictures)
+    xyz = _swept(done, pictures, job, store) if job.sweep else done.ties.xyz
     return Closed(
         ids=job.ids, poses={job.ids[k]: p for k, p in done.poses.items()}, cameras=dict(done.cameras),
-        camera_of={job.ids[k]: done.camera_of[k] for k in done.poses}, xyz=done.ties.xyz,
+        camera_of={job.ids[k]: done.camera_of[k] for k in done.poses}, xyz=xyz,
     )  # fmt: skip
+
+
+def _swept(done: Alignment, pictures: Pictures, job: Job, store: Store) -> NDArray[np.float64]:
+    """(P, 3) the ground as the batch story finds it, at the nodes of its grid below the photos."""
+    steps = survey_ground(done, pictures, job.methods, MosaicSettings(), store)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            ground: Ground = end.value
+            break
+    surface = ground.surface
+    rows, columns = np.mgrid[: surface.z.shape[0], : surface.z.shape[1]]
+    xyz = np.column_stack(
+        [
+            surface.x0 + columns.ravel() * surface.cell,
+            surface.y0 + rows.ravel() * surface.cell,
+            surface.z.ravel(),
+        ]
+    )
+    seen = np.zeros(surface.z.shape, np.uint8)
+    for view in ground.views:
+        corners = (view.footprint - (surface.x0, surface.y0)) / surface.cell
+        cv2.fillPoly(seen, [np.rint(corners).astype(np.int32)], 1)
+    return np.asarray(xyz[seen.ravel() > 0], np.float64)
 
 
 def _part(job: Job, links: Sequence[Link], features: Sequence[Features]) -> Closed:
@@ -147,6 +180,8 @@ def _part(job: Job, links: Sequence[Link], features: Sequence[Features]) -> Clos
 def _serve(wire: Connection, other: Connection) -> None:
     """The process: one job, one answer; it ends when its parent is gone."""
     other.close()
+    with suppress(OSError, AttributeError):
+        os.nice(10)  # the foreground comes first
     try:
         wire.send(close(wire.recv()))
     except (EOFError, BrokenPipeError):

@@ -13,9 +13,9 @@ from skyquilt.pipelines.live.settings import LiveSettings
 from skyquilt.pipelines.live.story import LiveMap, Update
 from skyquilt.pipelines.live.watch import Watch
 
-IDLE_S = 0.03
+IDLE_S = 0.02
 """Between looks when nothing is to be done."""
-LOOK_S = 0.1
+LOOK_S = 0.05
 """Between looks into the folders."""
 FULL_S = 2.0
 """Pause when the disk is full."""

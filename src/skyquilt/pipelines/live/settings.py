@@ -13,6 +13,8 @@ CLOSING = 300
 """Blocks of at most so many photos are bundled as a whole in the background; of larger ones a part is."""
 PART = 120
 """Photos that move in such a part."""
+SWEEPING = 60
+"""Blocks of at most so many photos get their heights swept from the pictures when it is quiet."""
 GROWTH = 1.3
 """A block is bundled in the background when it has grown by this factor since."""
 

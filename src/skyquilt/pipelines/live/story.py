@@ -27,7 +27,7 @@ from skyquilt.pipelines.live.closing import Closed, Closing, Job, close
 from skyquilt.pipelines.live.drawing import NEWEST, Canvas
 from skyquilt.pipelines.live.intake import Accepted, Intake, Refused
 from skyquilt.pipelines.live.placing import Change, Placing, link_bytes
-from skyquilt.pipelines.live.settings import CLOSING, GROWTH, PART, LiveSettings
+from skyquilt.pipelines.live.settings import CLOSING, GROWTH, PART, SWEEPING, LiveSettings
 from skyquilt.pipelines.live.state import Member, Members, pose_from, pose_record
 from skyquilt.raster.tile_store import Address, TileStore
 from skyquilt.run.inbox import Inbox
@@ -110,6 +110,7 @@ class LiveMap:
         self._later: dict[Address, None] = {}
         self._drawn: dict[int, Pose] = {}
         self._to_draw: set[int] = set()
+        self._unfinished: dict[str, None] = {}
         self._fresh: dict[str, list[Address]] = {}
         self._closed_at: dict[int, int] = {}
         self._loop: int | None = None
@@ -199,6 +200,10 @@ class LiveMap:
             return self._place(self._received[0])
         if self._urgent:
             return self._draw(self._urgent, "")
+        if self._unfinished:
+            rule = next(iter(self._unfinished))
+            del self._unfinished[rule]
+            return Update(what="drawn", tiles=self._told(rule))
         if (done := self.closing.outcome()) is not None:
             return self._take_over(done)
         if self._untried and self.members.frame is not None:
@@ -375,10 +380,18 @@ class LiveMap:
                 self._dirty.pop(address, None)
                 self._later.setdefault(address)
         self._fresh.setdefault(rule, []).extend(some)
-        tiles = len(written)
         if not queue:
-            tiles += self._told(rule)
-        return Update(what="drawn", tiles=tiles)
+            self._tell_early(rule)
+        return Update(what="drawn", tiles=len(written))
+
+    def _tell_early(self, rule: str) -> None:
+        """Those who look on see the finest level at once; the coarser ones, and that it is drawn, follow."""
+        with self.ledger.lightly(), self.ledger.change():
+            for i in self._to_draw if not rule else ():
+                if not self._waits(i):
+                    self._tell_place(self.members.by_id[i])
+            self._tell_tiles(self._fresh.get(rule, []), rule)
+        self._unfinished[rule] = None
 
     def _told(self, rule: str) -> int:
         """The coarser levels, and the news for those who look on."""
@@ -401,12 +414,21 @@ class LiveMap:
         if member.pose is None or member.state == "superseded":
             self.ledger.set_photo(member.id, footprint="")
             return
-        outline = self.canvas.outline(member.id)
-        ring = [] if outline is None else self.members.lonlat(outline)
-        at = self.members.lonlat(member.pose.map_C[None, :2])[0]
+        ring, at = self._place_of(member)
         self.ledger.set_photo(member.id, footprint={"ring": ring, "at": at, "pose": pose_record(member.pose)})
         self._drawn[member.id] = member.pose
-        self._tell(member, ring=ring, at=at)
+
+    def _place_of(self, member: Member) -> tuple[list[list[float]], list[float]]:
+        """Footprint and centre in degrees."""
+        assert member.pose is not None
+        outline = self.canvas.outline(member.id)
+        ring = [] if outline is None else self.members.lonlat(outline)
+        return ring, self.members.lonlat(member.pose.map_C[None, :2])[0]
+
+    def _tell_place(self, member: Member) -> None:
+        if member.pose is not None and member.state != "superseded":
+            ring, at = self._place_of(member)
+            self._tell(member, ring=ring, at=at)
 
     def _tell(self, member: Member, **more: Any) -> None:
         photo = member.photo
@@ -451,7 +473,8 @@ class LiveMap:
             if not idle and self._loop is None and self._since_closing < PART // 4:
                 return None
             ids, held = self._around(root)
-        return self._job(ids, held, self.members.block_of.get(root, root), len(block))
+        swept = quiet and not held and len(ids) <= SWEEPING
+        return self._job(ids, held, self.members.block_of.get(root, root), len(block), sweep=swept)
 
     def _around(self, root: int) -> tuple[list[int], frozenset[int]]:
         """The photos nearest along links, and the ring of those beyond, which are held."""
@@ -465,7 +488,7 @@ class LiveMap:
         ids = list(reached)
         return sorted(ids), frozenset(ids[PART:])
 
-    def _job(self, ids: list[int], held: frozenset[int], block: int, size: int) -> Job | None:
+    def _job(self, ids: list[int], held: frozenset[int], block: int, size: int, *, sweep: bool) -> Job | None:
         members = [self.members.by_id[i] for i in ids]
         frame = self.members.frame
         if frame is None or any(m.prior is None for m in members):
@@ -480,7 +503,7 @@ class LiveMap:
             priors=tuple(m.prior for m in members if m.prior is not None), frame=frame,
             poses={m.id: m.pose for m in members if m.pose is not None}, cameras=cameras,
             camera_of={m.id: m.camera or m.photo.camera_key for m in members},
-            ground=self.canvas.ground, folder=self.folder, store=self.folder / STORE, methods=self.methods,
+            ground=self.canvas.ground, folder=self.folder, store=self.folder / STORE, methods=self.methods, sweep=sweep,
         )  # fmt: skip
 
     def _take_over(self, done: Closed) -> Update:

@@ -15,7 +15,7 @@ from skyquilt.run.write_points import reached
 
 ENDINGS = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
 PARTIAL = (".part", ".partial", ".tmp", ".crdownload", ".filepart")
-QUIET_S = 0.06
+QUIET_S = 0.04
 """A file whose data end is taken when it has not grown for so long."""
 PATIENCE_S = 4.0
 """A file that is cut off is refused when it has not grown for so long; it is looked at again when it changes."""
