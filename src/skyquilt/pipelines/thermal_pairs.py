@@ -1,7 +1,8 @@
 """Two blocks joined by their pairs [Yahyanejad 2013, 5.2.3, (5.7)].
 
-Visual and thermal photos whose footprints overlap most are registered one by one; their correspondences are carried
-into both maps by the poses and surfaces of their own blocks, and one transform is fitted to all, in balance.
+Visual and thermal photos that show the same ground are registered one by one, each laid flat by the pose and the
+surface of its own block, so that height no longer parts them. Their correspondences are then in both maps already, and
+one transform is fitted to all, in balance.
 """
 
 from dataclasses import replace
@@ -10,23 +11,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.geometry.camera import project
-from skyquilt.geometry.transforms import fit
-from skyquilt.imaging.views import View, on_ground
-from skyquilt.model.photo import RejectedPhoto
-from skyquilt.model.registration import Guess, RefusedRegistration, Registration
-from skyquilt.pipelines.pictures import open_picture
-from skyquilt.pipelines.register import outcome_of
+from skyquilt.config import registration_method
+from skyquilt.geometry.transforms import transfer
+from skyquilt.imaging.views import View
+from skyquilt.model.raster import Grid, Window
+from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registration
 from skyquilt.pipelines.scene import Scene
+from skyquilt.render.blend import First
+from skyquilt.render.compose import Composer
 from skyquilt.spectral.propagation import PairPoints, Propagate
 
 MOST_PAIRS = 24
-"""Pairs that are registered, spread over the map: each costs one to three seconds."""
+"""Pairs that are registered, spread over the map: each costs a third of a second of CPU."""
 LEAST_OVERLAP = 0.4
 """Share of the thermal footprint that the visual one must show."""
 _REACH_M = 6.0
 """By how much the positions of two flights may differ."""
-_GRID = 5
+_SIDE_PX = 640
+"""Longest side of the pictures that a pair is registered in: finer detail is shadows, which move."""
+_GRID = 6
 """Points per side by which a pair's transform is carried."""
 
 
@@ -38,9 +41,8 @@ def by_pairs(visual: Scene, thermal: Scene) -> Registration | RefusedRegistratio
         return RefusedRegistration(
             reason=f"{len(found)} of {len(asked)} overlapping pairs of photos could be registered"
         )
-    # correspondences are in px of the maps already: poses and surfaces carry them better than a homography would
     there = {p.a: np.eye(3) for p in found}, {p.b: np.eye(3) for p in found}
-    outcome = Propagate(model="affine")(found, *there)
+    outcome = Propagate(model="similarity")(found, *there)
     if isinstance(outcome, RefusedRegistration):
         return outcome
     told = {"pairs_tried": float(len(asked)), "pairs_registered": float(len(found))}
@@ -50,16 +52,19 @@ def by_pairs(visual: Scene, thermal: Scene) -> Registration | RefusedRegistratio
 def overlapping(visual: Scene, thermal: Scene) -> list[tuple[View, View]]:
     """For thermal photos spread over the map, the visual photo that shows most of each."""
     views = [v for v in thermal.ground.views if v.photo in thermal.alignment.held]
-    chosen = (
-        [views[k] for k in np.unique(np.linspace(0, len(views) - 1, MOST_PAIRS).astype(int))] if views else []
-    )
-    shift = np.subtract(thermal.alignment.frame.origin, visual.alignment.frame.origin)
+    spread = sorted({int(k) for k in np.linspace(0, len(views) - 1, MOST_PAIRS)} if views else set())
     found = []
-    for view in chosen:
-        shares = [_share(v.footprint, view.footprint + shift) for v in visual.ground.views]
+    for view in (views[k] for k in spread):
+        there = view.footprint + _shift(visual, thermal)
+        shares = [_share(v.footprint, there) for v in visual.ground.views]
         if shares and max(shares) > LEAST_OVERLAP:
             found.append((visual.ground.views[int(np.argmax(shares))], view))
     return found
+
+
+def _shift(visual: Scene, thermal: Scene) -> NDArray[np.float64]:
+    """(2,) m from the thermal block's frame to the visual one's."""
+    return np.subtract(thermal.alignment.frame.origin, visual.alignment.frame.origin)
 
 
 def _share(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
@@ -70,48 +75,54 @@ def _share(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 def _registered(visual: Scene, thermal: Scene, a: View, b: View) -> PairPoints | None:
     """Correspondences of one pair in px of both maps; None where it cannot be registered."""
-    one, other = (
-        open_picture(s.taken.photos[v.photo].path) for s, v in ((visual, a), (thermal, b))
+    low, high = b.footprint.min(0) - _REACH_M, b.footprint.max(0) + _REACH_M
+    gsd = max(float((high - low).max()) / _SIDE_PX, thermal.ground.grid.gsd)
+    width, height = (int(n) for n in np.ceil((high - low) / gsd))
+    grid_b = Grid(west=float(low[0]), north=float(high[1]), gsd=gsd, width=width, height=height)
+    shift = _shift(visual, thermal)
+    grid_a = replace(grid_b, west=grid_b.west + float(shift[0]), north=grid_b.north + float(shift[1]))
+    flat = _flat(visual, a, grid_a), _flat(thermal, b, grid_b)
+    if any(p.valid is None or p.valid.mean() < 0.1 for p in flat):
+        return None
+    guess = Guess(
+        b_H_a=np.eye(3), reach=_REACH_M / gsd / max(width, height), rotation_deg=3, scale=1.06,
+        source="the adjustments of both flights",
     )  # fmt: skip
-    if isinstance(one, RejectedPhoto) or isinstance(other, RejectedPhoto):
-        return None
-    guess = _guess(visual, thermal, a, b)
-    if guess is None:
-        return None
-    small = np.linalg.inv(other.full_S_picture) @ guess.b_H_a @ one.full_S_picture
-    outcome = outcome_of(one, other, "auto", replace(guess, b_H_a=small / small[2, 2]))
+    outcome = registration_method("auto")(*flat, guess)
     if not isinstance(outcome, Registration):
         return None
+    px_a, px_b = _points(flat, outcome)
     return PairPoints(
-        a=a.photo, b=b.photo, px_a=_on_map(visual, a, outcome.px_a), px_b=_on_map(thermal, b, outcome.px_b)
+        a=a.photo, b=b.photo, px_a=_on_map(visual, grid_a, px_a), px_b=_on_map(thermal, grid_b, px_b)
     )
 
 
-def _guess(visual: Scene, thermal: Scene, a: View, b: View) -> Guess | None:
-    """Where the adjustments of both blocks, each placed by its own positions, put the pair."""
-    px_b = _grid(b)
-    ground = on_ground(b, px_b, thermal.ground.surface)
-    ground[:, :2] += np.subtract(thermal.alignment.frame.origin, visual.alignment.frame.origin)
-    ground[:, 2] = visual.ground.surface.at(ground[:, 0], ground[:, 1])
-    px_a = project(a.camera, a.pose.to_camera(ground))
-    known = np.isfinite(px_a).all(1)
-    matrix = fit("similarity", px_a[known], px_b[known]) if known.sum() > 3 else None
-    if matrix is None:
-        return None
-    reach = _REACH_M * b.camera.focal / max(float(b.pose.map_C[2] - np.median(thermal.ground.surface.z)), 1.0)
-    return Guess(
-        b_H_a=matrix, reach=min(0.5, reach / max(b.camera.width, b.camera.height)),
-        source="the adjustments of both flights",
+def _flat(scene: Scene, view: View, grid: Grid) -> Picture:
+    """One photo on a grid, by its pose and its block's surface."""
+    photo = scene.taken.photos[view.photo]
+    compose = Composer(
+        grid=grid, views=[view], surface=scene.ground.surface, blend=First(), pixels=scene.pixels,
+        bands=photo.channels, dtype=np.dtype(photo.dtype),
     )  # fmt: skip
+    composed = compose(Window(row=0, column=0, height=grid.height, width=grid.width))
+    values = composed.pixels[..., 0] if photo.channels == 1 else composed.pixels
+    return Picture(values=values, valid=composed.photo >= 0)
 
 
-def _grid(view: View) -> NDArray[np.float64]:
-    x, y = (np.linspace(0.1, 0.9, _GRID) * n for n in (view.camera.width, view.camera.height))
-    gx, gy = np.meshgrid(x, y)
-    return np.column_stack([gx.ravel(), gy.ravel()]).astype(np.float64)
+def _points(
+    flat: tuple[Picture, Picture], outcome: Registration
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(n, 2) px of a and of b, spread over what both show."""
+    a, b = (np.asarray(p.valid) for p in flat)
+    x, y = (np.linspace(0, n - 1, 3 * _GRID) for n in (b.shape[1], b.shape[0]))
+    px_b = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2).astype(np.float64)
+    px_a = transfer(np.asarray(np.linalg.inv(outcome.b_H_a), np.float64), px_b)
+    inside = ((px_a > 0) & (px_a < [a.shape[1] - 1, a.shape[0] - 1])).all(1)
+    px_a, px_b = px_a[inside], px_b[inside]
+    both = a[tuple(np.round(px_a[:, ::-1]).astype(int).T)] & b[tuple(np.round(px_b[:, ::-1]).astype(int).T)]
+    return px_a[both], px_b[both]
 
 
-def _on_map(scene: Scene, view: View, px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pixels of a photo in px of its own map."""
-    ground = on_ground(view, px, scene.ground.surface)
-    return np.stack(scene.ground.grid.pixel(ground[:, 0], ground[:, 1]), 1)
+def _on_map(scene: Scene, grid: Grid, px: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels of a grid in px of the block's map."""
+    return np.stack(scene.ground.grid.pixel(grid.x(px[:, 0]), grid.y(px[:, 1])), 1)
