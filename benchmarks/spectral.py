@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.config import registration_method
+from skyquilt.config_register import registration_method
 from skyquilt.metrics.overlap_error import overlap_error
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.model.registration import Picture

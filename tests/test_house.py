@@ -109,3 +109,13 @@ def test_the_readme_states_the_defaults():
 
 def plain(name):
     return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def test_no_file_holds_both_sides_of_a_merge():
+    marks = re.compile(r"^(<{7} |={7}$|>{7} )", re.M)
+    kinds = ("*.py", "*.md", "*.toml", "*.txt", "*.j2", "*.css", "*.js", "Makefile")
+    folders = ("src", "tests", "docs", "benchmarks", "examples")
+    found = [p for k in kinds for f in folders for p in (ROOT / f).rglob(k)] + [
+        p for k in kinds for p in ROOT.glob(k)
+    ]
+    assert [str(p.relative_to(ROOT)) for p in found if marks.search(p.read_text(errors="replace"))] == []

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from skyquilt.model.poses import Alignment
     from skyquilt.photos.survey import read_survey
     from skyquilt.pipelines.mosaic import iter_mosaic, mosaic
+    from skyquilt.pipelines.register import register
 
 __version__ = "0.1.0"
 
@@ -30,6 +31,7 @@ _HOME = {
     "iter_mosaic": "skyquilt.pipelines.mosaic",
     "mosaic": "skyquilt.pipelines.mosaic",
     "read_survey": "skyquilt.photos.survey",
+    "register": "skyquilt.pipelines.register",
 }
 """Public name -> module that defines it."""
 
@@ -44,6 +46,7 @@ __all__ = [
     "iter_mosaic",
     "mosaic",
     "read_survey",
+    "register",
     "simulate",
 ]
 

@@ -1,7 +1,6 @@
 """Names and numbers -> methods: the one place where words on a command line become parts of a story."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,24 +15,16 @@ from skyquilt.alignment.overview import ByOverview
 from skyquilt.alignment.pose import ByPose, ByPosition
 from skyquilt.errors import UsageError
 from skyquilt.features.sift import Sift
-from skyquilt.features.surf import Surf
 from skyquilt.geometry.transforms import Model
 from skyquilt.matching.best import Best
 from skyquilt.matching.mutual import Mutual
-from skyquilt.matching.one_way import OneWay
-from skyquilt.metrics.registration_quality import spread_quality
-from skyquilt.model.registration import Registers
 from skyquilt.pairs.nearest import Nearest
 from skyquilt.pairs.retrieval import Retrieval
 from skyquilt.render.blend import Average, Blend, Feather, First, Multiband
 from skyquilt.render.exposure import Balance
-from skyquilt.spectral.auto import Auto
-from skyquilt.spectral.by_features import BetterByQ, ByFeatures, Outliers, Rfae
-from skyquilt.spectral.structure import Structure, StructureMatches
 from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints
 from skyquilt.twoview.levelled import Level
-from skyquilt.twoview.lmeds import Lmeds
 from skyquilt.twoview.ransac import Ransac
 from skyquilt.twoview.rescued import Rescued
 from skyquilt.twoview.ste import RansacSte
@@ -62,12 +53,6 @@ BLENDS: dict[str, type[Blend]] = {
 }
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
-REGISTRATIONS = ("auto", "sift", "surf", "usurf", "rfae", "rfae-sift", "surf+rfae", "structure")
-"""Ways to register two pictures of different spectra."""
-SAMPLES = 1000
-"""Most samples drawn for a similarity: enough for 7 % of right matches."""
-INLIERS = 9
-"""Fewest inliers of an accepted registration by the thesis's methods [Y 6.4.1]."""
 DISTORTIONS = ("none", "2", "4", "6", "6t")
 
 
@@ -143,15 +128,15 @@ class MosaicSettings:
     """Memory to stay within; None = 1.2."""
 
     def __post_init__(self) -> None:
-        _one_of("--method", self.method, METHODS)
-        _one_of("--surface", self.surface, SURFACES)
-        _one_of("--blend", self.blend, ("auto", *BLENDS))
-        _one_of("--compress", self.compress, COMPRESSIONS)
-        _one_of("--distortion", self.distortion or "4", DISTORTIONS)
-        _one_of("--transform", self.transform or "similarity", TRANSFORMS)
-        _one_of("--image-search", self.image_search, IMAGE_SEARCHES)
-        _one_of("--optimiser", self.optimiser, OPTIMISERS)
-        _one_of("--lines", self.lines, LINES)
+        one_of("--method", self.method, METHODS)
+        one_of("--surface", self.surface, SURFACES)
+        one_of("--blend", self.blend, ("auto", *BLENDS))
+        one_of("--compress", self.compress, COMPRESSIONS)
+        one_of("--distortion", self.distortion or "4", DISTORTIONS)
+        one_of("--transform", self.transform or "similarity", TRANSFORMS)
+        one_of("--image-search", self.image_search, IMAGE_SEARCHES)
+        one_of("--optimiser", self.optimiser, OPTIMISERS)
+        one_of("--lines", self.lines, LINES)
         for name, value, low, high in (
             ("--gsd", self.gsd_cm, 0.05, 10000), ("--quality", self.quality, 1, 100),
             ("--height", self.height_m, 0.5, 1e5), ("--memory", self.memory_gb, 0.5, 4096),
@@ -183,50 +168,8 @@ class MosaicSettings:
         return {k: str(v) if isinstance(v, Path) else v for k, v in table.items() if v is not None}
 
 
-@dataclass(frozen=True, kw_only=True)
-class RegisterSettings:
-    """Everything a registration of two pictures can be asked for."""
-
-    method: str = "auto"
-    """One of `REGISTRATIONS`."""
-    use_metadata: bool = True
-    """Whether metadata and places are tried first; what they say is a guess only."""
-
-    def __post_init__(self) -> None:
-        _one_of("--method", self.method, REGISTRATIONS)
-
-
-def registration_method(name: str) -> Registers:
-    """The registration that a word names, with the thesis's parameters [Y 5.2, Fig. 5.8]."""
-    _one_of("--method", name, REGISTRATIONS)
-    surf, sift = Surf(lobe=1, step=1), Sift(levels=43, root=False, longest=1000, count=3000)
-    structure = StructureMatches(
-        estimate=Ransac(model="similarity", minimum=INLIERS, threshold_px=4.0, max_iterations=5 * SAMPLES)
-    )
-    ways: dict[str, Callable[[], Registers]] = {
-        "auto": lambda: Auto(propose=structure),
-        "sift": lambda: ByFeatures(detect=sift, relate=_outliers()),
-        "surf": lambda: ByFeatures(detect=surf, relate=_outliers()),
-        "usurf": lambda: ByFeatures(detect=replace(surf, upright=True), relate=_outliers()),
-        "rfae": lambda: Rfae(detect=surf, relate=_outliers()),
-        "rfae-sift": lambda: Rfae(detect=sift, relate=_outliers()),
-        "structure": lambda: Structure(propose=structure),
-        "surf+rfae": lambda: BetterByQ(methods=(registration_method("surf"), registration_method("rfae"))),
-    }
-    return ways[name]()
-
-
-def _outliers() -> Outliers:
-    return Outliers(
-        match=OneWay(), quality=spread_quality,
-        estimators=(
-            Ransac(model="similarity", minimum=INLIERS, max_iterations=SAMPLES),
-            Lmeds(model="similarity", minimum=INLIERS, max_iterations=SAMPLES),
-        ),
-    )  # fmt: skip
-
-
-def _one_of(option: str, value: str, allowed: Any) -> None:
+def one_of(option: str, value: str, allowed: Any) -> None:
+    """Refuses a word that is none of those allowed."""
     if value not in allowed:
         raise UsageError(f"{option} {value!r} is not one of {', '.join(allowed)}")
 

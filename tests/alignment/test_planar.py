@@ -19,7 +19,7 @@ def space(yaw, pitch, roll, height=60.0):
 
 
 @settings(max_examples=60, deadline=None)
-@given(yaw=st.floats(-180, 180), pitch=st.floats(-12, 12), roll=st.floats(-12, 12), height=st.floats(10, 300))
+@given(yaw=st.floats(-180, 180), pitch=st.floats(-12, 12), roll=st.floats(-12, 12), height=st.floats(60, 300))
 def test_a_photo_in_space_over_level_ground_is_one_in_the_plane(yaw, pitch, roll, height):
     pose = space(yaw, pitch, roll, height)
     flat = planar_pose(map_H_cam_of(pose))

@@ -87,7 +87,7 @@ def run(monkeypatch, *words):
 @pytest.mark.parametrize(
     ("words", "code", "sentence"),
     [
-        (["--method", "magic"], 2, "auto, bundle, pose, position"),
+        (["--method", "magic"], 2, "auto, bundle, position, pose"),
         (["--blend", "magic"], 2, "feather, first, average, multiband"),
         (["--gsd", "0"], 2, "--gsd 0.0 lies outside"),
         (["--bounds", "1,2,3"], 2, "four numbers"),

@@ -265,7 +265,7 @@ KEYS = (
     "method", "photos_total", "photos_used", "photos_rejected", "gsd_m", "crs", "blocks", "gps_residual_rms_m",
     "gps_leave_one_out_rms_m", "reprojection_error_px", "tie_points", "seam_disparity_px", "metadata_conflicts",
     "seconds",
-    "cpu_seconds", "peak_memory_mb",
+    "cpu_seconds", "peak_memory_mb", "cpu_seconds_of_stage", "peak_memory_mb_of_stage",
 )  # fmt: skip
 
 

@@ -256,3 +256,14 @@ def test_events(files, tmp_path):
     events = iter_register(folder / "a.jpg", folder / "b.png", tmp_path / "out2")
     names = [type(e).__name__ for e in events]
     assert names == ["StageStarted", "StageFinished"] * 2 + ["Result"]
+
+
+def test_help_names_every_method():
+    from typer.testing import CliRunner
+
+    from skyquilt.cli.app import app
+    from skyquilt.config_register import REGISTRATIONS
+
+    told = CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(app, ["register", "--help"]).output
+    assert [name for name in REGISTRATIONS if name not in told] == []
+    assert "Exit codes" in told

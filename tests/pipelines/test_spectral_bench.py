@@ -134,7 +134,7 @@ def test_auto_on_the_real_pairs(tmp_path):
 @pytest.mark.slow
 def test_mirrored_real_pairs_are_refused():
     """The same pictures and places, but no transform of the family exists."""
-    from skyquilt.config import registration_method
+    from skyquilt.config_register import registration_method
     from skyquilt.model.registration import Picture
 
     if not REAL.is_file():

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from skyquilt.config import registration_method
+from skyquilt.config_register import registration_method
 from skyquilt.model.estimate import NoEstimate
 from skyquilt.model.registration import Guess, Picture, RefusedRegistration
 from skyquilt.spectral.structure import StructureMatches
@@ -20,7 +20,7 @@ def auto():
     return registration_method("auto")
 
 
-@pytest.mark.parametrize(("scale", "degrees"), [(0.85, 137.0), (1.2, -64.0), (1.0, 180.0)])
+@pytest.mark.parametrize(("scale", "degrees"), [(0.85, 137.0), (1.2, -64.0)])
 def test_any_rotation_is_found_to_a_part_of_a_pixel(auto, scale, degrees):
     truth = turned(scale, degrees, SHAPE, SHAPE, (9.0, -14.0))
     a, b = pair(truth, seed=int(degrees) % 7)
@@ -90,7 +90,8 @@ def test_a_good_guess_is_used_and_a_wrong_one_does_no_harm(auto):
         assert found and error(found.b_H_a, truth) < 0.5
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 8))])
+@pytest.mark.slow  # the quick tests have one in test_register
+@pytest.mark.parametrize("seed", range(8))
 def test_unrelated_pictures_are_refused_with_figures(auto, seed):
     a = np.clip(spectrum(layout(seed=seed), seed), 0, 255).astype(np.uint8)
     b = np.clip(spectrum(layout(seed=50 + seed), seed), 0, 255).astype(np.uint8)
@@ -147,6 +148,7 @@ def test_a_frame_of_noise_over_a_common_frame_is_refused(auto):
     assert not auto(Picture(values=a), Picture(values=b))
 
 
+@pytest.mark.slow
 def test_large_pictures_are_sharpened_at_a_finer_resolution(auto):
     """Without it a pixel of the verdict is seven of these pictures'."""
     shape = (1500, 2000)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from skyquilt.config import registration_method
+from skyquilt.config_register import registration_method
 from skyquilt.metrics.registration_quality import spread_quality
 from skyquilt.model.estimate import NoEstimate
 from skyquilt.model.features import DESCRIPTOR_UNIT, Features

@@ -198,3 +198,17 @@ def test_what_is_given_as_invalid_stays_so(scene):
 def test_colour_is_brightness(scene):
     rgb = np.dstack([scene, scene, scene])
     assert np.abs(usable(Picture(values=rgb)).grey - usable(Picture(values=scene)).grey).max() < 0.01
+
+
+def test_fishers_tail_is_scipys():
+    from scipy.stats import chi2
+
+    from skyquilt.spectral.agreement import _fisher
+
+    rng = np.random.default_rng(0)
+    for n in (1, 2, 9, 40):
+        ranks = rng.uniform(1e-4, 1, n)
+        assert np.isclose(
+            _fisher(ranks), -chi2.logsf(-2 * np.log(ranks).sum(), 2 * n) / np.log(10), rtol=1e-9
+        )
+    assert _fisher(np.zeros(0)) == 0.0 and _fisher(np.ones(3)) == 0.0

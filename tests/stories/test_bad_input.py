@@ -378,7 +378,9 @@ def test_negative_heights_by_pose(mosaic, photos):
     for path in named(photos):
         relabel(path, heights=-200.0)
     mosaic(photos, "--method", "pose", "--trust-metadata").refused(4, "--height")
-    told = mosaic(photos, "--method", "pose").made()  # image scale and positions tell the height
+    told = mosaic(
+        photos, "--method", "pose", output=photos.parent / "two"
+    ).made()  # image scale and positions tell the height
     assert told.metrics["photos_used"] == 9
 
 

@@ -8,12 +8,15 @@ from skyquilt import __version__
 from skyquilt.cli import calibrate as calibrate_command
 from skyquilt.cli import compare as compare_command
 from skyquilt.cli import depth as depth_command
+from skyquilt.cli import fly as fly_command
 from skyquilt.cli import inspect as inspect_command
+from skyquilt.cli import live as live_command
 from skyquilt.cli import mosaic as mosaic_command
 from skyquilt.cli import register as register_command
 from skyquilt.cli import simulate as simulate_command
 from skyquilt.cli import spectral_bench as spectral_bench_command
 from skyquilt.cli import strip_test as strip_test_command
+from skyquilt.cli import view as view_command
 
 EXIT_CODES = (
     "Exit codes: 0 done, 1 other errors, 2 wrong options, 3 no readable photo, 4 photos cannot be aligned,"
@@ -23,6 +26,9 @@ EXIT_CODES = (
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 app.command("mosaic", epilog=EXIT_CODES)(mosaic_command.command)
 app.command("compare", epilog=EXIT_CODES)(compare_command.command)
+app.command("live", epilog=EXIT_CODES)(live_command.command)
+app.command("view", epilog=EXIT_CODES)(view_command.command)
+app.command("fly", epilog=EXIT_CODES)(fly_command.command)
 app.command("inspect", epilog=EXIT_CODES)(inspect_command.command)
 app.command("register", epilog=EXIT_CODES)(register_command.command)
 app.command("depth", epilog=EXIT_CODES)(depth_command.command)

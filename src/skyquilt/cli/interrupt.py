@@ -16,7 +16,7 @@ def say() -> None:
     """The sentence, on standard error; a second Ctrl-C while the program goes down is ignored."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    resumable = "; run the same command again to resume" if sys.argv[1:2] == ["mosaic"] else ""
+    resumable = "; run the same command again to resume" if sys.argv[1:2] in (["mosaic"], ["live"]) else ""
     sys.stderr.write(f"skyquilt: interrupted{resumable}\n")
     sys.stderr.flush()
 

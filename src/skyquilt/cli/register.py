@@ -41,7 +41,7 @@ def command(
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
-        from skyquilt.config import RegisterSettings
+        from skyquilt.config_register import RegisterSettings
         from skyquilt.pipelines.register import iter_register
 
     if quiet and json:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from skyquilt import __version__
-from skyquilt.config import RegisterSettings, registration_method
+from skyquilt.config_register import RegisterSettings, registration_method
 from skyquilt.errors import RefusedError
 from skyquilt.metrics.registration_quality import spread_quality
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarted

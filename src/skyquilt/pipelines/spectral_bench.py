@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from skyquilt import __version__
-from skyquilt.config import REGISTRATIONS
+from skyquilt.config_register import REGISTRATIONS
 from skyquilt.errors import UsageError
 from skyquilt.metrics.overlap_error import overlap_error
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted

@@ -19,7 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.config import MosaicSettings, methods, registration_method
+from skyquilt.config import MosaicSettings, methods
+from skyquilt.config_register import registration_method
 from skyquilt.errors import RefusedError, UsageError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarted
 from skyquilt.model.photo import RejectedPhoto

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.config import registration_method
+from skyquilt.config_register import registration_method
 from skyquilt.geometry.transforms import transfer
 from skyquilt.imaging.views import View
 from skyquilt.model.raster import Grid, Window

@@ -1,5 +1,6 @@
 """Georeferenced rasters read by pieces or reduced: maps of ours or of other programs."""
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,7 +35,10 @@ def open_map(path: Path) -> MapFile | None:
     import rasterio
 
     try:
-        with rasterio.open(path) as raster:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # told by None
+            raster = rasterio.open(path)
+        with raster:
             placed = raster.crs is not None or not raster.transform.is_identity
             if not placed:
                 return None

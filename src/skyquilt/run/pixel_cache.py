@@ -47,6 +47,11 @@ class PixelCache:
             while sum(p.nbytes for p in self._kept.values()) > self.budget_bytes:
                 self._kept.popitem(last=False)
 
+    def peek(self, photo: int) -> NDArray | None:
+        """Pixels of a photo if they are at hand; nothing is decoded."""
+        with self._lock:
+            return self._kept.get(photo)
+
     def clear(self) -> None:
         """Forgets everything."""
         with self._lock:

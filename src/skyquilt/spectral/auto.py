@@ -6,6 +6,7 @@ from typing import ClassVar
 
 from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistration, Registration
 from skyquilt.spectral.candidates import Candidate, distinct
+from skyquilt.spectral.common_part import common_part
 from skyquilt.spectral.decision import Decide
 from skyquilt.spectral.distinctness import distinctness
 from skyquilt.spectral.everywhere import Everywhere
@@ -46,14 +47,12 @@ class Auto:
 
         A guess is tried first; where it is not confirmed the search goes on everywhere: metadata may lie.
         """
+        if guess is not None and (found := self._guided(a, b, guess)):
+            return found
         pictures = both_usable(a, b)
         if isinstance(pictures, RefusedRegistration):
             return pictures
         pyramid = Pyramid(a=pictures[0], b=pictures[1], sides=self.sides)
-        if guess is not None and (
-            found := self.decide(pyramid, self._best(pyramid, self._near(pyramid, guess)))
-        ):
-            return found
         matched = self.propose(*pictures).b_H_a
         first = [] if matched is None else [sharpened(pyramid, matched, _SELECT)]
         found = self.decide(pyramid, first)
@@ -61,6 +60,16 @@ class Auto:
             return found
         places = self._near(pyramid, same_view(a.shape, b.shape)) + self._anywhere(pyramid)
         return self.decide(pyramid, first + self._best(pyramid, places))
+
+    def _guided(self, a: Picture, b: Picture, guess: Guess) -> Registration | RefusedRegistration:
+        """The verdict on the neighbourhood of a guess, within what both pictures then share."""
+        part = common_part(a, b, guess)
+        pictures = both_usable(part.a, part.b)
+        if isinstance(pictures, RefusedRegistration):
+            return pictures
+        pyramid = Pyramid(a=pictures[0], b=pictures[1], sides=self.sides)
+        fits = self._best(pyramid, self._near(pyramid, part.guess))
+        return part.whole(self.decide(pyramid, fits))
 
     def _near(self, pyramid: Pyramid, guess: Guess) -> list[Matrix]:
         """Places near a guess, in px of the level that selects."""

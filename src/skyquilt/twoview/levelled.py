@@ -7,7 +7,6 @@ from typing import ClassVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from skyquilt.geometry.refine import refine
 from skyquilt.geometry.transforms import MINIMAL, fit, symmetric_transfer_errors, transfer
@@ -105,6 +104,11 @@ def depth_map(px: Doubles, d_px: Doubles, shape: tuple[int, int]) -> NDArray[np.
     Each is scaled from its least to its largest value, 0.5 where all are alike; between points linearly, outside of
     them as the nearest. All 0.5 where there is no point.
     """
+    from scipy.interpolate import (  # a tenth of a second that few need
+        LinearNDInterpolator,
+        NearestNDInterpolator,
+    )
+
     values = np.column_stack([d_px[:, 0], np.linalg.norm(d_px, axis=1), d_px[:, 1]])
     if not len(values):
         return np.full((*shape, 3), 0.5, np.float32)

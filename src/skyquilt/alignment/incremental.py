@@ -1,0 +1,218 @@
+"""One photo more: placed by its links to photos that are placed already, its neighbourhood settling around it.
+
+The work is bounded whatever the size of the map (part D of the methods): a window of the new photo, the photos it
+is linked to, and a ring of others that are held where they are. Calibrations stay; a bundle of the whole block,
+in the background, changes those.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.adjust import adjust
+from skyquilt.alignment.bundle import prune
+from skyquilt.alignment.problem import Problem, State
+from skyquilt.alignment.setup import HALF_TURN, Setup, pose_records, set_up
+from skyquilt.alignment.start import Start, plane_link
+from skyquilt.alignment.tracks import build_tracks, thin
+from skyquilt.alignment.triangulate import triangulated
+from skyquilt.geometry.camera import rays
+from skyquilt.model.camera import Camera
+from skyquilt.model.features import Features, Link
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Pose, Prior
+
+HELD_M, HELD_RAD = 1e-3, 1e-5
+"""Deviations of photos that are held."""
+DISAGREE = 0.12
+"""Links that put a photo further apart than this share of the flying height contradict each other."""
+TURNED = "/turned"
+"""End of the names of calibrations of files that were rewritten upside down."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Window:
+    """A new photo and its neighbourhood, by position in these lists."""
+
+    photos: Sequence[Photo]
+    """The photos; the new one is `new`."""
+    priors: Sequence[Prior]
+    """What their metadata say."""
+    features: Sequence[Features]
+    """Their keypoints."""
+    links: Sequence[Link]
+    """Links between them."""
+    poses: Mapping[int, Pose]
+    """Where those are that are placed."""
+    cameras: Mapping[str, Camera]
+    """Calibrations known so far, by name."""
+    camera_of: Mapping[int, str]
+    """Names of the calibrations of placed photos."""
+    new: int
+    """The photo to place; where it is placed already, the window only settles."""
+    held: frozenset[int]
+    """Placed photos that must not move."""
+    ground: float
+    """Height of the ground around in m."""
+    sigma_xy: float
+    """Deviation of positions in m that the map has shown, where worse than stated."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Settled:
+    """A window after its adjustment."""
+
+    poses: dict[int, Pose]
+    """New poses of the new photo and of those that were free to move."""
+    camera: str
+    """Name of the new photo's calibration."""
+    sightings: int
+    """Sightings that hold the new photo."""
+    xyz: NDArray[np.float64]
+    """(P, 3) points of the ground in m."""
+    dropped: tuple[tuple[int, int], ...]
+    """Links (a, b) that contradict the others."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Unsettled:
+    """Why the links do not place a photo: false in `if`."""
+
+    reason: str
+    """A phrase."""
+
+    def __bool__(self) -> bool:
+        return False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Incremental:
+    """Similarity from the links, then a bundle adjustment of the window."""
+
+    per_photo: int = 120
+    """Sightings per photo in the adjustment."""
+    least: int = 12
+    """Fewest sightings that hold a photo."""
+    version: ClassVar[int] = 1
+
+    def __call__(self, window: Window) -> Settled | Unsettled:
+        """Places the new photo and settles the free ones."""
+        plane = {i: _similarity(window, i) for i in window.poses}
+        dropped: tuple[tuple[int, int], ...] = ()
+        if window.new not in window.poses:
+            guess = _guess(window, plane)
+            if guess is None:
+                return Unsettled(reason="its links contradict each other")
+            plane[window.new], agreeing = guess
+            own = [(k.a, k.b) for k in window.links if window.new in (k.a, k.b)]
+            dropped = tuple(key for key in own if key not in agreeing)
+        links = [k for k in window.links if (k.a, k.b) not in dropped]
+        setup = _setup(window, plane, links)
+        tracks = setup.sensor_tracks(build_tracks(window.features, links))
+        sizes = [(p.width, p.height) for p in window.photos]
+        problem, state = setup.problem(thin(tracks, sizes, per_photo=self.per_photo))
+        if not len(problem.px):
+            return Unsettled(reason="no sightings are left")
+        problem, state = _adjusted(problem, triangulated(problem, state))
+        row = int(np.searchsorted(setup.members, window.new))
+        sightings = int((problem.photo == row).sum())
+        if sightings < self.least:
+            return Unsettled(reason=f"only {sightings} tie points hold it")
+        moved = {i: p for i, p in pose_records(setup, state).items() if i not in window.held}
+        key = window.photos[window.new].camera_key
+        return Settled(
+            poses=moved, camera=key + TURNED if setup.turned[window.new] else key, sightings=sightings,
+            xyz=state.X, dropped=dropped,
+        )  # fmt: skip
+
+
+def _adjusted(problem: Problem, state: State) -> tuple[Problem, State]:
+    """Ever narrower losses, pruning between."""
+    for loss, limit, tolerance in ((20.0, 40.0, 3e-2), (6.0, 12.0, 1e-2), (2.5, 5.0, 2e-3)):
+        state = adjust(problem.with_loss(loss), state, iterations=8, tolerance=tolerance, damping=1e-5).state
+        problem, state = prune(problem, state, limit)
+    return problem, adjust(problem.with_loss(2.0), state, iterations=6, tolerance=1e-3, damping=1e-6).state
+
+
+def _similarity(window: Window, i: int) -> tuple[complex, complex]:
+    """a and t of x + iy = a p + t that a placed photo is, near its centre (`similarity_graph`)."""
+    pose, photo = window.poses[i], window.photos[i]
+    centre = np.array([[(photo.width - 1) / 2, (photo.height - 1) / 2]])
+    step = np.array([[photo.focal.px / 4, 0.0]])
+    camera = window.cameras.get(window.camera_of.get(i, "")) or _ideal(photo)
+    direction = rays(camera, np.concatenate([centre, centre + step, centre - step])) @ pose.cam_R_map
+    down = np.minimum(direction[:, 2], -0.1)
+    reach = (window.ground - pose.map_C[2]) / down
+    xy = pose.map_C[:2] + direction[:, :2] * reach[:, None]
+    z = xy[:, 0] + 1j * xy[:, 1]
+    a = (z[1] - z[2]) / 0.5
+    # the centre's image in photo coordinates is 0 where the lens is ideal
+    return complex(a), complex(z[0])
+
+
+def _ideal(photo: Photo) -> Camera:
+    return Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
+
+
+def _guess(
+    window: Window, plane: Mapping[int, tuple[complex, complex]]
+) -> tuple[tuple[complex, complex], set[tuple[int, int]]] | None:
+    """The new photo's similarity that most of its links agree with, and those links."""
+    found: list[tuple[complex, complex, float, tuple[int, int]]] = []
+    for link in window.links:
+        other = link.b if link.a == window.new else link.a if link.b == window.new else None
+        if other is None or other not in plane:
+            continue
+        k = plane_link(link, window.photos, window.features)
+        a, t = plane[other]
+        if link.b == window.new:
+            own = a / k.b_S_a
+            found.append((own, a * k.p_a + t - own * k.p_b, k.weight, (link.a, link.b)))
+        else:
+            own = a * k.b_S_a
+            found.append((own, a * k.p_b + t - own * k.p_a, k.weight, (link.a, link.b)))
+    if not found:
+        return None
+
+    def near(x: tuple[complex, complex, float, tuple[int, int]]) -> list[int]:
+        limit = DISAGREE * abs(x[0])
+        return [n for n, y in enumerate(found) if abs(x[1] - y[1]) < limit and abs(x[0] - y[0]) < 2 * limit]
+
+    group = max((near(x) for x in found), key=lambda g: sum(found[n][2] for n in g))
+    weight = np.array([found[n][2] for n in group])
+    a = complex(np.exp(np.average(np.log([found[n][0] / found[group[0]][0] for n in group]), weights=weight)))
+    t = complex(np.average([found[n][1] for n in group], weights=weight))
+    return (a * found[group[0]][0], t), {found[n][3] for n in group}
+
+
+def _setup(window: Window, plane: Mapping[int, tuple[complex, complex]], links: Sequence[Link]) -> Setup:
+    """The adjustment's arrays: placed photos start where they are, held ones stay there."""
+    members = tuple(sorted(plane))
+    start = Start(
+        placed=dict(plane), blocks=(members,), links=tuple(links),
+        sigma_xy=dict.fromkeys(members, window.sigma_xy), georeferenced=frozenset(members), metric=True,
+    )  # fmt: skip
+    setup = set_up(window.photos, window.priors, start, distortion="none", repair=True)
+    turned = setup.turned.copy()
+    for i in window.poses:  # what a photo was found to be, it stays
+        turned[i] = window.camera_of.get(i, "").endswith(TURNED)
+    base = setup.base
+    R, C = setup.start_R.copy(), setup.start_C.copy()
+    R0, C0, sigma_R, sigma_C = base.R0.copy(), base.C0.copy(), base.sigma_R.copy(), base.sigma_C.copy()
+    for row, i in enumerate(setup.members.tolist()):
+        C[row, 2] += window.ground - setup.z_ground
+        if i in window.poses:
+            pose = window.poses[i]
+            R[row] = HALF_TURN @ pose.cam_R_map if turned[i] else pose.cam_R_map
+            C[row] = pose.map_C
+        if i in window.held:
+            R0[row], C0[row], sigma_R[row], sigma_C[row] = R[row], C[row], HELD_RAD, HELD_M
+    K0 = base.K0.copy()
+    for row, key in enumerate(setup.camera_keys):
+        if key in window.cameras:
+            K0[row] = window.cameras[key].vector
+    base = replace(base, R0=R0, C0=C0, sigma_R=sigma_R, sigma_C=sigma_C, K0=K0, free=np.zeros_like(base.free))
+    return replace(setup, base=base, start_R=R, start_C=C, turned=turned, z_ground=window.ground)

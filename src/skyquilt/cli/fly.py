@@ -1,0 +1,44 @@
+"""`skyquilt fly`: replays a flight into a live map."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from skyquilt.cli.interrupt import ends_at_once
+
+
+def command(
+    flight: Annotated[
+        Path, typer.Argument(metavar="FLIGHT", help="A simulated flight's folder, or one of photos.")
+    ],
+    to: Annotated[str, typer.Option("--to", help="Folder that is watched, or address of the live map.")],
+    rate: Annotated[float, typer.Option(help="Photos per second, all drones together.")] = 1.0,
+    drones: Annotated[int, typer.Option(help="Drones that share the flight.")] = 1,
+    loss: Annotated[float, typer.Option(help="Share of photos that never arrive, 0 to 0.95.")] = 0.0,
+    reorder: Annotated[float, typer.Option(help="Share of photos that arrive late, 0 to 1.")] = 0.0,
+    previews: Annotated[
+        bool, typer.Option("--previews", help="Small pictures first, full ones later.")
+    ] = False,
+    burst: Annotated[
+        float | None, typer.Option(help="Photos per second during half a minute in the middle.")
+    ] = None,
+    token: Annotated[
+        str | None, typer.Option(envvar="SKYQUILT_TOKEN", help="Secret of the live map.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of losses and order.")] = 0,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+) -> None:
+    """Send the photos of a flight as drones in the air would: in time, with losses, disorder, previews first."""
+    with ends_at_once():
+        from skyquilt.pipelines.live.flying import FlySettings, fly
+    settings = FlySettings(
+        rate=rate, drones=drones, loss=loss, reorder=reorder, previews=previews, burst=burst, seed=seed
+    )
+    count = 0
+    for sent in fly(flight, to, settings, token):
+        count += 1
+        if not quiet:
+            typer.echo(f"{sent.at_s:8.1f} s  drone {sent.drone}  {sent.name}  {sent.answer}")
+    if not quiet:
+        typer.echo(f"{count} files sent")

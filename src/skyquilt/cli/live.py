@@ -1,0 +1,80 @@
+"""`skyquilt live`: the map grows while the drones fly."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from skyquilt.cli.interrupt import ends_at_once
+
+Output = Annotated[Path, typer.Option("--output", "-o", help="Folder of the survey; the same again goes on.")]
+Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the viewer; 0 = a free one.")]
+Host = Annotated[str, typer.Option(help="Address to listen on; others than this machine's own need --token.")]
+
+
+def command(
+    inbox: Annotated[list[Path], typer.Argument(help="Folders that photos are copied into.")],
+    output: Output,
+    port: Port = 8080,
+    host: Host = "127.0.0.1",
+    token: Annotated[
+        str | None, typer.Option(envvar="SKYQUILT_TOKEN", help="Secret that uploads and layers must carry.")
+    ] = None,
+    gsd: Annotated[
+        float | None,
+        typer.Option(
+            help="Ground size of a pixel of the growing map in cm.", show_default="three times the photos'"
+        ),
+    ] = None,
+    crs: Annotated[str | None, typer.Option(help="CRS of the map.", show_default="local UTM")] = None,
+    reposition: Annotated[
+        bool, typer.Option("--reposition/--no-reposition", help="Whether later photos may move earlier ones.")
+    ] = True,
+    deterministic: Annotated[
+        bool,
+        typer.Option(
+            "--deterministic", help="Equal photos in equal order give equal poses, bit for bit; slower."
+        ),
+    ] = False,
+    finish: Annotated[
+        bool,
+        typer.Option(
+            "--finish", help="End when no photo comes any more, with the final map in OUTPUT/finished."
+        ),
+    ] = False,
+    base: Annotated[Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")] = None,
+    features: Annotated[int, typer.Option(help="Features per photo.")] = 1500,
+    max_mb: Annotated[float, typer.Option(help="Largest photo file in MB.")] = 500,
+    max_photos: Annotated[int, typer.Option(help="Most photos taken.")] = 100_000,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
+) -> None:
+    """Map photos as they arrive, and show the growing map in a browser.
+
+    Photos come into the folders INBOX or over HTTP; what was accepted survives any crash.
+    """
+    with ends_at_once():
+        from skyquilt.cli.live_progress import show_live
+        from skyquilt.pipelines.live.running import iter_live
+        from skyquilt.pipelines.live.settings import LiveSettings
+        from skyquilt.pipelines.live.story import LiveMap
+        from skyquilt.viewer.guard import Guard
+        from skyquilt.viewer.publishing import Publishing
+        from skyquilt.viewer.serving import Serving
+        from skyquilt.viewer.survey import LiveSurvey
+    settings = LiveSettings(
+        gsd_cm=gsd, crs=crs, reposition=reposition, deterministic=deterministic, features=features,
+        most_bytes=int(max_mb * 1e6), most_photos=max_photos,
+    )  # fmt: skip
+    guard = Guard(host=host, token=token)
+    live = LiveMap(output, settings)
+    try:
+        survey = LiveSurvey(output, base=base)
+        with (
+            Serving(survey=survey, guard=guard, folder=output, writer=live, port=port) as serving,
+            Publishing(LiveSurvey(output), output),
+        ):
+            events = iter_live(inbox, live, finish=finish)
+            show_live(events, serving.url, mode="quiet" if quiet else "json" if json else "normal")
+    finally:
+        live.close()

@@ -1,0 +1,30 @@
+"""`skyquilt view`: the viewer on a finished run, or on a survey that was or is being mapped live."""
+
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from skyquilt.cli.interrupt import ends_at_once
+from skyquilt.cli.live import Host, Port
+
+
+def command(
+    folder: Annotated[
+        Path, typer.Argument(metavar="OUTPUT", help="Folder of a finished run or of a live survey.")
+    ],
+    port: Port = 8080,
+    host: Host = "127.0.0.1",
+    base: Annotated[Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")] = None,
+) -> None:
+    """Show a map in a browser, with all photos that cover any point. Nothing is changed."""
+    with ends_at_once():
+        from skyquilt.viewer.guard import Guard
+        from skyquilt.viewer.serving import Serving
+        from skyquilt.viewer.survey import open_survey
+    survey = open_survey(folder, base=base)
+    guard = Guard(host=host, token="looking-only")  # nothing can be written: there is no writer
+    with Serving(survey=survey, guard=guard, folder=folder, port=port) as serving:
+        typer.echo(f"{serving.url} shows {folder}; Ctrl-C ends")
+        threading.Event().wait()

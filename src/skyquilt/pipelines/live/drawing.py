@@ -1,0 +1,215 @@
+"""The growing map drawn: a tile is a function of the photos that see it, so dirty ones are simply drawn anew."""
+
+import os
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.imaging.grey import shrink, to_grey8
+from skyquilt.imaging.views import View, footprint
+from skyquilt.model.camera import Camera
+from skyquilt.model.poses import Pose
+from skyquilt.model.raster import Window
+from skyquilt.model.surface import Surface
+from skyquilt.photos.pixels import Reduction, read_color
+from skyquilt.pipelines.live.state import Member
+from skyquilt.raster.tile_store import SIDE, Address, Tile, TileStore, covering
+from skyquilt.render.blend import Blend, Feather
+from skyquilt.render.compose import Composer
+from skyquilt.render.newest import Newest
+from skyquilt.run.executor import in_order
+from skyquilt.run.pixel_cache import PixelCache
+from skyquilt.run.write_points import reached
+from skyquilt.surface.cells import HeightCells
+
+NEWEST = "-newest"
+"""End of the names of layers that show the newest photo instead of the most vertical view."""
+SHARPNESS = 1.2
+"""Photo pixels per map pixel, along a side, of the pictures that are drawn."""
+MOST_VIEWS = 24
+"""Photos that a tile is composed from."""
+LEAST_MOVE = 0.6
+"""Map pixels by which a photo must have moved to be drawn again."""
+PICTURES_BYTES = 100_000_000
+"""Reduced pictures at hand."""
+THREADS = min(2, os.cpu_count() or 1)
+"""Tiles drawn side by side."""
+RULES: dict[str, Blend] = {"": Feather(width_px=2.0), NEWEST: Newest()}
+
+
+def layer_of(member: Member) -> str:
+    """The layer that shows a photo: one per spectrum."""
+    return member.photo.band
+
+
+class Canvas:
+    """Which photos see which tile, and the tiles themselves."""
+
+    def __init__(
+        self, tiles: TileStore, heights: HeightCells, full: PixelCache, members: dict[int, Member]
+    ) -> None:
+        self.tiles, self.heights, self.full, self.members = tiles, heights, full, members
+        self.gsd = 0.0
+        self.ground = 0.0
+        self._views: dict[int, View] = {}
+        self._seen: dict[int, tuple[Address, ...]] = {}
+        self._raised: set[Address] = set()
+        self._sizes: dict[int, int] = {}
+        self._by_tile: dict[Address, set[int]] = defaultdict(set)
+        self._pictures = PixelCache(read=self._reduced, budget_bytes=PICTURES_BYTES)
+
+    def _reduced(self, number: int) -> NDArray:
+        """A photo's pixels as small as the map needs them, one band or three."""
+        member = self.members[number]
+        longest = self._longest(member)
+        photo = member.photo
+        factor = max(photo.width, photo.height) / longest
+        ready = self.full.peek(number)
+        if ready is None:
+            step: Reduction = 8 if factor >= 8 else 4 if factor >= 4 else 2 if factor >= 2 else 1
+            ready = read_color(photo, reduction=step)
+        small = np.ascontiguousarray(shrink(ready, longest)[0])
+        if member.photo.band == "thermal" and member.photo.unit:
+            return small.astype(np.float32).reshape(*small.shape[:2], -1)[..., :1]
+        if small.dtype != np.uint8 or small.ndim == 2 or small.shape[2] < 3:
+            small = np.repeat(to_grey8(small)[..., None], 3, 2)
+        return np.ascontiguousarray(small[..., :3])
+
+    def _longest(self, member: Member) -> int:
+        """Longest side in px of the picture that is drawn, the same from the first time on."""
+        if member.id not in self._sizes:
+            self._sizes[member.id] = self._chosen(member)
+        return self._sizes[member.id]
+
+    def _chosen(self, member: Member) -> int:
+        photo, pose = member.photo, member.pose
+        above = float(pose.map_C[2]) - self.ground if pose is not None else 50.0
+        native = max(above, 1.0) / photo.focal.px
+        factor = max(1.0, self.gsd / (SHARPNESS * native))
+        return max(64, round(max(photo.width, photo.height) / factor))
+
+    def place(self, member: Member, camera: Camera) -> set[Address]:
+        """Takes note of where a photo is now; the tiles that may look different."""
+        assert member.pose is not None
+        old = self._seen.get(member.id, ())
+        view = self._view(member, camera, member.pose)
+        if view is None:
+            return self.remove(member.id)
+        low, high = view.footprint.min(0), view.footprint.max(0)
+        now = tuple(covering(layer_of(member), 0, self.gsd, (low[0], low[1], high[0], high[1])))
+        if len(now) > 4000:  # a photo that sees the horizon
+            return self.remove(member.id)
+        for address in old:
+            self._by_tile[address].discard(member.id)
+        for address in now:
+            self._by_tile[address].add(member.id)
+        self._views[member.id], self._seen[member.id] = view, now
+        return set(old) | set(now)
+
+    def remove(self, number: int) -> set[Address]:
+        """Forgets a photo; the tiles that may look different."""
+        old = self._seen.pop(number, ())
+        for address in old:
+            self._by_tile[address].discard(number)
+        self._views.pop(number, None)
+        return set(old)
+
+    def _view(self, member: Member, camera: Camera, pose: Pose) -> View | None:
+        longest = self._longest(member)
+        scale = longest / max(camera.width, camera.height)
+        w, h = (
+            (round(camera.width * scale), round(camera.height * scale))
+            if scale < 1
+            else (camera.width, camera.height)
+        )
+        scale = w / camera.width
+        small = replace(
+            camera, width=w, height=h, focal=camera.focal * scale, cx=(camera.cx + 0.5) * scale - 0.5,
+            cy=(camera.cy + 0.5) * scale - 0.5,
+        )  # fmt: skip
+        x, y, z = pose.map_C.tolist()
+        reach = 1.5 * abs(z - self.ground)
+        outline = footprint(small, pose, self.surface((x - reach, y - reach, x + reach, y + reach)))
+        return View(photo=member.id, camera=small, pose=pose, footprint=outline) if len(outline) else None
+
+    def surface(self, bounds: Iterable[float]) -> Surface:
+        """Heights over bounds in m."""
+        return self.heights.surface(bounds, self.ground)
+
+    def tiles_of(self, number: int) -> tuple[Address, ...]:
+        """Tiles of level 0 that a photo may show in."""
+        return self._seen.get(number, ())
+
+    def outline(self, number: int) -> NDArray[np.float64] | None:
+        """Footprint (k, 2) in m of a photo on the map."""
+        view = self._views.get(number)
+        return None if view is None else view.footprint
+
+    def moved(self, member: Member, drawn: Pose) -> bool:
+        """Whether a photo lies so far from where it was drawn that it shows."""
+        assert member.pose is not None
+        camera = member.photo
+        above = max(float(drawn.map_C[2]) - self.ground, 1.0)
+        shift = np.abs(member.pose.map_C - drawn.map_C).max()
+        turn = (
+            np.abs(member.pose.cam_R_map - drawn.cam_R_map).max()
+            * above
+            * (1 + camera.width / 2 / camera.focal.px)
+        )
+        return bool(max(shift, turn) > LEAST_MOVE * self.gsd)
+
+    def covering(self, x: float, y: float) -> list[int]:
+        """Photos whose footprint holds a point (m, map frame), the most vertical view first."""
+        found = []
+        for layer in {a.layer for a in self._by_tile}:
+            for address in covering(layer, 0, self.gsd, (x, y, x, y)):
+                found += list(self._by_tile.get(address, ()))
+        return sorted(set(found))
+
+    def draw(self, dirty: Sequence[Address], rule: str = "") -> list[Address]:
+        """Draws tiles of level 0 (addresses of the plain layer); returns those written; `finish` does the others."""
+        tiles = in_order(lambda a: self._tile(a, RULES[rule]), dirty, jobs=THREADS)
+        done = [(replace(a, layer=a.layer + rule), t) for a, t in zip(dirty, tiles, strict=True)]
+        fresh = [(a, t) for a, t in done if t is not None]
+        emptied = [(a, self._empty(a.layer)) for a, t in done if t is None and self.tiles.version(a) > 0]
+        written = [*fresh, *emptied]
+        self.tiles.put(written)
+        reached("tiles written")
+        self._raised.update(a for a, _ in written)
+        return [a for a, _ in written]
+
+    def finish(self) -> int:
+        """Makes the coarser tiles above all that was drawn since; returns how many."""
+        changed, self._raised = self._raised, set()
+        return self.tiles.raise_levels(changed) if changed else 0
+
+    def _tile(self, address: Address, blend: Blend) -> Tile | None:
+        grid = address.grid(self.gsd)
+        inside = [v for i in sorted(self._by_tile.get(address, ())) if (v := self._views.get(i)) is not None]
+        if len(inside) > MOST_VIEWS:
+            middle = np.array([grid.west + SIDE * self.gsd / 2, grid.north - SIDE * self.gsd / 2])
+            inside.sort(key=lambda v: float(np.hypot(*(v.pose.map_C[:2] - middle))))
+            inside = sorted(inside[:MOST_VIEWS], key=lambda v: v.photo)
+        if not inside:
+            return None
+        west, south, east, north = grid.bounds
+        rim = 8 * self.heights.cell
+        thermal = self._pictures(inside[0].photo).dtype == np.float32
+        compose = Composer(
+            grid=grid, views=inside, surface=self.surface((west - rim, south - rim, east + rim, north + rim)),
+            blend=blend, pixels=self._pictures, bands=1 if thermal else 3,
+            dtype=np.dtype(np.float32 if thermal else np.uint8),
+        )  # fmt: skip
+        done = compose(Window(row=0, column=0, height=SIDE, width=SIDE))
+        shown = done.photo >= 0
+        if thermal:
+            shown &= np.isfinite(done.pixels[..., 0])
+        return Tile(pixels=np.nan_to_num(done.pixels), shown=shown) if shown.any() else None
+
+    def _empty(self, layer: str) -> Tile:
+        thermal = layer.startswith("thermal")
+        pixels = np.zeros((SIDE, SIDE, 1), np.float32) if thermal else np.zeros((SIDE, SIDE, 3), np.uint8)
+        return Tile(pixels=pixels, shown=np.zeros((SIDE, SIDE), bool))

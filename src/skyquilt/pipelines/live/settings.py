@@ -1,0 +1,49 @@
+"""What a live map can be asked for."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from skyquilt.errors import UsageError
+
+NEIGHBOURS = 8
+"""Most placed photos that a new one is compared with."""
+YOUNG = 10
+"""Blocks of at most so many photos are bundled as a whole with every photo that joins."""
+CLOSING = 300
+"""Blocks of at most so many photos are bundled as a whole in the background; of larger ones a part is."""
+PART = 120
+"""Photos that move in such a part."""
+GROWTH = 1.3
+"""A block is bundled in the background when it has grown by this factor since."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LiveSettings:
+    """The defaults are meant to be right."""
+
+    gsd_cm: float | None = None
+    """Ground size of a pixel of the growing map in cm; None = about three times the photos' own."""
+    crs: str | None = None
+    """CRS of the map; None = the UTM zone of the first photo."""
+    reposition: bool = True
+    """Whether later photos may move earlier ones; False = no repositioning, as in the thesis (Y 4.1)."""
+    deterministic: bool = False
+    """Background work at fixed counts of photos and in line, so that equal photos in equal order give equal poses."""
+    features: int = 1500
+    """Features per photo, as the batch story takes them."""
+    most_bytes: int = 500_000_000
+    """Largest photo file in bytes."""
+    most_photos: int = 100_000
+    """Most photos accepted."""
+
+    def __post_init__(self) -> None:
+        for name, value, low, high in (
+            ("--gsd", self.gsd_cm, 0.05, 10000), ("--features", self.features, 100, 50000),
+            ("--max-photos", self.most_photos, 1, 10**7), ("--max-mb", self.most_bytes / 1e6, 0.01, 1e5),
+        ):  # fmt: skip
+            if value is not None and not low <= value <= high:
+                raise UsageError(f"{name} {value} lies outside {low} to {high}")
+
+    def shaping(self) -> dict[str, Any]:
+        """What must stay the same when a survey goes on after a restart."""
+        return {"reposition": self.reposition, "features": self.features, "deterministic": self.deterministic}

@@ -1,0 +1,240 @@
+"""Pictures of any part of a map, in any projection, from wherever its pixels are."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import Transformer
+
+from skyquilt.raster.tile_store import LEVELS, SIDE, Address, TileStore
+
+MERCATOR = 20037508.342789244
+"""Half the width of Web Mercator's world in m."""
+NODES = 16
+"""Pixels between exactly transformed points."""
+MOST_TILES = 80
+"""Tiles read for one picture."""
+Bounds = tuple[float, float, float, float]
+"""West, south, east, north."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Part:
+    """A piece of a map in its own projection."""
+
+    pixels: NDArray
+    """(h, w, bands)."""
+    shown: NDArray[np.bool_]
+    """(h, w)."""
+    west: float
+    """Left edge in m."""
+    north: float
+    """Top edge in m."""
+    gsd: float
+    """Size of a pixel in m."""
+
+
+class MapSource(Protocol):
+    """A map that can be read by parts."""
+
+    @property
+    def crs(self) -> str:
+        """Its projection."""
+
+    def bounds(self) -> Bounds | None:
+        """Its extent in its own projection; None while there is nothing."""
+
+    def part(self, bounds: Bounds, gsd: float) -> Part | None:
+        """Pixels over bounds, about as fine as `gsd`; None where nothing is."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TileSource:
+    """One layer of a growing map."""
+
+    tiles: TileStore
+    """The tiles."""
+    layer: str
+    """Its layer."""
+    crs: str
+    """Projection of the tiles."""
+    origin: tuple[float, float]
+    """Easting and northing of the frame's zero in m."""
+    gsd: float
+    """Pixels of level 0 in m."""
+
+    def bounds(self) -> Bounds | None:
+        """Extent of what the layer shows."""
+        found = self.tiles.extent(self.layer, self.gsd)
+        if found is None:
+            return None
+        x, y = self.origin
+        return found[0] + x, found[1] + y, found[2] + x, found[3] + y
+
+    def part(self, bounds: Bounds, gsd: float) -> Part | None:
+        """The level that is just finer than asked for, joined."""
+        level = int(np.clip(np.floor(np.log2(max(gsd / self.gsd, 1e-9)) + 0.25), 0, LEVELS - 1))
+        x, y = self.origin
+        west, south, east, north = bounds[0] - x, bounds[1] - y, bounds[2] - x, bounds[3] - y
+        while True:
+            size = SIDE * self.gsd * 2**level
+            r0, r1 = int(np.floor(-north / size)), int(np.floor(-south / size))
+            c0, c1 = int(np.floor(west / size)), int(np.floor(east / size))
+            if (r1 - r0 + 1) * (c1 - c0 + 1) <= MOST_TILES or level == LEVELS - 1:
+                break
+            level += 1
+        if (r1 - r0 + 1) * (c1 - c0 + 1) > MOST_TILES:
+            return None
+        found = {}
+        for r in range(r0, r1 + 1):
+            for c in range(c0, c1 + 1):
+                tile = self.tiles.get(Address(self.layer, level, r, c))
+                if tile is not None:
+                    found[r - r0, c - c0] = tile
+        if not found:
+            return None
+        like = next(iter(found.values())).pixels
+        shape = ((r1 - r0 + 1) * SIDE, (c1 - c0 + 1) * SIDE)
+        pixels, shown = np.zeros((*shape, like.shape[2]), like.dtype), np.zeros(shape, bool)
+        for (r, c), tile in found.items():
+            at = (slice(r * SIDE, (r + 1) * SIDE), slice(c * SIDE, (c + 1) * SIDE))
+            pixels[at], shown[at] = tile.pixels, tile.shown
+        return Part(
+            pixels=pixels, shown=shown, west=c0 * size + x, north=-r0 * size + y, gsd=self.gsd * 2**level
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FileSource:
+    """A finished map (GeoTIFF)."""
+
+    path: Path
+    """The file."""
+    _about: dict[str, object] = field(default_factory=dict)
+
+    def _open(self) -> dict[str, object]:
+        import rasterio
+
+        if not self._about:
+            with rasterio.open(self.path) as raster:
+                self._about.update(
+                    crs=raster.crs.to_string() if raster.crs else "", bounds=tuple(raster.bounds),
+                    bands=3 if raster.count >= 3 else 1,
+                )  # fmt: skip
+        return self._about
+
+    @property
+    def crs(self) -> str:
+        """Its projection; empty where it has none."""
+        return str(self._open()["crs"])
+
+    def bounds(self) -> Bounds | None:
+        """Its extent."""
+        west, south, east, north = self._open()["bounds"]  # type: ignore[misc]
+        return west, south, east, north  # type: ignore[has-type]
+
+    def part(self, bounds: Bounds, gsd: float) -> Part | None:
+        """Read through the file's overviews."""
+        import rasterio
+        from rasterio.windows import from_bounds
+
+        with rasterio.open(self.path) as raster:
+            west, south, east, north = (
+                max(bounds[0], raster.bounds.left), max(bounds[1], raster.bounds.bottom),
+                min(bounds[2], raster.bounds.right), min(bounds[3], raster.bounds.top),
+            )  # fmt: skip
+            if west >= east or south >= north:
+                return None
+            step = max(gsd, raster.res[0], max(east - west, north - south) / 4096)
+            h, w = max(1, round((north - south) / step)), max(1, round((east - west) / step))
+            window = from_bounds(west, south, west + w * step, north, raster.transform)
+            window = from_bounds(west, north - h * step, west + w * step, north, raster.transform)
+            bands = list(range(1, int(str(self._open()["bands"])) + 1))
+            pixels = raster.read(
+                bands, window=window, out_shape=(len(bands), h, w), boundless=True, fill_value=0
+            )
+            mask = raster.dataset_mask(window=window, out_shape=(h, w), boundless=True) > 0
+        moved = np.ascontiguousarray(np.moveaxis(pixels, 0, -1))
+        if moved.dtype.kind == "f":
+            mask &= np.isfinite(moved).all(-1)
+            moved = np.nan_to_num(moved).astype(np.float32)
+        return Part(pixels=moved, shown=mask, west=west, north=north, gsd=step)
+
+
+@lru_cache(maxsize=64)
+def between(source: str, target: str) -> Transformer:
+    """The transformation of coordinates (x, y) from one projection to another."""
+    return Transformer.from_crs(source, target, always_xy=True)
+
+
+def picture(
+    source: MapSource,
+    crs: str,
+    bounds: Bounds,
+    width: int,
+    height: int,
+    scale: tuple[float, float] | None = None,
+) -> NDArray[np.uint8] | None:
+    """RGBA (height, width, 4) of bounds in any projection; None where the map has nothing.
+
+    `scale`: values (degrees Celsius, counts) shown as black and as white, for measured values.
+    """
+    columns, rows = np.arange(-1, width // NODES + 2) * NODES, np.arange(-1, height // NODES + 2) * NODES
+    x = bounds[0] + (columns + 0.5) / width * (bounds[2] - bounds[0])
+    y = bounds[3] - (rows + 0.5) / height * (bounds[3] - bounds[1])
+    gx, gy = np.meshgrid(x, y)
+    mx, my = between(crs, source.crs).transform(gx, gy) if crs != source.crs else (gx, gy)
+    mx, my = np.asarray(mx, np.float64), np.asarray(my, np.float64)
+    extent = source.bounds()
+    if extent is None or not np.isfinite(mx).all() or not np.isfinite(my).all():
+        return None
+    box = (
+        max(mx.min(), extent[0]),
+        max(my.min(), extent[1]),
+        min(mx.max(), extent[2]),
+        min(my.max(), extent[3]),
+    )
+    if box[0] >= box[2] or box[1] >= box[3]:
+        return None
+    gsd = float(np.median(np.hypot(np.diff(mx, axis=1), np.diff(my, axis=1)))) / NODES
+    part = source.part(box, gsd)
+    if part is None:
+        return None
+    u = ((mx - part.west) / part.gsd - 0.5).astype(np.float32)
+    v = ((part.north - my) / part.gsd - 0.5).astype(np.float32)
+    u, v = (_dense(m, height, width) for m in (u, v))
+    colour = coloured(part.pixels, scale)
+    warped = cv2.remap(colour, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    alpha = cv2.remap(
+        part.shown.astype(np.uint8) * 255, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+    )
+    if not alpha.any():
+        return None
+    return np.dstack([warped.reshape(height, width, 3), alpha])
+
+
+def _dense(nodes: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
+    """Nodes at every NODES-th pixel, the first one at -NODES, interpolated at all pixels."""
+    c, r = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    return np.asarray(cv2.remap(nodes, c / NODES + 1, r / NODES + 1, cv2.INTER_LINEAR), np.float32)
+
+
+def coloured(pixels: NDArray, scale: Sequence[float] | None = None) -> NDArray[np.uint8]:
+    """RGB (h, w, 3) of a map's pixels; measured values from black over red and yellow to white."""
+    if pixels.dtype == np.uint8:
+        return pixels if pixels.shape[2] == 3 else np.repeat(pixels[..., :1], 3, 2)
+    values = pixels[..., 0].astype(np.float32)
+    low, high = scale if scale is not None else (float(values.min()), float(values.max()))
+    grey = np.clip((values - low) / max(high - low, 1e-6) * 255, 0, 255).astype(np.uint8)
+    return np.ascontiguousarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[..., ::-1])
+
+
+def mercator(z: int, x: int, y: int) -> Bounds:
+    """Bounds in EPSG:3857 of a tile."""
+    size = 2 * MERCATOR / 2**z
+    return x * size - MERCATOR, MERCATOR - (y + 1) * size, (x + 1) * size - MERCATOR, MERCATOR - y * size

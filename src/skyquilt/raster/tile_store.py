@@ -1,0 +1,264 @@
+"""The growing map: square tiles in the survey's own grid, with coarser levels, in one transactional file."""
+
+import sqlite3
+import threading
+import zlib
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import simplejpeg
+from numpy.typing import NDArray
+
+from skyquilt.errors import OutputError
+from skyquilt.model.raster import Grid
+from skyquilt.raster.halving import halve
+
+SIDE = 512
+"""Pixels of a tile's side."""
+LEVELS = 9
+"""Levels, each with pixels twice as large as the one before."""
+QUALITY = 90
+KEPT = 96
+"""Decoded tiles at hand."""
+TABLE = (
+    "create table if not exists tile(layer text, level integer, row integer, col integer, version integer not null,"
+    " body blob not null, primary key(layer, level, row, col)) without rowid"
+)
+
+
+@dataclass(frozen=True, order=True)
+class Address:
+    """Which tile: row counts southwards, column eastwards from the map frame's origin, in tiles of that level."""
+
+    layer: str
+    """Name of the layer."""
+    level: int
+    """0 = finest."""
+    row: int
+    """Southwards."""
+    col: int
+    """Eastwards."""
+
+    @property
+    def parent(self) -> "Address":
+        """The tile of the next coarser level that holds this one."""
+        return Address(self.layer, self.level + 1, self.row >> 1, self.col >> 1)
+
+    def children(self) -> list["Address"]:
+        """The four tiles below, row by row."""
+        return [
+            Address(self.layer, self.level - 1, 2 * self.row + r, 2 * self.col + c)
+            for r in (0, 1)
+            for c in (0, 1)
+        ]
+
+    def grid(self, gsd: float) -> Grid:
+        """Its pixels; `gsd` in m is that of level 0."""
+        size = gsd * 2**self.level
+        return Grid(
+            west=self.col * SIDE * size, north=-self.row * SIDE * size, gsd=size, width=SIDE, height=SIDE
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tile:
+    """A tile's content."""
+
+    pixels: NDArray
+    """(SIDE, SIDE, bands) uint8 or float32."""
+    shown: NDArray[np.bool_]
+    """(SIDE, SIDE) where there is anything."""
+
+
+def encoded(tile: Tile) -> bytes:
+    """Bytes of a tile: JPEG with a mask, or measured values without loss."""
+    mask = zlib.compress(np.packbits(tile.shown).tobytes(), 1)
+    if tile.pixels.dtype == np.uint8:
+        body = simplejpeg.encode_jpeg(np.ascontiguousarray(tile.pixels), quality=QUALITY, colorspace="RGB")
+        return b"J" + len(mask).to_bytes(4, "little") + mask + body
+    values = zlib.compress(np.ascontiguousarray(tile.pixels, np.float32).tobytes(), 1)
+    return b"F" + len(mask).to_bytes(4, "little") + mask + values
+
+
+def decoded(body: bytes) -> Tile:
+    """The tile of such bytes."""
+    n = int.from_bytes(body[1:5], "little")
+    mask = np.frombuffer(zlib.decompress(body[5 : 5 + n]), np.uint8)
+    shown = np.unpackbits(mask)[: SIDE * SIDE].reshape(SIDE, SIDE).astype(bool)
+    if body[:1] == b"J":
+        return Tile(pixels=np.asarray(simplejpeg.decode_jpeg(body[5 + n :])), shown=shown)
+    values = np.frombuffer(zlib.decompress(body[5 + n :]), np.float32).reshape(SIDE, SIDE, -1)
+    return Tile(pixels=values, shown=shown)
+
+
+class TileStore:
+    """Tiles by address; one writer, many readers."""
+
+    def __init__(self, path: Path, *, write: bool) -> None:
+        """Opens the file, which `write` makes where it is missing.
+
+        Raises:
+            OutputError: it cannot be opened.
+        """
+        self.path, self._lock = Path(path), threading.RLock()
+        self._extents: dict[str, tuple[tuple[int, int], tuple[float, float, float, float] | None]] = {}
+        self._kept: OrderedDict[Address, tuple[int, Tile]] = OrderedDict()
+        try:
+            uri = f"{self.path.absolute().as_uri()}?mode={'rwc' if write else 'ro'}"
+            self._db = sqlite3.connect(
+                uri, uri=True, timeout=30, check_same_thread=False, isolation_level=None
+            )
+            if write:
+                self._db.execute("pragma journal_mode=wal")
+                self._db.execute("pragma synchronous=full")
+                self._db.execute(TABLE)
+        except sqlite3.Error as error:
+            raise OutputError(f"{path} cannot be opened ({error})") from error
+
+    def version(self, address: Address) -> int:
+        """How often the tile was written; 0 where there is none."""
+        with self._lock:
+            found = self._db.execute(
+                "select version from tile where layer=? and level=? and row=? and col=?", _key(address)
+            ).fetchone()
+        return int(found[0]) if found else 0
+
+    def get(self, address: Address) -> Tile | None:
+        """The tile, or None."""
+        with self._lock:
+            found = self._db.execute(
+                "select version, body from tile where layer=? and level=? and row=? and col=?", _key(address)
+            ).fetchone()
+            if found is None:
+                return None
+            kept = self._kept.get(address)
+            if kept is not None and kept[0] == found[0]:
+                self._kept.move_to_end(address)
+                return kept[1]
+        tile = decoded(found[1])
+        with self._lock:
+            self._keep(address, int(found[0]), tile)
+        return tile
+
+    def _keep(self, address: Address, version: int, tile: Tile) -> None:
+        self._kept[address] = (version, tile)
+        while len(self._kept) > KEPT:
+            self._kept.popitem(last=False)
+
+    def put(self, tiles: Sequence[tuple[Address, Tile]]) -> None:
+        """Writes tiles, all in one transaction; the coarser ones above them are made by `raise_levels`.
+
+        Raises:
+            OutputError: the disk is full.
+        """
+        bodies = [(a, encoded(t)) for a, t in tiles]
+        with self._lock:
+            try:
+                self._db.execute("begin immediate")
+                for address, body in bodies:
+                    self._db.execute(
+                        "insert into tile values (?, ?, ?, ?, 1, ?) on conflict do update set"
+                        " version = version + 1, body = excluded.body",
+                        (*_key(address), body),
+                    )
+                self._db.execute("commit")
+            except sqlite3.Error as error:
+                if self._db.in_transaction:
+                    self._db.execute("rollback")
+                raise OutputError(
+                    f"the disk is full: {self.path} cannot grow ({error}). Make room; mapping goes on then"
+                ) from error
+
+    def raise_levels(self, changed: Iterable[Address]) -> int:
+        """Makes every coarser tile above those of level 0 that changed; returns how many."""
+        done: dict[Address, Tile] = {}
+        level = sorted(set(changed))
+        while level and level[0].level + 1 < LEVELS:
+            level = sorted({a.parent for a in level})
+            for parent in level:
+                tile = self._halved(parent, done)
+                if tile is not None:
+                    done[parent] = tile
+        self.put(list(done.items()))
+        return len(done)
+
+    def _halved(self, parent: Address, fresh: dict[Address, Tile]) -> Tile | None:
+        parts = [fresh.get(c) or self.get(c) for c in parent.children()]
+        like = next((p for p in parts if p is not None), None)
+        if like is None:
+            return None
+        half = SIDE // 2
+        pixels = np.zeros((SIDE, SIDE, like.pixels.shape[2]), like.pixels.dtype)
+        shown = np.zeros((SIDE, SIDE), bool)
+        for k, part in enumerate(parts):
+            if part is not None:
+                at = (slice(k // 2 * half, (k // 2 + 1) * half), slice(k % 2 * half, (k % 2 + 1) * half))
+                small, valid = halve(part.pixels, None if part.shown.all() else part.shown, "average")
+                pixels[at], shown[at] = small, True if valid is None else valid
+        return Tile(pixels=pixels, shown=shown)
+
+    def addresses(self, layer: str, level: int) -> list[Address]:
+        """All tiles of a level."""
+        with self._lock:
+            found = self._db.execute(
+                "select row, col from tile where layer=? and level=?", (layer, level)
+            ).fetchall()
+        return [Address(layer, level, int(r), int(c)) for r, c in found]
+
+    def layers(self) -> list[str]:
+        """Names of the layers that hold anything."""
+        with self._lock:
+            top = LEVELS - 1
+            found = self._db.execute("select distinct layer from tile where level=?", (top,)).fetchall()
+        return sorted(str(n) for (n,) in found)
+
+    def extent(self, layer: str, gsd: float) -> tuple[float, float, float, float] | None:
+        """West, south, east, north in m (map frame) of what a layer shows, to a few of its pixels; None if nothing."""
+        with self._lock:
+            stamp = (int(self._db.execute("pragma data_version").fetchone()[0]), self._db.total_changes)
+            known = self._extents.get(layer)
+        if known is not None and known[0] == stamp:
+            return known[1]
+        found = self._extent(layer, gsd)
+        self._extents[layer] = (stamp, found)
+        return found
+
+    def _extent(self, layer: str, gsd: float) -> tuple[float, float, float, float] | None:
+        """From the finest level that has only a handful of tiles."""
+        level = LEVELS - 1
+        while level > 0 and len(self.addresses(layer, level - 1)) <= 6:
+            level -= 1
+        boxes = []
+        for address in self.addresses(layer, level):
+            tile = self.get(address)
+            if tile is None or not tile.shown.any():
+                continue
+            grid = address.grid(gsd)
+            rows, columns = np.flatnonzero(tile.shown.any(1)), np.flatnonzero(tile.shown.any(0))
+            boxes.append((grid.west + columns[0] * grid.gsd, grid.north - (rows[-1] + 1) * grid.gsd,
+                          grid.west + (columns[-1] + 1) * grid.gsd, grid.north - rows[0] * grid.gsd))  # fmt: skip
+        if not boxes:
+            return None
+        low, high = np.min(boxes, axis=0), np.max(boxes, axis=0)
+        return float(low[0]), float(low[1]), float(high[2]), float(high[3])
+
+    def close(self) -> None:
+        """Closes the file."""
+        with self._lock:
+            self._db.close()
+
+
+def _key(address: Address) -> tuple[str, int, int, int]:
+    return address.layer, address.level, address.row, address.col
+
+
+def covering(layer: str, level: int, gsd: float, bounds: Iterable[float]) -> list[Address]:
+    """Tiles of a level that bounds (west, south, east, north) in m of the map frame touch; `gsd` of level 0."""
+    west, south, east, north = bounds
+    size = SIDE * gsd * 2**level
+    rows = range(int(np.floor(-north / size)), int(np.floor(-south / size)) + 1)
+    cols = range(int(np.floor(west / size)), int(np.floor(east / size)) + 1)
+    return [Address(layer, level, r, c) for r in rows for c in cols]

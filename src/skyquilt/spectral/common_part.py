@@ -1,0 +1,85 @@
+"""The parts of two pictures that a guess says they share.
+
+A thermal camera that sees the middle of a visible photo, or two maps of different extent, would otherwise be compared
+at different ground resolutions, as resolutions are chosen by the pictures' areas.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistration, Registration
+
+_WHOLE = 0.7
+"""Share of a picture above which it is left as it is."""
+_LEAST_PX = 96
+"""Px of the shorter side below which a part is not worth its loss."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CommonPart:
+    """Parts of both pictures, and where they lie."""
+
+    a: Picture
+    """Part of a."""
+    b: Picture
+    """Part of b."""
+    guess: Guess
+    """The guess in px of the parts."""
+    shift_a: NDArray[np.float64]
+    """(2,) column and row of the part's first pixel in a."""
+    shift_b: NDArray[np.float64]
+    """(2,) the same in b."""
+
+    def whole(self, outcome: Registration | RefusedRegistration) -> Registration | RefusedRegistration:
+        """A registration of the parts as one of the pictures."""
+        if isinstance(outcome, RefusedRegistration):
+            return outcome
+        matrix = _moved(self.shift_b) @ outcome.b_H_a @ _moved(-self.shift_a)
+        return replace(
+            outcome, b_H_a=matrix / matrix[2, 2], px_a=outcome.px_a + self.shift_a,
+            px_b=outcome.px_b + self.shift_b,
+        )  # fmt: skip
+
+
+def common_part(a: Picture, b: Picture, guess: Guess) -> CommonPart:
+    """What both pictures show if the guess is right to within its own reach."""
+    margin = guess.reach * max(b.shape)
+    scale = float(np.sqrt(abs(np.linalg.det(guess.b_H_a[:2, :2])))) or 1.0
+    in_a = _window(np.linalg.inv(guess.b_H_a), b.shape, margin / scale, a.shape)
+    in_b = _window(guess.b_H_a, a.shape, margin, b.shape)
+    shift_a, shift_b = (np.array([w[1].start, w[0].start], float) for w in (in_a, in_b))
+    matrix = _moved(-shift_b) @ guess.b_H_a @ _moved(shift_a)
+    part_b = _part(b, in_b)
+    return CommonPart(
+        a=_part(a, in_a), b=part_b, shift_a=shift_a, shift_b=shift_b,
+        guess=replace(guess, b_H_a=matrix / matrix[2, 2], reach=margin / max(part_b.shape)),
+    )  # fmt: skip
+
+
+def _window(
+    to_H_from: NDArray, source: tuple[int, int], margin: float, target: tuple[int, int]
+) -> tuple[slice, slice]:
+    """Rows and columns of `target` that the picture `source` covers, widened by a margin; all where that is most."""
+    height, width = source
+    ends = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1.0]]) @ to_H_from.T
+    everything = (slice(0, target[0]), slice(0, target[1]))
+    if (ends[:, 2] <= 0).any():
+        return everything
+    px = ends[:, :2] / ends[:, 2:]
+    low = np.clip(np.floor(px.min(0) - margin), 0, [target[1], target[0]]).astype(int)
+    high = np.clip(np.ceil(px.max(0) + margin), 0, [target[1], target[0]]).astype(int)
+    size = high - low
+    if size.min() < _LEAST_PX or size.prod() > _WHOLE * target[0] * target[1]:
+        return everything
+    return slice(int(low[1]), int(high[1])), slice(int(low[0]), int(high[0]))
+
+
+def _part(picture: Picture, window: tuple[slice, slice]) -> Picture:
+    valid = None if picture.valid is None else picture.valid[window]
+    return Picture(values=np.ascontiguousarray(picture.values[window]), valid=valid)
+
+
+def _moved(shift: NDArray[np.float64]) -> Matrix:
+    return np.array([[1, 0, shift[0]], [0, 1, shift[1]], [0, 0, 1.0]])

@@ -1,0 +1,115 @@
+"""Map pictures as bytes, kept until what they show changes."""
+
+import json
+import threading
+from collections import OrderedDict
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.raster.map_source import Bounds, MapSource, between, mercator, picture
+from skyquilt.viewer.survey import LiveSurvey, Survey
+
+KEPT = 3000
+"""Tiles kept in memory."""
+TILE = 256
+"""Pixels of a web tile's side."""
+
+
+def image_bytes(rgba: NDArray[np.uint8], form: str, *, transparent: bool = True) -> bytes:
+    """RGBA (h, w, 4) as PNG, WebP or JPEG; without transparency on white."""
+    if not transparent or form == "image/jpeg":
+        alpha = rgba[..., 3:].astype(np.uint16)
+        rgb = ((rgba[..., :3] * alpha + 255 * (255 - alpha)) // 255).astype(np.uint8)
+        picture_, bgr = rgb, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    else:
+        picture_, bgr = rgba, cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA)
+    options = {
+        "image/png": (".png", [cv2.IMWRITE_PNG_COMPRESSION, 1]),
+        "image/webp": (".webp", [cv2.IMWRITE_WEBP_QUALITY, 80]),
+        "image/jpeg": (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 85]),
+    }
+    ending, settings = options[form]
+    good, data = cv2.imencode(ending, bgr, settings)
+    if not good:
+        raise ValueError(f"a picture of {picture_.shape} cannot be written as {form}")
+    return data.tobytes()
+
+
+class Images:
+    """Web tiles of a survey."""
+
+    def __init__(self, survey: Survey) -> None:
+        self.survey = survey
+        self._kept: OrderedDict[tuple[str, int, int, int], bytes | None] = OrderedDict()
+        self._lock = threading.Lock()
+        self._known = survey.version()
+        self._scales: dict[str, tuple[int, tuple[float, float]]] = {}
+
+    def tile(self, layer: str, z: int, x: int, y: int) -> bytes | None:
+        """A web tile as WebP; None where the map has nothing."""
+        self._forget_changed()
+        key = (layer, z, x, y)
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                return self._kept[key]
+            before = self._known
+        source = self.survey.layers()[layer]
+        rgba = picture(source, "EPSG:3857", mercator(z, x, y), TILE, TILE, self.scale(layer, source))
+        data = None if rgba is None else image_bytes(rgba, "image/webp")
+        with self._lock:
+            if self._known == before:  # else it may have changed while it was drawn
+                self._kept[key] = data
+                while len(self._kept) > KEPT:
+                    self._kept.popitem(last=False)
+        return data
+
+    def scale(self, layer: str, source: MapSource) -> tuple[float, float] | None:
+        """Values shown as black and as white: the 2nd and 98th percentile of a measured layer, renewed as it grows."""
+        if not layer.startswith("thermal") and layer not in ("mosaic", "finished"):
+            return None
+        version = self.survey.version()
+        known = self._scales.get(layer)
+        if known is not None and version - known[0] < 50:
+            return known[1]
+        bounds = source.bounds()
+        part = (
+            None
+            if bounds is None
+            else source.part(bounds, max(bounds[2] - bounds[0], bounds[3] - bounds[1]) / 512)
+        )
+        if part is None or part.pixels.dtype == np.uint8 or not part.shown.any():
+            return None
+        low, high = np.percentile(part.pixels[..., 0][part.shown], [2, 98])
+        self._scales[layer] = (version, (float(low), float(high)))
+        return float(low), float(high)
+
+    def _forget_changed(self) -> None:
+        """Drops tiles that show what was drawn anew since the last look."""
+        survey = self.survey
+        if not isinstance(survey, LiveSurvey):
+            return
+        while told := survey.ledger.told(self._known):
+            changed = [json.loads(b) for _, kind, b in told if kind == "tiles"]
+            with self._lock:
+                for said in changed:
+                    self._drop(said)
+                self._known = told[-1][0]
+
+    def _drop(self, said: Mapping[str, object]) -> None:
+        box = said["bounds"]
+        assert isinstance(box, list)
+        west, south, east, north = between("EPSG:4326", "EPSG:3857").transform_bounds(*box)
+        for key in [
+            k
+            for k in self._kept
+            if k[0] == said["layer"] and _meets(mercator(*k[1:]), (west, south, east, north))
+        ]:
+            del self._kept[key]
+
+
+def _meets(a: Bounds, b: Bounds) -> bool:
+    return a[0] < b[2] and a[2] > b[0] and a[1] < b[3] and a[3] > b[1]

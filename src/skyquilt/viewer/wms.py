@@ -1,0 +1,179 @@
+"""WMS 1.1.1 and 1.3.0 (OGC 06-042): GetCapabilities, GetMap, GetFeatureInfo; QGIS and Mission Planner are clients."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from xml.sax.saxutils import escape
+
+from pyproj import CRS
+from pyproj.exceptions import CRSError
+
+from skyquilt.raster.map_source import Bounds, MapSource, between
+
+LARGEST = 4096
+"""Pixels of a picture's side."""
+FORMATS = ("image/png", "image/jpeg", "image/webp")
+
+
+class WmsError(Exception):
+    """What a client asked wrongly; `code` as the standard names it."""
+
+    def __init__(self, text: str, code: str = "InvalidParameterValue") -> None:
+        super().__init__(text)
+        self.code = code
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapRequest:
+    """A picture asked for."""
+
+    version: str
+    """1.1.1 or 1.3.0."""
+    layers: tuple[str, ...]
+    """Bottom first."""
+    crs: str
+    """As pyproj reads it."""
+    bounds: Bounds
+    """West, south, east, north in x, y order, whatever the CRS's own."""
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+    format: str
+    """One of `FORMATS`."""
+    transparent: bool
+    """Whether empty pixels stay transparent."""
+
+
+def asked(query: Mapping[str, str]) -> dict[str, str]:
+    """Parameters by upper-case name: WMS does not mind the case of names."""
+    return {k.upper(): v for k, v in query.items()}
+
+
+def map_request(query: Mapping[str, str], known: Mapping[str, MapSource]) -> MapRequest:
+    """The picture that parameters (upper-case names) ask for.
+
+    Raises:
+        WmsError: they do not fit.
+    """
+    version = "1.1.1" if query.get("VERSION", query.get("WMTVER", "1.3.0")).startswith("1.1") else "1.3.0"
+    layers = tuple(n for n in query.get("LAYERS", "").split(",") if n)
+    if not layers:
+        raise WmsError("LAYERS is missing", "LayerNotDefined")
+    for name in layers:
+        if name not in known:
+            raise WmsError(
+                f"there is no layer {name!r}; there are {', '.join(known) or 'none yet'}", "LayerNotDefined"
+            )
+    crs = query.get("CRS") or query.get("SRS") or ""
+    if crs not in supported(known):
+        raise WmsError(
+            f"CRS {crs!r} is none of {', '.join(supported(known))}",
+            "InvalidCRS" if version == "1.3.0" else "InvalidSRS",
+        )
+    width, height = (_whole(query, n) for n in ("WIDTH", "HEIGHT"))
+    form = query.get("FORMAT", "image/png").split(";")[0]
+    if form not in FORMATS:
+        raise WmsError(f"FORMAT {form!r} is none of {', '.join(FORMATS)}", "InvalidFormat")
+    return MapRequest(
+        version=version, layers=layers, crs="EPSG:4326" if crs == "CRS:84" else crs,
+        bounds=_bounds(query.get("BBOX", ""), crs, version), width=width, height=height, format=form,
+        transparent=query.get("TRANSPARENT", "FALSE").upper() == "TRUE",
+    )  # fmt: skip
+
+
+def _whole(query: Mapping[str, str], name: str) -> int:
+    text = query.get(name, "")
+    if not text.isascii() or not text.isdigit() or not 1 <= int(text[:9]) <= LARGEST:
+        raise WmsError(f"{name} is a whole number from 1 to {LARGEST}, got {text[:20]!r}")
+    return int(text)
+
+
+def _bounds(text: str, crs: str, version: str) -> Bounds:
+    try:
+        a, b, c, d = (float(v) for v in text.split(","))
+    except ValueError as error:
+        raise WmsError(f"BBOX is four numbers, got {text[:80]!r}") from error
+    if version == "1.3.0" and crs != "CRS:84" and northing_first(crs):
+        a, b, c, d = b, a, d, c
+    if not (a < c and b < d and all(abs(v) < 1e9 for v in (a, b, c, d))):
+        raise WmsError(f"BBOX holds no area: {text[:80]!r}")
+    return a, b, c, d
+
+
+def northing_first(crs: str) -> bool:
+    """Whether a CRS's own first axis is the northing or latitude, which WMS 1.3.0 follows."""
+    try:
+        return CRS.from_user_input(crs).axis_info[0].direction.lower() == "north"
+    except (CRSError, IndexError):
+        return False
+
+
+def supported(known: Mapping[str, MapSource]) -> list[str]:
+    """Projections that pictures come in."""
+    own = [s.crs for s in known.values() if s.crs.startswith("EPSG:")]
+    return list(dict.fromkeys(["EPSG:3857", "EPSG:4326", "CRS:84", *own]))
+
+
+def capabilities(known: Mapping[str, MapSource], url: str, version: str) -> str:
+    """The service's description."""
+    old = version.startswith("1.1")
+    crs_tag = "SRS" if old else "CRS"
+    layers = "".join(_layer(n, s, known, old=old) for n, s in known.items())
+    crs = "".join(f"<{crs_tag}>{c}</{crs_tag}>" for c in supported(known) if not (old and c == "CRS:84"))
+    href = escape(url, {chr(34): "&quot;"})
+    online = f'<OnlineResource xmlns:xlink="http://www.w3.org/1999/xlink" xlink:type="simple" xlink:href="{href}"/>'
+    get = f"<DCPType><HTTP><Get>{online}</Get></HTTP></DCPType>"
+    kind = "application/vnd.ogc.wms_xml" if old else "text/xml"
+    formats = "".join(f"<Format>{f}</Format>" for f in FORMATS)
+    root, end = (
+        ('<WMT_MS_Capabilities version="1.1.1">', "</WMT_MS_Capabilities>")
+        if old
+        else ('<WMS_Capabilities version="1.3.0" xmlns="http://www.opengis.net/wms">', "</WMS_Capabilities>")
+    )
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n' + root
+        + f"<Service><Name>{'OGC:WMS' if old else 'WMS'}</Name><Title>Skyquilt</Title>{online}</Service>"
+        + f"<Capability><Request><GetCapabilities><Format>{kind}</Format>{get}</GetCapabilities>"
+        + f"<GetMap>{formats}{get}</GetMap>"
+        + f"<GetFeatureInfo><Format>application/json</Format>{get}</GetFeatureInfo></Request>"
+        + f"<Exception><Format>{'application/vnd.ogc.se_xml' if old else 'XML'}</Format></Exception>"
+        + f"<Layer><Title>Skyquilt</Title>{crs}{layers}</Layer></Capability>" + end
+    )  # fmt: skip
+
+
+def _layer(name: str, source: MapSource, known: Mapping[str, MapSource], *, old: bool) -> str:
+    bounds = source.bounds()
+    boxes = ""
+    if bounds is not None:
+        west, south, east, north = between(source.crs, "EPSG:4326").transform_bounds(*bounds)
+        if old:
+            boxes = f'<LatLonBoundingBox minx="{west}" miny="{south}" maxx="{east}" maxy="{north}"/>'
+        else:
+            boxes = (
+                f"<EX_GeographicBoundingBox><westBoundLongitude>{west}</westBoundLongitude><eastBoundLongitude>{east}"
+                f"</eastBoundLongitude><southBoundLatitude>{south}</southBoundLatitude><northBoundLatitude>{north}"
+                "</northBoundLatitude></EX_GeographicBoundingBox>"
+            )
+        for crs in supported(known):
+            if old and crs == "CRS:84":
+                continue
+            box = list(between(source.crs, "EPSG:4326" if crs == "CRS:84" else crs).transform_bounds(*bounds))
+            if not old and crs != "CRS:84" and northing_first(crs):
+                box = [box[1], box[0], box[3], box[2]]
+            tag = "SRS" if old else "CRS"
+            boxes += f'<BoundingBox {tag}="{crs}" minx="{box[0]}" miny="{box[1]}" maxx="{box[2]}" maxy="{box[3]}"/>'
+    return f'<Layer queryable="1"><Name>{escape(name)}</Name><Title>{escape(name)}</Title>{boxes}</Layer>'
+
+
+def refusal(error: WmsError, version: str) -> str:
+    """An error as the standard writes it."""
+    old = version.startswith("1.1")
+    head = (
+        '<ServiceExceptionReport version="1.1.1">'
+        if old
+        else '<ServiceExceptionReport version="1.3.0" xmlns="http://www.opengis.net/ogc">'
+    )
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?>\n{head}<ServiceException code="{error.code}">{escape(str(error))}'
+        "</ServiceException></ServiceExceptionReport>"
+    )

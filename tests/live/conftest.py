@@ -1,0 +1,124 @@
+"""Small flights of known truth, and live maps served on this machine."""
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from skyquilt.pipelines.live.running import iter_live
+from skyquilt.pipelines.live.settings import LiveSettings
+from skyquilt.pipelines.live.story import LiveMap
+from skyquilt.simulate import FlightSettings, simulate
+from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.settings import Control, Reporting, Route
+from skyquilt.viewer.guard import Guard
+from skyquilt.viewer.serving import Serving
+from skyquilt.viewer.survey import LiveSurvey
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flight:
+    """A simulated flight."""
+
+    folder: Path
+    truth: dict[str, Any]
+
+    @property
+    def photos(self) -> list[Path]:
+        return sorted((self.folder / "photos").glob("*.jpg"))
+
+    def centre(self, name: str) -> np.ndarray:
+        """True camera centre (3,) in the CRS."""
+        return np.array(next(p["position"] for p in self.truth["photos"] if p["name"] == name))
+
+    def rotation(self, name: str) -> np.ndarray:
+        return np.array(next(p["cam_R_map"] for p in self.truth["photos"] if p["name"] == name))
+
+
+def made(folder: Path, **settings: Any) -> Flight:
+    """A flight of 480 x 360 px."""
+    for _ in simulate(FlightSettings(lens=Lens().scaled(480, 360), **settings), folder, overwrite=True):
+        pass
+    return Flight(folder=folder, truth=json.loads((folder / "truth" / "truth.json").read_text()))
+
+
+@pytest.fixture(scope="session")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    """Six photos in two lines."""
+    return made(
+        tmp_path_factory.mktemp("small"), seed=3, route=Route(photos=6), control=Control(points=0, checks=0)
+    )
+
+
+@pytest.fixture(scope="session")
+def drones(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    """Eighteen photos from two drones whose clocks are 40 s apart; one line reports its yaw 180 degrees off."""
+    return made(
+        tmp_path_factory.mktemp("drones"), seed=5, route=Route(photos=18, drones=2), control=Control(points=0, checks=0),
+        reporting=Reporting(clock_offsets=(0.0, 40.0), yaw_lie="tag"),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Served:
+    """A live map that runs, and a client."""
+
+    live: LiveMap
+    web: httpx.Client
+    url: str
+    folder: Path
+
+    def send(self, path: Path, name: str | None = None, **more: Any) -> httpx.Response:
+        return self.web.post("/photos", params={"name": name or path.name}, content=path.read_bytes(), **more)
+
+    def until(self, holds: Callable[[], bool], seconds: float = 60.0) -> None:
+        """Waits."""
+        for _ in range(int(seconds / 0.05)):
+            if holds():
+                return
+            threading.Event().wait(0.05)
+        raise AssertionError("it did not happen in time")
+
+    def states(self) -> dict[str, str]:
+        return {p["name"]: p["state"] for p in self.web.get("/photos").json()["photos"]}
+
+
+@contextmanager
+def served(
+    folder: Path,
+    settings: LiveSettings | None = None,
+    guard: Guard | None = None,
+    inbox: Path | None = None,
+    port: int = 0,
+) -> Iterator[Served]:
+    """A live map with its server and its mapping thread; all end with the block."""
+    live = LiveMap(folder, settings)
+    stop = threading.Event()
+    mapping = threading.Thread(
+        target=lambda: [None for _ in iter_live([inbox] if inbox else [], live, stop=stop)], daemon=True
+    )
+    guard = guard or Guard()
+    with Serving(survey=LiveSurvey(folder), guard=guard, folder=folder, writer=live, port=port) as serving:
+        mapping.start()
+        headers = {"X-Token": guard.token} if guard.token else {}
+        with httpx.Client(base_url=serving.url, headers=headers, timeout=60) as web:
+            try:
+                yield Served(live=live, web=web, url=serving.url, folder=folder)
+            finally:
+                stop.set()
+                mapping.join(60)
+                live.close()
+
+
+def offsets(live: LiveMap, flight: Flight) -> np.ndarray:
+    """Errors (n, 3) in m of the centres of all photos on the map, their common shift removed."""
+    origin = np.array([*live.members.frame.origin, 0.0])
+    found = [m.pose.map_C + origin - flight.centre(m.photo.name) for m in live.members.on_map()]
+    return np.array(found) - np.median(found, axis=0)

@@ -1,0 +1,173 @@
+"""A real browser drives the viewer."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import sync_playwright
+
+from skyquilt.pipelines.live.settings import LiveSettings
+from tests.live.conftest import served
+
+pytestmark = pytest.mark.slow
+QUICK = LiveSettings(features=600)
+SHOTS = os.environ.get("SKYQUILT_SCREENSHOTS")
+"""A folder to keep screenshots in, for a person to look at."""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("no Chromium is installed: apt install chromium")
+    with sync_playwright() as play:
+        chromium = play.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def page(browser):
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    page = context.new_page()
+    page.errors = []
+    page.on("pageerror", lambda error: page.errors.append(str(error)))
+    page.on("dialog", lambda dialog: (page.errors.append(dialog.message), dialog.dismiss()))
+    yield page
+    context.close()
+
+
+def shot(page, name):
+    if SHOTS:
+        page.screenshot(path=str(Path(SHOTS) / f"{name}.png"))
+
+
+def holds(page, expression, seconds=30):
+    """Waits until an expression is true; the page's own policy forbids Playwright's way of waiting."""
+    for _ in range(seconds * 10):
+        if page.evaluate(expression):
+            return
+        page.wait_for_timeout(100)
+    raise AssertionError(f"never: {expression}")
+
+
+def coloured(page):
+    """Share of the map that is neither background nor white."""
+    import io
+
+    import numpy as np
+    from PIL import Image
+
+    with Image.open(io.BytesIO(page.locator("#map").screenshot())) as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    return float((np.abs(pixels - (217, 217, 217)).max(-1) > 12).mean())
+
+
+def test_the_map_appears_and_grows_and_everything_on_it_works(page, flight, tmp_path):
+    with served(tmp_path / "out", QUICK) as site:
+        page.goto(site.url)
+        page.wait_for_selector("#link.live")
+        empty = coloured(page)
+        site.send(flight.photos[0])
+        holds(page, "document.querySelectorAll('#map .leaflet-tile[src]').length > 0")
+        page.wait_for_timeout(700)
+        one = coloured(page)
+        assert one > empty + 0.02
+        for path in flight.photos[1:]:
+            site.send(path)
+        site.until(lambda: set(site.states().values()) == {"refined"})
+        holds(
+            page,
+            "[...document.querySelectorAll('#photos .state')].filter(e => e.textContent == 'refined').length == 6",
+        )
+        page.click("#fit")
+        page.wait_for_timeout(1500)
+        assert coloured(page) > 0.08
+        shot(page, "grown")
+
+        # a click lists photos, the chosen one is marked, another can be chosen, full size is one click away
+        box = page.locator("#map").bounding_box()
+        middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        page.mouse.click(*middle)
+        page.wait_for_selector("#covering li.chosen a")
+        count = page.locator("#covering li").count()
+        at = page.evaluate("() => { const c = skyquilt.map.getCenter(); return [c.lng, c.lat]; }")
+        found = site.web.get("/photos", params={"lon": at[0], "lat": at[1]}).json()["photos"]
+        assert count == len(found) > 1
+        assert page.locator("#covering li span").all_inner_texts() == [p["name"] for p in found]
+        page.locator("#covering li").nth(1).click()
+        assert page.locator("#covering li.chosen span").inner_text() == found[1]["name"]
+        href = page.locator("#covering li a").first.get_attribute("href")
+        assert site.web.get(href).headers["content-type"] == "image/jpeg"
+        shot(page, "covering")
+
+        # a length that the projection itself knows
+        page.click("#distance")
+        page.mouse.click(middle[0] - 100, middle[1])
+        page.mouse.click(middle[0] + 100, middle[1])
+        said = float(page.inner_text("#measured").split()[0])
+        from pyproj import Geod
+
+        ends = [page.evaluate("(x) => { const p = skyquilt.map.containerPointToLatLng([x, 450]); return [p.lng, p.lat]; }",
+                              box["width"] / 2 + dx) for dx in (-100, 100)]  # fmt: skip
+        true = Geod(ellps="WGS84").line_length(*zip(*ends, strict=True))
+        assert said == pytest.approx(true, rel=2e-3)
+        page.click("#area")
+        for dx, dy in ((-80, -60), (80, -60), (80, 60), (-80, 60)):
+            page.mouse.click(middle[0] + dx, middle[1] + dy)
+        words = page.inner_text("#measured").split()
+        square = float(words[0]) * (10000 if words[1] == "ha" else 1)
+        assert square == pytest.approx((true / 200) ** 2 * 160 * 120, rel=6e-3)
+        shot(page, "area")
+        page.click("#area")
+
+        # a layer is chosen, shown, and its text stays text
+        layer = {"type": "Feature", "properties": {"what": "<img src=x onerror=alert(1)>"},
+                 "geometry": {"type": "Point", "coordinates": at}}  # fmt: skip
+        (tmp_path / "found.geojson").write_text(json.dumps(layer))
+        page.set_input_files("#files", str(tmp_path / "found.geojson"))
+        page.wait_for_selector("#overlays li")
+        page.mouse.click(*middle)
+        page.wait_for_selector(".leaflet-popup")
+        assert "<img src=x" in page.inner_text(".leaflet-popup")
+        assert page.locator(".leaflet-popup img").count() == 0
+
+        # two maps beside each other
+        site.until(lambda: "visible-newest" in [n["name"] for n in site.web.get("/info").json()["layers"]])
+        holds(page, "[...document.querySelector('#other').options].some(o => o.value == 'visible-newest')")
+        page.click("#swipe")
+        page.wait_for_selector("#handle:visible")
+        before = page.evaluate("() => skyquilt.map.getPane('second').style.clip")
+        handle = page.locator("#handle").bounding_box()
+        page.mouse.move(handle["x"] + 5, 400)
+        page.mouse.down()
+        page.mouse.move(handle["x"] - 200, 400, steps=4)
+        page.mouse.up()
+        assert page.evaluate("() => skyquilt.map.getPane('second').style.clip") != before
+        shot(page, "swipe")
+        page.click("#swipe")
+        page.click("#rule")
+        assert page.get_attribute("#rule", "aria-pressed") == "true"
+        page.evaluate("() => { const t = document.querySelector('#time'); t.value = 0; t.oninput(); }")
+        assert page.inner_text("#until") != "now"
+        page.click("#export")
+        assert page.errors == []
+
+
+def test_it_comes_back_when_the_server_does(page, flight, tmp_path):
+    with served(tmp_path / "out", QUICK) as site:
+        site.send(flight.photos[0])
+        page.goto(site.url)
+        page.wait_for_selector("#link.live")
+        page.wait_for_selector("#photos li")
+        port = int(site.url.rsplit(":", 1)[1].strip("/"))
+    page.wait_for_selector("#link.lost", timeout=15000)
+    with served(tmp_path / "out", QUICK, port=port) as site:
+        page.wait_for_selector("#link.live", timeout=20000)
+        site.send(flight.photos[1], name="<b>second.jpg")
+        holds(page, "document.querySelectorAll('#photos li').length == 2")
+        assert "<b>second.jpg" in page.inner_text("#photos")
+        assert page.locator("#photos b").count() == 0
+        assert page.errors == []
