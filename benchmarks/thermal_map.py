@@ -1,7 +1,7 @@
 """How far the thermal map lies from where it belongs on the visual map, on a simulated flight.
 
     skyquilt simulate FLIGHT --preset thermal [--thermal-season winter --thermal-hour 5]
-    skyquilt mosaic FLIGHT/photos --thermal FLIGHT/thermal -o OUT [--thermal-route maps|heights]
+    skyquilt mosaic FLIGHT/photos --thermal FLIGHT/thermal -o OUT [--thermal-route maps|pairs|heights]
     python benchmarks/thermal_map.py OUT FLIGHT
 
 Both maps are compared with their own truth, and the difference of the two displacements is the error of the join:

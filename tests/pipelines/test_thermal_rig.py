@@ -42,7 +42,7 @@ def frames(flight, finished, tmp_path_factory):
         camera = Camera(
             width=lens["width"], height=lens["height"], focal=lens.get("focal_x", lens.get("focal")) * longest,
             cx=lens.get("c_x", 0) * longest + (lens["width"] - 1) / 2,
-            cy=lens.get("c_y", 0) * longest + (lens["height"] - 1) / 2, **dict(zip(("k1", "k2", "k3", "p1", "p2"), k, strict=False)),
+            cy=lens.get("c_y", 0) * longest + (lens["height"] - 1) / 2, **dict(zip(("k1", "k2", "k3", "p1", "p2"), k, strict=True)),
         )  # fmt: skip
         target = folder / f"heat_{path.stem.split('_')[-1]}.tif"
         cv2.imwrite(str(target), heat_of(path, camera))

@@ -135,8 +135,8 @@ def command(
         str,
         typer.Option(
             help="How the thermal map finds its place: rig (both cameras on one drone: on the visual poses), maps (the"
-            " pictures of both), heights (the surfaces under them), positions (GPS alone), auto (the first that can be"
-            " believed)."
+            " pictures of both), pairs (of photos), heights (the surfaces under them), positions (GPS alone), auto (the"
+            " first that can be believed)."
         ),
     ] = "auto",
     jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.")] = 0,

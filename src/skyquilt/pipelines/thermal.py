@@ -10,7 +10,7 @@ pictures, or of the heights under them, which look alike in every spectrum, by d
 (5.8). Where neither is to be believed, the thermal map lies where its own positions put it, and says so.
 """
 
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -32,21 +32,23 @@ from skyquilt.pipelines.pictures import Source, guess_of, open_picture
 from skyquilt.pipelines.register_files import overlays, resample_onto
 from skyquilt.pipelines.scene import scene_of_run
 from skyquilt.pipelines.thermal_files import write_figures, write_overlays
+from skyquilt.pipelines.thermal_pairs import by_pairs
 from skyquilt.pipelines.thermal_rig import draw_rigged, rig_figures, rigged
 from skyquilt.run.clock import Clock
 from skyquilt.spectral.orientation import between, full_size, orientation
 from skyquilt.spectral.sharpen import Sharpen
 from skyquilt.spectral.usable import both_usable
 
-ROUTES = ("auto", "rig", "maps", "heights", "positions")
-"""How the thermal map finds its place: by the rig where one drone took both, by pictures, by heights, or by its
-positions alone; auto takes the first of these that can be believed.
+ROUTES = ("auto", "rig", "maps", "pairs", "heights", "positions")
+"""How the thermal map finds its place: by the rig where one drone took both, by the pictures of both maps, by pairs
+of photos, by heights, or by its positions alone; auto takes the first of these that can be believed.
 """
 FINE = 700.0
 """Side in px of the square whose area the maps have when the join is sharpened: finer detail is shadows, which have
 moved between two flights, and the join would follow them."""
 FOLDER = "thermal"
 """Folder of the thermal run, below the visual one's."""
+_NO_PHOTOS = RefusedRegistration(reason="the photos behind the maps are not at hand")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,7 +108,11 @@ def iter_thermal(
     began = Clock.now()
     yield StageStarted(stage="join", total=0)
     a, b = (_opened(result.output / "mosaic.tif") for result in (visual, heat))
-    joined = join(a, b, (visual.output / "surface.tif", heat.output / "surface.tif"), route)
+
+    def pairs() -> Registration | RefusedRegistration:
+        return by_pairs(scene_of_run(photos, visual, settings), scene_of_run(thermal, heat, own))
+
+    joined = join(a, b, (visual.output / "surface.tif", heat.output / "surface.tif"), route, pairs)
     joined = replace(joined, refused=(*refused, *joined.refused))
     resample_onto(output / "thermal.tif", a, b, joined.thermal_H_visual)
     shown = replace_transform(joined)
@@ -166,8 +172,13 @@ def _told(events: Iterator[Event]) -> Generator[Event, None, Result]:
     return found
 
 
-def join(a: Source, b: Source, surfaces: tuple[Path, Path], route: str) -> Joined:
+def join(
+    a: Source, b: Source, surfaces: tuple[Path, Path], route: str,
+    pairs: Callable[[], Registration | RefusedRegistration] = lambda: _NO_PHOTOS,
+) -> Joined:  # fmt: skip
     """The place of the thermal map b on the visual map a, by the first route that can be believed.
+
+    `pairs` registers pairs of the photos behind both maps, px of a to px of b.
 
     Raises:
         RefusedError: the one route asked for cannot.
@@ -178,10 +189,15 @@ def join(a: Source, b: Source, surfaces: tuple[Path, Path], route: str) -> Joine
             "the two maps have no common place: one of them is not georeferenced; use --thermal-route maps"
         )
     refused: list[tuple[str, str]] = []
-    for name in ("maps", "heights") if route == "auto" else (route,):
+    ways = {
+        "maps": lambda: _by_maps(a, b, guess),
+        "pairs": pairs,
+        "heights": lambda: _by_heights(a, b, surfaces, guess),
+    }
+    for name in ways if route == "auto" else (route,):
         if name == "positions":
             break
-        outcome = _by_maps(a, b, guess) if name == "maps" else _by_heights(a, b, surfaces, guess)
+        outcome = ways[name]()
         if isinstance(outcome, Registration):
             return Joined(route=name, thermal_H_visual=outcome.b_H_a, outcome=outcome, refused=tuple(refused))
         refused.append((name, outcome.reason))

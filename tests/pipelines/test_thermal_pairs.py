@@ -1,0 +1,51 @@
+"""Two blocks joined by pairs of their photos: one flight against itself, in reversed contrast, in another frame."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skyquilt.config import MosaicSettings
+from skyquilt.model.event import Result
+from skyquilt.pipelines.mosaic import mosaic
+from skyquilt.pipelines.scene import scene_of_run
+from skyquilt.pipelines.thermal_pairs import by_pairs, overlapping
+
+SETTINGS = MosaicSettings(gsd_cm=15, jobs=2)
+OFF = (2.1, -1.2)
+"""m by which the other block lies wrong, east and north."""
+
+
+@pytest.fixture(scope="module")
+def scene(flight, tmp_path_factory):
+    output = tmp_path_factory.mktemp("pairs") / "out"
+    result = mosaic(flight / "photos", output, SETTINGS)
+    return scene_of_run(flight / "photos", Result(output=output, metrics=result.metrics), SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def other(scene):
+    """The same block in negative, its frame displaced."""
+    x, y = scene.alignment.frame.origin
+    frame = replace(scene.alignment.frame, origin=(x + OFF[0], y + OFF[1]))
+    return replace(
+        scene, alignment=replace(scene.alignment, frame=frame), pixels=lambda i: 255 - scene.pixels(i)
+    )
+
+
+def test_a_misplaced_block_is_brought_back(scene, other):
+    asked = overlapping(scene, other)
+    assert 5 <= len(asked) <= 9
+    found = by_pairs(scene, other)
+    assert found and found.evidence["pairs_registered"] >= 5
+    grid = scene.ground.grid
+    px = np.array([[0.3, 0.3], [0.7, 0.3], [0.3, 0.7], [0.6, 0.6]]) * (grid.width, grid.height)
+    moved = np.c_[px, np.ones(4)] @ found.b_H_a.T
+    # both maps have the same grid about their origins, so that right places are equal pixels
+    assert np.linalg.norm(moved[:, :2] / moved[:, 2:] - px, axis=1).max() < 1.0
+
+
+def test_blocks_that_share_no_ground_are_refused(scene, other):
+    far = replace(other.alignment.frame, origin=(other.alignment.frame.origin[0] + 5000, 0.0))
+    found = by_pairs(scene, replace(other, alignment=replace(other.alignment, frame=far)))
+    assert not found and found.reason.startswith("0 of 0 overlapping pairs")
