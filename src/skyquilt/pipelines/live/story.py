@@ -110,7 +110,6 @@ class LiveMap:
         self._later: dict[Address, None] = {}
         self._drawn: dict[int, Pose] = {}
         self._to_draw: set[int] = set()
-        self._unfinished: dict[str, None] = {}
         self._fresh: dict[str, list[Address]] = {}
         self._closed_at: dict[int, int] = {}
         self._loop: int | None = None
@@ -200,10 +199,6 @@ class LiveMap:
             return self._place(self._received[0])
         if self._urgent:
             return self._draw(self._urgent, "")
-        if self._unfinished:
-            rule = next(iter(self._unfinished))
-            del self._unfinished[rule]
-            return Update(what="drawn", tiles=self._told(rule))
         if (done := self.closing.outcome()) is not None:
             return self._take_over(done)
         if self._untried and self.members.frame is not None:
@@ -380,18 +375,10 @@ class LiveMap:
                 self._dirty.pop(address, None)
                 self._later.setdefault(address)
         self._fresh.setdefault(rule, []).extend(some)
+        tiles = len(written)
         if not queue:
-            self._tell_early(rule)
-        return Update(what="drawn", tiles=len(written))
-
-    def _tell_early(self, rule: str) -> None:
-        """Those who look on see the finest level at once; the coarser ones, and that it is drawn, follow."""
-        with self.ledger.lightly(), self.ledger.change():
-            for i in self._to_draw if not rule else ():
-                if not self._waits(i):
-                    self._tell_place(self.members.by_id[i])
-            self._tell_tiles(self._fresh.get(rule, []), rule)
-        self._unfinished[rule] = None
+            tiles += self._told(rule)
+        return Update(what="drawn", tiles=tiles)
 
     def _told(self, rule: str) -> int:
         """The coarser levels, and the news for those who look on."""
@@ -417,6 +404,7 @@ class LiveMap:
         ring, at = self._place_of(member)
         self.ledger.set_photo(member.id, footprint={"ring": ring, "at": at, "pose": pose_record(member.pose)})
         self._drawn[member.id] = member.pose
+        self._tell(member, ring=ring, at=at)
 
     def _place_of(self, member: Member) -> tuple[list[list[float]], list[float]]:
         """Footprint and centre in degrees."""
@@ -424,11 +412,6 @@ class LiveMap:
         outline = self.canvas.outline(member.id)
         ring = [] if outline is None else self.members.lonlat(outline)
         return ring, self.members.lonlat(member.pose.map_C[None, :2])[0]
-
-    def _tell_place(self, member: Member) -> None:
-        if member.pose is not None and member.state != "superseded":
-            ring, at = self._place_of(member)
-            self._tell(member, ring=ring, at=at)
 
     def _tell(self, member: Member, **more: Any) -> None:
         photo = member.photo
