@@ -41,6 +41,7 @@ def arm(point: str, count: int) -> None:
 
 
 def main(folder: Path, photos: Path, point: str, count: int) -> None:
+    began = time.monotonic()
     if point == "time":
         signal.signal(signal.SIGALRM, die)
         signal.setitimer(signal.ITIMER_REAL, count / 1000)
@@ -63,7 +64,9 @@ def main(folder: Path, photos: Path, point: str, count: int) -> None:
         for level in range(9):
             for address in live.tiles.addresses(layer, level):
                 assert live.tiles.get(address) is not None
-    sys.stdout.write(json.dumps({"poses": poses, "states": live.ledger.counts()}))
+    sys.stdout.write(
+        json.dumps({"poses": poses, "states": live.ledger.counts(), "seconds": time.monotonic() - began})
+    )
     live.close()
 
 
