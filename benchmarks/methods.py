@@ -132,10 +132,10 @@ def closing_step(output: Path, names: list[str]) -> float | None:
     """How far apart the first and the last photo put the same ground, m: both redrawn alone, and registered."""
     from skyquilt.imaging.plane import view_patch
     from skyquilt.imaging.views import make_views, native_gsd
-    from skyquilt.pipelines.compare import _alignment
+    from skyquilt.pipelines.compare import alignment_of
     from skyquilt.surface.plane import level
 
-    alignment = _alignment(output)
+    alignment = alignment_of(output)
     z = float(np.median(alignment.ties.xyz[:, 2])) if len(alignment.ties.xyz) else 0.0
     views = {v.photo: v for v in make_views(alignment, level(z))}
     gsd = 2 * native_gsd(list(views.values()), level(z))

@@ -1,7 +1,7 @@
 """`flightline`: mosaics of flight lines, joined, and laid on the map by regression (Arteaga et al. 2019)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import ClassVar, Literal
 
@@ -77,7 +77,7 @@ class ByFlightline:
             work.joins,
             work.notes,
         )
-        return Alignment(**{**vars(placed), "rejected": lost})
+        return replace(placed, rejected=lost)
 
     def _pairs(
         self, order: Sequence[int], xy: Array, strips: Sequence[dict[int, Array]]
@@ -183,7 +183,10 @@ class _Work:
         for i, j in pairs:
             if strip_of[i] != strip_of[j]:
                 a, b = (i, j) if strip_of[i] < strip_of[j] else (j, i)
-                matched.setdefault((strip_of[a], strip_of[b]), []).append(self._between(a, b, strips))
+                low, high = strip_of[a], strip_of[b]
+                matched.setdefault((low, high), []).append(
+                    self._between(a, b, strips[low][a], strips[high][b])
+                )
         order = middle_out([k for k in range(len(strips)) if len(strips[k]) > 1] or [0])
         order += [k for k in range(len(strips)) if k not in order]
         whole = {order[0]: np.eye(3)}
@@ -220,13 +223,12 @@ class _Work:
         whole[k] = found.b_H_a
         return True
 
-    def _between(self, a: int, b: int, strips: Sequence[dict[int, Array]]) -> tuple[Array, Array]:
+    def _between(self, a: int, b: int, plane_H_a: Array, plane_H_b: Array) -> tuple[Array, Array]:
         """The 50 best matches of two photos of neighbouring lines, each on the plane of its own strip."""
-        strip_of = {i: s for s in strips for i in s}
         matches = self.method.across(self.features[a], self.features[b])
         pa = to_working(self.lens[a], self.features[a].px[matches.index_a])
         pb = to_working(self.lens[b], self.features[b].px[matches.index_b])
-        return transfer(strip_of[a][a], pa), transfer(strip_of[b][b], pb)
+        return transfer(plane_H_a, pa), transfer(plane_H_b, pb)
 
 
 def _from_middle(strip: Sequence[int], before_H_photo: dict[int, Array]) -> dict[int, Array]:

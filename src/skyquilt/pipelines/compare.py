@@ -196,7 +196,7 @@ def _write_distances(path: Path, rows: Sequence[Row]) -> Path:
 
 def _by_bundle(photos: Sequence[Photo], output: Path, base: MosaicSettings) -> tuple[MosaicSettings, str]:
     """Distances between tie points of the bundle run: measured in its model, not on the ground."""
-    alignment = _alignment(output / "bundle")
+    alignment = alignment_of(output / "bundle")
     points = tie_targets(alignment, [p.name for p in photos]) if alignment is not None else []
     if len(points) < 2:
         return base, "no distances are known"
@@ -207,7 +207,7 @@ def _by_bundle(photos: Sequence[Photo], output: Path, base: MosaicSettings) -> t
     )
 
 
-def _alignment(run: Path) -> Alignment | None:
+def alignment_of(run: Path) -> Alignment | None:
     """The alignment of a run just made."""
     store = Store(folder=run / STATE / "store", registry=REGISTRY)
     found = sorted((run / STATE / "store" / "alignment").glob("*.npz"), key=lambda p: p.stat().st_mtime)

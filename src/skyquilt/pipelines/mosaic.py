@@ -133,7 +133,7 @@ def iter_mosaic(
         photos=taken.photos, total=len(survey.photos) + len(survey.rejected), rejected=rejected, priors=prior,
         links=links, alignment=alignment, ground=ground, drawn=drawn, seams=seams.figures,
         conflicts=conflicts(taken.photos, prior, alignment), notes=[*survey.notes, *alignment.notes],
-    ) | {"quality": judged.figures}  # fmt: skip
+    ) | {"quality": judged}  # fmt: skip
     finish = reporting.finish(
         run.path, taken, prior, alignment, ground, drawn, seams, figures, settings, clock, folder
     )

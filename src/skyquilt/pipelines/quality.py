@@ -1,7 +1,6 @@
 """The quality function of the thesis, for any method: lambda, its two parts, and the graphs beside them (Y 6.1)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,24 +21,10 @@ ACROSS = 400
 """Width in px of the photos that are compared: the thesis's scale."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Quality:
-    """lambda and what it is made of."""
-
-    figures: dict[str, Any]
-    """For metrics.json."""
-    order: tuple[int, ...]
-    """Photos in the order replayed."""
-    replayed: Replay
-    """Correlations, in that order."""
-    off_position: NDArray[np.float64]
-    """Distance of each from its reported position over the width of a photo on the ground, in that order."""
-
-
 def judge(
     taken: Intake, alignment: Alignment, priors: Sequence[Prior], ground: Ground, pictures: Pictures,
     known: Sequence[KnownDistance], alpha: float, order: Sequence[int],
-) -> Steps[Quality]:  # fmt: skip
+) -> Steps[dict[str, Any]]:  # fmt: skip
     """Replays the placements in the order given at one ground resolution, and measures known distances."""
     yield 0, 1
     views = {v.photo: v for v in ground.views}
@@ -57,7 +42,7 @@ def judge(
         "off_position_over_width": [_short(o) for o in off],
     }
     yield 1, 1
-    return Quality(figures=figures, order=order, replayed=seen, off_position=off)
+    return figures
 
 
 def _figures(
