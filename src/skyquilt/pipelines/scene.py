@@ -70,9 +70,10 @@ def scene_of(
 def scene_of_run(photos: Path | str, run: Result, settings: MosaicSettings) -> Scene:
     """What a finished mosaic of these photos and settings rests on, from its store."""
     folder = Path(photos)
-    survey, control = with_control(
-        read_survey(folder, geo=settings.geo, cameras=settings.cameras), folder, settings
+    survey = read_survey(
+        folder, geo=settings.geo, cameras=settings.cameras, thermal_unit=settings.thermal_unit
     )
+    survey, control = with_control(survey, folder, settings)
     store = Store(folder=run.output / STATE / "store", registry=REGISTRY)
     steps = scene_of(
         survey.photos, settings, methods(settings), Clock(store=store, began=Clock.now()), control

@@ -75,7 +75,9 @@ def iter_thermal(
         RefusedError: the one route asked for cannot be believed; both maps are there by then.
         SkyquiltError: anything else a user can mend.
     """
-    settings, output = settings or MosaicSettings(), Path(output)
+    asked, output = settings or MosaicSettings(), Path(output)
+    settings = replace(asked, thermal_unit=None)
+    heated = replace(asked, thermal_unit=asked.thermal_unit or "auto")
     if route not in ROUTES:
         raise UsageError(f"--thermal-route {route!r} is not one of {', '.join(ROUTES)}")
     if not Path(thermal).is_dir():
@@ -87,7 +89,7 @@ def iter_thermal(
     if route in ("auto", "rig"):
         began = Clock.now()
         yield StageStarted(stage="rig", total=0)
-        result = _by_rig(photos, thermal, visual, settings)
+        result = _by_rig(photos, thermal, visual, heated)
         yield _finished("rig", began)
         if isinstance(result, Result):
             yield result
@@ -98,7 +100,7 @@ def iter_thermal(
             )
         refused = (("rig", result.reason),)
     own = replace(
-        settings, gcp=None, geo=None, cameras=None, bounds=None, boundary=None, gsd_cm=None,
+        heated, gcp=None, geo=None, cameras=None, bounds=None, boundary=None, gsd_cm=None,
         crs=visual.metrics["crs"] or settings.crs, compress="auto",
     )  # fmt: skip
     yield Note(text="the thermal photos become a map of their own, then it is laid on the visual one")
@@ -140,12 +142,12 @@ def _by_rig(
     photos: Path | str, thermal: Path | str, visual: Result, settings: MosaicSettings
 ) -> Result | RefusedRegistration:
     """thermal.tif from the visual poses, where one drone took both, or why not."""
-    survey = read_survey(Path(thermal))
+    survey = read_survey(Path(thermal), thermal_unit=settings.thermal_unit)
     if not taken_together(read_survey(Path(photos), geo=settings.geo).photos, survey.photos):
         return RefusedRegistration(
             reason="no thermal photo was taken together with a visual one, by time or name"
         )
-    scene = scene_of_run(photos, visual, settings)
+    scene = scene_of_run(photos, visual, replace(settings, thermal_unit=None))
     found = rigged(scene, survey.photos)
     if isinstance(found, RefusedRegistration):
         return found
