@@ -1,5 +1,7 @@
-"""Two blocks joined by the heights under them [Yahyanejad 2013, 5.2.3, (5.8)]: from the place that pictures of the heights
-find, as everywhere, to the exact one, by heights measured anew and as densely as the photos allow.
+"""Two blocks joined by the heights under them [Yahyanejad 2013, 5.2.3, (5.8)].
+
+Pictures of both surfaces find the rough place, as pictures do everywhere; heights measured anew, as densely as the
+photos allow, find the exact one.
 """
 
 from dataclasses import replace
@@ -16,21 +18,31 @@ from skyquilt.surface.dense import Dense
 
 
 def finer(
-    visual: Scene, thermal: Scene, outcome: Registration, dense: Dense | None = None, align: AlignHeights | None = None
+    visual: Scene,
+    thermal: Scene,
+    outcome: Registration,
+    dense: Dense | None = None,
+    align: AlignHeights | None = None,
 ) -> Registration | RefusedRegistration:
     """A registration of the maps, px of the visual to px of the thermal one, sharpened by heights; or why heights do
     not confirm it.
     """
     fields = [_heights(scene, dense or Dense()) for scene in (visual, thermal)]
     if fields[0] is None or fields[1] is None:
-        return RefusedRegistration(reason="fewer than two photos of a map look down, so nothing tells heights")
+        return RefusedRegistration(
+            reason="fewer than two photos of a map look down, so nothing tells heights"
+        )
     metres = [_metres_of_px(scene.ground.grid) for scene in (visual, thermal)]
     start = metres[1] @ outcome.b_H_a @ np.linalg.inv(metres[0])
     fit = (align or AlignHeights())(fields[0], fields[1], start)
     if isinstance(fit, RefusedRegistration):
         return fit
     matrix = np.linalg.inv(metres[1]) @ fit.b_H_a @ metres[0]
-    told = {"cells": float(fit.cells), "residual_m": round(fit.residual_m, 4), "halves_apart_m": round(fit.apart_m, 4)}
+    told = {
+        "cells": float(fit.cells),
+        "residual_m": round(fit.residual_m, 4),
+        "halves_apart_m": round(fit.apart_m, 4),
+    }
     return replace(
         outcome, model="similarity", b_H_a=matrix / matrix[2, 2], evidence={**outcome.evidence, **told}
     )
