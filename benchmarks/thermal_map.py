@@ -32,7 +32,9 @@ def field(places: np.ndarray, off: np.ndarray, at: np.ndarray, near: int = 15) -
         nearest = np.argsort(np.linalg.norm(places - place, axis=1))[:near]
         terms, weight = np.c_[np.ones(len(nearest)), places[nearest] - place], np.ones(len(nearest))
         for _ in range(8):
-            plane = np.linalg.lstsq(terms * weight[:, None] ** 0.5, off[nearest] * weight[:, None] ** 0.5, rcond=None)[0]
+            plane = np.linalg.lstsq(
+                terms * weight[:, None] ** 0.5, off[nearest] * weight[:, None] ** 0.5, rcond=None
+            )[0]
             lacking = np.linalg.norm(off[nearest] - terms @ plane, axis=1)
             weight = 1 / (1 + (lacking / (2 * np.median(lacking) + 1e-6)) ** 2)
         out[k] = plane[0]
