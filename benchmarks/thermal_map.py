@@ -26,7 +26,7 @@ def displacements(raster: Path, truth: Path) -> tuple[np.ndarray, np.ndarray, fl
 
 
 def field(places: np.ndarray, off: np.ndarray, at: np.ndarray, near: int = 15) -> np.ndarray:
-    """Displacements (n, 2) at other places: robust planes through the nearest ones, as they change from place to place."""
+    """Displacements (n, 2) at other places, by robust planes through the nearest ones."""
     out = np.zeros_like(at)
     for k, place in enumerate(at):
         nearest = np.argsort(np.linalg.norm(places - place, axis=1))[:near]
