@@ -43,7 +43,17 @@ def value_tags(unit: str, exposure: Exposure) -> dict[str, str]:
     """What a raster says about its values; nothing for pictures."""
     if not unit:
         return {}
-    return {"UNIT": unit, TAG: "balanced on overlaps" if exposure.offsets else "as recorded"}
+    return {"UNIT": unit, TAG: _drift(balanced=bool(exposure.offsets))}
+
+
+def recorded_tags(metrics: Mapping[str, Any]) -> dict[str, str]:
+    """The same from the figures of a finished map."""
+    told = metrics.get("thermal_values")
+    return {"UNIT": told["unit"], TAG: _drift(balanced=told["balanced"])} if told else {}
+
+
+def _drift(*, balanced: bool) -> str:
+    return "balanced on overlaps" if balanced else "as recorded"
 
 
 def value_figures(photos: Sequence[Photo], exposure: Exposure, settings: MosaicSettings) -> dict[str, Any]:

@@ -10,13 +10,14 @@ pictures, or of the heights under them, which look alike in every spectrum, by d
 (5.8). Where none is to be believed, the thermal map lies where its own positions put it, and says so.
 """
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.config import MosaicSettings, methods
 from skyquilt.errors import RefusedError, UsageError
@@ -26,13 +27,15 @@ from skyquilt.photos.survey import read_survey
 from skyquilt.photos.together import taken_together
 from skyquilt.pipelines.mosaic import iter_mosaic
 from skyquilt.pipelines.pictures import Source
+from skyquilt.pipelines.radiometry import recorded_tags, value_figures
+from skyquilt.pipelines.register import residual
 from skyquilt.pipelines.register_files import overlays, resample_onto
 from skyquilt.pipelines.scene import Scene, scene_of_run
-from skyquilt.pipelines.thermal_files import write_figures, write_overlays
+from skyquilt.pipelines.thermal_files import write_figures, write_overlays, write_section
 from skyquilt.pipelines.thermal_heights import finer
 from skyquilt.pipelines.thermal_join import ROUTES, Joined, as_registration, join, opened
 from skyquilt.pipelines.thermal_pairs import by_pairs
-from skyquilt.pipelines.thermal_rig import draw_rigged, rig_figures, rigged
+from skyquilt.pipelines.thermal_rig import draw_rigged, drift_of_rigged, rig_figures, rigged
 from skyquilt.run.clock import Clock
 
 FOLDER = "thermal"
@@ -94,11 +97,9 @@ def iter_thermal(
         pairs=lambda: by_pairs(*scenes()), finer=lambda outcome: finer(*scenes(), outcome),
     )  # fmt: skip
     joined = replace(joined, refused=(*refused, *joined.refused))
-    resample_onto(output / "thermal.tif", a, b, joined.thermal_H_visual)
-    shown = as_registration(joined)
-    write_overlays(output, overlays(a, b, shown))
+    resample_onto(output / "thermal.tif", a, b, joined.thermal_H_visual, recorded_tags(heat.metrics))
     figures = {"thermal": _figures(joined, heat, b)}
-    write_figures(output, visual.metrics, figures)
+    _leave(output, overlays(a, b, as_registration(joined)), visual.metrics, figures)
     yield _finished("join", began)
     yield from (
         Note(text=f"registration by {name} was refused: {why}", warning=True) for name, why in joined.refused
@@ -130,13 +131,25 @@ def _by_rig(
     if isinstance(found, RefusedRegistration):
         return found
     output = visual.output
-    draw_rigged(output / "thermal.tif", found, scene, methods(settings).blend)
+    parts = methods(settings)
+    exposure = drift_of_rigged(found, scene, parts, settings)
+    draw_rigged(output / "thermal.tif", found, scene, parts.blend, exposure)
     none = np.zeros((0, 2))
     same = Registration(model="identity", b_H_a=np.eye(3), px_a=none, px_b=none)
-    write_overlays(output, overlays(opened(output / "mosaic.tif"), opened(output / "thermal.tif"), same))
     figures = {"thermal": rig_figures(found, len(survey.photos) + len(survey.rejected))}
-    write_figures(output, visual.metrics, figures)
+    figures["thermal"] |= value_figures(found.photos, exposure, settings)
+    pictures = overlays(opened(output / "mosaic.tif"), opened(output / "thermal.tif"), same)
+    _leave(output, pictures, visual.metrics, figures)
     return Result(output=output, metrics={**visual.metrics, **figures})
+
+
+def _leave(
+    output: Path, pictures: list[NDArray[np.uint8]], visual: Mapping[str, Any], figures: dict[str, Any]
+) -> None:
+    """Overlays, the report's section, and last the figures."""
+    write_overlays(output, pictures)
+    write_section(output, opened(output / "thermal.tif"), pictures, figures["thermal"])
+    write_figures(output, visual, figures)
 
 
 def _told(events: Iterator[Event]) -> Generator[Event, None, Result]:
@@ -154,11 +167,14 @@ def _told(events: Iterator[Event]) -> Generator[Event, None, Result]:
 
 def _figures(joined: Joined, heat: Result, b: Source) -> dict[str, Any]:
     m, outcome = heat.metrics, joined.outcome
+    error = residual(outcome) if outcome and len(outcome.px_a) else None
     return {
         "route": joined.route, "routes_refused": dict(joined.refused), "unit": b.unit,
         "thermal_H_visual": joined.thermal_H_visual.tolist(),
         "model": outcome.model if outcome else "positions", "inliers": len(outcome.px_a) if outcome else 0,
         "evidence": dict(outcome.evidence) if outcome else {},
+        "residual_px": error, "residual_m": None if error is None else round(error * float(m["gsd_m"]), 4),
+        "thermal_values": m.get("thermal_values"),
         "photos_used": m["photos_used"], "photos_total": m["photos_total"], "gsd_m": m["gsd_m"],
         "blocks": m["blocks"], "method": m["method"],
     }  # fmt: skip

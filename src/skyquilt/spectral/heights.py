@@ -123,7 +123,11 @@ class _Fit:
         rows, columns = a.z.shape
         middle = np.array([a.x0 + a.cell * (columns - 1) / 2, a.y0 + a.cell * (rows - 1) / 2])
         unit = a.cell * max(rows, columns) / 2
-        v, u = (np.mgrid[0:rows, 0:columns] - np.array([rows - 1, columns - 1])[:, None, None] / 2) * a.cell / unit
+        v, u = (
+            (np.mgrid[0:rows, 0:columns] - np.array([rows - 1, columns - 1])[:, None, None] / 2)
+            * a.cell
+            / unit
+        )
         there = start @ np.array([[middle[0], middle[0] + unit], [middle[1], middle[1]], [1, 1]])
         there = there[:2] / there[2]
         return cls(u=u, v=v, middle=middle, unit=unit, p=np.r_[there[:, 0], there[:, 1] - there[:, 0]])
@@ -135,7 +139,13 @@ class _Fit:
 
     def moved(self, change: Doubles, cells: int, residual: float) -> "_Fit":
         return _Fit(
-            u=self.u, v=self.v, middle=self.middle, unit=self.unit, p=self.p + change, cells=cells, residual=residual
+            u=self.u,
+            v=self.v,
+            middle=self.middle,
+            unit=self.unit,
+            p=self.p + change,
+            cells=cells,
+            residual=residual,
         )
 
     @property

@@ -40,7 +40,10 @@ class Dense:
         rough = self.coarse(surface, views, grid, grey)
         longest = [max(v.camera.width, v.camera.height) for v in views]
         side = int(min(self.longest, np.median(longest)))
-        gsd = float(np.median([height / v.camera.focal * n for v, n in zip(views, longest, strict=True)])) / side
+        gsd = (
+            float(np.median([height / v.camera.focal * n for v, n in zip(views, longest, strict=True)]))
+            / side
+        )
         work, z, trust = self.fine.searched(
             rough, views, grid, grey, side, gsd, height, (-self.reach, self.reach), relative=True
         )

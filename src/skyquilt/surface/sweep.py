@@ -68,9 +68,7 @@ class Sweep:
         height: float, span: tuple[float, float], *, relative: bool,
     ) -> Surface:  # fmt: skip
         """One pass; `span` in m, or in steps of about one pixel of disparity when `relative`."""
-        work, z, trust = self.searched(
-            surface, views, grid, grey, side, gsd, height, span, relative=relative
-        )
+        work, z, trust = self.searched(surface, views, grid, grey, side, gsd, height, span, relative=relative)
         return self._fused(surface, work, z, trust)
 
     def searched(
