@@ -246,6 +246,7 @@ def mosaic_spec(compose: Composer, alignment: Alignment, settings: MosaicSetting
         transform=geotransform(compose.grid, alignment), crs=alignment.frame.crs, compress=compress,
         quality=settings.quality, mask=not real, nodata=float("nan") if real else None,
         tags={"SOFTWARE": "Skyquilt", "METHOD": alignment.method} | value_tags(unit, compose.exposure),
+        band_units=(unit,) * compose.bands if unit else (),
     )  # fmt: skip
 
 

@@ -33,7 +33,7 @@ from skyquilt.pipelines.register_files import overlays, resample_onto
 from skyquilt.pipelines.scene import Scene, scene_of_run
 from skyquilt.pipelines.thermal_files import write_figures, write_overlays, write_section
 from skyquilt.pipelines.thermal_heights import finer
-from skyquilt.pipelines.thermal_join import ROUTES, Joined, as_registration, join, opened
+from skyquilt.pipelines.thermal_join import ROUTES, Joined, as_registration, join, opened, refuse_apart
 from skyquilt.pipelines.thermal_pairs import by_pairs
 from skyquilt.pipelines.thermal_rig import draw_rigged, drift_of_rigged, rig_figures, rigged
 from skyquilt.run.clock import Clock
@@ -59,6 +59,12 @@ def iter_thermal(
         raise UsageError(f"--thermal-route {route!r} is not one of {', '.join(ROUTES)}")
     if not Path(thermal).is_dir():
         raise UsageError(f"--thermal {thermal} is no folder; give the folder of the thermal photos")
+    heats = read_survey(Path(thermal), thermal_unit=heated.thermal_unit)
+    refuse_apart(read_survey(Path(photos), geo=settings.geo).photos, heats.photos)
+    if not any(p.band == "thermal" for p in heats.photos):
+        yield Note(
+            text=f"no photo in {thermal} is known to be thermal; they are mapped as they are", warning=True
+        )
     visual = yield from _told(
         iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
     )
@@ -167,7 +173,8 @@ def _told(events: Iterator[Event]) -> Generator[Event, None, Result]:
 
 def _figures(joined: Joined, heat: Result, b: Source) -> dict[str, Any]:
     m, outcome = heat.metrics, joined.outcome
-    error = residual(outcome) if outcome and len(outcome.px_a) else None
+    exact = outcome is not None and "cells" in outcome.evidence  # by heights everywhere, not by those places
+    error = residual(outcome) if outcome and len(outcome.px_a) and not exact else None
     return {
         "route": joined.route, "routes_refused": dict(joined.refused), "unit": b.unit,
         "thermal_H_visual": joined.thermal_H_visual.tolist(),

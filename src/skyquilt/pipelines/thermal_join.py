@@ -1,6 +1,6 @@
 """How the thermal map finds its place on the visual one: the routes, and which of them is believed."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from skyquilt.config_register import registration_method
 from skyquilt.errors import RefusedError
-from skyquilt.geometry.transforms import transfer
-from skyquilt.model.photo import RejectedPhoto
-from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistration, Registration
+from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registration
 from skyquilt.pipelines.pictures import Source, guess_of, open_picture
 from skyquilt.spectral.orientation import between, full_size, orientation
 from skyquilt.spectral.sharpen import Sharpen
@@ -20,13 +19,13 @@ from skyquilt.spectral.usable import both_usable
 
 ROUTES = ("auto", "rig", "maps", "pairs", "heights", "positions")
 """How the thermal map finds its place: by the rig where one drone took both, by the pictures of both maps, by pairs
-of photos, by heights, or by its positions alone; auto takes what can be believed.
+of photos, by heights, or by its positions alone; auto takes the first of these that can be believed.
 """
 FINE = 700.0
 """Side in px of the square whose area the maps have when the join is sharpened: finer detail is shadows, which have
 moved between two flights, and the join would follow them."""
-CONFIRMED_PX = 10.0
-"""Px of the thermal map within which two routes find the same place."""
+FAR_M = 1000.0
+"""Distance between the nearest photos of two flights beyond which they show different places."""
 Outcome = Registration | RefusedRegistration
 _NO_PHOTOS = RefusedRegistration(reason="the photos behind the maps are not at hand")
 
@@ -51,8 +50,7 @@ def join(
 ) -> Joined:  # fmt: skip
     """The place of the thermal map b on the visual map a.
 
-    `auto` takes the first of pictures, pairs and heights that can be believed. Where heights then find the same place
-    as pictures or pairs, it takes the heights': shadows and shading, which turn with the sun, do not draw them aside.
+    `auto` takes the first of pictures, pairs and heights that can be believed.
     `pairs` registers pairs of the photos behind both maps, px of a to px of b; `finer` sharpens a registration by
     heights measured in those photos.
 
@@ -73,8 +71,6 @@ def join(
     for name in ways if route == "auto" else (route,) if route in ways else ():
         outcome = ways[name]()
         if isinstance(outcome, Registration):
-            if route == "auto" and name != "heights":
-                name, outcome = _exacter(name, outcome, ways["heights"](), b, refused)
             return Joined(route=name, thermal_H_visual=outcome.b_H_a, outcome=outcome, refused=tuple(refused))
         refused.append((name, outcome.reason))
     if guess is None or route not in ("auto", "positions"):
@@ -84,31 +80,6 @@ def join(
         )
     full = b.full_S_picture @ guess.b_H_a @ np.linalg.inv(a.full_S_picture)
     return Joined(route="positions", thermal_H_visual=full / full[2, 2], outcome=None, refused=tuple(refused))
-
-
-def _exacter(
-    name: str, outcome: Registration, heights: Outcome, b: Source, refused: list[tuple[str, str]]
-) -> tuple[str, Registration]:
-    """The heights' place where another route confirms it, else that of the other route."""
-    if isinstance(heights, RefusedRegistration):
-        refused.append(("heights", heights.reason))
-        return name, outcome
-    apart = _apart_px(outcome.b_H_a, heights.b_H_a, b)
-    if apart > CONFIRMED_PX:
-        refused.append(
-            ("heights", f"they find a place {apart:.0f} px of the thermal map from that of the {name}")
-        )
-        return name, outcome
-    told = {**heights.evidence, f"px_from_{name}": round(apart, 2)}
-    return "heights", replace(heights, evidence=told)
-
-
-def _apart_px(one: Matrix, other: Matrix, b: Source) -> float:
-    """Median distance over b of the places that two transforms give the same px of a."""
-    x, y = np.meshgrid(np.linspace(0, b.width - 1, 9), np.linspace(0, b.height - 1, 9))
-    px = np.column_stack([x.ravel(), y.ravel()])
-    moved = transfer(np.asarray(other @ np.linalg.inv(one), np.float64), px)
-    return float(np.median(np.linalg.norm(moved - px, axis=1)))
 
 
 def _by_heights(
@@ -185,6 +156,27 @@ def _sharpened(a: Picture, b: Picture, outcome: Registration) -> Registration:
     rigid = Sharpen(freedom="similarity")(fields[0], fields[1], small)
     free = Sharpen(freedom="affine", steps=12)(fields[0], fields[1], rigid.b_H_a)
     return replace(outcome, model="affine", b_H_a=full_size(fields[0], fields[1], free.b_H_a))
+
+
+def refuse_apart(visual: Sequence[Photo], thermal: Sequence[Photo]) -> None:
+    """Refuses flights over different places, before anything is computed.
+
+    Raises:
+        RefusedError: all positions of the one lie far from all of the other.
+    """
+    places = [
+        np.radians([(p.position.latitude_deg, p.position.longitude_deg) for p in photos if p.position])
+        for photos in (visual, thermal)
+    ]
+    if not all(len(p) for p in places):
+        return
+    a, b = (p[:, None] * [1, np.cos(places[0][0, 0])] for p in places)
+    nearest = 6.371e6 * float(np.linalg.norm(a - b.transpose(1, 0, 2), axis=2).min())
+    if nearest > FAR_M:
+        raise RefusedError(
+            f"the thermal photos lie {nearest / 1000:.1f} km from the visual ones, by their positions; give the two"
+            " flights over one place"
+        )
 
 
 def opened(path: Path) -> Source:

@@ -42,8 +42,6 @@ _EVIDENCE = {
     "cells": "cells of heights compared",
     "residual_m": "robust deviation of the heights' differences, m",
     "halves_apart_m": "distance between the places that two halves of the ground find by themselves, m",
-    "px_from_maps": "distance from the place that the pictures of both maps find, px of the thermal map",
-    "px_from_pairs": "distance from the place that pairs of photos find, px of the thermal map",
 }
 _CAPTIONS = (
     ("Thermal map", "On the visual map's grid, {low} (dark) to {high} (bright)."),

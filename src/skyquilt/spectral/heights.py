@@ -6,7 +6,7 @@ how far the one must move for its heights to equal the other's (least squares ma
 and Torlegard 1988). Walls do not count, nor does what only one field has.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import cv2
@@ -90,7 +90,7 @@ class AlignHeights:
         self, one: NDArray[np.float32], known: NDArray[np.bool_], other: "_Slopes", fit: "_Fit", cell: float
     ) -> "tuple[_Fit, float] | None":
         """A step, and by how many m it moves the ground's border."""
-        z, gx, gy, both = other.at(*fit.there())
+        z, gx, gy, both = other.at(*fit.there(one - np.median(one[known])))
         both &= known
         if both.sum() < _LEAST:
             return None
@@ -100,7 +100,8 @@ class AlignHeights:
         found, lacking = _robust(np.concatenate([heights, place], 1), wanted, self.scale * cell)
         change = found[7:] / max(float(found[0]), 0.3)
         change *= min(1.0, 5 * cell / max(float(np.abs(change).max()), 1e-9))
-        told = fit.moved(change, int(both.sum()), 1.4826 * float(np.median(np.abs(lacking))))
+        residual = 1.4826 * float(np.median(np.abs(lacking)))
+        told = fit.moved(change, found[2:4] / fit.unit, int(both.sum()), residual)
         return told, float(np.abs(change).max())
 
 
@@ -115,6 +116,8 @@ class _Fit:
     unit: float
     p: Doubles
     """(4,) place of the middle, and the unit's image along x and y, all in m."""
+    tilt: Doubles = field(default_factory=lambda: np.zeros(2))
+    """(2,) slopes along x and y of a's heights less b's: one block leans against the other."""
     cells: int = 0
     residual: float = 0.0
 
@@ -132,18 +135,23 @@ class _Fit:
         there = there[:2] / there[2]
         return cls(u=u, v=v, middle=middle, unit=unit, p=np.r_[there[:, 0], there[:, 1] - there[:, 0]])
 
-    def there(self) -> tuple[Doubles, Doubles]:
-        """(rows, cols) where the cells of a lie in b."""
-        x, y, c, s = self.p
-        return x + c * self.u - s * self.v, y + s * self.u + c * self.v
+    def there(self, lift: NDArray) -> tuple[Doubles, Doubles]:
+        """(rows, cols) where the cells of a lie in b, `lift` m above the level that the similarity is true for.
 
-    def moved(self, change: Doubles, cells: int, residual: float) -> "_Fit":
+        A block that leans by a slope has roofs and crowns aside by the slope times their height.
+        """
+        x, y, c, s = self.p
+        along, across = self.tilt
+        return x + c * self.u - s * self.v + along * lift, y + s * self.u + c * self.v + across * lift
+
+    def moved(self, change: Doubles, tilt: Doubles, cells: int, residual: float) -> "_Fit":
         return _Fit(
             u=self.u,
             v=self.v,
             middle=self.middle,
             unit=self.unit,
             p=self.p + change,
+            tilt=tilt,
             cells=cells,
             residual=residual,
         )
