@@ -10,7 +10,8 @@ from skyquilt.model.event import Event, Note, Result
 from skyquilt.pipelines.live.finish import iter_finish
 from skyquilt.pipelines.live.intake import Refused
 from skyquilt.pipelines.live.settings import LiveSettings
-from skyquilt.pipelines.live.story import LiveMap, Update
+from skyquilt.pipelines.live.story import LiveMap
+from skyquilt.pipelines.live.update import Update
 from skyquilt.pipelines.live.watch import Watch
 
 IDLE_S = 0.02

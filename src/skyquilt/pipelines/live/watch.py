@@ -58,12 +58,12 @@ class Watch:
         Raises:
             OutputError: the disk is full; the file stays and is taken later.
         """
+        now = time.monotonic()  # one moment for all, so that files that came together are taken in order
         for path, stamp in sorted(self._files()):
             key = str(path)
             if self._seen.get(key) == stamp:
                 continue
             known = self.growing.get(key)
-            now = time.monotonic()
             if known is None or known.stamp != stamp:
                 self.growing[key] = Growing(stamp=stamp, since=now)
                 continue
