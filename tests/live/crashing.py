@@ -61,6 +61,7 @@ def main(folder: Path, photos: Path, point: str, count: int) -> None:
         if live.ledger.row("select count(*) from photo")[0] >= len(names) and live.work() is None:
             break
         time.sleep(0.01)
+    signal.setitimer(signal.ITIMER_REAL, 0)  # the work is done; dying while it is reported would mean nothing
     Publishing(LiveSurvey(folder), folder).step(now=True)
     poses = {m.photo.name: [m.pose.map_C.tolist(), m.pose.cam_R_map.tolist()] for m in live.members.on_map()}
     for layer in live.tiles.layers():
