@@ -98,6 +98,8 @@ class Ledger:
         """
         self.path = Path(folder) / NAME
         self.lock = threading.RLock()
+        self.changes = 0
+        """Transactions of this process so far: whoever waits for news need not ask the file."""
         self.db = connected(self.path, write=write)
         if write:
             self.db.executescript(TABLES)
@@ -120,6 +122,7 @@ class Ledger:
                 return
             with transaction(self.db, self.path):
                 yield self.db
+            self.changes += 1
 
     @contextmanager
     def lightly(self) -> Iterator[None]:

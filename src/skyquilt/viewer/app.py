@@ -33,7 +33,9 @@ from skyquilt.viewer.wms import WmsError, asked, capabilities, map_request, refu
 
 STATIC = Path(__file__).parent / "static"
 WAIT_S = 0.1
-"""Between looks for news."""
+"""Between looks for news in the survey's file."""
+LISTEN_S = 0.02
+"""Between looks whether this process has changed it."""
 KEEP_ALIVE_S = 15.0
 """A comment is sent to quiet listeners so often, so that the connection is known to live."""
 Degrees = Annotated[float, Query(ge=-180, le=180)]
@@ -423,7 +425,15 @@ class Site:
                 quiet = 0.0
                 yield ": still here\n\n"
             if len(told) < 100:
-                await asyncio.sleep(WAIT_S)
+                await self._pause()
+
+    async def _pause(self) -> None:
+        """Until there may be news."""
+        known = self.writer.ledger.changes if self.writer is not None else 0
+        for _ in range(round(WAIT_S / LISTEN_S)):
+            await asyncio.sleep(LISTEN_S)
+            if self.writer is not None and self.writer.ledger.changes != known:
+                return
 
 
 def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) -> FastAPI:

@@ -57,7 +57,7 @@ class Adopting:
     def _show(self, done: Closed) -> None:
         for i in done.poses:
             if self.members.by_id[i].state == "refined":
-                self.showing.show(self.members.by_id[i])
+                self.showing.changed(self.members.by_id[i])
 
     def _follow(self, member: Member, steps: dict[int, NDArray[np.float64]]) -> None:
         near = [steps[j] for j in sorted(member.links) if j in steps]

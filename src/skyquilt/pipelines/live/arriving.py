@@ -51,7 +51,7 @@ class Arriving:
         self.queues.received.popleft()
         self.queues.untried.append(member)
         if pose is not None:
-            self.showing.show(member, urgent=True)
+            self.showing.show(member)
         return Update(what=member.state, photo=member.id)
 
     def _preview(self, member: Member) -> Member | None:

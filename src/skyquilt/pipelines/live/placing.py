@@ -218,6 +218,10 @@ class Placing:
 
     # -- links ------------------------------------------------------------------------------------------------
 
+    def has_features(self, number: int) -> bool:
+        """Whether a photo's features are at hand."""
+        return number in self._features
+
     def features(self, number: int) -> Features:
         """Features of a photo: at hand, from the store, or found now."""
         if number in self._features:

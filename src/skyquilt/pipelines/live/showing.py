@@ -10,8 +10,10 @@ from skyquilt.pipelines.live.update import Update
 from skyquilt.raster.tile_store import Address
 from skyquilt.run.write_points import reached
 
-DRAWN_AT_ONCE = 8
-"""Tiles drawn in one unit of work."""
+DRAWN_AT_ONCE = 4
+"""Tiles drawn in one unit of work; of those of a new photo, twice as many."""
+NOTED_AT_ONCE = 8
+"""Photos whose places are taken note of in one unit of work."""
 Queue = dict[Address, None]
 """Tiles to draw, in order."""
 
@@ -25,6 +27,7 @@ class Showing:
         self.urgent: Queue = {}
         self.dirty: Queue = {}
         self.later: Queue = dict.fromkeys(canvas.owed())
+        self.pending: dict[int, None] = {}
         self._drawn: dict[int, Pose] = {}
         self._to_draw: set[int] = set()
         self._fresh: dict[str, list[Address]] = {}
@@ -42,17 +45,34 @@ class Showing:
                 self._to_draw.add(member.id)
                 self.dirty.update(dict.fromkeys(addresses))
 
-    def show(self, member: Member, *, urgent: bool = False) -> None:
-        """A photo is where it was not, or looks different."""
+    def show(self, member: Member) -> None:
+        """A photo has come and is to be seen at once."""
+        self._note(member, self.urgent)
+
+    def changed(self, member: Member) -> None:
+        """A photo looks different now, which will be taken note of when there is time."""
         self._to_draw.add(member.id)
-        queue = self.urgent if urgent else self.dirty
-        queue.update(dict.fromkeys(self.canvas.place(member, self.members.camera(member))))
+        self.pending[member.id] = None
 
     def moved(self, member: Member) -> None:
         """A photo has moved; it is drawn again where that shows."""
         drawn = self._drawn.get(member.id)
         if drawn is None or self.canvas.moved(member, drawn):
-            self.show(member)
+            self.changed(member)
+
+    def take_note(self) -> Update:
+        """Finds the tiles that some of the changed photos lie on."""
+        some = list(self.pending)[:NOTED_AT_ONCE]
+        for number in some:
+            member = self.members.by_id[number]
+            del self.pending[number]
+            if member.state != "superseded":
+                self._note(member, self.dirty)
+        return Update(what="noted")
+
+    def _note(self, member: Member, queue: Queue) -> None:
+        self._to_draw.add(member.id)
+        queue.update(dict.fromkeys(self.canvas.place(member, self.members.camera(member))))
 
     def gone(self, number: int) -> None:
         """A photo takes no part any more."""
@@ -60,7 +80,7 @@ class Showing:
 
     def draw(self, queue: Queue, rule: str = "") -> Update:
         """Some of the dirty tiles; when no more are, what was drawn is written down and told."""
-        some = list(queue)[:DRAWN_AT_ONCE]
+        some = list(queue)[: DRAWN_AT_ONCE * (2 if queue is self.urgent else 1)]
         written = self.canvas.draw(some, rule)
         for address in some:
             queue.pop(address, None)
@@ -91,7 +111,9 @@ class Showing:
 
     def _waits(self, number: int) -> bool:
         """Whether tiles of a photo are still to be drawn."""
-        return any(a in self.dirty or a in self.urgent for a in self.canvas.tiles_of(number))
+        return number in self.pending or any(
+            a in self.dirty or a in self.urgent for a in self.canvas.tiles_of(number)
+        )
 
     def _drawn_now(self, member: Member) -> None:
         if member.pose is None or member.state == "superseded":

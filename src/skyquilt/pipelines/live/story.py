@@ -175,14 +175,21 @@ class LiveMap:
         return self.arriving.place(self.queues.received[0])
 
     def _refined(self) -> Update | None:
+        """In two units, so that a photo that comes meanwhile need not wait for both."""
         if not self.queues.untried or self.members.frame is None:
             return None
-        return self.refining.refine(self.queues.untried[0])
+        member = self.queues.untried[0]
+        if member.state != "superseded" and not self.placing.has_features(member.id):
+            self.placing.features(member.id)
+            return Update(what="noted", photo=member.id)
+        return self.refining.refine(member)
 
     def _drawn_first(self) -> Update | None:
         return self.showing.draw(self.showing.urgent) if self.showing.urgent else None
 
     def _drawn_last(self) -> Update | None:
+        if self.showing.pending:
+            return self.showing.take_note()
         if self.showing.dirty:
             return self.showing.draw(self.showing.dirty)
         return self.showing.draw_newest() if self.showing.later else None
