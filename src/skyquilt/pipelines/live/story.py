@@ -42,6 +42,8 @@ PHOTOS, TILES, FINISHED = "photos", "tiles.db", "finished"
 STORE = Path(FINISHED) / ".skyquilt" / "store"
 FULL_BYTES = 120_000_000
 """Full-size photos at hand."""
+TOGETHER = 4
+"""Photos placed before they are drawn, where several wait: they share tiles."""
 
 
 class LiveMap:
@@ -68,6 +70,7 @@ class LiveMap:
         registry = {c.__name__: c for c in (Looked, features.Features, poses.Pose)}
         self.store = Store(folder=self.folder / STORE, registry=registry)
         self.closing = Closing()
+        self._room = TOGETHER
         self._load()
 
     def _same_settings(self) -> None:
@@ -152,10 +155,13 @@ class LiveMap:
     def _next(self) -> Update | None:
         if self.settings.deterministic:
             return self._drawn_first() or self._one_by_one() or self._drawn_last()
-        if self.queues.received:
-            return self._placed()
         return (
-            self._drawn_first() or self._adopted() or self._refined() or self._drawn_last() or self._behind()
+            (self._placed() if self._room else None)
+            or self._drawn_first()
+            or self._adopted()
+            or self._refined()
+            or self._drawn_last()
+            or self._behind()
         )
 
     def _one_by_one(self) -> Update | None:
@@ -168,9 +174,12 @@ class LiveMap:
             if job is not None:
                 return self.adopting.adopt(close(job))
             self.schedule.checked = True
-        return self._refined() or (self._placed() if self.queues.received else None)
+        return self._refined() or self._placed()
 
-    def _placed(self) -> Update:
+    def _placed(self) -> Update | None:
+        if not self.queues.received:
+            return None
+        self._room = max(0, self._room - 1)
         self.blocks.last_arrival = time.monotonic()
         return self.arriving.place(self.queues.received[0])
 
@@ -185,7 +194,10 @@ class LiveMap:
         return self.refining.refine(member)
 
     def _drawn_first(self) -> Update | None:
-        return self.showing.draw(self.showing.urgent) if self.showing.urgent else None
+        """Who came first is seen first: photos that come while others are drawn are placed after them."""
+        update = self.showing.draw(self.showing.urgent) if self.showing.urgent else None
+        self._room = 0 if self.showing.urgent else TOGETHER
+        return update
 
     def _drawn_last(self) -> Update | None:
         if self.showing.pending:
