@@ -33,6 +33,7 @@ PUT = (
     "insert into tile values (?, ?, ?, ?, 1, ?) on conflict do update set version = version + 1,"
     " body = excluded.body"
 )
+TOP = "select 1 from tile where layer=? and level=? limit 1"
 SETTLED = "delete from owed where layer=? and level=? and row=? and col=?"
 
 
@@ -228,11 +229,14 @@ class TileStore:
         return [Address(layer, level, int(r), int(c)) for r, c in found]
 
     def layers(self) -> list[str]:
-        """Names of the layers that hold anything."""
+        """Names of the layers that hold anything, without a look at every tile."""
+        found: list[str] = []
         with self._lock:
-            top = LEVELS - 1
-            found = self._db.execute("select distinct layer from tile where level=?", (top,)).fetchall()
-        return sorted(str(n) for (n,) in found)
+            while name := self._db.execute(
+                "select min(layer) from tile where layer > ?", (found[-1] if found else "",)
+            ).fetchone()[0]:
+                found.append(str(name))
+            return [n for n in found if self._db.execute(TOP, (n, LEVELS - 1)).fetchone()]
 
     def extent(self, layer: str, gsd: float) -> tuple[float, float, float, float] | None:
         """West, south, east, north in m (map frame) of what a layer shows, to a few of its pixels; None if nothing."""
