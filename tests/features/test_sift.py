@@ -32,7 +32,7 @@ def warped(image, angle, scale, shift):
 )  # fmt: skip
 def test_keypoints_move_with_the_image(picture, angle, scale, shift, within, share):
     other, M = warped(picture, angle, scale, shift)
-    sift = Sift(count=800)
+    sift = Sift(count=800, longest=640)
     a, b = sift(picture), sift(other)
     matches = Mutual()(a, b)
     expected = a.px[matches.index_a] @ M[:, :2].T + M[:, 2]
@@ -110,7 +110,7 @@ def test_no_corner_of_a_photo_stays_bare(picture):
 
 
 def test_descriptors_are_roots_of_unit_length(picture):
-    found = Sift(count=300)(picture)
+    found = Sift(count=300, longest=640)(picture)
     assert len(found) == 300
     stored = found.descriptors.astype(float)
     assert found.descriptors.dtype == np.uint8 and found.descriptors.max() < 255

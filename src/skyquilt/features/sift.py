@@ -16,9 +16,9 @@ from skyquilt.model.features import DESCRIPTOR_UNIT, Features
 class Sift:
     """SIFT (Lowe 2004) on a shrunken image, descriptors as RootSIFT (Arandjelovic and Zisserman 2012)."""
 
-    count: int = 1500
+    count: int = 1200
     """Most keypoints kept per photo."""
-    longest: int = 640
+    longest: int = 512
     """Longest side in px of the image searched; smaller photos are searched as they are."""
     contrast: float = 0.015
     """OpenCV's contrast threshold."""
@@ -28,7 +28,7 @@ class Sift:
     """RootSIFT; False keeps Lowe's descriptors, as the thesis used them."""
     cells: int = 10
     """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare."""
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
 
     def __call__(self, image: NDArray) -> Features:
         """Features of pixels (H, W[, C]) of a full sensor image."""

@@ -98,16 +98,17 @@ def make_views(alignment: Alignment, surface: Surface) -> list[View]:
 
 
 def project_nodes(view: View, x: NDArray, y: NDArray, z: NDArray) -> Nodes:
-    """Nodes at map coordinates (r, c): photo pixels and scores."""
-    d = np.stack([x, y, z], -1) - view.pose.map_C
-    local = view.pose.to_camera(np.stack([x, y, z], -1))
+    """Nodes at map coordinates (r, c), or at k heights z (k, r, c) over them: photo pixels and scores."""
+    ground = np.stack(np.broadcast_arrays(x, y, z), -1)
+    d = ground - view.pose.map_C
+    local = view.pose.to_camera(ground)
     depth = np.maximum(local[..., 2], 1e-3)
     plane = local[..., :2] / depth[..., None]
     k = view.camera.vector
     px = distort(plane, k) * k[0] + k[1:3]
     # behind the camera, or where the distortion polynomial folds back, a point is nowhere in the photo
     real = (local[..., 2] > 0.1) & ((plane**2).sum(-1) < monotone_radius(view.camera) ** 2)
-    u, v = np.where(real[..., None], px, -1e4).astype(np.float32).transpose(2, 0, 1)
+    u, v = np.moveaxis(np.where(real[..., None], px, -1e4).astype(np.float32), -1, 0)
     drop2 = np.maximum(d[..., 2] ** 2, 1e-6)
     return Nodes(
         view=view, u=u, v=v, seen=inside(view.camera, u, v), real=real,

@@ -44,6 +44,8 @@ from skyquilt.run.folder import STATE
 from skyquilt.run.store import Store
 from skyquilt.surface.disparities import OnePlane
 
+FEATURE_PX = 640
+"""Longest side in px of the pictures searched for features: their disparities are the map, so they lie dense."""
 ROUTES = ("auto", "pair", "disparities", "reconstruction")
 """auto: pair for two photos, reconstruction for more."""
 
@@ -114,6 +116,7 @@ def _by_route(
     route: str, survey: Survey, settings: MosaicSettings, relief_m: float | None, clock: Clock
 ) -> Generator[Event, None, tuple[Scene, Depth]]:
     parts = methods(settings)
+    parts = replace(parts, sift=replace(parts.sift, longest=FEATURE_PX))
     if route == "reconstruction":
         scene = yield from scene_of(survey.photos, settings, parts, clock)
         if not len(scene.alignment.ties.xyz):

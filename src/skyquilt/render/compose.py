@@ -15,7 +15,7 @@ from skyquilt.render.exposure import NEUTRAL, Exposure, image_place, with_odds
 
 PhotoPixels = Callable[[int], NDArray]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""
-PIECE = 512
+PIECE = 256
 """Pixels of a piece composed at a time."""
 
 
@@ -61,11 +61,11 @@ class Composer:
         margin = -(-self.blend.margin // STEP) * STEP
         wide = window.grown(margin)
         nodes = window_nodes(self.views, self.grid, self.surface, wide)
+        near = self._near(nodes)
         for row in range(0, window.height, PIECE):
             for column in range(0, window.width, PIECE):
                 h, w = min(PIECE, window.height - row), min(PIECE, window.width - column)
-                piece = [cut(n, row, column, h + 2 * margin, w + 2 * margin) for n in nodes]
-                merged = self._piece(piece, h + 2 * margin, w + 2 * margin)
+                merged = self._piece(nodes, near, row, column, h + 2 * margin, w + 2 * margin)
                 if merged is not None:
                     inner = (slice(margin, margin + h), slice(margin, margin + w))
                     out[row : row + h, column : column + w] = merged[0][inner]
@@ -80,47 +80,68 @@ class Composer:
             count += n.seen[k + 1 : k + 1 + rows, k + 1 : k + 1 + columns]
         return count
 
-    def _piece(self, nodes: Sequence[Nodes], h: int, w: int) -> tuple[NDArray, NDArray[np.int32]] | None:
-        chosen = self._needed(nodes)
-        if not chosen:
-            return None
-        layers = [self._layer(n, h, w, alone=len(chosen) == 1) for n in chosen]
-        return self.blend.merge(layers, self.grid.gsd)
-
-    def _needed(self, nodes: Sequence[Nodes]) -> list[Nodes]:
-        """The photos that can show in a piece, in order of capture."""
-        seen = [n for n in nodes if n.seen.any()]
-        if not seen:
+    def _near(self, nodes: Sequence[Nodes]) -> list[NDArray[np.bool_]]:
+        """Where each photo, in order of capture, can show: (r, c) per node, for the cell around it."""
+        if not nodes:
             return []
-        scores = [np.where(n.seen, n.score, np.float32(np.inf)) for n in seen]
+        scores = [np.where(n.seen, n.score, np.float32(np.inf)) for n in nodes]
         ranks = np.stack([self.blend.rank(k, score) for k, score in enumerate(scores)])
-        height = min(n.height for n in seen)
+        height = min(n.height for n in nodes)
         slack = self.blend.reach(self.grid.gsd) / max(height, 1e-3)
         # a node sees only itself: what is invisible at a node may win between it and the next one
         best = cv2.dilate(ranks.min(0), np.ones((3, 3), np.uint8)) if np.isfinite(slack) else np.inf
-        near = np.stack([cv2.erode(r, np.ones((3, 3), np.uint8)) for r in ranks])
-        return [n for n, r in zip(seen, near, strict=True) if (np.isfinite(r) & (r <= best + slack)).any()]
+        spread = [cv2.erode(r, np.ones((3, 3), np.uint8)) for r in ranks]
+        return [np.isfinite(r) & (r <= best + slack) for r in spread]
 
-    def _layer(self, n: Nodes, h: int, w: int, *, alone: bool) -> Layer:
-        """One photo over a piece."""
-        u, v = densify(n.u, h, w), densify(n.v, h, w)
-        image = self.pixels(n.view.photo)
-        # a photo may see a node of the ring around the piece and nothing of the piece itself: a pixel is kept then
-        x0 = min(max(int(u.min()) - 2, 0), image.shape[1] - 1)
-        y0 = min(max(int(v.min()) - 2, 0), image.shape[0] - 1)
-        x1, y1 = max(int(np.ceil(u.max())) + 3, 1), max(int(np.ceil(v.max())) + 3, 1)
-        part = image[y0:y1, x0:x1]  # remap works in 16 bits: a cut-out keeps its coordinates small
-        warped = cv2.remap(part, u - x0, v - y0, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        warped = warped.reshape(h, w, -1)
-        score = np.zeros((h, w), np.float32) if alone else densify(n.score, h, w)
-        if not n.seen.all():
-            score = np.where(inside_everywhere(n, u, v), score, np.float32(np.inf))
+    def _piece(
+        self, nodes: Sequence[Nodes], near: Sequence[NDArray[np.bool_]], row: int, column: int, h: int, w: int
+    ) -> tuple[NDArray, NDArray[np.int32]] | None:
+        """Pixels (h, w, bands) and leading photo (h, w) from a row and column of the window of the nodes."""
+        cells = (
+            slice(row // STEP + 1, (row + h - 1) // STEP + 2),
+            slice(column // STEP + 1, (column + w - 1) // STEP + 2),
+        )
+        chosen = [(n, here) for n, m in zip(nodes, near, strict=True) if (here := m[cells]).any()]
+        if not chosen:
+            return None
+        alone = len(chosen) == 1
+        layers = [self._layer(cut(n, row, column, h, w), here, h, w, alone=alone) for n, here in chosen]
+        return self.blend.merge(layers, self.grid.gsd)
+
+    def _layer(self, n: Nodes, near: NDArray[np.bool_], h: int, w: int, *, alone: bool) -> Layer:
+        """One photo over a piece; only the box of the cells where it can show is filled."""
+        rows, columns = _extent(near.any(1), h), _extent(near.any(0), w)
+        whole = (rows, columns) == (slice(0, h), slice(0, w))
+        size = rows.stop - rows.start, columns.stop - columns.start
+        pixels, score = self._warped(
+            n if whole else cut(n, rows.start, columns.start, *size), *size, alone=alone
+        )
+        if not whole:
+            pixels, score = (
+                _embedded(pixels, 0, rows, columns, h, w),
+                _embedded(score, np.inf, rows, columns, h, w),
+            )
         return Layer(
-            photo=n.view.photo, pixels=self._exposed(n, u, v, warped), score=score,
+            photo=n.view.photo, pixels=pixels, score=score,
             centre=(float(n.view.pose.map_C[0]), float(n.view.pose.map_C[1])), height=n.height,
         )  # fmt: skip
 
-    def _exposed(self, n: Nodes, u: NDArray, v: NDArray, warped: NDArray) -> NDArray:
+    def _warped(self, n: Nodes, h: int, w: int, *, alone: bool) -> tuple[NDArray, NDArray[np.float32]]:
+        """Pixels (h, w, bands) and scores (h, w) of a photo where these nodes are."""
+        image = self.pixels(n.view.photo)
+        # remap works in 16 bits: a cut-out keeps its coordinates small
+        x, y = _reach(n.u, image.shape[1]), _reach(n.v, image.shape[0])
+        u, v = densify(n.u - np.float32(x.start), h, w), densify(n.v - np.float32(y.start), h, w)
+        warped = cv2.remap(image[y, x], u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(
+            h, w, -1
+        )
+        score = np.zeros((h, w), np.float32) if alone else densify(n.score, h, w)
+        if not n.seen.all():
+            within = inside_everywhere(n, u + np.float32(x.start), v + np.float32(y.start))
+            score = np.where(within, score, np.float32(np.inf))
+        return self._exposed(n, warped), score
+
+    def _exposed(self, n: Nodes, warped: NDArray) -> NDArray:
         photo = n.view.photo
         if photo not in self.exposure.gains or warped.dtype != np.uint8:
             return warped
@@ -129,3 +150,22 @@ class Composer:
             return with_odds(warped, densify(odds, *warped.shape[:2]).reshape(warped.shape))
         table = self.exposure.table(photo)
         return warped if table is None else np.asarray(cv2.LUT(warped, table)).reshape(warped.shape)
+
+
+def _extent(needed: NDArray[np.bool_], size: int) -> slice:
+    """The pixels, of `size`, that hold the needed cells and one more cell on each side."""
+    at = np.flatnonzero(needed)
+    return slice(max(int(at[0]) - 1, 0) * STEP, min((int(at[-1]) + 2) * STEP, size))
+
+
+def _reach(places: NDArray[np.float32], size: int) -> slice:
+    """The pixels, of `size`, that lie within a photo's node coordinates; one at least."""
+    start = min(max(int(places.min()) - 2, 0), size - 1)
+    return slice(start, max(min(int(np.ceil(places.max())) + 3, size), start + 1))
+
+
+def _embedded(part: NDArray, empty: float, rows: slice, columns: slice, h: int, w: int) -> NDArray:
+    """A part (rows, columns[, bands]) in its place of a piece (h, w[, bands])."""
+    out = np.full((h, w, *part.shape[2:]), empty, part.dtype)
+    out[rows, columns] = part
+    return out

@@ -101,15 +101,10 @@ class Sweep:
             return start[inner, inner], np.zeros((TILE, TILE), np.float32)
         low, high = (span[0] * step, span[1] * step) if relative else span
         offsets = np.arange(low, high + 0.5 * step, step).astype(np.float32)
+        heights = ground + offsets[:, None, None]
+        pictures = [_shown(labels, views, x, y, heights, grey, side) for labels in (first, second)]
         scores = np.stack(
-            [
-                _agreement(
-                    _shown(first, views, x, y, ground + dz, grey, side, full),
-                    _shown(second, views, x, y, ground + dz, grey, side, full),
-                    self.window,
-                )[inner, inner]
-                for dz in offsets
-            ]
+            [_agreement(a, b, self.window)[inner, inner] for a, b in zip(*pictures, strict=True)]
         )
         best, trust = _summit(scores, offsets)
         return start[inner, inner] + best, np.where(trust > self.agree, trust, 0).astype(np.float32)
@@ -176,25 +171,33 @@ def pair_labels(
 
 def _shown(
     labels: NDArray[np.int32], views: Sequence[View], x: NDArray, y: NDArray, z: NDArray, grey: GreyPicture,
-    side: int, full: int,
+    side: int,
 ) -> Float:  # fmt: skip
-    """The ground at heights z as the labelled photos show it (full, full); NaN where none does."""
-    out = np.full((full, full), np.nan, np.float32)
+    """The ground at each of k heights z (k, r + 2, c + 2) as the labelled photos show it, (k, r, c) in pixels
+    instead of nodes; NaN where none does.
+    """
     inner = labels[1:-1, 1:-1]
+    out = np.full((len(z), inner.shape[0] * STEP, inner.shape[1] * STEP), np.nan, np.float32)
     for photo in np.unique(inner[inner >= 0]).tolist():
         view = next(v for v in views if v.photo == photo)
         rows, columns = np.nonzero(inner == photo)
         r0, r1, c0, c1 = rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
         box = (slice(r0, r1 + 2), slice(c0, c1 + 2))
-        n = project_nodes(view, x[box], y[box], z[box])
+        n = project_nodes(view, x[box], y[box], z[(slice(None), *box)])
         picture = grey(photo, side)
-        scale = picture.shape[1] / view.camera.width
+        scale = np.float32(picture.shape[1] / view.camera.width)
         h, w = int(r1 - r0) * STEP, int(c1 - c0) * STEP
-        u, v = densify((n.u + 0.5) * scale - 0.5, h, w), densify((n.v + 0.5) * scale - 0.5, h, w)
-        warped = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        cells = (inner[r0:r1, c0:c1] == photo) & n.seen[1:-1, 1:-1]
-        mine = np.repeat(np.repeat(cells, STEP, 0), STEP, 1)
-        np.copyto(out[r0 * STEP : r1 * STEP, c0 * STEP : c1 * STEP], warped, where=mine, casting="unsafe")
+        mine = inner[r0:r1, c0:c1] == photo
+        for k, (u, v, seen) in enumerate(
+            zip((n.u + 0.5) * scale - 0.5, (n.v + 0.5) * scale - 0.5, n.seen, strict=True)
+        ):
+            warped = cv2.remap(
+                picture, densify(u, h, w), densify(v, h, w), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
+            cells = mine & seen[1:-1, 1:-1]
+            dense = np.repeat(np.repeat(cells, STEP, 0), STEP, 1)
+            target = out[k, r0 * STEP : r1 * STEP, c0 * STEP : c1 * STEP]
+            np.copyto(target, warped, where=dense, casting="unsafe")
     return out
 
 
