@@ -2,8 +2,11 @@
 
 import json
 
+import numpy as np
+from numpy.typing import NDArray
+
 from skyquilt.model.poses import Pose
-from skyquilt.pipelines.live.drawing import NEWEST, Canvas
+from skyquilt.pipelines.live.drawing import LEAST_MOVE, NEWEST, Canvas
 from skyquilt.pipelines.live.news import News
 from skyquilt.pipelines.live.state import Member, Members, pose_from, pose_record
 from skyquilt.pipelines.live.update import Update
@@ -29,6 +32,7 @@ class Showing:
         self.later: Queue = dict.fromkeys(canvas.owed())
         self.pending: dict[int, None] = {}
         self._drawn: dict[int, Pose] = {}
+        self._rims: dict[int, NDArray[np.float64]] = {}
         self._to_draw: set[int] = set()
         self._fresh: dict[str, list[Address]] = {}
         self._take_up()
@@ -39,8 +43,9 @@ class Showing:
         for member in self.members.on_map():
             addresses = self.canvas.place(member, self.members.camera(member))
             pose = pose_from(drawn[member.id]) if member.id in drawn else None
-            if pose is not None and _equal(pose, member.pose):
-                self._drawn[member.id] = pose
+            rim = self.canvas.outline(member.id)
+            if pose is not None and rim is not None and not self.canvas.moved(member, pose):
+                self._drawn[member.id], self._rims[member.id] = pose, rim
             else:
                 self._to_draw.add(member.id)
                 self.dirty.update(dict.fromkeys(addresses))
@@ -66,9 +71,21 @@ class Showing:
         for number in some:
             member = self.members.by_id[number]
             del self.pending[number]
-            if member.state != "superseded":
-                self._note(member, self.dirty)
+            if member.state == "superseded":
+                continue
+            before = list(self.dirty)
+            self._note(member, self.dirty)
+            if self._looks_as_drawn(number):
+                self._to_draw.discard(number)
+                self.dirty = dict.fromkeys(before)
         return Update(what="noted")
+
+    def _looks_as_drawn(self, number: int) -> bool:
+        """Whether a photo's rim, where poses, lenses and heights show most, lies where it was drawn."""
+        rim, drawn = self.canvas.outline(number), self._rims.get(number)
+        if rim is None or drawn is None or rim.shape != drawn.shape:
+            return False
+        return bool(np.abs(rim - drawn).max() < LEAST_MOVE * self.canvas.gsd)
 
     def _note(self, member: Member, queue: Queue) -> None:
         self._to_draw.add(member.id)
@@ -122,8 +139,6 @@ class Showing:
         ring, at = self.news.place(member)
         self.ledger.set_photo(member.id, footprint={"ring": ring, "at": at, "pose": pose_record(member.pose)})
         self._drawn[member.id] = member.pose
+        if (rim := self.canvas.outline(member.id)) is not None:
+            self._rims[member.id] = rim
         self.news.photo(member, ring=ring, at=at)
-
-
-def _equal(a: Pose, b: Pose | None) -> bool:
-    return b is not None and bool((a.map_C == b.map_C).all() and (a.cam_R_map == b.cam_R_map).all())

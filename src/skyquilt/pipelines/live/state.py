@@ -76,6 +76,7 @@ class Members:
         self.blocks: dict[int, set[int]] = {}
         self.cameras: dict[str, Camera] = {}
         self.frame: MapFrame | None = None
+        self._last = 0
         self._to_map: Transformer | None = None
         self._to_wgs: Transformer | None = None
         if found := ledger.meta("frame"):
@@ -96,12 +97,12 @@ class Members:
 
     def take_up(self) -> list[Member]:
         """Photos that were accepted since the last look, in order."""
-        last = max(self.by_id, default=0)
         query = (
             "select id, name, source, file, state, pose, camera, about from photo where id > ? order by id"
         )
         new = []
-        for number, name, source, file, state, pose, camera, about in self.ledger.rows(query, last):
+        for number, name, source, file, state, pose, camera, about in self.ledger.rows(query, self._last):
+            self._last = int(number)
             photo = read_photo(self.inbox.folder / file, name=name)
             if isinstance(photo, RejectedPhoto):
                 self.ledger.set_photo(number, state="refused", reason=photo.reason)
