@@ -68,8 +68,8 @@ def handed_in(live: LiveMap, paths: list[Path]) -> tuple[list[float], list[float
             waiting = len(live.queues.untried)
             mean = np.mean(cpu[-50:])
             print(
-                f"{k + 1} photos: {mean:.3f} s per photo, {mean / np.mean(pieces[-50:]):.1f} pieces, {memory[-1]:.0f} MB,"
-                f" {waiting} to be refined, background {background():.0f} s",
+                f"{k + 1} photos: {mean:.3f} s per photo, {mean / np.mean(pieces[-50:]):.1f} pieces, {memory[-1]:.0f} MB"
+                f", {waiting} to be refined, background {background():.0f} s",
                 flush=True,
             )
     return cpu, memory, pieces
