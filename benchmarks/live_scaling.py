@@ -67,9 +67,9 @@ def handed_in(live: LiveMap, paths: list[Path]) -> tuple[list[float], list[float
         if k % 50 == 49:
             waiting = len(live.queues.untried)
             mean = np.mean(cpu[-50:])
+            work = f"{mean:.3f} s per photo, {mean / np.mean(pieces[-50:]):.1f} pieces"
             print(
-                f"{k + 1} photos: {mean:.3f} s per photo, {mean / np.mean(pieces[-50:]):.1f} pieces, {memory[-1]:.0f} MB"
-                f", {waiting} to be refined, background {background():.0f} s",
+                f"{k + 1} photos: {work}, {memory[-1]:.0f} MB, {waiting} to be refined, background {background():.0f} s",
                 flush=True,
             )
     return cpu, memory, pieces
