@@ -69,7 +69,7 @@ def handed_in(live: LiveMap, paths: list[Path]) -> tuple[list[float], list[float
             mean = np.mean(cpu[-50:])
             work = f"{mean:.3f} s per photo, {mean / np.mean(pieces[-50:]):.1f} pieces"
             print(
-                f"{k + 1} photos: {work}, {memory[-1]:.0f} MB, {waiting} to be refined, background {background():.0f} s",
+                f"{k + 1} photos: {work}, {memory[-1]:.0f} MB, {waiting} to refine, background {background():.0f} s",
                 flush=True,
             )
     return cpu, memory, pieces
