@@ -16,6 +16,7 @@ from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.pipelines.intake import Intake, Pictures
+from skyquilt.pipelines.radiometry import drift_of, value_tags
 from skyquilt.raster import Block, CogWriter, RasterSpec, write_array
 from skyquilt.raster.boundary import inside as inside_polygon
 from skyquilt.raster.boundary import read_boundary
@@ -191,7 +192,12 @@ def _local_bounds(settings: MosaicSettings, alignment: Alignment) -> tuple[float
 def balance(
     intake: Intake, ground: Ground, alignment: Alignment, methods: Methods, settings: MosaicSettings
 ) -> Exposure:
-    """Exposure of the placed 8-bit photos; neutral for measured values."""
+    """Exposure of the placed photos: of 8-bit pictures, or the drift of measured values."""
+    if unit_of(intake):
+        frames = {v.photo: intake.looked[v.photo].thumbnail for v in ground.views}
+        return drift_of(
+            ground.views, frames, ground.surface, ground.grid.bounds, unit_of(intake), methods, settings
+        )
     if not settings.balance or intake.photos[0].dtype != "uint8":
         return NEUTRAL
     thumbnails = {v.photo: _three(intake.looked[v.photo].thumbnail) for v in ground.views}
@@ -239,7 +245,7 @@ def mosaic_spec(compose: Composer, alignment: Alignment, settings: MosaicSetting
         width=compose.grid.width, height=compose.grid.height, bands=compose.bands, dtype=str(compose.dtype),
         transform=geotransform(compose.grid, alignment), crs=alignment.frame.crs, compress=compress,
         quality=settings.quality, mask=not real, nodata=float("nan") if real else None,
-        tags={"SOFTWARE": "Skyquilt", "METHOD": alignment.method} | ({"UNIT": unit} if unit else {}),
+        tags={"SOFTWARE": "Skyquilt", "METHOD": alignment.method} | value_tags(unit, compose.exposure),
     )  # fmt: skip
 
 

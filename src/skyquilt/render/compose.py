@@ -138,6 +138,8 @@ class Composer:
 
     def _exposed(self, n: Nodes, warped: NDArray) -> NDArray:
         photo = n.view.photo
+        if photo in self.exposure.offsets and warped.dtype.kind == "f":
+            return warped + np.float32(self.exposure.offsets[photo])
         if photo not in self.exposure.gains or warped.dtype != np.uint8:
             return warped
         if self.exposure.uneven(photo):

@@ -6,7 +6,7 @@ and white stays white, so nothing clips or turns purple, and two gains in a row 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import cv2
@@ -40,6 +40,8 @@ class Exposure:
     """Photo -> (bands,) in log odds."""
     fields: Mapping[int, Float]
     """Photo -> (5,) in log odds, for x and y from -1 to 1 over the image."""
+    offsets: Mapping[int, float] = field(default_factory=dict)
+    """Photo -> what is added to measured values, in their unit."""
 
     def uneven(self, photo: int) -> bool:
         """Whether the photo needs more than one gain per band."""
