@@ -1,12 +1,17 @@
 """How quickly does a photo appear, how good is the growing map, and does the work per photo stay bounded?
 
 python benchmarks/live.py latency SURVEY [--rate 1.0] [--gsd 5]     every photo from 'file complete' to 'tile in hand'
+python benchmarks/live.py browser SURVEY                            the same to 'tile shown by a real browser'
+python benchmarks/live.py viewers SURVEY [--viewers 20]             the same while so many viewers pan about
+python benchmarks/live.py cost SURVEY                               CPU seconds per photo, step by step
 python benchmarks/live.py seams SURVEY [--gsd 5]                    seam disparity of the live map against the batch map
-python benchmarks/live.py scaling PHOTOS                            a simulated flight: time and memory per photo
+
+`live_scaling.py` asks whether the work per photo stays bounded.
 """
 
 import argparse
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -14,54 +19,123 @@ import tempfile
 import threading
 import time
 import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+from live_viewers import Browser
 
 
-def latency(survey: Path, rate: float, gsd: float) -> None:
+@contextmanager
+def running(gsd: float) -> Iterator[tuple[str, Path]]:
+    """A live map in a process of its own: its address and the folder it watches."""
     home = Path(tempfile.mkdtemp())
-    inbox, out = home / "in", home / "out"
+    inbox = home / "in"
     inbox.mkdir()
-    command = [
-        sys.executable,
-        "-m",
-        "skyquilt",
-        "live",
-        str(inbox),
-        "-o",
-        str(out),
-        "--port",
-        "0",
-        "--gsd",
-        str(gsd),
-        "--json",
-    ]
+    options = ["-o", str(home / "out"), "--port", "0", "--gsd", str(gsd), "--json"]
+    command = [sys.executable, "-m", "skyquilt", "live", str(inbox), *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         url = json.loads(process.stdout.readline())["url"]
         threading.Thread(target=lambda: process.stdout.read(), daemon=True).start()
-        complete: dict[str, float] = {}
-        visible: dict[str, float] = {}
-        threading.Thread(target=watch, args=(url, visible), daemon=True).start()
         time.sleep(1)
-        for path in sorted(p for p in survey.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".tif")):
-            began = time.monotonic()
-            shutil.copyfile(path, inbox / path.name)
-            complete[path.name] = time.monotonic()
-            time.sleep(max(0.0, 1 / rate - (time.monotonic() - began)))
-        until = time.monotonic() + 60
-        while len(visible) < len(complete) and time.monotonic() < until:
-            time.sleep(0.1)
+        yield url, inbox
     finally:
         process.terminate()
         process.wait()
         shutil.rmtree(home, ignore_errors=True)
+
+
+def photos_of(survey: Path) -> list[Path]:
+    return sorted(p for p in survey.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".tif"))
+
+
+def replayed(
+    survey: Path, inbox: Path, rate: float, idle: Callable[[float], None] = time.sleep
+) -> dict[str, float]:
+    """Copies photos at a rate; when each was complete (seconds since the epoch)."""
+    complete: dict[str, float] = {}
+    for path in photos_of(survey):
+        began = time.time()
+        shutil.copyfile(path, inbox / path.name)
+        complete[path.name] = time.time()
+        idle(max(0.0, 1 / rate - (time.time() - began)))
+    return complete
+
+
+def told(complete: dict[str, float], visible: dict[str, float], what: str) -> float:
     waits = np.array([visible[n] - t for n, t in complete.items() if n in visible])
+    load = os.getloadavg()[0]
     print(
-        f"{len(waits)} of {len(complete)} photos seen: median {np.median(waits):.2f} s, worst {waits.max():.2f} s"
+        f"{what}: {len(waits)} of {len(complete)} photos seen: median {np.median(waits):.2f} s,"
+        f" worst {waits.max():.2f} s; load of the machine {load:.1f}"
     )
     print(" ".join(f"{w:.2f}" for w in waits))
+    return float(np.median(waits))
+
+
+def latency(survey: Path, rate: float, gsd: float, viewers: int = 0) -> float:
+    visible: dict[str, float] = {}
+    with running(gsd) as (url, inbox):
+        threading.Thread(target=watch, args=(url, visible), daemon=True).start()
+        crowd = None
+        if viewers:
+            script = Path(__file__).parent / "live_viewers.py"
+            crowd = subprocess.Popen(
+                [sys.executable, str(script), url, str(viewers)], stdout=subprocess.PIPE, text=True
+            )
+        complete = replayed(survey, inbox, rate)
+        until = time.time() + 60
+        while len(visible) < len(complete) and time.time() < until:
+            time.sleep(0.1)
+        if crowd is not None:
+            crowd.terminate()
+            print(crowd.communicate()[0].strip())
+    return told(complete, visible, f"{viewers} viewers besides" if viewers else "latency")
+
+
+def with_viewers(survey: Path, rate: float, gsd: float, viewers: int) -> None:
+    alone = latency(survey, rate, gsd)
+    crowded = latency(survey, rate, gsd, viewers)
+    print(f"factor {crowded / alone:.2f}")
+
+
+def browser(survey: Path, rate: float, gsd: float) -> None:
+    with running(gsd) as (url, inbox), Browser(url) as page:
+        complete = replayed(survey, inbox, rate, page.wait)
+        page.wait(5)
+        visible = page.shown()
+    told(complete, visible, "browser")
+
+
+def cost(survey: Path, gsd: float) -> None:
+    from skyquilt.pipelines.live.settings import LiveSettings
+    from skyquilt.pipelines.live.story import LiveMap
+
+    home = Path(tempfile.mkdtemp())
+    live = LiveMap(home / "out", LiveSettings(gsd_cm=gsd))
+    used: dict[str, list[float]] = {}
+    for path in photos_of(survey):
+        shown, first = 0.0, True
+        began = time.process_time()
+        live.intake.take_file(path, "survey")
+        steps = {"accepted": time.process_time() - began}
+        while True:
+            began = time.process_time()
+            update = live.work()
+            if update is None:
+                break
+            seconds = time.process_time() - began
+            what = "drawn first" if update.what == "drawn" and first else update.what
+            first = first and not (update.what == "drawn" and not live.showing.urgent)
+            steps[what] = steps.get(what, 0.0) + seconds
+        shown = sum(steps.get(k, 0.0) for k in ("accepted", "placed", "drawn first"))
+        for key, seconds in {**steps, "to the event": shown, "all": sum(steps.values())}.items():
+            used.setdefault(key, []).append(seconds)
+    print({k: round(sum(v) / len(photos_of(survey)), 3) for k, v in used.items()}, "s of CPU per photo")
+    live.close()
+    shutil.rmtree(home, ignore_errors=True)
 
 
 def watch(url: str, visible: dict[str, float]) -> None:
@@ -83,7 +157,7 @@ def watch(url: str, visible: dict[str, float]) -> None:
                     )
                     with urllib.request.urlopen(f"{url}tiles/21/{x}/{y}") as tile:
                         if tile.status == 200 and tile.read():
-                            visible[said["name"]] = time.monotonic()
+                            visible[said["name"]] = time.time()
 
 
 def seams(survey: Path, gsd: float) -> None:
@@ -146,62 +220,23 @@ def drain(steps):
         return stop.value
 
 
-def scaling(count: int) -> None:
-    from skyquilt.photos.survey import read_survey
-    from skyquilt.pipelines.live.flying import FlySettings, order_of
-    from skyquilt.pipelines.live.settings import LiveSettings
-    from skyquilt.pipelines.live.story import LiveMap
-    from skyquilt.simulate import FlightSettings, simulate
-    from skyquilt.simulate.camera import Lens
-    from skyquilt.simulate.settings import Control, Route
-
-    home = Path(tempfile.mkdtemp())
-    settings = FlightSettings(
-        seed=2,
-        lens=Lens().scaled(480, 360),
-        route=Route(photos=count, drones=3),
-        control=Control(points=0, checks=0),
-        gsd=0.3,
-    )
-    for _ in simulate(settings, home / "flight", overwrite=True):
-        pass
-    arrivals = order_of(read_survey(home / "flight" / "photos").photos, FlySettings(drones=3))
-    live = LiveMap(home / "out", LiveSettings())
-    seconds, memory = [], []
-    for k, (_, photo, _) in enumerate(arrivals):
-        began = time.thread_time()
-        live.add(photo.path)
-        seconds.append(time.thread_time() - began)
-        memory.append(resident_mb())
-        if k % 50 == 49:
-            print(
-                f"{k + 1} photos: {np.mean(seconds[-50:]):.3f} s of CPU per photo, {memory[-1]:.0f} MB",
-                flush=True,
-            )
-    early, late = np.mean(seconds[100:200]), np.mean(seconds[-100:])
-    print(f"photos 100-200: {early:.3f} s, last hundred: {late:.3f} s, factor {late / early:.2f}")
-    print(f"memory {memory[200 if count > 200 else 0]:.0f} -> {memory[-1]:.0f} MB; {live.ledger.counts()}")
-    live.close()
-    shutil.rmtree(home, ignore_errors=True)
-
-
-def resident_mb() -> float:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * 4096 / 1e6
-
-
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("latency", "seams", "scaling"))
-    parser.add_argument("of")
+    parser.add_argument("what", choices=("latency", "browser", "viewers", "cost", "seams"))
+    parser.add_argument("of", type=Path)
     parser.add_argument("--rate", type=float, default=1.0)
     parser.add_argument("--gsd", type=float, default=5.0)
+    parser.add_argument("--viewers", type=int, default=20)
     asked = parser.parse_args()
     if asked.what == "latency":
-        latency(Path(asked.of), asked.rate, asked.gsd)
-    elif asked.what == "seams":
-        seams(Path(asked.of), asked.gsd)
+        latency(asked.of, asked.rate, asked.gsd)
+    elif asked.what == "browser":
+        browser(asked.of, asked.rate, asked.gsd)
+    elif asked.what == "viewers":
+        with_viewers(asked.of, asked.rate, asked.gsd, asked.viewers)
+    elif asked.what == "cost":
+        cost(asked.of, asked.gsd)
     else:
-        scaling(int(asked.of))
+        seams(asked.of, asked.gsd)

@@ -11,6 +11,8 @@ from skyquilt.pipelines.live.settings import LiveSettings
 from skyquilt.pipelines.live.story import LiveMap
 from skyquilt.pipelines.live.watch import Watch
 from skyquilt.run import inbox, write_points
+from skyquilt.viewer.publishing import Publishing
+from skyquilt.viewer.survey import LiveSurvey
 
 
 def die(*_: object) -> None:
@@ -56,9 +58,11 @@ def main(folder: Path, photos: Path, point: str, count: int) -> None:
             break
         if live.work() is not None:
             continue
-        if live.ledger.row("select count(*) from photo")[0] >= len(names) and live._next() is None:
+        if live.ledger.row("select count(*) from photo")[0] >= len(names) and live.work() is None:
             break
         time.sleep(0.01)
+    signal.setitimer(signal.ITIMER_REAL, 0)  # the work is done; dying while it is reported would mean nothing
+    Publishing(LiveSurvey(folder), folder).step(now=True)
     poses = {m.photo.name: [m.pose.map_C.tolist(), m.pose.cam_R_map.tolist()] for m in live.members.on_map()}
     for layer in live.tiles.layers():
         for level in range(9):

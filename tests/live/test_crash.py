@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from skyquilt.run.write_points import POINTS
+from tests.stories.conftest import relabel
 
 KILLS = int(os.environ.get("SKYQUILT_KILLS", "5"))
-"""Kills at random moments; benchmarks ask for more."""
-PASSED = [p for p in POINTS if p != "published"]
-"""Points that a replay without a server passes."""
+"""Kills at random moments; more can be asked for."""
+OFTEN = 6
+"""Kills that one survey meets; with more, the last ones would find nothing left to do."""
 
 
 def replay(out, photos, point="", count=1):
@@ -29,9 +30,11 @@ def replay(out, photos, point="", count=1):
 
 @pytest.fixture(scope="module")
 def photos(flight, tmp_path_factory):
+    """Five photos, of which the second does not know where it was taken: it waits, is found and tried again."""
     folder = tmp_path_factory.mktemp("inbox")
-    for path in flight.photos[:4]:
+    for path in flight.photos[:5]:
         shutil.copyfile(path, folder / path.name)
+    relabel(folder / flight.photos[1].name, drop=("position",))
     return folder
 
 
@@ -40,54 +43,49 @@ def undisturbed(photos, tmp_path_factory):
     done = replay(tmp_path_factory.mktemp("undisturbed"), photos)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    assert len(found["poses"]) == 4
+    assert len(found["poses"]) == 5
+    assert found["states"] == {"refined": 5, "refused": 0}
     return found
 
 
 def same(done, undisturbed):
+    """Bit for bit: JSON gives floats back as they were."""
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    assert found["poses"].keys() == undisturbed["poses"].keys()
-    names = sorted(undisturbed["poses"])
-    centres, rotations = (
-        np.array([found["poses"][n][k] for n in names])
-        - np.array([undisturbed["poses"][n][k] for n in names])
-        for k in (0, 1)
-    )
-    # nothing lost, nothing far off: that holds always
-    assert np.abs(centres).max() < 0.5 and np.abs(rotations).max() < 0.01
-    if centres.any() or rotations.any():
-        pytest.xfail(
-            "known: at some moments (seen twice in eight runs) a kill changes what a photo is refined by"
-        )
-    return found
+    assert found["states"] == undisturbed["states"]
+    assert found["poses"] == undisturbed["poses"]
 
 
 @pytest.mark.slow
-def test_killed_at_every_write_point_in_one_survey(photos, undisturbed, tmp_path):
-    killed = 0
-    for k, point in enumerate([*PASSED, "torn"]):
-        done = replay(tmp_path / "out", photos, point, 1 + k % 2)
-        killed += done.returncode < 0
-        assert done.returncode in (-9, -14, 0), done.stderr
-    assert killed >= len(PASSED) // 2  # later points of an early photo are not passed again
-    same(replay(tmp_path / "out", photos), undisturbed)
-    assert not list((tmp_path / "out").rglob("*.partial"))
+def test_killed_at_every_write_point(photos, undisturbed, tmp_path):
+    surveys = 0
+    for k, point in enumerate([*POINTS, "torn"]):
+        done = replay(tmp_path / f"{surveys}", photos, point, 1 + k % 2)
+        if done.returncode == 0:  # the work that passes this point was done already
+            same(done, undisturbed)
+            surveys += 1
+            done = replay(tmp_path / f"{surveys}", photos, point, 1)
+        assert done.returncode == -9, (point, done.stderr)
+    for number in range(surveys + 1):
+        same(replay(tmp_path / f"{number}", photos), undisturbed)
+    assert not list(tmp_path.rglob("*.partial"))
 
 
 @pytest.mark.slow
 def test_killed_at_random_moments(photos, undisturbed, tmp_path):
     rng = np.random.default_rng(int(os.environ.get("SKYQUILT_SEED", "1")))
-    killed = 0
-    for _ in range(KILLS):
-        # moments within the time that an undisturbed replay takes; what is done is not done again, so rather early ones
-        done = replay(
-            tmp_path / "out", photos, "time", int(1000 * undisturbed["seconds"] * rng.uniform(0.05, 0.5))
-        )
-        killed += done.returncode < 0
-        assert done.returncode in (-9, -14, 0), done.stderr
-    assert killed >= 1
-    same(replay(tmp_path / "out", photos), undisturbed)
+    killed = surveys = 0
+    while killed < KILLS:
+        out = tmp_path / f"{surveys}"
+        for _ in range(min(OFTEN, KILLS - killed)):
+            moment = int(1000 * undisturbed["seconds"] * rng.uniform(0.05, 0.5))
+            done = replay(out, photos, "time", moment)
+            assert done.returncode in (-9, 0), done.stderr
+            killed += done.returncode == -9
+            if done.returncode == 0:
+                break
+        same(replay(out, photos), undisturbed)
+        surveys += 1
 
 
 def test_a_full_disk_refuses_and_loses_nothing(flight, tmp_path, monkeypatch):

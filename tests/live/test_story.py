@@ -22,7 +22,7 @@ def mapped(folder, paths, **settings):
     live = LiveMap(folder, LiveSettings(**settings))
     for path in paths:
         live.add(path)
-    live._last_arrival = -1e9  # as if it had been quiet for long
+    live.blocks.last_arrival = -1e9  # as if it had been quiet for long
     for _ in live.settle():
         pass
     return live
@@ -104,7 +104,7 @@ def test_a_restart_finds_everything_as_it_was(small, flight):
     for member in other.members.on_map():
         assert np.array_equal(member.pose.map_C, poses[member.photo.name].map_C)
         assert np.array_equal(member.pose.cam_R_map, poses[member.photo.name].cam_R_map)
-    assert not other._dirty  # nothing is to be drawn again
+    assert not other.showing.dirty  # nothing is to be drawn again
     for address in other.tiles.addresses("visible", 0):
         assert other.tiles.get(address).pixels.shape == (512, 512, 3)
     other.close()

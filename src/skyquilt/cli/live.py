@@ -58,10 +58,8 @@ def command(
         from skyquilt.pipelines.live.running import iter_live
         from skyquilt.pipelines.live.settings import LiveSettings
         from skyquilt.pipelines.live.story import LiveMap
+        from skyquilt.viewer.apart import Asked, ServingApart
         from skyquilt.viewer.guard import Guard
-        from skyquilt.viewer.publishing import Publishing
-        from skyquilt.viewer.serving import Serving
-        from skyquilt.viewer.survey import LiveSurvey
     settings = LiveSettings(
         gsd_cm=gsd, crs=crs, reposition=reposition, deterministic=deterministic, features=features,
         most_bytes=int(max_mb * 1e6), most_photos=max_photos,
@@ -69,11 +67,8 @@ def command(
     guard = Guard(host=host, token=token)
     live = LiveMap(output, settings)
     try:
-        survey = LiveSurvey(output, base=base)
-        with (
-            Serving(survey=survey, guard=guard, folder=output, writer=live, port=port) as serving,
-            Publishing(LiveSurvey(output), output),
-        ):
+        asked = Asked(folder=output, settings=settings, guard=guard, base=base)
+        with ServingApart(asked=asked, port=port) as serving:
             events = iter_live(inbox, live, finish=finish)
             show_live(events, serving.url, mode="quiet" if quiet else "json" if json else "normal")
     finally:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 from skyquilt.cli.progress import as_record, mosaic_summary
 from skyquilt.model.event import Event, Note, Result, StageStarted
-from skyquilt.pipelines.live.story import Update
+from skyquilt.pipelines.live.update import Update
 
 
 def show_live(events: Iterable[Event | Update], url: str, *, mode: str) -> None:

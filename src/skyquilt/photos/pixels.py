@@ -110,7 +110,6 @@ def decode_jpeg(data: bytes, *, gray: bool = False, reduction: Reduction = 1) ->
     height, width, _, _ = simplejpeg.decode_jpeg_header(data)
     wanted = {
         "colorspace": "GRAY" if gray else "RGB",
-        "fastupsample": True,  # colour differences between pixels are not interpolated: grey stays the same
         "min_height": -(-height // reduction) if reduction > 1 else 0,
         "min_width": -(-width // reduction) if reduction > 1 else 0,
     }

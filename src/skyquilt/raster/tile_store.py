@@ -23,10 +23,18 @@ LEVELS = 9
 QUALITY = 90
 KEPT = 96
 """Decoded tiles at hand."""
-TABLE = (
+TABLES = (
     "create table if not exists tile(layer text, level integer, row integer, col integer, version integer not null,"
-    " body blob not null, primary key(layer, level, row, col)) without rowid"
+    " body blob not null, primary key(layer, level, row, col)) without rowid",
+    "create table if not exists owed(layer text, level integer, row integer, col integer,"
+    " primary key(layer, level, row, col)) without rowid",
 )
+PUT = (
+    "insert into tile values (?, ?, ?, ?, 1, ?) on conflict do update set version = version + 1,"
+    " body = excluded.body"
+)
+TOP = "select 1 from tile where layer=? and level=? limit 1"
+SETTLED = "delete from owed where layer=? and level=? and row=? and col=?"
 
 
 @dataclass(frozen=True, order=True)
@@ -114,7 +122,8 @@ class TileStore:
             if write:
                 self._db.execute("pragma journal_mode=wal")
                 self._db.execute("pragma synchronous=full")
-                self._db.execute(TABLE)
+                for table in TABLES:
+                    self._db.execute(table)
         except sqlite3.Error as error:
             raise OutputError(f"{path} cannot be opened ({error})") from error
 
@@ -148,22 +157,27 @@ class TileStore:
         while len(self._kept) > KEPT:
             self._kept.popitem(last=False)
 
-    def put(self, tiles: Sequence[tuple[Address, Tile]]) -> None:
+    def put(
+        self,
+        tiles: Sequence[tuple[Address, Tile]],
+        *,
+        owing: Iterable[Address] = (),
+        settled: Iterable[Address] = (),
+    ) -> None:
         """Writes tiles, all in one transaction; the coarser ones above them are made by `raise_levels`.
+
+        `owing`: tiles of other layers that are to follow; they are remembered until they are `settled`.
 
         Raises:
             OutputError: the disk is full.
         """
-        bodies = [(a, encoded(t)) for a, t in tiles]
+        rows = [(*_key(a), encoded(t)) for a, t in tiles]
         with self._lock:
             try:
                 self._db.execute("begin immediate")
-                for address, body in bodies:
-                    self._db.execute(
-                        "insert into tile values (?, ?, ?, ?, 1, ?) on conflict do update set"
-                        " version = version + 1, body = excluded.body",
-                        (*_key(address), body),
-                    )
+                self._db.executemany(PUT, rows)
+                self._db.executemany("insert or ignore into owed values (?, ?, ?, ?)", map(_key, owing))
+                self._db.executemany(SETTLED, map(_key, settled))
                 self._db.execute("commit")
             except sqlite3.Error as error:
                 if self._db.in_transaction:
@@ -172,8 +186,14 @@ class TileStore:
                     f"the disk is full: {self.path} cannot grow ({error}). Make room; mapping goes on then"
                 ) from error
 
-    def raise_levels(self, changed: Iterable[Address]) -> int:
-        """Makes every coarser tile above those of level 0 that changed; returns how many."""
+    def owed(self) -> list[Address]:
+        """Tiles that are to follow others and have not yet, in order."""
+        with self._lock:
+            found = self._db.execute("select layer, level, row, col from owed").fetchall()
+        return [Address(str(layer), int(z), int(r), int(c)) for layer, z, r, c in found]
+
+    def raise_levels(self, changed: Iterable[Address], *, settled: Iterable[Address] = ()) -> int:
+        """Makes every coarser tile above those of level 0 that changed; returns how many. `settled`: as for `put`."""
         done: dict[Address, Tile] = {}
         level = sorted(set(changed))
         while level and level[0].level + 1 < LEVELS:
@@ -182,7 +202,7 @@ class TileStore:
                 tile = self._halved(parent, done)
                 if tile is not None:
                     done[parent] = tile
-        self.put(list(done.items()))
+        self.put(list(done.items()), settled=settled)
         return len(done)
 
     def _halved(self, parent: Address, fresh: dict[Address, Tile]) -> Tile | None:
@@ -209,11 +229,14 @@ class TileStore:
         return [Address(layer, level, int(r), int(c)) for r, c in found]
 
     def layers(self) -> list[str]:
-        """Names of the layers that hold anything."""
+        """Names of the layers that hold anything, without a look at every tile."""
+        found: list[str] = []
         with self._lock:
-            top = LEVELS - 1
-            found = self._db.execute("select distinct layer from tile where level=?", (top,)).fetchall()
-        return sorted(str(n) for (n,) in found)
+            while name := self._db.execute(
+                "select min(layer) from tile where layer > ?", (found[-1] if found else "",)
+            ).fetchone()[0]:
+                found.append(str(name))
+            return [n for n in found if self._db.execute(TOP, (n, LEVELS - 1)).fetchone()]
 
     def extent(self, layer: str, gsd: float) -> tuple[float, float, float, float] | None:
         """West, south, east, north in m (map frame) of what a layer shows, to a few of its pixels; None if nothing."""

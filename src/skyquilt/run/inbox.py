@@ -48,12 +48,14 @@ def ending_of(head: bytes) -> str | None:
 class Inbox:
     """The folder of accepted photos."""
 
-    def __init__(self, ledger: Ledger, folder: Path, *, most_bytes: int = 500_000_000) -> None:
-        """Photos go to `folder`; one file may have at most `most_bytes`."""
+    def __init__(
+        self, ledger: Ledger, folder: Path, *, most_bytes: int = 500_000_000, tidy: bool = True
+    ) -> None:
+        """Photos go to `folder`; one file may have at most `most_bytes`. `tidy`: removes what a crash left of some."""
         self.ledger, self.folder, self.most_bytes = ledger, folder, most_bytes
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            for left in folder.glob("*.partial"):
+            for left in folder.glob("*.partial") if tidy else ():
                 left.unlink()
         except OSError as error:
             raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error

@@ -31,19 +31,19 @@ MARGIN = 16
 class Sweep:
     """Coarse-to-fine plane sweep."""
 
-    sides: tuple[int, ...] = (500,)
+    sides: tuple[int, ...] = (400,)
     """Longest side in px of the pictures of each pass."""
     below: float = 0.05
     """Depth searched below the known surface in the first pass, as a share of the flying height."""
     above: float = 0.05
     """Height searched above it."""
-    window: int = 9
+    window: int = 7
     """Side in px of the window that must agree."""
     agree: float = 0.55
     """Correlation from which a height is believed."""
     smoothing_cells: float = 1.0
     """Standard deviation of the final Gaussian in cells."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def __call__(self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture) -> Surface:
         """The surface with the heights found; where pictures do not agree it stays as it was."""

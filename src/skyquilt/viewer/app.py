@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 
+from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI, HTTPException, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
@@ -33,7 +34,11 @@ from skyquilt.viewer.wms import WmsError, asked, capabilities, map_request, refu
 
 STATIC = Path(__file__).parent / "static"
 WAIT_S = 0.1
-"""Between looks for news."""
+"""Between looks for news at most."""
+LISTEN_S = 0.02
+"""Between looks whether there may be any."""
+DRAWN_AT_ONCE = 2
+"""Tiles drawn at a time: more would not be quicker, and take turns from others."""
 KEEP_ALIVE_S = 15.0
 """A comment is sent to quiet listeners so often, so that the connection is known to live."""
 Degrees = Annotated[float, Query(ge=-180, le=180)]
@@ -52,6 +57,7 @@ class Site:
     def __init__(self, survey: Survey, guard: Guard, writer: Writer | None, folder: Path) -> None:
         self.survey, self.guard, self.writer, self.folder = survey, guard, writer, folder
         self.images = Images(survey)
+        self._drawing = CapacityLimiter(DRAWN_AT_ONCE)
         self.ending = threading.Event()
         self.uploads = Uploads(folder / "uploads", most=guard.most_uploads) if writer is not None else None
 
@@ -74,16 +80,20 @@ class Site:
                 "event": self.survey.version(), "version": __version__, "token": self.guard.token is not None,
                 "finish": finish}  # fmt: skip
 
-    def tile(self, z: int, x: int, y: int, layer: str | None = None) -> Response:
-        """A web tile (EPSG:3857, 256 px, WebP); 204 where the map has nothing."""
+    async def tile(self, request: Request, z: int, x: int, y: int, layer: str | None = None) -> Response:
+        """A web tile (EPSG:3857, 256 px, WebP); 204 where the map has nothing, 304 where the client has it."""
         name = self._layer(layer)
         if not (0 <= z <= 26 and 0 <= x < 2**z and 0 <= y < 2**z):
             raise HTTPException(404, f"there is no tile {z}/{x}/{y}")
-        data = self.images.tile(name, z, x, y)
-        headers = {"Cache-Control": "no-cache"}
-        if data is None:
+        found = self.images.kept(name, z, x, y)
+        if found is None:
+            found = await to_thread.run_sync(self.images.tile, name, z, x, y, limiter=self._drawing)
+        headers = {"Cache-Control": "no-cache", "ETag": found.tag}
+        if found.tag in request.headers.get("if-none-match", ""):
+            return Response(status_code=304, headers=headers)
+        if found.data is None:
             return Response(status_code=204, headers=headers)
-        return Response(data, media_type="image/webp", headers=headers)
+        return Response(found.data, media_type="image/webp", headers=headers)
 
     def _layer(self, name: str | None) -> str:
         known = self.survey.layers()
@@ -423,7 +433,15 @@ class Site:
                 quiet = 0.0
                 yield ": still here\n\n"
             if len(told) < 100:
-                await asyncio.sleep(WAIT_S)
+                await self._pause()
+
+    async def _pause(self) -> None:
+        """Until there may be news."""
+        known = self.survey.stamp()
+        for _ in range(round(WAIT_S / LISTEN_S)):
+            await asyncio.sleep(LISTEN_S)
+            if self.survey.stamp() != known:
+                return
 
 
 def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) -> FastAPI:

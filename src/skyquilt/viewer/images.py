@@ -1,11 +1,15 @@
 """Map pictures as bytes, kept until what they show changes."""
 
+import hashlib
 import json
 import threading
 from collections import OrderedDict
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
+import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,9 +30,10 @@ def image_bytes(rgba: NDArray[np.uint8], form: str, *, transparent: bool = True)
         picture_, bgr = rgb, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
     else:
         picture_, bgr = rgba, cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA)
+    if form == "image/webp":  # the codec's quickest way takes a third of the time of its usual one
+        return bytes(imagecodecs.webp_encode(np.ascontiguousarray(picture_), level=80, method=0))
     options = {
         "image/png": (".png", [cv2.IMWRITE_PNG_COMPRESSION, 1]),
-        "image/webp": (".webp", [cv2.IMWRITE_WEBP_QUALITY, 80]),
         "image/jpeg": (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 85]),
     }
     ending, settings = options[form]
@@ -38,34 +43,52 @@ def image_bytes(rgba: NDArray[np.uint8], form: str, *, transparent: bool = True)
     return data.tobytes()
 
 
+@dataclass(frozen=True, kw_only=True)
+class WebTile:
+    """A web tile, as it is sent."""
+
+    data: bytes | None
+    """WebP; None where the map has nothing."""
+
+    @cached_property
+    def tag(self) -> str:
+        """What browsers know its content by (ETag)."""
+        return f'"{hashlib.blake2b(self.data or b"", digest_size=8).hexdigest()}"'
+
+
 class Images:
     """Web tiles of a survey."""
 
     def __init__(self, survey: Survey) -> None:
         self.survey = survey
-        self._kept: OrderedDict[tuple[str, int, int, int], bytes | None] = OrderedDict()
+        self._kept: OrderedDict[tuple[str, int, int, int], WebTile] = OrderedDict()
         self._lock = threading.Lock()
-        self._known = survey.version()
+        self._known, self._stamp = survey.version(), survey.stamp()
         self._scales: dict[str, tuple[int, tuple[float, float]]] = {}
 
-    def tile(self, layer: str, z: int, x: int, y: int) -> bytes | None:
-        """A web tile as WebP; None where the map has nothing."""
+    def kept(self, layer: str, z: int, x: int, y: int) -> WebTile | None:
+        """A web tile that is at hand and shows the map as it is; None where it would have to be drawn."""
         self._forget_changed()
         key = (layer, z, x, y)
         with self._lock:
             if key in self._kept:
                 self._kept.move_to_end(key)
-                return self._kept[key]
-            before = self._known
+            return self._kept.get(key)
+
+    def tile(self, layer: str, z: int, x: int, y: int) -> WebTile:
+        """A web tile."""
+        if (found := self.kept(layer, z, x, y)) is not None:
+            return found
+        before = self._known
         source = self.survey.layers()[layer]
         rgba = picture(source, "EPSG:3857", mercator(z, x, y), TILE, TILE, self.scale(layer, source))
-        data = None if rgba is None else image_bytes(rgba, "image/webp")
+        made = WebTile(data=None if rgba is None else image_bytes(rgba, "image/webp"))
         with self._lock:
             if self._known == before:  # else it may have changed while it was drawn
-                self._kept[key] = data
+                self._kept[layer, z, x, y] = made
                 while len(self._kept) > KEPT:
                     self._kept.popitem(last=False)
-        return data
+        return made
 
     def scale(self, layer: str, source: MapSource) -> tuple[float, float] | None:
         """Values shown as black and as white: the 2nd and 98th percentile of a measured layer, renewed as it grows."""
@@ -89,8 +112,8 @@ class Images:
 
     def _forget_changed(self) -> None:
         """Drops tiles that show what was drawn anew since the last look."""
-        survey = self.survey
-        if not isinstance(survey, LiveSurvey):
+        survey, stamp = self.survey, self.survey.stamp()
+        if not isinstance(survey, LiveSurvey) or stamp == self._stamp:
             return
         while told := survey.ledger.told(self._known):
             changed = [json.loads(b) for _, kind, b in told if kind == "tiles"]
@@ -98,6 +121,7 @@ class Images:
                 for said in changed:
                     self._drop(said)
                 self._known = told[-1][0]
+        self._stamp = stamp
 
     def _drop(self, said: Mapping[str, object]) -> None:
         box = said["bounds"]

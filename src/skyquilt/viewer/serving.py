@@ -49,6 +49,8 @@ class Serving:
     """The growing map, where there is one."""
     port: int = 0
     """Where it listens; 0 = a free port, to be read afterwards."""
+    listening: socket.socket | None = None
+    """A socket that listens already; None = one is made."""
     _parts: dict[str, Any] = field(default_factory=dict)
 
     def __enter__(self) -> Self:
@@ -63,7 +65,7 @@ class Serving:
             from skyquilt.viewer.app import make_app
         except ImportError as error:
             raise UsageError(NEEDED) from error
-        listening = bound(self.guard.host, self.port)
+        listening = self.listening or bound(self.guard.host, self.port)
         self.port = int(listening.getsockname()[1])
         app = make_app(self.survey, self.guard, self.writer, self.folder)
         config = uvicorn.Config(
@@ -88,6 +90,10 @@ class Serving:
     @property
     def url(self) -> str:
         """Where to look."""
-        host = self.guard.host
-        host = "127.0.0.1" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
-        return f"http://{host}:{self.port}/"
+        return address(self.guard.host, self.port)
+
+
+def address(host: str, port: int) -> str:
+    """What to type into a browser."""
+    host = "127.0.0.1" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+    return f"http://{host}:{port}/"

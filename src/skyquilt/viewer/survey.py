@@ -53,6 +53,9 @@ class Survey(Protocol):
     def version(self) -> int:
         """A number that grows with every change."""
 
+    def stamp(self) -> int:
+        """A number that differs where something may have changed; cheap."""
+
 
 def open_survey(folder: Path, base: Path | None = None) -> "LiveSurvey | FinishedSurvey":
     """The survey in a folder.
@@ -141,6 +144,10 @@ class LiveSurvey:
         """Number of the newest event."""
         return self.ledger.last_event()
 
+    def stamp(self) -> int:
+        """Of the ledger's file."""
+        return self.ledger.stamp()
+
 
 class FinishedSurvey:
     """The folder of a finished run."""
@@ -205,6 +212,10 @@ class FinishedSurvey:
 
     def version(self) -> int:
         """It does not change."""
+        return 1
+
+    def stamp(self) -> int:
+        """Neither does this."""
         return 1
 
 

@@ -95,9 +95,11 @@ def close(job: Job) -> Closed:
         features = [_features(p, store, job.methods) for p in job.photos]
         return _part(job, links, features) if job.held else _whole(job, links, features, store)
     except (AlignmentError, SkyquiltError, np.linalg.LinAlgError, ValueError) as error:
-        return Closed(
-            ids=job.ids, poses={}, cameras={}, camera_of={}, xyz=np.zeros((0, 3)), problem=str(error)
-        )
+        return _nothing(job.ids, str(error))
+
+
+def _nothing(ids: tuple[int, ...], problem: str) -> Closed:
+    return Closed(ids=ids, poses={}, cameras={}, camera_of={}, xyz=np.zeros((0, 3)), problem=problem)
 
 
 def _features(photo: Photo, store: Store, methods: Methods) -> Features:
@@ -222,7 +224,7 @@ class Closing:
         except (EOFError, OSError):
             done = None
         self.stop()
-        return done
+        return done or _nothing((), "its process ended early")
 
     def stop(self) -> None:
         """Ends the job, if there is one."""

@@ -176,15 +176,22 @@ class Canvas:
         fresh = [(a, t) for a, t in done if t is not None]
         emptied = [(a, self._empty(a.layer)) for a, t in done if t is None and self.tiles.version(a) > 0]
         written = [*fresh, *emptied]
-        self.tiles.put(written)
+        self.tiles.put(
+            written, owing=() if rule else [replace(a, layer=a.layer + NEWEST) for a, _ in written]
+        )
         reached("tiles written")
         self._raised.update(a for a, _ in written)
         return [a for a, _ in written]
 
-    def finish(self) -> int:
+    def finish(self, rule: str = "") -> int:
         """Makes the coarser tiles above all that was drawn since; returns how many."""
-        changed, self._raised = self._raised, set()
-        return self.tiles.raise_levels(changed) if changed else 0
+        changed = {a for a in self._raised if a.layer.endswith(NEWEST) == bool(rule)}
+        self._raised -= changed
+        return self.tiles.raise_levels(changed, settled=changed if rule else ()) if changed else 0
+
+    def owed(self) -> list[Address]:
+        """Tiles (addresses of the plain layer) whose newest-on-top fellows show less than they do."""
+        return [replace(a, layer=a.layer.removesuffix(NEWEST)) for a in self.tiles.owed()]
 
     def _tile(self, address: Address, blend: Blend) -> Tile | None:
         grid = address.grid(self.gsd)

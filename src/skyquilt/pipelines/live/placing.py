@@ -73,6 +73,8 @@ class Placing:
         for member in members.on_map():
             if member.tried:
                 self.indexed(member)
+        for member in sorted(members.by_id.values(), key=lambda m: m.tried):
+            self._remember(member)
 
     # -- metadata ---------------------------------------------------------------------------------------------
 
@@ -115,7 +117,7 @@ class Placing:
         return (turn if abs(turn) > 10 else 0.0), lift
 
     def learn(self, member: Member) -> None:
-        """Compares what a settled photo reported with where it is."""
+        """Compares what a photo that has just settled reported with where it is; `member.learned` keeps it."""
         assert member.pose is not None
         assert member.prior is not None
         yaw, _, _ = angles_from_cam_R_map(member.pose.cam_R_map)
@@ -124,9 +126,16 @@ class Placing:
             angle_difference_deg(member.prior.yaw_deg, yaw) if np.isfinite(member.prior.yaw_deg) else np.nan
         )
         lift = float(off[2]) if np.isfinite(off[2]) else float(member.pose.map_C[2])
+        member.learned = float(turn), lift, float(np.hypot(off[0], off[1]))
+        self._remember(member)
+
+    def _remember(self, member: Member) -> None:
+        if member.learned is None:
+            return
+        turn, lift, misfit = member.learned
         self._recent[f"{member.source}|{member.photo.camera_key}"].append((turn, lift))
-        if np.isfinite(off[:2]).all():
-            self._misfit.append(float(np.hypot(off[0], off[1])))
+        if np.isfinite(misfit):
+            self._misfit.append(misfit)
 
     def ground_at(self, xyz: NDArray) -> float:
         """Height of the ground near a place in m."""
@@ -148,17 +157,18 @@ class Placing:
         """Enters a photo that others may be compared with, or moves it."""
         if member.pose is None:
             return
-        c, r = np.floor(self.aim(member, member.pose) / self.cell).astype(int).tolist()
+        c, r = np.floor(member.pose.map_C[:2] / self.cell).astype(int).tolist()
         old = self._cell_of.get(member.id)
         if old is not None and old != (c, r):
             self._grid[old].discard(member.id)
         self._cell_of[member.id] = (c, r)
         self._grid[c, r].add(member.id)
 
-    def aim(self, member: Member, pose: Pose) -> NDArray[np.float64]:
-        """Where the middle of a photo lies on the ground (2,) in m."""
+    @staticmethod
+    def aim(pose: Pose, ground: float) -> NDArray[np.float64]:
+        """Where the middle of a photo lies (2,) in m on a ground of that height."""
         ray = pose.cam_R_map[2]
-        drop = (self.ground_at(pose.map_C) - pose.map_C[2]) / min(float(ray[2]), -0.3)
+        drop = (ground - pose.map_C[2]) / min(float(ray[2]), -0.3)
         return np.asarray(pose.map_C[:2] + ray[:2] * drop)
 
     def neighbours(self, member: Member, pose: Pose | None, most: int = NEIGHBOURS) -> list[int]:
@@ -166,27 +176,26 @@ class Placing:
         if pose is None:
             return self._latest(member, most)
         photo = member.photo
-        at = self.aim(member, pose)
-        above = max(float(pose.map_C[2]) - self.ground_at(pose.map_C), 2.0)
+        ground = self.ground_at(pose.map_C)
+        at = self.aim(pose, ground)
+        above = max(float(pose.map_C[2]) - ground, 2.0)
         reach = above * max(photo.width, photo.height) / photo.focal.px + 2 * self.scatter()
-        rings = int(np.ceil(reach / self.cell))
-        c, r = np.floor(at / self.cell).astype(int).tolist()
-        near = [i for dc in range(-rings, rings + 1) for dr in range(-rings, rings + 1)
-                for i in self._grid.get((c + dc, r + dr), ())]  # fmt: skip
         found = []
-        for i in near:
+        for i in self._near(at, reach + above):
             other = self.members.by_id[i]
-            if (
-                i == member.id
-                or other.photo.band != photo.band
-                or other.pose is None
-                or other.state == "superseded"
-            ):
+            if i == member.id or other.photo.band != photo.band or other.state == "superseded":
                 continue
-            apart = float(np.hypot(*(self.aim(other, other.pose) - at)))
+            apart = np.inf if other.pose is None else float(np.hypot(*(self.aim(other.pose, ground) - at)))
             if apart <= reach:
                 found.append((apart, i))
         return [i for _, i in sorted(found)[:most]]
+
+    def _near(self, at: NDArray, reach: float) -> list[int]:
+        """Photos taken from above a square around a place; cameras that look aslant stand beside what they see."""
+        rings = int(np.ceil(reach / self.cell))
+        c, r = np.floor(at / self.cell).astype(int).tolist()
+        return [i for dc in range(-rings, rings + 1) for dr in range(-rings, rings + 1)
+                for i in self._grid.get((c + dc, r + dr), ())]  # fmt: skip
 
     def _latest(self, member: Member, most: int) -> list[int]:
         found = []
@@ -208,6 +217,10 @@ class Placing:
         return float(np.median(self._misfit)) / 1.18 if len(self._misfit) >= 5 else 0.0
 
     # -- links ------------------------------------------------------------------------------------------------
+
+    def has_features(self, number: int) -> bool:
+        """Whether a photo's features are at hand."""
+        return number in self._features
 
     def features(self, number: int) -> Features:
         """Features of a photo: at hand, from the store, or found now."""
@@ -296,13 +309,13 @@ class Placing:
     ) -> Change:
         """A photo that joins a larger block: its window adjusted, everything around it held."""
         direct = sorted({a for a, _ in good if self.members.by_id[a].pose is not None})
-        by_strength = sorted(direct, key=lambda a: -len(good[a, member.id]))
+        by_strength = sorted(direct, key=lambda a: (-len(good[a, member.id]), a))
         moving = set(by_strength[:MOVING]) if self.settings.reposition else set()
         ring = {
             j for i in moving for j in self.members.by_id[i].links if self.members.by_id[j].pose is not None
         }
         ring -= {member.id, *direct}
-        kept = sorted(ring, key=lambda j: -len(self.members.by_id[j].links & moving))[:RING]
+        kept = sorted(ring, key=lambda j: (-len(self.members.by_id[j].links & moving), j))[:RING]
         ids = sorted({member.id, *direct, *kept})
         held = frozenset(ids) - moving - {member.id}
         done = self.settle(self.window(member, ids, held, list(good.values())))

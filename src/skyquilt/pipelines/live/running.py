@@ -10,13 +10,12 @@ from skyquilt.model.event import Event, Note, Result
 from skyquilt.pipelines.live.finish import iter_finish
 from skyquilt.pipelines.live.intake import Refused
 from skyquilt.pipelines.live.settings import LiveSettings
-from skyquilt.pipelines.live.story import LiveMap, Update
+from skyquilt.pipelines.live.story import LiveMap
+from skyquilt.pipelines.live.update import Update
 from skyquilt.pipelines.live.watch import Watch
 
-IDLE_S = 0.02
+IDLE_S = 0.01
 """Between looks when nothing is to be done."""
-LOOK_S = 0.05
-"""Between looks into the folders."""
 FULL_S = 2.0
 """Pause when the disk is full."""
 STEADY_S = 5.0
@@ -35,13 +34,10 @@ def iter_live(
     """
     stop = stop or threading.Event()
     watches = [Watch(folder=f, intake=live.intake) for f in folders]
-    looked = changed = 0.0
     busy_since = time.monotonic()
     while not stop.is_set():
         try:
-            if time.monotonic() - looked > LOOK_S:
-                looked = time.monotonic()
-                yield from _taken(watches)
+            yield from _taken(watches)
             update = live.work()
         except OutputError as error:
             yield Note(text=str(error), warning=True)
@@ -49,7 +45,6 @@ def iter_live(
             continue
         if update is not None:
             busy_since = time.monotonic()
-            changed = changed or busy_since
             yield update
             continue
         growing = any(w.growing for w in watches) or live.closing.busy

@@ -1,7 +1,8 @@
 """What the mapping holds in memory of each photo, and how that is written down and read again."""
 
 import json
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,10 +39,30 @@ class Member:
     """Where it is."""
     camera: str = ""
     """Name of its calibration."""
-    tried: bool = False
-    """Whether it has been compared with its neighbours."""
+    tried: int = 0
+    """Which one it was to be compared with its neighbours, counted from 1; 0 = it has yet to be."""
+    again: int = 0
+    """Counts from 1 when a photo without place has met one that it links to and is to be tried again."""
+    learned: tuple[float, float, float] | None = None
+    """By how much its metadata were found wrong: heading in degrees, height in m, place in m; NaN = not known."""
     links: set[int] = field(default_factory=set)
     """Photos it is linked to."""
+
+
+class Queues:
+    """Photos that are waiting for something."""
+
+    def __init__(self, members: Iterable[Member]) -> None:
+        """As they would be without a restart in between."""
+        known = list(members)
+        self.received = deque(m for m in known if m.state == "received")
+        """To be placed by their metadata, in order of acceptance."""
+        untried = [m for m in known if m.state in ("placed", "waiting") and not m.tried]
+        self.untried = deque(sorted(untried, key=lambda m: (m.again, m.id)))
+        """To be compared with their neighbours."""
+        lost = [m for m in known if m.state == "waiting" and m.tried]
+        self.lost = sorted(lost, key=lambda m: m.tried)
+        """Compared, and without a place still."""
 
 
 class Members:
@@ -55,11 +76,12 @@ class Members:
         self.blocks: dict[int, set[int]] = {}
         self.cameras: dict[str, Camera] = {}
         self.frame: MapFrame | None = None
+        self._last = 0
         self._to_map: Transformer | None = None
         self._to_wgs: Transformer | None = None
         if found := ledger.meta("frame"):
             self.set_frame(MapFrame(**{**found, "origin": tuple(found["origin"])}))
-        for key, body in ledger.rows("select key, body from camera"):
+        for key, body in ledger.rows("select key, body from camera order by key"):
             self.cameras[str(key)] = Camera(**json.loads(body))
         self.take_up()
         for a, b in ledger.rows("select a, b from link where body is not null order by a, b"):
@@ -75,12 +97,12 @@ class Members:
 
     def take_up(self) -> list[Member]:
         """Photos that were accepted since the last look, in order."""
-        last = max(self.by_id, default=0)
         query = (
             "select id, name, source, file, state, pose, camera, about from photo where id > ? order by id"
         )
         new = []
-        for number, name, source, file, state, pose, camera, about in self.ledger.rows(query, last):
+        for number, name, source, file, state, pose, camera, about in self.ledger.rows(query, self._last):
+            self._last = int(number)
             photo = read_photo(self.inbox.folder / file, name=name)
             if isinstance(photo, RejectedPhoto):
                 self.ledger.set_photo(number, state="refused", reason=photo.reason)
@@ -88,7 +110,7 @@ class Members:
             member = Member(
                 id=int(number), photo=photo, source=source, state=state, camera=camera or "",
                 pose=pose_from(json.loads(pose)) if pose else None,
-                tried=bool(about and json.loads(about).get("tried")),
+                **_about(json.loads(about) if about else {}),
             )  # fmt: skip
             if self.frame is not None:
                 member.prior = photo_prior(photo, self.frame, self._to_map)
@@ -99,19 +121,17 @@ class Members:
         return new
 
     def joined(self, a: int, b: int) -> None:
-        """Notes a link; the smaller block becomes part of the larger one."""
+        """Notes a link; a block is named by its first photo, in whatever order its links were found."""
         if a not in self.by_id or b not in self.by_id:
             return
         self.by_id[a].links.add(b)
         self.by_id[b].links.add(a)
-        one, other = self.block_of[a], self.block_of[b]
+        one, other = sorted((self.block_of[a], self.block_of[b]))
         if one == other:
             return
-        if (len(self.blocks[one]), -one) < (len(self.blocks[other]), -other):
-            one, other = other, one
+        self.blocks[one] |= self.blocks[other]
         for i in self.blocks.pop(other):
             self.block_of[i] = one
-            self.blocks[one].add(i)
 
     def block(self, photo: int) -> set[int]:
         """Photos that hang together with this one."""
@@ -152,6 +172,23 @@ class Members:
         x0, y0 = self.frame.origin
         lon, lat = self._to_wgs.transform(np.asarray(xy)[:, 0] + x0, np.asarray(xy)[:, 1] + y0)
         return [[round(float(a), 8), round(float(b), 8)] for a, b in zip(lon, lat, strict=True)]
+
+
+def _about(said: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a member that its row holds as JSON."""
+    learned = said.get("learned")
+    return {
+        "tried": int(said.get("tried", 0)), "again": int(said.get("again", 0)),
+        "learned": None if learned is None else tuple(np.nan if v is None else float(v) for v in learned),
+    }  # fmt: skip
+
+
+def about_record(member: Member, why: str) -> dict[str, Any]:
+    """What a row holds as JSON of a photo that was compared with its neighbours."""
+    learned = None
+    if member.learned is not None:
+        learned = [v if np.isfinite(v) else None for v in member.learned]
+    return {"tried": member.tried, "again": member.again, "learned": learned, "why": why}
 
 
 def pose_record(pose: Pose) -> dict[str, list[float]]:

@@ -10,27 +10,36 @@ from skyquilt.errors import UsageError
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.photos.read import read_photo
 from skyquilt.pipelines.live.intake import Accepted, Intake, Refused
+from skyquilt.run.closed_files import ClosedFiles
 from skyquilt.run.inbox import ending_of
 from skyquilt.run.write_points import reached
 
 ENDINGS = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
 PARTIAL = (".part", ".partial", ".tmp", ".crdownload", ".filepart")
 QUIET_S = 0.04
-"""A file whose data end is taken when it has not grown for so long."""
+"""A file whose end was not told is taken when it has not grown for so long."""
+SCAN_S = 0.05
+"""Between looks at the whole folder where the system does not tell of files that are complete."""
+SCAN_TOLD_S = 1.0
+"""The same where it does: it does not tell of files that other machines write into a shared folder."""
+SHARE = 0.02
+"""Of the time that looking may take, however many files there are."""
 PATIENCE_S = 4.0
 """A file that is cut off is refused when it has not grown for so long; it is looked at again when it changes."""
+Stamp = tuple[int, int]
+"""Size and time of change of a file."""
 
 
 @dataclass(kw_only=True)
 class Growing:
     """A file that is not taken yet."""
 
-    stamp: tuple[int, int]
-    """Size and time of change."""
+    stamp: Stamp
+    """How it is."""
     since: float
     """When it was first seen so, monotonic seconds."""
-    refused: bool = False
-    """Already refused in this form."""
+    closed: bool = False
+    """Whether its writer has closed it since."""
 
 
 @dataclass(kw_only=True)
@@ -43,6 +52,7 @@ class Watch:
     """Where photos go."""
     growing: dict[str, Growing] = field(default_factory=dict)
     """Files that are not taken yet, by path."""
+    _due: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.folder.is_dir():
@@ -51,6 +61,7 @@ class Watch:
             )
         known = self.intake.ledger.rows("select path, size, mtime from seen")
         self._seen = {str(p): (int(s), int(m)) for p, s, m in known}
+        self._closed = ClosedFiles(folder=self.folder)
 
     def look(self) -> Iterator[Accepted | Refused]:
         """Takes every file that is complete now, in order of names.
@@ -58,27 +69,34 @@ class Watch:
         Raises:
             OutputError: the disk is full; the file stays and is taken later.
         """
-        for path, stamp in sorted(self._files()):
-            key = str(path)
-            if self._seen.get(key) == stamp:
+        now = time.monotonic()  # one moment for all, so that files that came together are taken in order
+        self._note(now)
+        for key in sorted(self.growing, key=Path):
+            known = self.growing[key]
+            if not known.closed and now - known.since < QUIET_S:
                 continue
-            known = self.growing.get(key)
-            now = time.monotonic()
-            if known is None or known.stamp != stamp:
-                self.growing[key] = Growing(stamp=stamp, since=now)
-                continue
-            if known.refused or now - known.since < QUIET_S:
-                continue
-            reason = self._unfinished(path)
+            reason = self._unfinished(Path(key))
             if reason and now - known.since < PATIENCE_S:
                 continue
-            yield self._take(path, key, known, reason)
+            yield self._take(Path(key), key, known, reason)
+
+    def _note(self, now: float) -> None:
+        """Files that are new or have grown, and those whose writers have closed them."""
+        closed, everything = self._closed.look()
+        for path, stamp in self._candidates(closed, everything=everything, now=now):
+            key = str(path)
+            if stamp is None or self._seen.get(key) == stamp:
+                self.growing.pop(key, None)
+                continue
+            known = self.growing.get(key)
+            if known is None or known.stamp != stamp:
+                known = self.growing[key] = Growing(stamp=stamp, since=now)
+            known.closed |= key in closed
 
     def _take(self, path: Path, key: str, known: Growing, reason: str) -> Accepted | Refused:
         source = path.parent.relative_to(self.folder).as_posix()
         source = self.folder.name if source == "." else source
         if reason:
-            known.refused = True
             done: Accepted | Refused = self.intake.refuse(path.name, source, reason)
         else:
             done = self.intake.take_file(path, source)
@@ -89,19 +107,21 @@ class Watch:
         reached("folder seen")
         return done
 
-    def _files(self) -> Iterator[tuple[Path, tuple[int, int]]]:
+    def _candidates(
+        self, closed: set[str], *, everything: bool, now: float
+    ) -> list[tuple[Path, Stamp | None]]:
+        """Files to look at, with what tells that they have changed; None where they are gone."""
+        known = {p for p in map(Path, closed | self.growing.keys()) if _photo_name(p.name)}
+        if everything or now >= self._due:
+            known.update(self._files())
+            took = time.monotonic() - now
+            self._due = now + max(SCAN_TOLD_S if self._closed.told else SCAN_S, took / SHARE)
+        return [(path, _stamp(path)) for path in known]
+
+    def _files(self) -> Iterator[Path]:
         for top, folders, names in os.walk(self.folder):
             folders[:] = [f for f in folders if not f.startswith(".")]
-            for name in names:
-                low = name.lower()
-                if low.startswith(".") or not low.endswith(ENDINGS) or low.endswith(PARTIAL):
-                    continue
-                path = Path(top) / name
-                try:
-                    status = path.stat()
-                except OSError:
-                    continue
-                yield path, (status.st_size, status.st_mtime_ns)
+            yield from (Path(top) / name for name in names if _photo_name(name))
 
     @staticmethod
     def _unfinished(path: Path) -> str:
@@ -117,3 +137,17 @@ class Watch:
             return "it is neither JPEG, TIFF nor PNG inside, whatever its name says"
         photo = read_photo(path)
         return photo.reason if isinstance(photo, RejectedPhoto) else ""
+
+
+def _photo_name(name: str) -> bool:
+    low = name.lower()
+    return not low.startswith(".") and low.endswith(ENDINGS) and not low.endswith(PARTIAL)
+
+
+def _stamp(path: Path) -> Stamp | None:
+    """Size and time of change; None where the file is gone."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_size, status.st_mtime_ns

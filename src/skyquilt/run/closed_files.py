@@ -1,0 +1,78 @@
+"""Files that were closed after writing, or moved into a folder, as Linux tells it (inotify); elsewhere nobody tells."""
+
+import ctypes
+import os
+import struct
+from dataclasses import dataclass, field
+from pathlib import Path
+
+CLOSE_WRITE, MOVED_TO, CREATE, IS_DIR, OVERFLOW = 0x8, 0x80, 0x100, 0x40000000, 0x4000
+_HEAD = struct.Struct("iIII")
+
+
+@dataclass(kw_only=True)
+class ClosedFiles:
+    """Of a folder and all below it."""
+
+    folder: Path
+    """The folder."""
+    told: bool = False
+    """Whether this system tells of closed files at all."""
+    _handle: int = -1
+    _folders: dict[int, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        try:
+            self._libc = ctypes.CDLL(None, use_errno=True)
+            self._handle = self._libc.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC)
+        except (AttributeError, OSError, TypeError):
+            return
+        self.told = self._handle >= 0 and self._watch(str(self.folder))
+
+    def _watch(self, folder: str) -> bool:
+        """Adds a folder and those below it; False where the system takes no more."""
+        number = self._libc.inotify_add_watch(
+            self._handle, os.fsencode(folder), CLOSE_WRITE | MOVED_TO | CREATE
+        )
+        if number < 0:
+            return False
+        self._folders[number] = folder
+        try:
+            below = [e.path for e in os.scandir(folder) if e.is_dir() and not e.name.startswith(".")]
+        except OSError:
+            return True
+        watched = [self._watch(path) for path in below]
+        return all(watched)
+
+    def look(self) -> tuple[set[str], bool]:
+        """Paths closed since the last look, and whether the whole folder should be looked at besides.
+
+        That is so where a folder has come, whose files may have come before it was watched, and after a flood.
+        """
+        closed: set[str] = set()
+        everything = False
+        while data := self._read():
+            at = 0
+            while at < len(data):
+                number, mask, _, size = _HEAD.unpack_from(data, at)
+                name = os.fsdecode(data[at + _HEAD.size : at + _HEAD.size + size].rstrip(b"\0"))
+                at += _HEAD.size + size
+                path = str(Path(self._folders.get(number, "")) / name)
+                if mask & IS_DIR:
+                    self.told &= self._watch(path) or not Path(path).is_dir()
+                everything |= bool(mask & (IS_DIR | OVERFLOW))
+                if mask & (CLOSE_WRITE | MOVED_TO) and not mask & IS_DIR:
+                    closed.add(path)
+        return closed, everything
+
+    def _read(self) -> bytes:
+        try:
+            return os.read(self._handle, 1 << 16) if self._handle >= 0 else b""
+        except OSError:
+            return b""
+
+    def close(self) -> None:
+        """No more is told."""
+        if self._handle >= 0:
+            os.close(self._handle)
+            self._handle, self.told = -1, False

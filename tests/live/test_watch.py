@@ -1,0 +1,118 @@
+"""Folders that photos are copied into, by writers of all manners."""
+
+import shutil
+import time
+
+import pytest
+
+from skyquilt.pipelines.live import watch as watching
+from skyquilt.pipelines.live.intake import Accepted, Intake, Refused
+from skyquilt.pipelines.live.settings import LiveSettings
+from skyquilt.pipelines.live.watch import Watch
+from skyquilt.run.inbox import Inbox
+from skyquilt.run.ledger import Ledger
+
+
+class Watched:
+    """A folder, what was taken from it, and the ledger."""
+
+    def __init__(self, home):
+        self.folder, self.out = home / "in", home / "out"
+        self.folder.mkdir()
+        self.out.mkdir()
+        self.ledger = Ledger(self.out, write=True)
+        self.intake = Intake(self.ledger, Inbox(self.ledger, self.out / "photos"), LiveSettings())
+        self.watch = Watch(folder=self.folder, intake=self.intake)
+
+    def look(self, seconds):
+        """All that is taken or refused within some seconds."""
+        done, until = [], time.monotonic() + seconds
+        while time.monotonic() < until:
+            done += self.watch.look()
+            time.sleep(0.005)
+        return done
+
+
+@pytest.fixture(params=["told", "untold"])
+def watched(request, tmp_path, monkeypatch):
+    """Where the system tells of complete files, and where it does not."""
+    if request.param == "untold":
+        monkeypatch.setattr(watching.ClosedFiles, "_watch", lambda *_: False)
+    found = Watched(tmp_path)
+    if request.param == "told" and not found.watch._closed.told:
+        pytest.skip("this system does not tell of files that are complete")
+    return found
+
+
+def test_a_file_that_grows_slowly_is_taken_once_and_whole(watched, flight):
+    data = flight.photos[0].read_bytes()
+    path = watched.folder / "slow.jpg"
+    with path.open("wb") as file:
+        for k in range(6):
+            file.write(data[len(data) * k // 6 : len(data) * (k + 1) // 6])
+            file.flush()
+            done = watched.look(0.1)  # twice as long as a file must be quiet
+            assert [type(d) for d in done] == ([Accepted] if k == 5 else [])
+    file = watched.ledger.row("select file from photo")[0]
+    assert (watched.out / "photos" / file).read_bytes() == data
+    assert watched.look(0.2) == []
+
+
+def test_a_file_that_stays_torn_is_refused_and_taken_when_it_is_whole(watched, flight, monkeypatch):
+    monkeypatch.setattr(watching, "PATIENCE_S", 0.4)
+    data = flight.photos[0].read_bytes()
+    path = watched.folder / "torn.jpg"
+    path.write_bytes(data[: len(data) // 2])
+    assert watched.look(0.25) == []
+    done = watched.look(0.5)
+    assert [type(d) for d in done] == [Refused]
+    assert "cut off" in done[0].reason
+    assert watched.look(0.5) == []  # said once
+    path.write_bytes(data)
+    assert [type(d) for d in watched.look(0.4)] == [Accepted]
+
+
+def test_a_complete_file_is_taken_without_waiting(tmp_path, flight, monkeypatch):
+    monkeypatch.setattr(watching, "QUIET_S", 60.0)
+    found = Watched(tmp_path)
+    if not found.watch._closed.told:
+        pytest.skip("this system does not tell of files that are complete")
+    shutil.copyfile(flight.photos[0], found.folder / "a.jpg")
+    shutil.copyfile(flight.photos[1], tmp_path / "elsewhere.jpg")
+    assert len(list(found.watch.look())) == 1
+    (tmp_path / "elsewhere.jpg").rename(found.folder / "b.jpg")
+    assert len(list(found.watch.look())) == 1
+    (found.folder / "drone-2").mkdir()
+    assert list(found.watch.look()) == []
+    shutil.copyfile(flight.photos[2], found.folder / "drone-2" / "c.jpg")
+    assert [d.name for d in found.watch.look()] == ["c.jpg"]
+    assert found.ledger.row("select source from photo where name = 'c.jpg'") == ("drone-2",)
+
+
+def test_files_that_came_together_are_taken_in_order_of_names(watched, flight):
+    for path in reversed(flight.photos):
+        shutil.copyfile(path, watched.folder / path.name)
+    names = [d.name for d in watched.look(0.8)]
+    assert names == sorted(p.name for p in flight.photos)
+
+
+def test_what_is_no_photo_by_its_name_or_not_ready_is_left_alone(watched, flight):
+    for name in ("notes.txt", ".hidden.jpg", "a.jpg.part", "b.jpg.crdownload"):
+        shutil.copyfile(flight.photos[0], watched.folder / name)
+    (watched.folder / ".cache").mkdir()
+    shutil.copyfile(flight.photos[0], watched.folder / ".cache" / "c.jpg")
+    assert watched.look(0.3) == []
+    (watched.folder / "empty.jpg").touch()
+    assert watched.look(0.3) == []  # it may be about to be written
+    shutil.copyfile(flight.photos[0], watched.folder / "empty.jpg")
+    assert [type(d) for d in watched.look(0.3)] == [Accepted]
+
+
+def test_a_file_that_vanishes_is_forgotten(watched, flight):
+    path = watched.folder / "gone.jpg"
+    path.write_bytes(flight.photos[0].read_bytes()[:1000])
+    assert watched.look(0.1) == []
+    assert watched.watch.growing
+    path.unlink()
+    assert watched.look(0.2) == []
+    assert not watched.watch.growing
