@@ -26,6 +26,25 @@ def test_round_trip(width, height, focal, k1, k2, p1, cx):
     assert back.vector == pytest.approx(camera.vector, rel=1e-9, abs=1e-6)
 
 
+def test_deviations_come_along_and_are_no_part_of_the_lens():
+    sigmas = (4.0, 2.0, 1.5, 0.01, 0.02, 0.03, 1e-4, 2e-4)
+    camera = Camera(width=640, height=480, focal=660, cx=320, cy=240, k1=-0.3, sigmas=sigmas)
+    record = camera_to_opensfm(camera)
+    assert record["standard_deviations"]["focal_x"] == pytest.approx(4 / 640)
+    assert camera_from_opensfm(record).sigmas == pytest.approx(sigmas)
+    del record["standard_deviations"]
+    assert camera_from_opensfm(record).sigmas is None
+
+
+@pytest.mark.parametrize("broken", [3, {"focal_x": 0.1}, {"focal_x": "wide"}])
+def test_broken_deviations_are_told(broken):
+    record = camera_to_opensfm(Camera.ideal(width=640, height=480, focal=660)) | {
+        "standard_deviations": broken
+    }
+    with pytest.raises(ValueError, match="expected"):
+        camera_from_opensfm(record)
+
+
 def test_a_centred_principal_point_is_the_middle_of_integer_centres():
     camera = camera_from_opensfm(
         {"projection_type": "perspective", "width": 4000, "height": 3000, "focal": 0.85}

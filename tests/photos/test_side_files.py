@@ -5,7 +5,10 @@ from datetime import datetime
 import pyproj
 import pytest
 
+from skyquilt.alignment.setup import intrinsic_priors
 from skyquilt.errors import SideFileError
+from skyquilt.geometry.camera_formats import camera_to_opensfm
+from skyquilt.model.camera import Camera
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
 from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.photos.geo_txt import read_geo_txt
@@ -254,6 +257,26 @@ def test_cameras_json_is_scaled_to_the_photo(tmp_path, photo):
     assert (after.calibration.width, after.calibration.focal) == (96, pytest.approx(0.58 * 96))
     assert after.calibration.cx == pytest.approx(47.5 + 0.96)
     assert (after.focal.source, after.focal.px) == ("calibrated", pytest.approx(0.58 * 96))
+
+
+def test_deviations_of_a_calibration_are_the_adjustment_s_priors(tmp_path, photo):
+    """Scaled with the photo; what states none, or too little to be true of a lens in flight, has the usual ones."""
+    record = camera_to_opensfm(
+        Camera(width=1500, height=1000, focal=1800, cx=750, cy=500, k1=-0.1,
+               sigmas=(9.0, 4.0, 5.0, 0.03, 0.04, 0.0, 0.0, 2e-3))
+    )  # fmt: skip
+    path = written(tmp_path, json.dumps({"all": record}), "cameras.json")
+    ((after,), _) = apply_cameras([photo], read_cameras_json(path), file=path)
+    s = max(photo.width, photo.height) / 1500
+    assert after.focal.sigma_px == pytest.approx(9 * s)
+    _, sigma, _ = intrinsic_priors([after], "4")
+    assert sigma[0] == pytest.approx([9 * s, 4 * s, 5 * s, 0.03, 0.04, 1e-3, 1e-4, 2e-3])
+    del record["standard_deviations"]
+    path = written(tmp_path, json.dumps({"all": record}), "cameras.json")
+    ((plain,), _) = apply_cameras([photo], read_cameras_json(path), file=path)
+    assert plain.focal.sigma_px == pytest.approx(0.01 * plain.focal.px)
+    _, sigma, _ = intrinsic_priors([plain], "4")
+    assert sigma[0, 3] == 0.01
 
 
 @pytest.mark.parametrize(

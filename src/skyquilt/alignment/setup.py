@@ -113,7 +113,7 @@ def set_up(
     start_R = np.array(
         [_start_R(priors[m], y, bool(turned[m])) for m, y in zip(members.tolist(), yaw, strict=True)]
     )
-    K0, sigma_K, free = _intrinsics([photos[m] for m in first], distortion)
+    K0, sigma_K, free = intrinsic_priors([photos[m] for m in first], distortion)
     base = Problem(
         point=np.zeros(0, np.int64), photo=np.zeros(0, np.int64), px=np.zeros((0, 2)), sigma_px=np.zeros(0),
         camera=camera, free=free, K0=K0, sigma_K=sigma_K, C0=C0, sigma_C=sigma_C, R0=R0, sigma_R=sigma_R,
@@ -183,20 +183,29 @@ def _attitudes(
     return np.array(R0), np.array(sigma)
 
 
-def _intrinsics(photos: Sequence[Photo], distortion: str) -> tuple[Array, Array, NDArray[np.bool_]]:
+def intrinsic_priors(photos: Sequence[Photo], distortion: str) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Priors, deviations and freedom of each camera's intrinsics."""
-    K0, sigma = [], []
+    K0: list[Array] = []
+    sigma: list[Array | list[float]] = []
     for photo in photos:
         wide = max(photo.width, photo.height)
         if photo.calibration is not None:
             K0.append(photo.calibration.vector)
-            sigma.append([photo.focal.sigma_px, 0.003 * wide, 0.003 * wide, 0.01, 0.01, 0.01, 1e-3, 1e-3])
+            sigma.append(_calibrated_sigma(photo.calibration, photo.focal.sigma_px))
         else:
             ideal = Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
             K0.append(ideal.vector)
             sigma.append([photo.focal.sigma_px, 0.01 * wide, 0.01 * wide, 0.1, 0.1, 0.05, 2e-3, 2e-3])
     free = np.tile(np.array(FREE[distortion], bool), (len(photos), 1))
     return np.array(K0), np.array(sigma), free
+
+
+def _calibrated_sigma(camera: Camera, sigma_focal: float) -> Array:
+    """Deviations of a known calibration: its own where it states them, never less than flying changes a lens."""
+    wide = max(camera.width, camera.height)
+    usual = [sigma_focal, 0.003 * wide, 0.003 * wide, 0.01, 0.01, 0.01, 1e-3, 1e-3]
+    least = [5e-4 * camera.focal, 5e-4 * wide, 5e-4 * wide, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4]
+    return np.maximum(camera.sigmas or usual, least)
 
 
 def pose_records(setup: Setup, state: State) -> dict[int, Pose]:

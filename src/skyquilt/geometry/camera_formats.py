@@ -4,17 +4,22 @@ Both put the origin at ((w - 1) / 2, (h - 1) / 2) with pixel centres at integers
 from undistorted to distorted as OpenCV's does, so coefficients carry over with their signs.
 """
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 from skyquilt.model.camera import Camera
+
+DEVIATIONS = "standard_deviations"
+"""Key of the deviations, in the units of the values; readers of OpenSfM's form pass over keys they do not know."""
+_NAMES = ("focal_x", "c_x", "c_y", "k1", "k2", "k3", "p1", "p2")
 
 
 def camera_from_opensfm(record: Mapping[str, Any]) -> Camera:
     """A `brown`, `perspective`, `simple_radial` or `radial` camera.
 
     Raises `ValueError` for any other projection and for a broken record. `focal_x` and `focal_y`
-    become their mean: pixels are square here.
+    become their mean: pixels are square here. Deviations are read where `camera_to_opensfm` wrote them.
     """
     kind = str(record.get("projection_type", "perspective"))
     if kind not in ("brown", "perspective", "simple_radial", "radial"):
@@ -37,12 +42,30 @@ def camera_from_opensfm(record: Mapping[str, Any]) -> Camera:
         k3=_number(record, "k3", 0.0),
         p1=_number(record, "p1", 0.0),
         p2=_number(record, "p2", 0.0),
+        sigmas=_deviations(record, unit),
     )
 
 
+def _deviations(record: Mapping[str, Any], unit: int) -> tuple[float, ...] | None:
+    """One sigma of each parameter in px; None where the record has none. Raises `ValueError` for broken ones."""
+    stated = record.get(DEVIATIONS)
+    if stated is None:
+        return None
+    if not isinstance(stated, Mapping):
+        raise ValueError(f"its '{DEVIATIONS}' are {stated!r}; expected numbers by name")
+    found = tuple(_number(stated, name) * (unit if k < 3 else 1) for k, name in enumerate(_NAMES))
+    if min(found) < 0 or not all(map(math.isfinite, found)):
+        raise ValueError(f"its '{DEVIATIONS}' are {dict(stated)}; expected none below zero")
+    return found
+
+
 def camera_to_opensfm(camera: Camera) -> dict[str, Any]:
-    """The camera as a `brown` record, ready for JSON."""
+    """The camera as a `brown` record, ready for JSON; its deviations, if it has any, under a key that others ignore."""
     unit = max(camera.width, camera.height)
+    stated = {}
+    if camera.sigmas:
+        shares = [s / unit if k < 3 else s for k, s in enumerate(camera.sigmas)]
+        stated = {DEVIATIONS: dict(zip(_NAMES, shares, strict=True))}
     return {
         "projection_type": "brown",
         "width": camera.width,
@@ -52,6 +75,7 @@ def camera_to_opensfm(camera: Camera) -> dict[str, Any]:
         "c_x": (camera.cx - (camera.width - 1) / 2) / unit,
         "c_y": (camera.cy - (camera.height - 1) / 2) / unit,
         **{k: getattr(camera, k) for k in ("k1", "k2", "p1", "p2", "k3")},
+        **stated,
     }
 
 

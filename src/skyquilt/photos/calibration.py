@@ -8,9 +8,9 @@ from skyquilt.photos.exif import Exif
 from skyquilt.photos.sensors import Sensor
 from skyquilt.photos.xmp import Xmp
 
-_SIGMA_SHARE = {"focal": 0.01, "centre": 0.005}
-_SIGMA_RADIAL, _SIGMA_TANGENTIAL, _SIGMA_FREE = 0.02, 0.002, 0.2
-"""How far a factory's coefficients are trusted, and the width left where it gives none."""
+_SIGMA_SHARE = {"focal": 0.01, "centre": 0.003}
+_SIGMA_RADIAL, _SIGMA_TANGENTIAL = 0.01, 0.001
+"""How far a factory's coefficients are trusted."""
 
 
 def read_calibration(
@@ -95,11 +95,10 @@ def _camera(
     if not (0.2 * long < focal < 60 * long and inside and all(abs(k) < 10 for k in distortion or ())):
         return None
     k1, k2, k3, p1, p2 = distortion or (0.0,) * 5
-    radial = _SIGMA_RADIAL if distortion else _SIGMA_FREE
     sigmas = (
         _SIGMA_SHARE["focal"] * focal,
         *(_SIGMA_SHARE["centre"] * long,) * 2,
-        *(radial,) * 3,
+        *(_SIGMA_RADIAL,) * 3,
         *(_SIGMA_TANGENTIAL,) * 2,
     )
     w, h = size

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from skyquilt.geometry.camera_formats import camera_to_opensfm
 from skyquilt.imaging.grey import to_grey8
 from skyquilt.model.board import Board, BoardView
 from skyquilt.model.calibration import Calibration, rms
-from skyquilt.model.camera import PARAMETERS
+from skyquilt.model.camera import PARAMETERS, Camera
 from skyquilt.pipelines.board_views import Seen
 from skyquilt.pipelines.calibrate_judging import Judged
 from skyquilt.raster.atomic import whole_file, write_text
@@ -33,7 +34,7 @@ def finish(
 ) -> Steps[dict[str, Any]]:  # fmt: skip
     """Writes all files; calibration.json comes last."""
     yield 0, 1
-    write_text(output / "cameras.json", json.dumps({key: camera_to_opensfm(centres.camera)}, indent=1))
+    write_text(output / "cameras.json", json.dumps({key: camera_to_opensfm(_stated(centres))}, indent=1))
     figures = as_record(seen, board, key, centres, corners, judged) | {"frames_from": frames.name}
     sheet = contact_sheet(seen)
     done, data = cv2.imencode(".jpg", sheet[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
@@ -54,6 +55,14 @@ def finish(
     write_text(output / "calibration.json", json.dumps(figures, indent=1, allow_nan=False))
     yield 1, 1
     return figures
+
+
+def _stated(found: Calibration) -> Camera:
+    """The camera with deviations that hold for a flight: a coefficient dropped is known to its tolerance."""
+    dropped = {name: tolerance for name, _, tolerance in found.dropped}
+    return replace(
+        found.camera, sigmas=tuple(float(dropped.get(name, found.sigma(name))) for name in PARAMETERS)
+    )
 
 
 def as_record(

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ def in_crs(alignment: Alignment, xyz: NDArray) -> NDArray[np.float64]:
 def write_cameras(path: Path, alignment: Alignment) -> None:
     """cameras.json: calibrations by camera."""
     used = {alignment.camera_of[i] for i in alignment.poses}
-    records = {key: camera_to_opensfm(alignment.cameras[key]) for key in sorted(used)}
+    records = {key: camera_to_opensfm(replace(alignment.cameras[key], sigmas=None)) for key in sorted(used)}
     write_text(path, json.dumps(records, indent=1))
 
 
