@@ -217,3 +217,13 @@ def test_frames_of_one_survey_are_read_alike(tmp_path):
     assert read_photo(tmp_path / "t.tif", thermal_unit="auto").unit == "counts"
     hot = read_photo(tmp_path / "t.tif", thermal_unit="centikelvin")
     assert read_color(hot)[0, 0] == pytest.approx(156.85, abs=1e-2)
+
+
+def test_a_broken_flir_block_is_no_temperature(tmp_path):
+    """What remains is the palette, and nothing calls it degrees."""
+    data = bytearray(flir_jpeg(np.round(planck_counts(scene())).astype(np.uint16)))
+    at = data.index(b"FFF\0")
+    data[at + 24 : at + 32] = b"\xff" * 8  # where the records lie
+    (tmp_path / "a.jpg").write_bytes(bytes(data))
+    photo = read_photo(tmp_path / "a.jpg")
+    assert isinstance(photo, Photo) and photo.unit == "" and photo.dtype == "uint8"

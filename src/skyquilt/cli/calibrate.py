@@ -62,7 +62,8 @@ def parse_board(text: str) -> tuple[int, int]:
 def summary(result: "Result") -> str:
     """A calibration in a few lines."""
     m = result.metrics
-    found, held = m["centres"], m["centres"]["held_out_px"]["centres"]
+    found, other = m["centres"], m["corners"]
+    held, held_corners = (m[k]["held_out_px"] for k in ("centres", "corners"))
     values = found["parameters"]
     terms = [
         f"{n} {values[n]['value']:+.4f} ± {values[n]['sigma']:.4f}" for n in values if values[n]["free"]
@@ -72,8 +73,10 @@ def summary(result: "Result") -> str:
             f"{m['views_used']} views ({m['frames']} frames), {found['points']} centres of squares",
             f"focal length {values['focal']['value']:.2f} ± {values['focal']['sigma']:.2f} px, principal point"
             f" ({values['cx']['value']:.1f}, {values['cy']['value']:.1f}), {', '.join(terms) or 'no distortion'}",
-            f"reprojection error {found['rms_px']:.3f} px (RMS), {held:.3f} px on views kept out;"
-            f" from corners {m['corners']['rms_px']:.3f} and {m['corners']['held_out_px']['corners']:.3f} px",
+            f"reprojection error from centres {found['rms_px']:.3f} px (RMS), from corners {other['rms_px']:.3f} px",
+            f"on views kept out, each by its own marks: {held['centres']:.3f} px, from corners"
+            f" {held_corners['corners']:.3f} px; both judged by the corners: {held['corners']:.3f} px, from corners"
+            f" {held_corners['corners']:.3f} px",
             *(f"left out: {name}: {reason}" for name, reason in list(m["views_rejected"].items())[:10]),
             f"camera: {result.output / 'cameras.json'}",
             f"report: {result.output / 'report.html'}",

@@ -6,7 +6,7 @@ how far the one must move for its heights to equal the other's (least squares ma
 and Torlegard 1988). Walls do not count, nor does what only one field has.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import cv2
@@ -21,6 +21,7 @@ _TILES = 4
 """Per side of the chess-board that parts the ground into halves."""
 _LEAST = 400
 """Cells that both fields must know."""
+_TOO_LITTLE = RefusedRegistration(reason="too little ground has heights in both maps to compare them")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -49,8 +50,12 @@ class AlignHeights:
     """Difference in cells beyond which a height counts ever less."""
     steps: int = 20
     """Most steps at each smoothing."""
-    furthest_apart: float = 4.0
+    furthest_apart: float = 2.0
     """Cells by which the places that two halves of the ground find may differ."""
+    likeness: float = 1.25
+    """Factor, either way, by which what stands out of the ground may be higher in one map than in the other: noise and
+    other ground come out at nearly none.
+    """
     version: ClassVar[int] = 1
 
     def __call__(self, a: HeightField, b: HeightField, start: Matrix) -> HeightFit | RefusedRegistration:
@@ -59,10 +64,15 @@ class AlignHeights:
         a, b = a.coarser(cell), b.coarser(cell)
         everything = np.ones(a.z.shape, bool)
         fit = self._fitted(a, b, _Fit.of(a, start), everything, self.sigmas)
-        halves = _halves(a.z.shape)
-        parts = [None if fit is None else self._fitted(a, b, fit, h, self.sigmas[-2:]) for h in halves]
-        if fit is None or parts[0] is None or parts[1] is None:
-            return RefusedRegistration(reason="too little ground has heights in both maps to compare them")
+        if fit is None:
+            return _TOO_LITTLE
+        if abs(np.log(max(fit.factor, 1e-3))) > np.log(self.likeness):
+            return RefusedRegistration(
+                reason=f"heights of the one map stand {fit.factor:.2f} times as high in the other: no likeness"
+            )
+        parts = [self._fitted(a, b, fit, half, self.sigmas[-2:]) for half in _halves(a.z.shape)]
+        if parts[0] is None or parts[1] is None:
+            return _TOO_LITTLE
         apart = float(np.sqrt((((parts[0].p - parts[1].p) @ fit.spread) ** 2).sum()))
         if apart > self.furthest_apart * cell:
             return RefusedRegistration(
@@ -101,7 +111,10 @@ class AlignHeights:
         change = found[7:] / max(float(found[0]), 0.3)
         change *= min(1.0, 5 * cell / max(float(np.abs(change).max()), 1e-9))
         residual = 1.4826 * float(np.median(np.abs(lacking)))
-        told = fit.moved(change, found[2:4] / fit.unit, int(both.sum()), residual)
+        told = replace(
+            fit, p=fit.p + change, tilt=found[2:4] / fit.unit, factor=float(found[0]), cells=int(both.sum()),
+            residual=residual,
+        )  # fmt: skip
         return told, float(np.abs(change).max())
 
 
@@ -118,6 +131,8 @@ class _Fit:
     """(4,) place of the middle, and the unit's image along x and y, all in m."""
     tilt: Doubles = field(default_factory=lambda: np.zeros(2))
     """(2,) slopes along x and y of a's heights less b's: one block leans against the other."""
+    factor: float = 1.0
+    """Of b's heights that fits a's, general slope and bend apart."""
     cells: int = 0
     residual: float = 0.0
 
@@ -143,18 +158,6 @@ class _Fit:
         x, y, c, s = self.p
         along, across = self.tilt
         return x + c * self.u - s * self.v + along * lift, y + s * self.u + c * self.v + across * lift
-
-    def moved(self, change: Doubles, tilt: Doubles, cells: int, residual: float) -> "_Fit":
-        return _Fit(
-            u=self.u,
-            v=self.v,
-            middle=self.middle,
-            unit=self.unit,
-            p=self.p + change,
-            tilt=tilt,
-            cells=cells,
-            residual=residual,
-        )
 
     @property
     def matrix(self) -> Matrix:
