@@ -14,7 +14,7 @@ import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.raster.map_source import MERCATOR, MapSource, between, mercator, picture
+from skyquilt.raster.map_source import MERCATOR, Bounds, MapSource, between, mercator, picture
 from skyquilt.viewer.survey import LiveSurvey, Survey
 
 KEPT = 3000
@@ -128,15 +128,18 @@ class Images:
         keys = [k for k in self._kept if k[0] == said["layer"]]
         if not keys:
             return
-        to_web = between("EPSG:4326", "EPSG:3857")
-        boxes = np.array([to_web.transform_bounds(*box) for box in changed_boxes(said)])
+        boxes = np.array(changed_boxes(said))
         for k in np.flatnonzero(_meet(np.array([k[1:] for k in keys], float), boxes)).tolist():
             del self._kept[keys[k]]
 
 
-def changed_boxes(said: Mapping[str, Any]) -> list[list[float]]:
-    """Where news of tiles say that the map has changed: west, south, east, north in degrees."""
-    return list(said.get("boxes") or [said["bounds"]])
+def changed_boxes(said: Mapping[str, Any]) -> list[Bounds]:
+    """Where news of tiles say that the map has changed, in EPSG:3857."""
+    to_web = between("EPSG:4326", "EPSG:3857")
+    found = []
+    for west, south, east, north in said.get("boxes") or [said["bounds"]]:
+        found.append(to_web.transform_bounds(west, south, east, north))
+    return found
 
 
 def _meet(tiles: NDArray[np.float64], boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -145,4 +148,4 @@ def _meet(tiles: NDArray[np.float64], boxes: NDArray[np.float64]) -> NDArray[np.
     west, north = tiles[:, 1:2] * size - MERCATOR, MERCATOR - tiles[:, 2:3] * size
     beside = (west >= boxes[:, 2]) | (west + size <= boxes[:, 0])
     above = (north - size >= boxes[:, 3]) | (north <= boxes[:, 1])
-    return np.asarray(~(beside | above)).any(1)
+    return np.asarray((~(beside | above)).any(1), bool)

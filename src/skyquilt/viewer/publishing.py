@@ -73,8 +73,7 @@ class Publishing:
             for _, kind, body in told:
                 said = json.loads(body)
                 if kind == "tiles" and said["layer"] == layer:
-                    to_web = between("EPSG:4326", "EPSG:3857")
-                    self._boxes += [to_web.transform_bounds(*box) for box in changed_boxes(said)]
+                    self._boxes += changed_boxes(said)
             self._known = told[-1][0]
 
     def _tiles(self, layer: str) -> None:
