@@ -16,7 +16,7 @@ demo: $(USE)
 
 # Lint, format, types and import contract, then the tests that take no more than a few seconds each.
 test: check
-	@$(BIN)/pytest -m "not slow"
+	@$(BIN)/pytest -m "not slow" --numprocesses auto --dist loadscope
 
 # Every test, the slow ones included.
 test-all: $(DEVELOP)

@@ -25,13 +25,28 @@ def displacements(raster: Path, truth: Path) -> tuple[np.ndarray, np.ndarray, fl
     return at, off, found.measured / max(found.attempted, 1)
 
 
+def field(places: np.ndarray, off: np.ndarray, at: np.ndarray, near: int = 15) -> np.ndarray:
+    """Displacements (n, 2) at other places, by robust planes through the nearest ones."""
+    out = np.zeros_like(at)
+    for k, place in enumerate(at):
+        nearest = np.argsort(np.linalg.norm(places - place, axis=1))[:near]
+        terms, weight = np.c_[np.ones(len(nearest)), places[nearest] - place], np.ones(len(nearest))
+        for _ in range(8):
+            plane = np.linalg.lstsq(
+                terms * weight[:, None] ** 0.5, off[nearest] * weight[:, None] ** 0.5, rcond=None
+            )[0]
+            lacking = np.linalg.norm(off[nearest] - terms @ plane, axis=1)
+            weight = 1 / (1 + (lacking / (2 * np.median(lacking) + 1e-6)) ** 2)
+        out[k] = plane[0]
+    return out
+
+
 def main(output: Path, flight: Path) -> None:
     """Print the figures."""
     m = json.loads((output / "metrics.json").read_text())
     at, off, share = displacements(output / "thermal.tif", flight / "truth" / "truth_thermal.tif")
     there, visual, _ = displacements(output / "mosaic.tif", flight / "truth" / "truth_ortho.tif")
-    nearest = np.argsort(((at[:, None] - there[None]) ** 2).sum(-1), axis=1)[:, :5]
-    error = np.linalg.norm(off - np.median(visual[nearest], axis=1), axis=1)
+    error = np.linalg.norm(off - field(there, visual, at), axis=1)
     gsd = m["native_gsd_m"]
     print(
         f"route {m['thermal']['route']} (refused: {m['thermal']['routes_refused'] or 'none'});"

@@ -21,6 +21,7 @@ from skyquilt.matching.mutual import Mutual
 from skyquilt.pairs.nearest import Nearest
 from skyquilt.pairs.retrieval import Retrieval
 from skyquilt.render.blend import Average, Blend, Feather, First, Multiband
+from skyquilt.render.drift import Drift
 from skyquilt.render.exposure import Balance
 from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints
@@ -53,6 +54,7 @@ BLENDS: dict[str, type[Blend]] = {
 }
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
+THERMAL_UNITS = ("auto", "celsius", "kelvin", "decikelvin", "centikelvin", "counts")
 DISTORTIONS = ("none", "2", "4", "6", "6t")
 
 
@@ -83,7 +85,15 @@ class MosaicSettings:
     feather_px: float = 6.0
     """Width of feathered seams in map pixels."""
     balance: bool = True
-    """Bring photos to one brightness (8-bit pictures only; measured values are never changed)."""
+    """Bring photos to one brightness: 8-bit pictures; for measured values see `balance_thermal`."""
+    balance_thermal: bool | None = None
+    """Balance the drift between thermal frames on their overlaps; False leaves values as recorded. None = temperatures,
+    if `balance`, but not counts.
+    """
+    thermal_unit: str | None = None
+    """One of `THERMAL_UNITS`: what values of single-band TIFFs mean; None = found out, as is whether they are
+    thermal.
+    """
     compress: str = "auto"
     """One of `COMPRESSIONS`; auto = JPEG for 8-bit pictures, zstd for measured values."""
     quality: int = 85
@@ -137,6 +147,8 @@ class MosaicSettings:
         one_of("--image-search", self.image_search, IMAGE_SEARCHES)
         one_of("--optimiser", self.optimiser, OPTIMISERS)
         one_of("--lines", self.lines, LINES)
+        if self.thermal_unit is not None:
+            one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
         for name, value, low, high in (
             ("--gsd", self.gsd_cm, 0.05, 10000), ("--quality", self.quality, 1, 100),
             ("--height", self.height_m, 0.5, 1e5), ("--memory", self.memory_gb, 0.5, 4096),
@@ -206,6 +218,8 @@ class Methods:
     """Refinement of the heights from the pictures."""
     balance: Balance
     """Exposure."""
+    drift: Drift
+    """Offsets of thermal frames."""
     blend: Blend
     """Merge rule."""
 
@@ -228,7 +242,7 @@ def methods(settings: MosaicSettings) -> Methods:
         by_position=ByPosition(height_m=settings.height_m, heading_deg=settings.heading_deg),
         by_image=_by_image(settings), hybrid=_hybrid(settings), by_flightline=_by_flightline(settings),
         surface=FromTiePoints(), sweep=Sweep() if settings.surface == "sweep" else None, balance=Balance(),
-        blend=Feather(width_px=settings.feather_px) if blend == "feather" else BLENDS[blend](),
+        drift=Drift(), blend=Feather(width_px=settings.feather_px) if blend == "feather" else BLENDS[blend](),
     )  # fmt: skip
 
 

@@ -160,3 +160,60 @@ def test_thermal_tiff_from_file(tmp_path):
     photo = read_photo(tmp_path / "u.tif")
     assert (photo.band, photo.unit) == ("thermal", "celsius")
     assert read_color(photo)[1, 1] == pytest.approx(22.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("stated", "values", "unit", "first"),
+    [
+        (
+            "unit: centikelvin (temperature in K times 100)",
+            np.full((60, 80), 29515, np.uint16),
+            "celsius",
+            22.0,
+        ),
+        ("Unit=Kelvin", np.full((60, 80), 300.15, np.float32), "celsius", 27.0),
+        (
+            "unit: celsius",
+            np.full((60, 80), 290.0, np.float32),
+            "celsius",
+            290.0,
+        ),  # a furnace, not 17 degrees
+        ("unit: counts", np.full((60, 80), 29515, np.uint16), "counts", 29515.0),
+        ("unit: decikelvin", np.full((60, 80), 2951, np.uint16), "celsius", 21.95),
+    ],
+)
+def test_a_stated_unit_is_believed_whatever_the_values(tmp_path, stated, values, unit, first):
+    tifffile.imwrite(tmp_path / "t.tif", values, description=stated)
+    photo = read_photo(tmp_path / "t.tif")
+    assert (photo.band, photo.unit) == ("thermal", unit)
+    assert read_color(photo)[1, 1] == pytest.approx(first, abs=1e-3)
+    assert any("as the file or --thermal-unit says" in n for n in photo.notes)
+
+
+def test_gdal_says_the_unit_of_a_band(tmp_path):
+    xml = '<GDALMetadata><Item name="UNITTYPE" sample="0" role="unittype">K</Item></GDALMetadata>'
+    tifffile.imwrite(
+        tmp_path / "t.tif", np.full((60, 80), 300.15, np.float32), extratags=[(42112, "s", 0, xml, True)]
+    )
+    assert read_color(read_photo(tmp_path / "t.tif"))[0, 0] == pytest.approx(27.0, abs=1e-3)
+
+
+def test_sixteen_bits_without_a_word_are_a_picture_until_somebody_says_what_they_are(tmp_path):
+    tifffile.imwrite(tmp_path / "t.tif", np.full((60, 80), 29515, np.uint16))
+    assert (read_photo(tmp_path / "t.tif").band, read_photo(tmp_path / "t.tif").unit) == ("visible", "")
+    found = {u: read_photo(tmp_path / "t.tif", thermal_unit=u) for u in ("auto", "centikelvin", "counts")}
+    assert {u: p.unit for u, p in found.items()} == {
+        "auto": "celsius",
+        "centikelvin": "celsius",
+        "counts": "counts",
+    }
+    assert any("no unit is stated" in n for n in found["auto"].notes)
+    assert float(read_color(found["counts"])[0, 0]) == 29515
+
+
+def test_frames_of_one_survey_are_read_alike(tmp_path):
+    """A hot frame's median lies where no temperature of tenths of a kelvin is; what was decided is what is read."""
+    tifffile.imwrite(tmp_path / "t.tif", np.full((60, 80), 43000, np.uint16))
+    assert read_photo(tmp_path / "t.tif", thermal_unit="auto").unit == "counts"
+    hot = read_photo(tmp_path / "t.tif", thermal_unit="centikelvin")
+    assert read_color(hot)[0, 0] == pytest.approx(156.85, abs=1e-2)

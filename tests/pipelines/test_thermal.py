@@ -8,7 +8,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from skyquilt.errors import RefusedError, UsageError
 from skyquilt.pipelines.register_files import resample_onto
-from skyquilt.pipelines.thermal import _opened, heights_on, iter_thermal, join
+from skyquilt.pipelines.thermal import iter_thermal
+from skyquilt.pipelines.thermal_join import heights_on, join, opened
 
 GSD_A, GSD_B = 0.1, 0.2
 TRUE_SHIFT = (1.4, -0.8)
@@ -49,7 +50,7 @@ def maps(tmp_path_factory):
     b = write(
         folder / "thermal.tif", thermal, GSD_B, west + 2.0 + TRUE_SHIFT[0], north - 2.0 + TRUE_SHIFT[1], "celsius"
     )  # fmt: skip
-    return _opened(a), _opened(b)
+    return opened(a), opened(b)
 
 
 def where(matrix, px):
@@ -92,7 +93,7 @@ def test_maps_of_other_places_are_not_joined(maps, tmp_path):
     a, _ = maps
     other = write(tmp_path / "other.tif", np.float32(280) + ground(9)[:400, :400], GSD_B, 500002.0, 4999998.0)
     with pytest.raises(RefusedError, match="both maps are in the output"):
-        join(a, _opened(other), (tmp_path / "no", tmp_path / "no"), "maps")
+        join(a, opened(other), (tmp_path / "no", tmp_path / "no"), "maps")
 
 
 def test_heights_lie_on_the_grid_of_the_map_without_their_slope(maps, tmp_path):

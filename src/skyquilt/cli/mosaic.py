@@ -50,6 +50,14 @@ def command(
     balance: Annotated[
         bool, typer.Option("--balance/--no-balance", help="Bring photos to one brightness.")
     ] = True,
+    balance_thermal: Annotated[
+        bool | None,
+        typer.Option(
+            "--balance-thermal/--raw-thermal",
+            help="Balance the drift between thermal frames on their overlaps, or leave values as recorded.",
+            show_default="temperatures balanced, counts raw",
+        ),
+    ] = None,
     compress: Annotated[
         str, typer.Option(help="auto, jpeg, or lossless: deflate, zstd, lzw, none.")
     ] = "auto",
@@ -131,6 +139,14 @@ def command(
         Path | None,
         typer.Option(help="Folder of thermal photos: their map is laid on the visual one as thermal.tif."),
     ] = None,
+    thermal_unit: Annotated[
+        str | None,
+        typer.Option(
+            help="What values of single-band TIFFs mean: auto (they are thermal; the unit is stated in them or found"
+            " from the values), celsius, kelvin, decikelvin, centikelvin, counts.",
+            show_default="auto with --thermal; else files of thermal cameras, or that state a unit, are read as auto",
+        ),
+    ] = None,
     thermal_route: Annotated[
         str,
         typer.Option(
@@ -173,7 +189,7 @@ def command(
     settings = MosaicSettings(
         method=method, gsd_cm=gsd, crs=crs, gcp=gcp, geo=geo, cameras=cameras, bounds=parse_bounds(bounds),
         boundary=boundary, surface=surface, blend=blend, feather_px=feather, balance=balance,
-        compress=compress, quality=quality,
+        balance_thermal=balance_thermal, thermal_unit=thermal_unit, compress=compress, quality=quality,
         distortion=distortion, transform=transform, levelled=levelled, image_search=image_search,
         relief_m=relief, alpha=alpha, optimiser=optimiser, seed=seed, sequence=sequence, lines=lines,
         distances=distances, height_m=height, heading_deg=heading, repair=repair, features=features,

@@ -11,6 +11,10 @@ Datum = Literal["takeoff", "sea_level", "ellipsoid", "control", "unknown"]
 """What a height is counted from; `control`: whatever the heights of the control points are."""
 
 
+Stored = Literal["", "celsius", "kelvin", "decikelvin", "centikelvin", "counts"]
+"""What a value of a thermal TIFF may mean: degrees Celsius, (tenths, hundredths of a) kelvin, or sensor counts."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GeoPosition:
     """A measured camera position, WGS 84."""
@@ -95,6 +99,8 @@ class Photo:
     """Spectrum."""
     unit: Literal["", "celsius", "counts"] = ""
     """What a single-band pixel value means; empty for pictures."""
+    stored: Stored = ""
+    """What a value of a thermal TIFF means as stored in the file; empty for other files."""
     camera_key: str
     """Photos with equal keys share their intrinsics: make, model, serial, lens, size."""
     calibration: Camera | None = None

@@ -41,3 +41,32 @@ class Surface:
                 )
             )
         return np.concatenate(parts, 1, dtype=np.float32).reshape(shape)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HeightField:
+    """Heights as measured, gaps left open, on a regular grid in the map frame; row 0 is the southernmost."""
+
+    z: NDArray[np.float32]
+    """(rows, cols) heights in m above the frame's vertical datum; meaningless where not known."""
+    known: NDArray[np.bool_]
+    """(rows, cols) where two pictures agree on the height."""
+    x0: float
+    """Easting of column 0 in m (map frame)."""
+    y0: float
+    """Northing of row 0 in m (map frame)."""
+    cell: float
+    """Spacing in m."""
+
+    def coarser(self, cell: float) -> "HeightField":
+        """Means over cells of about the size asked for; known where three in five of the heights in it are."""
+        rows, columns = self.z.shape
+        size = max(2, round(columns * self.cell / cell)), max(2, round(rows * self.cell / cell))
+        share = np.asarray(cv2.resize(self.known.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+        held = np.where(self.known, self.z, np.float32(0))
+        total = np.asarray(cv2.resize(held, size, interpolation=cv2.INTER_AREA))
+        wide, high = columns * self.cell / size[0], rows * self.cell / size[1]
+        return HeightField(
+            z=(total / np.maximum(share, 1e-3)).astype(np.float32), known=share > 0.6,
+            x0=self.x0 + (wide - self.cell) / 2, y0=self.y0 + (high - self.cell) / 2, cell=(wide + high) / 2,
+        )  # fmt: skip

@@ -97,7 +97,9 @@ def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
         return reduce_pixels(_png(data, photo.channels), reduction)
     pixels = read_tiff(photo.path)[..., : photo.channels]
     pixels = pixels[..., 0] if photo.channels == 1 else pixels
-    return reduce_pixels(thermal_frame_of_values(pixels).values if photo.unit else pixels, reduction)
+    return reduce_pixels(
+        thermal_frame_of_values(pixels, photo.stored).values if photo.unit else pixels, reduction
+    )
 
 
 def decode_jpeg(data: bytes, *, gray: bool = False, reduction: Reduction = 1) -> NDArray[np.uint8]:
@@ -108,7 +110,6 @@ def decode_jpeg(data: bytes, *, gray: bool = False, reduction: Reduction = 1) ->
     height, width, _, _ = simplejpeg.decode_jpeg_header(data)
     wanted = {
         "colorspace": "GRAY" if gray else "RGB",
-        "fastupsample": True,  # colour differences between pixels are not interpolated: grey stays the same
         "min_height": -(-height // reduction) if reduction > 1 else 0,
         "min_width": -(-width // reduction) if reduction > 1 else 0,
     }

@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.camera import Camera
-from skyquilt.model.photo import Focal, Photo, RejectedPhoto
+from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Stored
 from skyquilt.photos import exif as tag
 from skyquilt.photos.attitude import read_attitude, read_flight_yaw
 from skyquilt.photos.calibration import read_calibration
@@ -19,19 +20,30 @@ from skyquilt.photos.header import Header, content_digest, read_header
 from skyquilt.photos.pixels import read_tiff
 from skyquilt.photos.position import read_position
 from skyquilt.photos.sensors import Sensor, find_sensor
-from skyquilt.photos.thermal import ThermalFrame, thermal_frame_of_jpeg, thermal_frame_of_values
+from skyquilt.photos.thermal import (
+    ThermalFrame,
+    stated_unit,
+    thermal_frame_of_jpeg,
+    thermal_frame_of_values,
+)
 
 _SMALLEST = 32
 _STRANGE = "its metadata are of a kind that was not foreseen"
 _LARGEST_THERMAL = 1280
 
 
-def read_photo(path: Path, *, name: str | None = None) -> Photo | RejectedPhoto:
-    """What a file says of itself, its pixels not decoded; a bad file is a `RejectedPhoto`."""
+def read_photo(
+    path: Path, *, name: str | None = None, thermal_unit: str | None = None
+) -> Photo | RejectedPhoto:
+    """What a file says of itself, its pixels not decoded; a bad file is a `RejectedPhoto`.
+
+    `thermal_unit`: what values of a single-band TIFF mean (`model.photo.Stored`); `auto` = it is thermal, its unit is
+    stated in it or found from its values; None = whether it is thermal at all is found out too.
+    """
     name = name or path.name
     try:
         header = read_header(path)
-        return _photo(path, name, header)
+        return _photo(path, name, header, thermal_unit)
     except UnreadablePhotoError as error:
         return RejectedPhoto(name=name, reason=str(error))
     except OSError as error:
@@ -49,8 +61,8 @@ class _Lens:
     notes: tuple[str, ...]
 
 
-def _photo(path: Path, name: str, header: Header) -> Photo:
-    frame = _thermal_frame(path, header)
+def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> Photo:
+    frame = _thermal_frame(path, header, thermal_unit)
     height, width = frame.values.shape if frame else (header.height, header.width)
     if min(width, height) < _SMALLEST:
         raise UnreadablePhotoError(f"it has only {width}x{height} px; at least {_SMALLEST} a side are needed")
@@ -68,6 +80,7 @@ def _photo(path: Path, name: str, header: Header) -> Photo:
         dtype="float32" if frame else header.dtype,
         band="thermal" if lens.thermal else "visible",
         unit=frame.unit if frame else "",
+        stored=frame.stored if frame else "",
         camera_key=_camera_key(header, width, height),
         calibration=lens.calibration,
         focal=lens.focal,
@@ -97,20 +110,26 @@ def _lens(header: Header, width: int, height: int, *, thermal: bool) -> _Lens:
     return _Lens(sensor=sensor, thermal=thermal, calibration=calibration, focal=focal, notes=notes)
 
 
-def _thermal_frame(path: Path, header: Header) -> ThermalFrame | None:
+def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame | None:
     if header.jpeg:
         return thermal_frame_of_jpeg(header.jpeg, make=header.exif.text(tag.MAKE))
-    if header.kind != "tiff" or header.channels != 1 or header.width > _LARGEST_THERMAL:
+    if header.kind != "tiff" or header.channels != 1 or (said is None and header.width > _LARGEST_THERMAL):
         return None
+    stored = cast(Stored, said) if said not in (None, "auto") else _stated(header)
     sensor = find_sensor(model=header.exif.text(tag.MODEL), long_side=max(header.width, header.height))
-    known = _is_lwir(header) or (sensor is not None and sensor.band == "thermal")
+    known = said is not None or bool(stored) or _is_lwir(header)
+    known = known or (sensor is not None and sensor.band == "thermal")
     if not known and header.dtype != "float32":
         return None
     try:
-        frame = thermal_frame_of_values(np.asarray(read_tiff(path)[..., 0]))
+        frame = thermal_frame_of_values(np.asarray(read_tiff(path)[..., 0]), stored)
     except Exception as error:  # tifffile raises many kinds; all mean that there are no pixels
         raise UnreadablePhotoError(f"its pixels cannot be decoded ({error})") from error
     return frame if known or frame.unit == "celsius" else None
+
+
+def _stated(header: Header) -> Stored:
+    return stated_unit(f"{header.exif.text(tag.DESCRIPTION)} {header.exif.text(tag.GDAL_METADATA)}")
 
 
 def _is_lwir(header: Header) -> bool:

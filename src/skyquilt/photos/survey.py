@@ -16,17 +16,19 @@ from skyquilt.photos.voids import without_ground_heights, without_outliers, with
 
 
 def read_survey(
-    folder: Path | Sequence[Path], *, geo: Path | None = None, cameras: Path | None = None
-) -> Survey:
+    folder: Path | Sequence[Path], *, geo: Path | None = None, cameras: Path | None = None,
+    thermal_unit: str | None = None,
+) -> Survey:  # fmt: skip
     """All photos below a folder (or those given) in order of capture, without decoding their pixels.
 
     `geo` is a side file of positions (`geo.txt`, CSV, `.SRT`, `.MRK`); without one, a `geo.txt` at the top of
-    the folder counts. `cameras` is a `cameras.json`. A bad photo becomes a `RejectedPhoto`.
+    the folder counts. `cameras` is a `cameras.json`, `thermal_unit` as in `read_photo`.
+    A bad photo becomes a `RejectedPhoto`.
     Raises `UsageError` for a folder that does not exist, `NoPhotosError` where no photo can be read,
     `SideFileError` for a bad side file.
     """
     found = find_files(folder)
-    read = [read_photo(path, name=name) for name, path in found.photos]
+    read = [read_photo(path, name=name, thermal_unit=thermal_unit) for name, path in found.photos]
     rejected = [p for p in read if isinstance(p, RejectedPhoto)]
     photos, copies = _without_copies(p for p in read if isinstance(p, Photo))
     if not photos:

@@ -12,7 +12,7 @@ _LONG_GAP_H = 12.0
 
 def survey_notes(photos: Sequence[Photo], copies: int = 0) -> tuple[str, ...]:
     """Plain sentences: several cameras or bands, rolling shutters, clocks, what most photos lack."""
-    return tuple(_cameras(photos)) + tuple(_gaps(photos)) + tuple(_clocks(photos)) + _copies(copies)
+    return (*_cameras(photos), *_thermal_units(photos), *_gaps(photos), *_clocks(photos), *_copies(copies))
 
 
 def _cameras(photos: Sequence[Photo]) -> Iterator[str]:
@@ -27,6 +27,15 @@ def _cameras(photos: Sequence[Photo]) -> Iterator[str]:
     rolling = sorted({p.camera_key for p in photos if p.rolling_shutter})
     if rolling:
         yield f"Rolling (electronic) shutter, not modelled: {sentence_of(rolling)}."
+
+
+def _thermal_units(photos: Sequence[Photo]) -> Iterator[str]:
+    units = Counter(p.stored for p in photos if p.stored)
+    listed = " and ".join(f"{n} as {unit}" for unit, n in units.most_common())
+    if len(units) > 1:
+        yield f"Thermal TIFFs are read in different units, {listed}; --thermal-unit says which is right for all."
+    elif units:
+        yield f"Thermal TIFFs are read as {listed.split(' as ')[1]} ({sum(units.values())})."
 
 
 def _gaps(photos: Sequence[Photo]) -> Iterator[str]:

@@ -1,11 +1,13 @@
 """Radiometric thermal frames: raw data, never the palette."""
 
+import re
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.model.photo import Stored
 from skyquilt.photos.flir import read_flir
 from skyquilt.photos.jpeg import APP3, JpegHeader
 
@@ -14,6 +16,15 @@ _CENTIKELVIN = (22_000, 42_000)
 _DECIKELVIN = (2_200, 4_200)
 _KELVIN = (220.0, 420.0)
 _CELSIUS = (-60.0, 160.0)
+_KELVIN_PER = {"kelvin": 1.0, "decikelvin": 0.1, "centikelvin": 0.01}
+_STATED = re.compile(
+    r"""\bunit\s*[:=]\s*["']?([a-z]+)|role=["']unittype["'][^>]*>\s*([^<]+?)\s*<""", re.IGNORECASE
+)
+_WORDS: dict[str, Stored] = {
+    "celsius": "celsius", "degc": "celsius", "c": "celsius", "\u00b0c": "celsius", "degreescelsius": "celsius",
+    "kelvin": "kelvin", "k": "kelvin", "decikelvin": "decikelvin", "centikelvin": "centikelvin", "ck": "centikelvin",
+    "counts": "counts", "dn": "counts",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -26,6 +37,8 @@ class ThermalFrame:
     """What a value means."""
     note: str
     """A sentence on how the values were read."""
+    stored: Stored = ""
+    """What a value of a TIFF meant as stored."""
 
 
 def thermal_frame_of_jpeg(jpeg: JpegHeader, *, make: str) -> ThermalFrame | None:
@@ -55,27 +68,49 @@ def _dji(jpeg: JpegHeader) -> ThermalFrame | None:
     return ThermalFrame(values=counts.astype(np.float32), unit="counts", note=note)
 
 
-def thermal_frame_of_values(values: NDArray[np.generic]) -> ThermalFrame:
-    """Degrees Celsius from a single-band thermal TIFF, its unit guessed from the median value.
+def stated_unit(text: str) -> Stored:
+    """The unit that a TIFF's description or GDAL's metadata name; empty where they name none."""
+    found = _STATED.search(text)
+    word = (found[1] or found[2]).lower().replace(" ", "") if found else ""
+    return _WORDS.get(word, "")
 
-    Whole numbers: hundredths or tenths of a kelvin; real numbers: kelvin or degrees Celsius; else counts.
+
+def thermal_frame_of_values(values: NDArray[np.generic], stored: Stored = "") -> ThermalFrame:
+    """Degrees Celsius from a single-band thermal TIFF whose values mean `stored`.
+
+    Where nobody says it, the median value does. Whole numbers: hundredths or tenths of a kelvin; real numbers: kelvin
+    or degrees Celsius; else counts.
     """
     real = values.astype(np.float32)
     whole = values.dtype.kind in "iu"
     if whole:
         real[values == 0] = np.nan
+    if stored:
+        note = f"Its values are read as {stored}, as the file or --thermal-unit says."
+        return _frame(real, stored, note)
     finite = real[np.isfinite(real)]
     middle = float(np.median(finite)) if finite.size else float("nan")
-    steps = ((_CENTIKELVIN, 0.01), (_DECIKELVIN, 0.1)) if whole else ((_KELVIN, 1.0),)
-    for (low, high), kelvin in steps:
-        if low <= middle <= high:
-            note = (
-                f"Its median value {middle:g} reads as {kelvin:g} K per unit; temperatures follow from that."
-            )
-            return ThermalFrame(
-                values=real * np.float32(kelvin) - np.float32(273.15), unit="celsius", note=note
-            )
-    if not whole and _CELSIUS[0] <= middle <= _CELSIUS[1]:
-        return ThermalFrame(values=real, unit="celsius", note=f"Its median value {middle:g} reads as deg C.")
-    note = f"Its median value {middle:g} fits no unit of temperature: values are counts."
-    return ThermalFrame(values=real, unit="counts", note=note)
+    found = _likely(middle, whole=whole)
+    if found == "counts":
+        words = "fits no unit of temperature: values are counts, unless --thermal-unit says what they are."
+    else:
+        words = f"reads as {found}; no unit is stated (--thermal-unit says it)."
+    return _frame(real, found, f"Its median value {middle:g} {words}")
+
+
+def _likely(middle: float, *, whole: bool) -> Stored:
+    """The unit in which a median value is a temperature on Earth."""
+    ranges: tuple[tuple[tuple[float, float], Stored], ...] = (
+        ((_CENTIKELVIN, "centikelvin"), (_DECIKELVIN, "decikelvin"))
+        if whole
+        else ((_KELVIN, "kelvin"), (_CELSIUS, "celsius"))
+    )
+    return next((unit for (low, high), unit in ranges if low <= middle <= high), "counts")
+
+
+def _frame(real: NDArray[np.float32], stored: Stored, note: str) -> ThermalFrame:
+    if stored == "counts":
+        return ThermalFrame(values=real, unit="counts", note=note, stored=stored)
+    if stored != "celsius":
+        real = real * np.float32(_KELVIN_PER[stored]) - np.float32(273.15)
+    return ThermalFrame(values=real, unit="celsius", note=note, stored=stored)

@@ -16,6 +16,7 @@ from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.pipelines.intake import Intake, Pictures
+from skyquilt.pipelines.radiometry import drift_of, value_tags
 from skyquilt.raster import Block, CogWriter, RasterSpec, write_array
 from skyquilt.raster.boundary import inside as inside_polygon
 from skyquilt.raster.boundary import read_boundary
@@ -191,7 +192,12 @@ def _local_bounds(settings: MosaicSettings, alignment: Alignment) -> tuple[float
 def balance(
     intake: Intake, ground: Ground, alignment: Alignment, methods: Methods, settings: MosaicSettings
 ) -> Exposure:
-    """Exposure of the placed 8-bit photos; neutral for measured values."""
+    """Exposure of the placed photos: of 8-bit pictures, or the drift of measured values."""
+    if unit_of(intake):
+        frames = {v.photo: intake.looked[v.photo].thumbnail for v in ground.views}
+        return drift_of(
+            ground.views, frames, ground.surface, ground.grid.bounds, unit_of(intake), methods, settings
+        )
     if not settings.balance or intake.photos[0].dtype != "uint8":
         return NEUTRAL
     thumbnails = {v.photo: _three(intake.looked[v.photo].thumbnail) for v in ground.views}
@@ -239,7 +245,7 @@ def mosaic_spec(compose: Composer, alignment: Alignment, settings: MosaicSetting
         width=compose.grid.width, height=compose.grid.height, bands=compose.bands, dtype=str(compose.dtype),
         transform=geotransform(compose.grid, alignment), crs=alignment.frame.crs, compress=compress,
         quality=settings.quality, mask=not real, nodata=float("nan") if real else None,
-        tags={"SOFTWARE": "Skyquilt", "METHOD": alignment.method} | ({"UNIT": unit} if unit else {}),
+        tags={"SOFTWARE": "Skyquilt", "METHOD": alignment.method} | value_tags(unit, compose.exposure),
     )  # fmt: skip
 
 
@@ -355,16 +361,23 @@ def preview_factor(grid: Grid) -> int:
 
 def _reduced(pixels: NDArray, valid: NDArray[np.bool_], factor: int) -> tuple[NDArray, NDArray[np.uint8]]:
     """Area averages of the valid pixels (h, w, bands), and how much of each cell is valid (0 to 255)."""
-    size = (-(-pixels.shape[1] // factor), -(-pixels.shape[0] // factor))
     opaque = valid.view(np.uint8) * np.uint8(255)
-    share = np.asarray(cv2.resize(opaque, size, interpolation=cv2.INTER_AREA), np.uint8)
+    share = np.asarray(_averaged(opaque, factor), np.uint8)
     solid = np.nan_to_num(pixels) if pixels.dtype.kind == "f" else pixels
-    mean: NDArray = np.asarray(cv2.resize(solid, size, interpolation=cv2.INTER_AREA))
-    mean = mean.reshape(size[1], size[0], -1)
+    mean = _averaged(solid, factor).reshape(*share.shape, -1)
     if share.min() < 255:  # pixels that are not valid are zero: divide by what was
         whole = mean.astype(np.float32) * (255.0 / np.maximum(share, 1))[..., None]
         mean = (np.minimum(whole, 255) if pixels.dtype == np.uint8 else whole).astype(pixels.dtype)
     return mean, share
+
+
+def _averaged(values: NDArray, factor: int) -> NDArray:
+    """Area averages over factor x factor pixels; factor is a power of two."""
+    height, width = (-(-n // factor) for n in values.shape[:2])
+    while factor > 2 and values.shape[0] % 2 == 0 and values.shape[1] % 2 == 0:
+        half = (values.shape[1] // 2, values.shape[0] // 2)
+        values, factor = cv2.resize(values, half, interpolation=cv2.INTER_AREA), factor // 2
+    return np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def coloured(preview: NDArray, shown: NDArray[np.uint8]) -> NDArray[np.uint8]:

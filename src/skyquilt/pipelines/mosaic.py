@@ -29,7 +29,7 @@ from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.sequence import sequence_of
 from skyquilt.photos.survey import read_survey
-from skyquilt.pipelines import drawing, intake, judging, linking, placing, quality, reporting
+from skyquilt.pipelines import drawing, intake, judging, linking, placing, quality, radiometry, reporting
 from skyquilt.raster.boundary import read_boundary
 from skyquilt.run.clock import Clock, Steps
 from skyquilt.run.folder import STATE, RunFolder, open_run
@@ -117,6 +117,7 @@ def iter_mosaic(
         ground.surface.z,
         dict(exposure.gains),
         dict(exposure.fields),
+        dict(exposure.offsets),
     )
     unit = drawing.unit_of(taken)
     drawn = yield from clock.stage(
@@ -133,7 +134,7 @@ def iter_mosaic(
         photos=taken.photos, total=len(survey.photos) + len(survey.rejected), rejected=rejected, priors=prior,
         links=links, alignment=alignment, ground=ground, drawn=drawn, seams=seams.figures,
         conflicts=conflicts(taken.photos, prior, alignment), notes=[*survey.notes, *alignment.notes],
-    ) | {"quality": judged}  # fmt: skip
+    ) | {"quality": judged} | radiometry.value_figures(taken.photos, exposure, settings)  # fmt: skip
     finish = reporting.finish(
         run.path, taken, prior, alignment, ground, drawn, seams, figures, settings, clock, folder
     )
@@ -159,7 +160,9 @@ def mosaic(
 
 def _read(folder: Path | Sequence[Path], settings: MosaicSettings) -> tuple[Survey, tuple[ControlPoint, ...]]:
     """Metadata and side files; a gcp_list.txt beside the photos is used unasked."""
-    survey = read_survey(folder, geo=settings.geo, cameras=settings.cameras)
+    survey = read_survey(
+        folder, geo=settings.geo, cameras=settings.cameras, thermal_unit=settings.thermal_unit
+    )
     survey, control = with_control(survey, folder, settings)
     _checked(survey, control, settings)
     return survey, control

@@ -1,5 +1,6 @@
 """What a registration leaves behind: B on A's grid, pictures for people, a page."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +90,9 @@ def _apply(matrix: NDArray, px: NDArray) -> NDArray:
     return np.asarray(moved[:, :2] / moved[:, 2:])
 
 
-def resample_onto(path: Path, a: Source, b: Source, b_H_a: Matrix) -> None:
+def resample_onto(
+    path: Path, a: Source, b: Source, b_H_a: Matrix, tags: Mapping[str, str] | None = None
+) -> None:
     """B's values on A's pixels, bilinear, in pieces; A's place where it has one, else A's pixels."""
     sample = b.picture.values
     kind = sample.dtype.name if sample.dtype.name in ("uint8", "uint16") else "float32"
@@ -98,7 +101,7 @@ def resample_onto(path: Path, a: Source, b: Source, b_H_a: Matrix) -> None:
         width=a.width, height=a.height, bands=bands, dtype=kind,
         transform=a.place.affine if a.place else (1, 0, 0, 0, -1, 0), crs=a.place.crs if a.place else None,
         nodata=float("nan") if kind == "float32" else None, mask=kind != "float32", compress="deflate",
-        band_units=(b.unit,) * bands if b.unit else (),
+        band_units=(b.unit,) * bands if b.unit else (), tags={"SOFTWARE": "Skyquilt"} | dict(tags or {}),
     )  # fmt: skip
     with CogWriter(path, spec) as writer:
         for block in writer.blocks():

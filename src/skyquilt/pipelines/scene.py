@@ -5,6 +5,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.priors import choose_frame, priors
@@ -37,6 +38,8 @@ class Scene:
     """Heights, views and the map's grid."""
     pixels: Callable[[int], NDArray]
     """Full-size pixels of a photo by its index."""
+    grey: Callable[[int, int], NDArray[np.uint8]]
+    """Grey picture of a photo (index), its longest side at most the px given."""
 
 
 def scene_of(
@@ -64,15 +67,16 @@ def scene_of(
     ground = yield from clock.stage(
         "surface", drawing.survey_ground(alignment, pictures, parts, settings, store)
     )
-    return Scene(taken=taken, links=links, alignment=alignment, ground=ground, pixels=cache)
+    return Scene(taken=taken, links=links, alignment=alignment, ground=ground, pixels=cache, grey=pictures)
 
 
 def scene_of_run(photos: Path | str, run: Result, settings: MosaicSettings) -> Scene:
     """What a finished mosaic of these photos and settings rests on, from its store."""
     folder = Path(photos)
-    survey, control = with_control(
-        read_survey(folder, geo=settings.geo, cameras=settings.cameras), folder, settings
+    survey = read_survey(
+        folder, geo=settings.geo, cameras=settings.cameras, thermal_unit=settings.thermal_unit
     )
+    survey, control = with_control(survey, folder, settings)
     store = Store(folder=run.output / STATE / "store", registry=REGISTRY)
     steps = scene_of(
         survey.photos, settings, methods(settings), Clock(store=store, began=Clock.now()), control

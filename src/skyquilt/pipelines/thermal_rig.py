@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from skyquilt.alignment.pose import reported_camera
+from skyquilt.config import Methods, MosaicSettings
 from skyquilt.geometry.transforms import transfer
+from skyquilt.imaging.grey import shrink
 from skyquilt.imaging.views import make_views
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import Alignment, Pose, no_ties
@@ -17,12 +19,15 @@ from skyquilt.model.registration import RefusedRegistration, Registration
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.together import taken_together
 from skyquilt.pipelines.drawing import geotransform
+from skyquilt.pipelines.intake import THUMBNAIL
 from skyquilt.pipelines.pictures import guess_of, open_picture
+from skyquilt.pipelines.radiometry import balances_drift, drift_of, value_tags
 from skyquilt.pipelines.register import outcome_of
 from skyquilt.pipelines.scene import Scene
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.render.blend import Blend
 from skyquilt.render.compose import Composer
+from skyquilt.render.exposure import NEUTRAL, Exposure
 from skyquilt.spectral.rig import FindRig, Rig, RigPair
 
 MOST_PAIRS = 12
@@ -103,20 +108,31 @@ def _registered(scene: Scene, index: int, thermal: Photo) -> RigPair | None:
     return RigPair(px_a=px_a[inside], px_b=px_b[inside], camera_a=scene.alignment.camera(index))
 
 
-def draw_rigged(path: Path, found: Rigged, scene: Scene, blend: Blend) -> None:
-    """thermal.tif on the visual map's grid and surface, values resampled only."""
+def drift_of_rigged(found: Rigged, scene: Scene, parts: Methods, settings: MosaicSettings) -> Exposure:
+    """What brings the thermal frames to one level, if they are to be."""
+    unit, ground = found.photos[0].unit, scene.ground
+    if not balances_drift(settings, unit):
+        return NEUTRAL
+    views = make_views(found.alignment, ground.surface)
+    frames = {v.photo: shrink(read_color(found.photos[v.photo]), THUMBNAIL)[0] for v in views}
+    return drift_of(views, frames, ground.surface, ground.grid.bounds, unit, parts, settings)
+
+
+def draw_rigged(path: Path, found: Rigged, scene: Scene, blend: Blend, exposure: Exposure = NEUTRAL) -> None:
+    """thermal.tif on the visual map's grid and surface, values resampled only, but for their drift."""
     first, grid = found.photos[0], scene.ground.grid
     kind, real = np.dtype(first.dtype), np.dtype(first.dtype).kind == "f"
     compose = Composer(
         grid=grid, views=make_views(found.alignment, scene.ground.surface), surface=scene.ground.surface,
         blend=blend, pixels=lambda i: read_color(found.photos[i]), bands=first.channels,
-        dtype=kind,
+        dtype=kind, exposure=exposure,
     )  # fmt: skip
     spec = RasterSpec(
         width=grid.width, height=grid.height, bands=first.channels, dtype=kind.name,
         transform=geotransform(grid, found.alignment), crs=found.alignment.frame.crs, compress="deflate",
         nodata=float("nan") if real else None, mask=not real,
         band_units=(first.unit,) * first.channels if first.unit else (),
+        tags={"SOFTWARE": "Skyquilt"} | value_tags(first.unit, exposure),
     )  # fmt: skip
     with CogWriter(path, spec) as writer:
         for block in writer.blocks():

@@ -110,17 +110,12 @@ class Composer:
 
     def _layer(self, n: Nodes, near: NDArray[np.bool_], h: int, w: int, *, alone: bool) -> Layer:
         """One photo over a piece; only the box of the cells where it can show is filled."""
-        rows, columns = _extent(near.any(1), h), _extent(near.any(0), w)
-        whole = (rows, columns) == (slice(0, h), slice(0, w))
+        rows, columns = _extent(np.asarray(near.any(1)), h), _extent(np.asarray(near.any(0)), w)
         size = rows.stop - rows.start, columns.stop - columns.start
-        pixels, score = self._warped(
-            n if whole else cut(n, rows.start, columns.start, *size), *size, alone=alone
-        )
-        if not whole:
-            pixels, score = (
-                _embedded(pixels, 0, rows, columns, h, w),
-                _embedded(score, np.inf, rows, columns, h, w),
-            )
+        pixels, score = self._warped(cut(n, rows.start, columns.start, *size), *size, alone=alone)
+        if size != (h, w):
+            pixels = _embedded(pixels, 0, rows, columns, h, w)
+            score = _embedded(score, np.inf, rows, columns, h, w)
         return Layer(
             photo=n.view.photo, pixels=pixels, score=score,
             centre=(float(n.view.pose.map_C[0]), float(n.view.pose.map_C[1])), height=n.height,
@@ -143,6 +138,8 @@ class Composer:
 
     def _exposed(self, n: Nodes, warped: NDArray) -> NDArray:
         photo = n.view.photo
+        if photo in self.exposure.offsets and warped.dtype.kind == "f":
+            return warped + np.float32(self.exposure.offsets[photo])
         if photo not in self.exposure.gains or warped.dtype != np.uint8:
             return warped
         if self.exposure.uneven(photo):

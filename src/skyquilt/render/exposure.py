@@ -6,7 +6,7 @@ and white stays white, so nothing clips or turns purple, and two gains in a row 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import cv2
@@ -20,6 +20,8 @@ from skyquilt.model.surface import Surface
 
 Float = NDArray[np.float32]
 
+SETTLED = 1e-3
+"""Change of log odds that no 8-bit level can show."""
 SIGMA_LEVEL = 0.15
 """Deviation in log odds of two photos' brightness of one ground point, all else equal."""
 EVEN = 0.1
@@ -38,6 +40,8 @@ class Exposure:
     """Photo -> (bands,) in log odds."""
     fields: Mapping[int, Float]
     """Photo -> (5,) in log odds, for x and y from -1 to 1 over the image."""
+    offsets: Mapping[int, float] = field(default_factory=dict)
+    """Photo -> what is added to measured values, in their unit."""
 
     def uneven(self, photo: int) -> bool:
         """Whether the photo needs more than one gain per band."""
@@ -175,15 +179,14 @@ def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: fl
     columns = 6 * s.row[:, None] + np.arange(6)
     A = sparse.csr_matrix((terms.ravel(), columns.ravel(), 6 * np.arange(N + 1)), (N, 6 * n))
     ridge = np.tile(1 / np.array([sigma_gain] + 5 * [sigma_field]) ** 2, n)
-    x = _robust_differences(A, point, s.log.mean(1), ridge).reshape(n, 6)
+    x = _robust_differences(A, point, s.log.mean(1, keepdims=True), ridge).reshape(n, 6)
     fields = (
         x[:, 1:]
         * (np.abs(_basis(*np.meshgrid([-1, 0, 1], [-1, 0, 1])) @ x[:, 1:].T).max((0, 1)) > EVEN)[:, None]
     )
     even = s.log + (terms[:, 1:] * fields[s.row]).sum(1)[:, None]
     ones = sparse.csr_matrix((np.ones(N), (np.arange(N), s.row)), (N, n))
-    bands = [_robust_differences(ones, point, even[:, k], ridge[::6]) for k in range(s.log.shape[1])]
-    gains = np.stack(bands, 1)
+    gains = _robust_differences(ones, point, even, ridge[::6])
     gains = (gains - np.median(gains, axis=0)).astype(np.float32)
     return Exposure(
         gains=dict(zip(photos, gains, strict=True)),
@@ -194,23 +197,22 @@ def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: fl
 def _robust_differences(
     A: sparse.csr_matrix, point: NDArray, y: NDArray, ridge: NDArray
 ) -> NDArray[np.float64]:
-    """x that makes y + A x equal within each point, reweighted against moving things and shadows."""
+    """x (m, bands) that makes y + A x equal within each point, y (N, bands), reweighted against moving things
+    and shadows, which all bands see.
+    """
     w = np.ones(len(y))
-    x = np.zeros(A.shape[1])
+    x = np.zeros((A.shape[1], y.shape[1]))
     for _ in range(6):
         mass = np.bincount(point, w)
-        select = sparse.csr_matrix((w, (point, np.arange(len(y)))), (len(mass), len(y)))
-        mean_A = sparse.diags(1 / np.maximum(mass, 1e-9)) @ (select @ A)
-        mean_y = (select @ y) / np.maximum(mass, 1e-9)
-        W = sparse.diags(w)
-        normal = (
-            A.T @ W @ A
-            - mean_A.T @ sparse.diags(mass) @ mean_A
-            + sparse.diags(ridge * SIGMA_LEVEL**2 * CORRELATED)
-        )
-        rhs = -(A.T @ (w * y) - mean_A.T @ (mass * mean_y))
-        x = sparse_linalg.spsolve(normal.tocsc(), rhs)
+        share = sparse.csr_matrix((w / np.maximum(mass, 1e-9)[point], (point, np.arange(len(y)))))
+        mean_A, mean_y = share @ A, share @ y
+        normal = A.T @ A.multiply(w[:, None]) - mean_A.T @ mean_A.multiply(mass[:, None])
+        rhs = -(A.T @ (w[:, None] * y) - mean_A.T @ (mass[:, None] * mean_y))
+        normal = normal + sparse.diags(ridge * SIGMA_LEVEL**2 * CORRELATED)
+        before, x = x, sparse_linalg.splu(normal.tocsc()).solve(rhs)
+        if np.abs(x - before).max() < SETTLED:
+            break
         level = y + A @ x
-        residual = level - (select @ level / np.maximum(mass, 1e-9))[point]
-        w = 1 / (1 + (residual / 0.25) ** 2)
+        residual = level - (share @ level)[point]
+        w = 1 / (1 + (residual**2).mean(1) / 0.25**2)
     return np.asarray(x)

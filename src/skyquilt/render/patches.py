@@ -16,20 +16,26 @@ COARSE = 8
 """Pixels between exactly projected points of a patch."""
 
 
-def grey_patch(
-    view: View, surface: Surface, pixels: PhotoPixels, x: float, y: float, gsd: float, *, side: int = SIDE
-) -> NDArray[np.float32] | None:
-    """What a photo shows around map coordinates x, y in m: grey (side, side), north up;
-    None if not all of it.
+def grey_patches(
+    view: View, surface: Surface, pixels: PhotoPixels, xy: NDArray, gsd: float, *, side: int = SIDE
+) -> list[NDArray[np.float32] | None]:
+    """What a photo shows around map points xy (n, 2) in m: grey (side, side) each, north up;
+    None where it does not see all of it.
     """
     nodes = (np.arange(-1, side // COARSE + 1) + 0.5) * COARSE - side / 2
-    gx, gy = np.meshgrid(x + nodes * gsd, y - nodes * gsd)
+    shape = (len(xy), len(nodes), len(nodes))
+    gx = np.broadcast_to(xy[:, 0, None, None] + nodes * gsd, shape)
+    gy = np.broadcast_to(xy[:, 1, None, None] - nodes[:, None] * gsd, shape)
     n = project_nodes(view, gx, gy, surface.at(gx, gy))
-    if not inside(view.camera, n.u, n.v).all():
-        return None
+    whole = np.asarray(inside(view.camera, n.u, n.v).all((1, 2)))
+    return [_cut_out(view, pixels, n.u[k], n.v[k], side) if whole[k] else None for k in range(len(xy))]
+
+
+def _cut_out(view: View, pixels: PhotoPixels, nu: NDArray, nv: NDArray, side: int) -> NDArray[np.float32]:
+    """The grey patch (side, side) whose nodes lie at these photo pixels."""
     size = ((side // COARSE + 2) * COARSE,) * 2
     inner = slice(COARSE, COARSE + side)
-    u, v = (cv2.resize(m, size, interpolation=cv2.INTER_LINEAR)[inner, inner] for m in (n.u, n.v))
+    u, v = (cv2.resize(m, size, interpolation=cv2.INTER_LINEAR)[inner, inner] for m in (nu, nv))
     x0, y0 = int(u.min()) - 1, int(v.min()) - 1
     part = pixels(view.photo)[y0 : int(v.max()) + 3, x0 : int(u.max()) + 3]
     if part.ndim == 3:
@@ -48,12 +54,18 @@ def grey_pairs(
     gsd: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """Patches (n, 64, 64) of two photos each around map points (n, 2), and whether both see them whole."""
-    a = np.zeros((len(xy), SIDE, SIDE), np.float32)
-    b = np.zeros_like(a)
-    seen = np.zeros(len(xy), bool)
-    for k, (one, other, (x, y)) in enumerate(zip(first, second, xy, strict=True)):
-        pa = grey_patch(one, surface, pixels, float(x), float(y), gsd)
-        pb = grey_patch(other, surface, pixels, float(x), float(y), gsd) if pa is not None else None
-        if pa is not None and pb is not None:
-            a[k], b[k], seen[k] = pa, pb, True
-    return a, b, seen
+    patches = np.zeros((2, len(xy), SIDE, SIDE), np.float32)
+    seen = np.zeros((2, len(xy)), bool)
+    sides: dict[int, list[tuple[int, int]]] = {}
+    views = (first, second)
+    for which, row in enumerate(views):
+        for k, view in enumerate(row):
+            sides.setdefault(view.photo, []).append((which, k))
+    for asked in sides.values():  # a photo's patches at once: it is decoded once, and projected in one go
+        which, k = asked[0]
+        at = np.array([place for _, place in asked])
+        found = grey_patches(views[which][k], surface, pixels, xy[at], gsd)
+        for (which, k), patch in zip(asked, found, strict=True):
+            if patch is not None:
+                patches[which, k], seen[which, k] = patch, True
+    return patches[0], patches[1], np.asarray(seen.all(0))

@@ -30,6 +30,7 @@ from skyquilt.report.tables import (
     rejected_section,
     settings_section,
 )
+from skyquilt.report.values import values_section
 
 HERE = Path(__file__).parent
 
@@ -44,6 +45,7 @@ def build_report(data: ReportInput) -> str:
         positions_section(data, ground, named),
         residuals_section(data),
         seams_section(data, ground, named),
+        *values_section(data),
         surface_section(data, ground, named),
         quality_section(data),
         calibration_section(data),
@@ -117,6 +119,11 @@ def plain_page(
         title=title, summary=summary, version=version, source=source, sections=sections, tiles=tiles,
         style=_asset("style.css"),
     )  # fmt: skip
+
+
+def section_html(section: Section) -> str:
+    """One section as it stands in a page."""
+    return _template("section.html.j2").render(section=section)
 
 
 @cache

@@ -31,19 +31,19 @@ MARGIN = 16
 class Sweep:
     """Coarse-to-fine plane sweep."""
 
-    sides: tuple[int, ...] = (500,)
+    sides: tuple[int, ...] = (400,)
     """Longest side in px of the pictures of each pass."""
     below: float = 0.05
     """Depth searched below the known surface in the first pass, as a share of the flying height."""
     above: float = 0.05
     """Height searched above it."""
-    window: int = 9
+    window: int = 7
     """Side in px of the window that must agree."""
     agree: float = 0.55
     """Correlation from which a height is believed."""
     smoothing_cells: float = 1.0
     """Standard deviation of the final Gaussian in cells."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def __call__(self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture) -> Surface:
         """The surface with the heights found; where pictures do not agree it stays as it was."""
@@ -68,6 +68,16 @@ class Sweep:
         height: float, span: tuple[float, float], *, relative: bool,
     ) -> Surface:  # fmt: skip
         """One pass; `span` in m, or in steps of about one pixel of disparity when `relative`."""
+        work, z, trust = self.searched(surface, views, grid, grey, side, gsd, height, span, relative=relative)
+        return self._fused(surface, work, z, trust)
+
+    def searched(
+        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, side: int, gsd: float,
+        height: float, span: tuple[float, float], *, relative: bool,
+    ) -> tuple[Grid, Float, Float]:  # fmt: skip
+        """A grid of cells of gsd m, the heights on it (h, w) in m, and how far two pictures agree there (h, w), 0 where
+        they do not. Pictures are `side` px long, cameras `height` m above ground; `span` as in a pass.
+        """
         w, s, e, n = grid.bounds
         work = Grid(west=w, north=n, gsd=gsd, width=int((e - w) / gsd) + 1, height=int((n - s) / gsd) + 1)
         z = np.zeros((work.height, work.width), np.float32)
@@ -78,7 +88,7 @@ class Sweep:
                 h, c = min(TILE, work.height - row), min(TILE, work.width - column)
                 inner = (slice(row, row + h), slice(column, column + c))
                 z[inner], trust[inner] = piece[0][:h, :c], piece[1][:h, :c]
-        return self._fused(surface, work, z, trust)
+        return work, z, trust
 
     def _piece(
         self, surface: Surface, views: Sequence[View], work: Grid, grey: GreyPicture, side: int,

@@ -1,0 +1,153 @@
+"""Drift: what a thermal camera's frames differ by though they show the same ground.
+
+An uncooled sensor warms and cools, so a frame's values are off by an amount of its own. Where frames overlap they
+show the same ground, and one number per frame makes them agree. That is a correction and no measurement: values
+as recorded are an option away.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import linalg as sparse_linalg
+from scipy.sparse.csgraph import connected_components
+
+from skyquilt.imaging.views import View, project_nodes
+from skyquilt.model.surface import Surface
+
+Doubles = NDArray[np.float64]
+Ints = NDArray[np.int64]
+CORRELATED = 30.0
+"""Neighbouring samples err alike: so many count as one."""
+_TINY = 1e-9
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Overlaps:
+    """By how much frames differ where they overlap: the edges of a graph of frames."""
+
+    first: Ints
+    """(E,) row of the one frame."""
+    second: Ints
+    """(E,) row of the other."""
+    difference: Doubles
+    """(E,) median of second minus first, in the values' unit."""
+    sigma: Doubles
+    """(E,) its standard deviation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drift:
+    """One offset per frame from the medians of all overlaps, outlying overlaps down-weighted (Cauchy).
+
+    Overlaps leave a common offset open. It is fixed so that the median offset of frames that hang together is
+    zero: the map keeps the level that most of its frames have.
+    """
+
+    points: int = 4000
+    """Ground points looked at; more on surveys of many frames."""
+    least: int = 8
+    """Fewest points that two frames must share."""
+    rounds: int = 12
+    """Of reweighting."""
+    version: ClassVar[int] = 1
+
+    def __call__(
+        self, views: Sequence[View], thumbnails: Mapping[int, NDArray], surface: Surface,
+        bounds: tuple[float, float, float, float],
+    ) -> dict[int, float]:  # fmt: skip
+        """Photo -> what is to be added to its values, from thumbnails (h, w) of the photos in their unit."""
+        usable = [v for v in views if v.photo in thumbnails]
+        if len(usable) < 2:
+            return {}
+        point, row, value = self._samples(usable, thumbnails, surface, bounds)
+        edges = overlaps(point, row, value, self.least)
+        if not len(edges.first):
+            return {}
+        offsets = solved(edges, len(usable), self.rounds)
+        return {v.photo: float(o) for v, o in zip(usable, offsets, strict=True)}
+
+    def _samples(
+        self, views: Sequence[View], thumbnails: Mapping[int, NDArray], surface: Surface,
+        bounds: tuple[float, float, float, float],
+    ) -> tuple[Ints, Ints, Doubles]:  # fmt: skip
+        """Ground point, view and value (N,) of everything seen."""
+        west, south, east, north = bounds
+        step = np.sqrt((east - west) * (north - south) / max(self.points, 40 * len(views)))
+        x, y = np.meshgrid(np.arange(west, east, step), np.arange(south, north, step))
+        z = surface.at(x, y)
+        parts = []
+        for row, view in enumerate(views):
+            nodes = project_nodes(view, x, y, z)
+            seen = np.flatnonzero(nodes.seen.ravel())
+            value = _nearest(thumbnails[view.photo], nodes.u.ravel()[seen], nodes.v.ravel()[seen], view)
+            good = np.isfinite(value)
+            parts.append((seen[good], np.full(int(good.sum()), row), value[good]))
+        point, rows, values = (np.concatenate(p) for p in zip(*parts, strict=True))
+        return point.astype(np.int64), rows.astype(np.int64), values
+
+
+def _nearest(thumbnail: NDArray, u: NDArray, v: NDArray, view: View) -> Doubles:
+    """Thumbnail values (n,), themselves area means, at photo pixels."""
+    height, width = thumbnail.shape[:2]
+    column = np.rint((u + 0.5) * width / view.camera.width - 0.5).astype(int)
+    row = np.rint((v + 0.5) * height / view.camera.height - 0.5).astype(int)
+    flat = thumbnail.reshape(height, width, -1)[..., 0]
+    return np.asarray(flat[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)], np.float64)
+
+
+def overlaps(point: Ints, row: Ints, value: Doubles, least: int) -> Overlaps:
+    """Median differences of all pairs of frames with `least` ground points in common, from samples (N,)."""
+    order = np.lexsort((row, point))
+    point, row, value = point[order], row[order], value[order]
+    a, b, d = [], [], []
+    for lag in range(1, int(np.bincount(point).max(initial=1))):
+        same = np.flatnonzero(point[lag:] == point[:-lag])
+        a.append(row[same])
+        b.append(row[same + lag])
+        d.append(value[same + lag] - value[same])
+    if not a:
+        return Overlaps(first=row[:0], second=row[:0], difference=value[:0], sigma=value[:0])
+    first, second, difference = np.concatenate(a), np.concatenate(b), np.concatenate(d)
+    order = np.lexsort((difference, second, first))
+    first, second, difference = first[order], second[order], difference[order]
+    cuts = np.flatnonzero((np.diff(first) != 0) | (np.diff(second) != 0)) + 1
+    groups = [g for g in np.split(np.arange(len(first)), cuts) if len(g) >= least]
+    middle = np.array([np.median(difference[g]) for g in groups])
+    spread = [
+        1.4826 * np.median(np.abs(difference[g] - m)) / np.sqrt(max(len(g) / CORRELATED, 1.0))
+        for g, m in zip(groups, middle, strict=True)
+    ]
+    start = np.array([g[0] for g in groups], np.int64)
+    sigma = np.array(spread)
+    floor = 0.3 * float(np.median(sigma)) if len(sigma) else 0.0
+    return Overlaps(
+        first=first[start], second=second[start], difference=middle, sigma=np.maximum(sigma, floor + _TINY)
+    )
+
+
+def solved(edges: Overlaps, count: int, rounds: int) -> Doubles:
+    """Offsets (count,) that make frames agree: second + o[second] = first + o[first], median zero per component.
+
+    A weak pull to zero, its width what frames differ by as a rule, keeps a long line of frames from drifting off by the
+    sum of many small errors.
+    """
+    number = np.arange(len(edges.first))
+    ones = np.ones(len(number))
+    A = sparse.csr_matrix(
+        (np.r_[ones, -ones], (np.r_[number, number], np.r_[edges.second, edges.first])), (len(number), count)
+    )
+    usual = 1.4826 * float(np.median(np.abs(edges.difference))) + _TINY
+    pull = sparse.identity(count) / usual**2
+    weight, offset = 1 / edges.sigma**2, np.zeros(count)
+    for k in range(rounds):
+        W = sparse.diags(weight)
+        offset = sparse_linalg.spsolve((A.T @ W @ A + pull).tocsc(), -A.T @ (weight * edges.difference))
+        lacking = edges.difference + A @ offset
+        scale = max(1.4826 * float(np.median(np.abs(lacking))), 0.5 * usual * 0.5**k, _TINY)
+        weight = 1 / edges.sigma**2 / (1 + (lacking / (2 * scale)) ** 2)
+    _, part = connected_components(A.T @ A)
+    return np.asarray(offset - np.array([np.median(offset[part == p]) for p in range(part.max() + 1)])[part])

@@ -1,0 +1,211 @@
+"""Two fields of heights laid on one another to a fraction of a cell.
+
+Heights look alike in every spectrum, at any hour and in every season, but for leaves: no shadow and no shading draws
+the fit aside, as it does with pictures. Two adjusted blocks differ by a similarity, heights included; slopes tell
+how far the one must move for its heights to equal the other's (least squares matching; for elevation models Rosenholm
+and Torlegard 1988). Walls do not count, nor does what only one field has.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.model.registration import Matrix, RefusedRegistration
+from skyquilt.model.surface import HeightField
+
+Doubles = NDArray[np.float64]
+_TILES = 4
+"""Per side of the chess-board that parts the ground into halves."""
+_LEAST = 400
+"""Cells that both fields must know."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HeightFit:
+    """How one field lies on the other."""
+
+    b_H_a: Matrix
+    """(3, 3) similarity, takes a's ground coordinates in m to b's."""
+    cells: int
+    """Cells compared."""
+    residual_m: float
+    """Robust deviation of the heights' differences."""
+    apart_m: float
+    """RMS distance over the ground between the places that the two halves of it find by themselves."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AlignHeights:
+    """Gauss-Newton, coarse to fine: a similarity of the plane, and of the heights a factor and a bent plane."""
+
+    sigmas: tuple[float, ...] = (5.0, 2.5, 1.25, 0.75)
+    """Standard deviations of the smoothing, in cells."""
+    steepest: float = 2.5
+    """Slope above which heights are walls."""
+    scale: float = 1.0
+    """Difference in cells beyond which a height counts ever less."""
+    steps: int = 20
+    """Most steps at each smoothing."""
+    furthest_apart: float = 4.0
+    """Cells by which the places that two halves of the ground find may differ."""
+    version: ClassVar[int] = 1
+
+    def __call__(self, a: HeightField, b: HeightField, start: Matrix) -> HeightFit | RefusedRegistration:
+        """b on a near a start (3, 3), ground coordinates in m, or why heights do not tell it."""
+        cell = 2 * max(a.cell, b.cell)
+        a, b = a.coarser(cell), b.coarser(cell)
+        everything = np.ones(a.z.shape, bool)
+        fit = self._fitted(a, b, _Fit.of(a, start), everything, self.sigmas)
+        halves = _halves(a.z.shape)
+        parts = [None if fit is None else self._fitted(a, b, fit, h, self.sigmas[-2:]) for h in halves]
+        if fit is None or parts[0] is None or parts[1] is None:
+            return RefusedRegistration(reason="too little ground has heights in both maps to compare them")
+        apart = float(np.sqrt((((parts[0].p - parts[1].p) @ fit.spread) ** 2).sum()))
+        if apart > self.furthest_apart * cell:
+            return RefusedRegistration(
+                reason=f"two halves of the ground find places {apart:.1f} m apart: its relief does not tell the place"
+            )
+        return HeightFit(b_H_a=fit.matrix, cells=fit.cells, residual_m=fit.residual, apart_m=apart)
+
+    def _fitted(
+        self, a: HeightField, b: HeightField, fit: "_Fit", part: NDArray[np.bool_], sigmas: tuple[float, ...]
+    ) -> "_Fit | None":
+        """The best place by the cells of a in `part`; None where too few can be compared."""
+        for sigma in sigmas:
+            one, other = _smooth(a, sigma), _Slopes.of(_smooth(b, sigma), b, self.steepest)
+            known = a.known & part
+            for _ in range(self.steps):
+                change = self._step(one, known, other, fit, a.cell)
+                if change is None:
+                    return None
+                fit, moved = change
+                if moved < 0.01 * a.cell:
+                    break
+        return fit
+
+    def _step(
+        self, one: NDArray[np.float32], known: NDArray[np.bool_], other: "_Slopes", fit: "_Fit", cell: float
+    ) -> "tuple[_Fit, float] | None":
+        """A step, and by how many m it moves the ground's border."""
+        z, gx, gy, both = other.at(*fit.there())
+        both &= known
+        if both.sum() < _LEAST:
+            return None
+        z, gx, gy, u, v, wanted = z[both], gx[both], gy[both], fit.u[both], fit.v[both], one[both]
+        heights = np.stack([z, np.ones_like(z), u, v, u * u, u * v, v * v], 1)
+        place = np.stack([gx, gy, gx * u + gy * v, gy * u - gx * v], 1)
+        found, lacking = _robust(np.concatenate([heights, place], 1), wanted, self.scale * cell)
+        change = found[7:] / max(float(found[0]), 0.3)
+        change *= min(1.0, 5 * cell / max(float(np.abs(change).max()), 1e-9))
+        told = fit.moved(change, int(both.sum()), 1.4826 * float(np.median(np.abs(lacking))))
+        return told, float(np.abs(change).max())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Fit:
+    """A similarity by its movement in m of the ground's middle and border: x = x0 + p0 + p2 u - p3 v and so on."""
+
+    u: Doubles
+    v: Doubles
+    """(rows, cols) places of a from its middle, in units of half its longer side."""
+    middle: Doubles
+    unit: float
+    p: Doubles
+    """(4,) place of the middle, and the unit's image along x and y, all in m."""
+    cells: int = 0
+    residual: float = 0.0
+
+    @classmethod
+    def of(cls, a: HeightField, start: Matrix) -> "_Fit":
+        rows, columns = a.z.shape
+        middle = np.array([a.x0 + a.cell * (columns - 1) / 2, a.y0 + a.cell * (rows - 1) / 2])
+        unit = a.cell * max(rows, columns) / 2
+        v, u = (
+            (np.mgrid[0:rows, 0:columns] - np.array([rows - 1, columns - 1])[:, None, None] / 2)
+            * a.cell
+            / unit
+        )
+        there = start @ np.array([[middle[0], middle[0] + unit], [middle[1], middle[1]], [1, 1]])
+        there = there[:2] / there[2]
+        return cls(u=u, v=v, middle=middle, unit=unit, p=np.r_[there[:, 0], there[:, 1] - there[:, 0]])
+
+    def there(self) -> tuple[Doubles, Doubles]:
+        """(rows, cols) where the cells of a lie in b."""
+        x, y, c, s = self.p
+        return x + c * self.u - s * self.v, y + s * self.u + c * self.v
+
+    def moved(self, change: Doubles, cells: int, residual: float) -> "_Fit":
+        return _Fit(
+            u=self.u,
+            v=self.v,
+            middle=self.middle,
+            unit=self.unit,
+            p=self.p + change,
+            cells=cells,
+            residual=residual,
+        )
+
+    @property
+    def matrix(self) -> Matrix:
+        x, y, c, s = self.p
+        linear = np.array([[c, -s], [s, c]]) / self.unit
+        shift = np.array([x, y]) - linear @ self.middle
+        return np.vstack([np.c_[linear, shift], [0, 0, 1]])
+
+    @property
+    def spread(self) -> Doubles:
+        """(4, 4) that turns a difference of parameters into RMS distances over the ground."""
+        r2 = float((self.u**2 + self.v**2).mean())
+        return np.diag(np.sqrt([1, 1, r2, r2]))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Slopes:
+    """Heights of b and how they change, to be looked up."""
+
+    layers: NDArray[np.float32]
+    """(rows, cols, 4): height, slope along x and y, 1 where all three are known and no wall."""
+    field: HeightField
+
+    @classmethod
+    def of(cls, smooth: NDArray[np.float32], b: HeightField, steepest: float) -> "_Slopes":
+        gy, gx = np.gradient(smooth, b.cell)
+        inner = cv2.erode(b.known.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        gentle = inner & (np.hypot(gx, gy) < steepest)
+        return cls(layers=np.stack([smooth, gx, gy, gentle], -1).astype(np.float32), field=b)
+
+    def at(self, x: Doubles, y: Doubles) -> tuple[Doubles, Doubles, Doubles, NDArray[np.bool_]]:
+        """Height, slopes and whether they are known, each in the shape of x and y."""
+        b = self.field
+        column, row = ((x - b.x0) / b.cell).astype(np.float32), ((y - b.y0) / b.cell).astype(np.float32)
+        found = cv2.remap(self.layers, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        z, gx, gy, known = np.moveaxis(np.asarray(found, np.float64), -1, 0)
+        return z, gx, gy, known > 0.99
+
+
+def _smooth(one: HeightField, sigma: float) -> NDArray[np.float32]:
+    """Heights smoothed over what is known."""
+    weight = one.known.astype(np.float32)
+    total = np.asarray(cv2.GaussianBlur(np.where(one.known, one.z, np.float32(0)), (0, 0), sigma))
+    return np.asarray(total / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3), np.float32)
+
+
+def _robust(A: Doubles, wanted: NDArray, scale: float) -> tuple[Doubles, Doubles]:
+    """Least squares reweighted (Geman and McClure), and what it leaves."""
+    weight = np.ones(len(A))
+    for _ in range(6):
+        W = A * weight[:, None]
+        found = np.linalg.solve(W.T @ A + 1e-9 * np.eye(A.shape[1]), W.T @ wanted)
+        lacking = wanted - A @ found
+        weight = 1 / (1 + (lacking / scale) ** 2) ** 2
+    return np.asarray(found), np.asarray(lacking)
+
+
+def _halves(shape: tuple[int, int]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """The white and the black squares of a chess-board over the ground."""
+    row, column = (np.arange(n) * _TILES // n for n in shape)
+    white = (row[:, None] + column) % 2 == 0
+    return white, ~white
