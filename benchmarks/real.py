@@ -127,8 +127,11 @@ def control_from_full_run(source: Path, work: Path) -> Path:
     prior = priors(photos, frame)
     pictures = intake.Pictures(photos, cache, store)
     links = drain(linking.link_up(taken, prior, parts, store, 2))
-    ties = drain(placing.place(taken, frame, prior, links, (), parts, settings, store, pictures))
-    ties, frame = ties.ties, ties.frame
+    known = placing.Known(
+        intake=taken, frame=frame, priors=prior, links=links, control=(), order=range(len(photos)), pictures=pictures,
+    )  # fmt: skip
+    aligned = drain(placing.place(known, parts, settings, store))
+    ties, frame = aligned.ties, aligned.frame
     seen = np.bincount(ties.point)
     good = np.flatnonzero(seen >= 3)
     xy = ties.xyz[good, :2]

@@ -1,6 +1,8 @@
 """What no committed file may hold, and files that must say the same as others."""
 
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -119,3 +121,23 @@ def test_no_file_holds_both_sides_of_a_merge():
         p for k in kinds for p in ROOT.glob(k)
     ]
     assert [str(p.relative_to(ROOT)) for p in found if marks.search(p.read_text(errors="replace"))] == []
+
+
+@pytest.mark.slow
+def test_benchmarks_call_what_is_there():
+    """Benchmarks are run by hand and rarely: a function that changed its arguments is found here."""
+    programs = sorted(str(p) for p in (ROOT / "benchmarks").glob("*.py"))
+    words = [
+        sys.executable,
+        "-m",
+        "mypy",
+        "--check-untyped-defs",
+        "--config-file",
+        str(ROOT / "pyproject.toml"),
+    ]
+    said = subprocess.run(
+        [*words, *programs], cwd=ROOT / "benchmarks", capture_output=True, text=True, check=False
+    )
+    assert "Found" in said.stdout or "Success" in said.stdout, said.stderr
+    broken = [line for line in said.stdout.splitlines() if "[call-arg]" in line or "[name-defined]" in line]
+    assert len(programs) > 10 and not broken, broken

@@ -105,13 +105,13 @@ def prior(C):
     )  # fmt: skip
 
 
-def test_gps_residuals_are_of_placed_photos_that_reported_a_position():
-    frame = MapFrame(crs=None, origin=(0, 0), vertical_datum="unknown")
+@pytest.mark.parametrize(("datum", "z"), [("takeoff", -1), ("control", 0)])
+def test_gps_residuals_are_of_photos_held_by_ties(datum, z):
+    frame = MapFrame(crs=None, origin=(0, 0), vertical_datum=datum)
     alignment = Alignment(
-        method="bundle", why="", frame=frame, cameras={}, camera_of={}, blocks=(), ties=no_ties(),
-        poses={k: Pose(cam_R_map=np.eye(3), map_C=np.full(3, float(k))) for k in (5, 1, 2)},
+        method="bundle", why="", frame=frame, cameras={}, camera_of={}, blocks=((0, 1, 2), (3,)), ties=no_ties(),
+        poses={k: Pose(cam_R_map=np.eye(3), map_C=np.full(3, float(k))) for k in range(4)},
     )  # fmt: skip
-    priors = {1: prior((0, 1, 2)), 2: prior((np.nan,) * 3), 5: prior((5, 5, np.nan)), 9: prior((0, 0, 0))}
-    residuals = gps_residuals(alignment, priors)
-    np.testing.assert_array_equal(residuals, [(1, 0, -1), (0, 0, np.nan)])
-    assert gps_residuals(alignment, {}).shape == (0, 3)
+    priors = [prior((0, 1, 1)), prior((np.nan,) * 3), prior((1, 2, np.nan)), prior((9, 9, 9))]
+    expected = [(0, -1, z), (np.nan,) * 3, (1, 0, np.nan)]
+    np.testing.assert_array_equal(gps_residuals(alignment, priors), expected)

@@ -1,6 +1,6 @@
 """Geolocation errors per axis [Arteaga 2019, Table 2]."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,16 +39,16 @@ def geolocation_errors(estimated: NDArray, reference: NDArray) -> AxisErrors:
     )
 
 
-def gps_residuals(alignment: Alignment, priors: Mapping[int, Prior]) -> Array:
-    """(n, 3) solution minus reported position in m (map frame) of the placed photos that reported one, in
-    order of their index.
+def gps_residuals(alignment: Alignment, priors: Sequence[Prior]) -> Array:
+    """(n, 3) solution minus reported position in m (map frame) of the photos held by tie points, in the order of
+    `alignment.held`; NaN where none was reported.
+
+    Where control points give the heights, the offset of their datum from the photos' is no residual.
     """
-    rows = [
-        pose.map_C - priors[photo].map_C
-        for photo, pose in sorted(alignment.poses.items())
-        if photo in priors and np.isfinite(priors[photo].map_C).any()
-    ]
-    return np.array(rows, np.float64).reshape(-1, 3)
+    residual = np.array([alignment.poses[i].map_C - priors[i].map_C for i in alignment.held]).reshape(-1, 3)
+    if alignment.frame.vertical_datum == "control" and np.isfinite(residual[:, 2]).any():
+        residual[:, 2] -= np.nanmedian(residual[:, 2])
+    return residual
 
 
 def _axes(values: Array) -> Axes:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.metrics.geolocation import gps_residuals
 from skyquilt.model.camera import PARAMETERS
 from skyquilt.model.event import MetadataConflict
 from skyquilt.model.photo import Photo, RejectedPhoto
@@ -25,17 +26,6 @@ def xyz(values: Sequence[float] | NDArray | None) -> dict[str, float | None] | N
     if values is None or not np.isfinite(np.asarray(values, float)).any():
         return None
     return {axis: _round(v) for axis, v in zip("xyz", values, strict=True)}
-
-
-def gps_residuals(alignment: Alignment, priors: Sequence[Prior]) -> NDArray[np.float64]:
-    """Solution minus measured position (n, 3) in m of the photos held by tie points; NaN where unknown.
-
-    Where control points give the heights, the offset of their datum from the photos' is no residual.
-    """
-    residual = np.array([alignment.poses[i].map_C - priors[i].map_C for i in alignment.held]).reshape(-1, 3)
-    if alignment.frame.vertical_datum == "control" and np.isfinite(residual[:, 2]).any():
-        residual[:, 2] -= np.nanmedian(residual[:, 2])
-    return residual
 
 
 def _rms(values: NDArray[np.float64]) -> float:
