@@ -1,7 +1,6 @@
 """A thermal camera beside a visible one: two layers over one ground."""
 
 import io
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from PIL import Image
 
 from skyquilt.pipelines.live.settings import LiveSettings
 from skyquilt.raster.map_source import TileSource
-from skyquilt.simulate import run
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route, Thermal
 from tests.live.conftest import made, served
@@ -19,18 +17,12 @@ from tests.live.test_http import middle, tile_of
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory):
-    """Six visible photos and the thermal frames of a second drone, in degrees Celsius as radiometric cameras store them."""
-    honest = run.write_tiff
-
-    def celsius(path, counts, *more):
-        honest(path, (counts / 100 - 273.15).astype(np.float32), *more)
-
+    """Six visible photos and the thermal frames of a second drone, whose files state their unit."""
     thermal = Thermal(lens=Lens(width=320, height=256, focal=386.0, k1=-0.2, k2=0.05, p1=0.0, p2=0.0))
-    with mock.patch.object(run, "write_tiff", celsius):
-        return made(
-            tmp_path_factory.mktemp("thermal"), seed=3, route=Route(photos=6), control=Control(points=0, checks=0),
-            thermal=thermal,
-        )  # fmt: skip
+    return made(
+        tmp_path_factory.mktemp("thermal"), seed=3, route=Route(photos=6), control=Control(points=0, checks=0),
+        thermal=thermal,
+    )  # fmt: skip
 
 
 @pytest.mark.slow
