@@ -134,3 +134,58 @@ def test_a_database_that_cannot_grow_refuses_and_loses_nothing(flight, tmp_path)
     again = LiveMap(tmp_path / "out", LiveSettings(features=600))
     assert len(list(again.members.on_map())) == 4
     again.close()
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A disk of 3 MB of its own, which can be made larger."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = shutil.which("mount")
+    size = ["-t", "tmpfs", "-o", "size=3m", "tmpfs", str(folder)]
+    if mount is None or subprocess.run([mount, *size], capture_output=True, check=False).returncode:
+        pytest.skip("no disk can be mounted here; a full one is played by failing writes in the tests above")
+    yield folder
+    subprocess.run([shutil.which("umount"), "--lazy", str(folder)], check=True)
+
+
+@pytest.mark.slow
+def test_a_real_full_disk_refuses_and_loses_nothing(flight, small_disk):
+    from skyquilt.errors import OutputError
+    from skyquilt.pipelines.live.settings import LiveSettings
+    from skyquilt.pipelines.live.story import LiveMap
+
+    settings = LiveSettings(features=300, deterministic=True)
+    live = LiveMap(small_disk / "out", settings)
+    safe, refused = set(), 0
+    for path in flight.photos:
+        try:
+            safe.add(live.intake.take_file(path, "drone").id)
+            for _ in live.drain():
+                pass
+        except OutputError as error:
+            assert "full" in str(error)
+            refused += 1
+    assert refused >= 1
+    assert len(safe) >= 2
+    held = {row[0] for row in live.ledger.rows("select id from photo")}
+    assert held == safe  # what was promised is there, and nothing else
+    bigger = ["-o", "remount,size=60m", str(small_disk)]
+    subprocess.run([shutil.which("mount"), *bigger], check=True)
+    for path in flight.photos:
+        live.intake.take_file(path, "drone")
+    for _ in live.drain():
+        pass
+    poses = {m.photo.name: m.pose.map_C.tolist() for m in live.members.on_map()}
+    assert set(poses) == {p.name for p in flight.photos}
+    for level in range(9):
+        for address in live.tiles.addresses("visible", level):
+            assert live.tiles.get(address) is not None
+    order = [row[0] for row in live.ledger.rows("select name from photo order by id")]
+    live.close()
+    # the disk has cost nothing but time: the same photos in the same order lie where they lie without it
+    other = LiveMap(small_disk / "undisturbed", settings)
+    for name in order:
+        other.add(flight.folder / "photos" / name, "drone")
+    assert {m.photo.name: m.pose.map_C.tolist() for m in other.members.on_map()} == poses
+    other.close()

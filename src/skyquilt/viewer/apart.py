@@ -109,9 +109,10 @@ class ServingApart:
     ) -> None:
         self._ending.set()
         self._parts["wire"].close()
-        self._parts["process"].join(5)
-        if self._parts["process"].is_alive():
+        self._parts["thread"].join(5)  # it alone waits for the process
+        if self._parts["thread"].is_alive():
             self._parts["process"].terminate()
+            self._parts["thread"].join(5)
         self._parts["socket"].close()
 
     @property

@@ -7,13 +7,14 @@ from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cv2
 import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.raster.map_source import Bounds, MapSource, between, mercator, picture
+from skyquilt.raster.map_source import MERCATOR, Bounds, MapSource, between, mercator, picture
 from skyquilt.viewer.survey import LiveSurvey, Survey
 
 KEPT = 3000
@@ -123,17 +124,28 @@ class Images:
                 self._known = told[-1][0]
         self._stamp = stamp
 
-    def _drop(self, said: Mapping[str, object]) -> None:
-        box = said["bounds"]
-        assert isinstance(box, list)
-        west, south, east, north = between("EPSG:4326", "EPSG:3857").transform_bounds(*box)
-        for key in [
-            k
-            for k in self._kept
-            if k[0] == said["layer"] and _meets(mercator(*k[1:]), (west, south, east, north))
-        ]:
-            del self._kept[key]
+    def _drop(self, said: Mapping[str, Any]) -> None:
+        keys = [k for k in self._kept if k[0] == said["layer"]]
+        if not keys:
+            return
+        boxes = np.array(changed_boxes(said))
+        for k in np.flatnonzero(_meet(np.array([k[1:] for k in keys], float), boxes)).tolist():
+            del self._kept[keys[k]]
 
 
-def _meets(a: Bounds, b: Bounds) -> bool:
-    return a[0] < b[2] and a[2] > b[0] and a[1] < b[3] and a[3] > b[1]
+def changed_boxes(said: Mapping[str, Any]) -> list[Bounds]:
+    """Where news of tiles say that the map has changed, in EPSG:3857."""
+    to_web = between("EPSG:4326", "EPSG:3857")
+    found = []
+    for west, south, east, north in said.get("boxes") or [said["bounds"]]:
+        found.append(to_web.transform_bounds(west, south, east, north))
+    return found
+
+
+def _meet(tiles: NDArray[np.float64], boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether web tiles (n, 3) z, x, y touch any of boxes (m, 4) in EPSG:3857."""
+    size = (2 * MERCATOR / 2 ** tiles[:, 0])[:, None]
+    west, north = tiles[:, 1:2] * size - MERCATOR, MERCATOR - tiles[:, 2:3] * size
+    beside = (west >= boxes[:, 2]) | (west + size <= boxes[:, 0])
+    above = (north - size >= boxes[:, 3]) | (north <= boxes[:, 1])
+    return np.asarray((~(beside | above)).any(1), bool)

@@ -11,7 +11,7 @@ from skyquilt.raster.map_source import MERCATOR, Bounds, between, mercator, pict
 from skyquilt.raster.mbtiles import touched, write_mbtiles
 from skyquilt.run.write_points import reached
 from skyquilt.viewer.export import write_cog
-from skyquilt.viewer.images import TILE, image_bytes
+from skyquilt.viewer.images import TILE, changed_boxes, image_bytes
 from skyquilt.viewer.survey import LiveSurvey
 
 PAUSE_S = 3.0
@@ -73,8 +73,7 @@ class Publishing:
             for _, kind, body in told:
                 said = json.loads(body)
                 if kind == "tiles" and said["layer"] == layer:
-                    box = between("EPSG:4326", "EPSG:3857").transform_bounds(*said["bounds"])
-                    self._boxes.append(box)
+                    self._boxes += changed_boxes(said)
             self._known = told[-1][0]
 
     def _tiles(self, layer: str) -> None:

@@ -14,7 +14,7 @@ from skyquilt.raster.read_map import open_map
 from skyquilt.raster.tile_store import TileStore
 from skyquilt.run.ledger import NAME, Ledger
 
-PHOTOS, TILES, FINISHED = "photos", "tiles.db", "finished"
+PHOTOS, TILES, FINISHED, NAMED = "photos", "tiles.db", "finished", "named"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -226,15 +226,16 @@ def _flat(ring: list[Any]) -> list[Any]:
 
 
 def _photo_folder(folder: Path) -> Path | None:
-    """Where the photos of a run lie, as its run.toml says."""
+    """Where the photos of a run lie, as its run.toml says; those of a live survey's final map lie beside it."""
     import tomllib
 
     try:
         said = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8")).get("photos")
     except (OSError, ValueError):
         return None
-    path = Path(str(said)) if said else None
-    return path if path is not None and path.is_dir() else None
+    beside = folder.parent / NAMED
+    places = [Path(str(said))] if said else []
+    return next((p for p in (*places, beside) if p.is_dir()), None)
 
 
 def covering(photos: list[Shown], lon: float, lat: float) -> list[Shown]:

@@ -2,6 +2,7 @@
 
     accept (durable) -> place (metadata) -> draw -> link -> settle -> draw -> close loops in the background
 
-`story.LiveMap` is the file to read first; `intake` and `watch` bring photos in, `placing` says where they are,
-`drawing` shows them, `closing` bundles whole blocks behind the scenes, `finish` runs the batch story at the end.
+`story.LiveMap` is the file to read first. `intake` and `watch` bring photos in; `arriving` and `metadata` place them,
+`refining`, `neighbours`, `linking` and `placing` settle them; `showing` and `drawing` keep the tiles; `schedule`,
+`closing` and `adopting` bundle whole blocks behind the scenes; `finish` runs the batch story at the end.
 """

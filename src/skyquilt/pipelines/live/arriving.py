@@ -7,11 +7,12 @@ import numpy as np
 
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.pipelines.drawing import round_gsd
+from skyquilt.pipelines.live.metadata import Metadata
 from skyquilt.pipelines.live.news import News
-from skyquilt.pipelines.live.placing import Placing
 from skyquilt.pipelines.live.showing import Showing
 from skyquilt.pipelines.live.state import Member, Queues
 from skyquilt.pipelines.live.update import Update
+from skyquilt.run.pixel_cache import PixelCache
 from skyquilt.run.write_points import reached
 
 ABOVE_M = 50.0
@@ -21,20 +22,23 @@ ABOVE_M = 50.0
 class Arriving:
     """Photos received become photos placed, or photos that wait for a place."""
 
-    def __init__(self, placing: Placing, showing: Showing, news: News, queues: Queues) -> None:
-        self.placing, self.showing, self.news, self.queues = placing, showing, news, queues
-        self.members, self.canvas = placing.members, showing.canvas
-        self.ledger = placing.members.ledger
+    def __init__(
+        self, metadata: Metadata, pixels: PixelCache, showing: Showing, news: News, queues: Queues
+    ) -> None:
+        self.metadata, self.pixels = metadata, pixels
+        self.showing, self.news, self.queues = showing, news, queues
+        self.members, self.canvas = metadata.members, showing.canvas
+        self.ledger = metadata.members.ledger
 
     def place(self, member: Member) -> Update:
         """Places the photo, which heads the queue of those received."""
-        if self.placing.frame_from(member) and self.canvas.gsd == 0:
+        if self.metadata.frame_from(member) and self.canvas.gsd == 0:
             self._begin(member)
         preview = self._preview(member)
         known = preview.pose if preview is not None else None
-        pose = known if known is not None else self.placing.first(member)
+        pose = known if known is not None else self.metadata.first(member)
         try:
-            self.placing.pixels(member.id)
+            self.pixels(member.id)
         except UnreadablePhotoError as error:
             return self._unreadable(member, str(error))
         with self.ledger.change():
@@ -67,14 +71,14 @@ class Arriving:
         assert prior is not None
         assert frame is not None
         takeoff = frame.vertical_datum == "takeoff"
-        pose = self.placing.first(member)
+        pose = self.metadata.first(member)
         above = max(float(pose.map_C[2]), 5.0) if takeoff and pose is not None else ABOVE_M
-        asked = self.placing.settings.gsd_cm
+        asked = self.metadata.settings.gsd_cm
         gsd = asked / 100 if asked else round_gsd(3 * above / photo.focal.px)
         ground = 0.0 if takeoff else float(prior.map_C[2]) - above
         ground = ground if np.isfinite(ground) else 0.0
         cell = max(0.04 * above, 4 * gsd)
-        self.canvas.gsd, self.canvas.ground, self.placing.heights.cell = gsd, ground, cell
+        self.canvas.gsd, self.canvas.ground, self.metadata.heights.cell = gsd, ground, cell
         with self.ledger.change():
             self.ledger.put_meta("frame", asdict(frame))
             self.ledger.put_meta("gsd", gsd)

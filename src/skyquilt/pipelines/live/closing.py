@@ -7,7 +7,7 @@ import multiprocessing
 import os
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from skyquilt.model.surface import Surface
 from skyquilt.photos.pixels import read_color
 from skyquilt.pipelines.drawing import Ground, survey_ground
 from skyquilt.pipelines.intake import THUMBNAIL, Looked, Pictures
-from skyquilt.run.codec import decode
+from skyquilt.pipelines.live.linking import link_from
 from skyquilt.run.ledger import Ledger
 from skyquilt.run.store import Store, digest
 
@@ -118,11 +118,7 @@ def _links(job: Job, ledger: Ledger) -> list[Link]:
             "select a, b, body from link where a = ? and body is not null order by b", i
         ):
             if b in where:
-                d = decode(body, {})
-                links.append(
-                    Link(a=where[a], b=where[b], index_a=d["ia"].astype(np.int64), index_b=d["ib"].astype(np.int64),
-                         b_S_a=d["s"])
-                )  # fmt: skip
+                links.append(replace(link_from(body), a=where[a], b=where[b]))
     return links
 
 

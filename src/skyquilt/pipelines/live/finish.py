@@ -35,7 +35,8 @@ def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
         raise NoPhotosError(f"{folder} holds no accepted photo; there is nothing to finish")
     paths = named(folder, [(int(i), str(n), str(f)) for i, n, f in rows])
     wanted = MosaicSettings(features=settings.features, crs=settings.crs)
-    yield from iter_mosaic(paths, folder / FINISHED, wanted, overwrite=False)
+    # asked for again after more photos have come, the final map is made anew; what was computed before is found
+    yield from iter_mosaic(paths, folder / FINISHED, wanted, overwrite=True)
 
 
 def named(folder: Path, photos: list[tuple[int, str, str]]) -> list[Path]:

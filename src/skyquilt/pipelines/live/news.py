@@ -9,6 +9,9 @@ from skyquilt.pipelines.live.drawing import Canvas
 from skyquilt.pipelines.live.state import Member, Members
 from skyquilt.raster.tile_store import Address
 
+MOST_BOXES = 24
+"""Parts that a change of the map is told by."""
+
 
 class News:
     """Of photos and of tiles."""
@@ -35,12 +38,28 @@ class News:
         return ring, self.members.lonlat(member.pose.map_C[None, :2])[0]
 
     def tiles(self, addresses: Iterable[Address], rule: str) -> None:
-        """Where the map has changed, by layer."""
-        by_layer: dict[str, list[tuple[float, float, float, float]]] = {}
+        """Where the map has changed, by layer: as a whole, and by parts, so that the rest need not be fetched again."""
+        by_layer: dict[str, set[Address]] = {}
         for a in addresses:
-            by_layer.setdefault(a.layer + rule, []).append(a.grid(self.canvas.gsd).bounds)
-        for layer, boxes in by_layer.items():
-            box = np.array(boxes)
-            corners = np.array([[box[:, 0].min(), box[:, 1].min()], [box[:, 2].max(), box[:, 3].max()]])
-            low, high = self.members.lonlat(corners)
-            self.ledger.tell("tiles", {"layer": layer, "bounds": [*low, *high], "count": len(boxes)})
+            by_layer.setdefault(a.layer + rule, set()).add(a)
+        for layer, changed in by_layer.items():
+            boxes = [self._degrees(a) for a in sorted(_gathered(changed))]
+            low, high = np.min(boxes, axis=0).tolist(), np.max(boxes, axis=0).tolist()
+            whole = [low[0], low[1], high[2], high[3]]
+            self.ledger.tell(
+                "tiles", {"layer": layer, "bounds": whole, "boxes": boxes, "count": len(changed)}
+            )
+
+    def _degrees(self, address: Address) -> list[float]:
+        """West, south, east, north in degrees of all corners of a tile."""
+        west, south, east, north = address.grid(self.canvas.gsd).bounds
+        corners = np.array([[west, south], [west, north], [east, south], [east, north]])
+        found = np.array(self.members.lonlat(corners))
+        return [*found.min(0).tolist(), *found.max(0).tolist()]
+
+
+def _gathered(changed: set[Address]) -> set[Address]:
+    """The same ground in few tiles: coarser ones where there are many."""
+    while len(changed) > MOST_BOXES:
+        changed = {a.parent for a in changed}
+    return changed

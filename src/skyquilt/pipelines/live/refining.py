@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.model.poses import Pose
+from skyquilt.pipelines.live.linking import link_bytes
 from skyquilt.pipelines.live.news import News
-from skyquilt.pipelines.live.placing import Change, Placing, link_bytes
+from skyquilt.pipelines.live.placing import Change, Placing
 from skyquilt.pipelines.live.schedule import Schedule
 from skyquilt.pipelines.live.showing import Showing
 from skyquilt.pipelines.live.state import Member, Queues, about_record
@@ -59,7 +60,7 @@ class Refining:
             self.heights(change.xyz, known=bool(change.cameras))
             self.move(change.moved, change.camera_of)
             if member.state == "refined":
-                self.placing.learn(member)
+                self.placing.metadata.learn(member)
                 self.schedule.refined(member.id, loop=far)
             self.members.save(member, about=about_record(member, change.reason), reason=change.reason)
             for lost in found:
@@ -68,7 +69,7 @@ class Refining:
             self.schedule.write(self.ledger)
             self.news.photo(member, reason=change.reason)
         reached("photo refined")
-        self.placing.indexed(member)
+        self.placing.neighbours.indexed(member)
 
     def move(self, moved: dict[int, Pose], camera_of: dict[int, str]) -> None:
         """New poses of photos (inside a transaction of the ledger)."""
@@ -78,13 +79,13 @@ class Refining:
             if member.state != "superseded":
                 member.state = "refined"
             self.members.save(member, reason="")
-            self.placing.indexed(member)
+            self.placing.neighbours.indexed(member)
             if member.state == "refined":
                 self.showing.moved(member)
 
     def heights(self, xyz: NDArray[np.float64], *, known: bool, anew: bool = False) -> None:
         """Takes in ground points (P, 3) (inside a transaction); `known`: they come from calibrated cameras."""
-        cells = self.placing.heights
+        cells = self.placing.metadata.heights
         touched = sorted(cells.add(xyz, anew=anew))
         with self.ledger.change() as db:
             values = [(c, r, cells.z[c, r]) for c, r in touched]
@@ -115,7 +116,7 @@ class Refining:
         return [m for m in lost if self._links(m, member)]
 
     def _links(self, lost: Member, member: Member) -> bool:
-        return any(k is not None for k in self.placing.compared(lost, [member.id]).values())
+        return any(k is not None for k in self.placing.linking.compared(lost, [member.id]).values())
 
     def _requeue(self, member: Member, found: Iterable[Member]) -> None:
         for lost in found:

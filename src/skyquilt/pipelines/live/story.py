@@ -22,6 +22,9 @@ from skyquilt.pipelines.live.arriving import Arriving
 from skyquilt.pipelines.live.closing import Closing, close
 from skyquilt.pipelines.live.drawing import Canvas
 from skyquilt.pipelines.live.intake import Intake, Refused
+from skyquilt.pipelines.live.linking import Linking
+from skyquilt.pipelines.live.metadata import Metadata
+from skyquilt.pipelines.live.neighbours import Neighbours
 from skyquilt.pipelines.live.news import News
 from skyquilt.pipelines.live.placing import Placing
 from skyquilt.pipelines.live.refining import Refining
@@ -91,14 +94,17 @@ class LiveMap:
         self.full = PixelCache(read=self._pixels, budget_bytes=FULL_BYTES)
         self.heights = HeightCells(cell=float(self.ledger.meta("cell", 2.0)))
         self.heights.z = {(int(c), int(r)): float(z) for c, r, z in self.ledger.rows("select * from height")}
-        self.placing = Placing(self.members, self.heights, self.methods, self.store, self.settings, self.full)
+        metadata = Metadata(self.members, self.heights, self.settings)
+        neighbours = Neighbours(self.members, metadata)
+        self.linking = Linking(self.members, self.methods, self.store, self.full)
+        placing = Placing(self.members, metadata, neighbours, self.linking, self.settings)
         self.canvas = Canvas(self.tiles, self.heights, self.full, self.members.by_id)
         self.canvas.gsd = float(self.ledger.meta("gsd", 0.0))
         self.canvas.ground = float(self.ledger.meta("ground", 0.0))
         news = News(self.members, self.canvas)
         self.showing = Showing(self.members, self.canvas, news)
-        self.arriving = Arriving(self.placing, self.showing, news, self.queues)
-        self.refining = Refining(self.placing, self.showing, news, self.queues, self.schedule)
+        self.arriving = Arriving(metadata, self.full, self.showing, news, self.queues)
+        self.refining = Refining(placing, self.showing, news, self.queues, self.schedule)
         self.adopting = Adopting(self.refining)
         store = self.folder / STORE
         self.blocks = Blocks(self.members, self.schedule, self.settings, self.folder, store, self.methods)
@@ -188,8 +194,8 @@ class LiveMap:
         if not self.queues.untried or self.members.frame is None:
             return None
         member = self.queues.untried[0]
-        if member.state != "superseded" and not self.placing.has_features(member.id):
-            self.placing.features(member.id)
+        if member.state != "superseded" and not self.linking.has_features(member.id):
+            self.linking.features(member.id)
             return Update(what="noted", photo=member.id)
         return self.refining.refine(member)
 

@@ -39,10 +39,10 @@ const Growing = L.GridLayer.extend({
       next.src = address;
     }).catch(() => { if (empty) empty(); });
   },
-  refresh(bounds) {
+  refresh(boxes) {
     for (const key of Object.keys(this._tiles)) {
-      const tile = this._tiles[key];
-      if (this._tileCoordsToBounds(tile.coords).intersects(bounds)) this.fill(tile.el, this._wrapCoords(tile.coords), null);
+      const tile = this._tiles[key], place = this._tileCoordsToBounds(tile.coords);
+      if (boxes.some((box) => place.overlaps(box))) this.fill(tile.el, this._wrapCoords(tile.coords), null);
     }
   },
 });
@@ -269,9 +269,9 @@ const listen = () => {
   news.onerror = () => { $("link").textContent = "lost, trying"; $("link").className = "lost"; if (news.readyState === 2) setTimeout(listen, 1000); };
   news.addEventListener("photo", told("photo", (p) => { state.photos.set(p.id, { received: Date.now() / 1000, ...(state.photos.get(p.id) || {}), ...p }); listSoon(); readInfoSoon(); }));
   news.addEventListener("tiles", told("tiles", (t) => {
-    const bounds = L.latLngBounds([t.bounds[1], t.bounds[0]], [t.bounds[3], t.bounds[2]]);
+    const boxes = (t.boxes || [t.bounds]).map(([west, south, east, north]) => L.latLngBounds([south, west], [north, east]));
     if (!state.layers.has(t.layer) || !state.fitted) readInfoSoon();
-    for (const layer of [first, second]) if (layer && layer.options.layer === t.layer) layer.refresh(bounds);
+    for (const layer of [first, second]) if (layer && layer.options.layer === t.layer) layer.refresh(boxes);
   }));
   news.addEventListener("layer", told("layer", (l) => showOverlay(l.name)));
   news.addEventListener("refused", told("refused", (r) => { (state.refused = state.refused || []).unshift(r); listSoon(); readInfoSoon(); }));

@@ -1,0 +1,75 @@
+"""A thermal camera beside a visible one: two layers over one ground."""
+
+import io
+
+import numpy as np
+import pytest
+import rasterio
+from PIL import Image
+
+from skyquilt.pipelines.live.settings import LiveSettings
+from skyquilt.raster.map_source import TileSource
+from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.settings import Control, Route, Thermal
+from tests.live.conftest import made, served
+from tests.live.test_http import middle, tile_of
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory):
+    """Six visible photos and the thermal frames of a second drone, whose files state their unit."""
+    thermal = Thermal(lens=Lens(width=320, height=256, focal=386.0, k1=-0.2, k2=0.05, p1=0.0, p2=0.0))
+    return made(
+        tmp_path_factory.mktemp("thermal"), seed=3, route=Route(photos=6), control=Control(points=0, checks=0),
+        thermal=thermal,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_two_spectra_are_two_layers_and_temperatures_stay_temperatures(both, tmp_path):
+    frames = sorted((both.folder / "thermal").glob("*.tif"))
+    assert len(frames) >= 4
+    with served(tmp_path / "out", LiveSettings(features=800)) as site:
+        for pair in zip(both.photos, frames, strict=False):
+            for path in pair:  # by turns
+                assert site.send(path).is_success
+        site.until(lambda: all(p["ring"] for p in site.web.get("/photos").json()["photos"]))
+        live = site.live
+        site.until(lambda: not live.queues.untried and not live.showing.dirty)
+        names = [n["name"] for n in site.web.get("/info").json()["layers"]]
+        assert names[0] == "visible"
+        assert "thermal" in names
+        linked = live.ledger.rows("select a, b from link where body is not null")
+        band = {m.id: m.photo.band for m in live.members.by_id.values()}
+        assert linked
+        assert all(band[a] == band[b] for a, b in linked)
+        x, y = tile_of(*middle(site), 19)
+        answer = site.web.get(f"/tiles/19/{x}/{y}", params={"layer": "thermal"})
+        with Image.open(io.BytesIO(answer.content)) as image:
+            assert np.asarray(image.convert("RGBA"))[..., 3].max() == 255
+        swiped = site.web.get(f"/tiles/19/{x}/{y}", params={"layer": "visible"})
+        assert swiped.content != answer.content
+        measured(live, both)
+
+
+def measured(live, both):
+    """Temperatures of the map against the simulator's, where both know them."""
+    frame = live.members.frame
+    source = TileSource(
+        tiles=live.tiles, layer="thermal", crs=frame.crs, origin=frame.origin, gsd=live.canvas.gsd
+    )
+    part = source.part(source.bounds(), live.canvas.gsd)
+    assert part.pixels.dtype == np.float32
+    rows, columns = np.nonzero(part.shown)
+    chosen = np.random.default_rng(0).choice(len(rows), 4000)
+    rows, columns = rows[chosen], columns[chosen]
+    x, y = part.west + (columns + 0.5) * part.gsd, part.north - (rows + 0.5) * part.gsd
+    with rasterio.open(both.folder / "truth" / "truth_thermal.tif") as truth:
+        true = np.array(list(truth.sample(zip(x, y, strict=True))))[:, 0].astype(float) / 100 - 273.15
+    known = true > -100
+    assert known.mean() > 0.5
+    seen = part.pixels[rows, columns, 0].astype(float)
+    off = seen[known] - true[known]
+    # places are off by the positions' 2 m, frames by 0.2 K: over fields, half of all points hardly notice
+    assert abs(np.median(off)) < 0.4
+    assert np.corrcoef(seen[known], true[known])[0, 1] > 0.6
