@@ -47,6 +47,7 @@ def test_photo_by_photo(flight):
     assert re.search(r"6 photos, ([5-9]|1\d) links, frame EPSG:32633", said)
 
 
+@pytest.mark.slow
 def test_your_own_features(flight):
     said = run("03_your_own_features.py", flight / "photos")
     placed = re.findall(r"(\d) of 6 photos placed", said)

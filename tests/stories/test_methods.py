@@ -39,7 +39,12 @@ def solved(told):
     return {s["properties"]["filename"]: np.array(s["properties"]["translation"]) for s in shots}
 
 
-@pytest.mark.parametrize("method", [*METHODS[:4], pytest.param("flightline", marks=pytest.mark.slow)])
+LONG = ("hybrid", "flightline")
+
+
+@pytest.mark.parametrize(
+    "method", [pytest.param(m, marks=pytest.mark.slow) if m in LONG else m for m in METHODS]
+)
 def test_every_method_makes_a_map(mosaic, lines, method):
     told = mosaic(lines / "photos", "--method", method).made()
     m, q = told.metrics, told.metrics["quality"]
@@ -142,6 +147,7 @@ def test_what_methods_need_is_said_when_it_is_missing(mosaic, photos):
     assert told.metrics["crs"] is None and told.metrics["photos_used"] == 9
 
 
+@pytest.mark.slow
 def test_headings_missing(mosaic, photos):
     for path in named(photos):
         relabel(path, drop=["xmp"])
