@@ -28,12 +28,11 @@ class HeightCells:
             return set()
         place = np.floor(xyz[:, :2] / self.cell).astype(int)
         cells, which = np.unique(place, axis=0, return_inverse=True)
-        order = np.argsort(which.ravel(), kind="stable")
-        cuts = np.flatnonzero(np.diff(which.ravel()[order])) + 1
-        for (c, r), heights in zip(cells.tolist(), np.split(xyz[order, 2], cuts), strict=True):
-            new, old = float(np.median(heights)), self.z.get((c, r))
-            self.z[c, r] = new if old is None or anew else old + WEIGHT * (new - old)
-        return {(int(c), int(r)) for c, r in cells.tolist()}
+        touched = [(int(c), int(r)) for c, r in cells.tolist()]
+        for at, new in zip(touched, _medians(which.ravel(), xyz[:, 2]).tolist(), strict=True):
+            old = self.z.get(at)
+            self.z[at] = new if old is None or anew else old + WEIGHT * (new - old)
+        return set(touched)
 
     def median(self, bounds: Iterable[float]) -> float | None:
         """Median height inside bounds (west, south, east, north) in m; None where no point is."""
@@ -58,6 +57,13 @@ class HeightCells:
             z=_filled(z, otherwise), x0=(c0 + 0.5) * self.cell, y0=(r0 + 0.5) * self.cell, cell=self.cell,
             source="tie points",
         )  # fmt: skip
+
+
+def _medians(group: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The median of the values (n,) of each group 0, 1, 2 ..., none of them empty."""
+    number = np.bincount(group)
+    ordered, first = values[np.lexsort((values, group))], np.cumsum(number) - number
+    return np.asarray((ordered[first + (number - 1) // 2] + ordered[first + number // 2]) / 2)
 
 
 def _filled(z: NDArray[np.float32], otherwise: float) -> NDArray[np.float32]:

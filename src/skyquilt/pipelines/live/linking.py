@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -15,6 +16,8 @@ from skyquilt.run.store import Store, digest
 
 FEATURES_KEPT = 48
 """Photos whose features stay at hand."""
+LINKS_KEPT = 1500
+"""Links decoded and at hand, of some kilobytes each."""
 
 
 class Linking:
@@ -77,8 +80,9 @@ def link_bytes(link: Link) -> bytes:
     )  # fmt: skip
 
 
+@lru_cache(maxsize=LINKS_KEPT)
 def link_from(body: bytes) -> Link:
-    """The link of such bytes."""
+    """The link of such bytes; every photo asks for the same links of its surroundings."""
     d = decode(body, {})
     return Link(
         a=d["a"], b=d["b"], index_a=d["ia"].astype(np.int64), index_b=d["ib"].astype(np.int64), b_S_a=d["s"]
