@@ -105,7 +105,11 @@ class Composer:
         if not chosen:
             return None
         alone = len(chosen) == 1
-        layers = [self._layer(cut(n, row, column, h, w), here, h, w, alone=alone) for n, here in chosen]
+        cuts = [cut(n, row, column, h, w) for n, _ in chosen]
+        if alone and cuts[0].seen.all():  # nothing to merge, whatever the rule
+            pixels, _ = self._warped(cuts[0], h, w, alone=True)
+            return pixels, np.full((h, w), cuts[0].view.photo, np.int32)
+        layers = [self._layer(n, here, h, w, alone=alone) for n, (_, here) in zip(cuts, chosen, strict=True)]
         return self.blend.merge(layers, self.grid.gsd)
 
     def _layer(self, n: Nodes, near: NDArray[np.bool_], h: int, w: int, *, alone: bool) -> Layer:
