@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from skyquilt.config import Methods, MosaicSettings
 from skyquilt.errors import SideFileError, UsageError
+from skyquilt.imaging.grey import averaged
 from skyquilt.imaging.views import STEP, View, grid_of, make_views, native_gsd
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid, Window
@@ -363,22 +364,14 @@ def preview_factor(grid: Grid) -> int:
 def _reduced(pixels: NDArray, valid: NDArray[np.bool_], factor: int) -> tuple[NDArray, NDArray[np.uint8]]:
     """Area averages of the valid pixels (h, w, bands), and how much of each cell is valid (0 to 255)."""
     opaque = valid.view(np.uint8) * np.uint8(255)
-    share = np.asarray(_averaged(opaque, factor), np.uint8)
+    size = (-(-pixels.shape[1] // factor), -(-pixels.shape[0] // factor))
+    share = np.asarray(averaged(opaque, size), np.uint8)
     solid = np.nan_to_num(pixels) if pixels.dtype.kind == "f" else pixels
-    mean = _averaged(solid, factor).reshape(*share.shape, -1)
+    mean = averaged(solid, size).reshape(*share.shape, -1)
     if share.min() < 255:  # pixels that are not valid are zero: divide by what was
         whole = mean.astype(np.float32) * (255.0 / np.maximum(share, 1))[..., None]
         mean = (np.minimum(whole, 255) if pixels.dtype == np.uint8 else whole).astype(pixels.dtype)
     return mean, share
-
-
-def _averaged(values: NDArray, factor: int) -> NDArray:
-    """Area averages over factor x factor pixels; factor is a power of two."""
-    height, width = (-(-n // factor) for n in values.shape[:2])
-    while factor > 2 and values.shape[0] % 2 == 0 and values.shape[1] % 2 == 0:
-        half = (values.shape[1] // 2, values.shape[0] // 2)
-        values, factor = cv2.resize(values, half, interpolation=cv2.INTER_AREA), factor // 2
-    return np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def coloured(preview: NDArray, shown: NDArray[np.uint8]) -> NDArray[np.uint8]:
