@@ -91,8 +91,8 @@ class Feather:
         return score
 
     def reach(self, gsd: float) -> float:
-        """A seam moves by its width when ranks differ by this much, for cameras half a height apart."""
-        return 2.0 * (self.width_px + 20) * gsd
+        """Half the blend's width from the seam of two cameras a height apart."""
+        return self.width_px * gsd
 
     def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray, NDArray[np.int32]]:
         """Ramps across seams, whose distance follows from the ranks: they differ linearly in the plane."""

@@ -85,13 +85,14 @@ class Composer:
         if not nodes:
             return []
         scores = [np.where(n.seen, n.score, np.float32(np.inf)) for n in nodes]
-        ranks = np.stack([self.blend.rank(k, score) for k, score in enumerate(scores)])
+        ranks = [self.blend.rank(k, score) for k, score in enumerate(scores)]
         height = min(n.height for n in nodes)
         slack = self.blend.reach(self.grid.gsd) / max(height, 1e-3)
-        # a node sees only itself: what is invisible at a node may win between it and the next one
-        best = cv2.dilate(ranks.min(0), np.ones((3, 3), np.uint8)) if np.isfinite(slack) else np.inf
-        spread = [cv2.erode(r, np.ones((3, 3), np.uint8)) for r in ranks]
-        return [np.isfinite(r) & (r <= best + slack) for r in spread]
+        # between nodes a rank lies between theirs: nobody wins there whose least rank exceeds another's greatest
+        around = np.ones((3, 3), np.uint8)
+        best = np.min([cv2.dilate(r, around) for r in ranks], axis=0) if np.isfinite(slack) else np.inf
+        least = [cv2.erode(r, around) for r in ranks]
+        return [np.isfinite(r) & (r <= best + slack) for r in least]
 
     def _piece(
         self, nodes: Sequence[Nodes], near: Sequence[NDArray[np.bool_]], row: int, column: int, h: int, w: int
