@@ -14,6 +14,7 @@ from skyquilt.pipelines.live.flying import FlySettings, fly, order_of, preview_o
 from skyquilt.pipelines.live.settings import LiveSettings
 from skyquilt.pipelines.live.story import LiveMap
 from skyquilt.raster.map_source import TileSource
+from skyquilt.raster.tile_store import SIDE
 from tests.live.conftest import offsets
 from tests.stories.conftest import relabel
 
@@ -106,7 +107,7 @@ def test_a_restart_finds_everything_as_it_was(small, flight):
         assert np.array_equal(member.pose.cam_R_map, poses[member.photo.name].cam_R_map)
     assert not other.showing.dirty  # nothing is to be drawn again
     for address in other.tiles.addresses("visible", 0):
-        assert other.tiles.get(address).pixels.shape == (512, 512, 3)
+        assert other.tiles.get(address).pixels.shape == (SIDE, SIDE, 3)
     other.close()
 
 

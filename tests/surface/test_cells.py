@@ -2,26 +2,47 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from skyquilt.surface.cells import WEIGHT, HeightCells
 
 
 def test_cells_hold_the_medians_of_their_points():
     rng = np.random.default_rng(0)
-    xyz = np.column_stack([rng.uniform(-9, 9, (700, 2)), rng.normal(size=700)])
+    xyz = np.column_stack([rng.uniform(-90, 90, (3000, 2)), rng.normal(size=3000)])
     cells = HeightCells(cell=2.0)
-    touched = cells.add(xyz)
-    assert touched == set(cells.z) == {tuple(p) for p in np.floor(xyz[:, :2] / 2).astype(int).tolist()}
-    for column, row in touched:
-        inside = (np.floor(xyz[:, :2] / 2) == (column, row)).all(1)
-        assert cells.z[column, row] == np.median(xyz[inside, 2])
+    touched, z = cells.add(xyz)
+    place = np.floor(xyz[:, :2] / 2)
+    assert {tuple(p) for p in touched.tolist()} == {tuple(p) for p in place.astype(int).tolist()}
+    for cell, height in zip(touched, z, strict=True):
+        assert height == np.median(xyz[(place == cell).all(1), 2])
 
 
 def test_later_points_move_a_cell_part_of_the_way_or_replace_it():
     cells = HeightCells(cell=1.0)
     cells.add(np.array([(0.5, 0.5, 10.0), (3.5, 0.5, 1.0)]))
-    assert cells.add(np.array([(0.2, 0.9, 20.0)])) == {(0, 0)}
-    assert cells.z == {(0, 0): pytest.approx(10 + WEIGHT * 10), (3, 0): 1.0}
+    touched, z = cells.add(np.array([(0.2, 0.9, 20.0)]))
+    assert touched.tolist() == [[0, 0]]
+    assert z == pytest.approx(10 + WEIGHT * 10)
+    assert cells.at(np.array([(0, 0), (3, 0)])).tolist() == [*z, 1.0]
     cells.add(np.array([(0.2, 0.9, 5.0)]), anew=True)
-    assert cells.z[0, 0] == 5.0
-    assert cells.add(np.zeros((0, 3))) == set()
+    assert cells.at(np.array([(0, 0)])) == 5.0
+    assert len(cells.add(np.zeros((0, 3)))[0]) == 0
+
+
+@given(
+    st.lists(st.tuples(st.integers(-70, 70), st.integers(-70, 70), st.floats(-9, 9)), max_size=60),
+    st.tuples(*[st.integers(-80, 80)] * 2), st.tuples(*[st.integers(0, 90)] * 2),
+)  # fmt: skip
+def test_any_part_of_the_cells_is_what_was_put_there(entries, corner, size):
+    known = {(c, r): z for c, r, z in entries}
+    cells = HeightCells(cell=1.0)
+    cells.put(np.array(list(known), int).reshape(-1, 2), np.array(list(known.values())))
+    c0, r0, c1, r1 = *corner, corner[0] + size[0], corner[1] + size[1]
+    asked = [(c, r) for c in range(c0, c1 + 1) for r in range(r0, r1 + 1)]
+    expected = np.array([known.get(cell, np.nan) for cell in asked])
+    assert np.array_equal(cells.at(np.array(asked)), expected, equal_nan=True)
+    inside = expected[np.isfinite(expected)]
+    middle = cells.median((c0 + 0.5, r0 + 0.5, c1 + 0.5, r1 + 0.5))
+    assert middle == (pytest.approx(np.median(inside)) if len(inside) else None)

@@ -17,7 +17,7 @@ MERCATOR = 20037508.342789244
 """Half the width of Web Mercator's world in m."""
 NODES = 16
 """Pixels between exactly transformed points."""
-MOST_TILES = 80
+MOST_TILES = 320
 """Tiles read for one picture."""
 Bounds = tuple[float, float, float, float]
 """West, south, east, north."""

@@ -16,12 +16,12 @@ from skyquilt.errors import OutputError
 from skyquilt.model.raster import Grid
 from skyquilt.raster.halving import halve
 
-SIDE = 512
+SIDE = 256
 """Pixels of a tile's side."""
-LEVELS = 9
+LEVELS = 10
 """Levels, each with pixels twice as large as the one before."""
 QUALITY = 90
-KEPT = 96
+KEPT = 384
 """Decoded tiles at hand."""
 TABLES = (
     "create table if not exists tile(layer text, level integer, row integer, col integer, version integer not null,"
@@ -122,10 +122,16 @@ class TileStore:
             if write:
                 self._db.execute("pragma journal_mode=wal")
                 self._db.execute("pragma synchronous=full")
+                if not self._db.execute("pragma schema_version").fetchone()[0]:
+                    self._db.execute(f"pragma user_version={SIDE}")
                 for table in TABLES:
                     self._db.execute(table)
+            side = int(self._db.execute("pragma user_version").fetchone()[0])
         except sqlite3.Error as error:
             raise OutputError(f"{path} cannot be opened ({error})") from error
+        if side != SIDE:
+            self._db.close()
+            raise OutputError(f"{path} was written by another version of Skyquilt; use another folder")
 
     def version(self, address: Address) -> int:
         """How often the tile was written; 0 where there is none."""

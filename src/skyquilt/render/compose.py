@@ -32,6 +32,25 @@ class Composed:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Plan:
+    """What is known of a window before any pixel is touched."""
+
+    window: Window
+    """Part of the map."""
+    margin: int
+    """Pixels beyond it that its merge rule must see."""
+    nodes: Sequence[Nodes]
+    """Where its nodes lie in each photo that sees any."""
+    near: Sequence[NDArray[np.bool_]]
+    """(r, c) per photo, for the cells around the nodes: whether it can show there."""
+
+    @property
+    def shown(self) -> list[int]:
+        """Photos that can show."""
+        return [n.view.photo for n, m in zip(self.nodes, self.near, strict=True) if m.any()]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Composer:
     """Everything that composition needs, but the window."""
 
@@ -53,24 +72,31 @@ class Composer:
     """Gains."""
 
     def __call__(self, window: Window) -> Composed:
-        """The window, piece by piece."""
+        """The window."""
+        return self.drawn(self.plan(window))
+
+    def plan(self, window: Window) -> Plan:
+        """Which photos can show where; costs little, and no photo is read."""
+        margin = -(-self.blend.margin // STEP) * STEP
+        nodes = window_nodes(self.views, self.grid, self.surface, window.grown(margin))
+        return Plan(window=window, margin=margin, nodes=nodes, near=self._near(nodes))
+
+    def drawn(self, plan: Plan) -> Composed:
+        """A window as planned, piece by piece."""
+        window, margin = plan.window, plan.margin
         out = np.full(
             (window.height, window.width, self.bands), np.nan if self.dtype.kind == "f" else 0, self.dtype
         )
         photo = np.full((window.height, window.width), -1, np.int32)
-        margin = -(-self.blend.margin // STEP) * STEP
-        wide = window.grown(margin)
-        nodes = window_nodes(self.views, self.grid, self.surface, wide)
-        near = self._near(nodes)
         for row in range(0, window.height, PIECE):
             for column in range(0, window.width, PIECE):
                 h, w = min(PIECE, window.height - row), min(PIECE, window.width - column)
-                merged = self._piece(nodes, near, row, column, h + 2 * margin, w + 2 * margin)
+                merged = self._piece(plan, row, column, h + 2 * margin, w + 2 * margin)
                 if merged is not None:
                     inner = (slice(margin, margin + h), slice(margin, margin + w))
                     out[row : row + h, column : column + w] = merged[0][inner]
                     photo[row : row + h, column : column + w] = merged[1][inner]
-        return Composed(pixels=out, photo=photo, views=self._counted(nodes, margin, window))
+        return Composed(pixels=out, photo=photo, views=self._counted(plan.nodes, margin, window))
 
     def _counted(self, nodes: Sequence[Nodes], margin: int, window: Window) -> NDArray[np.uint16]:
         rows, columns = -(-window.height // STEP), -(-window.width // STEP)
@@ -95,14 +121,14 @@ class Composer:
         return [np.isfinite(r) & (r <= best + slack) for r in least]
 
     def _piece(
-        self, nodes: Sequence[Nodes], near: Sequence[NDArray[np.bool_]], row: int, column: int, h: int, w: int
+        self, plan: Plan, row: int, column: int, h: int, w: int
     ) -> tuple[NDArray, NDArray[np.int32]] | None:
         """Pixels (h, w, bands) and leading photo (h, w) from a row and column of the window of the nodes."""
         cells = (
             slice(row // STEP + 1, (row + h - 1) // STEP + 2),
             slice(column // STEP + 1, (column + w - 1) // STEP + 2),
         )
-        chosen = [(n, here) for n, m in zip(nodes, near, strict=True) if (here := m[cells]).any()]
+        chosen = [(n, here) for n, m in zip(plan.nodes, plan.near, strict=True) if (here := m[cells]).any()]
         if not chosen:
             return None
         alone = len(chosen) == 1

@@ -13,46 +13,84 @@ WEIGHT = 0.4
 """How far a cell follows points that come later."""
 
 
+BLOCK = 32
+"""Cells along a side of the blocks that they are kept in: parts of the map are then read as arrays."""
+
+
 @dataclass(kw_only=True)
 class HeightCells:
     """Cells of a regular grid in the map frame, (column, row) from its origin, rows northwards."""
 
     cell: float
     """Side in m."""
-    z: dict[tuple[int, int], float] = field(default_factory=dict)
-    """Height in m of the cells that points have fallen into."""
+    _blocks: dict[tuple[int, int], NDArray[np.float64]] = field(default_factory=dict)
 
-    def add(self, xyz: NDArray[np.float64], *, anew: bool = False) -> set[tuple[int, int]]:
-        """Takes in points (P, 3); `anew` replaces what their cells held. Returns the cells touched."""
-        if not len(xyz):
-            return set()
-        place = np.floor(xyz[:, :2] / self.cell).astype(int)
+    def add(
+        self, xyz: NDArray[np.float64], *, anew: bool = False
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Takes in points (P, 3); `anew` replaces what their cells held.
+
+        Returns the cells touched, (k, 2) in order, and their heights now, (k,) in m.
+        """
+        place = np.floor(xyz[:, :2] / self.cell).astype(np.int64)
         cells, which = np.unique(place, axis=0, return_inverse=True)
-        touched = [(int(c), int(r)) for c, r in cells.tolist()]
-        for at, new in zip(touched, _medians(which.ravel(), xyz[:, 2]).tolist(), strict=True):
-            old = self.z.get(at)
-            self.z[at] = new if old is None or anew else old + WEIGHT * (new - old)
-        return set(touched)
+        new = _medians(which.ravel(), xyz[:, 2])
+        old = self.at(cells)
+        z = np.where(np.isnan(old) | anew, new, old + WEIGHT * (new - old))
+        self.put(cells, z)
+        return cells, z
+
+    def put(self, cells: NDArray[np.int64], z: NDArray[np.float64]) -> None:
+        """Sets cells (k, 2) to heights (k,) in m."""
+        block, inner = np.divmod(cells, BLOCK)
+        for key in np.unique(block, axis=0).tolist():
+            mine = (block == key).all(1)
+            held = self._blocks.setdefault((key[0], key[1]), np.full((BLOCK, BLOCK), np.nan))
+            held[inner[mine, 1], inner[mine, 0]] = z[mine]
+
+    def at(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Heights (k,) in m of cells (k, 2); NaN where no point has been."""
+        z = np.full(len(cells), np.nan)
+        block, inner = np.divmod(cells, BLOCK)
+        for key in np.unique(block, axis=0).tolist():
+            held = self._blocks.get((key[0], key[1]))
+            if held is not None:
+                mine = (block == key).all(1)
+                z[mine] = held[inner[mine, 1], inner[mine, 0]]
+        return z
 
     def median(self, bounds: Iterable[float]) -> float | None:
         """Median height inside bounds (west, south, east, north) in m; None where no point is."""
-        c0, r0, c1, r1 = self._reach(bounds)
-        found = [
-            z for c in range(c0, c1 + 1) for r in range(r0, r1 + 1) if (z := self.z.get((c, r))) is not None
-        ]
-        return float(np.median(found)) if found else None
+        z = self._part(*self._reach(bounds))
+        found = z[np.isfinite(z)]
+        return float(np.median(found)) if len(found) else None
 
     def _reach(self, bounds: Iterable[float]) -> tuple[int, int, int, int]:
         c0, r0, c1, r1 = (int(np.floor(b / self.cell)) for b in bounds)
         return c0, r0, c1, r1
 
+    def _part(self, c0: int, r0: int, c1: int, r1: int) -> NDArray[np.float64]:
+        """Columns c0 ... c1 of rows r0 ... r1, both ends included."""
+        z = np.full((r1 - r0 + 1, c1 - c0 + 1), np.nan)
+        for R in range(r0 // BLOCK, r1 // BLOCK + 1):
+            for C in range(c0 // BLOCK, c1 // BLOCK + 1):
+                held = self._blocks.get((C, R))
+                if held is not None:
+                    row, column = max(r0, R * BLOCK), max(c0, C * BLOCK)
+                    end_row, end_column = (
+                        min(r1, R * BLOCK + BLOCK - 1) + 1,
+                        min(c1, C * BLOCK + BLOCK - 1) + 1,
+                    )
+                    z[row - r0 : end_row - r0, column - c0 : end_column - c0] = held[
+                        row - R * BLOCK : end_row - R * BLOCK, column - C * BLOCK : end_column - C * BLOCK
+                    ]
+        return z
+
     def surface(self, bounds: Iterable[float], otherwise: float) -> Surface:
         """Heights over bounds (west, south, east, north) in m: gaps filled from around, smoothed a little."""
         c0, r0, c1, r1 = self._reach(bounds)
         c0, r0, c1, r1 = c0 - 3, r0 - 3, c1 + 3, r1 + 3
-        z = np.array(
-            [[self.z.get((c, r), np.nan) for c in range(c0, c1 + 1)] for r in range(r0, r1 + 1)], np.float32
-        )
+        z = self._part(c0, r0, c1, r1).astype(np.float32)
         return Surface(
             z=_filled(z, otherwise), x0=(c0 + 0.5) * self.cell, y0=(r0 + 0.5) * self.cell, cell=self.cell,
             source="tie points",
@@ -61,6 +99,8 @@ class HeightCells:
 
 def _medians(group: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
     """The median of the values (n,) of each group 0, 1, 2 ..., none of them empty."""
+    if not len(group):
+        return np.zeros(0)
     number = np.bincount(group)
     ordered, first = values[np.lexsort((values, group))], np.cumsum(number) - number
     return np.asarray((ordered[first + (number - 1) // 2] + ordered[first + number // 2]) / 2)

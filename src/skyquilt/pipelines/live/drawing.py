@@ -2,7 +2,7 @@
 
 import os
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from skyquilt.photos.pixels import Reduction, read_color
 from skyquilt.pipelines.live.state import Member
 from skyquilt.raster.tile_store import SIDE, Address, Tile, TileStore, covering
 from skyquilt.render.blend import Blend, Feather
-from skyquilt.render.compose import Composer
+from skyquilt.render.compose import Composed, Composer
 from skyquilt.render.newest import Newest
 from skyquilt.run.executor import in_order
 from skyquilt.run.pixel_cache import PixelCache
@@ -37,12 +37,18 @@ PICTURES_BYTES = 100_000_000
 """Reduced pictures at hand."""
 THREADS = min(2, os.cpu_count() or 1)
 """Tiles drawn side by side."""
+WHOLE = Window(row=0, column=0, height=SIDE, width=SIDE)
 RULES: dict[str, Blend] = {"": Feather(width_px=2.0), NEWEST: Newest()}
 
 
 def layer_of(member: Member) -> str:
     """The layer that shows a photo: one per spectrum."""
     return member.photo.band
+
+
+def _measured(member: Member) -> bool:
+    """Whether a photo holds measured values, of one band, not a picture."""
+    return member.photo.band == "thermal" and bool(member.photo.unit)
 
 
 class Canvas:
@@ -57,6 +63,8 @@ class Canvas:
         self._views: dict[int, View] = {}
         self._seen: dict[int, tuple[Address, ...]] = {}
         self._raised: set[Address] = set()
+        self._met: set[Address] = set()
+        self._shown: dict[Address, tuple[int, ...]] = {}
         self._sizes: dict[int, int] = {}
         self._by_tile: dict[Address, set[int]] = defaultdict(set)
         self._pictures = PixelCache(read=self._reduced, budget_bytes=PICTURES_BYTES)
@@ -72,7 +80,7 @@ class Canvas:
             step: Reduction = 8 if factor >= 8 else 4 if factor >= 4 else 2 if factor >= 2 else 1
             ready = read_color(photo, reduction=step)
         small = np.ascontiguousarray(shrink(ready, longest)[0])
-        if member.photo.band == "thermal" and member.photo.unit:
+        if _measured(member):
             return small.astype(np.float32).reshape(*small.shape[:2], -1)[..., :1]
         if small.dtype != np.uint8 or small.ndim == 2 or small.shape[2] < 3:
             small = np.repeat(to_grey8(small)[..., None], 3, 2)
@@ -169,31 +177,50 @@ class Canvas:
                 found += list(self._by_tile.get(address, ()))
         return sorted(set(found))
 
-    def draw(self, dirty: Sequence[Address], rule: str = "") -> list[Address]:
-        """Draws tiles of level 0 (addresses of the plain layer); returns those written; `finish` does the others."""
-        tiles = in_order(lambda a: self._tile(a, RULES[rule]), dirty, jobs=THREADS)
-        done = [(replace(a, layer=a.layer + rule), t) for a, t in zip(dirty, tiles, strict=True)]
-        fresh = [(a, t) for a, t in done if t is not None]
-        emptied = [(a, self._empty(a.layer)) for a, t in done if t is None and self.tiles.version(a) > 0]
-        written = [*fresh, *emptied]
-        self.tiles.put(
-            written, owing=() if rule else [replace(a, layer=a.layer + NEWEST) for a, _ in written]
-        )
+    def draw(self, dirty: Mapping[Address, Collection[int]], rule: str = "") -> list[Address]:
+        """Draws tiles of level 0 (addresses of the plain layer) on which these photos have changed.
+
+        A tile stays as it is where none of them shows, before or now. Returns those written; `finish` does the
+        coarser ones.
+        """
+        drawn = list(in_order(lambda a: self._drawn(a, dirty[a], rule), list(dirty), jobs=THREADS))
+        written = [(at, tile) for at, tile in drawn if tile is not None]
+        newest = [at for at, _ in drawn] if rule else [replace(a, layer=a.layer + NEWEST) for a in dirty]
+        self.tiles.put(written, owing=() if rule else newest)
         reached("tiles written")
-        self._raised.update(a for a, _ in written)
-        return [a for a, _ in written]
+        self._met.update(newest if rule else ())
+        self._raised.update(at for at, _ in written)
+        return [at for at, _ in written]
+
+    def _drawn(self, address: Address, changed: Collection[int], rule: str) -> tuple[Address, Tile | None]:
+        """The tile's address in its own layer, and how it looks; None = as before."""
+        at = replace(address, layer=address.layer + rule)
+        compose = self._composer(address, RULES[rule])
+        plan = compose.plan(WHOLE) if compose else None
+        shown = tuple(plan.shown) if plan else ()
+        if self._shown.get(at) == shown and not set(shown).intersection(changed):
+            return at, None
+        self._shown[at] = shown
+        tile = self._tile(compose.drawn(plan)) if compose and plan and shown else None
+        if tile is None and self.tiles.version(at) > 0:
+            tile = self._empty(address.layer)
+        return at, tile
 
     def finish(self, rule: str = "") -> int:
         """Makes the coarser tiles above all that was drawn since; returns how many."""
         changed = {a for a in self._raised if a.layer.endswith(NEWEST) == bool(rule)}
+        met = self._met if rule else set[Address]()
         self._raised -= changed
-        return self.tiles.raise_levels(changed, settled=changed if rule else ()) if changed else 0
+        raised = self.tiles.raise_levels(changed, settled=met) if changed or met else 0
+        self._met -= met
+        return raised
 
     def owed(self) -> list[Address]:
         """Tiles (addresses of the plain layer) whose newest-on-top fellows show less than they do."""
         return [replace(a, layer=a.layer.removesuffix(NEWEST)) for a in self.tiles.owed()]
 
-    def _tile(self, address: Address, blend: Blend) -> Tile | None:
+    def _composer(self, address: Address, blend: Blend) -> Composer | None:
+        """What a tile is drawn with; None where no photo sees it."""
         grid = address.grid(self.gsd)
         inside = [v for i in sorted(self._by_tile.get(address, ())) if (v := self._views.get(i)) is not None]
         if len(inside) > MOST_VIEWS:
@@ -204,15 +231,17 @@ class Canvas:
             return None
         west, south, east, north = grid.bounds
         rim = 8 * self.heights.cell
-        thermal = self._pictures(inside[0].photo).dtype == np.float32
-        compose = Composer(
+        measured = _measured(self.members[inside[0].photo])
+        return Composer(
             grid=grid, views=inside, surface=self.surface((west - rim, south - rim, east + rim, north + rim)),
-            blend=blend, pixels=self._pictures, bands=1 if thermal else 3,
-            dtype=np.dtype(np.float32 if thermal else np.uint8),
+            blend=blend, pixels=self._pictures, bands=1 if measured else 3,
+            dtype=np.dtype(np.float32 if measured else np.uint8),
         )  # fmt: skip
-        done = compose(Window(row=0, column=0, height=SIDE, width=SIDE))
+
+    @staticmethod
+    def _tile(done: Composed) -> Tile | None:
         shown = done.photo >= 0
-        if thermal:
+        if done.pixels.dtype.kind == "f":
             shown &= np.isfinite(done.pixels[..., 0])
         return Tile(pixels=np.nan_to_num(done.pixels), shown=shown) if shown.any() else None
 

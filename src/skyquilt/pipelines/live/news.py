@@ -37,11 +37,11 @@ class News:
         ring = [] if outline is None else self.members.lonlat(outline)
         return ring, self.members.lonlat(member.pose.map_C[None, :2])[0]
 
-    def tiles(self, addresses: Iterable[Address], rule: str) -> None:
+    def tiles(self, addresses: Iterable[Address]) -> None:
         """Where the map has changed, by layer: as a whole, and by parts, so that the rest need not be fetched again."""
         by_layer: dict[str, set[Address]] = {}
         for a in addresses:
-            by_layer.setdefault(a.layer + rule, set()).add(a)
+            by_layer.setdefault(a.layer, set()).add(a)
         for layer, changed in by_layer.items():
             boxes = [self._degrees(a) for a in sorted(_gathered(changed))]
             low, high = np.min(boxes, axis=0).tolist(), np.max(boxes, axis=0).tolist()

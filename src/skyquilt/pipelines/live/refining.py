@@ -86,9 +86,9 @@ class Refining:
     def heights(self, xyz: NDArray[np.float64], *, known: bool, anew: bool = False) -> None:
         """Takes in ground points (P, 3) (inside a transaction); `known`: they come from calibrated cameras."""
         cells = self.placing.metadata.heights
-        touched = sorted(cells.add(xyz, anew=anew))
+        touched, z = cells.add(xyz, anew=anew)
         with self.ledger.change() as db:
-            values = [(c, r, cells.z[c, r]) for c, r in touched]
+            values = [(c, r, height) for (c, r), height in zip(touched.tolist(), z.tolist(), strict=True)]
             db.executemany("insert or replace into height values (?, ?, ?)", values)
             if known and len(xyz):
                 ground = float(np.median(xyz[:, 2]))

@@ -31,7 +31,7 @@ class LiveSettings:
     """Whether later photos may move earlier ones; False = no repositioning, as in the thesis (Y 4.1)."""
     deterministic: bool = False
     """Background work at fixed counts of photos and in line, so that equal photos in equal order give equal poses."""
-    features: int = 1500
+    features: int = 1200
     """Features per photo, as the batch story takes them."""
     most_bytes: int = 500_000_000
     """Largest photo file in bytes."""

@@ -1,6 +1,7 @@
 """Which tiles are to be drawn, the most urgent first, and when what was drawn is told."""
 
 import json
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +14,12 @@ from skyquilt.pipelines.live.update import Update
 from skyquilt.raster.tile_store import Address
 from skyquilt.run.write_points import reached
 
-DRAWN_AT_ONCE = 4
+DRAWN_AT_ONCE = 12
 """Tiles drawn in one unit of work; of those of a new photo, twice as many."""
 NOTED_AT_ONCE = 8
 """Photos whose places are taken note of in one unit of work."""
-Queue = dict[Address, None]
-"""Tiles to draw, in order."""
+Queue = dict[Address, set[int]]
+"""Tiles to draw, in order, and the photos that have changed on each."""
 
 
 class Showing:
@@ -29,7 +30,7 @@ class Showing:
         self.members, self.ledger, self.canvas, self.news = members, members.ledger, canvas, news
         self.urgent: Queue = {}
         self.dirty: Queue = {}
-        self.later: Queue = dict.fromkeys(canvas.owed())
+        self.later: Queue = {a: set() for a in canvas.owed()}
         self.pending: dict[int, None] = {}
         self._drawn: dict[int, Pose] = {}
         self._rims: dict[int, NDArray[np.float64]] = {}
@@ -48,11 +49,12 @@ class Showing:
                 self._drawn[member.id], self._rims[member.id] = pose, rim
             else:
                 self._to_draw.add(member.id)
-                self.dirty.update(dict.fromkeys(addresses))
+                _add(self.dirty, addresses, member.id)
 
     def show(self, member: Member) -> None:
         """A photo has come and is to be seen at once."""
-        self._note(member, self.urgent)
+        self._to_draw.add(member.id)
+        _add(self.urgent, self.canvas.place(member, self.members.camera(member)), member.id)
 
     def changed(self, member: Member) -> None:
         """A photo looks different now, which will be taken note of when there is time."""
@@ -73,11 +75,12 @@ class Showing:
             del self.pending[number]
             if member.state == "superseded":
                 continue
-            before = list(self.dirty)
-            self._note(member, self.dirty)
+            addresses = self.canvas.place(member, self.members.camera(member))
             if self._looks_as_drawn(number):
                 self._to_draw.discard(number)
-                self.dirty = dict.fromkeys(before)
+            else:
+                self._to_draw.add(number)
+                _add(self.dirty, addresses, number)
         return Update(what="noted")
 
     def _looks_as_drawn(self, number: int) -> bool:
@@ -87,24 +90,21 @@ class Showing:
             return False
         return bool(np.abs(rim - drawn).max() < LEAST_MOVE * self.canvas.gsd)
 
-    def _note(self, member: Member, queue: Queue) -> None:
-        self._to_draw.add(member.id)
-        queue.update(dict.fromkeys(self.canvas.place(member, self.members.camera(member))))
-
     def gone(self, number: int) -> None:
         """A photo takes no part any more."""
-        self.dirty.update(dict.fromkeys(self.canvas.remove(number)))
+        _add(self.dirty, self.canvas.remove(number), number)
 
     def draw(self, queue: Queue, rule: str = "") -> Update:
         """Some of the dirty tiles; when no more are, what was drawn is written down and told."""
         some = list(queue)[: DRAWN_AT_ONCE * (2 if queue is self.urgent else 1)]
-        written = self.canvas.draw(some, rule)
-        for address in some:
+        parts = {a: queue[a] if rule else queue[a] | self.dirty.get(a, set()) for a in some}
+        written = self.canvas.draw(parts, rule)
+        for address, changed in parts.items():
             queue.pop(address, None)
             if not rule:
                 self.dirty.pop(address, None)
-                self.later.setdefault(address)
-        self._fresh.setdefault(rule, []).extend(some)
+                self.later.setdefault(address, set()).update(changed)
+        self._fresh.setdefault(rule, []).extend(written)
         tiles = len(written)
         if not queue:
             tiles += self._told(rule)
@@ -121,7 +121,7 @@ class Showing:
         with self.ledger.change():
             for i in sorted(shown):
                 self._drawn_now(self.members.by_id[i])
-            self.news.tiles(self._fresh.pop(rule, []), rule)
+            self.news.tiles(self._fresh.pop(rule, []))
         reached("drawing told")
         self._to_draw.difference_update(shown)
         return raised
@@ -142,3 +142,8 @@ class Showing:
         if (rim := self.canvas.outline(member.id)) is not None:
             self._rims[member.id] = rim
         self.news.photo(member, ring=ring, at=at)
+
+
+def _add(queue: Queue, addresses: Iterable[Address], number: int) -> None:
+    for address in addresses:
+        queue.setdefault(address, set()).add(number)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from skyquilt.config import MosaicSettings, methods
 from skyquilt.errors import OutputError, UsageError
@@ -93,7 +94,8 @@ class LiveMap:
         self.schedule = Schedule.read(self.ledger)
         self.full = PixelCache(read=self._pixels, budget_bytes=FULL_BYTES)
         self.heights = HeightCells(cell=float(self.ledger.meta("cell", 2.0)))
-        self.heights.z = {(int(c), int(r)): float(z) for c, r, z in self.ledger.rows("select * from height")}
+        known = np.array(self.ledger.rows("select * from height"), np.float64).reshape(-1, 3)
+        self.heights.put(known[:, :2].astype(np.int64), known[:, 2])
         metadata = Metadata(self.members, self.heights, self.settings)
         neighbours = Neighbours(self.members, metadata)
         self.linking = Linking(self.members, self.methods, self.store, self.full)
