@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from skyquilt.geometry.camera import project
 from skyquilt.imaging.views import (
@@ -10,9 +12,10 @@ from skyquilt.imaging.views import (
     densify,
     footprint,
     grid_of,
+    least_score,
     native_gsd,
+    node_places,
     project_nodes,
-    window_nodes,
 )
 from skyquilt.model.camera import Camera
 from skyquilt.model.raster import Grid, Window
@@ -49,7 +52,7 @@ def test_a_photo_of_the_horizon_has_no_footprint():
 def test_nodes_are_exact_projections_and_in_between_nearly():
     shot = block()[2]
     window = Window(row=160, column=320, height=100, width=130)
-    (nodes,) = window_nodes([shot], GRID, FLAT, window)
+    nodes = project_nodes(shot, *node_places(GRID, FLAT, window))
     assert nodes.u.shape == (-(-100 // STEP) + 2, -(-130 // STEP) + 2)
     x, y = np.meshgrid(GRID.x(np.arange(320, 450)), GRID.y(np.arange(160, 260)))
     exact = project(CAMERA, shot.pose.to_camera(np.stack([x, y, 0 * x], -1).reshape(-1, 3))).reshape(
@@ -69,10 +72,33 @@ def test_nodes_are_exact_projections_and_in_between_nearly():
 
 def test_a_cut_is_the_nodes_of_the_sub_window():
     shot = block()[2]
-    (whole,) = window_nodes([shot], GRID, FLAT, Window(row=0, column=0, height=320, width=400))
-    (own,) = window_nodes([shot], GRID, FLAT, Window(row=96, column=160, height=90, width=100))
+    whole, own = (
+        project_nodes(shot, *node_places(GRID, FLAT, window))
+        for window in (
+            Window(row=0, column=0, height=320, width=400),
+            Window(row=96, column=160, height=90, width=100),
+        )
+    )
     part = cut(whole, 96, 160, 90, 100)
     assert part.u == pytest.approx(own.u, abs=1e-3) and part.seen.tolist() == own.seen.tolist()
+
+
+@given(st.integers(0, 600), st.integers(0, 600), st.integers(20, 200), st.floats(-5, 30))
+def test_no_node_has_a_smaller_score_than_the_least(row, column, size, rise):
+    slope = Surface(
+        z=np.linspace(0, rise, 41 * 41, dtype=np.float32).reshape(41, 41),
+        x0=-80.0,
+        y0=-80.0,
+        cell=4.0,
+        source="t",
+    )
+    shot = view(0, 3, -2, pitch=10)
+    x, y, z = node_places(GRID, slope, Window(row=row, column=column, height=size, width=size))
+    score = project_nodes(shot, x, y, z).score.min()
+    least = least_score(shot, x, y, z)
+    assert least <= score * (1 + 1e-5)
+    if x[0, 0] < shot.pose.map_C[0] < x[0, -1] and y[-1, 0] < shot.pose.map_C[1] < y[0, 0]:
+        assert least == 0.0
 
 
 def test_folded_distortion_and_the_sky_show_nothing():

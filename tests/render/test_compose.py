@@ -11,6 +11,7 @@ from skyquilt.imaging.views import STEP, inside
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.render.blend import Average, Feather, First, Multiband
+from skyquilt.render.newest import Newest
 from tests.render.scenes import CAMERA, GRID, block, composer, photograph, truth, view
 
 WHOLE = Window(row=0, column=0, height=GRID.height, width=GRID.width)
@@ -146,6 +147,25 @@ def test_pieces_fit_together(scene, blend):
             assert (part.photo != whole.photo[cut]).mean() < 1e-3
             k = np.s_[row // STEP : -(-(row + h) // STEP), column // STEP : -(-(column + w) // STEP)]
             assert (part.views == whole.views[k]).all()
+
+
+@pytest.mark.parametrize("blend", [Feather(), First(), Newest()], ids=lambda b: type(b).__name__)
+def test_photos_that_others_hide_need_not_be_looked_at(scene, blend):
+    """Each part of the map planned by itself, with as few photos as can show, is the part of the whole."""
+    views, pictures = scene
+    compose = composer(views, pictures, GRID, blend)
+    planned = 0
+    for row in range(0, GRID.height, 96):
+        for column in range(0, GRID.width, 96):
+            window = Window(row=row, column=column, height=96, width=96)
+            plan, whole = compose.plan(window), compose.plan(window, counted=True)
+            assert plan.shown == whole.shown
+            assert len(plan.nodes) <= len(whole.nodes)
+            planned += len(whole.nodes) - len(plan.nodes)
+            made, expected = compose.drawn(plan), compose.drawn(whole)
+            assert np.array_equal(made.pixels, expected.pixels) and np.array_equal(made.photo, expected.photo)
+            assert set(np.unique(expected.photo)) - {-1} <= set(plan.shown)
+    assert planned > 0  # some were spared
 
 
 def test_measured_values_are_resampled_and_nothing_else():

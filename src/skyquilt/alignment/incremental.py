@@ -17,7 +17,7 @@ from skyquilt.alignment.bundle import prune
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.setup import HALF_TURN, Setup, pose_records, set_up
 from skyquilt.alignment.start import Start, plane_link
-from skyquilt.alignment.tracks import build_tracks, thin
+from skyquilt.alignment.tracks import Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
 from skyquilt.geometry.camera import rays
 from skyquilt.model.camera import Camera
@@ -111,7 +111,7 @@ class Incremental:
             dropped = tuple(key for key in own if key not in agreeing)
         links = [k for k in window.links if (k.a, k.b) not in dropped]
         setup = _setup(window, plane, links)
-        tracks = setup.sensor_tracks(build_tracks(window.features, links))
+        tracks = _useful(setup.sensor_tracks(build_tracks(window.features, links)), window)
         sizes = [(p.width, p.height) for p in window.photos]
         problem, state = setup.problem(thin(tracks, sizes, per_photo=self.per_photo))
         if not len(problem.px):
@@ -127,6 +127,13 @@ class Incremental:
             poses=moved, camera=key + TURNED if setup.turned[window.new] else key, sightings=sightings,
             xyz=state.X, dropped=dropped,
         )  # fmt: skip
+
+
+def _useful(tracks: Tracks, window: Window) -> Tracks:
+    """Tracks that a photo which may move sees; what only held ones see moves nothing."""
+    free = np.array([i not in window.held for i in range(len(window.photos))])
+    seen = np.bincount(tracks.point, weights=free[tracks.photo], minlength=tracks.count) > 0
+    return tracks.only(seen[tracks.point])
 
 
 def _adjusted(problem: Problem, state: State) -> tuple[Problem, State]:

@@ -137,15 +137,26 @@ def inside_everywhere(nodes: Nodes, u: NDArray[np.float32], v: NDArray[np.float3
     return within & (densify(nodes.real.astype(np.float32), *u.shape) > 0.999)
 
 
-def window_nodes(views: Sequence[View], grid: Grid, surface: Surface, window: Window) -> list[Nodes]:
-    """Nodes (r + 2, c + 2) of every view that sees something of a window of r x c cells."""
+def node_places(grid: Grid, surface: Surface, window: Window) -> tuple[NDArray, NDArray, NDArray]:
+    """x, y, z in m, each (r + 2, c + 2), of the nodes of a window of r x c cells."""
     columns = window.column + STEP * (np.arange(-1, -(-window.width // STEP) + 1) + 0.5) - 0.5
     rows = window.row + STEP * (np.arange(-1, -(-window.height // STEP) + 1) + 0.5) - 0.5
     x, y = np.meshgrid(grid.x(columns), grid.y(rows))
-    z = surface.at(x, y)
+    return x, y, surface.at(x, y)
+
+
+def overlapping(views: Sequence[View], x: NDArray, y: NDArray) -> list[View]:
+    """The views whose footprint's box meets that of nodes at x, y (r, c) in m, rows southwards."""
     bounds = (float(x[0, 0]), float(y[-1, 0]), float(x[0, -1]), float(y[0, 0]))
-    nodes = [project_nodes(view, x, y, z) for view in views if view.overlaps(bounds)]
-    return [n for n in nodes if n.seen.any()]
+    return [view for view in views if view.overlaps(bounds)]
+
+
+def least_score(view: View, x: NDArray, y: NDArray, z: NDArray) -> float:
+    """No node at x, y, z (r, c) in m, rows southwards, has a smaller score in this view."""
+    east, north, up = view.pose.map_C.tolist()
+    aside = max(x[0, 0] - east, east - x[0, -1], 0.0)
+    along = max(y[-1, 0] - north, north - y[0, 0], 0.0)
+    return float((aside**2 + along**2) / max((up - z.min()) ** 2, (up - z.max()) ** 2, 1e-6))
 
 
 def cut(nodes: Nodes, row: int, column: int, height: int, width: int) -> Nodes:

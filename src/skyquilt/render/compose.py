@@ -7,7 +7,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import STEP, Nodes, View, cut, densify, inside_everywhere, window_nodes
+from skyquilt.imaging.views import (
+    STEP,
+    Nodes,
+    View,
+    cut,
+    densify,
+    inside_everywhere,
+    least_score,
+    node_places,
+    overlapping,
+    project_nodes,
+)
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.render.blend import Blend, Layer
@@ -28,7 +39,7 @@ class Composed:
     photo: NDArray[np.int32]
     """(h, w) index of the photo that leads each pixel, -1 = none."""
     views: NDArray[np.uint16]
-    """(r, c) number of photos that see each STEP x STEP cell."""
+    """(r, c) number of photos, of those planned with, that see each STEP x STEP cell."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,13 +84,37 @@ class Composer:
 
     def __call__(self, window: Window) -> Composed:
         """The window."""
-        return self.drawn(self.plan(window))
+        return self.drawn(self.plan(window, counted=True))
 
-    def plan(self, window: Window) -> Plan:
-        """Which photos can show where; costs little, and no photo is read."""
+    def plan(self, window: Window, *, counted: bool = False) -> Plan:
+        """Which photos can show where; costs little, and no photo is read.
+
+        `counted`: all photos that see the window are in the plan, not only those that others do not surely hide.
+        """
         margin = -(-self.blend.margin // STEP) * STEP
-        nodes = window_nodes(self.views, self.grid, self.surface, window.grown(margin))
-        return Plan(window=window, margin=margin, nodes=nodes, near=self._near(nodes))
+        x, y, z = node_places(self.grid, self.surface, window.grown(margin))
+        views = overlapping(self.views, x, y)
+        rank_of = self.blend.rank
+        scores = [np.full(1, least_score(v, x, y, z), np.float32) for v in views]
+        low = [float(rank_of(k, score)[0]) for k, score in enumerate(scores)]
+        height = min((float(v.pose.map_C[2] - np.median(z)) for v in views), default=1.0)
+        slack = self.blend.reach(self.grid.gsd) / max(height, 1e-3)
+        # between nodes a rank lies between theirs: nobody wins there whose least rank exceeds another's greatest
+        around, best = np.ones((3, 3), np.uint8), np.full(x.shape, np.float32(np.inf))
+        found: dict[int, tuple[Nodes, NDArray]] = {}
+        for k in np.argsort(low, kind="stable").tolist():
+            if not counted and low[k] > best.max() + slack:
+                break
+            nodes = project_nodes(views[k], x, y, z)
+            if nodes.seen.any():
+                rank = rank_of(k, np.where(nodes.seen, nodes.score, np.float32(np.inf)))
+                best = np.minimum(best, cv2.dilate(rank, around))
+                found[k] = nodes, cv2.erode(rank, around)
+        kept = [found[k] for k in sorted(found)]
+        return Plan(
+            window=window, margin=margin, nodes=[nodes for nodes, _ in kept],
+            near=[np.isfinite(least) & (least <= best + slack) for _, least in kept],
+        )  # fmt: skip
 
     def drawn(self, plan: Plan) -> Composed:
         """A window as planned, piece by piece."""
@@ -105,20 +140,6 @@ class Composer:
         for n in nodes:
             count += n.seen[k + 1 : k + 1 + rows, k + 1 : k + 1 + columns]
         return count
-
-    def _near(self, nodes: Sequence[Nodes]) -> list[NDArray[np.bool_]]:
-        """Where each photo, in order of capture, can show: (r, c) per node, for the cell around it."""
-        if not nodes:
-            return []
-        scores = [np.where(n.seen, n.score, np.float32(np.inf)) for n in nodes]
-        ranks = [self.blend.rank(k, score) for k, score in enumerate(scores)]
-        height = min(n.height for n in nodes)
-        slack = self.blend.reach(self.grid.gsd) / max(height, 1e-3)
-        # between nodes a rank lies between theirs: nobody wins there whose least rank exceeds another's greatest
-        around = np.ones((3, 3), np.uint8)
-        best = np.min([cv2.dilate(r, around) for r in ranks], axis=0) if np.isfinite(slack) else np.inf
-        least = [cv2.erode(r, around) for r in ranks]
-        return [np.isfinite(r) & (r <= best + slack) for r in least]
 
     def _piece(
         self, plan: Plan, row: int, column: int, h: int, w: int
