@@ -17,7 +17,7 @@ from skyquilt.pipelines.live.settings import LiveSettings
 from skyquilt.pipelines.live.story import LiveMap
 from skyquilt.simulate import FlightSettings, simulate
 from skyquilt.simulate.camera import Lens
-from skyquilt.simulate.settings import Control, Reporting, Route
+from skyquilt.simulate.settings import Control, Reporting, Route, Thermal
 from skyquilt.viewer.guard import Guard
 from skyquilt.viewer.serving import Serving
 from skyquilt.viewer.survey import LiveSurvey
@@ -63,6 +63,16 @@ def drones(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     return made(
         tmp_path_factory.mktemp("drones"), seed=5, route=Route(photos=18, drones=2), control=Control(points=0, checks=0),
         reporting=Reporting(clock_offsets=(0.0, 40.0), yaw_lie="tag"),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    """Six visible photos and the thermal frames of a second drone, whose files state their unit."""
+    thermal = Thermal(lens=Lens(width=320, height=256, focal=386.0, k1=-0.2, k2=0.05, p1=0.0, p2=0.0))
+    return made(
+        tmp_path_factory.mktemp("thermal"), seed=3, route=Route(photos=6), control=Control(points=0, checks=0),
+        thermal=thermal,
     )  # fmt: skip
 
 

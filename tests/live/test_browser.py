@@ -1,11 +1,14 @@
 """A real browser drives the viewer."""
 
+import io
 import json
 import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 from playwright.sync_api import sync_playwright
 
 from skyquilt.pipelines.live.settings import LiveSettings
@@ -53,16 +56,26 @@ def holds(page, expression, seconds=30):
     raise AssertionError(f"never: {expression}")
 
 
+def seen(page):
+    """(h, w, 3) what the map shows."""
+    with Image.open(io.BytesIO(page.locator("#map").screenshot())) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
 def coloured(page):
     """Share of the map that is neither background nor white."""
-    import io
-
-    import numpy as np
-    from PIL import Image
-
-    with Image.open(io.BytesIO(page.locator("#map").screenshot())) as image:
-        pixels = np.asarray(image.convert("RGB")).astype(int)
+    pixels = seen(page)
     return float((np.abs(pixels - (217, 217, 217)).max(-1) > 12).mean())
+
+
+def dropped(page, name, content):
+    """A file is let go over the map."""
+    files = page.evaluate_handle(
+        "([name, text]) => { const d = new DataTransfer(); d.items.add(new File([text], name)); return d; }",
+        [name, json.dumps(content)],
+    )
+    for event in ("dragover", "drop"):
+        page.dispatch_event("#map", event, {"dataTransfer": files})
 
 
 def test_the_map_appears_and_grows_and_everything_on_it_works(page, flight, tmp_path):
@@ -129,6 +142,13 @@ def test_the_map_appears_and_grows_and_everything_on_it_works(page, flight, tmp_
         (tmp_path / "found.geojson").write_text(json.dumps(layer))
         page.set_input_files("#files", str(tmp_path / "found.geojson"))
         page.wait_for_selector("#overlays li")
+        dropped(
+            page,
+            "area.geojson",
+            {**layer, "geometry": {"type": "LineString", "coordinates": [at, [at[0] + 1e-4, at[1]]]}},
+        )
+        holds(page, "document.querySelectorAll('#overlays li').length == 2")
+        assert site.web.get("/layers/area.geojson").json()["features"][0]["geometry"]["type"] == "LineString"
         page.mouse.click(*middle)
         page.wait_for_selector(".leaflet-popup")
         assert "<img src=x" in page.inner_text(".leaflet-popup")
@@ -170,4 +190,41 @@ def test_it_comes_back_when_the_server_does(page, flight, tmp_path):
         holds(page, "document.querySelectorAll('#photos li').length == 2")
         assert "<b>second.jpg" in page.inner_text("#photos")
         assert page.locator("#photos b").count() == 0
+        assert page.errors == []
+
+
+def test_two_spectra_lie_beside_each_other_on_either_side_of_the_handle(page, both, tmp_path):
+    with served(tmp_path / "out", QUICK) as site:
+        for path in [*both.photos, *sorted((both.folder / "thermal").glob("*.tif"))]:
+            assert site.send(path).is_success
+        site.until(lambda: all(p["ring"] for p in site.web.get("/photos").json()["photos"]))
+        site.until(
+            lambda: not (site.live.queues.untried or site.live.showing.dirty or site.live.showing.later)
+        )
+        page.goto(site.url)
+        page.wait_for_selector("#link.live")
+        holds(page, "[...document.querySelector('#layer').options].some(o => o.value == 'thermal')")
+        page.click("#fit")
+
+        def settled():
+            page.wait_for_timeout(1200)
+            return seen(page)
+
+        alone = {}
+        for name in ("thermal", "visible"):
+            page.select_option("#layer", name)
+            alone[name] = settled()
+        assert np.abs(alone["thermal"] - alone["visible"]).max(-1).mean() > 5
+        page.click("#swipe")
+        page.select_option("#other", "thermal")
+        both_shown = settled()
+        shot(page, "spectra")
+        handle, box = page.locator("#handle").bounding_box(), page.locator("#map").bounding_box()
+        middle = round(handle["x"] + handle["width"] / 2 - box["x"])
+        aside = round(handle["width"])
+        assert 0.4 * box["width"] < middle < 0.6 * box["width"]
+        for part, name in (
+            (np.s_[:, : middle - aside], "visible"), (np.s_[:, middle + aside :], "thermal")
+        ):  # fmt: skip
+            assert (np.abs(both_shown[part] - alone[name][part]).max(-1) > 8).mean() < 0.002, name
         assert page.errors == []

@@ -9,20 +9,8 @@ from PIL import Image
 
 from skyquilt.pipelines.live.settings import LiveSettings
 from skyquilt.raster.map_source import TileSource
-from skyquilt.simulate.camera import Lens
-from skyquilt.simulate.settings import Control, Route, Thermal
-from tests.live.conftest import made, served
+from tests.live.conftest import served
 from tests.live.test_http import middle, tile_of
-
-
-@pytest.fixture(scope="module")
-def both(tmp_path_factory):
-    """Six visible photos and the thermal frames of a second drone, whose files state their unit."""
-    thermal = Thermal(lens=Lens(width=320, height=256, focal=386.0, k1=-0.2, k2=0.05, p1=0.0, p2=0.0))
-    return made(
-        tmp_path_factory.mktemp("thermal"), seed=3, route=Route(photos=6), control=Control(points=0, checks=0),
-        thermal=thermal,
-    )  # fmt: skip
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 const $ = (id) => document.getElementById(id);
 const map = L.map("map", { zoomControl: true, maxZoom: 25, preferCanvas: true }).setView([0, 0], 2);
 L.control.scale({ imperial: false }).addTo(map);
+map.createPane("first").style.zIndex = 240;
 map.createPane("second").style.zIndex = 250;
 const state = { layers: new Map(), photos: new Map(), last: 0, rule: "", mode: null, points: [], overlays: new Map(), fitted: false, info: null };
 const outlines = L.layerGroup(), trails = L.layerGroup().addTo(map), drawn = L.layerGroup().addTo(map), marked = L.layerGroup().addTo(map);
@@ -46,7 +47,7 @@ const Growing = L.GridLayer.extend({
     }
   },
 });
-const growing = (name, pane) => new Growing({ layer: name, pane: pane || "tilePane", maxZoom: 25, updateWhenZooming: false, keepBuffer: 1 });
+const growing = (name, pane) => new Growing({ layer: name, pane, maxZoom: 25, updateWhenZooming: false, keepBuffer: 1 });
 let first = null, second = null, base = null;
 
 const shownName = () => {
@@ -57,24 +58,28 @@ const showMap = () => {
   const name = shownName();
   if (!name || (first && first.options.layer === name)) return;
   if (first) first.remove();
-  first = growing(name).addTo(map);
+  first = growing(name, "first").addTo(map);
 };
 const showSecond = () => {
   if (second) { second.remove(); second = null; }
   const on = isPressed("swipe") && $("other").value;
   $("other").hidden = !isPressed("swipe");
   $("handle").hidden = !on;
-  if (!on) return;
-  second = growing($("other").value, "second").addTo(map);
+  if (on) second = growing($("other").value, "second").addTo(map);
   clip();
 };
 let cut = 0.5;
 const clip = () => {
+  map.getPane("first").style.clip = "";
   if (!second) return;
   const box = map.getContainer().getBoundingClientRect(), x = cut * box.width;
   $("handle").style.left = `${box.left + x}px`;
-  const a = map.containerPointToLayerPoint([x, 0]), b = map.containerPointToLayerPoint([box.width, box.height]);
-  map.getPane("second").style.clip = `rect(${a.y}px,${b.x}px,${b.y}px,${a.x}px)`;
+  const part = (from, to) => {
+    const a = map.containerPointToLayerPoint([from, 0]), b = map.containerPointToLayerPoint([to, box.height]);
+    return `rect(${a.y}px,${b.x}px,${b.y}px,${a.x}px)`;
+  };
+  map.getPane("first").style.clip = part(0, x);
+  map.getPane("second").style.clip = part(x, box.width);
 };
 map.on("move zoom resize", clip);
 $("handle").addEventListener("pointerdown", (e) => {
