@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import adjust
 from skyquilt.alignment.bundle import prune
-from skyquilt.alignment.problem import Problem, State
+from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import HALF_TURN, Setup, pose_records, set_up
 from skyquilt.alignment.start import Start, plane_link
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
@@ -29,6 +29,9 @@ HELD_M, HELD_RAD = 1e-3, 1e-5
 """Deviations of photos that are held."""
 DISAGREE = 0.12
 """Links that put a photo further apart than this share of the flying height contradict each other."""
+STAGES = ((2.0, 20.0, 40.0, 3e-2), (0.8, 6.0, 12.0, 1e-2), (0.0, 2.5, 5.0, 2e-3))
+"""Rounds of an adjustment: from which median misfit in px of the new photo on, width of the loss in px, residual in
+px beyond which sightings go, and tolerance."""
 TURNED = "/turned"
 """End of the names of calibrations of files that were rewritten upside down."""
 
@@ -116,8 +119,8 @@ class Incremental:
         problem, state = setup.problem(thin(tracks, sizes, per_photo=self.per_photo))
         if not len(problem.px):
             return Unsettled(reason="no sightings are left")
-        problem, state = _adjusted(problem, triangulated(problem, state))
         row = int(np.searchsorted(setup.members, window.new))
+        problem, state = _adjusted(problem, triangulated(problem, state), row)
         sightings = int((problem.photo == row).sum())
         if sightings < self.least:
             return Unsettled(reason=f"only {sightings} tie points hold it")
@@ -136,11 +139,16 @@ def _useful(tracks: Tracks, window: Window) -> Tracks:
     return tracks.only(seen[tracks.point])
 
 
-def _adjusted(problem: Problem, state: State) -> tuple[Problem, State]:
-    """Ever narrower losses, pruning between."""
-    for loss, limit, tolerance in ((20.0, 40.0, 3e-2), (6.0, 12.0, 1e-2), (2.5, 5.0, 2e-3)):
-        state = adjust(problem.with_loss(loss), state, iterations=8, tolerance=tolerance, damping=1e-5).state
-        problem, state = prune(problem, state, limit)
+def _adjusted(problem: Problem, state: State, new: int) -> tuple[Problem, State]:
+    """Ever narrower losses, pruning between; the wide ones only where the new photo, of that row, starts far off."""
+    off = np.hypot(*residuals_px(problem, state)[problem.photo == new].T)
+    start = float(np.nanmedian(off)) if np.isfinite(off).any() else np.inf
+    for beyond, loss, limit, tolerance in STAGES:
+        if not start < beyond:
+            state = adjust(
+                problem.with_loss(loss), state, iterations=8, tolerance=tolerance, damping=1e-5
+            ).state
+            problem, state = prune(problem, state, limit)
     return problem, adjust(problem.with_loss(2.0), state, iterations=6, tolerance=1e-3, damping=1e-6).state
 
 

@@ -21,7 +21,7 @@ SIDE = 256
 LEVELS = 10
 """Levels, each with pixels twice as large as the one before."""
 QUALITY = 90
-KEPT = 384
+KEPT = 256
 """Decoded tiles at hand."""
 TABLES = (
     "create table if not exists tile(layer text, level integer, row integer, col integer, version integer not null,"

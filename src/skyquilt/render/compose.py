@@ -97,7 +97,7 @@ class Composer:
         rank_of = self.blend.rank
         scores = [np.full(1, least_score(v, x, y, z), np.float32) for v in views]
         low = [float(rank_of(k, score)[0]) for k, score in enumerate(scores)]
-        height = min((float(v.pose.map_C[2] - np.median(z)) for v in views), default=1.0)
+        height = min((float(v.pose.map_C[2]) for v in views), default=1.0) - float(np.median(z))
         slack = self.blend.reach(self.grid.gsd) / max(height, 1e-3)
         # between nodes a rank lies between theirs: nobody wins there whose least rank exceeds another's greatest
         around, best = np.ones((3, 3), np.uint8), np.full(x.shape, np.float32(np.inf))

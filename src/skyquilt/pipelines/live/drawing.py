@@ -33,7 +33,7 @@ MOST_VIEWS = 24
 """Photos that a tile is composed from."""
 LEAST_MOVE = 0.6
 """Map pixels by which a photo must have moved to be drawn again."""
-PICTURES_BYTES = 200_000_000
+PICTURES_BYTES = 150_000_000
 """Reduced pictures at hand."""
 THREADS = min(2, os.cpu_count() or 1)
 """Tiles drawn side by side."""

@@ -1,7 +1,7 @@
 """Features of photos and links between them, as they are found and as they are written down."""
 
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -57,10 +57,11 @@ class Linking:
             found[i, member.id] = link if isinstance(link, Link) else None
         return found
 
-    def links_among(self, ids: Iterable[int]) -> list[Link]:
-        """Known links between these photos."""
+    def links_among(self, ids: Iterable[int], touching: Collection[int] | None = None) -> list[Link]:
+        """Known links between these photos, or only those that hold one of `touching`."""
         inside = set(ids)
-        pairs = sorted({(min(i, j), max(i, j)) for i in inside for j in self.members.by_id[i].links & inside})
+        ends = inside if touching is None else touching
+        pairs = sorted({(min(i, j), max(i, j)) for i in ends for j in self.members.by_id[i].links & inside})
         return [k for a, b in pairs if (k := self.link(a, b)) is not None]
 
     def link(self, a: int, b: int) -> Link | None:

@@ -129,7 +129,8 @@ class Placing:
         where = {i: k for k, i in enumerate(ids)}
         members = [self.members.by_id[i] for i in ids]
         known = {(k.a, k.b) for k in more}
-        links = [*(k for k in self.linking.links_among(ids) if (k.a, k.b) not in known), *more]
+        free = set(ids) - held  # what links held photos to each other moves nothing
+        links = [*(k for k in self.linking.links_among(ids, free) if (k.a, k.b) not in known), *more]
         placed = {where[m.id]: m.pose for m in members if m.pose is not None and m.id != member.id}
         cameras: dict[str, Camera] = {}
         for m in members:
