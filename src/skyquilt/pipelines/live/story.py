@@ -35,6 +35,7 @@ from skyquilt.pipelines.live.showing import Showing
 from skyquilt.pipelines.live.state import Members, Queues
 from skyquilt.pipelines.live.update import Update
 from skyquilt.raster.tile_store import TileStore
+from skyquilt.run.free_memory import give_back
 from skyquilt.run.inbox import Inbox
 from skyquilt.run.ledger import Ledger
 from skyquilt.run.pixel_cache import PixelCache
@@ -48,6 +49,8 @@ FULL_BYTES = 120_000_000
 """Full-size photos at hand."""
 TOGETHER = 4
 """Photos placed before they are drawn, where several wait: they share tiles."""
+TIDY = 16
+"""Photos after which free memory is given back."""
 
 
 class LiveMap:
@@ -75,6 +78,7 @@ class LiveMap:
         self.store = Store(folder=self.folder / STORE, registry=registry)
         self.closing = Closing()
         self._room = TOGETHER
+        self._taken = 0
         self._load()
 
     def _same_settings(self) -> None:
@@ -188,6 +192,9 @@ class LiveMap:
         if not self.queues.received:
             return None
         self._room = max(0, self._room - 1)
+        self._taken += 1
+        if self._taken % TIDY == 0:
+            give_back()
         self.blocks.last_arrival = time.monotonic()
         return self.arriving.place(self.queues.received[0])
 
