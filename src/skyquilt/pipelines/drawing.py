@@ -328,7 +328,7 @@ def _thinned(numbers: NDArray) -> NDArray:
         np.minimum(np.arange(PROVENANCE // 2, size + PROVENANCE // 2, PROVENANCE), size - 1)
         for size in numbers.shape
     )
-    return np.asarray(numbers[np.ix_(rows, columns)])
+    return np.asarray(numbers[rows][:, columns])
 
 
 def _blanked(pixels: NDArray, valid: NDArray[np.bool_]) -> NDArray:
