@@ -43,7 +43,7 @@ def command(
         ),
     ] = False,
     base: Annotated[Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")] = None,
-    features: Annotated[int, typer.Option(help="Features per photo.")] = 1200,
+    features: Annotated[int, typer.Option(help="Features per photo.")] = 1000,
     max_mb: Annotated[float, typer.Option(help="Largest photo file in MB.")] = 500,
     max_photos: Annotated[int, typer.Option(help="Most photos taken.")] = 100_000,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,

@@ -134,7 +134,7 @@ def command(
     repair: Annotated[
         bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")
     ] = True,
-    features: Annotated[int, typer.Option(help="Features per photo.")] = 1200,
+    features: Annotated[int, typer.Option(help="Features per photo.")] = 1000,
     thermal: Annotated[
         Path | None,
         typer.Option(help="Folder of thermal photos: their map is laid on the visual one as thermal.tif."),
