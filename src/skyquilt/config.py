@@ -12,6 +12,7 @@ from skyquilt.errors import UsageError
 from skyquilt.features.sift import Sift
 from skyquilt.geometry.transforms import Model
 from skyquilt.matching.mutual import Mutual
+from skyquilt.model.distortion import ORDERS
 from skyquilt.pairs.nearest import Nearest
 from skyquilt.pairs.retrieval import Retrieval
 from skyquilt.render.blend import Average, Blend, Feather, First, Multiband
@@ -51,7 +52,7 @@ BLENDS: dict[str, type[Blend]] = {
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
 THERMAL_UNITS = ("auto", "celsius", "kelvin", "decikelvin", "centikelvin", "counts")
-DISTORTIONS = ("none", "2", "4", "6", "6t")
+DISTORTIONS = tuple(ORDERS)
 
 
 @dataclass(frozen=True, kw_only=True)
