@@ -49,7 +49,7 @@ class Blend(Protocol):
 
 def leader(layers: Sequence[Layer], ranks: Sequence[Float]) -> NDArray[np.int32]:
     """Position in `layers` of the lowest finite rank per pixel, -1 where none is."""
-    best, lead = ranks[0], np.where(np.isfinite(ranks[0]), np.int32(0), np.int32(-1))
+    best, lead = ranks[0], np.isfinite(ranks[0]).astype(np.int32) - 1
     for position, rank in enumerate(ranks[1:], 1):
         np.copyto(lead, np.int32(position), where=rank < best)
         best = np.minimum(best, rank)

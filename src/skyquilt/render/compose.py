@@ -137,7 +137,7 @@ class Composer:
         score = np.zeros((h, w), np.float32) if alone else densify(n.score, h, w)
         if not n.seen.all():
             within = inside_everywhere(n, u + np.float32(x.start), v + np.float32(y.start))
-            score = np.where(within, score, np.float32(np.inf))
+            np.copyto(score, np.float32(np.inf), where=~within)
         return self._exposed(n, warped), score
 
     def _exposed(self, n: Nodes, warped: NDArray) -> NDArray:
