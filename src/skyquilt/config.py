@@ -127,7 +127,7 @@ class MosaicSettings:
     """Common heading for method `position`; None = the commonest reported one, north where none is."""
     repair: bool = True
     """Treat metadata as measurements that may lie."""
-    features: int = 1000
+    features: int = 1200
     """Features per photo."""
     jobs: int = 0
     """Threads; 0 = all processors."""

@@ -44,7 +44,7 @@ def command(
         ),
     ] = False,
     base: Annotated[Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")] = None,
-    features: Features = 1000,
+    features: Features = 1200,
     max_mb: Annotated[float, typer.Option(help="Largest photo file in MB.")] = 500,
     max_photos: Annotated[int, typer.Option(help="Most photos taken.")] = 100_000,
     quiet: Quiet = False,

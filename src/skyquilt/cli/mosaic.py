@@ -143,7 +143,7 @@ def command(
         ),
     ] = None,
     repair: Repair = True,
-    features: Features = 1000,
+    features: Features = 1200,
     thermal: Annotated[
         Path | None,
         typer.Option(help="Folder of thermal photos: their map is laid on the visual one as thermal.tif."),

@@ -19,9 +19,9 @@ SPARE = 1.2
 class Sift:
     """SIFT (Lowe 2004) on a shrunken image, descriptors as RootSIFT (Arandjelovic and Zisserman 2012)."""
 
-    count: int = 1000
+    count: int = 1200
     """Most keypoints kept per photo."""
-    longest: int = 480
+    longest: int = 512
     """Longest side in px of the image searched; smaller photos are searched as they are."""
     contrast: float = 0.015
     """OpenCV's contrast threshold."""
