@@ -46,6 +46,7 @@ $(USE): .venv/pyvenv.cfg pyproject.toml constraints.txt
 	@echo "installing Skyquilt into .venv (a minute or two, the first time)"
 	@$(PIP) setuptools
 	@$(PIP) --no-build-isolation --editable .
+	@$(BIN)/python -m compileall -q src/skyquilt  # as pip does where it copies files
 	@touch $@
 
 $(DEVELOP): $(USE)

@@ -2,22 +2,17 @@
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from skyquilt.alignment.bundle import Bundle
-from skyquilt.alignment.by_flightline import ByFlightline
-from skyquilt.alignment.chain import Chain
-from skyquilt.alignment.hybrid import Hybrid
-from skyquilt.alignment.optimise import Anneal, Surfaces
-from skyquilt.alignment.overview import ByOverview
 from skyquilt.alignment.pose import ByPose, ByPosition
 from skyquilt.errors import UsageError
 from skyquilt.features.sift import Sift
 from skyquilt.geometry.transforms import Model
-from skyquilt.matching.best import Best
 from skyquilt.matching.mutual import Mutual
+from skyquilt.model.distortion import ORDERS
 from skyquilt.pairs.nearest import Nearest
 from skyquilt.pairs.retrieval import Retrieval
 from skyquilt.render.blend import Average, Blend, Feather, First, Multiband
@@ -25,11 +20,13 @@ from skyquilt.render.drift import Drift
 from skyquilt.render.exposure import Balance
 from skyquilt.surface.sweep import Sweep
 from skyquilt.surface.tiepoints import FromTiePoints
-from skyquilt.twoview.levelled import Level
-from skyquilt.twoview.ransac import Ransac
-from skyquilt.twoview.rescued import Rescued
-from skyquilt.twoview.ste import RansacSte
 from skyquilt.twoview.verify import Verify
+
+if TYPE_CHECKING:
+    from skyquilt.alignment.by_flightline import ByFlightline
+    from skyquilt.alignment.chain import Chain
+    from skyquilt.alignment.hybrid import Hybrid
+    from skyquilt.alignment.overview import ByOverview
 
 METHODS = ("auto", "bundle", "position", "pose", "image", "hybrid", "flightline")
 BY_METADATA = ("position", "pose", "hybrid")
@@ -55,7 +52,7 @@ BLENDS: dict[str, type[Blend]] = {
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
 THERMAL_UNITS = ("auto", "celsius", "kelvin", "decikelvin", "centikelvin", "counts")
-DISTORTIONS = ("none", "2", "4", "6", "6t")
+DISTORTIONS = tuple(ORDERS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,11 +203,11 @@ class Methods:
     """Alignment from metadata."""
     by_position: ByPosition
     """Alignment from positions."""
-    by_image: Chain | ByOverview
-    """Alignment from pixels alone."""
-    hybrid: Hybrid
+    by_image: "Chain | ByOverview | None"
+    """Alignment from pixels alone; like the next two, made (and loaded) only where it is asked for."""
+    hybrid: "Hybrid | None"
     """Alignment from metadata, corrected by pixels."""
-    by_flightline: ByFlightline
+    by_flightline: "ByFlightline | None"
     """Alignment of flight lines."""
     surface: FromTiePoints
     """Heights."""
@@ -240,13 +237,20 @@ def methods(settings: MosaicSettings) -> Methods:
         bundle=Bundle(distortion=settings.distortion or "4", repair=settings.repair),
         by_pose=ByPose(height_m=settings.height_m),
         by_position=ByPosition(height_m=settings.height_m, heading_deg=settings.heading_deg),
-        by_image=_by_image(settings), hybrid=_hybrid(settings), by_flightline=_by_flightline(settings),
+        by_image=_by_image(settings) if settings.method == "image" else None,
+        hybrid=_hybrid(settings) if settings.method == "hybrid" else None,
+        by_flightline=_by_flightline(settings) if flightline else None,
         surface=FromTiePoints(), sweep=Sweep() if settings.surface == "sweep" else None, balance=Balance(),
         drift=Drift(), blend=Feather(width_px=settings.feather_px) if blend == "feather" else BLENDS[blend](),
     )  # fmt: skip
 
 
-def _by_image(settings: MosaicSettings) -> Chain | ByOverview:
+def _by_image(settings: MosaicSettings) -> "Chain | ByOverview":
+    from skyquilt.alignment.chain import Chain
+    from skyquilt.alignment.overview import ByOverview
+    from skyquilt.twoview.levelled import Level
+    from skyquilt.twoview.ransac import Ransac
+
     model = cast(Model, settings.transform or "similarity")
     order, height = settings.distortion or "6t", settings.height_m
     if settings.image_search == "overview":
@@ -261,12 +265,20 @@ def _by_image(settings: MosaicSettings) -> Chain | ByOverview:
     return Chain(match=Mutual(), estimate=estimate, level=level, distortion=order, height_m=height)
 
 
-def _hybrid(settings: MosaicSettings) -> Hybrid:
+def _hybrid(settings: MosaicSettings) -> "Hybrid":
+    from skyquilt.alignment.hybrid import Hybrid
+    from skyquilt.alignment.optimise import Anneal, Surfaces
+
     optimise = Anneal() if settings.optimiser == "anneal" else Surfaces()
     return Hybrid(optimise=optimise, alpha=settings.alpha, seed=settings.seed)
 
 
-def _by_flightline(settings: MosaicSettings) -> ByFlightline:
+def _by_flightline(settings: MosaicSettings) -> "ByFlightline":
+    from skyquilt.alignment.by_flightline import ByFlightline
+    from skyquilt.matching.best import Best
+    from skyquilt.twoview.rescued import Rescued
+    from skyquilt.twoview.ste import RansacSte
+
     model = cast(Model, settings.transform or "homography")
     estimate = Rescued(
         first=RansacSte(model=model, seed=settings.seed),

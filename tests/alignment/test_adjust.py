@@ -146,6 +146,20 @@ def test_the_sparse_system_is_the_dense_one(monkeypatch, points):
     assert covariance(block.problem, block.start) is None
 
 
+def test_both_dense_solvers_agree_and_refuse_alike(monkeypatch):
+    block = make_block(5, lines=2, per_line=4, points=60)
+    reduced = Reduced(block.problem, normal_equations(block.problem, block.start), 1e-3)
+    assert reduced.size <= module.SMALL
+    small = reduced.solve(reduced.g)
+    monkeypatch.setattr(module, "SMALL", 0)
+    assert reduced.solve(reduced.g) == pytest.approx(small, rel=1e-6, abs=1e-9)
+    reduced.S = -reduced.S
+    for limit in (0, 500):
+        monkeypatch.setattr(module, "SMALL", limit)
+        with pytest.raises(np.linalg.LinAlgError):
+            reduced.solve(reduced.g)
+
+
 def test_the_sparse_adjustment_ends_where_the_dense_one_does(monkeypatch):
     block = make_block(6, lines=2, per_line=4)
     dense = adjust(block.problem, block.start, tolerance=1e-12)

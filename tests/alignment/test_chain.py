@@ -5,7 +5,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment.chain import Chain, implausible
+from skyquilt.alignment.chain import Chain
+from skyquilt.alignment.joining import implausible
 from skyquilt.alignment.overview import ByOverview
 from skyquilt.features.sift import Sift
 from skyquilt.imaging.views import make_views, on_ground

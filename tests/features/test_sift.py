@@ -6,7 +6,7 @@ import pytest
 
 from skyquilt.features.sift import Sift
 from skyquilt.features.spread import spread
-from skyquilt.imaging.grey import full_px, shrink, to_grey8
+from skyquilt.imaging.grey import full_px, halved, shrink, to_grey8
 from skyquilt.matching.mutual import Mutual
 from skyquilt.model.features import DESCRIPTOR_UNIT
 from tests.texture import texture
@@ -157,3 +157,10 @@ def test_a_blank_image_has_no_features(blank):
 
 def test_grey_of_eight_bits_is_left_alone(picture):
     assert to_grey8(picture) is picture
+
+
+@pytest.mark.parametrize("size", [(2250, 4000, 3), (960, 1280), (1500, 1000, 3), (300, 400)])
+def test_halving_first_changes_nothing(size):
+    image = np.random.default_rng(3).integers(0, 256, size, np.uint8)
+    rough = halved(image, 400)
+    assert max(rough.shape) >= min(400, max(size)) and (shrink(rough, 400)[0] == shrink(image, 400)[0]).all()

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from skyquilt.errors import OutputError, RefusedError, UsageError
-from skyquilt.geometry.board_camera import ORDERS, board_camera
+from skyquilt.geometry.board_camera import board_camera
+from skyquilt.model.distortion import ORDERS
 from skyquilt.model.event import Result, StageProgress
 from skyquilt.pipelines.strip_test import iter_strip_test
 from skyquilt.simulate import StripSettings, fly_strip

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -11,6 +12,7 @@ from skyquilt.imaging.views import STEP, inside
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.render.blend import Average, Feather, First, Multiband
+from skyquilt.render.compose import _remapped
 from skyquilt.render.newest import Newest
 from tests.render.scenes import CAMERA, GRID, block, composer, photograph, truth, view
 
@@ -213,3 +215,15 @@ def test_nothing_to_see():
     far = view(0, 500, 500)
     made = composer([far], {0: np.zeros((300, 400, 1), np.uint8)}, GRID)(WHOLE)
     assert (made.photo == -1).all() and not made.pixels.any() and not made.views.any()
+
+
+@pytest.mark.parametrize("bands", [1, 3, 4])
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+@pytest.mark.parametrize("cut", [40, 400])
+def test_a_fourth_band_on_the_way_changes_nothing(bands, dtype, cut):
+    rng = np.random.default_rng(bands)
+    image = rng.uniform(0, 255, (cut, cut, bands)).astype(dtype)
+    u, v = rng.uniform(-3, cut + 3, (2, 48, 64)).astype(np.float32)
+    plain = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(48, 64, bands)
+    found = _remapped(image, u, v)
+    assert found.dtype == dtype and (found == plain).all()

@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyquilt.model.raster import Window
+from skyquilt.render import exposure
 from skyquilt.render.exposure import NEUTRAL, Balance, Exposure, odds_table, with_odds
 from tests.render.scenes import FLAT, GRID, block, composer, photograph
 
@@ -142,3 +143,42 @@ def test_measured_values_are_never_touched(lit):
         Window(row=64, column=64, height=64, width=64)
     )
     assert made.pixels == pytest.approx(21.5)
+
+
+def stated_plainly(terms, row, point, y, ridge, count):
+    """The robust solution by full matrices: of each point's samples the weighted mean is taken off, then least squares."""
+    k = terms.shape[1]
+    A = np.zeros((len(y), count * k))
+    for sample, photo in enumerate(row):
+        A[sample, photo * k : (photo + 1) * k] = terms[sample]
+    w, x = np.ones(len(y)), np.zeros((count * k, y.shape[1]))
+    same = (point[:, None] == point).astype(float)
+    for _ in range(6):
+        mean = same * w / (same @ w)[:, None]
+        root = np.sqrt(w)[:, None]
+        B, z = root * (A - mean @ A), root * (y - mean @ y)
+        pull = np.diag(np.tile(ridge, count) * exposure.SIGMA_LEVEL**2 * exposure.CORRELATED)
+        before, x = x, np.linalg.solve(B.T @ B + pull, -B.T @ z)
+        if np.abs(x - before).max() < exposure.SETTLED:
+            break
+        level = y + A @ x
+        w = 1 / (1 + ((level - mean @ level) ** 2).mean(1) / 0.25**2)
+    return x.reshape(count, k, -1)
+
+
+@pytest.mark.parametrize("dense", [1, 1000])
+@pytest.mark.parametrize(("k", "bands"), [(6, 1), (1, 3)])
+def test_blocks_give_what_full_matrices_give(k, bands, dense, monkeypatch):
+    monkeypatch.setattr(exposure, "DENSE", dense)
+    rng = np.random.default_rng(k)
+    seen = rng.random((60, 7)) < 0.5
+    seen[0] = False
+    seen[1] = True
+    point, row = np.nonzero(seen)
+    shuffled = rng.permutation(len(row))
+    _, point = np.unique(point[shuffled], return_inverse=True)
+    row = row[shuffled]
+    terms = np.concatenate([np.ones((len(row), 1)), rng.uniform(-1, 1, (len(row), k - 1))], 1)
+    y, ridge = rng.normal(0, 0.4, (len(row), bands)), rng.uniform(1, 50, k)
+    found = exposure._robust_differences(terms, row, point, y, ridge, 7)
+    assert np.abs(found - stated_plainly(terms, row, point, y, ridge, 7)).max() < 1e-9

@@ -7,16 +7,19 @@ intrinsic as well. The tests hold this code against pycolmap's Ceres on problems
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse
-from scipy.sparse import linalg as sparse_linalg
 
 from skyquilt.alignment.problem import Problem, State, attitude_error, linearise, residuals_px
 
+if TYPE_CHECKING:
+    from scipy import sparse
+
 Array = NDArray[np.float64]
+SMALL = 500
+"""Unknowns up to which NumPy's solver does: SciPy's halves the work, but takes longer to load than that saves."""
 DENSE_LIMIT = 4000
 """Unknowns of the reduced system up to which dense Cholesky is used."""
 
@@ -170,6 +173,24 @@ def _chunks(problem: Problem, count: int) -> list[tuple[int, int]]:
     return list(pairwise(cuts))
 
 
+def _zeros(size: int) -> "Array | sparse.lil_matrix":
+    if size <= DENSE_LIMIT:
+        return np.zeros((size, size))
+    from scipy import sparse
+
+    return sparse.lil_matrix((size, size))
+
+
+def _solve_positive(S: Array, rhs: Array) -> Array:
+    """S^-1 rhs; `LinAlgError` where S is not positive definite."""
+    if len(S) <= SMALL:
+        np.linalg.cholesky(S)  # the solver itself would take any matrix
+        return np.asarray(np.linalg.solve(S, rhs))
+    from scipy import linalg
+
+    return np.asarray(linalg.cho_solve(linalg.cho_factor(S, check_finite=False), rhs))
+
+
 class Reduced:
     """The Schur complement on photos and cameras of damped normal equations."""
 
@@ -184,10 +205,9 @@ class Reduced:
         self.g = np.concatenate([normal.gp.ravel(), normal.gc.ravel()])
         self.S: Array | sparse.csc_matrix = self._assemble(damping)
 
-    def _diagonal_blocks(self, damping: float) -> Array | sparse.lil_matrix:
+    def _diagonal_blocks(self, damping: float) -> "Array | sparse.lil_matrix":
         n, m, N = self.n, self.m, self.normal
-        dense = self.size <= DENSE_LIMIT
-        S = np.zeros((self.size, self.size)) if dense else sparse.lil_matrix((self.size, self.size))
+        S = _zeros(self.size)
         for i in range(n):
             block = N.U[i] + np.diag(np.diag(N.U[i]) * damping + 1e-9)
             S[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = block
@@ -221,7 +241,7 @@ class Reduced:
         )
         return unknowns, rows.reshape(len(rows), -1), slice(first, last)
 
-    def _assemble(self, damping: float) -> Array | sparse.csc_matrix:
+    def _assemble(self, damping: float) -> "Array | sparse.csc_matrix":
         S = self._diagonal_blocks(damping)
         z = np.einsum("pij,pj->pi", self.L_inv, self.normal.gv)
         parts: list[tuple[Array, Array, Array]] = []
@@ -237,14 +257,18 @@ class Reduced:
                 parts.append((i[keep], j[keep], -product[keep]))
         if isinstance(S, np.ndarray):
             return S
+        from scipy import sparse
+
         i, j, v = (np.concatenate(x) for x in zip(*parts, strict=True))
         return (S.tocsc() + sparse.coo_matrix((v, (i, j)), S.shape).tocsc()).tocsc()
 
     def solve(self, rhs: Array) -> Array:
         """S^-1 rhs."""
         if isinstance(self.S, np.ndarray):
-            return np.asarray(linalg.cho_solve(linalg.cho_factor(self.S, check_finite=False), rhs))
-        return np.asarray(sparse_linalg.splu(self.S, permc_spec="MMD_AT_PLUS_A").solve(rhs))
+            return _solve_positive(self.S, rhs)
+        from scipy.sparse import linalg
+
+        return np.asarray(linalg.splu(self.S, permc_spec="MMD_AT_PLUS_A").solve(rhs))
 
     def step(self) -> tuple[Array, Array, Array]:
         """The Gauss-Newton step of photos (n, 6), cameras (m, 8) and points (P, 3)."""

@@ -8,8 +8,8 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.chain import Estimator, Matcher, implausible, plane_alignment
 from skyquilt.alignment.flightlines import by_distance, by_heading, middle_out, pairs_across, reversals
+from skyquilt.alignment.joining import Estimator, Matcher, implausible, plane_alignment
 from skyquilt.alignment.lens import of_order, to_working, working_K
 from skyquilt.alignment.planar import planar_pose
 from skyquilt.alignment.pose import reported_camera

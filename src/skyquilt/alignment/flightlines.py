@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay, QhullError
 
 Array = NDArray[np.float64]
 BINS = 9
@@ -97,6 +96,8 @@ def pairs_across(xy: Array, lines: Sequence[Sequence[int]]) -> list[tuple[int, i
 
     An edge goes when any triangle it belongs to is obtuse, as A prints it.
     """
+    from scipy.spatial import Delaunay, QhullError  # few ask for flight lines, and all would wait for it
+
     line_of = {i: k for k, line in enumerate(lines) for i in line}
     used = np.array(sorted(line_of))
     try:

@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 
 from skyquilt.geometry.camera import undistort
 from skyquilt.model.camera import Camera
+from skyquilt.model.distortion import order_named
 
 Array = NDArray[np.float64]
-TERMS = {"none": 0, "2": 1, "4": 2, "6": 3, "6t": 3}
-"""Radial coefficients of each order of distortion."""
 WORKING_WIDTH = 1500
 """Width in px of the working image that thresholds are meant for (Y 4.2.2, A 2.1)."""
 
@@ -21,21 +20,19 @@ def of_order(camera: Camera, order: str) -> Camera:
     Fitted by itself, focal length and principal point included, never cut from the higher one: what the left-out
     terms did is taken over by the others as far as they can (linear least squares over a grid of pixels).
     """
-    if order not in TERMS:
-        raise ValueError(f"one of {', '.join(TERMS)} expected, got {order!r}")
-    steps = 25
+    kept, steps = order_named(order), 25
     grid = np.meshgrid(np.linspace(0, camera.width - 1, steps), np.linspace(0, camera.height - 1, steps))
     px = np.stack(grid, -1).reshape(-1, 2)
     x, y = undistort(camera, px).T
-    r2, n, zero = x * x + y * y, TERMS[order], np.zeros_like(x)
+    r2, n, zero = x * x + y * y, kept.radial, np.zeros_like(x)
     columns = [np.r_[x, y], np.r_[zero + 1, zero], np.r_[zero, zero + 1]]
     columns += [np.r_[x * r2**k, y * r2**k] for k in range(1, n + 1)]
-    if order == "6t":
+    if kept.tangential:
         columns += [np.r_[2 * x * y, r2 + 2 * y * y], np.r_[r2 + 2 * x * x, 2 * x * y]]
     solved = np.linalg.lstsq(np.stack(columns, -1), np.r_[px[:, 0], px[:, 1]], rcond=None)[0]
     radial = np.zeros(3)
     radial[:n] = solved[3 : 3 + n] / solved[0]
-    tangential = solved[3 + n :] / solved[0] if order == "6t" else np.zeros(2)
+    tangential = solved[3 + n :] / solved[0] if kept.tangential else np.zeros(2)
     return replace(
         camera, focal=float(solved[0]), cx=float(solved[1]), cy=float(solved[2]),
         k1=float(radial[0]), k2=float(radial[1]), k3=float(radial[2]),

@@ -8,12 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.chain import Estimator, Leveller, Matcher, implausible, plane_alignment
+from skyquilt.alignment.joining import Estimator, Leveller, Matcher, plane_alignment, registered
 from skyquilt.alignment.lens import of_order
 from skyquilt.alignment.pieces import Piece, lay
 from skyquilt.alignment.pose import reported_camera
 from skyquilt.geometry.camera import undistort
-from skyquilt.geometry.transforms import transfer
 from skyquilt.imaging.plane import Overview, to_grid
 from skyquilt.model.camera import Camera
 from skyquilt.model.estimate import NoEstimate
@@ -110,20 +109,8 @@ class ByOverview:
         px = features.px[matches.index_a]
         a = undistort(camera, px) * K[0, 0]
         b = known.px[matches.index_b] + (overview.column, overview.row)
-        found = self.estimate(a, b)
-        if isinstance(found, NoEstimate):
-            return found
-        if reason := implausible(found.b_H_a, np.zeros(2)):
-            return NoEstimate(reason=reason)
-        inner = np.flatnonzero(found.inliers)
-        disparity, level = b[inner] - transfer(found.b_H_a, a[inner]), np.ones(len(inner), bool)
-        if self.level is not None:
-            levelled = self.level(a, b, found)
-            found, disparity, level = levelled.estimate, levelled.d_px, levelled.level
-        return found.b_H_a @ K, Join(
-            photo=photo, onto=-1, matches=len(matches), inliers=int(found.inliers.sum()),
-            ste_px2=found.ste_per_inlier, score=np.nan, moved_m=np.nan, px=px[inner], d_px=disparity, levelled=level,
-        )  # fmt: skip
+        found = registered(photo, -1, px, a, b, estimate=self.estimate, level=self.level, centre=np.zeros(2))
+        return found if isinstance(found, NoEstimate) else (found[0] @ K, found[1])
 
     def _features(self, overview: Overview) -> Features:
         """Features of the overview, those at its rim left out."""

@@ -11,15 +11,12 @@ from skyquilt.alignment.start import Start
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.geometry.frames import angle_difference_deg, cam_R_map_from_angles
 from skyquilt.model.camera import Camera
+from skyquilt.model.distortion import order_named
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Pose, Prior
 
 Array = NDArray[np.float64]
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
-FREE = {
-    "none": (1, 1, 1, 0, 0, 0, 0, 0), "2": (1, 1, 1, 1, 0, 0, 0, 0), "4": (1, 1, 1, 1, 1, 0, 0, 0),
-    "6": (1, 1, 1, 1, 1, 1, 0, 0), "6t": (1, 1, 1, 1, 1, 1, 1, 1),
-}  # fmt: skip
 INDEPENDENT = 40
 """Independent sightings that a photo's many correlated ones are worth."""
 YAW_LIE_DEG = 20.0
@@ -196,7 +193,7 @@ def intrinsic_priors(photos: Sequence[Photo], distortion: str) -> tuple[Array, A
             ideal = Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
             K0.append(ideal.vector)
             sigma.append([photo.focal.sigma_px, 0.01 * wide, 0.01 * wide, 0.1, 0.1, 0.05, 2e-3, 2e-3])
-    free = np.tile(np.array(FREE[distortion], bool), (len(photos), 1))
+    free = np.tile(np.array((True, True, True, *order_named(distortion).terms)), (len(photos), 1))
     return np.array(K0), np.array(sigma), free
 
 

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse import linalg as sparse_linalg
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+
+from skyquilt.alignment.connected import connected, outwards, spanning_tree
 
 DENSE = 300
 """Photos up to which the normal equations are solved as a full matrix."""
@@ -56,28 +55,21 @@ class PlaneSolution:
 
 def components(count: int, links: Sequence[PlaneLink]) -> list[NDArray[np.int64]]:
     """Connected groups of photos, largest first (single photos included)."""
-    graph = sparse.coo_matrix(
-        (np.ones(len(links)), ([k.a for k in links], [k.b for k in links])), (count, count)
-    )
-    _, label = connected_components(graph, directed=False)
+    label = connected(count, np.array([k.a for k in links], int), np.array([k.b for k in links], int))
     groups = [np.flatnonzero(label == g) for g in range(label.max() + 1)]
     return sorted(groups, key=lambda g: (-len(g), int(g[0])))
 
 
 def _spanning_start(members: NDArray, links: Sequence[PlaneLink], index: dict[int, int]) -> Complex:
     """log a of each member along the strongest spanning tree; root 0."""
-    k = len(members)
-    cost = sparse.lil_matrix((k, k))
+    i, j = (np.array([index[m] for m in ends], int) for ends in ([k.a for k in links], [k.b for k in links]))
     step: dict[tuple[int, int], complex] = {}
-    for link in links:
-        i, j = index[link.a], index[link.b]
-        cost[i, j] = 1.0 / (1e-6 + link.weight)
-        step[i, j], step[j, i] = -np.log(link.b_S_a), np.log(link.b_S_a)  # log a_b = log a_a - log S
-    tree = minimum_spanning_tree(cost.tocsr())
-    order, parent = breadth_first_order(tree, 0, directed=False)
-    log_a = np.zeros(k, complex)
-    for node in order[1:]:
-        log_a[node] = log_a[parent[node]] + step[int(parent[node]), int(node)]
+    for link, a, b in zip(links, i.tolist(), j.tolist(), strict=True):
+        step[a, b], step[b, a] = -np.log(link.b_S_a), np.log(link.b_S_a)  # log a_b = log a_a - log S
+    tree = spanning_tree(len(members), i, j, np.array([1.0 / (1e-6 + link.weight) for link in links]))
+    log_a = np.zeros(len(members), complex)
+    for parent, node in outwards(len(members), i, j, tree):
+        log_a[node] = log_a[parent] + step[parent, node]
     return log_a
 
 
@@ -87,6 +79,9 @@ def _solve_differences(
     """Least squares of x_j - x_i = d with weights w and of x = anchor with weights wa (>= 1e-6)."""
     if count <= DENSE:
         return _solve_small(i, j, d, w, count, anchor, wa)
+    from scipy import sparse
+    from scipy.sparse import linalg as sparse_linalg
+
     rows = np.arange(len(i))
     B = sparse.csr_matrix((np.r_[w, -w], (np.r_[rows, rows], np.r_[j, i])), (len(i), count))
     normal = (B.T @ B + sparse.diags(wa**2)).tocsc()

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
+from skyquilt.alignment.connected import connected
 from skyquilt.model.features import Features, Link
 
 Index = NDArray[np.int64]
@@ -60,9 +59,7 @@ def build_tracks(features: Sequence[Features], links: Sequence[Link], *, sigma: 
     a = np.concatenate([offset[k.a] + k.index_a for k in links])
     b = np.concatenate([offset[k.b] + k.index_b for k in links])
     total = int(offset[-1])
-    _, label = connected_components(
-        sparse.coo_matrix((np.ones(len(a)), (a, b)), (total, total)), directed=False
-    )
+    label = connected(total, a, b)
     used = np.unique(np.concatenate([a, b]))
     photo = np.searchsorted(offset, used, "right") - 1
     order = np.lexsort((photo, label[used]))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
+from skyquilt.cli.options import Json, Output, Overwrite, Quiet, mode_of
 from skyquilt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ def command(
     frames: Annotated[
         Path, typer.Argument(help="Folder of frames, thermal or visible (subfolders included).")
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
+    output: Output,
     board: Annotated[str, typer.Option(help="Squares (not corners) of the board, such as 7x6.")],
     square: Annotated[float, typer.Option(help="Side of a square in m.")],
     series: Annotated[
@@ -28,23 +29,20 @@ def command(
         ),
     ] = "auto",
     jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.", min=0)] = 0,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the results of another run in OUTPUT.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Calibrate a lens from views of a chess-board; writes cameras.json as `mosaic --cameras` reads it."""
     with ends_at_once():
         from skyquilt.cli.progress import show
         from skyquilt.pipelines.calibrate import CalibrateSettings, iter_calibrate
 
-    if quiet and json:
-        raise UsageError("--quiet and --json exclude one another")
+    mode = mode_of(quiet=quiet, json=json)
     columns, rows = parse_board(board)
     settings = CalibrateSettings(columns=columns, rows=rows, square_m=square, series=series, jobs=jobs)
     events = iter_calibrate(frames, output, settings, overwrite=overwrite)
-    show(events, mode="quiet" if quiet else "json" if json else "normal", summary=summary)
+    show(events, mode=mode, summary=summary)
 
 
 def parse_board(text: str) -> tuple[int, int]:

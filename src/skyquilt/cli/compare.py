@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.errors import UsageError
+from skyquilt.cli.options import Cameras, Gsd, Jobs, Json, Output, Overwrite, Photos, Quiet, Repair, mode_of
 
 if TYPE_CHECKING:
     from skyquilt.model.event import Result
 
 
 def command(
-    photos: Annotated[Path, typer.Argument(help="Folder of photos (subfolders included).")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
+    photos: Photos,
+    output: Output,
     methods: Annotated[
         str | None,
         typer.Option(
@@ -40,26 +40,20 @@ def command(
             show_default="tie points of bundle",
         ),
     ] = None,
-    gsd: Annotated[
-        float | None, typer.Option(help="Ground size of a map pixel in cm.", show_default="the photos' own")
-    ] = None,
+    gsd: Gsd = None,
     geo: Annotated[Path | None, typer.Option(help="Positions: geo.txt, CSV, .MRK or .SRT.")] = None,
-    cameras: Annotated[Path | None, typer.Option(help="Calibrations (cameras.json).")] = None,
+    cameras: Cameras = None,
     height: Annotated[float | None, typer.Option(help="Height above ground in m.")] = None,
     alpha: Annotated[float, typer.Option(help="Weight of distances against looks, 0 to 1.")] = 0.5,
     lines: Annotated[
         str, typer.Option(help="How flight lines are told apart: heading, distance.")
     ] = "heading",
-    repair: Annotated[
-        bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")
-    ] = True,
+    repair: Repair = True,
     seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
-    jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.")] = 0,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an earlier comparison in OUTPUT.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
+    jobs: Jobs = 0,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Align one survey by every method, and set the results side by side.
 
@@ -70,8 +64,7 @@ def command(
         from skyquilt.config import MosaicSettings
         from skyquilt.pipelines.compare import VARIANTS, CompareSettings, iter_compare
 
-    if quiet and json:
-        raise UsageError("--quiet and --json exclude one another")
+    mode = mode_of(quiet=quiet, json=json)
     shared = MosaicSettings(
         gsd_cm=gsd, geo=geo, cameras=cameras, height_m=height, alpha=alpha, lines=lines, repair=repair, seed=seed,
         jobs=jobs, distances=distances,
@@ -79,7 +72,7 @@ def command(
     asked = tuple(m.strip() for m in methods.split(",")) if methods is not None else tuple(VARIANTS)
     settings = CompareSettings(mosaic=shared, variants=asked, first=first, known=known)
     events = iter_compare(photos, output, settings, overwrite=overwrite)
-    show(events, mode="quiet" if quiet else "json" if json else "normal", summary=summary)
+    show(events, mode=mode, summary=summary)
 
 
 def summary(result: "Result") -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.errors import UsageError
+from skyquilt.cli.options import Crs, Features, Gsd, Jobs, Json, Output, Overwrite, Quiet, mode_of
 
 if TYPE_CHECKING:
     from skyquilt.model.event import Result
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def command(
     photos: Annotated[list[Path], typer.Argument(help="A folder of photos, or two photos and more.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
+    output: Output,
     route: Annotated[
         str,
         typer.Option(
@@ -22,12 +22,8 @@ def command(
             " merged), reconstruction (heights of the whole adjustment), auto (pair for two photos)."
         ),
     ] = "auto",
-    gsd: Annotated[
-        float | None, typer.Option(help="Ground size of a map pixel in cm.", show_default="the photos' own")
-    ] = None,
-    crs: Annotated[
-        str | None, typer.Option(help="Output CRS, e.g. EPSG:32633.", show_default="local UTM")
-    ] = None,
+    gsd: Gsd = None,
+    crs: Crs = None,
     relief: Annotated[
         float | None,
         typer.Option(
@@ -35,13 +31,11 @@ def command(
             show_default="a tenth of the height",
         ),
     ] = None,
-    features: Annotated[int, typer.Option(help="Features per photo.")] = 3000,
-    jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.")] = 0,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace a former result in OUTPUT.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
+    features: Features = 3000,
+    jobs: Jobs = 0,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Depth maps: of a pair, a mosaic of disparities, or the whole reconstruction on a plane.
 
@@ -52,12 +46,11 @@ def command(
         from skyquilt.config import MosaicSettings
         from skyquilt.pipelines.depth import iter_depth
 
-    if quiet and json:
-        raise UsageError("--quiet and --json exclude one another")
+    mode = mode_of(quiet=quiet, json=json)
     settings = MosaicSettings(gsd_cm=gsd, crs=crs, features=features, jobs=jobs)
     source = photos[0] if len(photos) == 1 else photos
     events = iter_depth(source, output, settings, route=route, relief_m=relief, overwrite=overwrite)
-    show(events, mode="quiet" if quiet else "json" if json else "normal", summary=summary)
+    show(events, mode=mode, summary=summary)
 
 
 def summary(result: "Result") -> str:

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
+from skyquilt.cli.options import Quiet
 
 
 def command(
@@ -27,7 +28,7 @@ def command(
         str | None, typer.Option(envvar="SKYQUILT_TOKEN", help="Secret of the live map.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Of losses and order.")] = 0,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Send the photos of a flight as drones in the air would: in time, with losses, disorder, previews first."""
     with ends_at_once():

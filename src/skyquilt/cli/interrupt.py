@@ -1,5 +1,6 @@
 """Ctrl-C: one sentence and exit code 130, whenever it comes."""
 
+import gc
 import os
 import signal
 import sys
@@ -32,13 +33,20 @@ def leave() -> NoReturn:
 def ends_at_once() -> Iterator[None]:
     """While modules load, Ctrl-C ends the program then and there.
 
-    Nothing is under way yet that needs care, and some modules swallow every exception while they load.
+    Nothing is under way yet that needs care, and some modules swallow every exception while they load. The garbage
+    collector rests meanwhile, and what was loaded it never looks through again: modules are no garbage, and looking
+    takes a tenth of the time that loading does.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     former = signal.signal(signal.SIGINT, lambda *_: leave())
+    collects = gc.isenabled()
+    gc.disable()
     try:
         yield
     finally:
+        gc.freeze()
+        if collects:
+            gc.enable()
         signal.signal(signal.SIGINT, former)

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
+from skyquilt.cli.options import Features, Json, Quiet
 
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder of the survey; the same again goes on.")]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the viewer; 0 = a free one.")]
@@ -43,11 +44,11 @@ def command(
         ),
     ] = False,
     base: Annotated[Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")] = None,
-    features: Annotated[int, typer.Option(help="Features per photo.")] = 1200,
+    features: Features = 1200,
     max_mb: Annotated[float, typer.Option(help="Largest photo file in MB.")] = 500,
     max_photos: Annotated[int, typer.Option(help="Most photos taken.")] = 100_000,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Map photos as they arrive, and show the growing map in a browser.
 

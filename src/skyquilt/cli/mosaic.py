@@ -6,6 +6,21 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
+from skyquilt.cli.options import (
+    Cameras,
+    Crs,
+    Features,
+    Gsd,
+    Jobs,
+    Json,
+    Output,
+    Overwrite,
+    Photos,
+    Quiet,
+    Repair,
+    Verbose,
+    mode_of,
+)
 from skyquilt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -13,18 +28,14 @@ if TYPE_CHECKING:
 
 
 def command(
-    photos: Annotated[Path, typer.Argument(help="Folder of photos (subfolders included).")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
+    photos: Photos,
+    output: Output,
     method: Annotated[
         str,
         typer.Option(help="How photos are aligned: auto, bundle, position, pose, image, hybrid, flightline."),
     ] = "auto",
-    gsd: Annotated[
-        float | None, typer.Option(help="Ground size of a map pixel in cm.", show_default="the photos' own")
-    ] = None,
-    crs: Annotated[
-        str | None, typer.Option(help="Output CRS, e.g. EPSG:32633.", show_default="local UTM")
-    ] = None,
+    gsd: Gsd = None,
+    crs: Crs = None,
     gcp: Annotated[
         Path | None,
         typer.Option(help="Control points.", show_default="gcp_list.txt among the photos, if any"),
@@ -35,7 +46,7 @@ def command(
             help="Positions: geo.txt, CSV, .MRK or .SRT.", show_default="geo.txt among the photos, if any"
         ),
     ] = None,
-    cameras: Annotated[Path | None, typer.Option(help="Calibrations (cameras.json).")] = None,
+    cameras: Cameras = None,
     bounds: Annotated[str | None, typer.Option(help="west,south,east,north in the output CRS.")] = None,
     boundary: Annotated[
         Path | None, typer.Option(help="Polygon to cut the map to: GeoJSON, KML, GeoPackage, Shapefile.")
@@ -131,10 +142,8 @@ def command(
             show_default="the commonest reported",
         ),
     ] = None,
-    repair: Annotated[
-        bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")
-    ] = True,
-    features: Annotated[int, typer.Option(help="Features per photo.")] = 1200,
+    repair: Repair = True,
+    features: Features = 1200,
     thermal: Annotated[
         Path | None,
         typer.Option(help="Folder of thermal photos: their map is laid on the visual one as thermal.tif."),
@@ -155,7 +164,7 @@ def command(
             " first that can be believed)."
         ),
     ] = "auto",
-    jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.")] = 0,
+    jobs: Jobs = 0,
     memory: Annotated[
         float | None, typer.Option(help="Memory to stay within, in GB.", show_default="1.2")
     ] = None,
@@ -166,12 +175,10 @@ def command(
             " measure, report."
         ),
     ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the results of another run in OUTPUT.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Say more: every stage's time.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    json: Json = False,
 ) -> None:
     """Turn a folder of drone photos into a georeferenced, orthorectified mosaic.
 
@@ -184,8 +191,7 @@ def command(
 
     if rerun_from is not None and rerun_from not in STAGES[1:]:
         raise UsageError(f"--rerun-from {rerun_from!r} is not one of {', '.join(STAGES[1:])}")
-    if quiet + verbose + json > 1:
-        raise UsageError("--quiet, --verbose and --json exclude one another")
+    mode = mode_of(quiet=quiet, json=json, verbose=verbose)
     settings = MosaicSettings(
         method=method, gsd_cm=gsd, crs=crs, gcp=gcp, geo=geo, cameras=cameras, bounds=parse_bounds(bounds),
         boundary=boundary, surface=surface, blend=blend, feather_px=feather, balance=balance,
@@ -204,7 +210,7 @@ def command(
             photos, thermal, output, settings, route=thermal_route, overwrite=overwrite, rerun_from=rerun_from
         )
     show(
-        events, mode="quiet" if quiet else "json" if json else "verbose" if verbose else "normal",
+        events, mode=mode,
         summary=None if thermal is None else with_thermal,
     )  # fmt: skip
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.errors import UsageError
+from skyquilt.cli.options import Json, Output, Overwrite, Quiet, mode_of
 
 if TYPE_CHECKING:
     from skyquilt.model.event import Result
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 def command(
     a: Annotated[Path, typer.Argument(metavar="A", help="The reference: a photo or a GeoTIFF.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="The picture to lay on it.")],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
+    output: Output,
     method: Annotated[
         str,
         typer.Option(
@@ -29,11 +29,9 @@ def command(
             "--use-metadata/--ignore-metadata", help="Try first what metadata and places say beforehand."
         ),
     ] = True,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the results of another run in OUTPUT.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Register two pictures of different spectra: photos, radiometric photos or maps.
 
@@ -44,11 +42,10 @@ def command(
         from skyquilt.config_register import RegisterSettings
         from skyquilt.pipelines.register import iter_register
 
-    if quiet and json:
-        raise UsageError("--quiet and --json exclude one another")
+    mode = mode_of(quiet=quiet, json=json)
     settings = RegisterSettings(method=method, use_metadata=metadata)
     events = iter_register(a, b, output, settings, overwrite=overwrite)
-    show(events, mode="quiet" if quiet else "json" if json else "normal", summary=summary)
+    show(events, mode=mode, summary=summary)
 
 
 def summary(result: "Result") -> str:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
+from skyquilt.cli.options import Json, Output, Overwrite, Quiet, mode_of
 from skyquilt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -19,15 +20,13 @@ def command(
             metavar="PAIRS.csv", help="Pairs: class, source, a, b, tolerance_px, h11 to h33 (b_H_a)."
         ),
     ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")],
+    output: Output,
     method: Annotated[
         str, typer.Option(help="Methods, separated by commas.")
     ] = "auto,sift,surf,usurf,rfae,surf+rfae",
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace the results of another run in OUTPUT.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Register every pair of a list by every method, and compare with the truth.
 
@@ -37,13 +36,12 @@ def command(
         from skyquilt.cli.progress import show
         from skyquilt.pipelines.spectral_bench import iter_spectral_bench
 
-    if quiet and json:
-        raise UsageError("--quiet and --json exclude one another")
+    mode = mode_of(quiet=quiet, json=json)
     asked = tuple(dict.fromkeys(word.strip() for word in method.split(",") if word.strip()))
     if not asked:
         raise UsageError("--method names no method; give at least one, such as auto")
     events = iter_spectral_bench(pairs, output, asked, overwrite=overwrite)
-    show(events, mode="quiet" if quiet else "json" if json else "normal", summary=summary)
+    show(events, mode=mode, summary=summary)
 
 
 def summary(result: "Result") -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.errors import UsageError
+from skyquilt.cli.options import Json, Overwrite, Quiet, mode_of
 
 if TYPE_CHECKING:
     from skyquilt.model.event import Result
@@ -22,11 +22,9 @@ def command(
     noise: Annotated[float, typer.Option(help="Standard deviation of a sighting, px.")] = 0.3,
     flights: Annotated[int, typer.Option(help="Strips flown with different seeds; curves are medians.")] = 5,
     seed: Annotated[int, typer.Option(help="Equal seeds give equal results.")] = 1,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace a former result in OUTPUT.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")] = False,
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")] = False,
+    overwrite: Overwrite = False,
+    quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """How true to shape a strip of photos stays: eta under seven lens models, features and transformations."""
     with ends_at_once():
@@ -34,13 +32,12 @@ def command(
         from skyquilt.pipelines.strip_test import iter_strip_test
         from skyquilt.simulate import StripSettings
 
-    if quiet and json:
-        raise UsageError("--quiet and --json exclude one another")
+    mode = mode_of(quiet=quiet, json=json)
     settings = StripSettings(
         photos=photos, overlap=overlap / 100, height=height, relief=relief, tilt=tilt, noise=noise, seed=seed
     )
     events = iter_strip_test(output, settings, flights=flights, overwrite=overwrite)
-    show(events, mode="quiet" if quiet else "json" if json else "normal", summary=_summary)
+    show(events, mode=mode, summary=_summary)
 
 
 def _summary(result: "Result") -> str:

@@ -11,6 +11,9 @@ from skyquilt.features.spread import spread
 from skyquilt.imaging.grey import full_px, shrink, to_grey8
 from skyquilt.model.features import DESCRIPTOR_UNIT, Features
 
+SPARE = 1.2
+"""Keypoints described per keypoint kept: the choice that `spread` has."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Sift:
@@ -28,7 +31,7 @@ class Sift:
     """RootSIFT; False keeps Lowe's descriptors, as the thesis used them."""
     cells: int = 10
     """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare."""
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
 
     def __call__(self, image: NDArray) -> Features:
         """Features of pixels (H, W[, C]) of a full sensor image."""
@@ -43,7 +46,7 @@ class Sift:
         grey = to_grey8(small)
         # without precise upscaling OpenCV reports every keypoint a quarter pixel down and to the right
         detector = cv2.SIFT.create(
-            int(1.4 * self.count), nOctaveLayers=self.levels, contrastThreshold=self.contrast,
+            int(SPARE * self.count), nOctaveLayers=self.levels, contrastThreshold=self.contrast,
             enable_precise_upscale=True,
         )  # fmt: skip
         points, found = detector.detectAndCompute(grey, None)

@@ -7,11 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.model.camera import Camera
+from skyquilt.model.distortion import order_named
 
 Doubles = NDArray[np.float64]
-
-ORDERS = ("none", "2", "4", "6", "6t")
-"""Radial terms up to r^0, r^2, r^4, r^6, and r^6 with tangential ones."""
 
 
 def board_camera(
@@ -22,12 +20,10 @@ def board_camera(
     `size` is (width, height) in px. Pixels are square. Each order is a fit of its own, none is cut off
     from a higher one.
     """
-    if order not in ORDERS:
-        raise ValueError(f"one of {', '.join(ORDERS)} expected, got '{order}'")
-    flags = cv2.CALIB_FIX_ASPECT_RATIO
-    flags |= 0 if order == "6t" else cv2.CALIB_ZERO_TANGENT_DIST
-    for needs, flag in (("2", cv2.CALIB_FIX_K1), ("4", cv2.CALIB_FIX_K2), ("6", cv2.CALIB_FIX_K3)):
-        flags |= flag if ORDERS.index(order) < ORDERS.index(needs) else 0
+    kept, flags = order_named(order), cv2.CALIB_FIX_ASPECT_RATIO
+    flags |= 0 if kept.tangential else cv2.CALIB_ZERO_TANGENT_DIST
+    for fixed in (cv2.CALIB_FIX_K1, cv2.CALIB_FIX_K2, cv2.CALIB_FIX_K3)[kept.radial :]:
+        flags |= fixed
     points = [board.astype(np.float32)] * len(views)
     seen = [v.astype(np.float32) for v in views]
     rms, K, d, _, _ = cv2.calibrateCamera(points, seen, size, np.eye(3), np.zeros(5), flags=flags)

@@ -31,16 +31,17 @@ def distort(xy: Array, k: Array) -> Array:
 
     `k` is (..., 8) in the order of `PARAMETERS`, one row or one row per point.
     """
-    x, y = xy[..., 0], xy[..., 1]
+    return np.stack(distort_planes(xy[..., 0], xy[..., 1], k), -1)
+
+
+def distort_planes(x: Array, y: Array, k: Array) -> tuple[Array, Array]:
+    """`distort` of coordinates that lie apart: x and y (...), `k` (8,) or a row per point."""
     k1, k2, k3, p1, p2 = (k[..., i] for i in range(3, 8))
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        -1,
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
     )
 
 

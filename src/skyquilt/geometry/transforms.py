@@ -105,12 +105,18 @@ def transfer(H: Doubles, xy: ArrayLike) -> Doubles:
         return np.asarray(p[..., :2] / p[..., 2:])
 
 
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]
+
+
 def inverse(H: Doubles) -> Doubles:
     """Inverses of (..., 3, 3), in closed form; not finite where there is none. Their last element is not made 1."""
-    rows = [np.cross(H[..., i, :], H[..., j, :]) for i, j in ((1, 2), (2, 0), (0, 1))]
-    adjugate = np.stack(rows, -1)
+    # the cross products of its rows; NumPy's own function takes five times as long for few matrices
+    a, b = H[..., _NEXT, :], H[..., _LAST, :]
+    rows = a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT]
     with np.errstate(all="ignore"):
-        return np.asarray(adjugate / (H[..., 0, :] * rows[0]).sum(-1)[..., None, None])
+        return np.asarray(
+            np.swapaxes(rows, -1, -2) / (H[..., 0, :] * rows[..., 0, :]).sum(-1)[..., None, None]
+        )
 
 
 def symmetric_transfer_errors(H: Doubles, a: ArrayLike, b: ArrayLike) -> Doubles:

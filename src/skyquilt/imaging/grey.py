@@ -10,21 +10,34 @@ def shrink(image: NDArray, longest: int) -> tuple[NDArray, float]:
 
     The scale is full-size px per px of the result, exact for both axes to within rounding of the size.
     """
+    width, size = image.shape[1], _fitting(image, longest)
+    return (image, 1.0) if size is None else (averaged(image, size), width / size[0])
+
+
+def halved(image: NDArray, longest: int) -> NDArray:
+    """The image, averaged over 2 x 2 px as often as `shrink` to the longest side does; it shrinks to the same."""
+    size = _fitting(image, longest)
+    return image if size is None else _halved(image, size)
+
+
+def _fitting(image: NDArray, longest: int) -> tuple[int, int] | None:
+    """(width, height) with the longest side as asked for; None where it is no longer."""
     height, width = image.shape[:2]
-    scale = max(1.0, max(width, height) / longest)
-    if scale == 1.0:
-        return image, 1.0
-    size = (round(width / scale), round(height / scale))
-    return averaged(image, size), width / size[0]
+    scale = max(width, height) / longest
+    return (round(width / scale), round(height / scale)) if scale > 1 else None
 
 
 def averaged(image: NDArray, size: tuple[int, int]) -> NDArray:
     """Area averages: the image (h, w[, bands]) at a smaller size (width, height)."""
+    return np.asarray(cv2.resize(_halved(image, size), size, interpolation=cv2.INTER_AREA))
+
+
+def _halved(image: NDArray, size: tuple[int, int]) -> NDArray:
     # averages of 2 x 2 have a path of their own in OpenCV, ten times as fast as any other ratio
     while image.shape[1] >= 3 * size[0] and image.shape[0] % 2 == 0 and image.shape[1] % 2 == 0:
         half = (image.shape[1] // 2, image.shape[0] // 2)
-        image = cv2.resize(image, half, interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+        image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA))
+    return image
 
 
 def to_grey8(image: NDArray) -> NDArray[np.uint8]:

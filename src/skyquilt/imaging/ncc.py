@@ -2,7 +2,6 @@
 
 import cv2
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -27,6 +26,8 @@ def ncc_of_shifts(
     At [r + dy, c + dx] b(x + dx, y + dy) lies on a(x, y). -1 where fewer than `overlap` of the smaller picture's pixels
     meet. By FFT, means and norms over the pixels that meet at each shift (Padfield, IEEE TIP 2012).
     """
+    import scipy.fft  # few ask for all shifts, and all would wait for it
+
     masks = [np.ones(p.shape, bool) if m is None else m for p, m in ((a, mask_a), (b, mask_b))]
     centred = [
         np.where(m, p - (p[m].mean() if m.any() else 0.0), 0.0) for p, m in zip((a, b), masks, strict=True)

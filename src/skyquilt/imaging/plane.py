@@ -52,18 +52,8 @@ def to_grid(
     k = camera.vector
     px = distort(plane, k) * k[0] + k[1:3]
     real = (plane**2).sum(-1) < monotone_radius(camera) ** 2
-    factor = np.array([picture.shape[1] / camera.width, picture.shape[0] / camera.height])
-    small = np.where(real[..., None], (px + 0.5) * factor - 0.5, -1e4).astype(np.float32)
-    pixels = cv2.remap(
-        picture, small[..., 0], small[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    off = np.abs((px + 0.5) / (camera.width, camera.height) - 0.5)
-    edge = 0.5 - 1.5 / np.array([picture.shape[1], picture.shape[0]])
-    shown = real & (off < edge).all(-1)
-    return Patch(
-        column=int(c0), row=int(r0), pixels=pixels.astype(np.float32), shown=shown,
-        central=shown & (off < CENTRE / 2).all(-1),
-    )  # fmt: skip
+    u, v = np.moveaxis(np.where(real[..., None], px, -1e4), -1, 0)
+    return _seen(picture, camera, u, v, real, column=int(c0), row=int(r0))
 
 
 def view_patch(picture: NDArray[np.uint8], view: View, surface: Surface, gsd: float) -> Patch | None:
@@ -86,18 +76,23 @@ def view_patch(picture: NDArray[np.uint8], view: View, surface: Surface, gsd: fl
         cv2.resize(m, size, interpolation=cv2.INTER_LINEAR)[inner, inner]
         for m in (nodes.u, nodes.v, nodes.real.astype(np.float32))
     )
-    camera = view.camera
-    across, down = picture.shape[1] / camera.width, picture.shape[0] / camera.height
-    pixels = cv2.remap(
-        picture, (u + 0.5) * np.float32(across) - 0.5, (v + 0.5) * np.float32(down) - 0.5, cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )  # fmt: skip
-    off_u, off_v = np.abs((u + 0.5) / camera.width - 0.5), np.abs((v + 0.5) / camera.height - 0.5)
-    shown = (real > 0.999) & (off_u < 0.5 - 1.5 / picture.shape[1]) & (off_v < 0.5 - 1.5 / picture.shape[0])
+    return _seen(picture, view.camera, u, v, real > 0.999, column=c0, row=r0)
+
+
+def _seen(
+    picture: NDArray[np.uint8], camera: Camera, u: NDArray, v: NDArray, real: NDArray[np.bool_], *, column: int,
+    row: int,
+) -> Patch:  # fmt: skip
+    """What a grey picture (h, w) of a photo shows at the photo's pixels u, v, where those are real."""
+    places, shown, central = [], real, real
+    for px, size, small in ((u, camera.width, picture.shape[1]), (v, camera.height, picture.shape[0])):
+        places.append(((px + 0.5) * px.dtype.type(small / size) - 0.5).astype(np.float32))
+        off = np.abs((px + 0.5) / size - 0.5)
+        shown, central = shown & (off < 0.5 - 1.5 / small), central & (off < CENTRE / 2)
+    pixels = cv2.remap(picture, places[0], places[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return Patch(
-        column=c0, row=r0, pixels=pixels.astype(np.float32), shown=shown,
-        central=shown & (off_u < CENTRE / 2) & (off_v < CENTRE / 2),
-    )  # fmt: skip
+        column=column, row=row, pixels=pixels.astype(np.float32), shown=shown, central=shown & central
+    )
 
 
 def _rim(camera: Camera, grid_H_cam: NDArray, per_side: int = 8) -> NDArray[np.float64] | None:

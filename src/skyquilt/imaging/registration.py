@@ -12,9 +12,9 @@ All sums are correlations, found by FFT; the summit is found by Newton's method 
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
+from skyquilt.imaging.fourier import fft2, ifft2
 from skyquilt.imaging.gradients import Spectra, Stack, gradients, window
 
 RADIUS = 8
@@ -78,9 +78,9 @@ def shifts_between(a: NDArray, b: NDArray, *, radius: int = RADIUS) -> list[Shif
 def _block(ga: Spectra, gb: Spectra, radius: int) -> list[Shift]:
     """Shifts from gradients."""
     w = window(ga.shape[1])
-    cross = np.conj(scipy.fft.fft2(ga * w)) * scipy.fft.fft2(gb * w)
+    cross = np.conj(fft2(ga * w)) * fft2(gb * w)
     energy = _energies(ga, gb, w, radius + 1)
-    field = (_near(scipy.fft.ifft2(cross).real, radius + 1) / np.sqrt(energy)).astype(np.float32)
+    field = (_near(ifft2(cross).real, radius + 1) / np.sqrt(energy)).astype(np.float32)
     inner = field[:, 1:-1, 1:-1]
     top = inner.reshape(len(inner), -1).argmax(1)
     row, column = top // inner.shape[2], top % inner.shape[2]
@@ -117,7 +117,7 @@ def _energies(ga: Spectra, gb: Spectra, w: Stack, radius: int) -> Stack:
     power.real = (ga.real**2 + ga.imag**2) * w
     # the window is symmetric, so a's energy at d equals that of the turned field: one transform serves both
     power.imag = (gb.real**2 + gb.imag**2) * w
-    both = scipy.fft.ifft2(np.conj(scipy.fft.fft2(w)) * scipy.fft.fft2(power))
+    both = ifft2(np.conj(fft2(w[None])) * fft2(power))
     a, b = _near(both.real, radius)[:, ::-1, ::-1], _near(both.imag, radius)
     return np.maximum(a, 0) * np.maximum(b, 0) + np.float32(1e-20)
 

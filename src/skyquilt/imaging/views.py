@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.geometry.camera import distort, monotone_radius, rays
+from skyquilt.geometry.camera import distort_planes, monotone_radius, rays
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Alignment, Pose
 from skyquilt.model.raster import Grid, Window
@@ -99,21 +99,22 @@ def make_views(alignment: Alignment, surface: Surface) -> list[View]:
 
 def project_nodes(view: View, x: NDArray, y: NDArray, z: NDArray) -> Nodes:
     """Nodes at map coordinates (r, c), or at k heights z (k, r, c) over them: photo pixels and scores."""
-    ground = np.stack(np.broadcast_arrays(x, y, z), -1)
-    d = ground - view.pose.map_C
-    local = view.pose.to_camera(ground)
-    depth = np.maximum(local[..., 2], 1e-3)
-    plane = local[..., :2] / depth[..., None]
-    k = view.camera.vector
-    px = distort(plane, k) * k[0] + k[1:3]
+    k, C = view.camera.vector, view.pose.map_C
+    across, down, depth = view.pose.planes_to_camera(x, y, z)
+    ahead = np.maximum(depth, 1e-3)
+    px, py = across / ahead, down / ahead
     # behind the camera, or where the distortion polynomial folds back, a point is nowhere in the photo
-    real = (local[..., 2] > 0.1) & ((plane**2).sum(-1) < monotone_radius(view.camera) ** 2)
-    u, v = np.moveaxis(np.where(real[..., None], px, -1e4).astype(np.float32), -1, 0)
-    drop2 = np.maximum(d[..., 2] ** 2, 1e-6)
+    real = (depth > 0.1) & (px * px + py * py < monotone_radius(view.camera) ** 2)
+    real = np.broadcast_to(real, np.broadcast_shapes(x.shape, z.shape))
+    u, v = (
+        np.where(real, k[0] * p + c, -1e4).astype(np.float32)
+        for p, c in zip(distort_planes(px, py, k), k[1:3], strict=True)
+    )
+    drop = z - C[2]
     return Nodes(
         view=view, u=u, v=v, seen=inside(view.camera, u, v), real=real,
-        score=((d[..., 0] ** 2 + d[..., 1] ** 2) / drop2).astype(np.float32),
-        height=float(np.median(-d[..., 2])),
+        score=(((x - C[0]) ** 2 + (y - C[1]) ** 2) / np.maximum(drop**2, 1e-6)).astype(np.float32),
+        height=float(np.median(-drop)),
     )  # fmt: skip
 
 

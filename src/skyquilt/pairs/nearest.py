@@ -5,7 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+
+from skyquilt.geometry.neighbours import nearest
 
 Pair = tuple[int, int]
 
@@ -28,10 +29,9 @@ class Nearest:
         known = np.flatnonzero(np.isfinite(map_xy).all(1))
         if len(known) < 2:
             return []
-        tree = cKDTree(map_xy[known])
-        distance, index = tree.query(map_xy[known], k=min(self.neighbours + 1, len(known)))
+        distance, index = nearest(map_xy[known], map_xy[known], min(self.neighbours + 1, len(known)))
         found: dict[Pair, float] = {}
-        for row, (ds, js) in enumerate(zip(np.atleast_2d(distance), np.atleast_2d(index), strict=True)):
+        for row, (ds, js) in enumerate(zip(distance, index, strict=True)):
             for d, j in zip(ds, js, strict=True):
                 if j != row and (reach_m is None or d <= reach_m):
                     i, k = sorted((int(known[row]), int(known[j])))

@@ -4,16 +4,18 @@ import hashlib
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import TYPE_CHECKING, BinaryIO, Literal
 
 import numpy as np
-import tifffile
 from PIL import Image
 
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.photos.exif import Exif, parse_exif, read_tiff_tags
 from skyquilt.photos.jpeg import JpegHeader, has_end, read_jpeg_header
 from skyquilt.photos.xmp import Xmp, parse_xmp
+
+if TYPE_CHECKING:
+    import tifffile
 
 Dtype = Literal["uint8", "uint16", "float32"]
 Kind = Literal["jpeg", "tiff", "png"]
@@ -108,6 +110,8 @@ def _jpeg(file: BinaryIO) -> Header:
 
 
 def _tiff(file: BinaryIO) -> Header:
+    import tifffile  # most photos are JPEGs
+
     exif = read_tiff_tags(file)
     file.seek(0)
     with tifffile.TiffFile(file) as tiff:
@@ -128,7 +132,7 @@ def _tiff(file: BinaryIO) -> Header:
         )
 
 
-def _check_extent(page: tifffile.TiffPage, file: BinaryIO) -> None:
+def _check_extent(page: "tifffile.TiffPage", file: BinaryIO) -> None:
     need = max((o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=False)), default=0)
     have = file.seek(0, io.SEEK_END)
     if need > have:

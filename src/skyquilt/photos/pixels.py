@@ -13,7 +13,6 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 import simplejpeg
-import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -139,6 +138,8 @@ def _png(data: bytes, channels: int) -> Pixels:
 
 def read_tiff(path: Path) -> Pixels:
     """The first page of a TIFF as (height, width, bands), signed and wide types as float32."""
+    import tifffile  # most photos are JPEGs
+
     with tifffile.TiffFile(path) as tiff:
         page = tiff.pages[0]
         pixels = np.asarray(page.asarray())

@@ -19,8 +19,6 @@ from skyquilt.model.surface import Surface
 from skyquilt.pipelines.intake import Intake, Pictures
 from skyquilt.pipelines.radiometry import drift_of, value_tags
 from skyquilt.raster import Block, CogWriter, RasterSpec, write_array
-from skyquilt.raster.boundary import inside as inside_polygon
-from skyquilt.raster.boundary import read_boundary
 from skyquilt.raster.spec import Compression
 from skyquilt.render.compose import Composed, Composer, PhotoPixels
 from skyquilt.render.exposure import NEUTRAL, Exposure
@@ -183,6 +181,8 @@ def _local_bounds(settings: MosaicSettings, alignment: Alignment) -> tuple[float
     if settings.boundary is not None and bounds is None:
         if frame.crs is None:
             raise UsageError("--boundary needs a georeferenced survey, and these photos have no positions")
+        from skyquilt.raster.boundary import read_boundary
+
         bounds = read_boundary(settings.boundary, frame.crs).bounds
     if bounds is None:
         return None
@@ -328,7 +328,7 @@ def _thinned(numbers: NDArray) -> NDArray:
         np.minimum(np.arange(PROVENANCE // 2, size + PROVENANCE // 2, PROVENANCE), size - 1)
         for size in numbers.shape
     )
-    return np.asarray(numbers[np.ix_(rows, columns)])
+    return np.asarray(numbers[rows][:, columns])
 
 
 def _blanked(pixels: NDArray, valid: NDArray[np.bool_]) -> NDArray:
@@ -346,6 +346,9 @@ def _keeper(
 ) -> Callable[[Block], NDArray[np.bool_]] | None:
     if settings.boundary is None or alignment.frame.crs is None:
         return None
+    from skyquilt.raster.boundary import inside as inside_polygon
+    from skyquilt.raster.boundary import read_boundary
+
     polygon = read_boundary(settings.boundary, alignment.frame.crs)
     transform = geotransform(compose.grid, alignment)
     return lambda b: inside_polygon(

@@ -30,7 +30,6 @@ from skyquilt.photos.pixels import read_color
 from skyquilt.photos.sequence import sequence_of
 from skyquilt.photos.survey import read_survey
 from skyquilt.pipelines import drawing, intake, judging, linking, placing, quality, radiometry, reporting
-from skyquilt.raster.boundary import read_boundary
 from skyquilt.run.clock import Clock, Steps
 from skyquilt.run.folder import STATE, RunFolder, open_run
 from skyquilt.run.pixel_cache import PixelCache
@@ -217,6 +216,8 @@ def _checked(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSe
                 "--boundary needs a georeferenced survey, and these photos have no positions;"
                 " add --geo or --gcp"
             )
+        from skyquilt.raster.boundary import read_boundary
+
         read_boundary(settings.boundary, frame.crs)
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from skyquilt.alignment.control import control_in_frame
-from skyquilt.alignment.overview import ByOverview
 from skyquilt.alignment.pose import ByMetadata, reported_camera
 from skyquilt.alignment.repair import Repaired, repair
 from skyquilt.config import BY_METADATA, IN_SEQUENCE, Methods, MosaicSettings
@@ -18,7 +17,6 @@ from skyquilt.pipelines.intake import Intake, Pictures
 from skyquilt.pipelines.linking import Links
 from skyquilt.run.clock import Steps
 from skyquilt.run.store import Store, digest
-from skyquilt.twoview.levelled import Level
 
 
 def choose_method(asked: str, photos: int, links: int, positions: int) -> tuple[str, str]:
@@ -138,7 +136,11 @@ def _by_metadata(method: ByMetadata, known: Known, repaired: Repaired | None) ->
 
 
 def _image(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
+    from skyquilt.alignment.overview import ByOverview
+    from skyquilt.twoview.levelled import Level
+
     photos, features, method = known.intake.photos, known.intake.features, methods.by_image
+    assert method is not None, "configured where it is asked for"
     if isinstance(method.level, Level) and method.level.height_m is None:
         method = replace(method, level=replace(method.level, height_m=_least_height(known)))
     if isinstance(method, ByOverview):
@@ -157,10 +159,12 @@ def _least_height(known: Known) -> float | None:
 def _hybrid(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
     placed = _by_metadata(methods.by_pose, known, repaired)
     priors = known.priors if repaired is None else repaired.priors
+    assert methods.hybrid is not None, "configured where it is asked for"
     return methods.hybrid(placed, known.intake.photos, priors, known.order, known.pictures)
 
 
 def _flightline(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
+    assert methods.by_flightline is not None, "configured where it is asked for"
     return methods.by_flightline(
         known.intake.photos, known.frame, known.priors, known.intake.features, known.order
     )

@@ -49,18 +49,16 @@ class Blend(Protocol):
 
 def leader(layers: Sequence[Layer], ranks: Sequence[Float]) -> NDArray[np.int32]:
     """Position in `layers` of the lowest finite rank per pixel, -1 where none is."""
-    best = np.full(ranks[0].shape, np.inf, np.float32)
-    lead = np.full(ranks[0].shape, -1, np.int32)
-    for position, rank in enumerate(ranks):
-        better = rank < best
-        np.copyto(best, rank, where=better)
-        lead[better] = position
+    best, lead = ranks[0], np.isfinite(ranks[0]).astype(np.int32) - 1
+    for position, rank in enumerate(ranks[1:], 1):
+        np.copyto(lead, np.int32(position), where=rank < best)
+        best = np.minimum(best, rank)
     return lead
 
 
 def _photos(lead: NDArray[np.int32], layers: Sequence[Layer]) -> NDArray[np.int32]:
     table = np.array([*(layer.photo for layer in layers), -1], np.int32)
-    return table[lead]
+    return np.asarray(np.take(table, lead))
 
 
 def _weighted(layers: Sequence[Layer], weights: Sequence[Float]) -> NDArray:

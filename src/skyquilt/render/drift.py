@@ -11,9 +11,6 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse import linalg as sparse_linalg
-from scipy.sparse.csgraph import connected_components
 
 from skyquilt.imaging.views import View, project_nodes
 from skyquilt.model.surface import Surface
@@ -135,6 +132,10 @@ def solved(edges: Overlaps, count: int, rounds: int) -> Doubles:
     A weak pull to zero, its width what frames differ by as a rule, keeps a long line of frames from drifting off by the
     sum of many small errors.
     """
+    from scipy import sparse  # few runs are thermal, and all would wait for it
+    from scipy.sparse import linalg as sparse_linalg
+    from scipy.sparse.csgraph import connected_components
+
     number = np.arange(len(edges.first))
     ones = np.ones(len(number))
     A = sparse.csr_matrix(

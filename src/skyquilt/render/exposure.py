@@ -12,8 +12,6 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse import linalg as sparse_linalg
 
 from skyquilt.imaging.views import View, project_nodes
 from skyquilt.model.surface import Surface
@@ -30,6 +28,8 @@ alone: it saves time.
 """
 CORRELATED = 30.0
 """Neighbouring samples err alike: so many count as one."""
+DENSE = 1000
+"""Unknowns up to which the normal equations are solved as a full matrix."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -176,17 +176,14 @@ def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: fl
     n, N = len(photos), len(s.point)
     _, point = np.unique(s.point, return_inverse=True)
     terms = np.concatenate([np.ones((N, 1)), _basis(s.place[:, 0], s.place[:, 1])], 1)
-    columns = 6 * s.row[:, None] + np.arange(6)
-    A = sparse.csr_matrix((terms.ravel(), columns.ravel(), 6 * np.arange(N + 1)), (N, 6 * n))
-    ridge = np.tile(1 / np.array([sigma_gain] + 5 * [sigma_field]) ** 2, n)
-    x = _robust_differences(A, point, s.log.mean(1, keepdims=True), ridge).reshape(n, 6)
+    ridge = 1 / np.array([sigma_gain] + 5 * [sigma_field]) ** 2
+    x = _robust_differences(terms, s.row, point, s.log.mean(1, keepdims=True), ridge, n)[..., 0]
     fields = (
         x[:, 1:]
         * (np.abs(_basis(*np.meshgrid([-1, 0, 1], [-1, 0, 1])) @ x[:, 1:].T).max((0, 1)) > EVEN)[:, None]
     )
     even = s.log + (terms[:, 1:] * fields[s.row]).sum(1)[:, None]
-    ones = sparse.csr_matrix((np.ones(N), (np.arange(N), s.row)), (N, n))
-    gains = _robust_differences(ones, point, even, ridge[::6])
+    gains = _robust_differences(terms[:, :1], s.row, point, even, ridge[:1], n)[:, 0]
     gains = (gains - np.median(gains, axis=0)).astype(np.float32)
     return Exposure(
         gains=dict(zip(photos, gains, strict=True)),
@@ -195,24 +192,91 @@ def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: fl
 
 
 def _robust_differences(
-    A: sparse.csr_matrix, point: NDArray, y: NDArray, ridge: NDArray
+    terms: NDArray, row: NDArray, point: NDArray, y: NDArray, ridge: NDArray, count: int
 ) -> NDArray[np.float64]:
-    """x (m, bands) that makes y + A x equal within each point, y (N, bands), reweighted against moving things
-    and shadows, which all bands see.
+    """x (count, k, bands) that makes y + terms . x[row] equal within each point, y (N, bands) and terms (N, k),
+    reweighted against moving things and shadows, which all bands see. `ridge` (k,) pulls x to zero.
     """
+    pairs = _Pairs.of(row, point)
     w = np.ones(len(y))
-    x = np.zeros((A.shape[1], y.shape[1]))
+    x: NDArray[np.float64] = np.zeros((count, terms.shape[1], y.shape[1]))
+    pull = np.tile(ridge * SIGMA_LEVEL**2 * CORRELATED, count)
     for _ in range(6):
-        mass = np.bincount(point, w)
-        share = sparse.csr_matrix((w / np.maximum(mass, 1e-9)[point], (point, np.arange(len(y)))))
-        mean_A, mean_y = share @ A, share @ y
-        normal = A.T @ A.multiply(w[:, None]) - mean_A.T @ mean_A.multiply(mass[:, None])
-        rhs = -(A.T @ (w[:, None] * y) - mean_A.T @ (mass[:, None] * mean_y))
-        normal = normal + sparse.diags(ridge * SIGMA_LEVEL**2 * CORRELATED)
-        before, x = x, sparse_linalg.splu(normal.tocsc()).solve(rhs)
+        mass = np.maximum(np.bincount(point, w), 1e-9)
+        weighted = w[:, None] * terms
+        blocks = pairs.products(weighted / np.sqrt(mass[point])[:, None])
+        mean_y = _sums(point, w[:, None] * y, len(mass)) / mass[:, None]
+        rhs = -_sums(row, weighted[:, :, None] * (y - mean_y[point])[:, None], count)
+        own = _sums(row, weighted[:, :, None] * terms[:, None], count)
+        before, x = x, _solved(own, pairs, blocks, pull, rhs.reshape(len(pull), -1)).reshape(x.shape)
         if np.abs(x - before).max() < SETTLED:
             break
-        level = y + A @ x
-        residual = level - (share @ level)[point]
+        level = y + np.einsum("nk,nkb->nb", terms, x[row])
+        residual = level - (_sums(point, w[:, None] * level, len(mass)) / mass[:, None])[point]
         w = 1 / (1 + (residual**2).mean(1) / 0.25**2)
-    return np.asarray(x)
+    return x
+
+
+def _sums(group: NDArray, values: NDArray, count: int) -> NDArray[np.float64]:
+    """(count, ...) sums of values (N, ...) by group (N,)."""
+    flat = values.reshape(len(values), -1)
+    total = [np.bincount(group, column, count) for column in flat.T]
+    return np.asarray(np.stack(total, 1).reshape(count, *values.shape[1:]), np.float64)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Pairs:
+    """All pairs of samples of one point, a sample with itself included, sorted by their photos."""
+
+    a: NDArray[np.int64]
+    """(M,) first sample."""
+    b: NDArray[np.int64]
+    """(M,) second sample; its photo is not before the first's."""
+    cuts: NDArray[np.int64]
+    """(G + 1,) where the pairs of another two photos begin."""
+    row_a: NDArray[np.int64]
+    """(G,) first photo."""
+    row_b: NDArray[np.int64]
+    """(G,) second photo."""
+
+    @classmethod
+    def of(cls, row: NDArray, point: NDArray) -> "_Pairs":
+        """The pairs of samples (N,), whose rows and points are given."""
+        order = np.lexsort((row, point))
+        a, b = [], []
+        for lag in range(int(np.bincount(point).max(initial=0))):
+            same = np.flatnonzero(point[order[lag:]] == point[order[: len(order) - lag]])
+            a.append(order[same])
+            b.append(order[same + lag])
+        first, second = np.concatenate(a), np.concatenate(b)
+        sort = np.lexsort((row[second], row[first]))
+        first, second = first[sort], second[sort]
+        new = np.flatnonzero((np.diff(row[first]) != 0) | (np.diff(row[second]) != 0)) + 1
+        cuts = np.r_[0, new, len(first)]
+        return cls(a=first, b=second, cuts=cuts, row_a=row[first[cuts[:-1]]], row_b=row[second[cuts[:-1]]])
+
+    def products(self, terms: NDArray) -> NDArray[np.float64]:
+        """(G, k, k) sums of the outer products of terms (N, k) over the pairs of two photos."""
+        left, right = terms[self.a], terms[self.b]
+        ends = zip(self.cuts[:-1].tolist(), self.cuts[1:].tolist(), strict=True)
+        return np.stack([left[i:j].T @ right[i:j] for i, j in ends])
+
+
+def _solved(own: NDArray, pairs: _Pairs, blocks: NDArray, pull: NDArray, rhs: NDArray) -> NDArray:
+    """Solution (n k, bands) of the normal equations: own blocks (n, k, k) less those of pairs, and a pull to zero."""
+    n, k, _ = own.shape
+    i, j = np.r_[pairs.row_a, pairs.row_b, np.arange(n)], np.r_[pairs.row_b, pairs.row_a, np.arange(n)]
+    turned = np.where((pairs.row_a != pairs.row_b)[:, None, None], blocks.transpose(0, 2, 1), 0.0)
+    values = np.concatenate([-blocks, -turned, own])
+    if n * k <= DENSE:
+        normal = np.zeros((n, n, k, k))
+        np.add.at(normal, (i, j), values)
+        return np.asarray(np.linalg.solve(normal.swapaxes(1, 2).reshape(n * k, n * k) + np.diag(pull), rhs))
+    from scipy import sparse  # where it saves more time than it takes to load
+    from scipy.sparse import linalg
+
+    at = np.arange(k)
+    rows = (k * i[:, None, None] + at[:, None] + 0 * at).ravel()
+    columns = (k * j[:, None, None] + 0 * at[:, None] + at).ravel()
+    normal = sparse.coo_matrix((values.ravel(), (rows, columns)), (n * k, n * k)).tocsc()
+    return np.asarray(linalg.splu((normal + sparse.diags(pull)).tocsc()).solve(rhs))

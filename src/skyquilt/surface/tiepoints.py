@@ -6,8 +6,8 @@ from typing import ClassVar
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from skyquilt.geometry.neighbours import nearest
 from skyquilt.model.surface import Surface
 from skyquilt.surface.plane import level
 
@@ -44,8 +44,7 @@ class FromTiePoints:
 
     def _interpolate(self, points: Array, at: Array, cell: float) -> Array:
         k = min(self.neighbours, len(points))
-        distance, index = cKDTree(points[:, :2]).query(at, k=k)
-        distance, index = distance.reshape(len(at), k), index.reshape(len(at), k)
+        distance, index = nearest(points[:, :2], at, k)
         # beyond the points, the reach grows with the distance to them: the rim continues the average, not one
         # point
         weight = 1.0 / (distance + 0.5 * cell + 0.5 * distance[:, :1]) ** 2
@@ -57,8 +56,8 @@ def without_outliers(xyz: Array, limit: float) -> Array:
     deviations of the survey.
     """
     k = min(10, len(xyz))
-    _, index = cKDTree(xyz[:, :2]).query(xyz[:, :2], k=k)
-    around = xyz[index.reshape(len(xyz), k), 2]
+    _, index = nearest(xyz[:, :2], xyz[:, :2], k)
+    around = xyz[index, 2]
     median = np.median(around, axis=1)
     spread = 1.48 * np.median(np.abs(around - median[:, None]), axis=1)
     floor = 1.48 * np.median(np.abs(xyz[:, 2] - median)) + 1e-6
@@ -67,7 +66,7 @@ def without_outliers(xyz: Array, limit: float) -> Array:
 
 def grid_spacing(points: Array, bounds: tuple[float, float, float, float]) -> float:
     """About half the typical distance of points in m, but no more than four million cells."""
-    distance, _ = cKDTree(points[:, :2]).query(points[:, :2], k=2)
+    distance, _ = nearest(points[:, :2], points[:, :2], 2)
     typical = max(0.6 * float(np.median(distance[:, 1])) + 1e-3, 1e-3)
     area = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
     density = np.sqrt((np.ptp(points[:, 0]) * np.ptp(points[:, 1]) + 1e-6) / len(points))

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skyquilt.geometry.transforms import MINIMAL, Model, symmetric_transfer_errors
-from skyquilt.twoview.estimate import Estimate, NoEstimate, matched, polished, too_few, weak
+from skyquilt.twoview.estimate import Doubles, Estimate, NoEstimate
+from skyquilt.twoview.frame import estimated
 from skyquilt.twoview.search import search
 
 _MEDIAN = 2 * np.log(2)
@@ -36,26 +37,20 @@ class Lmeds:
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> Estimate | NoEstimate:
         """b_H_a from matches a, b (N, 2) px, or why there is none."""
-        a, b = matched(a, b)
-        if (few := too_few(self.model, len(a), self.minimum)) is not None:
-            return few
-        found = search(
-            self.model, a, b, confidence=self.confidence, cap=self.max_iterations, seed=self.seed,
-            cost=lambda e: np.median(e, 1), support=lambda e: len(e) // 2,
+        return estimated(
+            "LMedS", self.model, a, b, minimum=self.minimum, settle=self._limit,
+            find=lambda a, b: search(
+                self.model, a, b, confidence=self.confidence, cap=self.max_iterations, seed=self.seed,
+                cost=lambda e: np.median(e, 1), support=lambda e: len(e) // 2,
+            ),
         )  # fmt: skip
-        if found is None:
-            return NoEstimate(reason=f"no {self.model} passes through the matches")
-        variance = self._variance(float(np.median(symmetric_transfer_errors(found.b_H_a, a, b))), len(a))
+
+    def _limit(self, H: Doubles, a: Doubles, b: Doubles) -> tuple[Doubles, float] | NoEstimate:
+        variance = self._variance(float(np.median(symmetric_transfer_errors(H, a, b))), len(a))
         if not variance <= self.max_sigma_px**2:
             scatter = f"{np.sqrt(variance):.1f} px, above {self.max_sigma_px:g} px"
             return NoEstimate(reason=f"the matches scatter by {scatter}: half of them or more are wrong")
-        H, inliers = polished(self.model, found.b_H_a, a, b, 2 * _FAR * variance)
-        if (feeble := weak(self.model, int(inliers.sum()), len(a), self.minimum)) is not None:
-            return feeble
-        return Estimate(
-            model=self.model, b_H_a=H, inliers=inliers, iterations=found.iterations, capped=found.capped,
-            ste_per_inlier=float(symmetric_transfer_errors(H, a[inliers], b[inliers]).mean()), method="LMedS",
-        )  # fmt: skip
+        return H, 2 * _FAR * variance
 
     def _variance(self, median: float, count: int) -> float:
         """Of the inliers' transfer errors per axis, px^2; half of the STE is one way's square, few matches fit too well

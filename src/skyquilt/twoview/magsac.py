@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import gamma, gammaincc
 
 from skyquilt.geometry.transforms import Model, fit, symmetric_transfer_errors
-from skyquilt.twoview.estimate import Estimate, NoEstimate, matched, polished, too_few, weak
+from skyquilt.twoview.estimate import Estimate, NoEstimate
+from skyquilt.twoview.frame import estimated
 from skyquilt.twoview.search import Found, search
 
 Doubles = NDArray[np.float64]
@@ -40,18 +41,11 @@ class Magsac:
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> Estimate | NoEstimate:
         """b_H_a from matches a, b (N, 2) px, or why there is none."""
-        a, b = matched(a, b)
-        if (few := too_few(self.model, len(a), self.minimum)) is not None:
-            return few
-        found = self._usac(a, b) if self.model == "homography" else self._search(a, b)
-        if found is None:
-            return NoEstimate(reason=f"no {self.model} passes through the matches")
-        H, inliers = polished(self.model, self._reweighted(found.b_H_a, a, b), a, b, 2 * self.threshold_px**2)
-        if (feeble := weak(self.model, int(inliers.sum()), len(a), self.minimum)) is not None:
-            return feeble
-        return Estimate(
-            model=self.model, b_H_a=H, inliers=inliers, iterations=found.iterations, capped=found.capped,
-            ste_per_inlier=float(symmetric_transfer_errors(H, a[inliers], b[inliers]).mean()), method="MAGSAC",
+        limit = 2 * self.threshold_px**2
+        return estimated(
+            "MAGSAC", self.model, a, b, minimum=self.minimum,
+            find=self._usac if self.model == "homography" else self._search,
+            settle=lambda H, a, b: (self._reweighted(H, a, b), limit),
         )  # fmt: skip
 
     @property

@@ -6,8 +6,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skyquilt.geometry.transforms import Model, symmetric_transfer_errors
-from skyquilt.twoview.estimate import Estimate, NoEstimate, matched, polished, too_few, weak
+from skyquilt.geometry.transforms import Model
+from skyquilt.twoview.estimate import Estimate, NoEstimate
+from skyquilt.twoview.frame import estimated
 from skyquilt.twoview.search import search
 
 
@@ -31,20 +32,11 @@ class Ransac:
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> Estimate | NoEstimate:
         """b_H_a from matches a, b (N, 2) px, or why there is none."""
-        a, b = matched(a, b)
-        if (few := too_few(self.model, len(a), self.minimum)) is not None:
-            return few
         limit = 2 * self.threshold_px**2
-        found = search(
-            self.model, a, b, confidence=self.confidence, cap=self.max_iterations, seed=self.seed,
-            cost=lambda e: np.minimum(e, limit).sum(1), support=lambda e: int((e < limit).sum()),
-        )  # fmt: skip
-        if found is None:
-            return NoEstimate(reason=f"no {self.model} passes through the matches")
-        H, inliers = polished(self.model, found.b_H_a, a, b, limit)
-        if (feeble := weak(self.model, int(inliers.sum()), len(a), self.minimum)) is not None:
-            return feeble
-        return Estimate(
-            model=self.model, b_H_a=H, inliers=inliers, iterations=found.iterations, capped=found.capped,
-            ste_per_inlier=float(symmetric_transfer_errors(H, a[inliers], b[inliers]).mean()), method="RANSAC",
+        return estimated(
+            "RANSAC", self.model, a, b, minimum=self.minimum, settle=lambda H, a, b: (H, limit),
+            find=lambda a, b: search(
+                self.model, a, b, confidence=self.confidence, cap=self.max_iterations, seed=self.seed,
+                cost=lambda e: np.minimum(e, limit).sum(1), support=lambda e: int((e < limit).sum()),
+            ),
         )  # fmt: skip

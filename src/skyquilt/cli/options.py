@@ -1,0 +1,39 @@
+"""Options that several commands have, each said once, and what `--quiet`, `--verbose` and `--json` together mean."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from skyquilt.errors import UsageError
+
+Mode = Literal["quiet", "normal", "verbose", "json"]
+
+Photos = Annotated[Path, typer.Argument(help="Folder of photos (subfolders included).")]
+Output = Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")]
+Gsd = Annotated[
+    float | None, typer.Option(help="Ground size of a map pixel in cm.", show_default="the photos' own")
+]
+Crs = Annotated[str | None, typer.Option(help="Output CRS, e.g. EPSG:32633.", show_default="local UTM")]
+Cameras = Annotated[Path | None, typer.Option(help="Calibrations (cameras.json).")]
+Repair = Annotated[
+    bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")
+]
+Features = Annotated[int, typer.Option(help="Features per photo.")]
+Jobs = Annotated[int, typer.Option(help="Threads; 0 = all processors.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the results of another run in OUTPUT.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more: every stage's time.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")]
+
+
+def mode_of(*, quiet: bool, json: bool, verbose: bool | None = None) -> Mode:
+    """How much a command says; `verbose` is None where there is no such option.
+
+    Raises:
+        UsageError: more than one was asked for.
+    """
+    if quiet + json + bool(verbose) > 1:
+        names = "--quiet and --json" if verbose is None else "--quiet, --verbose and --json"
+        raise UsageError(f"{names} exclude one another")
+    return "quiet" if quiet else "json" if json else "verbose" if verbose else "normal"
