@@ -1,9 +1,42 @@
 """Figures of the finished map."""
 
+from types import SimpleNamespace
+
 import numpy as np
+import pytest
 from scipy import ndimage
 
-from skyquilt.pipelines.judging import _holes
+from skyquilt.model.poses import ControlResidual
+from skyquilt.pipelines.judging import _holes, control_figures
+
+
+@pytest.mark.parametrize(
+    ("datum", "controls", "offset"),
+    [("takeoff", 0, -440.0), ("unknown", 0, -440.0), ("sea_level", 0, 0.0), ("control", 1, 0.0)],
+)
+def test_a_constant_between_two_height_datums_is_no_error(datum, controls, offset):
+    """Check points of known errors, seen from a map whose heights count from elsewhere."""
+    errors = np.array([(0.1, -0.2, 0.03), (0.0, 0.1, 0.0), (-0.3, 0.0, -0.05)])
+    points = [
+        ControlResidual(
+            name=f"p{k}", check=k >= controls, error_m=e + (0, 0, -440.0), reprojection_px=0.3, sightings=4
+        )
+        for k, e in enumerate(errors)
+    ]
+    said = control_figures(SimpleNamespace(control=points, frame=SimpleNamespace(vertical_datum=datum)))
+    assert said["control_height_offset_m"] == offset
+    assert [r["dz_m"] for r in said["control"]] == pytest.approx(errors[:, 2] - 440.0 - offset, abs=1e-9)
+    assert [r["dx_m"] for r in said["control"]] == pytest.approx(errors[:, 0])
+
+
+def test_points_without_heights_have_no_offset():
+    lone = ControlResidual(
+        name="p", check=True, error_m=np.array([0.1, 0.2, np.nan]), reprojection_px=0.3, sightings=2
+    )
+    said = control_figures(SimpleNamespace(control=[lone], frame=SimpleNamespace(vertical_datum="takeoff")))
+    assert (said["control"][0]["dz_m"], said["control_height_offset_m"]) == (None, 0.0)
+    nobody = SimpleNamespace(control=[], frame=SimpleNamespace(vertical_datum="takeoff"))
+    assert control_figures(nobody) == {"control": [], "control_height_offset_m": None}
 
 
 def test_holes_are_what_the_map_encloses():

@@ -48,15 +48,28 @@ def alignment_figures(alignment: Alignment, priors: Sequence[Prior]) -> dict[str
         "rms": _round(rms_px)} if len(error) else None,
         "tie_points": len(alignment.ties.xyz),
         "sightings": len(alignment.ties.point),
-        "control": [
-            {
-                "name": c.name, "check": c.check, "dx_m": _round(c.error_m[0]), "dy_m": _round(c.error_m[1]),
-                "dz_m": _round(c.error_m[2]), "reprojection_px": _round(c.reprojection_px),
-                "sightings": c.sightings,
-            }
-            for c in alignment.control
-        ],
+        **control_figures(alignment),
     }  # fmt: skip
+
+
+def control_figures(alignment: Alignment) -> dict[str, Any]:
+    """Control and check points.
+
+    Where heights count from the take-off point (or nobody knows), and no control point ties them to the survey's, both
+    differ by a constant: the median, told apart from the errors.
+    """
+    points = alignment.control
+    dz = np.array([c.error_m[2] for c in points], float)
+    tied = alignment.frame.vertical_datum not in ("takeoff", "unknown") or any(not c.check for c in points)
+    offset = 0.0 if tied or not np.isfinite(dz).any() else float(np.nanmedian(dz))
+    rows = [
+        {
+            "name": c.name, "check": c.check, "dx_m": _round(c.error_m[0]), "dy_m": _round(c.error_m[1]),
+            "dz_m": _round(z - offset), "reprojection_px": _round(c.reprojection_px), "sightings": c.sightings,
+        }
+        for c, z in zip(points, dz, strict=True)
+    ]  # fmt: skip
+    return {"control": rows, "control_height_offset_m": _round(offset) if points else None}
 
 
 def camera_figures(photos: Sequence[Photo], alignment: Alignment) -> dict[str, Any]:

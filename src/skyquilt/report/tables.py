@@ -112,6 +112,11 @@ def control_section(data: ReportInput) -> Section:
         for p in sorted(points, key=lambda p: bool(p.get("check")))[:MOST_ROWS]
     )
     sums = [_rms(points, check, name) for check, name in ((False, "control"), (True, "check"))]
+    offset = number(data.metrics.get("control_height_offset_m"))
+    if offset:
+        sums.append(
+            f"Heights differ by {fixed(offset, 2, sign=True)} m between the two datums; that is taken out."
+        )
     return Section(
         id="control",
         title="Control and check points",
