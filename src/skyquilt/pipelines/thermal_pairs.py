@@ -19,10 +19,8 @@ from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Reg
 from skyquilt.pipelines.scene import Scene
 from skyquilt.render.blend import First
 from skyquilt.render.compose import Composer
-from skyquilt.spectral.orientation import between, full_size, orientation
 from skyquilt.spectral.propagation import PairPoints, Propagate
-from skyquilt.spectral.sharpen import Sharpen
-from skyquilt.spectral.usable import both_usable
+from skyquilt.spectral.settle import Settle
 
 MOST_PAIRS = 24
 """Pairs that are registered, spread over the map: each costs a third of a second of CPU."""
@@ -30,8 +28,8 @@ LEAST_OVERLAP = 0.4
 """Share of the thermal footprint that the visual one must show."""
 _REACH_M = 6.0
 """By how much the positions of two flights may differ."""
-FINE = 640.0
-"""Side in px of the square whose area a pair has when it is sharpened."""
+SETTLE = Settle(side=640.0)
+"""How a believed pair gets exact: as stiff as what two adjusted blocks differ by; a freer model follows shadows."""
 _SIDE_PX = 640
 """Longest side of the pictures that a pair is registered in: finer detail is shadows, which move."""
 _GRID = 6
@@ -96,22 +94,10 @@ def _registered(visual: Scene, thermal: Scene, a: View, b: View) -> PairPoints |
     outcome = registration_method("auto")(*flat, guess)
     if not isinstance(outcome, Registration):
         return None
-    px_a, px_b = _points(flat, _sharpened(flat, outcome))
+    px_a, px_b = _points(flat, SETTLE(*flat, outcome))
     return PairPoints(
         a=a.photo, b=b.photo, px_a=_on_map(visual, grid_a, px_a), px_b=_on_map(thermal, grid_b, px_b)
     )
-
-
-def _sharpened(flat: tuple[Picture, Picture], outcome: Registration) -> Registration:
-    """The pair at full sharpness, and as stiff as what two adjusted blocks differ by: coarse edges are shadows', and a
-    freer model follows them.
-    """
-    pair = both_usable(*flat)
-    if isinstance(pair, RefusedRegistration):
-        return outcome
-    a, b = (orientation(p.grey, p.valid, FINE) for p in pair)
-    fit = Sharpen(freedom="similarity", steps=12)(a, b, between(a, b, outcome.b_H_a))
-    return replace(outcome, model="similarity", b_H_a=full_size(a, b, fit.b_H_a))
 
 
 def _flat(scene: Scene, view: View, grid: Grid) -> Picture:
