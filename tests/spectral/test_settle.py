@@ -44,7 +44,7 @@ def test_colours_find_the_place_that_shading_hides(seed, sky):
     found = Settle()(Picture(values=a), warm(b), believed(START))
     without = Settle()(Picture(values=a.mean(2).astype(np.uint8)), warm(b), believed(START))
     assert off(believed(START)) > 5
-    assert found.evidence["by_colour"] == 1 and without.evidence["by_colour"] == 0
+    assert found.evidence["by_colour"] == 1 and "by_colour" not in without.evidence
     assert off(found) < 1.0 < 2.0 < off(without)
     assert found.evidence["surprise"] == 9.0  # what it was believed for stays
 

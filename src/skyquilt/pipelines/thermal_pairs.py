@@ -1,8 +1,9 @@
 """Two blocks joined by their pairs [Yahyanejad 2013, 5.2.3, (5.7)].
 
 Visual and thermal photos that show the same ground are registered one by one, each laid flat by the pose and the
-surface of its own block, so that height no longer parts them. Their correspondences are then in both maps already, and
-one transform is fitted to all, in balance.
+surface of its own block, so that height no longer parts them, and settled by their colours, since the sun draws all
+of them aside in one direction, which no adjustment would notice. Their correspondences are then in both maps already,
+and one transform is fitted to all, in balance.
 """
 
 from dataclasses import replace
@@ -39,7 +40,8 @@ _GRID = 6
 def by_pairs(visual: Scene, thermal: Scene) -> Registration | RefusedRegistration:
     """The transform from px of the visual map to those of the thermal map, or why there is none."""
     asked = overlapping(visual, thermal)
-    found = [p for a, b in asked if (p := _registered(visual, thermal, a, b)) is not None]
+    told = [r for a, b in asked if (r := _registered(visual, thermal, a, b)) is not None]
+    found = [p for p, _ in told]
     if len(found) < 3:
         return RefusedRegistration(
             reason=f"{len(found)} of {len(asked)} overlapping pairs of photos could be registered"
@@ -48,8 +50,11 @@ def by_pairs(visual: Scene, thermal: Scene) -> Registration | RefusedRegistratio
     outcome = Propagate(model="similarity")(found, *there)
     if isinstance(outcome, RefusedRegistration):
         return outcome
-    told = {"pairs_tried": float(len(asked)), "pairs_registered": float(len(found))}
-    return replace(outcome, evidence={**outcome.evidence, **told})
+    counts = {
+        "pairs_tried": float(len(asked)), "pairs_registered": float(len(found)),
+        "pairs_by_colour": float(sum(by_colour for _, by_colour in told)),
+    }  # fmt: skip
+    return replace(outcome, evidence={**outcome.evidence, **counts})
 
 
 def overlapping(visual: Scene, thermal: Scene) -> list[tuple[View, View]]:
@@ -76,8 +81,8 @@ def _share(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(cv2.intersectConvexConvex(*hulls)[0] / max(cv2.contourArea(hulls[1]), 1e-9))
 
 
-def _registered(visual: Scene, thermal: Scene, a: View, b: View) -> PairPoints | None:
-    """Correspondences of one pair in px of both maps; None where it cannot be registered."""
+def _registered(visual: Scene, thermal: Scene, a: View, b: View) -> tuple[PairPoints, bool] | None:
+    """Correspondences of one pair in px of both maps, and whether by colours; None where it cannot be registered."""
     low, high = b.footprint.min(0) - _REACH_M, b.footprint.max(0) + _REACH_M
     gsd = max(float((high - low).max()) / _SIDE_PX, thermal.ground.grid.gsd)
     width, height = (int(n) for n in np.ceil((high - low) / gsd))
@@ -94,10 +99,12 @@ def _registered(visual: Scene, thermal: Scene, a: View, b: View) -> PairPoints |
     outcome = registration_method("auto")(*flat, guess)
     if not isinstance(outcome, Registration):
         return None
-    px_a, px_b = _points(flat, SETTLE(*flat, outcome))
-    return PairPoints(
+    settled = SETTLE(*flat, outcome)
+    px_a, px_b = _points(flat, settled)
+    points = PairPoints(
         a=a.photo, b=b.photo, px_a=_on_map(visual, grid_a, px_a), px_b=_on_map(thermal, grid_b, px_b)
     )
+    return points, settled.evidence.get("by_colour", 0.0) > 0
 
 
 def _flat(scene: Scene, view: View, grid: Grid) -> Picture:

@@ -60,7 +60,8 @@ class Settle:
                 return _placed(outcome, colours, target, found, told)
         grey = orientation(one.grey, one.valid, self.side)
         settled = self._fitted(grey, target, start, start)
-        return outcome if settled is None else _placed(outcome, grey, target, settled, {"by_colour": 0.0})
+        told = {"by_colour": 0.0} if a.values.ndim == 3 else {}
+        return outcome if settled is None else _placed(outcome, grey, target, settled, told)
 
     def _confirmed(
         self, colours: Orientation | None, other: Usable, start: Matrix
