@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
+from skyquilt.cli.thermal_unit import ThermalUnit
 from skyquilt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ def command(
     ] = None,
     geo: Annotated[Path | None, typer.Option(help="Positions: geo.txt, CSV, .MRK or .SRT.")] = None,
     cameras: Annotated[Path | None, typer.Option(help="Calibrations (cameras.json).")] = None,
+    thermal_unit: ThermalUnit = None,
     height: Annotated[float | None, typer.Option(help="Height above ground in m.")] = None,
     alpha: Annotated[float, typer.Option(help="Weight of distances against looks, 0 to 1.")] = 0.5,
     lines: Annotated[
@@ -73,8 +75,8 @@ def command(
     if quiet and json:
         raise UsageError("--quiet and --json exclude one another")
     shared = MosaicSettings(
-        gsd_cm=gsd, geo=geo, cameras=cameras, height_m=height, alpha=alpha, lines=lines, repair=repair, seed=seed,
-        jobs=jobs, distances=distances,
+        gsd_cm=gsd, geo=geo, cameras=cameras, thermal_unit=thermal_unit, height_m=height, alpha=alpha,
+        lines=lines, repair=repair, seed=seed, jobs=jobs, distances=distances,
     )  # fmt: skip
     asked = tuple(m.strip() for m in methods.split(",")) if methods is not None else tuple(VARIANTS)
     settings = CompareSettings(mosaic=shared, variants=asked, first=first, known=known)

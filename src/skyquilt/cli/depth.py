@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
+from skyquilt.cli.thermal_unit import ThermalUnit
 from skyquilt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ def command(
             show_default="a tenth of the height",
         ),
     ] = None,
+    thermal_unit: ThermalUnit = None,
     features: Annotated[int, typer.Option(help="Features per photo.")] = 3000,
     jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.")] = 0,
     overwrite: Annotated[
@@ -54,7 +56,7 @@ def command(
 
     if quiet and json:
         raise UsageError("--quiet and --json exclude one another")
-    settings = MosaicSettings(gsd_cm=gsd, crs=crs, features=features, jobs=jobs)
+    settings = MosaicSettings(gsd_cm=gsd, crs=crs, thermal_unit=thermal_unit, features=features, jobs=jobs)
     source = photos[0] if len(photos) == 1 else photos
     events = iter_depth(source, output, settings, route=route, relief_m=relief, overwrite=overwrite)
     show(events, mode="quiet" if quiet else "json" if json else "normal", summary=summary)

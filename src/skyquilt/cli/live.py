@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
+from skyquilt.cli.thermal_unit import ThermalUnit
 
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder of the survey; the same again goes on.")]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the viewer; 0 = a free one.")]
@@ -42,6 +43,7 @@ def command(
             "--finish", help="End when no photo comes any more, with the final map in OUTPUT/finished."
         ),
     ] = False,
+    thermal_unit: ThermalUnit = None,
     base: Annotated[Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")] = None,
     features: Annotated[int, typer.Option(help="Features per photo.")] = 1200,
     max_mb: Annotated[float, typer.Option(help="Largest photo file in MB.")] = 500,
@@ -61,7 +63,8 @@ def command(
         from skyquilt.viewer.apart import Asked, ServingApart
         from skyquilt.viewer.guard import Guard
     settings = LiveSettings(
-        gsd_cm=gsd, crs=crs, reposition=reposition, deterministic=deterministic, features=features,
+        gsd_cm=gsd, crs=crs, reposition=reposition, deterministic=deterministic,
+        thermal_unit=thermal_unit, features=features,
         most_bytes=int(max_mb * 1e6), most_photos=max_photos,
     )  # fmt: skip
     guard = Guard(host=host, token=token)
