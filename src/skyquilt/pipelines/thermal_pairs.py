@@ -29,10 +29,10 @@ LEAST_OVERLAP = 0.4
 """Share of the thermal footprint that the visual one must show."""
 _REACH_M = 6.0
 """By how much the positions of two flights may differ."""
-SETTLE = Settle(side=640.0)
+SETTLE = Settle()
 """How a believed pair gets exact: as stiff as what two adjusted blocks differ by; a freer model follows shadows."""
-_SIDE_PX = 640
-"""Longest side of the pictures that a pair is registered in: finer detail is shadows, which move."""
+_SIDE_PX = 1000
+"""Longest side of the pictures that a pair is registered in, or fewer where a thermal pixel is larger."""
 _GRID = 6
 """Points per side by which a pair's transform is carried."""
 
