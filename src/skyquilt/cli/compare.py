@@ -8,6 +8,7 @@ import typer
 
 from skyquilt.cli.interrupt import ends_at_once
 from skyquilt.cli.options import Cameras, Gsd, Jobs, Json, Output, Overwrite, Photos, Quiet, Repair, mode_of
+from skyquilt.cli.thermal_unit import ThermalUnit
 
 if TYPE_CHECKING:
     from skyquilt.model.event import Result
@@ -43,6 +44,7 @@ def command(
     gsd: Gsd = None,
     geo: Annotated[Path | None, typer.Option(help="Positions: geo.txt, CSV, .MRK or .SRT.")] = None,
     cameras: Cameras = None,
+    thermal_unit: ThermalUnit = None,
     height: Annotated[float | None, typer.Option(help="Height above ground in m.")] = None,
     alpha: Annotated[float, typer.Option(help="Weight of distances against looks, 0 to 1.")] = 0.5,
     lines: Annotated[
@@ -66,8 +68,8 @@ def command(
 
     mode = mode_of(quiet=quiet, json=json)
     shared = MosaicSettings(
-        gsd_cm=gsd, geo=geo, cameras=cameras, height_m=height, alpha=alpha, lines=lines, repair=repair, seed=seed,
-        jobs=jobs, distances=distances,
+        gsd_cm=gsd, geo=geo, cameras=cameras, thermal_unit=thermal_unit, height_m=height, alpha=alpha,
+        lines=lines, repair=repair, seed=seed, jobs=jobs, distances=distances,
     )  # fmt: skip
     asked = tuple(m.strip() for m in methods.split(",")) if methods is not None else tuple(VARIANTS)
     settings = CompareSettings(mosaic=shared, variants=asked, first=first, known=known)

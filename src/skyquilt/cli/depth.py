@@ -7,6 +7,7 @@ import typer
 
 from skyquilt.cli.interrupt import ends_at_once
 from skyquilt.cli.options import Crs, Features, Gsd, Jobs, Json, Output, Overwrite, Quiet, mode_of
+from skyquilt.cli.thermal_unit import ThermalUnit
 
 if TYPE_CHECKING:
     from skyquilt.model.event import Result
@@ -31,6 +32,7 @@ def command(
             show_default="a tenth of the height",
         ),
     ] = None,
+    thermal_unit: ThermalUnit = None,
     features: Features = 3000,
     jobs: Jobs = 0,
     overwrite: Overwrite = False,
@@ -47,7 +49,7 @@ def command(
         from skyquilt.pipelines.depth import iter_depth
 
     mode = mode_of(quiet=quiet, json=json)
-    settings = MosaicSettings(gsd_cm=gsd, crs=crs, features=features, jobs=jobs)
+    settings = MosaicSettings(gsd_cm=gsd, crs=crs, thermal_unit=thermal_unit, features=features, jobs=jobs)
     source = photos[0] if len(photos) == 1 else photos
     events = iter_depth(source, output, settings, route=route, relief_m=relief, overwrite=overwrite)
     show(events, mode=mode, summary=summary)

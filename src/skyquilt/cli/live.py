@@ -7,6 +7,7 @@ import typer
 
 from skyquilt.cli.interrupt import ends_at_once
 from skyquilt.cli.options import Features, Json, Quiet
+from skyquilt.cli.thermal_unit import ThermalUnit
 
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder of the survey; the same again goes on.")]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the viewer; 0 = a free one.")]
@@ -43,6 +44,7 @@ def command(
             "--finish", help="End when no photo comes any more, with the final map in OUTPUT/finished."
         ),
     ] = False,
+    thermal_unit: ThermalUnit = None,
     base: Annotated[Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")] = None,
     features: Features = 1200,
     max_mb: Annotated[float, typer.Option(help="Largest photo file in MB.")] = 500,
@@ -62,7 +64,8 @@ def command(
         from skyquilt.viewer.apart import Asked, ServingApart
         from skyquilt.viewer.guard import Guard
     settings = LiveSettings(
-        gsd_cm=gsd, crs=crs, reposition=reposition, deterministic=deterministic, features=features,
+        gsd_cm=gsd, crs=crs, reposition=reposition, deterministic=deterministic,
+        thermal_unit=thermal_unit, features=features,
         most_bytes=int(max_mb * 1e6), most_photos=max_photos,
     )  # fmt: skip
     guard = Guard(host=host, token=token)

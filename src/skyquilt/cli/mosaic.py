@@ -21,6 +21,7 @@ from skyquilt.cli.options import (
     Verbose,
     mode_of,
 )
+from skyquilt.cli.thermal_unit import MEANING, UNSAID
 from skyquilt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -150,11 +151,7 @@ def command(
     ] = None,
     thermal_unit: Annotated[
         str | None,
-        typer.Option(
-            help="What values of single-band TIFFs mean: auto (they are thermal; the unit is stated in them or found"
-            " from the values), celsius, kelvin, decikelvin, centikelvin, counts.",
-            show_default="auto with --thermal; else files of thermal cameras, or that state a unit, are read as auto",
-        ),
+        typer.Option(help=MEANING, show_default=f"auto with --thermal; else {UNSAID}"),
     ] = None,
     thermal_route: Annotated[
         str,

@@ -60,13 +60,13 @@ class HeightField:
 
     def coarser(self, cell: float) -> "HeightField":
         """Means over cells of about the size asked for; known where three in five of the heights in it are."""
-        rows, columns = self.z.shape
-        size = max(2, round(columns * self.cell / cell)), max(2, round(rows * self.cell / cell))
-        share = np.asarray(cv2.resize(self.known.astype(np.float32), size, interpolation=cv2.INTER_AREA))
-        held = np.where(self.known, self.z, np.float32(0))
-        total = np.asarray(cv2.resize(held, size, interpolation=cv2.INTER_AREA))
-        wide, high = columns * self.cell / size[0], rows * self.cell / size[1]
+        factor = min(1.0, self.cell / cell)  # one for both axes, so that cells stay square: see `shrunken`
+        share, total = (
+            np.asarray(cv2.resize(one, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
+            for one in (self.known.astype(np.float32), np.where(self.known, self.z, np.float32(0)))
+        )
+        size = self.cell / factor
         return HeightField(
             z=(total / np.maximum(share, 1e-3)).astype(np.float32), known=share > 0.6,
-            x0=self.x0 + (wide - self.cell) / 2, y0=self.y0 + (high - self.cell) / 2, cell=(wide + high) / 2,
+            x0=self.x0 + (size - self.cell) / 2, y0=self.y0 + (size - self.cell) / 2, cell=size,
         )  # fmt: skip

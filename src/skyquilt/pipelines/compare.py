@@ -75,7 +75,8 @@ def iter_compare(
             but a row with its reason.
     """
     _checked(output, overwrite)
-    survey = read_survey(folder, geo=settings.mosaic.geo, cameras=settings.mosaic.cameras)
+    shared = settings.mosaic
+    survey = read_survey(folder, geo=shared.geo, cameras=shared.cameras, thermal_unit=shared.thermal_unit)
     photos = survey.photos[: settings.first] if settings.first else survey.photos
     source: Path | Sequence[Path] = [p.path for p in photos] if settings.first else folder
     base, says = _judged_by(photos, output, settings)

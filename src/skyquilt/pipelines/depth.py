@@ -78,7 +78,10 @@ def iter_depth(
     if route not in ROUTES:
         raise UsageError(f"--route {route!r} is not one of {', '.join(ROUTES)}")
     survey = read_survey(
-        Path(photos) if isinstance(photos, str) else photos, geo=settings.geo, cameras=settings.cameras
+        Path(photos) if isinstance(photos, str) else photos,
+        geo=settings.geo,
+        cameras=settings.cameras,
+        thermal_unit=settings.thermal_unit,
     )
     if len(survey.photos) < 2:
         raise UsageError("depth takes two photos at least, and here is one; give its neighbour too")

@@ -13,17 +13,15 @@ from skyquilt.errors import RefusedError
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registration
 from skyquilt.pipelines.pictures import Source, guess_of, open_picture
-from skyquilt.spectral.orientation import between, full_size, orientation
+from skyquilt.spectral.settle import Settle
 from skyquilt.spectral.sharpen import Sharpen
-from skyquilt.spectral.usable import both_usable
 
 ROUTES = ("auto", "rig", "maps", "pairs", "heights", "positions")
 """How the thermal map finds its place: by the rig where one drone took both, by the pictures of both maps, by pairs
 of photos, by heights, or by its positions alone; auto takes the first of these that can be believed.
 """
-FINE = 700.0
-"""Side in px of the square whose area the maps have when the join is sharpened: finer detail is shadows, which have
-moved between two flights, and the join would follow them."""
+SETTLE = Settle(free=Sharpen(freedom="affine", steps=12))
+"""How a believed registration of maps gets exact: with the freedom that pictures support."""
 FAR_M = 1000.0
 """Distance between the nearest photos of two flights beyond which they show different places."""
 Outcome = Registration | RefusedRegistration
@@ -135,27 +133,13 @@ def _registered(a: Source, b: Source, one: Picture, other: Picture, guess: Guess
     outcome = registration_method("auto")(one, other, guess)
     if isinstance(outcome, RefusedRegistration):
         return outcome
-    outcome = _sharpened(one, other, outcome)
+    outcome = SETTLE(one, other, outcome)
     full_a, full_b = a.full_S_picture, b.full_S_picture
     matrix = full_b @ outcome.b_H_a @ np.linalg.inv(full_a)
     moved_a, moved_b = (
         px @ S[:2, :2].T + S[:2, 2] for px, S in ((outcome.px_a, full_a), (outcome.px_b, full_b))
     )
     return replace(outcome, b_H_a=matrix / matrix[2, 2], px_a=moved_a, px_b=moved_b)
-
-
-def _sharpened(a: Picture, b: Picture, outcome: Registration) -> Registration:
-    """A believed registration with the freedom that two adjusted blocks have between them: their positions may tilt
-    and stretch one against the other by some pixels, which a similarity cannot follow.
-    """
-    pair = both_usable(a, b)
-    if isinstance(pair, RefusedRegistration):
-        return outcome
-    fields = [orientation(p.grey, p.valid, FINE) for p in pair]
-    small = between(fields[0], fields[1], outcome.b_H_a)
-    rigid = Sharpen(freedom="similarity")(fields[0], fields[1], small)
-    free = Sharpen(freedom="affine", steps=12)(fields[0], fields[1], rigid.b_H_a)
-    return replace(outcome, model="affine", b_H_a=full_size(fields[0], fields[1], free.b_H_a))
 
 
 def refuse_apart(visual: Sequence[Photo], thermal: Sequence[Photo]) -> None:

@@ -1,8 +1,9 @@
 """Two blocks joined by their pairs [Yahyanejad 2013, 5.2.3, (5.7)].
 
 Visual and thermal photos that show the same ground are registered one by one, each laid flat by the pose and the
-surface of its own block, so that height no longer parts them. Their correspondences are then in both maps already, and
-one transform is fitted to all, in balance.
+surface of its own block, so that height no longer parts them, and settled by their colours, since the sun draws all
+of them aside in one direction, which no adjustment would notice. Their correspondences are then in both maps already,
+and one transform is fitted to all, in balance.
 """
 
 from dataclasses import replace
@@ -19,10 +20,8 @@ from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Reg
 from skyquilt.pipelines.scene import Scene
 from skyquilt.render.blend import First
 from skyquilt.render.compose import Composer
-from skyquilt.spectral.orientation import between, full_size, orientation
 from skyquilt.spectral.propagation import PairPoints, Propagate
-from skyquilt.spectral.sharpen import Sharpen
-from skyquilt.spectral.usable import both_usable
+from skyquilt.spectral.settle import Settle
 
 MOST_PAIRS = 24
 """Pairs that are registered, spread over the map: each costs a third of a second of CPU."""
@@ -30,10 +29,10 @@ LEAST_OVERLAP = 0.4
 """Share of the thermal footprint that the visual one must show."""
 _REACH_M = 6.0
 """By how much the positions of two flights may differ."""
-FINE = 640.0
-"""Side in px of the square whose area a pair has when it is sharpened."""
-_SIDE_PX = 640
-"""Longest side of the pictures that a pair is registered in: finer detail is shadows, which move."""
+SETTLE = Settle()
+"""How a believed pair gets exact: as stiff as what two adjusted blocks differ by; a freer model follows shadows."""
+_SIDE_PX = 1000
+"""Longest side of the pictures that a pair is registered in, or fewer where a thermal pixel is larger."""
 _GRID = 6
 """Points per side by which a pair's transform is carried."""
 
@@ -41,7 +40,8 @@ _GRID = 6
 def by_pairs(visual: Scene, thermal: Scene) -> Registration | RefusedRegistration:
     """The transform from px of the visual map to those of the thermal map, or why there is none."""
     asked = overlapping(visual, thermal)
-    found = [p for a, b in asked if (p := _registered(visual, thermal, a, b)) is not None]
+    told = [r for a, b in asked if (r := _registered(visual, thermal, a, b)) is not None]
+    found = [p for p, _ in told]
     if len(found) < 3:
         return RefusedRegistration(
             reason=f"{len(found)} of {len(asked)} overlapping pairs of photos could be registered"
@@ -50,8 +50,11 @@ def by_pairs(visual: Scene, thermal: Scene) -> Registration | RefusedRegistratio
     outcome = Propagate(model="similarity")(found, *there)
     if isinstance(outcome, RefusedRegistration):
         return outcome
-    told = {"pairs_tried": float(len(asked)), "pairs_registered": float(len(found))}
-    return replace(outcome, evidence={**outcome.evidence, **told})
+    counts = {
+        "pairs_tried": float(len(asked)), "pairs_registered": float(len(found)),
+        "pairs_by_colour": float(sum(by_colour for _, by_colour in told)),
+    }  # fmt: skip
+    return replace(outcome, evidence={**outcome.evidence, **counts})
 
 
 def overlapping(visual: Scene, thermal: Scene) -> list[tuple[View, View]]:
@@ -78,8 +81,8 @@ def _share(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(cv2.intersectConvexConvex(*hulls)[0] / max(cv2.contourArea(hulls[1]), 1e-9))
 
 
-def _registered(visual: Scene, thermal: Scene, a: View, b: View) -> PairPoints | None:
-    """Correspondences of one pair in px of both maps; None where it cannot be registered."""
+def _registered(visual: Scene, thermal: Scene, a: View, b: View) -> tuple[PairPoints, bool] | None:
+    """Correspondences of one pair in px of both maps, and whether by colours; None where it cannot be registered."""
     low, high = b.footprint.min(0) - _REACH_M, b.footprint.max(0) + _REACH_M
     gsd = max(float((high - low).max()) / _SIDE_PX, thermal.ground.grid.gsd)
     width, height = (int(n) for n in np.ceil((high - low) / gsd))
@@ -96,22 +99,12 @@ def _registered(visual: Scene, thermal: Scene, a: View, b: View) -> PairPoints |
     outcome = registration_method("auto")(*flat, guess)
     if not isinstance(outcome, Registration):
         return None
-    px_a, px_b = _points(flat, _sharpened(flat, outcome))
-    return PairPoints(
+    settled = SETTLE(*flat, outcome)
+    px_a, px_b = _points(flat, settled)
+    points = PairPoints(
         a=a.photo, b=b.photo, px_a=_on_map(visual, grid_a, px_a), px_b=_on_map(thermal, grid_b, px_b)
     )
-
-
-def _sharpened(flat: tuple[Picture, Picture], outcome: Registration) -> Registration:
-    """The pair at full sharpness, and as stiff as what two adjusted blocks differ by: coarse edges are shadows', and a
-    freer model follows them.
-    """
-    pair = both_usable(*flat)
-    if isinstance(pair, RefusedRegistration):
-        return outcome
-    a, b = (orientation(p.grey, p.valid, FINE) for p in pair)
-    fit = Sharpen(freedom="similarity", steps=12)(a, b, between(a, b, outcome.b_H_a))
-    return replace(outcome, model="similarity", b_H_a=full_size(a, b, fit.b_H_a))
+    return points, settled.evidence.get("by_colour", 0.0) > 0
 
 
 def _flat(scene: Scene, view: View, grid: Grid) -> Picture:

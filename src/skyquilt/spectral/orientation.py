@@ -49,21 +49,33 @@ class Orientation:
 def orientation(grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float) -> Orientation:
     """Fields of a picture (H, W) shrunken to the area of a square of `side` px (never enlarged)."""
     small, whole, small_S_full = shrunken(grey, valid, side)
+    return of_bands(small, whole, small_S_full)
+
+
+def of_bands(small: NDArray, whole: NDArray[np.bool_], small_S_full: Matrix) -> Orientation:
+    """Fields of a picture (h, w) or (h, w, bands) at its own resolution; `whole` (h, w) where it is known.
+
+    Gradients g of several bands add up as g^2: the direction along which all of them together change most (Di Zenzo
+    1986), whichever way each of them changes.
+    """
     inner = cv2.erode(
         whole.astype(np.float32), np.ones((MARGIN, MARGIN)), borderType=cv2.BORDER_CONSTANT, borderValue=0
     )
-    return Orientation(
-        fields=_fields(cv2.GaussianBlur(small, (0, 0), BLUR), inner), valid=inner,
-        small_S_full=small_S_full,
-    )  # fmt: skip
+    smooth = np.asarray(cv2.GaussianBlur(small, (0, 0), BLUR))
+    return Orientation(fields=_fields(smooth, inner), valid=inner, small_S_full=small_S_full)
 
 
 def _fields(small: NDArray, valid: NDArray) -> Fields:
-    gx, gy = cv2.Sobel(small, cv2.CV_32F, 1, 0), cv2.Sobel(small, cv2.CV_32F, 0, 1)
-    length = np.hypot(gx, gy)
+    bands = small[..., None] if small.ndim == 2 else small
+    square = np.zeros(small.shape[:2], np.complex64)
+    for band in np.moveaxis(bands, -1, 0):
+        band = np.ascontiguousarray(band)
+        g = cv2.Sobel(band, cv2.CV_32F, 1, 0) + 1j * cv2.Sobel(band, cv2.CV_32F, 0, 1)
+        square += g * g
+    strength = np.abs(square)
+    length = np.sqrt(strength)
     weight = np.minimum(length / _surroundings(length, valid), STRONGEST) * valid
-    unit = (gx + 1j * gy) / np.maximum(length, 1e-6)
-    double = unit * unit
+    double = square / np.maximum(strength, 1e-12)
     first, second = weight * double, weight * double * double
     return np.stack([first.real, first.imag, second.real, second.imag], -1).astype(np.float32)
 
@@ -80,10 +92,10 @@ def _surroundings(length: NDArray, valid: NDArray) -> NDArray[np.float32]:
 def shrunken(
     grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float
 ) -> tuple[NDArray, NDArray[np.bool_], Matrix]:
-    """A picture and its validity (H, W) averaged down to the area of a square of `side` px (never enlarged), and the
-    (3, 3) that takes its pixels there. Both axes shrink alike, so a similarity stays one.
+    """A picture (H, W) or (H, W, bands) and its validity (H, W) averaged down to the area of a square of `side` px
+    (never enlarged), and the (3, 3) that takes its pixels there. Both axes shrink alike, so a similarity stays one.
     """
-    factor = min(1.0, side / float(np.sqrt(grey.size)))
+    factor = min(1.0, side / float(np.sqrt(valid.size)))
     small, share = (
         np.asarray(cv2.resize(one, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
         for one in (grey, valid.astype(np.float32))

@@ -34,7 +34,7 @@ def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
     if not rows:
         raise NoPhotosError(f"{folder} holds no accepted photo; there is nothing to finish")
     paths = named(folder, [(int(i), str(n), str(f)) for i, n, f in rows])
-    wanted = MosaicSettings(features=settings.features, crs=settings.crs)
+    wanted = MosaicSettings(features=settings.features, crs=settings.crs, thermal_unit=settings.thermal_unit)
     # asked for again after more photos have come, the final map is made anew; what was computed before is found
     yield from iter_mosaic(paths, folder / FINISHED, wanted, overwrite=True)
 

@@ -95,7 +95,7 @@ class Intake:
         known = self.ledger.row("select id, name from photo where digest = ?", arrived.digest)
         if known is not None:
             return Accepted(id=int(known[0]), name=str(known[1]), duplicate=True)
-        photo = read_photo(arrived.path, name=name)
+        photo = read_photo(arrived.path, name=name, thermal_unit=self.settings.thermal_unit)
         reason = photo.reason if isinstance(photo, RejectedPhoto) else _too_large(photo)
         if isinstance(photo, RejectedPhoto) or reason:
             _gone(arrived.path)

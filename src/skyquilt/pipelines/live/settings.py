@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+from skyquilt.config import THERMAL_UNITS, one_of
 from skyquilt.errors import UsageError
 
 NEIGHBOURS = 8
@@ -31,6 +32,10 @@ class LiveSettings:
     """Whether later photos may move earlier ones; False = no repositioning, as in the thesis (Y 4.1)."""
     deterministic: bool = False
     """Background work at fixed counts of photos and in line, so that equal photos in equal order give equal poses."""
+    thermal_unit: str | None = None
+    """One of `THERMAL_UNITS`: what values of single-band TIFFs mean; None = found out, as is whether they are
+    thermal.
+    """
     features: int = 1200
     """Features per photo, as the batch story takes them."""
     most_bytes: int = 500_000_000
@@ -39,6 +44,8 @@ class LiveSettings:
     """Most photos accepted."""
 
     def __post_init__(self) -> None:
+        if self.thermal_unit is not None:
+            one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
         for name, value, low, high in (
             ("--gsd", self.gsd_cm, 0.05, 10000), ("--features", self.features, 100, 50000),
             ("--max-photos", self.most_photos, 1, 10**7), ("--max-mb", self.most_bytes / 1e6, 0.01, 1e5),
@@ -48,4 +55,7 @@ class LiveSettings:
 
     def shaping(self) -> dict[str, Any]:
         """What must stay the same when a survey goes on after a restart."""
-        return {"reposition": self.reposition, "features": self.features, "deterministic": self.deterministic}
+        return {
+            "reposition": self.reposition, "features": self.features, "deterministic": self.deterministic,
+            "thermal_unit": self.thermal_unit,
+        }  # fmt: skip

@@ -68,9 +68,9 @@ class Queues:
 class Members:
     """All accepted photos, blocks of linked ones, the frame and the cameras; what changes is written by `save`."""
 
-    def __init__(self, ledger: Ledger, inbox: Inbox) -> None:
-        """Reads what the ledger holds."""
-        self.ledger, self.inbox = ledger, inbox
+    def __init__(self, ledger: Ledger, inbox: Inbox, thermal_unit: str | None = None) -> None:
+        """Reads what the ledger holds; `thermal_unit` as photos were accepted with."""
+        self.ledger, self.inbox, self.thermal_unit = ledger, inbox, thermal_unit
         self.by_id: dict[int, Member] = {}
         self.block_of: dict[int, int] = {}
         self.blocks: dict[int, set[int]] = {}
@@ -103,7 +103,7 @@ class Members:
         new = []
         for number, name, source, file, state, pose, camera, about in self.ledger.rows(query, self._last):
             self._last = int(number)
-            photo = read_photo(self.inbox.folder / file, name=name)
+            photo = read_photo(self.inbox.folder / file, name=name, thermal_unit=self.thermal_unit)
             if isinstance(photo, RejectedPhoto):
                 self.ledger.set_photo(number, state="refused", reason=photo.reason)
                 continue

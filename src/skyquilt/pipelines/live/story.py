@@ -93,7 +93,7 @@ class LiveMap:
 
     def _load(self) -> None:
         """Everything in memory, from what is durable: after a start, and after a write that failed."""
-        self.members = Members(self.ledger, self.inbox)
+        self.members = Members(self.ledger, self.inbox, self.settings.thermal_unit)
         self.queues = Queues(self.members.by_id.values())
         self.schedule = Schedule.read(self.ledger)
         self.full = PixelCache(read=self._pixels, budget_bytes=FULL_BYTES)
