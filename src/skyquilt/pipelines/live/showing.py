@@ -1,7 +1,7 @@
 """Which tiles are to be drawn, the most urgent first, and when what was drawn is told."""
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,6 +97,23 @@ class Showing:
     def draw(self, queue: Queue, rule: str = "") -> Update:
         """Some of the dirty tiles; when no more are, what was drawn is written down and told."""
         some = list(queue)[: DRAWN_AT_ONCE * (2 if queue is self.urgent else 1)]
+        return self._drawn_some(queue, some, rule)
+
+    def draw_moved(self) -> Update:
+        """The same for photos that moved, and soon after, their pictures still at hand, for the other layers."""
+        ready = self._newest()
+        if len(ready) >= DRAWN_AT_ONCE:
+            return self._drawn_some(self.later, ready[:DRAWN_AT_ONCE], NEWEST)
+        return self.draw(self.dirty)
+
+    def draw_newest(self) -> Update:
+        """The same for the layers that show the newest photo on top."""
+        return self.draw(self.later, NEWEST)
+
+    def _newest(self) -> list[Address]:
+        return [a for a in self.later if a not in self.dirty]
+
+    def _drawn_some(self, queue: Queue, some: Sequence[Address], rule: str) -> Update:
         parts = {a: queue[a] if rule else queue[a] | self.dirty.get(a, set()) for a in some}
         written = self.canvas.draw(parts, rule)
         for address, changed in parts.items():
@@ -109,10 +126,6 @@ class Showing:
         if not queue:
             tiles += self._told(rule)
         return Update(what="drawn", tiles=tiles)
-
-    def draw_newest(self) -> Update:
-        """The same for the layers that show the newest photo on top."""
-        return self.draw(self.later, NEWEST)
 
     def _told(self, rule: str) -> int:
         """The coarser levels, and the news for those who look on."""

@@ -85,8 +85,7 @@ class LiveMap:
         known, asked = self.ledger.meta("settings"), self.settings.shaping()
         if known is None:
             self.ledger.put_meta("settings", asked)
-        elif known != asked:
-            differing = ", ".join(k for k in asked if known.get(k) != asked[k])
+        elif differing := ", ".join(k for k in asked if known.get(k) != asked[k]):
             raise UsageError(
                 f"{self.folder} was begun with other settings ({differing}); use the same, or another folder"
             )
@@ -218,7 +217,7 @@ class LiveMap:
         if self.showing.pending:
             return self.showing.take_note()
         if self.showing.dirty:
-            return self.showing.draw(self.showing.dirty)
+            return self.showing.draw_moved()
         return self.showing.draw_newest() if self.showing.later else None
 
     def _adopted(self) -> Update | None:
