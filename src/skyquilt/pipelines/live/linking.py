@@ -16,6 +16,8 @@ from skyquilt.run.store import Store, digest
 
 FEATURES_KEPT = 48
 """Photos whose features stay at hand."""
+ENOUGH = 5
+"""Links that hold a new photo; further neighbours are not compared."""
 LINKS_KEPT = 1500
 """Links decoded and at hand, of some kilobytes each."""
 
@@ -47,10 +49,12 @@ class Linking:
         return looked.features
 
     def compared(self, member: Member, others: Sequence[int]) -> dict[tuple[int, int], Link | None]:
-        """Links to others; None where a pair does not match."""
+        """Links to others, one after the other until enough hold; None where a pair does not match."""
         own = self.features(member.id)
         found: dict[tuple[int, int], Link | None] = {}
         for i in others:
+            if sum(link is not None for link in found.values()) >= ENOUGH:
+                break
             theirs = self.features(i)
             matches = self.methods.mutual(theirs, own)
             link = self.methods.verify(i, member.id, theirs, own, matches, self.members.by_id[i].photo.width)

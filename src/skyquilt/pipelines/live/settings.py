@@ -10,7 +10,7 @@ NEIGHBOURS = 8
 """Most placed photos that a new one is compared with."""
 YOUNG = 10
 """Blocks of at most so many photos are bundled as a whole with every photo that joins."""
-CLOSING = 300
+CLOSING = 150
 """Blocks of at most so many photos are bundled as a whole in the background; of larger ones a part is."""
 PART = 120
 """Photos that move in such a part."""
