@@ -1,10 +1,15 @@
 """The server as other programs use it, and as those use it who mean no good."""
 
 import http.client
+import io
 import json
 import re
 import sqlite3
+from itertools import pairwise
+from pathlib import Path
+from urllib.parse import parse_qsl
 
+import cv2
 import defusedxml.ElementTree as ElementTree
 import httpx
 import numpy as np
@@ -50,8 +55,6 @@ def test_tiles_tilejson_and_info(site):
     x, y = tile_of(*middle(site), 19)
     tile = site.web.get(f"/tiles/19/{x}/{y}")
     assert tile.status_code == 200
-    import io
-
     with Image.open(io.BytesIO(tile.content)) as image:
         assert image.format == "WEBP"
         assert image.size == (256, 256)
@@ -93,8 +96,6 @@ def test_wms_as_a_desktop_gis_asks(site, version, crs):
             "HEIGHT": 300, "FORMAT": "image/png", "TRANSPARENT": "TRUE"}  # fmt: skip
     answer = site.web.get("/wms", params=want)
     assert answer.headers["content-type"] == "image/png"
-    import io
-
     with Image.open(io.BytesIO(answer.content)) as image:
         alpha = np.asarray(image)[..., 3]
     assert 0.2 < (alpha > 0).mean() < 1.0
@@ -113,6 +114,59 @@ def test_wms_as_a_desktop_gis_asks(site, version, crs):
         (tag, "EPSG:0"),
     ):
         assert site.web.get("/wms", params={**want, name: value}).status_code == 400, name
+
+
+def recorded():
+    """(version, CRS) and queries, in order, of what a real QGIS asked; the first picture of a group is the whole map."""
+    groups = {}
+    lines = (Path(__file__).parent / "qgis_3_22.txt").read_text().splitlines()
+    for line in lines[1:]:
+        query = dict(parse_qsl(line.partition("?")[2], keep_blank_values=True))
+        if query["REQUEST"] == "GetMap":
+            key = query["VERSION"], query.get("CRS") or query["SRS"]
+            groups.setdefault(key, []).append(query)
+    return groups
+
+
+@pytest.mark.parametrize(("version", "crs"), list(recorded()))
+def test_the_requests_of_a_real_qgis(site, version, crs):
+    """Replayed with this map's extent in place of the one that was recorded; closer views show a part of the whole."""
+    asked = {"SERVICE": "WMS", "REQUEST": "GetCapabilities"} | (
+        {"VERSION": version} if version != "1.3.0" else {}
+    )
+    root = ElementTree.fromstring(
+        site.web.get("/wms", params=asked).text
+    )  # QGIS leaves the version to the server
+    assert root.get("version") == version
+    tag = "SRS" if version == "1.1.1" else "CRS"
+    here = site.web.get("/info").json()["layers"][0]["crs"] if crs == "EPSG:32615" else crs
+    box = next(e for e in root.iter() if e.tag.endswith("BoundingBox") and e.get(tag) == here)
+    own = np.array([float(box.get(k)) for k in ("minx", "miny", "maxx", "maxy")])
+    queries = recorded()[version, crs]
+    whole = np.array([float(v) for v in queries[0]["BBOX"].split(",")])
+    pictures = []
+    for query in queries:
+        part = (np.array([float(v) for v in query["BBOX"].split(",")]) - whole[[0, 1, 0, 1]]) / np.tile(
+            whole[2:] - whole[:2], 2
+        )
+        bbox = own[[0, 1, 0, 1]] + part * np.tile(own[2:] - own[:2], 2)
+        sent = {**query, tag: here, "LAYERS": "visible", "BBOX": ",".join(map(repr, bbox.tolist()))}
+        answer = site.web.get("/wms", params=sent)
+        assert answer.status_code == 200
+        assert answer.headers["content-type"] == query["FORMAT"]
+        with Image.open(io.BytesIO(answer.content)) as image:
+            assert image.size == (int(query["WIDTH"]), int(query["HEIGHT"]))
+            pictures.append((part, np.asarray(image.convert("L")).astype(np.float32)))
+    for (wide, far), (close, near) in pairwise(pictures):
+        flipped = crs == "EPSG:4326" and version == "1.3.0"  # latitude comes first
+        order = [1, 0, 3, 2] if flipped else [0, 1, 2, 3]
+        (x0, y0, x1, y1), (wx0, wy0, wx1, wy1) = close[order], wide[order]
+        h, w = far.shape
+        columns = [round((x - wx0) / (wx1 - wx0) * w) for x in (x0, x1)]
+        rows = [round((wy1 - y) / (wy1 - wy0) * h) for y in (y1, y0)]
+        shown = far[rows[0] : rows[1], columns[0] : columns[1]]
+        again = cv2.resize(near, shown.shape[::-1], interpolation=cv2.INTER_AREA)
+        assert np.corrcoef(shown.ravel(), again.ravel())[0, 1] > 0.95
 
 
 def test_export_is_a_georeferenced_cog(site, tmp_path):
