@@ -49,7 +49,7 @@ FULL_BYTES = 120_000_000
 """Full-size photos at hand."""
 TOGETHER = 4
 """Photos placed before they are drawn, where several wait: they share tiles."""
-TIDY = 16
+TIDY = 4
 """Photos after which free memory is given back."""
 
 
