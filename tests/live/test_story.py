@@ -1,20 +1,24 @@
 """The incremental story against simulated truth."""
 
 import shutil
+import sqlite3
 import time
 
 import numpy as np
 import pytest
 import rasterio
 
+from skyquilt.errors import OutputError, UsageError
 from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
 from skyquilt.metrics.correlation import correlation
 from skyquilt.photos.survey import read_survey
+from skyquilt.pipelines.live.drawing import WHOLE
 from skyquilt.pipelines.live.flying import FlySettings, fly, order_of, preview_of
 from skyquilt.pipelines.live.settings import LiveSettings
 from skyquilt.pipelines.live.story import LiveMap
 from skyquilt.raster.map_source import TileSource
 from skyquilt.raster.tile_store import SIDE
+from skyquilt.render.blend import Feather
 from tests.live.conftest import offsets
 from tests.stories.conftest import relabel
 
@@ -96,6 +100,37 @@ def test_the_same_content_twice_is_one_photo(small, flight, tmp_path):
     before = len(small.members.by_id)
     assert small.add(copy).text == "it was there already"
     assert len(small.members.by_id) == before
+
+
+def test_tiles_that_were_left_alone_look_as_if_drawn_now(small):
+    """Only tiles on which a changed photo shows are drawn again: the others must not lag behind."""
+    compared = []
+    for address in small.tiles.addresses("visible", 0):
+        compose = small.canvas._composer(address, Feather(width_px=2.0))
+        assert compose is not None
+        now, stored = compose.drawn(compose.plan(WHOLE)), small.tiles.get(address)
+        both = stored.shown & (now.photo >= 0)
+        assert (stored.shown ^ (now.photo >= 0)).mean() < 0.02
+        compared.append(np.abs(stored.pixels[both].astype(int) - now.pixels[both]).max(-1))
+    off = np.concatenate(compared)
+    assert len(off) > 20_000
+    assert np.median(off) <= 4  # what JPEG changes
+    assert (off > 40).mean() < 0.02
+
+
+def test_folders_of_earlier_versions(small, tmp_path):
+    folder = tmp_path / "old"
+    live = LiveMap(folder)
+    known = live.ledger.meta("settings")
+    live.ledger.put_meta("settings", {k: v for k, v in known.items() if k != "thermal_unit"})
+    live.close()
+    LiveMap(folder).close()  # an option that did not exist then stands at its default
+    with pytest.raises(UsageError, match="features"):
+        LiveMap(folder, LiveSettings(features=700))
+    with sqlite3.connect(folder / "tiles.db") as db:
+        db.execute("pragma user_version=512")
+    with pytest.raises(OutputError, match="another version"):
+        LiveMap(folder)
 
 
 def test_a_restart_finds_everything_as_it_was(small, flight):
