@@ -7,8 +7,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.options import Cameras, Gsd, Jobs, Json, Output, Overwrite, Photos, Quiet, Repair, mode_of
-from skyquilt.cli.thermal_unit import ThermalUnit
+from skyquilt.cli.options import (
+    Cameras,
+    Gsd,
+    Jobs,
+    Json,
+    Output,
+    Overwrite,
+    Photos,
+    Quiet,
+    Repair,
+    ThermalUnit,
+    mode_of,
+)
 
 if TYPE_CHECKING:
     from skyquilt.model.event import Result

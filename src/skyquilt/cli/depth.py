@@ -6,8 +6,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.options import Crs, Features, Gsd, Jobs, Json, Output, Overwrite, Quiet, mode_of
-from skyquilt.cli.thermal_unit import ThermalUnit
+from skyquilt.cli.options import (
+    Crs,
+    Features,
+    Gsd,
+    Jobs,
+    Json,
+    Output,
+    Overwrite,
+    Quiet,
+    ThermalUnit,
+    mode_of,
+)
 
 if TYPE_CHECKING:
     from skyquilt.model.event import Result

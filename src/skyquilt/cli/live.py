@@ -6,8 +6,7 @@ from typing import Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.options import Features, Json, Quiet
-from skyquilt.cli.thermal_unit import ThermalUnit
+from skyquilt.cli.options import Features, Json, Quiet, ThermalUnit
 
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder of the survey; the same again goes on.")]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the viewer; 0 = a free one.")]

@@ -7,6 +7,8 @@ import typer
 
 from skyquilt.cli.interrupt import ends_at_once
 from skyquilt.cli.options import (
+    THERMAL_UNITS,
+    UNIT_UNSAID,
     Cameras,
     Crs,
     Features,
@@ -21,7 +23,6 @@ from skyquilt.cli.options import (
     Verbose,
     mode_of,
 )
-from skyquilt.cli.thermal_unit import MEANING, UNSAID
 from skyquilt.errors import UsageError
 
 if TYPE_CHECKING:
@@ -151,7 +152,7 @@ def command(
     ] = None,
     thermal_unit: Annotated[
         str | None,
-        typer.Option(help=MEANING, show_default=f"auto with --thermal; else {UNSAID}"),
+        typer.Option(help=THERMAL_UNITS, show_default=f"auto with --thermal; else {UNIT_UNSAID}"),
     ] = None,
     thermal_route: Annotated[
         str,

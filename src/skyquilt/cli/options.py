@@ -26,6 +26,13 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but erro
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more: every stage's time.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")]
 
+THERMAL_UNITS = (
+    "What values of single-band TIFFs mean: auto (they are thermal; the unit is stated in them or found from the"
+    " values), celsius, kelvin, decikelvin, centikelvin, counts."
+)
+UNIT_UNSAID = "files of thermal cameras, or that state a unit, are read as auto"
+ThermalUnit = Annotated[str | None, typer.Option(help=THERMAL_UNITS, show_default=UNIT_UNSAID)]
+
 
 def mode_of(*, quiet: bool, json: bool, verbose: bool | None = None) -> Mode:
     """How much a command says; `verbose` is None where there is no such option.

@@ -1,6 +1,6 @@
 """Heights of a map that grows: a grid of cells that points of the ground fill, and the surface of any part of it."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import cv2
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from skyquilt.model.surface import Surface
 
+Cells = NDArray[np.int64]
 WEIGHT = 0.4
 """How far a cell follows points that come later."""
 
@@ -42,21 +43,16 @@ class HeightCells:
 
     def put(self, cells: NDArray[np.int64], z: NDArray[np.float64]) -> None:
         """Sets cells (k, 2) to heights (k,) in m."""
-        block, inner = np.divmod(cells, BLOCK)
-        for key in np.unique(block, axis=0).tolist():
-            mine = (block == key).all(1)
-            held = self._blocks.setdefault((key[0], key[1]), np.full((BLOCK, BLOCK), np.nan))
-            held[inner[mine, 1], inner[mine, 0]] = z[mine]
+        for key, mine, (column, row) in _by_block(cells):
+            held = self._blocks.setdefault(key, np.full((BLOCK, BLOCK), np.nan))
+            held[row, column] = z[mine]
 
     def at(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
         """Heights (k,) in m of cells (k, 2); NaN where no point has been."""
         z = np.full(len(cells), np.nan)
-        block, inner = np.divmod(cells, BLOCK)
-        for key in np.unique(block, axis=0).tolist():
-            held = self._blocks.get((key[0], key[1]))
-            if held is not None:
-                mine = (block == key).all(1)
-                z[mine] = held[inner[mine, 1], inner[mine, 0]]
+        for key, mine, (column, row) in _by_block(cells):
+            if (held := self._blocks.get(key)) is not None:
+                z[mine] = held[row, column]
         return z
 
     def median(self, bounds: Iterable[float]) -> float | None:
@@ -95,6 +91,14 @@ class HeightCells:
             z=_filled(z, otherwise), x0=(c0 + 0.5) * self.cell, y0=(r0 + 0.5) * self.cell, cell=self.cell,
             source="tie points",
         )  # fmt: skip
+
+
+def _by_block(cells: Cells) -> Iterator[tuple[tuple[int, int], NDArray[np.bool_], Cells]]:
+    """Each block that some of the cells (k, 2) lie in: which block, which of them, and their columns and rows in it."""
+    block, inner = np.divmod(cells, BLOCK)
+    for column, row in np.unique(block, axis=0).tolist():
+        mine = (block == (column, row)).all(1)
+        yield (column, row), mine, inner[mine].T
 
 
 def _medians(group: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -78,7 +78,6 @@ class LiveMap:
         self.store = Store(folder=self.folder / STORE, registry=registry)
         self.closing = Closing()
         self._room = TOGETHER
-        self._taken = 0
         self._load()
 
     def _same_settings(self) -> None:
@@ -191,11 +190,11 @@ class LiveMap:
         if not self.queues.received:
             return None
         self._room = max(0, self._room - 1)
-        self._taken += 1
-        if self._taken % TIDY == 0:
-            give_back()
         self.blocks.last_arrival = time.monotonic()
-        return self.arriving.place(self.queues.received[0])
+        first = self.queues.received[0]
+        if first.id % TIDY == 0:
+            give_back()
+        return self.arriving.place(first)
 
     def _refined(self) -> Update | None:
         """In two units, so that a photo that comes meanwhile need not wait for both."""
