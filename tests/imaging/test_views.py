@@ -1,5 +1,7 @@
 """Footprints, nodes and grids against rays and projections computed one by one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,9 +14,10 @@ from skyquilt.imaging.views import (
     densify,
     footprint,
     grid_of,
-    least_score,
+    least_scores,
     native_gsd,
     node_places,
+    project_all,
     project_nodes,
 )
 from skyquilt.model.camera import Camera
@@ -95,7 +98,7 @@ def test_no_node_has_a_smaller_score_than_the_least(row, column, size, rise):
     shot = view(0, 3, -2, pitch=10)
     x, y, z = node_places(GRID, slope, Window(row=row, column=column, height=size, width=size))
     score = project_nodes(shot, x, y, z).score.min()
-    least = least_score(shot, x, y, z)
+    least = least_scores([shot], x, y, z)[0]
     assert least <= score * (1 + 1e-5)
     if x[0, 0] < shot.pose.map_C[0] < x[0, -1] and y[-1, 0] < shot.pose.map_C[1] < y[0, 0]:
         assert least == 0.0
@@ -147,3 +150,24 @@ def test_boxes_that_meet():
     )
     assert not shot.overlaps((-1, low[1] - 9, 1, low[1] - 0.1)) and shot.overlaps((-1, -1, 1, 1))
     assert len(footprint(CAMERA, shot.pose, FLAT, per_side=3)) == 12
+
+
+def test_many_photos_are_projected_as_each_by_itself():
+    folded = replace(CAMERA, k1=-0.3, k2=0.0)
+    shots = [view(k, 9.0 * k - 20, 5 - 3.0 * k, z=30 + 4 * k, yaw=77 * k, pitch=8 * k) for k in range(5)]
+    shots = [
+        *shots[:3],
+        replace(shots[3], camera=folded),
+        replace(shots[4], camera=replace(CAMERA, width=320)),
+    ]
+    hill = Surface(
+        z=np.arange(400, dtype=np.float32).reshape(20, 20) / 40, x0=-30.0, y0=-30.0, cell=3.0, source="t"
+    )
+    places = node_places(GRID, hill, Window(row=0, column=0, height=360, width=480))
+    for some in (shots, shots[1:2]):
+        for shot, found in zip(some, project_all(some, *places), strict=True):
+            alone = project_nodes(shot, *places)
+            assert found.view is shot and found.height == alone.height
+            for name in ("u", "v", "score", "seen", "real"):
+                assert np.array_equal(getattr(found, name), getattr(alone, name))
+    assert not found.real.all() or project_nodes(shots[3], *places).real.min() == 0

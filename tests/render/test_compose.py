@@ -12,9 +12,9 @@ from skyquilt.imaging.views import STEP, inside
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.render.blend import Average, Feather, First, Multiband
-from skyquilt.render.compose import _remapped
+from skyquilt.render.compose import STILL, _remapped
 from skyquilt.render.newest import Newest
-from tests.render.scenes import CAMERA, GRID, block, composer, photograph, truth, view
+from tests.render.scenes import CAMERA, FLAT, GRID, block, composer, photograph, truth, view
 
 WHOLE = Window(row=0, column=0, height=GRID.height, width=GRID.width)
 
@@ -168,6 +168,62 @@ def test_photos_that_others_hide_need_not_be_looked_at(scene, blend):
             assert np.array_equal(made.pixels, expected.pixels) and np.array_equal(made.photo, expected.photo)
             assert set(np.unique(expected.photo)) - {-1} <= set(plan.shown)
     assert planned > 0  # some were spared
+
+
+@pytest.mark.parametrize("blend", [Feather(width_px=2.0), First(), Newest()], ids=lambda b: type(b).__name__)
+def test_what_changed_is_drawn_into_what_was_there(scene, blend):
+    """Photos come, move and go, and the ground rises: only some cells are drawn, and nobody can tell."""
+    views, pictures = scene
+    away, moved = views[2], replace(views[1], pose=replace(views[1].pose, map_C=views[1].pose.map_C + 0.7))
+    shots = [
+        [v for v in views if v is not away],
+        views,
+        [moved if v is views[1] else v for v in views],
+        views[:-1],
+    ]
+    hill = replace(FLAT, z=np.array([[0, 0], [0, 3]], np.float32), cell=9.0)
+    steps = [*((some, FLAT) for some in shots[:3]), *((some, hill) for some in (*shots[2:], []))]
+    touched = [np.zeros(())] * len(steps)
+    for column in (0, 256):
+        window = Window(row=32, column=column, height=256, width=200)
+        plan = made = None
+        for step, (some, surface) in enumerate(steps):
+            compose = composer(some, pictures, GRID, blend, surface=surface)
+            new = compose.plan(window, earlier=plan)
+            if plan is None or made is None:
+                plan, made = new, compose.drawn(new)
+                continue
+            before, made = made, compose.redrawn(new, plan, made)
+            expected = compose.drawn(new)
+            assert np.array_equal(made.photo, expected.photo)
+            if surface is FLAT:
+                fresh = compose.drawn(compose.plan(window))
+                assert np.array_equal(made.pixels, expected.pixels) and np.array_equal(
+                    made.pixels, fresh.pixels
+                )
+            off = np.abs(made.pixels.astype(int) - expected.pixels)
+            assert off.max() <= 1 and (off > 0).mean() < 1e-3  # ramps follow the height of the whole window
+            plan = new
+            touched[step] = touched[step] + (before.pixels != made.pixels).sum()
+    assert all(t > 0 for t in touched[1:3]) and touched[4] > 0 and touched[5] > 0
+
+
+def test_heights_that_shift_nothing_visibly_stay(scene):
+    views, pictures = scene
+    window = Window(row=32, column=0, height=256, width=256)
+    flat = composer(views, pictures, GRID)
+    plan = flat.plan(window)
+    steepest = np.sqrt(max(n.score[m].max() for n, m in zip(plan.nodes, plan.near, strict=True) if m.any()))
+    for rise, stays in ((0.9 * STILL * GRID.gsd / steepest, True), (4 * STILL * GRID.gsd / steepest, False)):
+        lifted = composer(views, pictures, GRID, surface=replace(FLAT, z=np.full((2, 2), rise, np.float32)))
+        again = lifted.plan(window, earlier=plan)
+        assert (again.z == plan.z).all() == stays
+        kept = [
+            again.projected[v.photo] is plan.projected[v.photo] for v in views if v.photo in plan.projected
+        ]
+        assert all(kept) if stays else not any(kept)
+        if stays:
+            assert np.array_equal(lifted.drawn(again).pixels, flat.drawn(plan).pixels)
 
 
 def test_measured_values_are_resampled_and_nothing_else():

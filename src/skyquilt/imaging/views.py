@@ -118,6 +118,33 @@ def project_nodes(view: View, x: NDArray, y: NDArray, z: NDArray) -> Nodes:
     )  # fmt: skip
 
 
+def project_all(views: Sequence[View], x: NDArray, y: NDArray, z: NDArray) -> list[Nodes]:
+    """`project_nodes` of many views at the same nodes (r, c): where those are few, several times as fast."""
+    if len(views) < 2 or any(v.pose.cam_H_map is not None for v in views):
+        return [project_nodes(v, x, y, z) for v in views]
+    R = np.array([v.pose.cam_R_map for v in views]).transpose(1, 2, 0)[..., None, None]
+    C = np.array([v.pose.map_C for v in views]).T[..., None, None]
+    k = np.array([v.camera.vector for v in views])[:, None, None, :]
+    limit = np.array([monotone_radius(v.camera) for v in views])[:, None, None] ** 2
+    size = np.array([(v.camera.width, v.camera.height) for v in views]).T[..., None, None] - 1 - BORDER_PX
+    dx, dy, dz = x - C[0], y - C[1], z - C[2]
+    across, down, depth = (row[0] * dx + row[1] * dy + row[2] * dz for row in R)
+    ahead = np.maximum(depth, 1e-3)
+    px, py = across / ahead, down / ahead
+    real = (depth > 0.1) & (px * px + py * py < limit)
+    u, v = (
+        np.where(real, k[..., 0] * p + k[..., i], -1e4).astype(np.float32)
+        for i, p in enumerate(distort_planes(px, py, k), 1)
+    )
+    seen = (u > BORDER_PX) & (v > BORDER_PX) & (u < size[0]) & (v < size[1])
+    score = ((dx**2 + dy**2) / np.maximum(dz**2, 1e-6)).astype(np.float32)
+    height = np.median(-dz.reshape(len(views), -1), axis=1).tolist()
+    return [
+        Nodes(view=view, u=u[n], v=v[n], score=score[n], seen=seen[n], real=real[n], height=height[n])
+        for n, view in enumerate(views)
+    ]
+
+
 def inside(camera: Camera, u: NDArray, v: NDArray) -> NDArray[np.bool_]:
     """Whether photo pixels lie in the photo, its border excluded."""
     edge = BORDER_PX
@@ -152,12 +179,13 @@ def overlapping(views: Sequence[View], x: NDArray, y: NDArray) -> list[View]:
     return [view for view in views if view.overlaps(bounds)]
 
 
-def least_score(view: View, x: NDArray, y: NDArray, z: NDArray) -> float:
-    """No node at x, y, z (r, c) in m, rows southwards, has a smaller score in this view."""
-    east, north, up = view.pose.map_C.tolist()
-    aside = max(x[0, 0] - east, east - x[0, -1], 0.0)
-    along = max(y[-1, 0] - north, north - y[0, 0], 0.0)
-    return float((aside**2 + along**2) / max((up - z.min()) ** 2, (up - z.max()) ** 2, 1e-6))
+def least_scores(views: Sequence[View], x: NDArray, y: NDArray, z: NDArray) -> NDArray[np.float32]:
+    """(views,) no node at x, y, z (r, c) in m, rows southwards, has a smaller score in that view."""
+    east, north, up = np.array([v.pose.map_C for v in views]).reshape(-1, 3).T
+    aside = np.maximum(np.maximum(x[0, 0] - east, east - x[0, -1]), 0.0)
+    along = np.maximum(np.maximum(y[-1, 0] - north, north - y[0, 0]), 0.0)
+    drop = np.maximum(np.maximum((up - z.min()) ** 2, (up - z.max()) ** 2), 1e-6)
+    return np.asarray((aside**2 + along**2) / drop, np.float32)
 
 
 def cut(nodes: Nodes, row: int, column: int, height: int, width: int) -> Nodes:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.float32]
+Order = int | NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,8 +38,10 @@ class Blend(Protocol):
     def margin(self) -> int:
         """Pixels beyond the window that the rule must see."""
 
-    def rank(self, order: int, score: Float) -> Float:
-        """What decides between photos: the lowest wins. `order`: position in order of capture."""
+    def rank(self, order: Order, score: Float) -> Float:
+        """What decides between photos: the lowest wins. `order`: position in order of capture, of one photo
+        or of each score's.
+        """
 
     def reach(self, gsd: float) -> float:
         """How far, in rank, a photo behind the winner still matters; infinite = all photos do."""
@@ -84,7 +87,7 @@ class Feather:
     margin: ClassVar[int] = 0
     version: ClassVar[int] = 3
 
-    def rank(self, order: int, score: Float) -> Float:
+    def rank(self, order: Order, score: Float) -> Float:
         """The angle off the vertical."""
         return score
 
@@ -155,7 +158,7 @@ class First:
     margin: ClassVar[int] = 0
     version: ClassVar[int] = 1
 
-    def rank(self, order: int, score: Float) -> Float:
+    def rank(self, order: Order, score: Float) -> Float:
         """Order of capture."""
         return np.where(np.isfinite(score), np.float32(order), np.float32(np.inf))
 
@@ -177,7 +180,7 @@ class Average:
     margin: ClassVar[int] = 0
     version: ClassVar[int] = 1
 
-    def rank(self, order: int, score: Float) -> Float:
+    def rank(self, order: Order, score: Float) -> Float:
         """The angle off the vertical decides which photo is named as the source."""
         return score
 
@@ -211,7 +214,7 @@ class Multiband:
         """Tiles see each other's rim, so that they meet without a step."""
         return 4 * 2**self.levels
 
-    def rank(self, order: int, score: Float) -> Float:
+    def rank(self, order: Order, score: Float) -> Float:
         """The angle off the vertical."""
         return score
 

@@ -1,6 +1,6 @@
 """Composition of a window of the map from the photos that see it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,10 +14,10 @@ from skyquilt.imaging.views import (
     cut,
     densify,
     inside_everywhere,
-    least_score,
+    least_scores,
     node_places,
     overlapping,
-    project_nodes,
+    project_all,
 )
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
@@ -28,6 +28,10 @@ PhotoPixels = Callable[[int], NDArray]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""
 PIECE = 256
 """Pixels of a piece composed at a time."""
+TOGETHER = 6
+"""Photos projected at a time."""
+STILL = 0.5
+"""Map pixels by which changed heights may shift a photo that is not drawn again for it."""
 MOST_PADDED = 12
 """Values of a photo's cut-out per map pixel up to which a fourth band pays."""
 
@@ -56,11 +60,19 @@ class Plan:
     """Where its nodes lie in each photo that sees any."""
     near: Sequence[NDArray[np.bool_]]
     """(r, c) per photo, for the cells around the nodes: whether it can show there."""
+    z: NDArray
+    """(r, c) heights in m of the nodes."""
+    projected: Mapping[int, Nodes]
+    """The nodes of all photos that were looked at, by photo."""
 
     @property
     def shown(self) -> list[int]:
         """Photos that can show."""
-        return [n.view.photo for n, m in zip(self.nodes, self.near, strict=True) if m.any()]
+        return list(self.showing())
+
+    def showing(self) -> dict[int, NDArray[np.bool_]]:
+        """The photos that can show, and where: (r, c) for the cells around the nodes."""
+        return {n.view.photo: m for n, m in zip(self.nodes, self.near, strict=True) if m.any()}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,35 +100,55 @@ class Composer:
         """The window."""
         return self.drawn(self.plan(window, counted=True))
 
-    def plan(self, window: Window, *, counted: bool = False) -> Plan:
+    def plan(self, window: Window, *, counted: bool = False, earlier: Plan | None = None) -> Plan:
         """Which photos can show where; costs little, and no photo is read.
 
         `counted`: all photos that see the window are in the plan, not only those that others do not surely hide.
+        `earlier`: a plan of the same window; photos that have not changed since are not projected again, and
+        heights stay where their change does not show.
         """
         margin = -(-self.blend.margin // STEP) * STEP
         x, y, z = node_places(self.grid, self.surface, window.grown(margin))
+        known: Mapping[int, Nodes] = {}
+        if earlier is not None:
+            z, same = self._settled(z, earlier)
+            known = earlier.projected if same else known
         views = overlapping(self.views, x, y)
-        rank_of = self.blend.rank
-        scores = [np.full(1, least_score(v, x, y, z), np.float32) for v in views]
-        low = [float(rank_of(k, score)[0]) for k, score in enumerate(scores)]
+        low = self.blend.rank(np.arange(len(views)), least_scores(views, x, y, z))
         height = min((float(v.pose.map_C[2]) for v in views), default=1.0) - float(np.median(z))
         slack = self.blend.reach(self.grid.gsd) / max(height, 1e-3)
         # between nodes a rank lies between theirs: nobody wins there whose least rank exceeds another's greatest
         around, best = np.ones((3, 3), np.uint8), np.full(x.shape, np.float32(np.inf))
         found: dict[int, tuple[Nodes, NDArray]] = {}
-        for k in np.argsort(low, kind="stable").tolist():
+        ready = {k: n for k, v in enumerate(views) if (n := known.get(v.photo)) is not None and n.view is v}
+        order = np.argsort(low, kind="stable").tolist()
+        for at, k in enumerate(order):
             if not counted and low[k] > best.max() + slack:
                 break
-            nodes = project_nodes(views[k], x, y, z)
+            if k not in ready:
+                some = [j for j in order[at:] if j not in ready][:TOGETHER]
+                ready.update(zip(some, project_all([views[j] for j in some], x, y, z), strict=True))
+            nodes = ready[k]
             if nodes.seen.any():
-                rank = rank_of(k, np.where(nodes.seen, nodes.score, np.float32(np.inf)))
+                rank = self.blend.rank(k, np.where(nodes.seen, nodes.score, np.float32(np.inf)))
                 best = np.minimum(best, cv2.dilate(rank, around))
                 found[k] = nodes, cv2.erode(rank, around)
         kept = [found[k] for k in sorted(found)]
         return Plan(
             window=window, margin=margin, nodes=[nodes for nodes, _ in kept],
-            near=[np.isfinite(least) & (least <= best + slack) for _, least in kept],
+            near=[np.isfinite(least) & (least <= best + slack) for _, least in kept], z=z,
+            projected={n.view.photo: n for n in ready.values()},
         )  # fmt: skip
+
+    def _settled(self, z: NDArray, earlier: Plan) -> tuple[NDArray, bool]:
+        """Heights (r, c): the earlier ones but where the new ones shift a photo visibly; whether that is nowhere."""
+        aside = max((float(n.score[m].max()) for n, m in zip(earlier.nodes, earlier.near, strict=True) if m.any()),
+                    default=0.0)  # fmt: skip
+        moved = np.abs(z - earlier.z) * np.sqrt(aside) > STILL * self.grid.gsd
+        if not moved.any():
+            return earlier.z, True
+        around = cv2.dilate(moved.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        return np.where(around, z, earlier.z), False
 
     def drawn(self, plan: Plan) -> Composed:
         """A window as planned, piece by piece."""
@@ -135,6 +167,27 @@ class Composer:
                     photo[row : row + h, column : column + w] = merged[1][inner]
         return Composed(pixels=out, photo=photo, views=self._counted(plan.nodes, margin, window))
 
+    def redrawn(self, plan: Plan, earlier: Plan, before: Composed) -> Composed:
+        """What `drawn(plan)` gives, from what an earlier plan gave: only cells that look different are touched.
+
+        For merge rules that look at nothing beyond a pixel (margin 0).
+        """
+        window = plan.window
+        stale = _stale(plan, earlier)[1:-1, 1:-1]
+        out, photo = before.pixels.copy(), before.photo.copy()
+        if stale.any():
+            rows, columns = (
+                _extent(np.asarray(stale.any(1)), window.height),
+                _extent(np.asarray(stale.any(0)), window.width),
+            )
+            h, w = rows.stop - rows.start, columns.stop - columns.start
+            empty = np.nan if self.dtype.kind == "f" else 0
+            new, lead = self._piece(plan, rows.start, columns.start, h, w, stale) or (empty, np.int32(-1))
+            where = stale.repeat(STEP, 0).repeat(STEP, 1)[rows, columns]
+            np.copyto(out[rows, columns], new, where=where[..., None], casting="unsafe")
+            np.copyto(photo[rows, columns], lead, where=where)
+        return Composed(pixels=out, photo=photo, views=self._counted(plan.nodes, 0, window))
+
     def _counted(self, nodes: Sequence[Nodes], margin: int, window: Window) -> NDArray[np.uint16]:
         rows, columns = -(-window.height // STEP), -(-window.width // STEP)
         count = np.zeros((rows, columns), np.uint16)
@@ -144,14 +197,21 @@ class Composer:
         return count
 
     def _piece(
-        self, plan: Plan, row: int, column: int, h: int, w: int
+        self, plan: Plan, row: int, column: int, h: int, w: int, wanted: NDArray[np.bool_] | None = None
     ) -> tuple[NDArray, NDArray[np.int32]] | None:
-        """Pixels (h, w, bands) and leading photo (h, w) from a row and column of the window of the nodes."""
+        """Pixels (h, w, bands) and leading photo (h, w) from a row and column of the window of the nodes.
+
+        `wanted`: (r, c) cells of the window that matter; None = all do.
+        """
         cells = (
             slice(row // STEP + 1, (row + h - 1) // STEP + 2),
             slice(column // STEP + 1, (column + w - 1) // STEP + 2),
         )
-        chosen = [(n, here) for n, m in zip(plan.nodes, plan.near, strict=True) if (here := m[cells]).any()]
+        near = [m[cells] for m in plan.near]
+        if wanted is not None:
+            some = wanted[cells[0].start - 1 : cells[0].stop - 1, cells[1].start - 1 : cells[1].stop - 1]
+            near = [m & some for m in near]
+        chosen = [(n, here) for n, here in zip(plan.nodes, near, strict=True) if here.any()]
         if not chosen:
             return None
         alone = len(chosen) == 1
@@ -201,6 +261,22 @@ class Composer:
         return warped if table is None else np.asarray(cv2.LUT(warped, table)).reshape(warped.shape)
 
 
+def _stale(plan: Plan, earlier: Plan) -> NDArray[np.bool_]:
+    """(r, c) for the cells around the nodes: whether they look different from what an earlier plan of them gave."""
+    now, before = plan.showing(), earlier.showing()
+    lifted = cv2.dilate((plan.z != earlier.z).view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    nowhere = np.zeros(plan.z.shape, np.bool_)
+    stale = nowhere.copy()
+    for photo in {*now, *before}:
+        a, b = now.get(photo, nowhere), before.get(photo, nowhere)
+        new, old = plan.projected.get(photo), earlier.projected.get(photo)
+        if new is not None and old is not None and new.view is old.view:
+            stale |= (a != b) | ((a | b) & lifted)
+        else:
+            stale |= a | b
+    return stale
+
+
 def _remapped(image: NDArray, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray:
     """Pixels (h, w, bands) of an image at columns u and rows v (h, w)."""
     if image.dtype == np.uint8 and image.shape[2:] == (3,) and image.size <= MOST_PADDED * u.size:
@@ -213,9 +289,9 @@ def _remapped(image: NDArray, u: NDArray[np.float32], v: NDArray[np.float32]) ->
 
 
 def _extent(needed: NDArray[np.bool_], size: int) -> slice:
-    """The pixels, of `size`, that hold the needed cells and one more cell on each side."""
+    """The pixels, of `size`, from the first to the last needed cell."""
     at = np.flatnonzero(needed)
-    return slice(max(int(at[0]) - 1, 0) * STEP, min((int(at[-1]) + 2) * STEP, size))
+    return slice(int(at[0]) * STEP, min((int(at[-1]) + 1) * STEP, size))
 
 
 def _reach(places: NDArray[np.float32], size: int) -> slice:

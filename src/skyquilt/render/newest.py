@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.render.blend import First, Float, Layer
+from skyquilt.render.blend import First, Float, Layer, Order
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,7 +17,7 @@ class Newest:
     margin: ClassVar[int] = 0
     version: ClassVar[int] = 1
 
-    def rank(self, order: int, score: Float) -> Float:
+    def rank(self, order: Order, score: Float) -> Float:
         """Order of capture, from the end."""
         return np.where(np.isfinite(score), np.float32(-order), np.float32(np.inf))
 

@@ -18,9 +18,9 @@ from skyquilt.pipelines.live.neighbours import Neighbours
 from skyquilt.pipelines.live.settings import YOUNG, LiveSettings
 from skyquilt.pipelines.live.state import Member, Members
 
-RING = 12
+RING = 8
 """Held photos around those that may move."""
-MOVING = 4
+MOVING = 2
 """Linked photos that settle together with a new one."""
 
 

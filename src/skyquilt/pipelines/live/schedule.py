@@ -101,11 +101,15 @@ class Blocks:
         return job
 
     def _root(self) -> int:
-        """A photo of the block: the one that closed a loop, else the newest of the largest block."""
+        """A photo of the block: the one that closed a loop, else the newest of the block that has grown most."""
         if self.schedule.loop is not None:
             return self.schedule.loop
-        largest = max(self.members.blocks.items(), key=lambda b: (len(b[1]), -b[0]), default=(0, {0}))
-        return max(largest[1])
+        closed = self.schedule.closed_at
+        grown = max(
+            self.members.blocks.items(), key=lambda b: (len(b[1]) / closed.get(b[0], 2), len(b[1]), -b[0]),
+            default=(0, {0}),
+        )  # fmt: skip
+        return max(grown[1])
 
     def _around(self, root: int) -> tuple[list[int], frozenset[int]]:
         """The photos nearest along links, and the ring of those beyond, which are held."""

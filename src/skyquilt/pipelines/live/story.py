@@ -102,7 +102,7 @@ class LiveMap:
         neighbours = Neighbours(self.members, metadata)
         self.linking = Linking(self.members, self.methods, self.store, self.full)
         placing = Placing(self.members, metadata, neighbours, self.linking, self.settings)
-        self.canvas = Canvas(self.tiles, self.heights, self.full, self.members.by_id)
+        self.canvas = Canvas(self.tiles, self.heights, self.full, self.members.by_id, self.store)
         self.canvas.gsd = float(self.ledger.meta("gsd", 0.0))
         self.canvas.ground = float(self.ledger.meta("ground", 0.0))
         news = News(self.members, self.canvas)
