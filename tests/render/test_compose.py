@@ -12,8 +12,9 @@ from skyquilt.imaging.views import STEP, inside
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.render.blend import Average, Feather, First, Multiband
-from skyquilt.render.compose import STILL, _remapped
+from skyquilt.render.compose import _remapped
 from skyquilt.render.newest import Newest
+from skyquilt.render.plan import STILL
 from tests.render.scenes import CAMERA, FLAT, GRID, block, composer, photograph, truth, view
 
 WHOLE = Window(row=0, column=0, height=GRID.height, width=GRID.width)

@@ -1,6 +1,6 @@
 """Composition of a window of the map from the photos that see it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,24 +14,17 @@ from skyquilt.imaging.views import (
     cut,
     densify,
     inside_everywhere,
-    least_scores,
-    node_places,
-    overlapping,
-    project_all,
 )
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.render.blend import Blend, Layer
 from skyquilt.render.exposure import NEUTRAL, Exposure, image_place, with_odds
+from skyquilt.render.plan import Plan, planned, stale
 
 PhotoPixels = Callable[[int], NDArray]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""
 PIECE = 256
 """Pixels of a piece composed at a time."""
-TOGETHER = 6
-"""Photos projected at a time."""
-STILL = 0.5
-"""Map pixels by which changed heights may shift a photo that is not drawn again for it."""
 MOST_PADDED = 12
 """Values of a photo's cut-out per map pixel up to which a fourth band pays."""
 
@@ -46,33 +39,6 @@ class Composed:
     """(h, w) index of the photo that leads each pixel, -1 = none."""
     views: NDArray[np.uint16]
     """(r, c) number of photos, of those planned with, that see each STEP x STEP cell."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Plan:
-    """What is known of a window before any pixel is touched."""
-
-    window: Window
-    """Part of the map."""
-    margin: int
-    """Pixels beyond it that its merge rule must see."""
-    nodes: Sequence[Nodes]
-    """Where its nodes lie in each photo that sees any."""
-    near: Sequence[NDArray[np.bool_]]
-    """(r, c) per photo, for the cells around the nodes: whether it can show there."""
-    z: NDArray
-    """(r, c) heights in m of the nodes."""
-    projected: Mapping[int, Nodes]
-    """The nodes of all photos that were looked at, by photo."""
-
-    @property
-    def shown(self) -> list[int]:
-        """Photos that can show."""
-        return list(self.showing())
-
-    def showing(self) -> dict[int, NDArray[np.bool_]]:
-        """The photos that can show, and where: (r, c) for the cells around the nodes."""
-        return {n.view.photo: m for n, m in zip(self.nodes, self.near, strict=True) if m.any()}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,48 +73,9 @@ class Composer:
         `earlier`: a plan of the same window; photos that have not changed since are not projected again, and
         heights stay where their change does not show.
         """
-        margin = -(-self.blend.margin // STEP) * STEP
-        x, y, z = node_places(self.grid, self.surface, window.grown(margin))
-        known: Mapping[int, Nodes] = {}
-        if earlier is not None:
-            z, same = self._settled(z, earlier)
-            known = earlier.projected if same else known
-        views = overlapping(self.views, x, y)
-        low = self.blend.rank(np.arange(len(views)), least_scores(views, x, y, z))
-        height = min((float(v.pose.map_C[2]) for v in views), default=1.0) - float(np.median(z))
-        slack = self.blend.reach(self.grid.gsd) / max(height, 1e-3)
-        # between nodes a rank lies between theirs: nobody wins there whose least rank exceeds another's greatest
-        around, best = np.ones((3, 3), np.uint8), np.full(x.shape, np.float32(np.inf))
-        found: dict[int, tuple[Nodes, NDArray]] = {}
-        ready = {k: n for k, v in enumerate(views) if (n := known.get(v.photo)) is not None and n.view is v}
-        order = np.argsort(low, kind="stable").tolist()
-        for at, k in enumerate(order):
-            if not counted and low[k] > best.max() + slack:
-                break
-            if k not in ready:
-                some = [j for j in order[at:] if j not in ready][:TOGETHER]
-                ready.update(zip(some, project_all([views[j] for j in some], x, y, z), strict=True))
-            nodes = ready[k]
-            if nodes.seen.any():
-                rank = self.blend.rank(k, np.where(nodes.seen, nodes.score, np.float32(np.inf)))
-                best = np.minimum(best, cv2.dilate(rank, around))
-                found[k] = nodes, cv2.erode(rank, around)
-        kept = [found[k] for k in sorted(found)]
-        return Plan(
-            window=window, margin=margin, nodes=[nodes for nodes, _ in kept],
-            near=[np.isfinite(least) & (least <= best + slack) for _, least in kept], z=z,
-            projected={n.view.photo: n for n in ready.values()},
-        )  # fmt: skip
-
-    def _settled(self, z: NDArray, earlier: Plan) -> tuple[NDArray, bool]:
-        """Heights (r, c): the earlier ones but where the new ones shift a photo visibly; whether that is nowhere."""
-        aside = max((float(n.score[m].max()) for n, m in zip(earlier.nodes, earlier.near, strict=True) if m.any()),
-                    default=0.0)  # fmt: skip
-        moved = np.abs(z - earlier.z) * np.sqrt(aside) > STILL * self.grid.gsd
-        if not moved.any():
-            return earlier.z, True
-        around = cv2.dilate(moved.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        return np.where(around, z, earlier.z), False
+        return planned(
+            window, self.grid, self.views, self.surface, self.blend, counted=counted, earlier=earlier
+        )
 
     def drawn(self, plan: Plan) -> Composed:
         """A window as planned, piece by piece."""
@@ -173,17 +100,17 @@ class Composer:
         For merge rules that look at nothing beyond a pixel (margin 0).
         """
         window = plan.window
-        stale = _stale(plan, earlier)[1:-1, 1:-1]
+        changed = stale(plan, earlier)[1:-1, 1:-1]
         out, photo = before.pixels.copy(), before.photo.copy()
-        if stale.any():
+        if changed.any():
             rows, columns = (
-                _extent(np.asarray(stale.any(1)), window.height),
-                _extent(np.asarray(stale.any(0)), window.width),
+                _extent(np.asarray(changed.any(1)), window.height),
+                _extent(np.asarray(changed.any(0)), window.width),
             )
             h, w = rows.stop - rows.start, columns.stop - columns.start
             empty = np.nan if self.dtype.kind == "f" else 0
-            new, lead = self._piece(plan, rows.start, columns.start, h, w, stale) or (empty, np.int32(-1))
-            where = stale.repeat(STEP, 0).repeat(STEP, 1)[rows, columns]
+            new, lead = self._piece(plan, rows.start, columns.start, h, w, changed) or (empty, np.int32(-1))
+            where = changed.repeat(STEP, 0).repeat(STEP, 1)[rows, columns]
             np.copyto(out[rows, columns], new, where=where[..., None], casting="unsafe")
             np.copyto(photo[rows, columns], lead, where=where)
         return Composed(pixels=out, photo=photo, views=self._counted(plan.nodes, 0, window))
@@ -259,22 +186,6 @@ class Composer:
             return with_odds(warped, densify(odds, *warped.shape[:2]).reshape(warped.shape))
         table = self.exposure.table(photo)
         return warped if table is None else np.asarray(cv2.LUT(warped, table)).reshape(warped.shape)
-
-
-def _stale(plan: Plan, earlier: Plan) -> NDArray[np.bool_]:
-    """(r, c) for the cells around the nodes: whether they look different from what an earlier plan of them gave."""
-    now, before = plan.showing(), earlier.showing()
-    lifted = cv2.dilate((plan.z != earlier.z).view(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    nowhere = np.zeros(plan.z.shape, np.bool_)
-    stale = nowhere.copy()
-    for photo in {*now, *before}:
-        a, b = now.get(photo, nowhere), before.get(photo, nowhere)
-        new, old = plan.projected.get(photo), earlier.projected.get(photo)
-        if new is not None and old is not None and new.view is old.view:
-            stale |= (a != b) | ((a | b) & lifted)
-        else:
-            stale |= a | b
-    return stale
 
 
 def _remapped(image: NDArray, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray:

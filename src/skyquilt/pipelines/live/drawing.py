@@ -6,39 +6,32 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import simplejpeg
 from numpy.typing import NDArray
 
-from skyquilt.imaging.grey import shrink, to_grey8
 from skyquilt.imaging.views import View, footprint
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Pose
 from skyquilt.model.raster import Window
 from skyquilt.model.surface import Surface
-from skyquilt.photos.pixels import Reduction, read_color
+from skyquilt.pipelines.live.pictures import SmallPictures, measured
 from skyquilt.pipelines.live.state import Member
 from skyquilt.raster.tile_store import SIDE, Address, Tile, TileStore, covering
 from skyquilt.render.blend import Blend, Feather
-from skyquilt.render.compose import Composed, Composer, Plan
+from skyquilt.render.compose import Composed, Composer
 from skyquilt.render.newest import Newest
+from skyquilt.render.plan import Plan
 from skyquilt.run.executor import in_order
 from skyquilt.run.pixel_cache import PixelCache
-from skyquilt.run.store import Store, digest
+from skyquilt.run.store import Store
 from skyquilt.run.write_points import reached
 from skyquilt.surface.cells import HeightCells
 
 NEWEST = "-newest"
 """End of the names of layers that show the newest photo instead of the most vertical view."""
-SHARPNESS = 1.2
-"""Photo pixels per map pixel, along a side, of the pictures that are drawn."""
 MOST_VIEWS = 24
 """Photos that a tile is composed from."""
 LEAST_MOVE = 0.6
 """Map pixels by which a photo must have moved to be drawn again."""
-SMALL_QUALITY = 95
-"""Of these pictures' files."""
-PICTURES_BYTES = 150_000_000
-"""Reduced pictures at hand."""
 DRAWINGS = 96
 """Tiles at hand with what they were composed from: where photos change, only their parts are drawn."""
 THREADS = min(2, os.cpu_count() or 1)
@@ -62,11 +55,6 @@ def layer_of(member: Member) -> str:
     return member.photo.band
 
 
-def _measured(member: Member) -> bool:
-    """Whether a photo holds measured values, of one band, not a picture."""
-    return member.photo.band == "thermal" and bool(member.photo.unit)
-
-
 class Canvas:
     """Which photos see which tile, and the tiles themselves."""
 
@@ -78,8 +66,7 @@ class Canvas:
         members: dict[int, Member],
         store: Store,
     ) -> None:
-        self.tiles, self.heights, self.full, self.members = tiles, heights, full, members
-        self.store = store
+        self.tiles, self.heights, self.members = tiles, heights, members
         self.gsd = 0.0
         self.ground = 0.0
         self._views: dict[int, View] = {}
@@ -88,53 +75,8 @@ class Canvas:
         self._met: set[Address] = set()
         self._shown: dict[Address, tuple[int, ...]] = {}
         self._kept: OrderedDict[Address, Drawing] = OrderedDict()
-        self._sizes: dict[int, int] = {}
         self._by_tile: dict[Address, set[int]] = defaultdict(set)
-        self._pictures = PixelCache(read=self._reduced, budget_bytes=PICTURES_BYTES)
-
-    def _reduced(self, number: int) -> NDArray:
-        """A photo's pixels as small as the map needs them, one band or three.
-
-        Pictures go through the store: on a large map each is needed again and again, and a small file is read in a
-        quarter of the time of the photo.
-        """
-        member = self.members[number]
-        if _measured(member):
-            return self._shrunken(member)
-        key = digest(member.photo.digest, self._longest(member), SMALL_QUALITY)
-        small = self.store.get_or("small", key, lambda: self._encoded(member))
-        return np.asarray(simplejpeg.decode_jpeg(small.tobytes()))
-
-    def _encoded(self, member: Member) -> NDArray[np.uint8]:
-        body = simplejpeg.encode_jpeg(self._shrunken(member), quality=SMALL_QUALITY, colorspace="RGB")
-        return np.frombuffer(body, np.uint8)
-
-    def _shrunken(self, member: Member) -> NDArray:
-        longest, number, photo = self._longest(member), member.id, member.photo
-        factor = max(photo.width, photo.height) / longest
-        ready = self.full.peek(number)
-        if ready is None:
-            step: Reduction = 8 if factor >= 8 else 4 if factor >= 4 else 2 if factor >= 2 else 1
-            ready = read_color(photo, reduction=step)
-        small = np.ascontiguousarray(shrink(ready, longest)[0])
-        if _measured(member):
-            return small.astype(np.float32).reshape(*small.shape[:2], -1)[..., :1]
-        if small.dtype != np.uint8 or small.ndim == 2 or small.shape[2] < 3:
-            small = np.repeat(to_grey8(small)[..., None], 3, 2)
-        return np.ascontiguousarray(small[..., :3])
-
-    def _longest(self, member: Member) -> int:
-        """Longest side in px of the picture that is drawn, the same from the first time on."""
-        if member.id not in self._sizes:
-            self._sizes[member.id] = self._chosen(member)
-        return self._sizes[member.id]
-
-    def _chosen(self, member: Member) -> int:
-        photo, pose = member.photo, member.pose
-        above = float(pose.map_C[2]) - self.ground if pose is not None else 50.0
-        native = max(above, 1.0) / photo.focal.px
-        factor = max(1.0, self.gsd / (SHARPNESS * native))
-        return max(64, round(max(photo.width, photo.height) / factor))
+        self._pictures = SmallPictures(full, members, store)
 
     def place(self, member: Member, camera: Camera) -> set[Address]:
         """Takes note of where a photo is now; the tiles that may look different."""
@@ -163,7 +105,7 @@ class Canvas:
         return set(old)
 
     def _view(self, member: Member, camera: Camera, pose: Pose) -> View | None:
-        longest = self._longest(member)
+        longest = self._pictures.longest(member, self.gsd, self.ground)
         scale = longest / max(camera.width, camera.height)
         w, h = (
             (round(camera.width * scale), round(camera.height * scale))
@@ -282,11 +224,11 @@ class Canvas:
             return None
         west, south, east, north = grid.bounds
         rim = 8 * self.heights.cell
-        measured = _measured(self.members[inside[0].photo])
+        values = measured(self.members[inside[0].photo])
         return Composer(
             grid=grid, views=inside, surface=self.surface((west - rim, south - rim, east + rim, north + rim)),
-            blend=blend, pixels=self._pictures, bands=1 if measured else 3,
-            dtype=np.dtype(np.float32 if measured else np.uint8),
+            blend=blend, pixels=self._pictures, bands=1 if values else 3,
+            dtype=np.dtype(np.float32 if values else np.uint8),
         )  # fmt: skip
 
     @staticmethod
