@@ -1,0 +1,55 @@
+"""Which block is adjusted as a whole next."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from skyquilt.config import MosaicSettings, methods
+from skyquilt.pipelines.live.schedule import Blocks, Schedule
+from skyquilt.pipelines.live.settings import CLOSING, GROWTH, PART, LiveSettings
+
+
+def blocks_of(*sizes, closed=(), since=1, loop=None):
+    """Blocks of so many photos, each a chain, and what `due` would work on: (photos, held)."""
+    sets, by_id, first = {}, {}, 1
+    for size in sizes:
+        sets[first] = set(range(first, first + size))
+        for i in sets[first]:
+            by_id[i] = SimpleNamespace(links={i - 1, i + 1} & sets[first], pose=object())
+        first += size
+    block_of = {i: name for name, ids in sets.items() for i in ids}
+    members = SimpleNamespace(blocks=sets, by_id=by_id, block_of=block_of, block=lambda i: sets[block_of[i]])
+    schedule = Schedule(closed_at=dict(zip(sets, closed, strict=False)), since=since, loop=loop)
+    parts = methods(MosaicSettings())
+    blocks = Blocks(members, schedule, LiveSettings(), Path(), Path(), parts)
+    blocks._job = lambda ids, held, ground, sweep: (ids, held)
+    return blocks
+
+
+def test_every_block_is_bundled_as_it_grows_not_only_the_largest():
+    blocks = blocks_of(13, 12, 7, closed=(10, 9, 6))
+    ids, held = blocks.due(0.0, idle=False)
+    assert ids == list(range(14, 26)) and not held  # grown by 12 / 9; the largest by 13 / 10, just as due
+    assert blocks.schedule.closed_at == {1: 10, 14: 12, 26: 6}
+    blocks.schedule.since = 1
+    assert blocks.due(0.0, idle=False)[0] == list(range(1, 14))
+    blocks.schedule.since = 1
+    assert blocks.due(0.0, idle=False) is None  # 7 photos where there were 6
+    assert 7 / 6 < GROWTH
+
+
+@pytest.mark.parametrize("size", [CLOSING, CLOSING + 1])
+def test_of_a_large_block_a_part_is_adjusted_around_its_newest_photo(size):
+    blocks = blocks_of(size, closed=(100,), since=PART)
+    ids, held = blocks.due(0.0, idle=False)
+    if size == CLOSING:
+        assert ids == list(range(1, size + 1)) and not held
+    else:
+        assert len(set(ids) - held) == PART and size in set(ids) - held and max(held) == size - PART
+
+
+def test_a_loop_comes_first():
+    blocks = blocks_of(13, 12, closed=(13, 3), loop=5)
+    assert blocks.due(0.0, idle=False)[0] == list(range(1, 14))
+    assert blocks.schedule.loop is None
