@@ -43,7 +43,8 @@ def dense_system(problem, state):
         i, c, p = problem.photo[k], problem.camera[problem.photo[k]], problem.point[k]
         rows = slice(2 * k, 2 * k + 2)
         A[rows, 6 * i : 6 * i + 6] = lin.J_photo[k]
-        A[rows, 6 * n + 8 * c : 6 * n + 8 * c + 8] = lin.J_camera[k]
+        if lin.J_camera.shape[2]:
+            A[rows, 6 * n + 8 * c : 6 * n + 8 * c + 8] = lin.J_camera[k]
         A[rows, 6 * n + 8 * m + 3 * p : 6 * n + 8 * m + 3 * p + 3] = lin.J_point[k]
     e = lin.residual.ravel()
     prior_e = np.concatenate(
@@ -64,14 +65,17 @@ def dense_system(problem, state):
     return A.T @ A + np.diag(prior_w), A.T @ e + prior_w * np.nan_to_num(prior_e)
 
 
-@pytest.fixture(scope="module")
-def small():
+@pytest.fixture(scope="module", params=["free", "fixed"])
+def small(request):
+    """Two cameras whose intrinsics are free, or all fixed."""
     block = make_block(3, lines=2, per_line=3, points=60, cameras=2, overlap=0.6)
     X0 = block.problem.X0.copy()
     X0[:3] = block.truth.X[:3]
     X0[2, 2] = np.nan
     C0 = block.problem.C0.copy()
     C0[1] = np.nan
+    free = block.problem.free & (request.param == "free")
+    block = replace(block, problem=replace(block.problem, free=free))
     problem = least_squares_only(replace(block.problem, X0=X0, sigma_X=np.full(X0.shape, 0.05), C0=C0))
     start = replace(block.start, C=np.where(np.isnan(C0), block.truth.C + 1, C0))
     return problem, start

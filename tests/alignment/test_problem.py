@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyquilt.alignment.problem import State, attitude_error, linearise, residuals_px
+from skyquilt.alignment.problem import State, attitude_error, linearise, linearised_points, residuals_px
 from skyquilt.geometry.frames import rotation_from_vector
 from tests.alignment.blocks import make_block, seen_by
 
@@ -75,6 +75,13 @@ def test_fixed_intrinsics_have_no_derivative():
     second = block.problem.camera[block.problem.photo] == 1
     assert not lin.J_camera[second].any() and not lin.J_camera[:, :, 3].any()
     assert np.abs(lin.J_camera[~second][:, :, [0, 4, 7]]).min() > 0
+    none = linearise(replace(block.problem, free=np.zeros_like(free)), block.start)
+    assert none.J_camera.shape == (len(second), 2, 0)
+    whole = linearise(block.problem, block.start)
+    for name in ("residual", "J_photo", "J_point"):
+        assert np.array_equal(getattr(none, name), getattr(whole, name))
+    residual, J_point = linearised_points(block.problem, block.start)
+    assert np.array_equal(residual, whole.residual) and np.array_equal(J_point, whole.J_point)
 
 
 def test_points_behind_a_camera_do_not_count():

@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.problem import Problem, State, attitude_error, linearise, residuals_px
+from skyquilt.alignment.problem import (
+    Problem,
+    State,
+    attitude_error,
+    linearise,
+    linearised_points,
+    residuals_px,
+)
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -26,24 +33,27 @@ DENSE_LIMIT = 4000
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Normal:
-    """Normal equations split for the Schur complement: photos and cameras (u), points (v)."""
+    """Normal equations split for the Schur complement: photos and cameras (u), points (v).
+
+    A camera has q = 8 unknowns, or none where all intrinsics are fixed.
+    """
 
     U: Array
     """(n, 6, 6) photo blocks."""
     Uc: Array
-    """(m, 8, 8) camera blocks."""
+    """(m, q, q) camera blocks."""
     Upc: Array
-    """(n, 6, 8) photo-camera blocks."""
+    """(n, 6, q) photo-camera blocks."""
     V: Array
     """(P, 3, 3) point blocks."""
     Wp: Array
     """(N, 6, 3) photo-point block of each sighting."""
     Wc: Array
-    """(N, 8, 3) camera-point block of each sighting."""
+    """(N, q, 3) camera-point block of each sighting."""
     gp: Array
     """(n, 6) gradient."""
     gc: Array
-    """(m, 8) gradient."""
+    """(m, q) gradient."""
     gv: Array
     """(P, 3) gradient."""
     cost: float
@@ -136,23 +146,23 @@ def normal_equations(problem: Problem, state: State) -> Normal:
     root = np.sqrt(weight)[:, None, None]
     e, J_point = lin.residual[..., None] * root, lin.J_point * root
     rows = np.concatenate([lin.J_photo, lin.J_camera, lin.residual[..., None]], 2) * root
-    n, m, count = len(state.C), len(state.K), len(state.X)
+    n, m, count, q = len(state.C), len(state.K), len(state.X), lin.J_camera.shape[2]
     by_photo = _by_photo(problem, rows, n)
-    by_camera = np.zeros((m, 8, 9))
-    np.add.at(by_camera, problem.camera, by_photo[:, 6:14, 6:15])
+    by_camera = np.zeros((m, q, q + 1))
+    np.add.at(by_camera, problem.camera, by_photo[:, 6 : 6 + q, 6:])
     point_rows = np.concatenate([J_point, e], 2)
     by_point = _by_point(problem, np.swapaxes(J_point, 1, 2) @ point_rows, count)
-    W = np.swapaxes(rows[:, :, :14], 1, 2) @ J_point
+    W = np.swapaxes(rows[:, :, :-1], 1, 2) @ J_point
     (pc, gc), (pr, gr), (pk, gk), (px, gx) = (terms := _prior_terms(problem, state))[0]
-    U, Uc, V = by_photo[:, :6, :6].copy(), by_camera[:, :, :8].copy(), by_point[:, :, :3].copy()
+    U, Uc, V = by_photo[:, :6, :6].copy(), by_camera[:, :, :q].copy(), by_point[:, :, :3].copy()
     _add_diagonal(U, 0, pr)
     _add_diagonal(U, 3, pc)
-    _add_diagonal(Uc, 0, np.where(problem.free, pk, 1.0))
+    _add_diagonal(Uc, 0, np.where(problem.free, pk, 1.0)[:, :q])
     _add_diagonal(V, 0, px)
-    gp = by_photo[:, :6, 14] + np.concatenate([gr, gc], 1)
+    gp = by_photo[:, :6, -1] + np.concatenate([gr, gc], 1)
     return Normal(
-        U=U, Uc=Uc, Upc=by_photo[:, :6, 6:14], V=V, Wp=W[:, :6], Wc=W[:, 6:],
-        gp=gp, gc=by_camera[:, :, 8] + gk, gv=by_point[:, :, 3] + gx, cost=cost + terms[1],
+        U=U, Uc=Uc, Upc=by_photo[:, :6, 6 : 6 + q], V=V, Wp=W[:, :6], Wc=W[:, 6:],
+        gp=gp, gc=by_camera[:, :, q] + gk[:, :q], gv=by_point[:, :, 3] + gx, cost=cost + terms[1],
     )  # fmt: skip
 
 
@@ -196,8 +206,8 @@ class Reduced:
 
     def __init__(self, problem: Problem, normal: Normal, damping: float) -> None:
         self.problem, self.normal = problem, normal
-        n, m = len(normal.U), len(normal.Uc)
-        self.n, self.m, self.size = n, m, 6 * n + 8 * m
+        n, m, q = len(normal.U), len(normal.Uc), normal.Uc.shape[2]
+        self.n, self.m, self.q, self.size = n, m, q, 6 * n + q * m
         V = normal.V.copy()
         k = np.arange(3)
         V[:, k, k] = V[:, k, k] * (1 + damping) + 1e-12
@@ -206,37 +216,38 @@ class Reduced:
         self.S: Array | sparse.csc_matrix = self._assemble(damping)
 
     def _diagonal_blocks(self, damping: float) -> "Array | sparse.lil_matrix":
-        n, m, N = self.n, self.m, self.normal
+        n, m, q, N = self.n, self.m, self.q, self.normal
         S = _zeros(self.size)
         for i in range(n):
             block = N.U[i] + np.diag(np.diag(N.U[i]) * damping + 1e-9)
             S[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = block
-            c = 6 * n + 8 * int(self.problem.camera[i])
-            S[6 * i : 6 * i + 6, c : c + 8] = N.Upc[i]
-            S[c : c + 8, 6 * i : 6 * i + 6] = N.Upc[i].T
-        for j in range(m):
-            c = 6 * n + 8 * j
-            S[c : c + 8, c : c + 8] = N.Uc[j] + np.diag(np.diag(N.Uc[j]) * damping)
+            c = 6 * n + q * int(self.problem.camera[i])
+            S[6 * i : 6 * i + 6, c : c + q] = N.Upc[i]
+            S[c : c + q, 6 * i : 6 * i + 6] = N.Upc[i].T
+        for j in range(m if q else 0):
+            c = 6 * n + q * j
+            S[c : c + q, c : c + q] = N.Uc[j] + np.diag(np.diag(N.Uc[j]) * damping)
         return S
 
     def _chunk(self, lo: int, hi: int) -> tuple[NDArray[np.int64], Array, slice]:
         """Unknowns touched by sightings [lo, hi), their rows of W L^-T (u, 3p), and the points' slice."""
-        p, N = self.problem, self.normal
+        p, N, q = self.problem, self.normal, self.q
         point, photo = p.point[lo:hi], p.photo[lo:hi]
         first, last = int(point[0]), int(point[-1]) + 1
         seen, local = np.unique(photo, return_inverse=True)
         cams, cam_local = np.unique(p.camera[photo], return_inverse=True)
         T = np.swapaxes(self.L_inv[point], 1, 2)
-        rows = np.zeros((6 * len(seen) + 8 * len(cams), last - first, 3))
+        rows = np.zeros((6 * len(seen) + q * len(cams), last - first, 3))
         view = rows[: 6 * len(seen)].reshape(len(seen), 6, last - first, 3)
         view[local, :, point - first] = N.Wp[lo:hi] @ T
-        cam_view = rows[6 * len(seen) :].reshape(len(cams), 8, last - first, 3)
-        place: Any = (cam_local, slice(None), point - first)
-        np.add.at(cam_view, place, N.Wc[lo:hi] @ T)
+        if q:
+            cam_view = rows[6 * len(seen) :].reshape(len(cams), q, last - first, 3)
+            place: Any = (cam_local, slice(None), point - first)
+            np.add.at(cam_view, place, N.Wc[lo:hi] @ T)
         unknowns = np.concatenate(
             [
                 (6 * seen[:, None] + np.arange(6)).ravel(),
-                (6 * self.n + 8 * cams[:, None] + np.arange(8)).ravel(),
+                (6 * self.n + q * cams[:, None] + np.arange(q)).ravel(),
             ]
         )
         return unknowns, rows.reshape(len(rows), -1), slice(first, last)
@@ -273,10 +284,12 @@ class Reduced:
     def step(self) -> tuple[Array, Array, Array]:
         """The Gauss-Newton step of photos (n, 6), cameras (m, 8) and points (P, 3)."""
         du = -self.solve(self.g)
-        photo_step, camera_step = du[: 6 * self.n].reshape(-1, 6), du[6 * self.n :].reshape(-1, 8)
+        photo_step, camera_step = du[: 6 * self.n].reshape(-1, 6), np.zeros((self.m, 8))
         p, N = self.problem, self.normal
         coupled = np.einsum("nij,ni->nj", N.Wp, photo_step[p.photo])
-        coupled += np.einsum("nij,ni->nj", N.Wc, camera_step[p.camera[p.photo]])
+        if self.q:
+            camera_step = du[6 * self.n :].reshape(-1, 8)
+            coupled += np.einsum("nij,ni->nj", N.Wc, camera_step[p.camera[p.photo]])
         rhs = N.gv + _by_point(p, coupled, len(N.V))
         half = np.einsum("pij,pj->pi", self.L_inv, rhs)
         return photo_step, camera_step, -np.einsum("pji,pj->pi", self.L_inv, half)
@@ -284,9 +297,9 @@ class Reduced:
 
 def polish_points(problem: Problem, state: State) -> State:
     """One Gauss-Newton step of the points alone."""
-    lin = linearise(problem, state)
-    weight, _ = _sighting_weights(problem, lin.residual)
-    rows = np.concatenate([lin.J_point, lin.residual[..., None]], 2) * np.sqrt(weight)[:, None, None]
+    residual, J_point = linearised_points(problem, state)
+    weight, _ = _sighting_weights(problem, residual)
+    rows = np.concatenate([J_point, residual[..., None]], 2) * np.sqrt(weight)[:, None, None]
     sums = _by_point(problem, np.swapaxes(rows[:, :, :3], 1, 2) @ rows, len(state.X))
     pull = np.where(np.isfinite(problem.X0), 1 / problem.sigma_X**2, 0.0)
     H = sums[:, :, :3]
@@ -347,4 +360,5 @@ def covariance(problem: Problem, state: State) -> Array | None:
         inverse = np.linalg.inv(S * scale) * scale
     except np.linalg.LinAlgError:
         return None
-    return inverse if np.isfinite(inverse).all() else None
+    fixed = 8 * reduced.m if reduced.q == 0 else 0  # what is fixed does not vary
+    return np.pad(inverse, (0, fixed)) if np.isfinite(inverse).all() else None

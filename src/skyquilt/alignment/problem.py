@@ -94,7 +94,7 @@ class Linearised:
     J_photo: Array
     """(N, 2, 6)."""
     J_camera: Array
-    """(N, 2, 8), fixed intrinsics zeroed."""
+    """(N, 2, 8), fixed intrinsics zeroed; (N, 2, 0) where all are fixed."""
     J_point: Array
     """(N, 2, 3)."""
     behind: NDArray[np.bool_]
@@ -113,18 +113,26 @@ def _local(problem: Problem, state: State) -> tuple[Array, NDArray[np.bool_]]:
 def linearise(problem: Problem, state: State) -> Linearised:
     """Residuals and Jacobians at a state."""
     local, behind = _local(problem, state)
-    cameras = problem.camera[problem.photo]
-    p = project_with_derivatives(state.K[cameras], local)
+    cameras, some = problem.camera[problem.photo], bool(problem.free.any())
+    p = project_with_derivatives(state.K[cameras], local, intrinsics=some)
     w = (~behind / problem.sigma_px)[:, None]
     d_point = p.d_point * w[..., None]
     J_photo = np.empty((len(local), 2, 6))
     J_photo[:, :, :3] = np.cross(local[:, None, :], d_point)  # d . (w x local) = (local x d) . w
     J_point = d_point @ state.R[problem.photo]
     J_photo[:, :, 3:] = -J_point
-    J_camera = p.d_intrinsics * w[..., None] * problem.free[cameras][:, None, :]
+    J_camera = p.d_intrinsics * w[..., None] * problem.free[cameras][:, None, :] if some else p.d_intrinsics
     return Linearised(
         residual=(p.px - problem.px) * w, J_photo=J_photo, J_camera=J_camera, J_point=J_point, behind=behind
     )
+
+
+def linearised_points(problem: Problem, state: State) -> tuple[Array, Array]:
+    """`residual` (N, 2) and `J_point` (N, 2, 3) of `linearise` alone."""
+    local, behind = _local(problem, state)
+    p = project_with_derivatives(state.K[problem.camera[problem.photo]], local, intrinsics=False)
+    w = (~behind / problem.sigma_px)[:, None]
+    return (p.px - problem.px) * w, (p.d_point * w[..., None]) @ state.R[problem.photo]
 
 
 def residuals_px(problem: Problem, state: State) -> Array:

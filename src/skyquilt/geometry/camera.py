@@ -23,7 +23,7 @@ class Projection(NamedTuple):
     d_point: Array
     """(N, 2, 3): by the point in camera coordinates."""
     d_intrinsics: Array
-    """(N, 2, 8): by the intrinsics in the order of `model.camera.PARAMETERS`."""
+    """(N, 2, 8): by the intrinsics in the order of `model.camera.PARAMETERS`; (N, 2, 0) where they are fixed."""
 
 
 def distort(xy: Array, k: Array) -> Array:
@@ -54,8 +54,11 @@ def project(camera: Camera, xyz_cam: Array) -> Array:
     return np.asarray(distort(xy, k) * k[0] + k[1:3])
 
 
-def project_with_derivatives(k: Array, xyz_cam: Array) -> Projection:
-    """Pixels and derivatives; `k` (N, 8) holds each point's intrinsics, `xyz_cam` is (N, 3) with z > 0."""
+def project_with_derivatives(k: Array, xyz_cam: Array, *, intrinsics: bool = True) -> Projection:
+    """Pixels and derivatives; `k` (N, 8) holds each point's intrinsics, `xyz_cam` is (N, 3) with z > 0.
+
+    `intrinsics`: False = they are fixed, and `d_intrinsics` is (N, 2, 0).
+    """
     f, cx, cy, k1, k2, k3, p1, p2 = k.T
     inv_z = 1.0 / xyz_cam[:, 2]
     x, y = xyz_cam[:, 0] * inv_z, xyz_cam[:, 1] * inv_z
@@ -73,6 +76,9 @@ def project_with_derivatives(k: Array, xyz_cam: Array) -> Projection:
     d_point[:, 1, 0], d_point[:, 1, 1] = f * dxy * inv_z, f * dyy * inv_z
     d_point[:, 0, 2] = -f * (dxx * x + dxy * y) * inv_z
     d_point[:, 1, 2] = -f * (dxy * x + dyy * y) * inv_z
+    px = np.stack([f * xd + cx, f * yd + cy], -1)
+    if not intrinsics:
+        return Projection(px, d_point, np.zeros((len(x), 2, 0)))
     d_k = np.zeros((len(x), 2, 8))
     d_k[:, 0, 0], d_k[:, 1, 0] = xd, yd
     d_k[:, 0, 1] = d_k[:, 1, 2] = 1
@@ -82,7 +88,7 @@ def project_with_derivatives(k: Array, xyz_cam: Array) -> Projection:
         power = power * r2
     d_k[:, 0, 6], d_k[:, 1, 6] = 2 * f * xy, f * (r2 + 2 * yy)
     d_k[:, 0, 7], d_k[:, 1, 7] = f * (r2 + 2 * xx), 2 * f * xy
-    return Projection(np.stack([f * xd + cx, f * yd + cy], -1), d_point, d_k)
+    return Projection(px, d_point, d_k)
 
 
 def undistort(camera: Camera, px: Array, *, iterations: int = 20) -> Array:
@@ -99,7 +105,7 @@ def undistort(camera: Camera, px: Array, *, iterations: int = 20) -> Array:
     unit = np.broadcast_to(np.r_[1.0, 0.0, 0.0, k[3:]], (len(flat), 8))
     guess = flat.copy()
     for _ in range(iterations):
-        step = project_with_derivatives(unit, np.column_stack([guess, ones]))
+        step = project_with_derivatives(unit, np.column_stack([guess, ones]), intrinsics=False)
         error = step.px - flat
         guess -= np.linalg.solve(step.d_point[:, :, :2], error[..., None])[..., 0]
         if np.abs(error).max(initial=0.0) < 1e-12:
