@@ -29,7 +29,7 @@ HELD_M, HELD_RAD = 1e-3, 1e-5
 """Deviations of photos that are held."""
 DISAGREE = 0.12
 """Links that put a photo further apart than this share of the flying height contradict each other."""
-STAGES = ((2.0, 20.0, 40.0, 3e-2), (0.8, 6.0, 12.0, 1e-2), (0.0, 2.5, 5.0, 2e-3))
+STAGES = ((2.0, 20.0, 40.0, 3e-2), (0.8, 6.0, 12.0, 1e-2), (0.0, 2.5, 5.0, 1e-2))
 """Rounds of an adjustment: from which median misfit in px of the new photo on, width of the loss in px, residual in
 px beyond which sightings go, and tolerance."""
 TURNED = "/turned"
@@ -149,7 +149,7 @@ def _adjusted(problem: Problem, state: State, new: int) -> tuple[Problem, State]
                 problem.with_loss(loss), state, iterations=8, tolerance=tolerance, damping=1e-5
             ).state
             problem, state = prune(problem, state, limit)
-    return problem, adjust(problem.with_loss(2.0), state, iterations=6, tolerance=1e-3, damping=1e-6).state
+    return problem, adjust(problem.with_loss(2.0), state, iterations=6, tolerance=3e-3, damping=1e-6).state
 
 
 def _similarity(window: Window, i: int) -> tuple[complex, complex]:
