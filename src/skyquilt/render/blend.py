@@ -105,8 +105,8 @@ class Feather:
 
     def _soften(self, hard: NDArray, layers: Sequence[Layer], lead: NDArray[np.int32], gsd: float) -> None:
         """Blends, in place, the few pixels that lie within half a width of a seam."""
-        slopes = [[self._slope(a, b, gsd) for b in layers] for a in layers]
-        steepest = max(max(row) for row in slopes)
+        slopes = _slopes(layers, gsd)
+        steepest = slopes.max()
         best, second = layers[0].score, np.full_like(layers[0].score, np.inf)
         for layer in layers[1:]:
             second = np.minimum(second, np.maximum(best, layer.score))
@@ -115,11 +115,14 @@ class Feather:
         if not len(near):
             return
         s = np.stack([layer.score.ravel()[near] for layer in layers])
+        # no ramp reaches further from the winner than half a width of the seam with it
+        within = (s < s.min(0) + slopes[:, s.argmin(0)] * np.float32(self.width_px / 2)).sum(0) > 1
+        near, s = near[within], s[:, within]
         ramps = np.empty(s.shape, np.float32)
         with np.errstate(invalid="ignore"):
             for k in range(len(layers)):
                 # signed distance in px to the nearest seam: positive where this layer wins
-                rows = [(s[j] - s[k]) / slopes[k][j] for j in range(len(layers)) if j != k]
+                rows = [(s[j] - s[k]) / slopes[k, j] for j in range(len(layers)) if j != k]
                 ramps[k] = np.clip(0.5 + np.min(rows, axis=0) / self.width_px, 0, 1)
         ramps = np.where(np.isfinite(s), np.nan_to_num(ramps), 0)
         total = np.maximum(ramps.sum(0), 1e-6)
@@ -133,11 +136,13 @@ class Feather:
             mixed = np.clip(np.rint(mixed), 0, np.iinfo(hard.dtype).max)
         hard.reshape(-1, hard.shape[2])[near[seen]] = mixed[seen].astype(hard.dtype)
 
-    @staticmethod
-    def _slope(a: Layer, b: Layer, gsd: float) -> float:
-        """Change of the ranks' difference per px across the seam of two photos."""
-        apart = float(np.hypot(a.centre[0] - b.centre[0], a.centre[1] - b.centre[1]))
-        return 2 * max(apart, 0.05 * a.height) * gsd / (a.height * b.height)
+
+def _slopes(layers: Sequence[Layer], gsd: float) -> Float:
+    """(k, k) change of the ranks' difference per px across the seam of two photos."""
+    centre = np.array([layer.centre for layer in layers])
+    height = np.array([layer.height for layer in layers])
+    apart = np.hypot(*(centre[:, None] - centre).transpose(2, 0, 1))
+    return (2 * np.maximum(apart, 0.05 * height[:, None]) * gsd / np.outer(height, height)).astype(np.float32)
 
 
 def _picked(layers: Sequence[Layer], lead: NDArray[np.int32]) -> NDArray:
