@@ -158,11 +158,20 @@ def test_an_older_orthophoto_lies_below(finished, flight, tmp_path):
         open_survey(finished[1], base=tmp_path / "no.tif")
 
 
+def interruptible():
+    """In the child, before it begins: a shell that started the tests in the background has them ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.mark.slow
 def test_view_is_a_command_that_only_looks(finished):
     before = {p: p.stat().st_mtime_ns for p in finished[1].rglob("*.tif")}
     with subprocess.Popen(
-        command("view", finished[1], "--port", 0), stdout=subprocess.PIPE, text=True, env=ENV
+        command("view", finished[1], "--port", 0),
+        stdout=subprocess.PIPE,
+        text=True,
+        env=ENV,
+        preexec_fn=interruptible,
     ) as process:
         try:
             url = process.stdout.readline().split()[0]
