@@ -3,6 +3,7 @@
 import http.client
 import io
 import json
+import math
 import re
 import sqlite3
 from itertools import pairwise
@@ -167,6 +168,42 @@ def test_the_requests_of_a_real_qgis(site, version, crs):
         shown = far[rows[0] : rows[1], columns[0] : columns[1]]
         again = cv2.resize(near, shown.shape[::-1], interpolation=cv2.INTER_AREA)
         assert np.corrcoef(shown.ravel(), again.ravel())[0, 1] > 0.95
+
+
+def test_the_requests_of_mission_planner(site):
+    """As its source makes them and checks the answers (ArduPilot/MissionPlanner: ExtLibs/Maps/WMSProvider.cs and
+    GCSViews/FlightPlanner.cs): capabilities asked for as 1.1.0, then tiles in degrees, as 1.1.1.
+    """
+    answer = site.web.get("/wms?version=1.1.0&Request=GetCapabilities&service=WMS")
+    root = ElementTree.fromstring(answer.content)
+    assert root.tag == "WMT_MS_Capabilities"
+    assert len(root.findall(".//GetMap")) == 1
+    assert any("image/png" in e.text for e in root.iter("Format"))
+    assert any("EPSG:4326" in e.text for e in root.iter("SRS"))
+    names = {e.findtext("Name"): e.findtext("Title") for e in root.findall(".//Layer/Layer")}
+    assert all(names) and all(names.values()) and "visible" in names
+
+    zoom = 19
+    x, y = tile_of(*middle(site), zoom)
+    west, east = (n / 2**zoom * 360 - 180 for n in (x, x + 1))
+    north, south = (
+        math.degrees(math.atan(math.sinh(math.pi * (1 - n / 2 ** (zoom - 1))))) for n in (y, y + 1)
+    )
+    query = (
+        f"VERSION=1.1.1&REQUEST=GetMap&SERVICE=WMS&layers=visible&styles=&bbox={west},{south},{east},{north}"
+    )
+    answer = site.web.get(f"/wms?{query}&width=256&height=256&srs=EPSG:4326&format=image/png")
+    assert answer.status_code == 200 and answer.headers["content-type"] == "image/png"
+    tile = site.web.get(f"/tiles/{zoom}/{x}/{y}")
+    with Image.open(io.BytesIO(answer.content)) as image, Image.open(io.BytesIO(tile.content)) as like:
+        seen, expected = (np.asarray(i.convert("RGBA")).astype(float) for i in (image, like))
+    shown = expected[..., 3] == 255
+    assert shown.mean() > 0.2
+    off = np.abs(seen - expected)[shown][:, :3].mean()
+    assert off < 6  # WebP, and degrees for metres
+    assert (
+        np.abs(np.roll(seen, 40, 0) - expected)[shown][:, :3].mean() > 2 * off
+    )  # the figure means something
 
 
 def test_export_is_a_georeferenced_cog(site, tmp_path):
