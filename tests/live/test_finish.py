@@ -24,6 +24,7 @@ from skyquilt.raster.map_source import mercator
 from skyquilt.viewer.guard import Guard
 from skyquilt.viewer.serving import Serving
 from skyquilt.viewer.survey import open_survey
+from tests.interrupts import hears_interrupts
 from tests.live.conftest import served
 from tests.live.test_http import middle, tile_of
 
@@ -158,11 +159,6 @@ def test_an_older_orthophoto_lies_below(finished, flight, tmp_path):
         open_survey(finished[1], base=tmp_path / "no.tif")
 
 
-def interruptible():
-    """In the child, before it begins: a shell that started the tests in the background has them ignore Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
 @pytest.mark.slow
 def test_view_is_a_command_that_only_looks(finished):
     before = {p: p.stat().st_mtime_ns for p in finished[1].rglob("*.tif")}
@@ -171,7 +167,7 @@ def test_view_is_a_command_that_only_looks(finished):
         stdout=subprocess.PIPE,
         text=True,
         env=ENV,
-        preexec_fn=interruptible,
+        preexec_fn=hears_interrupts,
     ) as process:
         try:
             url = process.stdout.readline().split()[0]

@@ -16,6 +16,7 @@ import rasterio
 
 from skyquilt.pipelines.mosaic import STAGES
 from skyquilt.run.folder import CONTRACT
+from tests.interrupts import hears_interrupts
 from tests.stories.conftest import leftovers, named
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning", "error::scipy.linalg.LinAlgWarning")
@@ -288,11 +289,6 @@ def test_an_unfinished_output_inside_the_folder_of_photos_is_no_input_either(mos
 
 
 # interrupts and kills
-
-
-def hears_interrupts() -> None:
-    """A shell's background jobs ignore Ctrl-C, and their children inherit that: not what is tested here."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 class Running:

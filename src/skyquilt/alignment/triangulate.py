@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.problem import Problem, State, linearise
+from skyquilt.alignment.problem import Problem, State, linearised_points
 from skyquilt.geometry.camera import undistort
 from skyquilt.model.camera import PARAMETERS, Camera
 
@@ -40,12 +40,11 @@ def polish(problem: Problem, state: State, *, iterations: int = 5) -> tuple[Stat
     """Gauss-Newton on the points alone; returns the state and each point's height deviation (P,) in m."""
     sigma_z = np.full(len(state.X), np.inf)
     for _ in range(iterations):
-        lin = linearise(problem, state)
-        w = 1 / (1 + (lin.residual**2).sum(1) / problem.loss_px**2)
-        J = lin.J_point
+        residual, J = linearised_points(problem, state)
+        w = 1 / (1 + (residual**2).sum(1) / problem.loss_px**2)
         H, g = np.zeros((len(state.X), 3, 3)), np.zeros((len(state.X), 3))
         np.add.at(H, problem.point, np.swapaxes(J, 1, 2) @ J * w[:, None, None])
-        np.add.at(g, problem.point, np.einsum("nki,nk->ni", J, lin.residual) * w[:, None])
+        np.add.at(g, problem.point, np.einsum("nki,nk->ni", J, residual) * w[:, None])
         H += np.eye(3) * 1e-9
         step = -np.linalg.solve(H, g[..., None])[..., 0]
         state = State(R=state.R, C=state.C, K=state.K, X=state.X + step)

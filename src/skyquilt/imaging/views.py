@@ -99,21 +99,13 @@ def make_views(alignment: Alignment, surface: Surface) -> list[View]:
 
 def project_nodes(view: View, x: NDArray, y: NDArray, z: NDArray) -> Nodes:
     """Nodes at map coordinates (r, c), or at k heights z (k, r, c) over them: photo pixels and scores."""
-    k, C = view.camera.vector, view.pose.map_C
-    across, down, depth = view.pose.planes_to_camera(x, y, z)
-    ahead = np.maximum(depth, 1e-3)
-    px, py = across / ahead, down / ahead
-    # behind the camera, or where the distortion polynomial folds back, a point is nowhere in the photo
-    real = (depth > 0.1) & (px * px + py * py < monotone_radius(view.camera) ** 2)
+    camera, C = view.camera, view.pose.map_C
+    planes = view.pose.planes_to_camera(x, y, z)
+    u, v, real = _photo_pixels(planes, camera.vector, monotone_radius(camera))
     real = np.broadcast_to(real, np.broadcast_shapes(x.shape, z.shape))
-    u, v = (
-        np.where(real, k[0] * p + c, -1e4).astype(np.float32)
-        for p, c in zip(distort_planes(px, py, k), k[1:3], strict=True)
-    )
     drop = z - C[2]
     return Nodes(
-        view=view, u=u, v=v, seen=inside(view.camera, u, v), real=real,
-        score=(((x - C[0]) ** 2 + (y - C[1]) ** 2) / np.maximum(drop**2, 1e-6)).astype(np.float32),
+        view=view, u=u, v=v, seen=inside(camera, u, v), real=real, score=_scores(x - C[0], y - C[1], drop),
         height=float(np.median(-drop)),
     )  # fmt: skip
 
@@ -125,32 +117,48 @@ def project_all(views: Sequence[View], x: NDArray, y: NDArray, z: NDArray) -> li
     R = np.array([v.pose.cam_R_map for v in views]).transpose(1, 2, 0)[..., None, None]
     C = np.array([v.pose.map_C for v in views]).T[..., None, None]
     k = np.array([v.camera.vector for v in views])[:, None, None, :]
-    limit = np.array([monotone_radius(v.camera) for v in views])[:, None, None] ** 2
-    size = np.array([(v.camera.width, v.camera.height) for v in views]).T[..., None, None] - 1 - BORDER_PX
+    limit = np.array([monotone_radius(v.camera) for v in views])[:, None, None]
     dx, dy, dz = x - C[0], y - C[1], z - C[2]
     across, down, depth = (row[0] * dx + row[1] * dy + row[2] * dz for row in R)
-    ahead = np.maximum(depth, 1e-3)
-    px, py = across / ahead, down / ahead
-    real = (depth > 0.1) & (px * px + py * py < limit)
-    u, v = (
-        np.where(real, k[..., 0] * p + k[..., i], -1e4).astype(np.float32)
-        for i, p in enumerate(distort_planes(px, py, k), 1)
-    )
-    seen = (u > BORDER_PX) & (v > BORDER_PX) & (u < size[0]) & (v < size[1])
-    score = ((dx**2 + dy**2) / np.maximum(dz**2, 1e-6)).astype(np.float32)
-    height = np.median(-dz.reshape(len(views), -1), axis=1).tolist()
+    u, v, real = _photo_pixels((across, down, depth), k, limit)
+    width, height = np.array([(v.camera.width, v.camera.height) for v in views]).T[..., None, None]
+    seen, score = _within(u, v, width, height), _scores(dx, dy, dz)
+    above = np.median(-dz.reshape(len(views), -1), axis=1).tolist()
     return [
-        Nodes(view=view, u=u[n], v=v[n], score=score[n], seen=seen[n], real=real[n], height=height[n])
+        Nodes(view=view, u=u[n], v=v[n], score=score[n], seen=seen[n], real=real[n], height=above[n])
         for n, view in enumerate(views)
     ]
 
 
+def _photo_pixels(
+    planes: tuple[NDArray, NDArray, NDArray], k: NDArray, limit: NDArray | float
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Columns, rows of places in camera coordinates, and which are real; `k` (..., 8), `limit`: the lens's radius."""
+    across, down, depth = planes
+    ahead = np.maximum(depth, 1e-3)
+    px, py = across / ahead, down / ahead
+    # behind the camera, or where the distortion polynomial folds back, a point is nowhere in the photo
+    real = (depth > 0.1) & (px * px + py * py < limit**2)
+    u, v = (
+        np.where(real, k[..., 0] * p + k[..., i], -1e4).astype(np.float32)
+        for i, p in enumerate(distort_planes(px, py, k), 1)
+    )
+    return u, v, real
+
+
+def _scores(dx: NDArray, dy: NDArray, dz: NDArray) -> NDArray[np.float32]:
+    """Squared tangents of the angle off the vertical of places that far from a camera in m."""
+    return ((dx**2 + dy**2) / np.maximum(dz**2, 1e-6)).astype(np.float32)
+
+
 def inside(camera: Camera, u: NDArray, v: NDArray) -> NDArray[np.bool_]:
     """Whether photo pixels lie in the photo, its border excluded."""
+    return _within(u, v, camera.width, camera.height)
+
+
+def _within(u: NDArray, v: NDArray, width: NDArray | int, height: NDArray | int) -> NDArray[np.bool_]:
     edge = BORDER_PX
-    return np.asarray(
-        (u > edge) & (v > edge) & (u < camera.width - 1 - edge) & (v < camera.height - 1 - edge)
-    )
+    return np.asarray((u > edge) & (v > edge) & (u < width - 1 - edge) & (v < height - 1 - edge))
 
 
 def inside_everywhere(nodes: Nodes, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.bool_]:

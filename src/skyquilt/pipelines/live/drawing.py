@@ -1,4 +1,4 @@
-"""The growing map drawn: a tile is a function of the photos that see it, so dirty ones are simply drawn anew."""
+"""The growing map drawn: a tile is a function of the photos that see it, drawn anew where those look different."""
 
 import os
 from collections import OrderedDict, defaultdict
