@@ -1,9 +1,11 @@
 """Simulated flights: poses, surface and map against the truth, in one table.
 
-    python benchmarks/accuracy.py [--flights default,default+gcp,strip] [--work FOLDER] [--json FILE]
+    python benchmarks/accuracy.py [--flights default,default+gcp,strip] [--work FOLDER] [--json
+    FILE]
 
-A flight is simulated once and kept in the work folder. `+gcp` uses its control points (check points stay
-out). Every figure has an error window on both sides: a result that is suspiciously good fails too.
+A flight is simulated once and kept in the work folder. `+gcp` uses its control points (check points
+stay out). Every figure has an error window on both sides: a result that is suspiciously good fails
+too.
 """
 
 import argparse
@@ -23,8 +25,16 @@ from skyquilt.metrics.map_error import map_error
 from skyquilt.pipelines.mosaic import mosaic
 
 WINDOWS = {
-    "default": {"map_median_gsd": (0.05, 60.0), "height_error_pct": (-4, 4), "bias_over_gps": (0, 3.0)},
-    "default+gcp": {"map_median_gsd": (0.02, 1.0), "height_error_pct": (-2, 2), "focal_error_pct": (-2, 2)},
+    "default": {
+        "map_median_gsd": (0.05, 60.0),
+        "height_error_pct": (-4, 4),
+        "bias_over_gps": (0, 3.0),
+    },
+    "default+gcp": {
+        "map_median_gsd": (0.02, 1.0),
+        "height_error_pct": (-2, 2),
+        "focal_error_pct": (-2, 2),
+    },
     "strip": {"tilt_max_deg": (0.001, 1.0)},
     "strip+gcp": {"tilt_max_deg": (0.001, 1.0)},
 }
@@ -48,7 +58,9 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--flights", default="default,default+gcp,strip")
-    parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "skyquilt-accuracy")
+    parser.add_argument(
+        "--work", type=Path, default=Path(tempfile.gettempdir()) / "skyquilt-accuracy"
+    )
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     rows, bad = {}, 0
@@ -106,7 +118,11 @@ def pose_figures(out: Path, truth: Truth, metrics: dict) -> dict[str, object]:
         error[:, 2] += truth.record["vertical"]["takeoff_m"]
     tilt = [
         np.degrees(
-            np.arccos(np.clip(_axis(found[k]["rotation"]) @ np.array(truth.shots[k]["cam_R_map"])[2], -1, 1))
+            np.arccos(
+                np.clip(
+                    _axis(found[k]["rotation"]) @ np.array(truth.shots[k]["cam_R_map"])[2], -1, 1
+                )
+            )
         )
         for k in common
     ]

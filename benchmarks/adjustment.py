@@ -1,9 +1,11 @@
-"""What a bundle adjustment costs: this project's and pycolmap's Ceres on the same synthetic problems.
+"""What a bundle adjustment costs: this project's and pycolmap's Ceres on the same synthetic
+problems.
 
     python -m benchmarks.adjustment [--runs 5]
 
-Both get the same sightings and positions as priors, Cauchy's loss, focal length and radial distortion free, one
-thread, and stop at their default tolerance; the table says how far from the exact minimum each stopped.
+Both get the same sightings and positions as priors, Cauchy's loss, focal length and radial
+distortion free, one thread, and stop at their default tolerance; the table says how far from the
+exact minimum each stopped.
 """
 
 import argparse
@@ -32,14 +34,21 @@ SIZES = {
 
 
 def problem_of(layout: dict[str, int]) -> tuple[Problem, State]:
-    """A block both can state: no priors but positions, near its minimum as after a similarity graph."""
+    """A block both can state: no priors but positions, near its minimum as after a similarity
+    graph.
+    """
     block = make_block(1, lies=0.01, gps=1.5, lens_errs=False, **layout)
     n = len(block.truth.C)
     problem = replace(
-        block.problem, sigma_px=np.ones(len(block.problem.px)), loss_px=2.0, loss_C=1e6, loss_R=1e6,
+        block.problem,
+        sigma_px=np.ones(len(block.problem.px)),
+        loss_px=2.0,
+        loss_C=1e6,
+        loss_R=1e6,
         free=np.array([[1, 0, 0, 1, 1, 0, 0, 0]], bool),
-        sigma_R=np.full((n, 3), np.inf), sigma_K=np.full((1, 8), np.inf),
-    )  # fmt: skip
+        sigma_R=np.full((n, 3), np.inf),
+        sigma_K=np.full((1, 8), np.inf),
+    )
     start = replace(
         block.start,
         R=block.truth.R,
@@ -54,10 +63,12 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=5)
     runs = parser.parse_args().runs
     print(
-        f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, numpy {np.__version__}"
+        f"{platform.processor() or platform.machine()}, Python {platform.python_version()}, numpy"
+        f" {np.__version__}"
     )
     print(
-        f"{'problem':<12}{'sightings':>10}  {'solver':<22}{'CPU s':>8}{'min':>8}{'max':>8}{'above the minimum':>20}"
+        f"{'problem':<12}{'sightings':>10} "
+        f" {'solver':<22}{'CPU s':>8}{'min':>8}{'max':>8}{'above the minimum':>20}"
     )
     for name, layout in SIZES.items():
         problem, start = problem_of(layout)
@@ -68,22 +79,36 @@ def main() -> None:
 
         def theirs(exact: bool, problem: Problem = problem, start: State = start) -> State:
             return ceres.solve(
-                problem, start, WIDTH, HEIGHT, focal=True, lens=True, cauchy=2.0, threads=1, exact=exact
+                problem,
+                start,
+                WIDTH,
+                HEIGHT,
+                focal=True,
+                lens=True,
+                cauchy=2.0,
+                threads=1,
+                exact=exact,
             )
 
         def building(problem: Problem = problem, start: State = start) -> object:
             return ceres.reconstruction(problem, start, WIDTH, HEIGHT)
 
         solvers = {
-            "skyquilt, 1e-5": lambda: mine(1e-5), "skyquilt, 1e-9": lambda: mine(1e-9),
-            "pycolmap, its default": lambda: theirs(False), "(its reconstruction)": building,
-        }  # fmt: skip
+            "skyquilt, 1e-5": lambda: mine(1e-5),
+            "skyquilt, 1e-9": lambda: mine(1e-9),
+            "pycolmap, its default": lambda: theirs(False),
+            "(its reconstruction)": building,
+        }
         for solver, work in solvers.items():
             cost = measure(work, runs)
             state = work()
-            above = f"{robust_cost(problem, state) / best - 1:.1e}" if isinstance(state, State) else ""
+            above = (
+                f"{robust_cost(problem, state) / best - 1:.1e}" if isinstance(state, State) else ""
+            )
             line = f"{name:<12}{len(problem.px):>10}  {solver:<22}"
-            print(f"{line}{cost.cpu_median:>8.3f}{cost.cpu_min:>8.3f}{cost.cpu_max:>8.3f}{above:>20}")
+            print(
+                f"{line}{cost.cpu_median:>8.3f}{cost.cpu_min:>8.3f}{cost.cpu_max:>8.3f}{above:>20}"
+            )
 
 
 if __name__ == "__main__":

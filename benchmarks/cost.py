@@ -1,4 +1,6 @@
-"""What work costs: CPU seconds, wall seconds and peak memory, of this process or of a tree of others."""
+"""What work costs: CPU seconds, wall seconds and peak memory, of this process or of a tree of
+others.
+"""
 
 import os
 import platform
@@ -31,7 +33,9 @@ class Cost:
     @classmethod
     def of(cls, cpu: list[float], wall: list[float], peak_mb: float | None = None) -> "Cost":
         """From the figures of each run."""
-        return cls(statistics.median(cpu), min(cpu), max(cpu), statistics.median(wall), len(cpu), peak_mb)
+        return cls(
+            statistics.median(cpu), min(cpu), max(cpu), statistics.median(wall), len(cpu), peak_mb
+        )
 
 
 def cpu_seconds(who: int = resource.RUSAGE_SELF) -> float:
@@ -52,7 +56,9 @@ def measure(work: Callable[[], None], runs: int) -> Cost:
 
 
 def run_process(command: list[str]) -> tuple[float, float, float]:
-    """(CPU s, wall s, peak MB) of a command and everything it starts; ends this program if it fails."""
+    """(CPU s, wall s, peak MB) of a command and everything it starts; ends this program if it
+    fails.
+    """
     before, start = cpu_seconds(resource.RUSAGE_CHILDREN), time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     peak = [0.0]
@@ -105,7 +111,9 @@ def machine() -> dict[str, str | int | float | None]:
     """Where and with what it was measured."""
     names = [line for line in _read("/proc/cpuinfo").splitlines() if line.startswith("model name")]
     git = shutil.which("git")
-    found = [git, "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"] if git else ["true"]
+    found = (
+        [git, "-C", str(Path(__file__).parent), "rev-parse", "--short", "HEAD"] if git else ["true"]
+    )
     return {
         "cpu": names[0].partition(": ")[2] if names else platform.processor(),
         "cores": os.cpu_count(),

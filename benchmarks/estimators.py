@@ -2,9 +2,10 @@
 
     python benchmarks/estimators.py [-o FILE] [--trials 10] [--noise 0.2] [--matches 150]
 
-Two photos of 1500 x 1000 px that differ by a homography as of neighbours in a flight line: shifted by a third, turned
-and scaled a little, tilted. Right matches err by `noise` px per axis, wrong ones lie anywhere in the frame. The error
-is the RMS of the true transfer over the frame; a trial succeeds with an error of at most 3 px.
+Two photos of 1500 x 1000 px that differ by a homography as of neighbours in a flight line: shifted
+by a third, turned and scaled a little, tilted. Right matches err by `noise` px per axis, wrong ones
+lie anywhere in the frame. The error is the RMS of the true transfer over the frame; a trial
+succeeds with an error of at most 3 px.
 """
 
 import argparse
@@ -58,7 +59,9 @@ def matches(rng, count, noise, outliers):
     """Points a, b (N, 2) px and the true b_H_a."""
     angle, scale = np.radians(rng.normal(0, 5)), np.exp(rng.normal(0, 0.03))
     c, s = scale * np.cos(angle), scale * np.sin(angle)
-    H = np.array([[c, -s, rng.normal(0, 40)], [s, c, rng.normal(330, 40)], [*rng.normal(0, 2e-5, 2), 1]])
+    H = np.array(
+        [[c, -s, rng.normal(0, 40)], [s, c, rng.normal(330, 40)], [*rng.normal(0, 2e-5, 2), 1]]
+    )
     a = rng.uniform((0, 0), (1500, 670), (count, 2))
     b = transfer(H, a) + rng.normal(0, noise, (count, 2))
     wrong = rng.permutation(count)[: round(outliers * count)]
@@ -88,7 +91,8 @@ def main():
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     lines = [
-        f"{arguments.trials} trials of {arguments.matches} matches, noise {arguments.noise:g} px per axis."
+        f"{arguments.trials} trials of {arguments.matches} matches, noise {arguments.noise:g} px"
+        " per axis."
         f" Median error in px / success (at most {SUCCESS_PX:g} px) in % / mean CPU ms.",
         "",
         "| outliers | " + " | ".join(METHODS) + " |",
@@ -105,7 +109,9 @@ def main():
             ]
             errors, spent = np.array([trial(estimate, *m) for m in made]).T
             median = f"{np.median(errors):.2f}" if np.isfinite(np.median(errors)) else "none"
-            cells.append(f"{median} / {100 * np.mean(errors <= SUCCESS_PX):.0f} / {1000 * spent.mean():.0f}")
+            cells.append(
+                f"{median} / {100 * np.mean(errors <= SUCCESS_PX):.0f} / {1000 * spent.mean():.0f}"
+            )
         lines.append(f"| {percent} % | " + " | ".join(cells) + " |")
         print(lines[-1], flush=True)
     if arguments.output:

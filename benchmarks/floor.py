@@ -1,7 +1,8 @@
 """What is the least CPU time a mosaic can cost, and how far above it is `skyquilt mosaic`?
 
-The floor is (a) decoding every JPEG once at full resolution plus (b) encoding the finished COG, overviews
-included, from memory. `--run` measures the whole command beside it, from a cold store, in its own process.
+The floor is (a) decoding every JPEG once at full resolution plus (b) encoding the finished COG,
+overviews included, from memory. `--run` measures the whole command beside it, from a cold store, in
+its own process.
 
     python benchmarks/floor.py PHOTOS --mosaic OUT/mosaic.tif --run 3 -- --gsd 2
 
@@ -34,7 +35,9 @@ def decode_all(files: list[Path], fast_upsample: bool) -> None:
 
 
 def run_mosaic(photos: Path, arguments: list[str]) -> tuple[float, float, float]:
-    """(CPU s, wall s, peak MB) of one `skyquilt mosaic` into an empty folder, so from a cold store."""
+    """(CPU s, wall s, peak MB) of one `skyquilt mosaic` into an empty folder, so from a cold
+    store.
+    """
     with tempfile.TemporaryDirectory() as folder:
         words = [
             "mosaic",
@@ -76,9 +79,16 @@ def tiled_photos(files: list[Path]) -> np.ndarray:
 def write_ours(path: Path, pixels: np.ndarray, valid: np.ndarray | None, quality: int) -> None:
     height, width, bands = pixels.shape
     spec = RasterSpec(
-        width=width, height=height, bands=bands, dtype="uint8", transform=PLACE, crs="EPSG:32615",
-        compress="jpeg", quality=quality, mask=valid is not None,
-    )  # fmt: skip
+        width=width,
+        height=height,
+        bands=bands,
+        dtype="uint8",
+        transform=PLACE,
+        crs="EPSG:32615",
+        compress="jpeg",
+        quality=quality,
+        mask=valid is not None,
+    )
     write_array(path, pixels, spec, valid)
 
 
@@ -86,7 +96,12 @@ def write_gdal(path: Path, pixels: np.ndarray, valid: np.ndarray | None, quality
     """GDAL's COG driver at the same quality, overviews averaged."""
     height, width, bands = pixels.shape
     shape = {"width": width, "height": height, "count": bands, "dtype": "uint8"}
-    options = {"compress": "JPEG", "quality": quality, "blocksize": 512, "overview_resampling": "average"}
+    options = {
+        "compress": "JPEG",
+        "quality": quality,
+        "blocksize": 512,
+        "overview_resampling": "average",
+    }
     place = {"crs": "EPSG:32615", "transform": rasterio.Affine(*PLACE)}
     with (
         rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True, GDAL_NUM_THREADS=1),
@@ -98,7 +113,9 @@ def write_gdal(path: Path, pixels: np.ndarray, valid: np.ndarray | None, quality
 
 
 def measure_floor(options: argparse.Namespace) -> dict[str, Cost | float]:
-    files = sorted(path for path in options.photos.rglob("*") if path.suffix.lower() in (".jpg", ".jpeg"))
+    files = sorted(
+        path for path in options.photos.rglob("*") if path.suffix.lower() in (".jpg", ".jpeg")
+    )
     if not files:
         sys.exit(f"no JPEG in {options.photos}")
     results: dict[str, Cost | float] = {"photos": len(files)}
@@ -109,10 +126,16 @@ def measure_floor(options: argparse.Namespace) -> dict[str, Cost | float]:
     results["valid_share"] = 1.0 if valid is None else float(valid.mean())
     with tempfile.TemporaryDirectory() as folder:
         ours, gdal = Path(folder) / "ours.tif", Path(folder) / "gdal.tif"
-        results["encode"] = measure(lambda: write_ours(ours, pixels, valid, options.quality), options.repeat)
+        results["encode"] = measure(
+            lambda: write_ours(ours, pixels, valid, options.quality), options.repeat
+        )
         gdal_runs = 1 if options.repeat < 4 else 2
-        results["encode_gdal"] = measure(lambda: write_gdal(gdal, pixels, valid, options.quality), gdal_runs)
-        results["file_mb"], results["file_gdal_mb"] = (path.stat().st_size / 1e6 for path in (ours, gdal))
+        results["encode_gdal"] = measure(
+            lambda: write_gdal(gdal, pixels, valid, options.quality), gdal_runs
+        )
+        results["file_mb"], results["file_gdal_mb"] = (
+            path.stat().st_size / 1e6 for path in (ours, gdal)
+        )
     decode = min(results[name].cpu_median for name in ("decode", "decode_fast_upsample"))  # type: ignore[union-attr]
     results["floor"] = decode + results["encode"].cpu_median  # type: ignore[union-attr]
     return results
@@ -130,13 +153,19 @@ def main() -> None:
         "--mosaic", type=Path, help="RGB GeoTIFF to encode; default: 81 MP of photos side by side"
     )
     parser.add_argument("--quality", type=int, default=85, help="JPEG quality")
-    parser.add_argument("--repeat", type=int, default=5, help="runs of each measurement after one warm-up")
-    parser.add_argument("--run", type=int, default=0, metavar="N", help="also run skyquilt mosaic N times")
+    parser.add_argument(
+        "--repeat", type=int, default=5, help="runs of each measurement after one warm-up"
+    )
+    parser.add_argument(
+        "--run", type=int, default=0, metavar="N", help="also run skyquilt mosaic N times"
+    )
     parser.add_argument("--json", type=Path, help="write all figures to this file")
     options = parser.parse_args(own)
     results = measure_floor(options)
     if options.run:
-        cpu, wall, peak = zip(*(run_mosaic(options.photos, further) for _ in range(options.run)), strict=True)
+        cpu, wall, peak = zip(
+            *(run_mosaic(options.photos, further) for _ in range(options.run)), strict=True
+        )
         results["run"] = Cost.of(list(cpu), list(wall), max(peak))
         results["ratio"] = results["run"].cpu_median / results["floor"]  # type: ignore[union-attr, operator]
     report = {"machine": machine()} | {
@@ -154,7 +183,11 @@ def show(where: dict, results: dict[str, Cost | float]) -> None:
         if isinstance(value, Cost):
             figures = (value.cpu_median, value.cpu_min, value.cpu_max, value.wall_median)
             peak = f"{value.peak_mb:9.0f}" if value.peak_mb is not None else ""
-            print(f"{name:24}" + "".join(f"{figure:8.2f}" for figure in figures) + f"{value.runs:6}{peak}")
+            print(
+                f"{name:24}"
+                + "".join(f"{figure:8.2f}" for figure in figures)
+                + f"{value.runs:6}{peak}"
+            )
         else:
             print(f"{name:24}{value:8.2f}")
 

@@ -2,9 +2,9 @@
 
 python benchmarks/large_flight.py FOLDER [--photos 2000]
 
-The simulator's country, camera, noise and reports; only its rays are cut short: they meet the smoothed ground (hills,
-not houses and trees, which are painted flat), so nothing hides anything. That is right for time and memory per photo,
-and would be wrong for any figure about accuracy.
+The simulator's country, camera, noise and reports; only its rays are cut short: they meet the
+smoothed ground (hills, not houses and trees, which are painted flat), so nothing hides anything.
+That is right for time and memory per photo, and would be wrong for any figure about accuracy.
 """
 
 import argparse
@@ -46,7 +46,8 @@ def main() -> None:
         if step.done * 10 // step.total != last:
             last = step.done * 10 // step.total
             print(
-                f"{step.stage} {step.done} of {step.total}, {time.process_time() - began:.0f} s", flush=True
+                f"{step.stage} {step.done} of {step.total}, {time.process_time() - began:.0f} s",
+                flush=True,
             )
 
 

@@ -1,10 +1,11 @@
-"""How quickly does a photo appear, how good is the growing map, and does the work per photo stay bounded?
+"""How quickly does a photo appear, how good is the growing map, and does the work per photo stay
+bounded?
 
-python benchmarks/live.py latency SURVEY [--rate 1.0] [--gsd 5]     every photo from 'file complete' to 'tile in hand'
-python benchmarks/live.py browser SURVEY                            the same to 'tile shown by a real browser'
-python benchmarks/live.py viewers SURVEY [--viewers 20]             the same while so many viewers pan about
-python benchmarks/live.py cost SURVEY                               CPU seconds per photo, step by step
-python benchmarks/live.py seams SURVEY [--gsd 5]                    seam disparity of the live map against the batch map
+python benchmarks/live.py latency SURVEY [--rate 1.0] [--gsd 5]   file complete to tile in hand
+python benchmarks/live.py browser SURVEY                          to tile shown by a browser
+python benchmarks/live.py viewers SURVEY [--viewers 20]           the same while viewers pan about
+python benchmarks/live.py cost SURVEY                             CPU seconds per photo and step
+python benchmarks/live.py seams SURVEY [--gsd 5]                  seam disparity, live against batch
 
 `live_scaling.py` asks whether the work per photo stays bounded.
 """
@@ -133,7 +134,10 @@ def cost(survey: Path, gsd: float) -> None:
         shown = sum(steps.get(k, 0.0) for k in ("accepted", "placed", "drawn first"))
         for key, seconds in {**steps, "to the event": shown, "all": sum(steps.values())}.items():
             used.setdefault(key, []).append(seconds)
-    print({k: round(sum(v) / len(photos_of(survey)), 3) for k, v in used.items()}, "s of CPU per photo")
+    print(
+        {k: round(sum(v) / len(photos_of(survey)), 3) for k, v in used.items()},
+        "s of CPU per photo",
+    )
     live.close()
     shutil.rmtree(home, ignore_errors=True)
 
@@ -175,7 +179,9 @@ def seams(survey: Path, gsd: float) -> None:
 
     home = Path(tempfile.mkdtemp())
     live = LiveMap(home / "live", LiveSettings(gsd_cm=gsd))
-    for path in sorted(p for p in survey.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".tif")):
+    for path in sorted(
+        p for p in survey.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".tif")
+    ):
         live.add(path)
     time.sleep(2.2)
     for _ in live.settle():
@@ -188,22 +194,30 @@ def seams(survey: Path, gsd: float) -> None:
     parts = methods(settings)
     taken = drain(intake.take_in(photos, cache, parts, store, 2))
     alignment = Alignment(
-        method="live", why="", frame=live.members.frame,
+        method="live",
+        why="",
+        frame=live.members.frame,
         poses={k: m.pose for k, m in enumerate(members)},
         cameras={m.camera: live.members.camera(m) for m in members},
         camera_of={k: m.camera for k, m in enumerate(members)},
-        blocks=(tuple(range(len(members))),), ties=no_ties(),
-    )  # fmt: skip
+        blocks=(tuple(range(len(members))),),
+        ties=no_ties(),
+    )
     rough = make_views(alignment, live.canvas.surface((-1, -1, 1, 1)))
     bounds = grid_of(rough, 1.0).bounds
     surface = live.canvas.surface(bounds)
     views = make_views(alignment, surface)
     native = native_gsd(views, surface)
     ground = drawing.Ground(
-        surface=surface, views=tuple(views), grid=grid_of(views, drawing.round_gsd(native)), native_gsd=native
+        surface=surface,
+        views=tuple(views),
+        grid=grid_of(views, drawing.round_gsd(native)),
+        native_gsd=native,
     )
     compose = drawing.composer(taken, ground, alignment, NEUTRAL, parts, cache)
-    drawn = drain(drawing.draw(home, compose, alignment, settings, store, "live", drawing.unit_of(taken), 2))
+    drawn = drain(
+        drawing.draw(home, compose, alignment, settings, store, "live", drawing.unit_of(taken), 2)
+    )
     of_live = drain(reporting.seams(compose, drawn, ground)).figures
     of_batch = mosaic(survey, home / "batch").metrics["seam_disparity_px"]
     print("live: ", of_live)

@@ -1,12 +1,13 @@
 """Does the work per photo, and the memory, stay bounded as a live map grows?
 
-python benchmarks/large_flight.py FLIGHT            first: 2,000 photos of 2 MP from three drones
-python benchmarks/live_scaling.py FLIGHT            then: all of them into a live map, with a burst in the middle
+python benchmarks/large_flight.py FLIGHT   first: 2,000 photos of 2 MP from three drones
+python benchmarks/live_scaling.py FLIGHT    then: all into a live map, with a burst
 
-Photos are handed in as fast as the map takes them, but for the burst: 90 photos, of each of which the map has a third
-of a second before the next one comes. What counts is CPU time per photo of the process that places, links and draws;
-that of the background process is told besides. CPU seconds grow longer where other work shares caches and cores: so
-a fixed piece of work is timed after every photo, and figures are given in its time too.
+Photos are handed in as fast as the map takes them, but for the burst: 90 photos, of each of which
+the map has a third of a second before the next one comes. What counts is CPU time per photo of the
+process that places, links and draws; that of the background process is told besides. CPU seconds
+grow longer where other work shares caches and cores: so a fixed piece of work is timed after every
+photo, and figures are given in its time too.
 """
 
 import argparse
@@ -43,14 +44,19 @@ def main() -> None:
     print(f"in pieces of fixed work: {fair[0]:.1f}, {fair[1]:.1f}, factor {fair[1] / fair[0]:.2f}")
     low, high = np.median(memory[100:200]), np.median(memory[-100:])
     print(f"photos 100-200: {early:.3f} s, last hundred: {late:.3f} s, factor {late / early:.2f}")
-    print(f"memory: {low:.0f} -> {high:.0f} MB, factor {high / low:.2f}; background {background():.0f} s")
+    print(
+        f"memory: {low:.0f} -> {high:.0f} MB, factor {high / low:.2f}; background"
+        f" {background():.0f} s"
+    )
     print(f"{live.ledger.counts()}; blocks {sorted(map(len, live.members.blocks.values()))[-5:]}")
     live.close()
     shutil.rmtree(home, ignore_errors=True)
 
 
 def handed_in(live: LiveMap, paths: list[Path]) -> tuple[list[float], list[float], list[float]]:
-    """CPU seconds and MB of memory per photo, and CPU seconds of a fixed piece of work after each."""
+    """CPU seconds and MB of memory per photo, and CPU seconds of a fixed piece of work after
+    each.
+    """
     middle = range(len(paths) // 2, len(paths) // 2 + BURST)
     cpu: list[float] = []
     memory: list[float] = []
@@ -69,7 +75,8 @@ def handed_in(live: LiveMap, paths: list[Path]) -> tuple[list[float], list[float
             mean = np.mean(cpu[-50:])
             work = f"{mean:.3f} s per photo, {mean / np.mean(pieces[-50:]):.1f} pieces"
             print(
-                f"{k + 1} photos: {work}, {memory[-1]:.0f} MB, {waiting} to refine, background {background():.0f} s",
+                f"{k + 1} photos: {work}, {memory[-1]:.0f} MB, {waiting} to refine, background"
+                f" {background():.0f} s",
                 flush=True,
             )
     return cpu, memory, pieces

@@ -1,6 +1,7 @@
-"""Those who look at a live map while it is measured: one real browser, or many viewers that pan about.
+"""Those who look at a live map while it is measured: one real browser, or many viewers that pan
+about.
 
-python benchmarks/live_viewers.py URL 20        pans until it is ended, then says how long its requests took
+python benchmarks/live_viewers.py URL 20   pans until it is ended, then tells its requests' times
 """
 
 import http.client
@@ -66,7 +67,9 @@ class Browser:
         self.page.wait_for_timeout(1000 * seconds)
 
     def shown(self) -> dict[str, float]:
-        """When each photo's centre was first shown: by a picture asked for after the photo was told to be drawn."""
+        """When each photo's centre was first shown: by a picture asked for after the photo was told
+        to be drawn.
+        """
         import urllib.request
 
         drawn: dict[str, tuple[int, list[float]]] = {}
@@ -96,11 +99,17 @@ class Browser:
 
 def tile_of(lon: float, lat: float, z: int) -> tuple[int, int]:
     n, phi = 2**z, np.radians(lat)
-    return int((lon + 180) / 360 * n), int((1 - np.log(np.tan(phi) + 1 / np.cos(phi)) / np.pi) / 2 * n)
+    return int((lon + 180) / 360 * n), int(
+        (1 - np.log(np.tan(phi) + 1 / np.cos(phi)) / np.pi) / 2 * n
+    )
 
 
-def pan(url: str, number: int, waits: list[float], kept: list[int], ending: threading.Event) -> None:
-    """One viewer: every two seconds another place or zoom, 5 x 4 tiles; what it has, it asks about as browsers do."""
+def pan(
+    url: str, number: int, waits: list[float], kept: list[int], ending: threading.Event
+) -> None:
+    """One viewer: every two seconds another place or zoom, 5 x 4 tiles; what it has, it asks about
+    as browsers do.
+    """
     web = http.client.HTTPConnection(urlsplit(url).netloc, timeout=30)
     rng, known = random.Random(number), {}
 
@@ -136,7 +145,8 @@ def main(url: str, count: int) -> None:
     kept, ending = [0], threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: ending.set())
     crowd = [
-        threading.Thread(target=pan, args=(url, k, waits, kept, ending), daemon=True) for k in range(count)
+        threading.Thread(target=pan, args=(url, k, waits, kept, ending), daemon=True)
+        for k in range(count)
     ]
     began = time.monotonic()
     for one in crowd:
@@ -144,7 +154,8 @@ def main(url: str, count: int) -> None:
     ending.wait()
     spent = time.monotonic() - began
     print(
-        f"{count} viewers: {len(waits) / spent:.0f} requests per second, answered in {1000 * np.median(waits):.0f} ms"
+        f"{count} viewers: {len(waits) / spent:.0f} requests per second, answered in"
+        f" {1000 * np.median(waits):.0f} ms"
         f" (median), {1000 * np.percentile(waits, 95):.0f} ms (95 %), {kept[0]} known already"
     )
 

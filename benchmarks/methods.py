@@ -1,13 +1,16 @@
-"""Both papers' methods on simulated surveys: A's Tables 1 and 2 for six-line surveys, and the loop of the thesis.
+"""Both papers' methods on simulated surveys: A's Tables 1 and 2 for six-line surveys, and the loop
+of the thesis.
 
     python benchmarks/methods.py [--surveys six-73,six-168,loop] [--work FOLDER] [--json FILE]
 
-six-N: N photos in six lines; flightline and bundle, geolocation MAE and RMS per axis against the TRUE positions (which
-the papers could not have), and CPU seconds. loop: the thesis's round trip of 40 planned photos, three lost; each
-method's step where the loop closes: how far apart the first and the last photo put the same ground over level ground
-(bundle, which knows the relief, is not asked; null for others: too far apart to be registered).
+six-N: N photos in six lines; flightline and bundle, geolocation MAE and RMS per axis against the
+TRUE positions (which the papers could not have), and CPU seconds. loop: the thesis's round trip of
+40 planned photos, three lost; each method's step where the loop closes: how far apart the first and
+the last photo put the same ground over level ground (bundle, which knows the relief, is not asked;
+null for others: too far apart to be registered).
 
-Photos have 640 x 480 px (six lines) and 1600 x 1200 px (loop). A survey is simulated once and kept in the work folder.
+Photos have 640 x 480 px (six lines) and 1600 x 1200 px (loop). A survey is simulated once and kept
+in the work folder.
 """
 
 import argparse
@@ -35,9 +38,12 @@ METHODS = {
     "bundle": {"method": "bundle"},
 }
 LOOP = (
-    ("pose", {}), ("image", {}), ("hybrid", {"optimiser": "surfaces"}), ("hybrid-anneal", {"optimiser": "anneal"}),
+    ("pose", {}),
+    ("image", {}),
+    ("hybrid", {"optimiser": "surfaces"}),
+    ("hybrid-anneal", {"optimiser": "anneal"}),
     ("bundle", {}),
-)  # fmt: skip
+)
 
 
 def main() -> None:
@@ -45,7 +51,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--surveys", default="six-73,six-168,loop")
-    parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "skyquilt-methods")
+    parser.add_argument(
+        "--work", type=Path, default=Path(tempfile.gettempdir()) / "skyquilt-methods"
+    )
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     rows = {}
@@ -70,7 +78,9 @@ def six_lines(photos: int) -> sim.FlightSettings:
     along = 60.0 * lens.height / lens.focal * (1 - 0.75)
     across = 60.0 * lens.width / lens.focal * (1 - 0.60)
     each = -(-photos // LINES)
-    route = Route(site=((each - 1) * along, (LINES - 1) * across), overlap=0.75, sidelap=0.60, height=60.0)
+    route = Route(
+        site=((each - 1) * along, (LINES - 1) * across), overlap=0.75, sidelap=0.60, height=60.0
+    )
     return sim.FlightSettings(seed=7, lens=lens, route=route, control=Control(points=0, checks=0))
 
 
@@ -85,7 +95,10 @@ def six(photos: int, work: Path) -> dict:
         began = time.process_time()
         try:
             result = mosaic(
-                chosen, work / f"six{photos}-{method}", MosaicSettings(**METHODS[method]), overwrite=True
+                chosen,
+                work / f"six{photos}-{method}",
+                MosaicSettings(**METHODS[method]),
+                overwrite=True,
             )
         except SkyquiltError as error:
             found[method] = {"refused": str(error)}
@@ -97,11 +110,13 @@ def six(photos: int, work: Path) -> dict:
         found[method] = {
             "placed": len(names),
             # heights count from take-off on one side and from the sea on the other
-            "mae_xy_m": np.round(errors.mae_m[:2], 3).tolist(), "rms_xy_m": np.round(errors.rms_m[:2], 3).tolist(),
-            "cpu_seconds": round(time.process_time() - began, 1), "align_seconds": result.metrics["seconds"]["align"],
+            "mae_xy_m": np.round(errors.mae_m[:2], 3).tolist(),
+            "rms_xy_m": np.round(errors.rms_m[:2], 3).tolist(),
+            "cpu_seconds": round(time.process_time() - began, 1),
+            "align_seconds": result.metrics["seconds"]["align"],
             "lambda_corr": result.metrics["quality"]["lambda_corr"],
             "notes": [n for n in result.metrics["notes"] if "line" in n],
-        }  # fmt: skip
+        }
     return found
 
 
@@ -117,19 +132,26 @@ def loop(work: Path) -> dict:
         result = mosaic(folder / "photos", work / f"loop-{name}", settings, overwrite=True)
         q = result.metrics["quality"]
         shots = json.loads((result.output / "shots.geojson").read_text())["features"]
-        solved = {s["properties"]["filename"]: np.array(s["properties"]["translation"]) for s in shots}
+        solved = {
+            s["properties"]["filename"]: np.array(s["properties"]["translation"]) for s in shots
+        }
         off = np.array([solved[n][:2] - places[n][:2] for n in sorted(solved)])
         found[name] = {
             "lambda_corr": q["lambda_corr"],
-            "closing_step_m": None if name == "bundle" else closing_step(result.output, sorted(solved)),
+            "closing_step_m": None
+            if name == "bundle"
+            else closing_step(result.output, sorted(solved)),
             "nadirs_rms_m": round(float(np.sqrt(((off - off.mean(0)) ** 2).sum(1).mean())), 2),
-            "align_seconds": result.metrics["seconds"]["align"], "cpu_seconds": result.metrics["cpu_seconds"],
-        }  # fmt: skip
+            "align_seconds": result.metrics["seconds"]["align"],
+            "cpu_seconds": result.metrics["cpu_seconds"],
+        }
     return found
 
 
 def closing_step(output: Path, names: list[str]) -> float | None:
-    """How far apart the first and the last photo put the same ground, m: both redrawn alone, and registered."""
+    """How far apart the first and the last photo put the same ground, m: both redrawn alone, and
+    registered.
+    """
     from skyquilt.imaging.plane import view_patch
     from skyquilt.imaging.views import make_views, native_gsd
     from skyquilt.pipelines.compare import alignment_of
@@ -151,7 +173,9 @@ def closing_step(output: Path, names: list[str]) -> float | None:
     if r1 - r0 < 128 or c1 - c0 < 128:
         return None
     one, other = (p.pixels[r0 - p.row : r1 - p.row, c0 - p.column : c1 - p.column] for p in patches)
-    both = np.logical_and(*(p.shown[r0 - p.row : r1 - p.row, c0 - p.column : c1 - p.column] for p in patches))
+    both = np.logical_and(
+        *(p.shown[r0 - p.row : r1 - p.row, c0 - p.column : c1 - p.column] for p in patches)
+    )
     # the largest square that both show
     reach = cv2.distanceTransform(np.pad(both, 1).astype(np.uint8), cv2.DIST_C, 3)[1:-1, 1:-1]
     row, column = np.unravel_index(int(reach.argmax()), reach.shape)
@@ -160,7 +184,9 @@ def closing_step(output: Path, names: list[str]) -> float | None:
         return None
     inner = (slice(row - half, row + half), slice(column - half, column + half))
     hann = cv2.createHanningWindow((2 * half, 2 * half), cv2.CV_64F)
-    shift, response = cv2.phaseCorrelate(one[inner].astype(np.float64), other[inner].astype(np.float64), hann)
+    shift, response = cv2.phaseCorrelate(
+        one[inner].astype(np.float64), other[inner].astype(np.float64), hann
+    )
     return round(float(np.hypot(*shift) * gsd), 3) if response > 0.03 else None
 
 

@@ -1,9 +1,10 @@
 """The real surveys beside the checkout: figures against what is asked of them.
 
-    python benchmarks/real.py [--data ../shared/data] [--only brighton,caliterra,...] [--work FOLDER]
+    python benchmarks/real.py [--data ../shared/data] [--only brighton,caliterra,...] [--work
+    FOLDER]
 
-`stripped` is brighton without any metadata; `stripped+gcp` adds three control points whose pixels and
-coordinates come from the full run's own tie points, and judges by the others.
+`stripped` is brighton without any metadata; `stripped+gcp` adds three control points whose pixels
+and coordinates come from the full run's own tie points, and judges by the others.
 """
 
 import argparse
@@ -19,20 +20,26 @@ from skyquilt.pipelines.mosaic import mosaic
 
 ASKED = {
     "brighton": {
-        "photos": (18, 18), "reprojection_mean_px": (0.1, 0.7), "gps_x_m": (0.02, 0.6),
+        "photos": (18, 18),
+        "reprojection_mean_px": (0.1, 0.7),
+        "gps_x_m": (0.02, 0.6),
         "gps_y_m": (0.02, 0.6),
-        "focal_px": (2310 * 0.95, 2310 * 1.05), "seam_median_px": (0.1, 2.0),
+        "focal_px": (2310 * 0.95, 2310 * 1.05),
+        "seam_median_px": (0.1, 2.0),
         "seam_measured_share": (0.6, 1.0),
-        "yaw_conflicts": (6, 6), "peak_memory_mb": (100, 1200),
+        "yaw_conflicts": (6, 6),
+        "peak_memory_mb": (100, 1200),
     },
     "caliterra": {
-        "photos": (74, 75), "largest_block": (74, 75), "reprojection_mean_px": (0.1, 0.6),
+        "photos": (74, 75),
+        "largest_block": (74, 75),
+        "reprojection_mean_px": (0.1, 0.6),
         "altitude_conflicts": (1, 75),
     },
     "thermal-strip": {"photos": (17, 17), "yaw_conflicts": (17, 17)},
     "stripped": {"photos": (18, 18), "largest_block": (18, 18), "georeferenced": (0, 0)},
     "stripped+gcp": {"photos": (18, 18), "georeferenced": (1, 1), "check_rms_xy_m": (0.001, 0.5)},
-}  # fmt: skip
+}
 """Survey -> figure -> (least, most)."""
 
 
@@ -40,7 +47,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--data", type=Path, default=Path(__file__).resolve().parents[2] / "shared" / "data")
+    parser.add_argument(
+        "--data", type=Path, default=Path(__file__).resolve().parents[2] / "shared" / "data"
+    )
     parser.add_argument("--only", default=",".join(ASKED))
     parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "skyquilt-real")
     args = parser.parse_args()
@@ -55,7 +64,11 @@ def main() -> int:
         for key, value in row.items():
             low, high = ASKED[name].get(key, (-np.inf, np.inf))
             verdict = (
-                "" if key not in ASKED[name] else "ok" if low <= value <= high else f"MISSED {low}..{high}"
+                ""
+                if key not in ASKED[name]
+                else "ok"
+                if low <= value <= high
+                else f"MISSED {low}..{high}"
             )
             missed += verdict.startswith("MISSED")
             print(f"  {key:24s} {value:12.3f} {verdict}")
@@ -77,19 +90,29 @@ def figures(name: str, data: Path, work: Path) -> dict[str, float]:
     check = [np.hypot(c["dx_m"], c["dy_m"]) for c in m["control"] if c["check"]]
     nan = float("nan")
     return {
-        "photos": m["photos_used"], "largest_block": m["blocks"][0],
+        "photos": m["photos_used"],
+        "largest_block": m["blocks"][0],
         "georeferenced": float(m["georeferenced"]),
-        "reprojection_mean_px": m["reprojection_error_px"]["mean"], "tie_points": m["tie_points"],
-        "gps_x_m": gps.get("x", nan), "gps_y_m": gps.get("y", nan), "gps_z_m": gps.get("z", nan),
-        "loo_x_m": loo.get("x", nan), "loo_y_m": loo.get("y", nan), "loo_z_m": loo.get("z", nan),
+        "reprojection_mean_px": m["reprojection_error_px"]["mean"],
+        "tie_points": m["tie_points"],
+        "gps_x_m": gps.get("x", nan),
+        "gps_y_m": gps.get("y", nan),
+        "gps_z_m": gps.get("z", nan),
+        "loo_x_m": loo.get("x", nan),
+        "loo_y_m": loo.get("y", nan),
+        "loo_z_m": loo.get("z", nan),
         "focal_px": next(iter(m["cameras"].values()))["focal"]["value"],
-        "seam_median_px": seam["median"], "seam_p95_px": seam["p95"],
+        "seam_median_px": seam["median"],
+        "seam_p95_px": seam["p95"],
         "seam_measured_share": seam["measured"] / max(seam["attempted"], 1),
-        "yaw_conflicts": fields.count("yaw"), "altitude_conflicts": fields.count("altitude"),
-        "position_conflicts": fields.count("position"), "focal_conflicts": fields.count("focal"),
+        "yaw_conflicts": fields.count("yaw"),
+        "altitude_conflicts": fields.count("altitude"),
+        "position_conflicts": fields.count("position"),
+        "focal_conflicts": fields.count("focal"),
         "check_rms_xy_m": float(np.sqrt(np.mean(np.square(check)))) if check else nan,
-        "cpu_seconds": m["cpu_seconds"], "peak_memory_mb": m["peak_memory_mb"],
-    }  # fmt: skip
+        "cpu_seconds": m["cpu_seconds"],
+        "peak_memory_mb": m["peak_memory_mb"],
+    }
 
 
 def strip_all(source: Path, target: Path) -> Path:
@@ -128,8 +151,14 @@ def control_from_full_run(source: Path, work: Path) -> Path:
     pictures = intake.Pictures(photos, cache, store)
     links = drain(linking.link_up(taken, prior, parts, store, 2))
     known = placing.Known(
-        intake=taken, frame=frame, priors=prior, links=links, control=(), order=range(len(photos)), pictures=pictures,
-    )  # fmt: skip
+        intake=taken,
+        frame=frame,
+        priors=prior,
+        links=links,
+        control=(),
+        order=range(len(photos)),
+        pictures=pictures,
+    )
     aligned = drain(placing.place(known, parts, settings, store))
     ties, frame = aligned.ties, aligned.frame
     seen = np.bincount(ties.point)
@@ -148,7 +177,8 @@ def control_from_full_run(source: Path, work: Path) -> Path:
         for row in np.flatnonzero(ties.point == k):
             u, v = ties.px[row]
             lines.append(
-                f"{x:.4f} {y:.4f} {z:.4f} {u:.3f} {v:.3f} img{ties.photo[row]:02d}.jpg p{number}{kind}"
+                f"{x:.4f} {y:.4f} {z:.4f} {u:.3f} {v:.3f} img{ties.photo[row]:02d}.jpg"
+                f" p{number}{kind}"
             )
     target = work / "gcp_list.txt"
     target.write_text("\n".join(lines) + "\n")

@@ -1,10 +1,11 @@
-"""What chance reaches, and what other rotations, scales and places cost: `auto` on pairs made from known ones.
+"""What chance reaches, and what other rotations, scales and places cost: `auto` on pairs made from
+known ones.
 
     python benchmarks/spectral.py PAIRS.csv [--unrelated 300] [--rounds 3]
 
-Unrelated: A of one pair with the MIRRORED B of any: no registration of them can be right, even where two pairs of
-the list show the same place, and the pictures' statistics are those of the true pairs.
-Variations: each pair's B turned, scaled, shifted and darkened anew; the truth is known.
+Unrelated: A of one pair with the MIRRORED B of any: no registration of them can be right, even
+where two pairs of the list show the same place, and the pictures' statistics are those of the true
+pairs. Variations: each pair's B turned, scaled, shifted and darkened anew; the truth is known.
 """
 
 import argparse
@@ -46,7 +47,9 @@ def main() -> None:
 def unrelated(pairs: tuple[Pair, ...], count: int, rng: np.random.Generator) -> None:
     every = [(i, j) for i in range(len(pairs)) for j in range(len(pairs))]
     own = [(i, i) for i in range(len(pairs))]
-    chosen = (own + [every[k] for k in rng.permutation(len(every)) if every[k][0] != every[k][1]])[:count]
+    chosen = (own + [every[k] for k in rng.permutation(len(every)) if every[k][0] != every[k][1]])[
+        :count
+    ]
     surprises, accepted, spent = [], 0, []
     for i, j in chosen:
         mirrored = Picture(values=np.ascontiguousarray(values(pairs[j].b)[:, ::-1]))
@@ -57,12 +60,17 @@ def unrelated(pairs: tuple[Pair, ...], count: int, rng: np.random.Generator) -> 
         surprises.append(outcome.evidence.get("surprise", 0.0))
         if surprises[-1] > 3.5:
             print(
-                f"  near miss: {pairs[i].source} with mirrored {pairs[j].source}: {surprises[-1]:.1f}",
+                f"  near miss: {pairs[i].source} with mirrored {pairs[j].source}:"
+                f" {surprises[-1]:.1f}",
                 flush=True,
             )
     steps = " ".join(f"{q}%: {np.percentile(surprises, q):.2f}" for q in (50, 90, 95, 99, 100))
-    print(f"unrelated: {accepted} of {len(chosen)} accepted; surprise {steps}; CPU {np.mean(spent):.2f} s,"
-          f" at most {max(spent):.2f} s", flush=True)  # fmt: skip
+    print(
+        f"unrelated: {accepted} of {len(chosen)} accepted; surprise {steps}; CPU"
+        f" {np.mean(spent):.2f} s,"
+        f" at most {max(spent):.2f} s",
+        flush=True,
+    )
 
 
 def variations(pairs: tuple[Pair, ...], rounds: int, rng: np.random.Generator) -> None:
@@ -80,18 +88,22 @@ def variations(pairs: tuple[Pair, ...], rounds: int, rng: np.random.Generator) -
             tally.setdefault(pair.kind, []).append((bool(outcome), right))
     for kind, found in tally.items():
         print(
-            f"{kind:16} {sum(a for a, _ in found)} accepted, {sum(r for _, r in found)} right of {len(found)}"
+            f"{kind:16} {sum(a for a, _ in found)} accepted, {sum(r for _, r in found)} right of"
+            f" {len(found)}"
         )
     every = [f for found in tally.values() for f in found]
     print(
-        f"variations: {sum(a for a, _ in every)} accepted, {sum(r for _, r in every)} right of {len(every)}"
+        f"variations: {sum(a for a, _ in every)} accepted, {sum(r for _, r in every)} right of"
+        f" {len(every)}"
     )
 
 
 def varied(
     pairs: tuple[Pair, ...], rng: np.random.Generator, turn_deg: float
 ) -> Iterator[tuple[Pair, NDArray, NDArray, float]]:
-    """Each pair with B turned by up to so many degrees, scaled by 0.8 to 1.25, shifted, its gamma changed."""
+    """Each pair with B turned by up to so many degrees, scaled by 0.8 to 1.25, shifted, its gamma
+    changed.
+    """
     for pair in pairs:
         b = values(pair.b)
         height, width = b.shape[:2]
@@ -102,7 +114,9 @@ def varied(
         t = middle + shift - np.array([[c, -s], [s, c]]) @ middle
         change = np.array([[c, -s, t[0]], [s, c, t[1]], [0, 0, 1]])
         gamma = 255 * (b / 255.0) ** rng.uniform(0.6, 1.7)
-        moved = cv2.warpPerspective(gamma.astype(np.uint8), change, (width, height), flags=cv2.INTER_LINEAR)
+        moved = cv2.warpPerspective(
+            gamma.astype(np.uint8), change, (width, height), flags=cv2.INTER_LINEAR
+        )
         yield pair, moved, change @ pair.b_H_a, scale
 
 

@@ -1,9 +1,11 @@
-"""SURF of our own beside OpenCV's detectors: time, repeatability and matching score under known warps.
+"""SURF of our own beside OpenCV's detectors: time, repeatability and matching score under known
+warps.
 
     python benchmarks/surf.py [PHOTO ...] [-o FILE]
 
-Without photos a simulated texture is used. Warps are of the photo reduced to 1000 px; the truth is the warp itself.
-OpenCV's own SURF is no reference here: no wheel has it. Where mahotas is installed, its SURF is measured too.
+Without photos a simulated texture is used. Warps are of the photo reduced to 1000 px; the truth is
+the warp itself. OpenCV's own SURF is no reference here: no wheel has it. Where mahotas is
+installed, its SURF is measured too.
 """
 
 import argparse
@@ -30,32 +32,48 @@ except ImportError:
 
 COUNT = 1500
 METHODS = {
-    "SIFT": Sift(count=COUNT, longest=1000), "SURF": Surf(count=COUNT), "SURF-128": Surf(count=COUNT, length=128),
-    "U-SURF": Surf(count=COUNT, upright=True), "Harris": Harris(count=COUNT), "ORB": Orb(count=COUNT),
+    "SIFT": Sift(count=COUNT, longest=1000),
+    "SURF": Surf(count=COUNT),
+    "SURF-128": Surf(count=COUNT, length=128),
+    "U-SURF": Surf(count=COUNT, upright=True),
+    "Harris": Harris(count=COUNT),
+    "ORB": Orb(count=COUNT),
     "AKAZE": Akaze(count=COUNT),
-}  # fmt: skip
+}
 
 
 def by_mahotas(image):
     """Another implementation of SURF, for comparison."""
     p = mahotas_surf.surf(image, 4, 6, 1, threshold=0.1, max_points=COUNT)
     return Features(
-        px=p[:, [1, 0]].astype(float), size=20 * p[:, 2].astype(np.float32),
-        descriptors=p[:, 6:].astype(np.float32), scale=1.0,
-    )  # fmt: skip
+        px=p[:, [1, 0]].astype(float),
+        size=20 * p[:, 2].astype(np.float32),
+        descriptors=p[:, 6:].astype(np.float32),
+        scale=1.0,
+    )
 
 
 if mahotas_surf is not None:
     METHODS["mahotas SURF"] = by_mahotas
 WARPS = {
-    "rotation 10": (10, 1, 0), "rotation 45": (45, 1, 0), "rotation 90": (90, 1, 0), "rotation 137": (137, 1, 0),
-    "scale 0.8": (0, 0.8, 0), "scale 0.6": (0, 0.6, 0), "scale 0.5": (0, 0.5, 0), "scale 0.6, 30": (30, 0.6, 0),
-    "blur 1": (0, 1, 1.0), "blur 2": (0, 1, 2.0), "noise": (0, 1, -1),
-}  # fmt: skip
+    "rotation 10": (10, 1, 0),
+    "rotation 45": (45, 1, 0),
+    "rotation 90": (90, 1, 0),
+    "rotation 137": (137, 1, 0),
+    "scale 0.8": (0, 0.8, 0),
+    "scale 0.6": (0, 0.6, 0),
+    "scale 0.5": (0, 0.5, 0),
+    "scale 0.6, 30": (30, 0.6, 0),
+    "blur 1": (0, 1, 1.0),
+    "blur 2": (0, 1, 2.0),
+    "noise": (0, 1, -1),
+}
 
 
 def warped(image, angle, scale, blur):
-    """The image turned and scaled about its centre, blurred (or noisy where negative); b_H_a (3, 3)."""
+    """The image turned and scaled about its centre, blurred (or noisy where negative); b_H_a (3,
+    3).
+    """
     h, w = image.shape
     H = np.vstack([cv2.getRotationMatrix2D(((w - 1) / 2, (h - 1) / 2), angle, scale), [0, 0, 1]])
     soft = cv2.GaussianBlur(image, (0, 0), 0.5 * np.sqrt(1 / scale**2 - 1)) if scale < 1 else image
@@ -69,9 +87,11 @@ def warped(image, angle, scale, blur):
 
 
 def scores(method, image, angle, scale, blur, near=2.0):
-    """(repeatability, matching score, precision): shares of the keypoints of `image` that the warp still shows.
+    """(repeatability, matching score, precision): shares of the keypoints of `image` that the warp
+    still shows.
 
-    Repeated: the warp has a keypoint within `near` px of the place. Matched: and it is what Mutual pairs it with.
+    Repeated: the warp has a keypoint within `near` px of the place. Matched: and it is what Mutual
+    pairs it with.
     """
     other, H = warped(image, angle, scale, blur)
     a, b = method(image), method(other)
@@ -123,10 +143,13 @@ def main():
     parser.add_argument("-o", "--output", type=Path)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    images = [to_grey8(shrink(cv2.imread(str(p)), 1000)[0][..., ::-1].copy()) for p in arguments.photos] or [
-        simulated()
+    images = [
+        to_grey8(shrink(cv2.imread(str(p)), 1000)[0][..., ::-1].copy()) for p in arguments.photos
+    ] or [simulated()]
+    lines = [
+        f"{len(images)} photo(s), {COUNT} keypoints at most, longest side 1000 px, one thread",
+        "",
     ]
-    lines = [f"{len(images)} photo(s), {COUNT} keypoints at most, longest side 1000 px, one thread", ""]
     reference = cpu_ms(METHODS["SIFT"], images[0])
     raw = cv2.SIFT.create(COUNT)
     bare = cpu_ms(lambda g: raw.detectAndCompute(g, None), images[0])

@@ -1,11 +1,12 @@
 """How far the thermal map lies from where it belongs on the visual map, on a simulated flight.
 
     skyquilt simulate FLIGHT --preset thermal [--thermal-season winter --thermal-hour 5]
-    skyquilt mosaic FLIGHT/photos --thermal FLIGHT/thermal -o OUT [--thermal-route maps|pairs|heights]
-    python benchmarks/thermal_map.py OUT FLIGHT
+    skyquilt mosaic FLIGHT/photos --thermal FLIGHT/thermal -o OUT [--thermal-route
+    maps|pairs|heights] python benchmarks/thermal_map.py OUT FLIGHT
 
-Both maps are compared with their own truth, and the difference of the two displacements is the error of the join:
-what the visual map is off by the ground truth, the thermal map should be off by too.
+Both maps are compared with their own truth, and the difference of the two displacements is the
+error of the join: what the visual map is off by the ground truth, the thermal map should be off by
+too.
 """
 
 import json
@@ -21,7 +22,10 @@ def displacements(raster: Path, truth: Path) -> tuple[np.ndarray, np.ndarray, fl
     """Places (n, 2) and displacements (n, 2) in m that could be trusted, and their share."""
     found = map_error(raster, truth, points=400)
     good = [s for s in found.samples if s.ok]
-    at, off = np.array([(s.x, s.y) for s in good]), np.array([(s.error_x_m, s.error_y_m) for s in good])
+    at, off = (
+        np.array([(s.x, s.y) for s in good]),
+        np.array([(s.error_x_m, s.error_y_m) for s in good]),
+    )
     return at, off, found.measured / max(found.attempted, 1)
 
 
@@ -50,8 +54,10 @@ def main(output: Path, flight: Path) -> None:
     gsd = m["native_gsd_m"]
     print(
         f"route {m['thermal']['route']} (refused: {m['thermal']['routes_refused'] or 'none'});"
-        f" {len(error)} places ({share:.0%} of those tried); thermal on visual: median {np.median(error):.3f} m ="
-        f" {np.median(error) / gsd:.2f} visual GSD, 95 % below {np.percentile(error, 95) / gsd:.2f};"
+        f" {len(error)} places ({share:.0%} of those tried); thermal on visual: median"
+        f" {np.median(error):.3f} m ="
+        f" {np.median(error) / gsd:.2f} visual GSD, 95 % below"
+        f" {np.percentile(error, 95) / gsd:.2f};"
         f" against the ground truth {np.median(np.linalg.norm(off, axis=1)):.3f} m"
     )
 

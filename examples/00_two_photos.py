@@ -38,7 +38,10 @@ def main(first: Path, second: Path) -> None:
     if not link:
         print(f"no link: {link.reason}")
         return
-    print(f"linked by {len(link)} matches; b shows the ground {abs(link.b_S_a):.3f} times as large as a,")
+    print(
+        f"linked by {len(link)} matches; b shows the ground {abs(link.b_S_a):.3f} times as large as"
+        " a,"
+    )
     print(f"turned by {np.degrees(np.angle(link.b_S_a)):.1f} degrees")
 
 

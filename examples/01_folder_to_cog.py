@@ -18,10 +18,16 @@ def main(photos: Path, output: Path, gsd_cm: float | None = None) -> None:
         if isinstance(event, Note):
             print(f"  {event.text}")
         elif isinstance(event, StageFinished):
-            print(f"{event.stage}: {event.seconds:.1f} s{' (from an earlier run)' if event.reused else ''}")
+            print(
+                f"{event.stage}: {event.seconds:.1f}"
+                f" s{' (from an earlier run)' if event.reused else ''}"
+            )
         elif isinstance(event, skyquilt.Result):
             figures = event.metrics
-            print(f"{figures['photos_used']} of {figures['photos_total']} photos by {figures['method']}:")
+            print(
+                f"{figures['photos_used']} of {figures['photos_total']} photos by"
+                f" {figures['method']}:"
+            )
             print(f"  {figures['why']}")
             for conflict in figures["metadata_conflicts"]:
                 print(f"  {conflict['photo']}: {conflict['meaning']}")
@@ -33,6 +39,8 @@ if __name__ == "__main__":
     if len(sys.argv) not in (3, 4):
         sys.exit(__doc__)
     try:
-        main(Path(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3]) if len(sys.argv) == 4 else None)
+        main(
+            Path(sys.argv[1]), Path(sys.argv[2]), float(sys.argv[3]) if len(sys.argv) == 4 else None
+        )
     except skyquilt.SkyquiltError as error:  # everything a user can mend
         sys.exit(str(error))

@@ -26,7 +26,9 @@ def main(folder: Path) -> None:
     for photo in survey.rejected:
         print(f"{photo.name} was left out: {photo.reason}")
     frame = choose_frame(survey.photos, None)
-    place = np.array([p.map_C[:2] for p in priors(survey.photos, frame)])  # m in local UTM, NaN where unknown
+    place = np.array(
+        [p.map_C[:2] for p in priors(survey.photos, frame)]
+    )  # m in local UTM, NaN where unknown
     detect, match, verify = Sift(count=1000), Mutual(), Verify()
     features: list[Features] = []
     links: list[Link] = []
@@ -35,7 +37,12 @@ def main(folder: Path) -> None:
         told = []
         for old in nearest(place, new):
             link = verify(
-                old, new, features[old], features[new], match(features[old], features[new]), photo.width
+                old,
+                new,
+                features[old],
+                features[new],
+                match(features[old], features[new]),
+                photo.width,
             )
             if link:
                 links.append(link)
@@ -49,7 +56,9 @@ def main(folder: Path) -> None:
 def nearest(place: np.ndarray, new: int) -> list[int]:
     """Earlier photos, nearest first; the last ones where positions are unknown."""
     distance = np.hypot(*(place[:new] - place[new]).T)
-    order = np.argsort(np.where(np.isfinite(distance), distance, 1e9 - np.arange(new)), kind="stable")
+    order = np.argsort(
+        np.where(np.isfinite(distance), distance, 1e9 - np.arange(new)), kind="stable"
+    )
     return [int(k) for k in order[:NEIGHBOURS]]
 
 

@@ -1,8 +1,9 @@
 """Features of your own, all the way to camera poses.
 
-A method is a frozen dataclass: its fields are its parameters, `__call__` does the work. Whatever returns
-`Features` can take SIFT's place; here it is Harris corners with upright SIFT descriptors. They
-are blind to photos of the way back, which are turned by 180 degrees: it shows in the number of links.
+A method is a frozen dataclass: its fields are its parameters, `__call__` does the work. Whatever
+returns `Features` can take SIFT's place; here it is Harris corners with upright SIFT descriptors.
+They are blind to photos of the way back, which are turned by 180 degrees: it shows in the number of
+links.
 
 python examples/03_your_own_features.py PHOTOS
 """
@@ -45,7 +46,9 @@ class UprightHarris:
         """Features of pixels (H, W[, C])."""
         grey = to_grey8(shrink(image, self.longest)[0])
         corners = cv2.goodFeaturesToTrack(grey, self.count, 0.001, 5, useHarrisDetector=True)
-        points = [cv2.KeyPoint(float(x), float(y), self.size, 0.0) for x, y in corners.reshape(-1, 2)]
+        points = [
+            cv2.KeyPoint(float(x), float(y), self.size, 0.0) for x, y in corners.reshape(-1, 2)
+        ]
         points, described = cv2.SIFT_create().compute(grey, points)
         unit = described / np.maximum(np.linalg.norm(described, axis=1, keepdims=True), 1e-9)
         xy = np.array([p.pt for p in points])
@@ -70,7 +73,10 @@ def align(survey: skyquilt.Survey, detect: Callable[[NDArray], Features]) -> sky
         for a, b in Nearest(neighbours=8)(np.array([p.map_C[:2] for p in prior]))
     ]
     links = [link for link in tried if link]
-    print(f"{len(tried)} pairs, {len(links)} links, {np.mean([len(k) for k in links]):.0f} matches each")
+    print(
+        f"{len(tried)} pairs, {len(links)} links, {np.mean([len(k) for k in links]):.0f} matches"
+        " each"
+    )
     return Bundle()(photos, frame, prior, features, links)
 
 

@@ -1,4 +1,5 @@
-"""How far is a map off? Against the true orthophoto of a simulated flight, or against any better map.
+"""How far is a map off? Against the true orthophoto of a simulated flight, or against any better
+map.
 
 python examples/04_map_against_truth.py MOSAIC.tif TRUTH.tif
 """
@@ -14,10 +15,14 @@ def main(mosaic: Path, truth: Path) -> None:
     if found.absolute is None or found.relative is None:
         sys.exit(f"none of {found.attempted} places could be found again")
     print(f"against the truth, at {found.measured} of {found.attempted} places:")
-    print(f"  the map as a whole lies {found.bias_x_m:+.2f} m east and {found.bias_y_m:+.2f} m north of it,")
+    print(
+        f"  the map as a whole lies {found.bias_x_m:+.2f} m east and {found.bias_y_m:+.2f} m north"
+        " of it,"
+    )
     print("  which is what the photos' positions have in common (control points take it away)")
     print(
-        f"  within the map: median {found.relative.median_m:.2f} m, 95 % below {found.relative.p95_m:.2f} m"
+        f"  within the map: median {found.relative.median_m:.2f} m, 95 % below"
+        f" {found.relative.p95_m:.2f} m"
     )
 
 

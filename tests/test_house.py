@@ -49,8 +49,11 @@ def test_no_file_names_a_place_on_a_machine_or_an_address_of_a_registry():
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
             for word in HOMES + REGISTRIES:
                 at = line.find(word)
-                # a path that goes on from something (docs/work/..., a/home/b) is relative, not a machine's
-                if at >= 0 and (word in REGISTRIES or at == 0 or not re.match(r"[\w.}\]-]", line[at - 1])):
+                # a path that goes on from something (docs/work/..., a/home/b) is relative, not a
+                # machine's
+                if at >= 0 and (
+                    word in REGISTRIES or at == 0 or not re.match(r"[\w.}\]-]", line[at - 1])
+                ):
                     found.append(f"{path.relative_to(ROOT)}:{number}: {line.strip()}")
     assert not found, "\n".join(found)
 
@@ -90,7 +93,9 @@ def test_the_readme_names_every_file_of_a_run_and_every_option():
 
     readme = (ROOT / "README.md").read_text()
     assert [name for name in CONTRACT if f"`{name}`" not in readme] == []
-    options = [o for p in get_command(app).commands["mosaic"].params for o in p.opts if o.startswith("--")]
+    options = [
+        o for p in get_command(app).commands["mosaic"].params for o in p.opts if o.startswith("--")
+    ]
     assert [o for o in options if f"`{o}" not in readme and f"{o}`" not in readme] == []
 
 
@@ -102,7 +107,9 @@ def test_the_readme_states_the_defaults():
     readme = (ROOT / "README.md").read_text()
     rows = dict(re.findall(r"^\| `(--[\w-]+)`[^|]*\|.*\| *([^|]*?) *\|$", readme, re.M))
     for name, parameter in inspect.signature(command).parameters.items():
-        if isinstance(parameter.default, (int, float, str)) and not isinstance(parameter.default, bool):
+        if isinstance(parameter.default, (int, float, str)) and not isinstance(
+            parameter.default, bool
+        ):
             stated = rows["--" + name.replace("_", "-")].strip("`")
             assert stated == (
                 "all processors" if name == "jobs" else str(parameter.default).removesuffix(".0")
@@ -120,12 +127,16 @@ def test_no_file_holds_both_sides_of_a_merge():
     found = [p for k in kinds for f in folders for p in (ROOT / f).rglob(k)] + [
         p for k in kinds for p in ROOT.glob(k)
     ]
-    assert [str(p.relative_to(ROOT)) for p in found if marks.search(p.read_text(errors="replace"))] == []
+    assert [
+        str(p.relative_to(ROOT)) for p in found if marks.search(p.read_text(errors="replace"))
+    ] == []
 
 
 @pytest.mark.slow
 def test_benchmarks_call_what_is_there():
-    """Benchmarks are run by hand and rarely: a function that changed its arguments is found here."""
+    """Benchmarks are run by hand and rarely: a function that changed its arguments is found
+    here.
+    """
     programs = sorted(str(p) for p in (ROOT / "benchmarks").glob("*.py"))
     words = [
         sys.executable,
@@ -139,5 +150,9 @@ def test_benchmarks_call_what_is_there():
         [*words, *programs], cwd=ROOT / "benchmarks", capture_output=True, text=True, check=False
     )
     assert "Found" in said.stdout or "Success" in said.stdout, said.stderr
-    broken = [line for line in said.stdout.splitlines() if "[call-arg]" in line or "[name-defined]" in line]
+    broken = [
+        line
+        for line in said.stdout.splitlines()
+        if "[call-arg]" in line or "[name-defined]" in line
+    ]
     assert len(programs) > 10 and not broken, broken

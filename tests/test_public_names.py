@@ -26,16 +26,20 @@ def test_an_unknown_name_is_an_attribute_error():
 
 def test_importing_the_package_imports_nothing_heavy():
     code = (
-        "import sys, skyquilt; print(*(m for m in ('numpy', 'cv2', 'scipy', 'rasterio') if m in sys.modules))"
+        "import sys, skyquilt; print(*(m for m in ('numpy', 'cv2', 'scipy', 'rasterio') if m in"
+        " sys.modules))"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == ""
 
 
 def test_the_story_of_a_small_survey_waits_for_nothing_it_does_not_need():
-    """SciPy alone takes a third of a second to load: large surveys ask for it, small ones do not wait for it."""
+    """SciPy alone takes a third of a second to load: large surveys ask for it, small ones do not
+    wait for it.
+    """
     code = (
-        "import sys, skyquilt.pipelines.mosaic as m; from skyquilt.config import *; methods(MosaicSettings());"
+        "import sys, skyquilt.pipelines.mosaic as m; from skyquilt.config import *;"
+        " methods(MosaicSettings());"
         "print(*(m for m in ('scipy', 'rasterio', 'shapely', 'tifffile') if m in sys.modules))"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

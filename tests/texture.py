@@ -10,7 +10,8 @@ FINE = 4
 
 @lru_cache(maxsize=4)
 def texture(height, width, seed=0, roughness=1.0):
-    """Grey values (height, width), mean 120, detail at every scale (amplitude ~ frequency ** -roughness).
+    """Grey values (height, width), mean 120, detail at every scale (amplitude ~ frequency **
+    -roughness).
 
     Not to be written to: who asks again gets the same.
     """

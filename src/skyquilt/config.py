@@ -1,4 +1,6 @@
-"""Names and numbers -> methods: the one place where words on a command line become parts of a story."""
+"""Names and numbers -> methods: the one place where words on a command line become parts of a
+story.
+"""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -40,7 +42,9 @@ LINES = ("heading", "distance")
 VLFEAT = 1.5**-0.5
 """Ratio of distances that VLFeat's matcher asks for."""
 SECOND_PX2 = 12.0
-"""STE of an inlier, px^2 at 1500 px, where the threshold by deviations fails: 5.99 times one px, both ways."""
+"""STE of an inlier, px^2 at 1500 px, where the threshold by deviations fails: 5.99 times one px,
+both ways.
+"""
 LEAST_INLIERS = 12
 """Matches that must agree before two photos count as registered."""
 BLENDS: dict[str, type[Blend]] = {
@@ -84,29 +88,32 @@ class MosaicSettings:
     balance: bool = True
     """Bring photos to one brightness: 8-bit pictures; for measured values see `balance_thermal`."""
     balance_thermal: bool | None = None
-    """Balance the drift between thermal frames on their overlaps; False leaves values as recorded. None = temperatures,
-    if `balance`, but not counts.
+    """Balance the drift between thermal frames on their overlaps; False leaves values as recorded.
+    None = temperatures, if `balance`, but not counts.
     """
     thermal_unit: str | None = None
-    """One of `THERMAL_UNITS`: what values of single-band TIFFs mean; None = found out, as is whether they are
-    thermal.
+    """One of `THERMAL_UNITS`: what values of single-band TIFFs mean; None = found out, as is
+    whether they are thermal.
     """
     compress: str = "auto"
     """One of `COMPRESSIONS`; auto = JPEG for 8-bit pictures, zstd for measured values."""
     quality: int = 85
     """JPEG quality."""
     distortion: str | None = None
-    """One of `DISTORTIONS`: what self-calibration may change of the lens model (None = 4), or, for methods that
-    do not calibrate, the order fitted to a calibration that photos bring along (None = 6t; `flightline` none).
+    """One of `DISTORTIONS`: what self-calibration may change of the lens model (None = 4), or, for
+    methods that do not calibrate, the order fitted to a calibration that photos bring along (None =
+    6t; `flightline` none).
     """
     transform: str | None = None
-    """One of `TRANSFORMS`: how two photos may differ, for methods `image` (None = similarity) and `flightline` (None =
-    homography).
+    """One of `TRANSFORMS`: how two photos may differ, for methods `image` (None = similarity) and
+    `flightline` (None = homography).
     """
     levelled: bool = True
     """Method `image` registers by features of the dominant plane only."""
     image_search: str = "chain"
-    """One of `IMAGE_SEARCHES`: against the last photo, or against the whole map so far, for method `image`."""
+    """One of `IMAGE_SEARCHES`: against the last photo, or against the whole map so far, for method
+    `image`.
+    """
     relief_m: float | None = None
     """Largest height variation on the ground in m; None = a tenth of the flying height."""
     alpha: float = 0.5
@@ -124,7 +131,8 @@ class MosaicSettings:
     height_m: float | None = None
     """Height above ground for methods without tie points, where altitudes do not tell it."""
     heading_deg: float | None = None
-    """Common heading for method `position`; None = the commonest reported one, north where none is."""
+    """Common heading for method `position`; None = the commonest reported one, north where none is.
+    """
     repair: bool = True
     """Treat metadata as measurements that may lie."""
     features: int = 1200
@@ -147,20 +155,28 @@ class MosaicSettings:
         if self.thermal_unit is not None:
             one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
         for name, value, low, high in (
-            ("--gsd", self.gsd_cm, 0.05, 10000), ("--quality", self.quality, 1, 100),
-            ("--height", self.height_m, 0.5, 1e5), ("--memory", self.memory_gb, 0.5, 4096),
-            ("--jobs", self.jobs, 0, 1024), ("--features", self.features, 100, 50000),
-            ("--feather", self.feather_px, 0, 10000), ("--heading", self.heading_deg, -360, 360),
-            ("--alpha", self.alpha, 0, 1), ("--relief", self.relief_m, 0, 1e4), ("--seed", self.seed, 0, 2**32 - 1),
-        ):  # fmt: skip
+            ("--gsd", self.gsd_cm, 0.05, 10000),
+            ("--quality", self.quality, 1, 100),
+            ("--height", self.height_m, 0.5, 1e5),
+            ("--memory", self.memory_gb, 0.5, 4096),
+            ("--jobs", self.jobs, 0, 1024),
+            ("--features", self.features, 100, 50000),
+            ("--feather", self.feather_px, 0, 10000),
+            ("--heading", self.heading_deg, -360, 360),
+            ("--alpha", self.alpha, 0, 1),
+            ("--relief", self.relief_m, 0, 1e4),
+            ("--seed", self.seed, 0, 2**32 - 1),
+        ):
             if value is not None and not low <= value <= high:
                 raise UsageError(f"{name} {value} lies outside {low} to {high}")
         for name, given, used_by in (
-            ("--transform", self.transform, ("image", "flightline")), ("--relief", self.relief_m, ("image",)),
-        ):  # fmt: skip
+            ("--transform", self.transform, ("image", "flightline")),
+            ("--relief", self.relief_m, ("image",)),
+        ):
             if given is not None and self.method not in used_by:
                 raise UsageError(
-                    f"{name} is for --method {' or '.join(used_by)}; the method here is {self.method}"
+                    f"{name} is for --method {' or '.join(used_by)}; the method here is"
+                    f" {self.method}"
                 )
         if self.bounds and not (
             np.isfinite(self.bounds).all()
@@ -168,7 +184,8 @@ class MosaicSettings:
             and self.bounds[1] < self.bounds[3]
         ):
             raise UsageError(
-                f"--bounds is west,south,east,north with west < east and south < north, got {self.bounds}"
+                "--bounds is west,south,east,north with west < east and south < north, got"
+                f" {self.bounds}"
             )
 
     def as_table(self) -> dict[str, Any]:
@@ -204,7 +221,8 @@ class Methods:
     by_position: ByPosition
     """Alignment from positions."""
     by_image: "Chain | ByOverview | None"
-    """Alignment from pixels alone; like the next two, made (and loaded) only where it is asked for."""
+    """Alignment from pixels alone; like the next two, made (and loaded) only where it is asked for.
+    """
     hybrid: "Hybrid | None"
     """Alignment from metadata, corrected by pixels."""
     by_flightline: "ByFlightline | None"
@@ -232,7 +250,10 @@ def methods(settings: MosaicSettings) -> Methods:
         else Sift(count=settings.features)
     )
     return Methods(
-        sift=sift, nearest=Nearest(), retrieval=Retrieval(), mutual=Mutual(),
+        sift=sift,
+        nearest=Nearest(),
+        retrieval=Retrieval(),
+        mutual=Mutual(),
         verify=Verify(),
         bundle=Bundle(distortion=settings.distortion or "4", repair=settings.repair),
         by_pose=ByPose(height_m=settings.height_m),
@@ -240,9 +261,12 @@ def methods(settings: MosaicSettings) -> Methods:
         by_image=_by_image(settings) if settings.method == "image" else None,
         hybrid=_hybrid(settings) if settings.method == "hybrid" else None,
         by_flightline=_by_flightline(settings) if flightline else None,
-        surface=FromTiePoints(), sweep=Sweep() if settings.surface == "sweep" else None, balance=Balance(),
-        drift=Drift(), blend=Feather(width_px=settings.feather_px) if blend == "feather" else BLENDS[blend](),
-    )  # fmt: skip
+        surface=FromTiePoints(),
+        sweep=Sweep() if settings.surface == "sweep" else None,
+        balance=Balance(),
+        drift=Drift(),
+        blend=Feather(width_px=settings.feather_px) if blend == "feather" else BLENDS[blend](),
+    )
 
 
 def _by_image(settings: MosaicSettings) -> "Chain | ByOverview":
@@ -255,11 +279,19 @@ def _by_image(settings: MosaicSettings) -> "Chain | ByOverview":
     order, height = settings.distortion or "6t", settings.height_m
     if settings.image_search == "overview":
         estimate = Ransac(model=model, threshold_px=3.0, minimum=LEAST_INLIERS, seed=settings.seed)
-        level = Level(relief_m=settings.relief_m, height_m=height, width=640) if settings.levelled else None
+        level = (
+            Level(relief_m=settings.relief_m, height_m=height, width=640)
+            if settings.levelled
+            else None
+        )
         return ByOverview(
-            detect=Sift(longest=1_000_000), match=Mutual(), estimate=estimate, level=level, distortion=order,
+            detect=Sift(longest=1_000_000),
+            match=Mutual(),
+            estimate=estimate,
+            level=level,
+            distortion=order,
             height_m=height,
-        )  # fmt: skip
+        )
     estimate = Ransac(model=model, threshold_px=6.0, minimum=LEAST_INLIERS, seed=settings.seed)
     level = Level(relief_m=settings.relief_m, height_m=height) if settings.levelled else None
     return Chain(match=Mutual(), estimate=estimate, level=level, distortion=order, height_m=height)
@@ -282,9 +314,14 @@ def _by_flightline(settings: MosaicSettings) -> "ByFlightline":
     model = cast(Model, settings.transform or "homography")
     estimate = Rescued(
         first=RansacSte(model=model, seed=settings.seed),
-        second=RansacSte(model=model, threshold_px2=SECOND_PX2, minimum=LEAST_INLIERS, seed=settings.seed),
+        second=RansacSte(
+            model=model, threshold_px2=SECOND_PX2, minimum=LEAST_INLIERS, seed=settings.seed
+        ),
     )
     return ByFlightline(
-        within=Best(count=150, ratio=VLFEAT), across=Best(count=50, ratio=VLFEAT), estimate=estimate,
-        split="distance" if settings.lines == "distance" else "heading", distortion=settings.distortion or "none",
-    )  # fmt: skip
+        within=Best(count=150, ratio=VLFEAT),
+        across=Best(count=50, ratio=VLFEAT),
+        estimate=estimate,
+        split="distance" if settings.lines == "distance" else "heading",
+        distortion=settings.distortion or "none",
+    )

@@ -1,4 +1,6 @@
-"""Words -> ways to register two pictures of different spectra; apart from `config`, since a mosaic needs none of it."""
+"""Words -> ways to register two pictures of different spectra; apart from `config`, since a mosaic
+needs none of it.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -41,7 +43,9 @@ def registration_method(name: str) -> Registers:
     one_of("--method", name, REGISTRATIONS)
     surf, sift = Surf(lobe=1, step=1), Sift(levels=43, root=False, longest=1000, count=3000)
     structure = StructureMatches(
-        estimate=Ransac(model="similarity", minimum=INLIERS, threshold_px=4.0, max_iterations=5 * SAMPLES)
+        estimate=Ransac(
+            model="similarity", minimum=INLIERS, threshold_px=4.0, max_iterations=5 * SAMPLES
+        )
     )
     ways: dict[str, Callable[[], Registers]] = {
         "auto": lambda: Auto(propose=structure),
@@ -51,16 +55,19 @@ def registration_method(name: str) -> Registers:
         "rfae": lambda: Rfae(detect=surf, relate=_outliers()),
         "rfae-sift": lambda: Rfae(detect=sift, relate=_outliers()),
         "structure": lambda: Structure(propose=structure),
-        "surf+rfae": lambda: BetterByQ(methods=(registration_method("surf"), registration_method("rfae"))),
+        "surf+rfae": lambda: BetterByQ(
+            methods=(registration_method("surf"), registration_method("rfae"))
+        ),
     }
     return ways[name]()
 
 
 def _outliers() -> Outliers:
     return Outliers(
-        match=OneWay(), quality=spread_quality,
+        match=OneWay(),
+        quality=spread_quality,
         estimators=(
             Ransac(model="similarity", minimum=INLIERS, max_iterations=SAMPLES),
             Lmeds(model="similarity", minimum=INLIERS, max_iterations=SAMPLES),
         ),
-    )  # fmt: skip
+    )

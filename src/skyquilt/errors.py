@@ -1,4 +1,6 @@
-"""What a user can mend: every error here states what was found, what was expected and the next step."""
+"""What a user can mend: every error here states what was found, what was expected and the next
+step.
+"""
 
 
 class SkyquiltError(Exception):

@@ -1,4 +1,6 @@
-"""Simulated blocks: cameras over rolling ground, their sightings with noise and lies, and priors that err."""
+"""Simulated blocks: cameras over rolling ground, their sightings with noise and lies, and priors
+that err.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -42,17 +44,36 @@ def ground(xy):
 
 
 def make_block(
-    seed=0, *, lines=3, per_line=6, points=300, noise=0.3, lies=0.0, gps=1.5, tilt_deg=1.0, yaw_deg=3.0,
-    overlap=0.75, sidelap=0.55, lens=LENS, free=FREE, sigma_k=SIGMA_K, lens_errs=True, loss_px=2.0, loss_prior=1e6,
-    true_tilt_deg=1.5, cameras=1,
-):  # fmt: skip
+    seed=0,
+    *,
+    lines=3,
+    per_line=6,
+    points=300,
+    noise=0.3,
+    lies=0.0,
+    gps=1.5,
+    tilt_deg=1.0,
+    yaw_deg=3.0,
+    overlap=0.75,
+    sidelap=0.55,
+    lens=LENS,
+    free=FREE,
+    sigma_k=SIGMA_K,
+    lens_errs=True,
+    loss_px=2.0,
+    loss_prior=1e6,
+    true_tilt_deg=1.5,
+    cameras=1,
+):
     """A block of serpentine lines; priors are the truth plus noise of their stated deviations."""
     rng = np.random.default_rng(seed)
     along, across = HEIGHT / FOCAL * FLYING * (1 - overlap), WIDTH / FOCAL * FLYING * (1 - sidelap)
     n = lines * per_line
     column, row = np.divmod(np.arange(n), per_line)
     row = np.where(column % 2 == 1, per_line - 1 - row, row)
-    C = np.column_stack([column * across, row * along, np.full(n, FLYING)]) + rng.normal(0, 0.5, (n, 3))
+    C = np.column_stack([column * across, row * along, np.full(n, FLYING)]) + rng.normal(
+        0, 0.5, (n, 3)
+    )
     yaw = np.where(column % 2 == 1, 180.0, 0.0) + rng.normal(0, 2, n)
     tilts = rng.normal(0, true_tilt_deg, (n, 2))
     R = np.array([cam_R_map_from_angles(y, *t) for y, t in zip(yaw, tilts, strict=True)])
@@ -82,11 +103,24 @@ def make_block(
     C0 = C + rng.normal(0, 1, C.shape) * sigma_C
     R0 = rotation_from_vector(rng.normal(0, 1, (n, 3)) * sigma_R) @ R
     problem = Problem(
-        point=point.astype(np.int64), photo=photo.astype(np.int64), px=px, sigma_px=np.full(len(px), noise or 0.3),
-        camera=camera, free=np.tile(free, (cameras, 1)), K0=K0, sigma_K=np.tile(sigma_k, (cameras, 1)), C0=C0,
-        sigma_C=sigma_C, R0=R0, sigma_R=sigma_R, X0=np.full(X.shape, np.nan), sigma_X=np.ones(X.shape),
-        loss_px=loss_px, loss_C=loss_prior, loss_R=loss_prior,
-    )  # fmt: skip
+        point=point.astype(np.int64),
+        photo=photo.astype(np.int64),
+        px=px,
+        sigma_px=np.full(len(px), noise or 0.3),
+        camera=camera,
+        free=np.tile(free, (cameras, 1)),
+        K0=K0,
+        sigma_K=np.tile(sigma_k, (cameras, 1)),
+        C0=C0,
+        sigma_C=sigma_C,
+        R0=R0,
+        sigma_R=sigma_R,
+        X0=np.full(X.shape, np.nan),
+        sigma_X=np.ones(X.shape),
+        loss_px=loss_px,
+        loss_C=loss_prior,
+        loss_R=loss_prior,
+    )
     start = State(R=R0, C=C0, K=K0.copy(), X=X + rng.normal(0, 2, X.shape))
     return Block(problem=problem, start=start, truth=State(R=R, C=C, K=K, X=X), wrong=wrong)
 

@@ -9,7 +9,9 @@ CORNER = 0.5
 """COLMAP counts pixels from the corner of the image: centres lie at 0.5."""
 
 
-def reconstruction(problem: Problem, state: State, width: int, height: int) -> pycolmap.Reconstruction:
+def reconstruction(
+    problem: Problem, state: State, width: int, height: int
+) -> pycolmap.Reconstruction:
     """Cameras (RADIAL: focal, cx, cy, k1, k2), images, and tracks."""
     made = pycolmap.Reconstruction()
     for j, K in enumerate(state.K):
@@ -46,9 +48,18 @@ def reconstruction(problem: Problem, state: State, width: int, height: int) -> p
 
 
 def solve(
-    problem: Problem, state: State, width: int, height: int, *, focal: bool, lens: bool = False, centre: bool = False,
-    cauchy: float | None = None, threads: int = 1, exact: bool = True,
-) -> State:  # fmt: skip
+    problem: Problem,
+    state: State,
+    width: int,
+    height: int,
+    *,
+    focal: bool,
+    lens: bool = False,
+    centre: bool = False,
+    cauchy: float | None = None,
+    threads: int = 1,
+    exact: bool = True,
+) -> State:
     """pycolmap's minimum with the positions as priors."""
     made = reconstruction(problem, state, width, height)
     options = pycolmap.BundleAdjustmentOptions()

@@ -1,4 +1,6 @@
-"""Flights over level, textured ground: photos, their features and their pictures, by formulas of their own."""
+"""Flights over level, textured ground: photos, their features and their pictures, by formulas of
+their own.
+"""
 
 from dataclasses import dataclass
 
@@ -36,10 +38,16 @@ class Flight:
         scale = longest / WIDTH
         K = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
         S = np.array([[scale, 0, scale / 2 - 0.5], [0, scale, scale / 2 - 0.5], [0, 0, 1]])
-        photo_H_map = S @ K @ np.column_stack([self.R[i][:, 0], self.R[i][:, 1], -self.R[i] @ self.C[i]])
-        map_H_cell = np.array([[CELL, 0, self.west + CELL / 2], [0, -CELL, self.north - CELL / 2], [0, 0, 1]])
+        photo_H_map = (
+            S @ K @ np.column_stack([self.R[i][:, 0], self.R[i][:, 1], -self.R[i] @ self.C[i]])
+        )
+        map_H_cell = np.array(
+            [[CELL, 0, self.west + CELL / 2], [0, -CELL, self.north - CELL / 2], [0, 0, 1]]
+        )
         size = (longest, round(HEIGHT * scale))
-        seen = cv2.warpPerspective(self.ground, photo_H_map @ map_H_cell, size, flags=cv2.INTER_AREA)
+        seen = cv2.warpPerspective(
+            self.ground, photo_H_map @ map_H_cell, size, flags=cv2.INTER_AREA
+        )
         return np.clip(seen, 0, 255).astype(np.uint8)
 
     def map_xy(self, i, px):
@@ -64,7 +72,8 @@ def fly(
     noise_px=0.2,
     relief=0.0,
 ):
-    """Photos at xy (n, 2) m; `gps` m and `yaw_error` degrees are deviations of what is reported, `tilt` of the truth.
+    """Photos at xy (n, 2) m; `gps` m and `yaw_error` degrees are deviations of what is reported,
+    `tilt` of the truth.
 
     `relief`: a tenth of the points stand this much above the ground, m.
     """
@@ -82,15 +91,23 @@ def fly(
     words = rng.normal(size=(points, 32))
     size = np.ceil((high - low) / CELL).astype(int)
     flight = Flight(
-        C=C, R=R, west=low[0], north=high[1], features=[],
+        C=C,
+        R=R,
+        west=low[0],
+        north=high[1],
+        features=[],
         photos=[photo(f"P{i:03d}.jpg", focal=FOCAL) for i in range(n)],
         priors=[
-            prior([*(xy[i] + rng.normal(0, gps, 2) if gps else xy[i]), height], yaw=yaws[i] + rng.normal(0, yaw_error),
-                  sigma=max(gps, 0.5), sigma_yaw=max(yaw_error, 1.0))
+            prior(
+                [*(xy[i] + rng.normal(0, gps, 2) if gps else xy[i]), height],
+                yaw=yaws[i] + rng.normal(0, yaw_error),
+                sigma=max(gps, 0.5),
+                sigma_yaw=max(yaw_error, 1.0),
+            )
             for i in range(n)
         ],
         ground=texture(int(size[1]), int(size[0]), seed=seed, roughness=1.2),
-    )  # fmt: skip
+    )
     for i in range(n):
         local = (X - C[i]) @ R[i].T
         px = local[:, :2] / local[:, 2:] * FOCAL + ((WIDTH - 1) / 2, (HEIGHT - 1) / 2)
@@ -123,5 +140,11 @@ def lawn(lines, each, step=25.0, apart=30.0):
 
 CAMERA = Camera.ideal(width=WIDTH, height=HEIGHT, focal=FOCAL)
 CORNERS = np.array(
-    [[50.0, 50.0], [WIDTH - 51, 50], [WIDTH - 51, HEIGHT - 51], [50, HEIGHT - 51], [WIDTH / 2, HEIGHT / 2]]
+    [
+        [50.0, 50.0],
+        [WIDTH - 51, 50],
+        [WIDTH - 51, HEIGHT - 51],
+        [50, HEIGHT - 51],
+        [WIDTH / 2, HEIGHT / 2],
+    ]
 )

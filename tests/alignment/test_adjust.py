@@ -1,4 +1,6 @@
-"""The adjustment: its algebra, what it finds on simulated blocks, and whether its deviations are honest."""
+"""The adjustment: its algebra, what it finds on simulated blocks, and whether its deviations are
+honest.
+"""
 
 from dataclasses import replace
 
@@ -34,7 +36,9 @@ def free_mask(block):
 
 
 def dense_system(problem, state):
-    """The normal matrix and gradient of plain weighted squares over all unknowns, by stacking every row."""
+    """The normal matrix and gradient of plain weighted squares over all unknowns, by stacking every
+    row.
+    """
     n, m, P = len(state.C), len(state.K), len(state.X)
     lin = linearise(problem, state)
     N = len(lin.residual)
@@ -50,18 +54,20 @@ def dense_system(problem, state):
     prior_e = np.concatenate(
         [
             np.concatenate([attitude_error(state.R, problem.R0), state.C - problem.C0], 1).ravel(),
-            (state.K - problem.K0).ravel(), np.nan_to_num(state.X - problem.X0).ravel(),
+            (state.K - problem.K0).ravel(),
+            np.nan_to_num(state.X - problem.X0).ravel(),
         ]
-    )  # fmt: skip
+    )
     prior_w = np.concatenate(
         [
             np.concatenate(
-                [1 / problem.sigma_R**2, np.where(np.isnan(problem.C0), 0, 1 / problem.sigma_C**2)], 1
+                [1 / problem.sigma_R**2, np.where(np.isnan(problem.C0), 0, 1 / problem.sigma_C**2)],
+                1,
             ).ravel(),
             (problem.free / problem.sigma_K**2).ravel(),
             np.where(np.isnan(problem.X0), 0, 1 / problem.sigma_X**2).ravel(),
         ]
-    )  # fmt: skip
+    )
     return A.T @ A + np.diag(prior_w), A.T @ e + prior_w * np.nan_to_num(prior_e)
 
 
@@ -76,7 +82,9 @@ def small(request):
     C0[1] = np.nan
     free = block.problem.free & (request.param == "free")
     block = replace(block, problem=replace(block.problem, free=free))
-    problem = least_squares_only(replace(block.problem, X0=X0, sigma_X=np.full(X0.shape, 0.05), C0=C0))
+    problem = least_squares_only(
+        replace(block.problem, X0=X0, sigma_X=np.full(X0.shape, 0.05), C0=C0)
+    )
     start = replace(block.start, C=np.where(np.isnan(C0), block.truth.C + 1, C0))
     return problem, start
 
@@ -85,7 +93,9 @@ def test_a_step_is_that_of_the_dense_normal_equations(small):
     problem, state = small
     H, g = dense_system(problem, state)
     n, m = len(state.C), len(state.K)
-    used = np.concatenate([np.ones(6 * n, bool), problem.free.ravel(), np.ones(3 * len(state.X), bool)])
+    used = np.concatenate(
+        [np.ones(6 * n, bool), problem.free.ravel(), np.ones(3 * len(state.X), bool)]
+    )
     expected = np.zeros(len(g))
     expected[used] = -np.linalg.solve(H[np.ix_(used, used)], g[used])
     photos, cameras, points = Reduced(problem, normal_equations(problem, state), 0.0).step()
@@ -98,7 +108,9 @@ def test_the_covariance_is_the_dense_inverse_s(small):
     problem, state = small
     H, _ = dense_system(problem, state)
     n, m = len(state.C), len(state.K)
-    used = np.concatenate([np.ones(6 * n, bool), problem.free.ravel(), np.ones(3 * len(state.X), bool)])
+    used = np.concatenate(
+        [np.ones(6 * n, bool), problem.free.ravel(), np.ones(3 * len(state.X), bool)]
+    )
     whole = np.linalg.inv(H[np.ix_(used, used)])
     u = int(used[: 6 * n + 8 * m].sum())
     mine = covariance(problem, state)
@@ -108,9 +120,13 @@ def test_the_covariance_is_the_dense_inverse_s(small):
 
 
 def test_the_gradient_is_the_slope_of_the_robust_cost():
-    """Cauchy on sightings, pseudo-Huber on priors: g = half the derivative of the cost, so weights fit losses."""
+    """Cauchy on sightings, pseudo-Huber on priors: g = half the derivative of the cost, so weights
+    fit losses.
+    """
     block = make_block(4, lines=1, per_line=3, points=30, lies=0.1, loss_px=2.0, loss_prior=1.5)
-    problem = replace(block.problem, trust=0.4, X0=block.truth.X.copy(), sigma_X=np.ones_like(block.truth.X))
+    problem = replace(
+        block.problem, trust=0.4, X0=block.truth.X.copy(), sigma_X=np.ones_like(block.truth.X)
+    )
     far = np.random.default_rng(1).normal(0, 4, block.start.C.shape)  # so far that losses matter
     state = replace(block.start, C=block.start.C + far)
     normal = normal_equations(problem, state)
@@ -121,7 +137,9 @@ def test_the_gradient_is_the_slope_of_the_robust_cost():
         step = [np.zeros(s) for s in shapes]
         step[part] = rng.normal(0, 1, shapes[part]) * (1e-2 if part == 1 else 1.0)
         if part == 0:
-            step[0][:, :3] = 0  # attitudes: the prior's Jacobian is the identity only near R0; see below
+            step[0][:, :3] = (
+                0  # attitudes: the prior's Jacobian is the identity only near R0; see below
+            )
         if part == 1:
             step[1] *= problem.free
         h = 1e-5
@@ -137,7 +155,9 @@ def test_the_gradient_is_the_slope_of_the_robust_cost():
 
 @pytest.mark.parametrize("points", [60, 4000])
 def test_the_sparse_system_is_the_dense_one(monkeypatch, points):
-    block = make_block(5, lines=2, per_line=4, points=points, cameras=2)  # 4000 points: several chunks
+    block = make_block(
+        5, lines=2, per_line=4, points=points, cameras=2
+    )  # 4000 points: several chunks
     normal = normal_equations(block.problem, block.start)
     dense = Reduced(block.problem, normal, 1e-3)
     monkeypatch.setattr(module, "DENSE_LIMIT", 10)
@@ -177,7 +197,9 @@ def test_the_sparse_adjustment_ends_where_the_dense_one_does(monkeypatch):
 
 
 def test_exact_sightings_give_the_exact_block():
-    """No noise at all, positions exact: the truth is the minimum, from a start metres and degrees away."""
+    """No noise at all, positions exact: the truth is the minimum, from a start metres and degrees
+    away.
+    """
     block = make_block(1, noise=0.0, gps=1.5)
     problem = replace(block.problem, C0=block.truth.C, R0=block.truth.R, K0=block.truth.K)
     found = adjust(problem, block.start, iterations=60, tolerance=1e-14)
@@ -189,12 +211,19 @@ def test_exact_sightings_give_the_exact_block():
 
 
 def test_a_block_with_lies_is_recovered_within_its_deviations():
-    """3 lines x 6, 0.3 px, 3 % lies, 1.5 m GPS. The window has two sides: suspiciously good fails too."""
+    """3 lines x 6, 0.3 px, 3 % lies, 1.5 m GPS. The window has two sides: suspiciously good fails
+    too.
+    """
     ratios, errors = [], []
     for seed in range(6):
         block = make_block(seed, lies=0.03, loss_prior=3.0)
         problem, state = block.problem, block.start
-        for wide, limit in ((1000.0, 200.0), (20.0, 40.0), (5.0, 12.0), (2.0, 5.0)):  # as `bundle` does
+        for wide, limit in (
+            (1000.0, 200.0),
+            (20.0, 40.0),
+            (5.0, 12.0),
+            (2.0, 5.0),
+        ):  # as `bundle` does
             state = adjust(problem.with_loss(wide), state, tolerance=1e-3).state
             problem, state = prune(problem, state, limit)
         found = adjust(problem, state, iterations=60, tolerance=1e-6)
@@ -218,13 +247,21 @@ def test_a_block_with_lies_is_recovered_within_its_deviations():
 def test_deviations_are_calibrated():
     """Normalised squared errors of plain least squares follow chi-squared over 24 blocks.
 
-    With priors as good as RTK's: the valley of worse ones is bent, and no covariance describes it (next test).
+    With priors as good as RTK's: the valley of worse ones is bent, and no covariance describes it
+    (next test).
     """
     total, dof, per_axis = 0.0, 0, []
     tight = np.array([2.0, 0.5, 0.5, 3e-3, 3e-3, 1e-3, 1e-4, 1e-4])
     for seed in range(24):
         block = make_block(
-            100 + seed, lines=2, per_line=3, points=120, gps=0.1, tilt_deg=0.1, yaw_deg=0.2, sigma_k=tight
+            100 + seed,
+            lines=2,
+            per_line=3,
+            points=120,
+            gps=0.1,
+            tilt_deg=0.1,
+            yaw_deg=0.2,
+            sigma_k=tight,
         )
         problem = least_squares_only(block.problem)
         found = adjust(problem, block.start, iterations=40, tolerance=1e-10)
@@ -240,7 +277,9 @@ def test_deviations_are_calibrated():
 
 
 def test_the_truth_costs_what_chi_squared_says():
-    """The cost at the true poses (points settled) less that of the minimum is chi-squared, however bent the valley."""
+    """The cost at the true poses (points settled) less that of the minimum is chi-squared, however
+    bent the valley.
+    """
     rises = []
     for seed in range(16):
         block = make_block(100 + seed, lines=2, per_line=3, points=120)
@@ -256,7 +295,9 @@ def test_the_truth_costs_what_chi_squared_says():
 
 def test_the_cost_never_rises_and_convergence_is_told():
     block = make_block(8, lines=2, per_line=4, lies=0.05, loss_prior=3.0)
-    costs = [adjust(block.problem, block.start, iterations=k, tolerance=0).cost for k in (1, 2, 3, 5, 8)]
+    costs = [
+        adjust(block.problem, block.start, iterations=k, tolerance=0).cost for k in (1, 2, 3, 5, 8)
+    ]
     start = robust_cost(block.problem, block.start)
     assert costs[0] <= start and (np.diff(costs) <= 1e-9 * start).all()
     assert not adjust(block.problem, block.start, iterations=1, tolerance=0).converged
@@ -283,7 +324,9 @@ def test_fixed_intrinsics_stay_and_free_ones_move():
     assert (found.state.K == block.start.K).all()
     free[0, 0] = True
     found = adjust(replace(block.problem, free=free), block.start)
-    assert (found.state.K[0, 1:] == block.start.K[0, 1:]).all() and found.state.K[0, 0] != block.start.K[0, 0]
+    assert (found.state.K[0, 1:] == block.start.K[0, 1:]).all() and found.state.K[
+        0, 0
+    ] != block.start.K[0, 0]
 
 
 def test_surveyed_points_hold_the_block():
@@ -307,12 +350,22 @@ def test_surveyed_points_hold_the_block():
 
 
 def strip(seed):
-    """One line of 20 photos; sightings with a bending systematic error of the lens that nobody models."""
+    """One line of 20 photos; sightings with a bending systematic error of the lens that nobody
+    models.
+    """
     lens = np.array([700.0, 399.5, 299.5, -0.006, 0.0, 0.0, 0.0, 0.0])
     block = make_block(
-        seed, lines=1, per_line=20, points=500, gps=1.5, lens=lens, free=np.zeros(8, bool), lens_errs=False,
-        true_tilt_deg=0.0, tilt_deg=1.0,
-    )  # fmt: skip
+        seed,
+        lines=1,
+        per_line=20,
+        points=500,
+        gps=1.5,
+        lens=lens,
+        free=np.zeros(8, bool),
+        lens_errs=False,
+        true_tilt_deg=0.0,
+        tilt_deg=1.0,
+    )
     wrong = replace(
         block.problem,
         K0=np.array([[700.0, 399.5, 299.5, 0, 0, 0, 0, 0]]),

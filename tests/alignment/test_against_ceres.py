@@ -18,9 +18,12 @@ NOTHING = np.inf
 def both(seed, *, free, cauchy=None, lies=0.0, **ceres_options):
     block = make_block(seed, lines=3, per_line=4, points=160, lens_errs=False, lies=lies)
     problem = replace(
-        least_squares_only(block.problem), sigma_px=np.ones(len(block.problem.px)), free=np.array([free], bool),
-        sigma_R=np.full(block.problem.sigma_R.shape, NOTHING), sigma_K=np.full((1, 8), NOTHING),
-    )  # fmt: skip
+        least_squares_only(block.problem),
+        sigma_px=np.ones(len(block.problem.px)),
+        free=np.array([free], bool),
+        sigma_R=np.full(block.problem.sigma_R.shape, NOTHING),
+        sigma_K=np.full((1, 8), NOTHING),
+    )
     if cauchy is not None:
         problem = replace(problem, loss_px=cauchy)
     mine = adjust(problem, block.start, iterations=300, tolerance=1e-14)
@@ -50,7 +53,9 @@ def test_both_find_the_same_minimum(free, options, cauchy, lies):
 
 
 def test_the_pixel_convention_matters():
-    """Had COLMAP's half pixel been forgotten, the sightings would be off by it: the comparison would notice."""
+    """Had COLMAP's half pixel been forgotten, the sightings would be off by it: the comparison
+    would notice.
+    """
     block = make_block(1, lines=2, per_line=3, points=60)
     made = ceres.reconstruction(block.problem, block.truth, WIDTH, HEIGHT)
     k = 10

@@ -15,7 +15,10 @@ from tests.alignment.test_chain import ground_error
 
 def run(flight, **more):
     method = ByFlightline(
-        within=Best(count=150), across=Best(count=50), estimate=RansacSte(max_iterations=200), **more
+        within=Best(count=150),
+        across=Best(count=50),
+        estimate=RansacSte(max_iterations=200),
+        **more,
     )
     return method(flight.photos, FRAME, flight.priors, flight.features, range(len(flight.photos)))
 
@@ -40,7 +43,8 @@ def test_photos_that_look_back_along_every_other_line_are_no_matter():
 def test_the_regression_averages_the_errors_of_positions():
     flight = fly(lawn(4, 6, step=20.0, apart=30.0), gps=1.0, points=8000, seed=2)
     found = run(flight)
-    # an affinity has 6 parameters, 24 photos tell 48 numbers: what is left of 1 m is about sqrt(6 / 48)
+    # an affinity has 6 parameters, 24 photos tell 48 numbers: what is left of 1 m is about sqrt(6 /
+    # 48)
     assert 0.1 < ground_error(flight, found, free=False) < 1.2
 
 
@@ -55,7 +59,9 @@ def test_the_faithful_variant_refuses_a_line_that_turns_back():
 
 def elsewhere(flight, xy):
     """The flight as if reported elsewhere."""
-    priors = [replace(p, map_C=np.array([*q, 60.0])) for p, q in zip(flight.priors, xy, strict=True)]
+    priors = [
+        replace(p, map_C=np.array([*q, 60.0])) for p, q in zip(flight.priors, xy, strict=True)
+    ]
     return replace(flight, priors=priors)
 
 
@@ -93,9 +99,11 @@ def test_a_line_that_nothing_links_is_left_out_by_name():
 
 def test_lines_around_a_field_are_joined_at_its_corners():
     sides = [
-        line(6, 20.0), line(5, 20.0, start=(20.0, 100.0), heading=90.0),
-        line(5, 20.0, start=(100.0, 80.0), heading=180.0), line(4, 20.0, start=(80.0, 0.0), heading=270.0),
-    ]  # fmt: skip
+        line(6, 20.0),
+        line(5, 20.0, start=(20.0, 100.0), heading=90.0),
+        line(5, 20.0, start=(100.0, 80.0), heading=180.0),
+        line(4, 20.0, start=(80.0, 0.0), heading=270.0),
+    ]
     flight = fly(np.concatenate(sides), gps=0.5, points=6000)
     found = run(flight)
     assert len(found.poses) == 20 and not found.rejected

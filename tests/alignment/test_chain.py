@@ -22,7 +22,9 @@ def chain(model="similarity", **more):
 
 
 def ground_error(flight, found, *, free=True):
-    """RMS distance in m of the photos' corners on the map from the truth, after the best similarity if `free`."""
+    """RMS distance in m of the photos' corners on the map from the truth, after the best similarity
+    if `free`.
+    """
     views = {v.photo: v for v in make_views(found, level(0.0))}
     a = np.concatenate([on_ground(views[i], CORNERS, level(0.0))[:, :2] for i in sorted(views)])
     b = np.concatenate([flight.map_xy(i, CORNERS) for i in sorted(views)])
@@ -36,7 +38,9 @@ def ground_error(flight, found, *, free=True):
 
 def run(flight, method=None, order=None, **more):
     n = len(flight.photos)
-    return (method or chain(**more))(flight.photos, FRAME, flight.priors, flight.features, order or range(n))
+    return (method or chain(**more))(
+        flight.photos, FRAME, flight.priors, flight.features, order or range(n)
+    )
 
 
 @pytest.mark.parametrize("model", ["similarity", "affine", "homography"])
@@ -45,7 +49,11 @@ def test_a_strip_over_level_ground_keeps_its_shape(model):
     found = run(flight, model=model)
     assert found.blocks == (tuple(range(12)),) and len(found.joins) == 11
     # the more freely photos may bend, the more the noise of 0.2 px bends them along the strip
-    assert 0.001 < ground_error(flight, found) < {"similarity": 0.1, "affine": 0.4, "homography": 2.0}[model]
+    assert (
+        0.001
+        < ground_error(flight, found)
+        < {"similarity": 0.1, "affine": 0.4, "homography": 2.0}[model]
+    )
 
 
 def test_a_translation_cannot_turn():
@@ -73,7 +81,9 @@ def test_without_positions_the_height_gives_the_scale():
     step = np.linalg.norm(np.diff([found.poses[i].map_C[:2] for i in range(6)], axis=0), axis=1)
     assert np.allclose(step, 25.0, atol=0.1) and found.frame.metric
     ahead = found.poses[5].map_C[:2] - found.poses[0].map_C[:2]
-    assert np.degrees(np.arctan2(*ahead)) == pytest.approx(75.0, abs=0.5)  # turned as the photos report
+    assert np.degrees(np.arctan2(*ahead)) == pytest.approx(
+        75.0, abs=0.5
+    )  # turned as the photos report
     assert not chain()(flight.photos, free, blind, flight.features, range(6)).frame.metric
 
 
@@ -144,9 +154,11 @@ class Counting:
 
 def overview(flight, sizes=None):
     method = ByOverview(
-        detect=Counting(sizes=sizes if sizes is not None else []), match=Mutual(), longest=400,
+        detect=Counting(sizes=sizes if sizes is not None else []),
+        match=Mutual(),
+        longest=400,
         estimate=Ransac(model="similarity", threshold_px=3.0, minimum=12),
-    )  # fmt: skip
+    )
     own = [Sift(longest=400)(np.asarray(flight.grey(i, 800))) for i in range(len(flight.photos))]
     return method(flight.photos, FRAME, flight.priors, own, range(len(flight.photos)), flight.grey)
 
@@ -177,6 +189,6 @@ def test_the_overview_closes_a_loop_that_the_chain_cannot():
     ],
 )
 def test_what_no_two_aerial_photos_can_be(H, says):
-    assert says in implausible(H, np.array([750.0, 560.0])) and bool(implausible(H, np.zeros(2))) == bool(
-        says
-    )
+    assert says in implausible(H, np.array([750.0, 560.0])) and bool(
+        implausible(H, np.zeros(2))
+    ) == bool(says)

@@ -1,4 +1,6 @@
-"""Every contradiction between metadata and pixels is named with both values, and nothing else is."""
+"""Every contradiction between metadata and pixels is named with both values, and nothing else
+is.
+"""
 
 import numpy as np
 import pytest
@@ -21,10 +23,12 @@ def test_honest_metadata_with_honest_noise_is_not_accused():
     rng = np.random.default_rng(0)
     photos, _ = survey()
     told = [
-        prior(np.array([0, 15 * i, 72]) + np.clip(rng.normal(0, 1, 3), -1.9, 1.9) * (1.5, 1.5, 1.4),
-              yaw=10 + rng.uniform(-9, 9))
+        prior(
+            np.array([0, 15 * i, 72]) + np.clip(rng.normal(0, 1, 3), -1.9, 1.9) * (1.5, 1.5, 1.4),
+            yaw=10 + rng.uniform(-9, 9),
+        )
         for i in range(8)
-    ]  # fmt: skip
+    ]
     assert conflicts(photos, told, alignment(focal=740.0)) == []
 
 
@@ -55,8 +59,12 @@ def test_a_height_that_drifts():
     told[6], told[7] = prior((0, 90, 95), yaw=10), prior((0, 105, 52), yaw=10)
     found = conflicts(photos, told, alignment())
     assert named(found) == [("6.jpg", "altitude"), ("7.jpg", "altitude")]
-    assert (found[0].reported, found[0].estimated) == (95.0, 60.0) and "35 m lower" in found[0].meaning
-    assert (found[1].reported, found[1].estimated) == (52.0, 60.0) and "8 m higher" in found[1].meaning
+    assert (found[0].reported, found[0].estimated) == (95.0, 60.0) and "35 m lower" in found[
+        0
+    ].meaning
+    assert (found[1].reported, found[1].estimated) == (52.0, 60.0) and "8 m higher" in found[
+        1
+    ].meaning
     told[6] = prior((0, 90, np.nan), yaw=10)
     assert named(conflicts(photos, told, alignment())) == [("7.jpg", "altitude")]
 

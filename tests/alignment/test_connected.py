@@ -14,7 +14,9 @@ graphs = st.tuples(st.integers(0, 10**6), st.integers(1, 60), st.integers(0, 120
 def edges(seed, count, number):
     rng = np.random.default_rng(seed)
     a, b = rng.integers(0, count, (2, number))
-    pairs = sorted({(min(i, j), max(i, j)) for i, j in zip(a.tolist(), b.tolist(), strict=True) if i != j})
+    pairs = sorted(
+        {(min(i, j), max(i, j)) for i, j in zip(a.tolist(), b.tolist(), strict=True) if i != j}
+    )
     a, b = np.array(pairs, int).reshape(-1, 2).T
     cost = rng.uniform(1, 2, len(a))
     return a, b, cost, sparse.coo_matrix((cost, (a, b)), (count, count)).tocsr()

@@ -38,7 +38,9 @@ def test_surveys_of_the_papers_size_fall_into_their_lines(count, lines, heading)
     xy = np.concatenate([r if k % 2 == 0 else r[::-1] for k, r in enumerate(rows)]) @ rotate.T
     xy += np.random.default_rng(1).normal(0, 1.0, xy.shape)
     assert sizes(by_heading(xy)) == each
-    assert sizes(by_distance(xy)) == each  # 60 m to the next line against 20 m along it: distance tells, too
+    assert (
+        sizes(by_distance(xy)) == each
+    )  # 60 m to the next line against 20 m along it: distance tells, too
 
 
 def test_lines_as_far_apart_as_photos_are_told_by_heading_only():
@@ -68,7 +70,10 @@ def test_no_pair_across_belongs_to_an_obtuse_triangle():
         a, b, c = (xy[k] for k in simplex)
         sides = sorted(float(np.sum((p - q) ** 2)) for p, q in ((a, b), (b, c), (a, c)))
         if sides[2] > sides[0] + sides[1] + 1e-6:  # obtuse, by the law of cosines
-            edges = {tuple(sorted((int(simplex[i]), int(simplex[j])))) for i, j in ((0, 1), (1, 2), (0, 2))}
+            edges = {
+                tuple(sorted((int(simplex[i]), int(simplex[j]))))
+                for i, j in ((0, 1), (1, 2), (0, 2))
+            }
             assert not edges & set(pairs)
 
 

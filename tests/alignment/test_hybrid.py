@@ -27,7 +27,11 @@ def objective(shift=(3.0, -2.0), alpha=0.0, gsd=0.5, neighbours=None):
     cut = ground[60:130, 90:190]
     column, row = round(90 + shift[0] / gsd), round(60 - shift[1] / gsd)
     patch = Patch(
-        column=column, row=row, pixels=cut, shown=np.ones(cut.shape, bool), central=np.ones(cut.shape, bool)
+        column=column,
+        row=row,
+        pixels=cut,
+        shown=np.ones(cut.shape, bool),
+        central=np.ones(cut.shape, bool),
     )
     nadir_px = np.array([column + 49.5, row + 34.5])
     levels = pyramid(patch, overview, gsd, 8.0, nadir_px)
@@ -84,16 +88,27 @@ def test_the_correlation_is_that_of_numpy():
 def test_a_turn_is_about_the_nadir_and_clockwise():
     gsd, ground = 0.5, texture(160, 160, seed=9, roughness=1.4)
     level = Level(
-        gsd=gsd, patch=ground[40:120, 40:120], shown=np.ones((80, 80), np.float32), pivot=np.array([39.5, 39.5]),
-        window=np.rot90(ground, -1).copy(), filled=np.ones((160, 160), np.float32), offset=np.array([40.0, 40.0]),
-    )  # fmt: skip
-    assert level.correlation(np.array([0, 0, 90.0])) > 0.99 > level.correlation(np.array([0, 0, -90.0])) + 0.3
+        gsd=gsd,
+        patch=ground[40:120, 40:120],
+        shown=np.ones((80, 80), np.float32),
+        pivot=np.array([39.5, 39.5]),
+        window=np.rot90(ground, -1).copy(),
+        filled=np.ones((160, 160), np.float32),
+        offset=np.array([40.0, 40.0]),
+    )
+    assert (
+        level.correlation(np.array([0, 0, 90.0]))
+        > 0.99
+        > level.correlation(np.array([0, 0, -90.0])) + 0.3
+    )
 
 
 def test_distances_pull_back_what_looks_do_not_hold():
     told = Distances(
-        reported=np.array([20.0, 20.0]), placed=np.array([[0.0, 0.0], [40.0, 0.0]]), weight=np.ones(2)
-    )  # fmt: skip
+        reported=np.array([20.0, 20.0]),
+        placed=np.array([[0.0, 0.0], [40.0, 0.0]]),
+        weight=np.ones(2),
+    )
     assert told.quality(np.array([20.0, 0.0])) == pytest.approx(1.0)
     # 22 m and 18 m for 20 m: 1 / 1.1 both
     assert told.quality(np.array([22.0, 0.0])) == pytest.approx(1 / 1.1)
@@ -106,7 +121,9 @@ def placed(flight):
 
 def run(flight, **more):
     method = Hybrid(**{"optimise": Surfaces(), "across": 200} | more)
-    return method(placed(flight), flight.photos, flight.priors, range(len(flight.photos)), flight.grey)
+    return method(
+        placed(flight), flight.photos, flight.priors, range(len(flight.photos)), flight.grey
+    )
 
 
 @pytest.mark.parametrize("optimise", OPTIMISERS, ids=("anneal", "surfaces"))
@@ -131,10 +148,14 @@ def test_earlier_photos_stay():
 
 
 def test_the_loop_closes_without_any_global_optimisation():
-    around = np.concatenate([
-        line(6, 20.0), line(5, 20.0, start=(20.0, 100.0), heading=90.0),
-        line(6, 20.0, start=(100.0, 80.0), heading=180.0)[:5], line(4, 20.0, start=(80.0, 0.0), heading=270.0),
-    ])  # fmt: skip
+    around = np.concatenate(
+        [
+            line(6, 20.0),
+            line(5, 20.0, start=(20.0, 100.0), heading=90.0),
+            line(6, 20.0, start=(100.0, 80.0), heading=180.0)[:5],
+            line(4, 20.0, start=(80.0, 0.0), heading=270.0),
+        ]
+    )
     flight = fly(around, gps=1.5, seed=5)
     found = run(flight)
     last = len(around) - 1
@@ -147,7 +168,9 @@ def test_a_survey_of_lines_keeps_its_distances():
     found = run(flight)
     xy = np.array([found.poses[i].map_C[:2] for i in range(12)])
     i, j = np.triu_indices(12, 1)
-    off = np.linalg.norm(xy[i] - xy[j], axis=1) - np.linalg.norm(flight.C[i, :2] - flight.C[j, :2], axis=1)
+    off = np.linalg.norm(xy[i] - xy[j], axis=1) - np.linalg.norm(
+        flight.C[i, :2] - flight.C[j, :2], axis=1
+    )
     assert np.sqrt((off**2).mean()) < 0.3  # the thesis's claim
 
 

@@ -12,19 +12,32 @@ from skyquilt.geometry.camera import undistort
 from skyquilt.model.camera import Camera
 
 TRUE = Camera(
-    width=4000, height=3000, focal=2900.0, cx=2010.0, cy=1480.0, k1=-0.12, k2=0.06, k3=-0.02, p1=8e-4, p2=-5e-4
-)  # fmt: skip
+    width=4000,
+    height=3000,
+    focal=2900.0,
+    cx=2010.0,
+    cy=1480.0,
+    k1=-0.12,
+    k2=0.06,
+    k3=-0.02,
+    p1=8e-4,
+    p2=-5e-4,
+)
 ORDERS = ("none", "2", "4", "6", "6t")
 GRID = np.stack(np.meshgrid(np.linspace(0, 3999, 15), np.linspace(0, 2999, 12)), -1).reshape(-1, 2)
 
 
 def misfit(camera):
-    """RMS in px between two cameras over the image, rays compared in px, by OpenCV's own undistortion."""
+    """RMS in px between two cameras over the image, rays compared in px, by OpenCV's own
+    undistortion.
+    """
     K = np.array([[TRUE.focal, 0, TRUE.cx], [0, TRUE.focal, TRUE.cy], [0, 0, 1.0]])
     rays = cv2.undistortPoints(
-        GRID.reshape(-1, 1, 2), K, np.array([TRUE.k1, TRUE.k2, TRUE.p1, TRUE.p2, TRUE.k3]),
+        GRID.reshape(-1, 1, 2),
+        K,
+        np.array([TRUE.k1, TRUE.k2, TRUE.p1, TRUE.p2, TRUE.k3]),
         criteria=(cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 200, 1e-12),
-    )  # fmt: skip
+    )
     own = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
     K2 = np.array([[camera.focal, 0, camera.cx], [0, camera.focal, camera.cy], [0, 0, 1.0]])
     back, _ = cv2.projectPoints(
@@ -42,7 +55,9 @@ def test_every_order_fits_better_than_the_one_before():
     assert all(a > 1.001 * b for a, b in pairwise(errors))
 
 
-@pytest.mark.parametrize(("order", "left"), [("2", ("k2", "k3", "p1", "p2")), ("4", ("k3", "p1", "p2"))])
+@pytest.mark.parametrize(
+    ("order", "left"), [("2", ("k2", "k3", "p1", "p2")), ("4", ("k3", "p1", "p2"))]
+)
 def test_fitted_is_better_than_cut_off(order, left):
     fitted = of_order(TRUE, order)
     assert all(getattr(fitted, name) == 0 for name in left)

@@ -15,11 +15,18 @@ from tests.alignment.surveys import alignment
 
 
 def space(yaw, pitch, roll, height=60.0):
-    return Pose(cam_R_map=cam_R_map_from_angles(yaw, pitch, roll), map_C=np.array([12.0, -7.0, height]))
+    return Pose(
+        cam_R_map=cam_R_map_from_angles(yaw, pitch, roll), map_C=np.array([12.0, -7.0, height])
+    )
 
 
 @settings(max_examples=60, deadline=None)
-@given(yaw=st.floats(-180, 180), pitch=st.floats(-12, 12), roll=st.floats(-12, 12), height=st.floats(60, 300))
+@given(
+    yaw=st.floats(-180, 180),
+    pitch=st.floats(-12, 12),
+    roll=st.floats(-12, 12),
+    height=st.floats(60, 300),
+)
 def test_a_photo_in_space_over_level_ground_is_one_in_the_plane(yaw, pitch, roll, height):
     pose = space(yaw, pitch, roll, height)
     flat = planar_pose(map_H_cam_of(pose))
@@ -39,7 +46,10 @@ def test_a_vertical_photo_keeps_its_place_height_and_heading(yaw, height):
 
 def test_height_does_not_matter_in_the_plane():
     flat = planar_pose(map_H_cam_of(space(30.0, 3.0, -2.0)))
-    low, high = flat.to_camera(np.array([[1.0, 2.0, 0.0]])), flat.to_camera(np.array([[1.0, 2.0, 30.0]]))
+    low, high = (
+        flat.to_camera(np.array([[1.0, 2.0, 0.0]])),
+        flat.to_camera(np.array([[1.0, 2.0, 30.0]])),
+    )
     assert np.array_equal(low, high)
 
 
@@ -62,7 +72,9 @@ def test_views_of_the_plane_see_what_views_in_space_see():
         (view,) = make_views(told, level(0.0))
         x, y = np.meshgrid(np.linspace(-20, 40, 30), np.linspace(-30, 20, 30))
         nodes = project_nodes(view, x, y, np.zeros_like(x))
-        found.append((view.footprint, nodes.u, nodes.v, nodes.seen, on_ground(view, CORNERS, level(0.0))))
+        found.append(
+            (view.footprint, nodes.u, nodes.v, nodes.seen, on_ground(view, CORNERS, level(0.0)))
+        )
     for a, b in zip(*found, strict=True):
         assert np.allclose(a, b, atol=2e-3)
     assert found[0][3].any() and not found[0][3].all()

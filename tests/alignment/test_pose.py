@@ -1,4 +1,6 @@
-"""Placing by metadata: `position` (Y 4.2: one scale, no rotation of one's own) and `pose` (Y 4.3, 4.4)."""
+"""Placing by metadata: `position` (Y 4.2: one scale, no rotation of one's own) and `pose` (Y 4.3,
+4.4).
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +14,9 @@ from tests.alignment.surveys import FOCAL, HEIGHT, WIDTH, photo, prior
 
 FRAME = MapFrame(crs="EPSG:32630", origin=(0.0, 0.0), vertical_datum="takeoff")
 PHOTOS = [photo(f"{i}.jpg") for i in range(5)]
-TOLD = [prior((3.0 * i, 10.0 * i, 50.0 + 4 * i), yaw=30.0 * i, pitch=2.0, roll=-3.0) for i in range(5)]
+TOLD = [
+    prior((3.0 * i, 10.0 * i, 50.0 + 4 * i), yaw=30.0 * i, pitch=2.0, roll=-3.0) for i in range(5)
+]
 
 
 def ground_of(alignment, i, px):
@@ -33,7 +37,9 @@ def test_position_is_a_translation_at_one_scale():
     for i in range(5):
         for px in ((0, 0), (WIDTH - 1, 0), (100, 500)):
             east, south = (np.array(px) - middle) * metres_per_px
-            assert ground_of(found, i, px) - TOLD[i].map_C[:2] == pytest.approx([east, -south], abs=1e-9)
+            assert ground_of(found, i, px) - TOLD[i].map_C[:2] == pytest.approx(
+                [east, -south], abs=1e-9
+            )
     assert found.method == "position" and found.blocks == ((0,), (1,), (2,), (3,), (4,))
 
 
@@ -47,22 +53,31 @@ def test_position_takes_one_heading_for_all():
 def test_pose_believes_angles_and_heights():
     found = ByPose()(PHOTOS, FRAME, TOLD)
     for i, pose in found.poses.items():
-        assert angles_from_cam_R_map(pose.cam_R_map) == pytest.approx((TOLD[i].yaw_deg, 2.0, -3.0), abs=1e-9)
+        assert angles_from_cam_R_map(pose.cam_R_map) == pytest.approx(
+            (TOLD[i].yaw_deg, 2.0, -3.0), abs=1e-9
+        )
         assert pose.map_C == pytest.approx(TOLD[i].map_C)
         # projecting the ground of a pixel gives the pixel
         xy = ground_of(found, i, (123.0, 456.0))
-        assert project(found.camera(i), pose.to_camera(np.array([*xy, 0.0]))[None])[0] == pytest.approx(
-            [123, 456]
-        )
+        assert project(found.camera(i), pose.to_camera(np.array([*xy, 0.0]))[None])[
+            0
+        ] == pytest.approx([123, 456])
 
 
 def test_what_cannot_be_placed_says_why():
-    told = [*TOLD[:2], prior((np.nan, np.nan, 50)), prior((1, 2, 60), yaw=np.nan), prior((1, 2, -5), yaw=3)]
+    told = [
+        *TOLD[:2],
+        prior((np.nan, np.nan, 50)),
+        prior((1, 2, 60), yaw=np.nan),
+        prior((1, 2, -5), yaw=3),
+    ]
     found = ByPose()(PHOTOS, FRAME, told)
     assert sorted(found.poses) == [0, 1]
     assert {i: r.split(" would")[0] for i, r in found.rejected.items()} == {
-        2: "it has no position", 3: "it has a position but no heading", 4: "its height above ground",
-    }  # fmt: skip
+        2: "it has no position",
+        3: "it has a position but no heading",
+        4: "its height above ground",
+    }
     assert sorted(ByPosition()(PHOTOS, FRAME, told).poses) == [0, 1, 3, 4]  # needs no heading
 
 
@@ -78,6 +93,8 @@ def test_no_position_at_all():
     with pytest.raises(AlignmentError, match="none of 5 can be placed .it has no position"):
         ByPose()(PHOTOS, FRAME, [prior((np.nan,) * 3)] * 5)
     alone = ByPose()(
-        PHOTOS[:1], MapFrame(crs=None, origin=(0, 0), vertical_datum="unknown"), [prior((np.nan,) * 3)]
+        PHOTOS[:1],
+        MapFrame(crs=None, origin=(0, 0), vertical_datum="unknown"),
+        [prior((np.nan,) * 3)],
     )
     assert list(alone.poses) == [0] and not alone.frame.metric

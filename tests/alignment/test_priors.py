@@ -17,7 +17,9 @@ places = (st.floats(-79, 79), st.floats(-179.9, 179.9))
 def at(latitude, longitude, **more):
     return photo(
         position=GeoPosition(
-            latitude_deg=latitude, longitude_deg=longitude, **{"altitude_m": 60.0, "datum": "takeoff", **more}
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            **{"altitude_m": 60.0, "datum": "takeoff", **more},
         )
     )
 
@@ -25,10 +27,16 @@ def at(latitude, longitude, **more):
 @pytest.mark.parametrize(
     ("latitude", "longitude", "code"),
     [
-        (50.8, -0.14, 32630), (50.8, 0.14, 32631), (-33.9, 18.4, 32734), (0.0, -180.0, 32601),
-        (-0.1, 179.99, 32760), (64.1, -21.9, 32627), (-54.8, -68.3, 32719), (10.0, 180.0, 32601),
+        (50.8, -0.14, 32630),
+        (50.8, 0.14, 32631),
+        (-33.9, 18.4, 32734),
+        (0.0, -180.0, 32601),
+        (-0.1, 179.99, 32760),
+        (64.1, -21.9, 32627),
+        (-54.8, -68.3, 32719),
+        (10.0, 180.0, 32601),
     ],
-)  # fmt: skip
+)
 def test_utm_zones(latitude, longitude, code):
     assert utm_epsg(latitude, longitude) == f"EPSG:{code}"
 
@@ -44,7 +52,9 @@ def test_the_zone_holds_its_place(latitude, longitude):
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-75, 75), st.floats(-179, 179), st.floats(-180, 180))
 def test_grid_yaw_is_where_a_step_that_way_leads(latitude, longitude, yaw):
-    """A metre along a true heading, projected: the map's direction is the prior's yaw (sign of the convergence)."""
+    """A metre along a true heading, projected: the map's direction is the prior's yaw (sign of the
+    convergence).
+    """
     there = photo(
         position=GeoPosition(
             latitude_deg=latitude, longitude_deg=longitude, altitude_m=60.0, datum="takeoff"
@@ -73,10 +83,14 @@ def test_a_crs_asked_for():
 
 @pytest.mark.parametrize(
     ("crs", "words"),
-    [("EPSG:999999", "no coordinate system"), ("nonsense", "no coordinate system"),
-     ("EPSG:4326", "not projected in metres"),
-     ("EPSG:2263", "not projected in metres"), ("EPSG:4978", "not projected")],
-)  # fmt: skip
+    [
+        ("EPSG:999999", "no coordinate system"),
+        ("nonsense", "no coordinate system"),
+        ("EPSG:4326", "not projected in metres"),
+        ("EPSG:2263", "not projected in metres"),
+        ("EPSG:4978", "not projected"),
+    ],
+)
 def test_a_crs_that_will_not_do(crs, words):
     with pytest.raises(UsageError, match=words):
         choose_frame([at(50.8, -0.14)], crs)
@@ -84,7 +98,9 @@ def test_a_crs_that_will_not_do(crs, words):
 
 def test_without_positions_the_control_points_give_the_frame():
     nothing = photo(position=None)
-    point = ControlPoint(name="a", x=500000.0, y=5600000.0, z=3.0, crs="EPSG:32630", observations=())
+    point = ControlPoint(
+        name="a", x=500000.0, y=5600000.0, z=3.0, crs="EPSG:32630", observations=()
+    )
     assert choose_frame([nothing], None, [point]).crs == "EPSG:32630"
     frame = choose_frame([nothing], None)
     assert frame.crs is None
@@ -98,11 +114,15 @@ def test_the_median_place_outvotes_a_stray():
 
 
 def test_heights_of_the_majority_s_datum():
-    """Heights above take-off of two; the third's own is above the sea, but it also states one above take-off."""
+    """Heights above take-off of two; the third's own is above the sea, but it also states one above
+    take-off.
+    """
     photos = [
-        at(50.8, -0.14), at(50.8, -0.14), at(50.8, -0.14, altitude_m=170.0, datum="sea_level", takeoff_m=61.5),
+        at(50.8, -0.14),
+        at(50.8, -0.14),
+        at(50.8, -0.14, altitude_m=170.0, datum="sea_level", takeoff_m=61.5),
         at(50.8, -0.14, altitude_m=170.0, datum="sea_level"),
-    ]  # fmt: skip
+    ]
     photos = photos[:2] + photos
     frame = choose_frame(photos, None)
     assert frame.vertical_datum == "takeoff"

@@ -7,7 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyquilt.alignment.problem import State, attitude_error, linearise, linearised_points, residuals_px
+from skyquilt.alignment.problem import (
+    State,
+    attitude_error,
+    linearise,
+    linearised_points,
+    residuals_px,
+)
 from skyquilt.geometry.frames import rotation_from_vector
 from tests.alignment.blocks import make_block, seen_by
 
@@ -17,7 +23,9 @@ ALL = np.ones(8, bool)
 def bent(seed=0, cameras=2):
     """A small block of two cameras away from its minimum, every intrinsic in use."""
     lens = np.array([700.0, 402, 297, -0.06, 0.03, -0.01, 2e-3, -1e-3])
-    return make_block(seed, lines=2, per_line=2, points=40, lens=lens, free=ALL, cameras=cameras, overlap=0.6)
+    return make_block(
+        seed, lines=2, per_line=2, points=40, lens=lens, free=ALL, cameras=cameras, overlap=0.6
+    )
 
 
 def test_residuals_are_projected_minus_seen():
@@ -91,7 +99,9 @@ def test_points_behind_a_camera_do_not_count():
     lin = linearise(block.problem, s)
     mine = block.problem.point == 0
     assert lin.behind[mine].all() and not lin.behind[~mine].any()
-    assert not lin.residual[mine].any() and not lin.J_photo[mine].any() and not lin.J_point[mine].any()
+    assert (
+        not lin.residual[mine].any() and not lin.J_photo[mine].any() and not lin.J_point[mine].any()
+    )
     assert np.isnan(residuals_px(block.problem, s)[mine]).all()
 
 
@@ -105,7 +115,9 @@ def test_attitude_error_undoes_a_rotation(w, turn):
     if np.linalg.norm(w) > 3.1:
         return
     R0 = rotation_from_vector(turn)
-    assert attitude_error((rotation_from_vector(w) @ R0)[None], R0[None])[0] == pytest.approx(w, abs=1e-7)
+    assert attitude_error((rotation_from_vector(w) @ R0)[None], R0[None])[0] == pytest.approx(
+        w, abs=1e-7
+    )
 
 
 def test_a_step_of_a_state():

@@ -16,11 +16,20 @@ from tests.alignment.surveys import WIDTH
 def links_of(flight, reach=45.0):
     xy = flight.C[:, :2]
     n = len(xy)
-    pairs = {(i, j) for i in range(n) for j in range(i + 1, n) if np.hypot(*(xy[i] - xy[j])) < reach}
+    pairs = {
+        (i, j) for i in range(n) for j in range(i + 1, n) if np.hypot(*(xy[i] - xy[j])) < reach
+    }
     found = [
-        Verify()(i, j, flight.features[i], flight.features[j], Mutual()(flight.features[i], flight.features[j]), WIDTH)
+        Verify()(
+            i,
+            j,
+            flight.features[i],
+            flight.features[j],
+            Mutual()(flight.features[i], flight.features[j]),
+            WIDTH,
+        )
         for i, j in sorted(pairs | set(sequence(n)))
-    ]  # fmt: skip
+    ]
     return [k for k in found if k]
 
 
@@ -59,7 +68,9 @@ def test_headings_that_are_missing_are_filled(flight, links):
 
 def test_headings_that_agree_stay(flight, links):
     found = repair(flight.photos, flight.priors, flight.features, links)
-    assert [p.yaw_deg for p in found.priors] == [p.yaw_deg for p in flight.priors] and not found.notes
+    assert [p.yaw_deg for p in found.priors] == [
+        p.yaw_deg for p in flight.priors
+    ] and not found.notes
 
 
 def test_the_tilt_of_a_file_turned_in_a_viewer_turns_with_it(flight, links):

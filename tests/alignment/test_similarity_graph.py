@@ -1,4 +1,6 @@
-"""Blocks of known similarities: outlier links, half-turn lies, drift, and positions of which many are wrong."""
+"""Blocks of known similarities: outlier links, half-turn lies, drift, and positions of which many
+are wrong.
+"""
 
 from dataclasses import replace
 
@@ -71,12 +73,16 @@ def test_members_need_not_be_numbered_from_zero():
 
 
 def test_noisy_links_do_not_shrink_the_map():
-    """Least squares of points would: its cost falls with the scale. Mean scale and extent stay within 0.1 %..."""
+    """Least squares of points would: its cost falls with the scale. Mean scale and extent stay
+    within 0.1 %...
+    """
     scales, extents = [], []
     for seed in range(12):
         a, t = plane(seed, lines=6, per_line=8)
         rng = np.random.default_rng(100 + seed)
-        solution = solve_block(np.arange(len(a)), links_of(a, t, rng, scale_noise=0.01, shift_noise=0.02))
+        solution = solve_block(
+            np.arange(len(a)), links_of(a, t, rng, scale_noise=0.01, shift_noise=0.02)
+        )
         mean = np.exp(np.mean(np.log(np.abs(solution.a / a))))
         scales.append(mean / np.abs(solution.a[0] / a[0]) * np.abs(solution.a[0] / a[0]))
         spread = np.sqrt(np.var(solution.t) / np.var(t))
@@ -93,7 +99,9 @@ def test_outlier_links_are_outvoted_and_named():
     for k in wrong:
         i, j = links[k].a, links[k].b
         b_S_a = links[k].b_S_a * np.exp(complex(*rng.uniform(0.3, 0.6, 2)))
-        links[k] = PlaneLink(a=i, b=j, b_S_a=b_S_a, p_a=links[k].p_a, p_b=links[k].p_b + 0.5, weight=30.0)
+        links[k] = PlaneLink(
+            a=i, b=j, b_S_a=b_S_a, p_a=links[k].p_a, p_b=links[k].p_b + 0.5, weight=30.0
+        )
     solutions, kept = _consistent_blocks(len(a), {(k.a, k.b): k for k in links})
     assert len(solutions) == 1
     assert {(links[k].a, links[k].b) for k in range(len(links)) if k not in wrong} == kept
@@ -107,7 +115,11 @@ def test_separate_groups_are_separate_blocks():
     rng = np.random.default_rng(3)
     links = [k for k in links_of(a, t, rng) if (k.a < 14) == (k.b < 14) and 20 not in (k.a, k.b)]
     groups = components(len(a), links)
-    assert [g.tolist() for g in groups] == [list(range(14)), [14, 15, 16, 17, 18, 19, 21, 22, 23], [20]]
+    assert [g.tolist() for g in groups] == [
+        list(range(14)),
+        [14, 15, 16, 17, 18, 19, 21, 22, 23],
+        [20],
+    ]
     solutions, _ = _consistent_blocks(len(a), {(k.a, k.b): k for k in links})
     assert [s.members.tolist() for s in solutions] == [g.tolist() for g in groups[:2]]
 
@@ -118,12 +130,16 @@ def test_separate_groups_are_separate_blocks():
 def priors_at(position, sigma=1.5, yaw=None, z=np.nan):
     return [
         Prior(
-            map_C=np.array([p.real, p.imag, z]), sigma_C=np.array([sigma, sigma, 3.0]),
-            yaw_deg=np.nan if yaw is None else yaw[i], pitch_deg=0.0, roll_deg=0.0, sigma_yaw_deg=5.0,
+            map_C=np.array([p.real, p.imag, z]),
+            sigma_C=np.array([sigma, sigma, 3.0]),
+            yaw_deg=np.nan if yaw is None else yaw[i],
+            pitch_deg=0.0,
+            roll_deg=0.0,
+            sigma_yaw_deg=5.0,
             sigma_tilt_deg=1.0,
         )
         for i, p in enumerate(position)
-    ]  # fmt: skip
+    ]
 
 
 def solved(seed, **noise):
@@ -133,14 +149,22 @@ def solved(seed, **noise):
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.integers(8, 40), st.floats(0.1, 100), st.floats(-3.1, 3.1), st.integers(0, 1000), st.floats(0, 0.4))
+@given(
+    st.integers(8, 40),
+    st.floats(0.1, 100),
+    st.floats(-3.1, 3.1),
+    st.integers(0, 1000),
+    st.floats(0, 0.4),
+)
 def test_a_similarity_survives_two_lies_in_five(count, scale, angle, seed, share):
     rng = np.random.default_rng(seed)
     x = rng.normal(0, 1, count) + 1j * rng.normal(0, 1, count)
     g, c = scale * np.exp(1j * angle), complex(*rng.normal(0, 100, 2))
     y = g * x + c
     lies = rng.choice(count, int(share * count), replace=False)
-    y[lies] += 20 * scale * np.exp(1j * rng.uniform(0, 6.3, len(lies))) * rng.uniform(1, 3, len(lies))
+    y[lies] += (
+        20 * scale * np.exp(1j * rng.uniform(0, 6.3, len(lies))) * rng.uniform(1, 3, len(lies))
+    )
     found_g, found_c, misfit = fit_similarity(x, y, np.full(count, 0.01 * scale))
     assert found_g == pytest.approx(g, rel=0.01)
     assert found_c == pytest.approx(c, abs=0.02 * scale)
@@ -168,7 +192,9 @@ def test_half_turn_lies_of_the_yaw_do_not_turn_the_block():
     yaw[6:12] += 180
     found, _, _ = georeference(solution, links, priors_at(t, yaw=yaw))
     assert found.a == pytest.approx(a, rel=1e-3)
-    found, spread, metric = georeference(solution, links, priors_at(np.full(len(a), np.nan), yaw=yaw, z=60.0))
+    found, spread, metric = georeference(
+        solution, links, priors_at(np.full(len(a), np.nan), yaw=yaw, z=60.0)
+    )
     assert np.isnan(spread) and metric
     assert np.degrees(np.abs(np.angle(found.a / a))).max() < 0.1
     assert np.median(np.abs(found.a)) == pytest.approx(60.0, rel=1e-5)
@@ -183,7 +209,9 @@ def test_no_positions_and_no_height_is_not_metric():
 
 @pytest.mark.parametrize("known", [[4], list(range(24))])
 def test_one_position_or_all_the_same(known):
-    """The scale comes from the heights, the direction from the yaws, the place from what there is."""
+    """The scale comes from the heights, the direction from the yaws, the place from what there
+    is.
+    """
     a, t, links, solution = solved(8)
     position = np.full(len(a), np.nan, complex)
     position[known] = 1000 + 2000j
@@ -204,7 +232,9 @@ def test_one_position_or_all_the_same(known):
 
 
 def test_positions_straighten_a_strip_that_links_bend():
-    """Forty photos whose links all turn a little: tied to positions, the ends come a third nearer at once."""
+    """Forty photos whose links all turn a little: tied to positions, the ends come a third nearer
+    at once.
+    """
     n, rng = 40, np.random.default_rng(9)
     a, t = 60 * np.ones(n, complex), 15j * np.arange(n) + 0
     links = []
@@ -213,7 +243,12 @@ def test_positions_straighten_a_strip_that_links_bend():
             k = link(a, t, i, j, rng)
             links.append(
                 PlaneLink(
-                    a=i, b=j, b_S_a=k.b_S_a * np.exp(0.003j * (j - i)), p_a=k.p_a, p_b=k.p_b, weight=100.0
+                    a=i,
+                    b=j,
+                    b_S_a=k.b_S_a * np.exp(0.003j * (j - i)),
+                    p_a=k.p_a,
+                    p_b=k.p_b,
+                    weight=100.0,
                 )
             )
     solution = solve_block(np.arange(n), links)

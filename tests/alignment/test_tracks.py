@@ -1,4 +1,6 @@
-"""Tracks from matches, against a union-find written out; triangulation of exact and of noisy rays."""
+"""Tracks from matches, against a union-find written out; triangulation of exact and of noisy
+rays.
+"""
 
 from dataclasses import replace
 
@@ -16,9 +18,11 @@ from tests.alignment.blocks import make_block
 def features(count, seed=0, scale=2.0):
     rng = np.random.default_rng(seed)
     return Features(
-        px=rng.uniform(0, 600, (count, 2)), size=np.ones(count, np.float32),
-        descriptors=np.zeros((count, 8), np.float32), scale=scale,
-    )  # fmt: skip
+        px=rng.uniform(0, 600, (count, 2)),
+        size=np.ones(count, np.float32),
+        descriptors=np.zeros((count, 8), np.float32),
+        scale=scale,
+    )
 
 
 def link(a, b, pairs):
@@ -34,7 +38,8 @@ def test_chains_become_tracks_and_a_photo_visited_twice_spoils_its_track():
         link(0, 2, [(2, 0), (4, 2)]),
     ]
     tracks = build_tracks(f, links)
-    # (0,0)-(1,0)-(2,4); (0,1)-(1,1)-(2,3); (0,2)-(1,2)-(2,1) and (2,0): photo 2 twice, dropped; (0,4)-(2,2)
+    # (0,0)-(1,0)-(2,4); (0,1)-(1,1)-(2,3); (0,2)-(1,2)-(2,1) and (2,0): photo 2 twice, dropped;
+    # (0,4)-(2,2)
     found = {
         frozenset(zip(tracks.photo[m].tolist(), map(tuple, tracks.px[m].tolist()), strict=True))
         for m in (tracks.point == p for p in range(tracks.count))
@@ -44,9 +49,10 @@ def test_chains_become_tracks_and_a_photo_visited_twice_spoils_its_track():
         return photo, tuple(f[photo].px[k].tolist())
 
     assert found == {
-        frozenset({at(0, 0), at(1, 0), at(2, 4)}), frozenset({at(0, 1), at(1, 1), at(2, 3)}),
+        frozenset({at(0, 0), at(1, 0), at(2, 4)}),
+        frozenset({at(0, 1), at(1, 1), at(2, 3)}),
         frozenset({at(0, 4), at(2, 2)}),
-    }  # fmt: skip
+    }
     assert (np.diff(tracks.point) >= 0).all()
     assert tracks.sigma_px == pytest.approx(np.maximum(0.25 * (1.0 + tracks.photo), 0.3))
 
@@ -54,7 +60,8 @@ def test_chains_become_tracks_and_a_photo_visited_twice_spoils_its_track():
 @settings(max_examples=80, deadline=None)
 @given(
     st.lists(
-        st.tuples(st.integers(0, 3), st.integers(0, 5), st.integers(0, 3), st.integers(0, 5)), max_size=25
+        st.tuples(st.integers(0, 3), st.integers(0, 5), st.integers(0, 3), st.integers(0, 5)),
+        max_size=25,
     )
 )
 def test_tracks_are_the_connected_components(matches):
@@ -78,8 +85,9 @@ def test_tracks_are_the_connected_components(matches):
         groups.setdefault(root(x), []).append(x)
     expected = {
         frozenset((a, *f[a].px[i].tolist()) for a, i in g)
-        for g in groups.values() if len(g) > 1 and len({a for a, _ in g}) == len(g)
-    }  # fmt: skip
+        for g in groups.values()
+        if len(g) > 1 and len({a for a, _ in g}) == len(g)
+    }
     tracks = build_tracks(f, [link(a, b, sorted(p)) for (a, b), p in by_pair.items()])
     found = [
         frozenset((int(a), *p.tolist()) for a, p in zip(tracks.photo[m], tracks.px[m], strict=True))
@@ -122,7 +130,10 @@ def test_thinning_keeps_every_cell_of_every_photo_and_its_longest_tracks():
         column, row = np.clip(((t.px + 0.5) / (800, 600) * cells).astype(int), 0, cells - 1).T
         return t.photo * cells**2 + row * cells + column
 
-    all_, kept = np.bincount(slots(tracks), minlength=192), np.bincount(slots(thinned), minlength=192)
+    all_, kept = (
+        np.bincount(slots(tracks), minlength=192),
+        np.bincount(slots(thinned), minlength=192),
+    )
     assert (kept >= np.minimum(all_, per_photo // cells**2)).all()
     assert np.bincount(thinned.point).mean() > np.bincount(tracks.point).mean() + 0.3
     # whole tracks survive or none of them
@@ -151,7 +162,9 @@ def test_two_skew_rays_meet_halfway_between():
 
 
 def test_polished_points_err_as_their_deviation_says():
-    """Heights over 20 blocks of true poses: normalised errors have unit variance (Cauchy's 0.79 at its scale of 2)."""
+    """Heights over 20 blocks of true poses: normalised errors have unit variance (Cauchy's 0.79 at
+    its scale of 2).
+    """
     z = []
     for seed in range(8):
         block = make_block(seed, lines=2, per_line=4, points=300, loss_px=1e6)

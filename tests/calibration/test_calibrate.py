@@ -19,7 +19,9 @@ def pose_of(simulated):
 
 
 def view(name, pose, rng, noise, camera=CAMERA, board_error=0.0):
-    """Centroids and corners as this project's own projection gives them: what is judged here is the fit."""
+    """Centroids and corners as this project's own projection gives them: what is judged here is the
+    fit.
+    """
     from skyquilt.calibration.square_image import centroid_bias
 
     centres, corners = BOARD.centres.reshape(-1, 3) + board_error, BOARD.corners.reshape(-1, 3)
@@ -27,10 +29,14 @@ def view(name, pose, rng, noise, camera=CAMERA, board_error=0.0):
     px = px + rng.normal(0, noise, px.shape)
     at = project(camera, pose(corners))
     return BoardView(
-        name=name, width=640, height=480, contrast=10.0, rounding_px=np.full((BOARD.rows, BOARD.columns), 8.0),
+        name=name,
+        width=640,
+        height=480,
+        contrast=10.0,
+        rounding_px=np.full((BOARD.rows, BOARD.columns), 8.0),
         centroids=px.reshape(BOARD.rows, BOARD.columns, 2),
         corners=(at + rng.normal(0, noise, at.shape)).reshape(BOARD.rows - 1, BOARD.columns - 1, 2),
-    )  # fmt: skip
+    )
 
 
 def views(count=10, noise=0.1, seed=0, **more):
@@ -61,9 +67,13 @@ def test_the_fit_agrees_with_opencv():
     flags = cv2.CALIB_FIX_ASPECT_RATIO
     K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
     error, K, k, *_ = cv2.calibrateCamera(
-        [s.board.astype(np.float32) for s in every], [s.px.astype(np.float32) for s in every], (640, 480), K,
-        np.zeros(5), flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS,
-    )  # fmt: skip
+        [s.board.astype(np.float32) for s in every],
+        [s.px.astype(np.float32) for s in every],
+        (640, 480),
+        K,
+        np.zeros(5),
+        flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS,
+    )
     assert found.rms_px == pytest.approx(error, rel=1e-4)
     assert found.camera.focal == pytest.approx(K[0, 0], abs=0.05)
     assert found.camera.cx == pytest.approx(K[0, 2], abs=0.1)
@@ -77,7 +87,9 @@ def test_small_coefficients_are_dropped_and_large_ones_stay():
     assert "k1" in found.free
     assert all(abs(v) < t for _, v, t in found.dropped)
     assert all(getattr(found.camera, n) == 0 and found.sigma(n) == 0 for n in names)
-    tilted = Camera(width=640, height=480, focal=690, cx=324.5, cy=235.5, k1=-0.3, k2=0.12, p1=0.01, p2=-0.01)
+    tilted = Camera(
+        width=640, height=480, focal=690, cx=324.5, cy=235.5, k1=-0.3, k2=0.12, p1=0.01, p2=-0.01
+    )
     kept = Calibrate()(views(count=15, camera=tilted), BOARD)
     assert {"p1", "p2"} <= set(kept.free)
 
@@ -95,7 +107,9 @@ def test_deviations_are_neither_too_small_nor_too_large():
 
 @pytest.mark.slow
 def test_errors_that_repeat_at_a_mark_are_not_averaged_away():
-    """A board drawn 0.3 mm wrong is as wrong in 20 views as in five: its deviation must not shrink like noise."""
+    """A board drawn 0.3 mm wrong is as wrong in 20 views as in five: its deviation must not shrink
+    like noise.
+    """
     rng = np.random.default_rng(5)
     bent = np.column_stack([rng.normal(0, 0.0003, (42, 2)), np.zeros(42)])
     few = Calibrate()(views(count=5, noise=0.05, board_error=bent), BOARD)

@@ -77,7 +77,9 @@ def test_two_squares_swapped_make_another_pattern():
     board = Chessboard(columns=7, rows=6)
     a, b = truth(frontal(), np.array([[0.25, 0.25, 0], [0.35, 0.25, 0]])).round().astype(int)
     patch = image[a[1] - 22 : a[1] + 22, a[0] - 22 : a[0] + 22].copy()
-    image[a[1] - 22 : a[1] + 22, a[0] - 22 : a[0] + 22] = image[b[1] - 22 : b[1] + 22, b[0] - 22 : b[0] + 22]
+    image[a[1] - 22 : a[1] + 22, a[0] - 22 : a[0] + 22] = image[
+        b[1] - 22 : b[1] + 22, b[0] - 22 : b[0] + 22
+    ]
     image[b[1] - 22 : b[1] + 22, b[0] - 22 : b[0] + 22] = patch
     assert board == CHESS
     assert not FindBoard()("", image, BOARD)
@@ -89,6 +91,8 @@ def test_the_same_board_in_a_large_photo_lies_where_it_lay():
     pose = tilted(20, 15, 5, (0.0, 0.0, 1.7))
     from skyquilt.simulate.board import Sensor, still
 
-    view = FindBoard()("", still(big, CHESS, pose, Sensor(), np.random.default_rng(2), clutter=0.5), BOARD)
+    view = FindBoard()(
+        "", still(big, CHESS, pose, Sensor(), np.random.default_rng(2), clutter=0.5), BOARD
+    )
     small = FindBoard()("", frame(pose), BOARD)
     assert np.abs((view.corners + 0.5) / 2 - 0.5 - small.corners).max() < 0.15

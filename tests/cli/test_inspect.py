@@ -7,7 +7,9 @@ from skyquilt.cli.main import app
 from skyquilt.errors import NoPhotosError
 from tests.photos.conftest import dji_exif, dji_xmp, jpeg_bytes, pixels
 
-XMP = dji_xmp(GimbalYawDegree="35", GimbalPitchDegree="-90", FlightYawDegree="90", RelativeAltitude="40")
+XMP = dji_xmp(
+    GimbalYawDegree="35", GimbalPitchDegree="-90", FlightYawDegree="90", RelativeAltitude="40"
+)
 
 
 @pytest.fixture

@@ -32,7 +32,9 @@ def said(*words):
 
 def described(option):
     """The line of `skyquilt mosaic --help` about an option."""
-    result = CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(commands.app, ["mosaic", "--help"])
+    result = CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(
+        commands.app, ["mosaic", "--help"]
+    )
     return next(line for line in result.output.splitlines() if re.search(rf"{option}\b", line))
 
 
@@ -52,8 +54,13 @@ def test_defaults_on_the_command_line_are_those_of_the_settings():
     import inspect
 
     parameters = inspect.signature(commands.mosaic_command.command).parameters
-    other_names = {"gsd": "gsd_cm", "feather": "feather_px", "height": "height_m", "heading": "heading_deg",
-                   "memory": "memory_gb"}  # fmt: skip
+    other_names = {
+        "gsd": "gsd_cm",
+        "feather": "feather_px",
+        "height": "height_m",
+        "heading": "heading_deg",
+        "memory": "memory_gb",
+    }
     settings = config.MosaicSettings()
     named = {other_names.get(name, name): p.default for name, p in parameters.items()}
     shared = [name for name in named if hasattr(settings, name)]
@@ -67,13 +74,23 @@ def test_version():
 
 def test_exit_codes_are_those_of_the_errors():
     stated = {int(code) for code in re.findall(r"\b(\d+) [a-z]", commands.EXIT_CODES)}
-    leaves = [e for e in vars(errors).values() if isinstance(e, type) and issubclass(e, errors.SkyquiltError)]
+    leaves = [
+        e
+        for e in vars(errors).values()
+        if isinstance(e, type) and issubclass(e, errors.SkyquiltError)
+    ]
     assert stated == {0, 130} | {e.exit_code for e in leaves}
 
 
 def test_codes_tell_errors_apart():
-    leaves = [errors.UsageError, errors.NoPhotosError, errors.AlignmentError, errors.OutputError,
-              errors.SideFileError, errors.RefusedError]  # fmt: skip
+    leaves = [
+        errors.UsageError,
+        errors.NoPhotosError,
+        errors.AlignmentError,
+        errors.OutputError,
+        errors.SideFileError,
+        errors.RefusedError,
+    ]
     assert [e.exit_code for e in leaves] == [2, 3, 4, 5, 6, 7]
 
 
@@ -119,6 +136,8 @@ main.run()
 
 def test_an_interrupt_ends_with_130_and_says_how_to_go_on():
     """In a process of its own: an interrupt takes all threads with it."""
-    done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 130
     assert done.stderr == "skyquilt: interrupted; run the same command again to resume\n"

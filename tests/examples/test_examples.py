@@ -61,7 +61,9 @@ def test_a_folder_becomes_a_map_that_fits_the_truth(flight, tmp_path):
     assert "6 of 6 photos by bundle" in said
     assert "EPSG:32633" in said
     judged = run(
-        "04_map_against_truth.py", tmp_path / "out" / "mosaic.tif", flight / "truth" / "truth_ortho.tif"
+        "04_map_against_truth.py",
+        tmp_path / "out" / "mosaic.tif",
+        flight / "truth" / "truth_ortho.tif",
     )
     bias = [float(m) for m in re.findall(r"([+-][\d.]+) m (?:east|north)", judged)]
     assert max(map(abs, bias)) < 4.0  # GPS noise of 2 m over six photos

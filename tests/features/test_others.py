@@ -1,4 +1,6 @@
-"""Harris, ORB and AKAZE: keypoints follow the image, descriptors match it, corners lie where they are."""
+"""Harris, ORB and AKAZE: keypoints follow the image, descriptors match it, corners lie where they
+are.
+"""
 
 import numpy as np
 import pytest
@@ -20,10 +22,18 @@ def picture():
 
 @pytest.mark.parametrize(
     ("method", "angle", "scale", "share"),
-    [(Harris(count=600), 0, 1, 0.7), (Harris(count=600), 8, 1, 0.3), (Harris(count=600, upright=False), 60, 1, 0.25),
-     (Orb(count=600), 0, 1, 0.45), (Orb(count=600), 40, 1, 0.25), (Orb(count=600), 0, 0.8, 0.2),
-     (Akaze(count=600), 0, 1, 0.5), (Akaze(count=600), 40, 1, 0.35), (Akaze(count=600, upright=True), 0, 0.8, 0.2)],
-)  # fmt: skip
+    [
+        (Harris(count=600), 0, 1, 0.7),
+        (Harris(count=600), 8, 1, 0.3),
+        (Harris(count=600, upright=False), 60, 1, 0.25),
+        (Orb(count=600), 0, 1, 0.45),
+        (Orb(count=600), 40, 1, 0.25),
+        (Orb(count=600), 0, 0.8, 0.2),
+        (Akaze(count=600), 0, 1, 0.5),
+        (Akaze(count=600), 40, 1, 0.35),
+        (Akaze(count=600, upright=True), 0, 0.8, 0.2),
+    ],
+)
 def test_keypoints_move_with_the_image(picture, method, angle, scale, share):
     other, M = warped(picture, angle, scale, (11, -6))
     a, b = method(picture), method(other)
@@ -40,7 +50,12 @@ def test_corners_of_squares_are_found():
     for y in range(20, 200, 60):
         for x in range(20, 280, 60):
             image[y : y + 30, x : x + 30] = 200
-            corners += [(x - 0.5, y - 0.5), (x + 29.5, y - 0.5), (x - 0.5, y + 29.5), (x + 29.5, y + 29.5)]
+            corners += [
+                (x - 0.5, y - 0.5),
+                (x + 29.5, y - 0.5),
+                (x - 0.5, y + 29.5),
+                (x + 29.5, y + 29.5),
+            ]
     found = Harris(count=500, block=3)(image)
     distance = np.linalg.norm(found.px[:, None] - np.array(corners)[None], axis=-1)
     assert distance.min(0).max() < 1.2 and len(found) == len(corners)
@@ -52,7 +67,9 @@ def test_bits_differ_as_often_as_similarities_say(picture):
     assert found.binary and found.descriptors.shape == (100, 32)
     s = found.unit @ found.unit.T
     for i, j in ((0, 1), (5, 70), (33, 33)):
-        bits = sum(bin(int(p ^ q)).count("1") for p, q in zip(*found.descriptors[[i, j]], strict=True))
+        bits = sum(
+            bin(int(p ^ q)).count("1") for p, q in zip(*found.descriptors[[i, j]], strict=True)
+        )
         assert 1 - s[i, j] == pytest.approx(2 * bits / 256, abs=1e-5)
     back = decode(encode(found), {"Features": Features})
     assert back.binary and (back.descriptors == found.descriptors).all()

@@ -1,4 +1,6 @@
-"""Keypoints follow what is done to the image; coordinates are those of the full image's pixel centres."""
+"""Keypoints follow what is done to the image; coordinates are those of the full image's pixel
+centres.
+"""
 
 import cv2
 import numpy as np
@@ -27,9 +29,14 @@ def warped(image, angle, scale, shift):
 
 @pytest.mark.parametrize(
     ("angle", "scale", "shift", "within", "share"),
-    [(0, 1, (13, -7), 0.05, 0.6), (0, 1, (4.5, 2.25), 0.2, 0.3),
-     (30, 1, (5, 5), 0.3, 0.25), (0, 0.8, (0, 0), 0.4, 0.15), (180, 1, (0, 0), 0.1, 0.6)],
-)  # fmt: skip
+    [
+        (0, 1, (13, -7), 0.05, 0.6),
+        (0, 1, (4.5, 2.25), 0.2, 0.3),
+        (30, 1, (5, 5), 0.3, 0.25),
+        (0, 0.8, (0, 0), 0.4, 0.15),
+        (180, 1, (0, 0), 0.1, 0.6),
+    ],
+)
 def test_keypoints_move_with_the_image(picture, angle, scale, shift, within, share):
     other, M = warped(picture, angle, scale, shift)
     sift = Sift(count=800, longest=640)
@@ -46,7 +53,9 @@ def test_keypoints_move_with_the_image(picture, angle, scale, shift, within, sha
 
 @pytest.mark.parametrize("size", [(1200, 1600), (1201, 1602), (600, 800)])
 def test_a_blob_is_found_where_it_is_in_full_pixels(size):
-    """Shrunken or not, the centre of a Gaussian blob comes back in coordinates of the full image."""
+    """Shrunken or not, the centre of a Gaussian blob comes back in coordinates of the full
+    image.
+    """
     height, width = size
     y, x = np.mgrid[:height, :width]
     centres = np.random.default_rng(1).uniform(0, 1, (16, 2)) * 20 + np.stack(
@@ -98,8 +107,10 @@ def test_spreading_keeps_the_strongest_of_every_cell():
 
 
 @pytest.mark.xfail(
-    reason="OpenCV keeps the strongest 1.4 x count of the whole photo before they are spread: on real photos a tenth of"
-    " the cells stays bare. Spreading before describing mends it for 20 % more time and a higher reprojection error."
+    reason="OpenCV keeps the strongest 1.4 x count of the whole photo before they are spread: on"
+    " real photos a tenth of"
+    " the cells stays bare. Spreading before describing mends it for 20 % more time and a higher"
+    " reprojection error."
 )
 def test_no_corner_of_a_photo_stays_bare(picture):
     dull = picture.astype(float)
@@ -114,7 +125,9 @@ def test_descriptors_are_roots_of_unit_length(picture):
     assert len(found) == 300
     stored = found.descriptors.astype(float)
     assert found.descriptors.dtype == np.uint8 and found.descriptors.max() < 255
-    assert np.linalg.norm(stored, axis=1) / DESCRIPTOR_UNIT == pytest.approx(1, abs=0.01)  # rounding
+    assert np.linalg.norm(stored, axis=1) / DESCRIPTOR_UNIT == pytest.approx(
+        1, abs=0.01
+    )  # rounding
     assert np.linalg.norm(found.unit, axis=1) == pytest.approx(1, abs=1e-5)
     # RootSIFT squared adds up to one: the L1 norm of SIFT
     detector = cv2.SIFT.create(420, contrastThreshold=0.015, enable_precise_upscale=True)
@@ -128,9 +141,9 @@ def test_whatever_the_sensor_gives(picture, kind):
     image = {
         "uint16": lambda: picture.astype(np.uint16) * 16 + 7000,
         "float32": lambda: picture.astype(np.float32) * 0.02 + 15,
-        "float32 with gaps": lambda: np.where(np.arange(640) < 100, np.nan, picture * 0.02 + 15).astype(
-            np.float32
-        ),
+        "float32 with gaps": lambda: np.where(
+            np.arange(640) < 100, np.nan, picture * 0.02 + 15
+        ).astype(np.float32),
         "colour": lambda: np.dstack([picture] * 3),
         "one band": lambda: picture[..., None],
     }[kind]()
@@ -163,4 +176,7 @@ def test_grey_of_eight_bits_is_left_alone(picture):
 def test_halving_first_changes_nothing(size):
     image = np.random.default_rng(3).integers(0, 256, size, np.uint8)
     rough = halved(image, 400)
-    assert max(rough.shape) >= min(400, max(size)) and (shrink(rough, 400)[0] == shrink(image, 400)[0]).all()
+    assert (
+        max(rough.shape) >= min(400, max(size))
+        and (shrink(rough, 400)[0] == shrink(image, 400)[0]).all()
+    )

@@ -1,4 +1,6 @@
-"""SURF against slow sums, known blobs and known warps; the shares are what its paper claims of it."""
+"""SURF against slow sums, known blobs and known warps; the shares are what its paper claims of
+it.
+"""
 
 import time
 
@@ -40,8 +42,12 @@ def slow_determinant(grey, x, y, lobe):
         - 2 * mean(-h, -reach + lobe, w, lobe)
         + mean(-h, -reach + 2 * lobe, w, lobe)
     )
-    xy = (mean(1, 1, lobe, lobe) + mean(-lobe, -lobe, lobe, lobe)
-          - mean(1, -lobe, lobe, lobe) - mean(-lobe, 1, lobe, lobe))  # fmt: skip
+    xy = (
+        mean(1, 1, lobe, lobe)
+        + mean(-lobe, -lobe, lobe, lobe)
+        - mean(1, -lobe, lobe, lobe)
+        - mean(-lobe, 1, lobe, lobe)
+    )
     return xx * yy - (0.9 * xy) ** 2
 
 
@@ -61,7 +67,11 @@ def test_determinants_are_those_of_slow_sums(picture, lobe, step):
 
 
 def test_lobes_are_the_papers():
-    assert [lobes for _, lobes in octave_lobes(3, 3)] == [[3, 5, 7, 9], [5, 9, 13, 17], [9, 17, 25, 33]]
+    assert [lobes for _, lobes in octave_lobes(3, 3)] == [
+        [3, 5, 7, 9],
+        [5, 9, 13, 17],
+        [9, 17, 25, 33],
+    ]
     assert [3 * k for k in next(octave_lobes(1, 1))[1]] == [3, 9, 15, 21]
 
 
@@ -91,13 +101,16 @@ def test_blobs_are_found_where_they_are_and_as_large(width):
     centres = np.random.default_rng(1).uniform(0, 1, (12, 2)) * 20 + np.stack(
         np.meshgrid([50, 140, 230, 320], [50, 140, 230]), -1
     ).reshape(-1, 2)
-    image = 60 + sum(150 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * width**2)) for cx, cy in centres)
+    image = 60 + sum(
+        150 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * width**2)) for cx, cy in centres
+    )
     found = blobs(np.rint(image).astype(np.uint8), octaves=4, lobe=3, step=1, threshold=50)
     distance = np.linalg.norm(found.xy[:, None] - centres[None], axis=-1)
     nearest = [int(np.where(distance[:, k] < 3, found.response, -1).argmax()) for k in range(12)]
     off = found.xy[nearest] - centres
     assert np.abs(off).max() < 0.3 and np.abs(off.mean(0)).max() < 0.06
-    # a box filter of side 9 answers as a Gaussian of 1.7 does, but SURF calls it 1.2: constant, so scales stay comparable
+    # a box filter of side 9 answers as a Gaussian of 1.7 does, but SURF calls it 1.2: constant, so
+    # scales stay comparable
     assert found.sigma[nearest] == pytest.approx(0.715 * width, rel=0.04)
 
 
@@ -117,9 +130,13 @@ def test_an_initial_lobe_of_one_finds_smaller_blobs():
 
 
 def scores(method, picture, angle, scale, blur=0.0):
-    """Shares of the keypoints still shown that are found again within 2 px, and that are matched right."""
+    """Shares of the keypoints still shown that are found again within 2 px, and that are matched
+    right.
+    """
     other, M = warped(
-        cv2.GaussianBlur(picture, (0, 0), 0.5 * np.sqrt(1 / scale**2 - 1)) if scale < 1 else picture,
+        cv2.GaussianBlur(picture, (0, 0), 0.5 * np.sqrt(1 / scale**2 - 1))
+        if scale < 1
+        else picture,
         angle,
         scale,
         0,
@@ -136,9 +153,16 @@ def scores(method, picture, angle, scale, blur=0.0):
 
 @pytest.mark.parametrize(
     ("angle", "scale", "blur", "repeated", "matched"),
-    [(90, 1, 0, 0.75, 0.75), (20, 1, 0, 0.55, 0.42), (45, 1, 0, 0.5, 0.35), (0, 0.8, 0, 0.4, 0.25),
-     (0, 0.6, 0, 0.25, 0.11), (0, 1, 1.0, 0.74, 0.69), (30, 0.7, 0, 0.3, 0.15)],
-)  # fmt: skip
+    [
+        (90, 1, 0, 0.75, 0.75),
+        (20, 1, 0, 0.55, 0.42),
+        (45, 1, 0, 0.5, 0.35),
+        (0, 0.8, 0, 0.4, 0.25),
+        (0, 0.6, 0, 0.25, 0.11),
+        (0, 1, 1.0, 0.74, 0.69),
+        (30, 0.7, 0, 0.3, 0.15),
+    ],
+)
 def test_known_warps(picture, angle, scale, blur, repeated, matched):
     found = scores(Surf(count=800), picture, angle, scale, blur)
     assert found[0] > repeated and found[1] > matched and found[2] > 0.7, found
@@ -157,7 +181,9 @@ def test_the_orientation_turns_with_the_image():
     for degrees in range(-170, 180, 20):
         t = np.radians(degrees)
         ramp = 128 + 100 * np.tanh((x * np.cos(t) + y * np.sin(t)) / 8)  # grows towards t
-        found = orientations(Means(ramp.astype(np.uint8)), np.array([[50.0, 50.0]]), np.array([2.0]))
+        found = orientations(
+            Means(ramp.astype(np.uint8)), np.array([[50.0, 50.0]]), np.array([2.0])
+        )
         assert np.degrees(np.angle(np.exp(1j * (found[0] - t)))) == pytest.approx(0, abs=1.5)
 
 
@@ -165,7 +191,9 @@ def test_the_orientation_turns_with_the_image():
 def test_descriptors(picture, length):
     found = Surf(count=400, length=length)(picture)
     assert found.descriptors.shape == (400, length) and found.descriptors.dtype == np.int8
-    assert (np.abs(found.descriptors.astype(int)) == 127).mean() < 1e-3  # hardly anything is cut off
+    assert (
+        np.abs(found.descriptors.astype(int)) == 127
+    ).mean() < 1e-3  # hardly anything is cut off
     assert np.linalg.norm(found.unit, axis=1) == pytest.approx(1, abs=1e-5)
     # contrast and brightness do not count
     dull = Surf(count=400, length=length, threshold=12.5)((picture * 0.5 + 30).astype(np.uint8))

@@ -24,12 +24,17 @@ def cameras(draw):
     width, height = draw(st.integers(300, 6000)), draw(st.integers(300, 6000))
     focal = draw(st.floats(0.5, 3.0)) * max(width, height)
     return Camera(
-        width=width, height=height, focal=focal,
+        width=width,
+        height=height,
+        focal=focal,
         cx=(width - 1) / 2 + draw(st.floats(-0.05, 0.05)) * width,
         cy=(height - 1) / 2 + draw(st.floats(-0.05, 0.05)) * height,
-        k1=draw(st.floats(-0.35, 0.35)), k2=draw(st.floats(-0.15, 0.15)), k3=draw(st.floats(-0.05, 0.05)),
-        p1=draw(small), p2=draw(small),
-    )  # fmt: skip
+        k1=draw(st.floats(-0.35, 0.35)),
+        k2=draw(st.floats(-0.15, 0.15)),
+        k3=draw(st.floats(-0.05, 0.05)),
+        p1=draw(small),
+        p2=draw(small),
+    )
 
 
 def points(seed, count=40, spread=0.6):
@@ -68,7 +73,9 @@ def test_derivatives_are_those_of_the_projection(camera, seed):
         h = 1e-6 * xyz[:, 2:]
         step = np.eye(3)[axis] * h
         numeric = (px(k, xyz + step) - px(k, xyz - step)) / (2 * h)
-        assert exact.d_point[:, :, axis] == pytest.approx(numeric, rel=1e-6, abs=2e-6 * camera.focal / 0.5)
+        assert exact.d_point[:, :, axis] == pytest.approx(
+            numeric, rel=1e-6, abs=2e-6 * camera.focal / 0.5
+        )
     for column in range(8):
         h = 1e-6 * (camera.focal if column < 3 else 1.0)
         step = np.eye(8)[column] * h
@@ -80,7 +87,9 @@ def test_derivatives_are_those_of_the_projection(camera, seed):
 @settings(max_examples=200)
 @given(cameras(), st.integers(0, 2**31))
 def test_undistortion_inverts_distortion(camera, seed):
-    """Wherever the image's own pixels are (their radius may be beyond what folds: not asked of those)."""
+    """Wherever the image's own pixels are (their radius may be beyond what folds: not asked of
+    those).
+    """
     rng = np.random.default_rng(seed)
     reach = min(0.98 * monotone_radius(camera), 0.9)
     radius, angle = reach * np.sqrt(rng.random(60)), rng.uniform(0, 2 * np.pi, 60)
@@ -88,7 +97,9 @@ def test_undistortion_inverts_distortion(camera, seed):
     jacobian = project_with_derivatives(
         np.tile(np.r_[1, 0, 0, camera.vector[3:]], (60, 1)), np.c_[xy, np.ones(60)]
     )
-    assume(np.linalg.det(jacobian.d_point[:, :, :2]).min() > 0.02)  # tangential terms may fold earlier
+    assume(
+        np.linalg.det(jacobian.d_point[:, :, :2]).min() > 0.02
+    )  # tangential terms may fold earlier
     px = project(camera, np.c_[xy, np.ones(60)])
     assert undistort(camera, px) == pytest.approx(xy, abs=1e-9)
     assert rays(camera, px) == pytest.approx(np.c_[xy, np.ones(60)], abs=1e-9)

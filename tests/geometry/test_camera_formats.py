@@ -8,7 +8,9 @@ from skyquilt.model.camera import Camera
 small = st.floats(-0.3, 0.3)
 
 
-@given(st.integers(100, 9000), st.integers(100, 9000), st.floats(0.3, 5), small, small, small, small)
+@given(
+    st.integers(100, 9000), st.integers(100, 9000), st.floats(0.3, 5), small, small, small, small
+)
 def test_round_trip(width, height, focal, k1, k2, p1, cx):
     unit = max(width, height)
     camera = Camera(

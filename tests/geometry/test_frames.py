@@ -64,7 +64,9 @@ def test_gimbal_pitch_counts_from_nadir(yaw, pitch):
 
 @given(yaws, st.floats(-80, 80), st.floats(-80, 80))
 def test_gimbal_and_belly_see_the_same_axis(yaw, pitch, roll):
-    """The gimbal's nose is the optical axis: its direction in NED follows from yaw and pitch alone."""
+    """The gimbal's nose is the optical axis: its direction in NED follows from yaw and pitch
+    alone.
+    """
     cam_R_map = cam_R_map_from_angles(*belly_from_gimbal(yaw, pitch, roll))
     a, b = np.radians([yaw, pitch])
     axis = (np.sin(a) * np.cos(b), np.cos(a) * np.cos(b), np.sin(b))

@@ -7,7 +7,9 @@ from scipy.spatial import cKDTree
 from skyquilt.geometry.neighbours import nearest
 
 
-@pytest.mark.parametrize(("count", "k", "offset"), [(1, 1, 0.0), (9, 9, 1e5), (3000, 8, 0.0), (3000, 2, 4e6)])
+@pytest.mark.parametrize(
+    ("count", "k", "offset"), [(1, 1, 0.0), (9, 9, 1e5), (3000, 8, 0.0), (3000, 2, 4e6)]
+)
 def test_neighbours_are_those_of_scipy(count, k, offset):
     rng = np.random.default_rng(count + k)
     points = rng.uniform(-200, 200, (count, 2)) + offset

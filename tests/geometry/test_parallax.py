@@ -19,7 +19,8 @@ def test_heights_are_exact_whatever_the_tilt_and_the_heights_of_the_cameras(seed
     R = cam_R_map_from_angles(yaw, pitch, roll)
     a, b = np.array([rng.uniform(5, 25), -4.0, rng.uniform(45, 60)]), np.array([0.0, 3.0, 50.0])
     xyz = np.c_[rng.uniform(-15, 20, (200, 2)), rng.uniform(-2, 12, 200)]
-    # the plane's homography takes what a sees of P to where b sees W, the point of the plane behind it
+    # the plane's homography takes what a sees of P to where b sees W, the point of the plane behind
+    # it
     on_plane = a + (xyz - a) * (a[2] / (a[2] - xyz[:, 2]))[:, None]
     w = seen(R, b, on_plane)
     h, along, across = heights_above_plane(

@@ -1,4 +1,6 @@
-"""Transformations are found exactly where data are exact, and the batched code equals OpenCV and slow loops."""
+"""Transformations are found exactly where data are exact, and the batched code equals OpenCV and
+slow loops.
+"""
 
 import cv2
 import numpy as np
@@ -27,7 +29,9 @@ def drawn(model, rng):
     H[:2, 2] = rng.uniform(-500, 500, 2)
     if model != "translation":
         angle, scale = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 2)
-        H[:2, :2] = scale * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        H[:2, :2] = scale * np.array(
+            [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        )
     if model in ("affine", "homography"):
         H[:2, :2] += rng.uniform(-0.2, 0.2, (2, 2))
     if model == "homography":
@@ -40,9 +44,17 @@ def drawn(model, rng):
 def test_exact_points_give_the_exact_model(model, seed, more):
     rng = np.random.default_rng(seed)
     H, a = drawn(model, rng), rng.uniform(0, FRAME, (MINIMAL[model] + more, 2))
-    if MINIMAL[model] > 2 and min(
-        abs(np.linalg.det([q - p, r - p])) for p in a[:4] for q in a[:4] for r in a[:4] if (p != q).any() and (q != r).any() and (p != r).any()
-    ) < 2e4:  # fmt: skip
+    if (
+        MINIMAL[model] > 2
+        and min(
+            abs(np.linalg.det([q - p, r - p]))
+            for p in a[:4]
+            for q in a[:4]
+            for r in a[:4]
+            if (p != q).any() and (q != r).any() and (p != r).any()
+        )
+        < 2e4
+    ):
         return  # nearly on one line
     found = fit(model, a, transfer(H, a))
     corners = np.array([[0, 0], [1500, 0], [0, 1000], [1500, 1000.0]])
@@ -81,17 +93,24 @@ def test_linear_models_are_least_squares():
         root = np.sqrt(np.r_[w, w])
         expected = D @ np.linalg.lstsq(D * root[:, None], target * root, rcond=None)[0]
         expected = expected + (np.r_[x, y] if model == "translation" else 0)
-        assert np.concatenate(transfer(fit(model, a, b, w), a).T) == pytest.approx(expected, abs=1e-8)
+        assert np.concatenate(transfer(fit(model, a, b, w), a).T) == pytest.approx(
+            expected, abs=1e-8
+        )
 
 
 def test_homography_as_opencv():
     rng = np.random.default_rng(3)
     H, a = drawn("homography", rng), rng.uniform(0, FRAME, (60, 2))
     b = transfer(H, a) + rng.normal(0, 1, (60, 2))
-    ours, theirs = fit("homography", a, b), cv2.findHomography(a, b, 0)[0]  # theirs ends with a refinement
+    ours, theirs = (
+        fit("homography", a, b),
+        cv2.findHomography(a, b, 0)[0],
+    )  # theirs ends with a refinement
     assert np.abs(transfer(ours, a) - transfer(theirs, a)).max() < 0.5
     four = cv2.getPerspectiveTransform(a[:4].astype(np.float32), b[:4].astype(np.float32))
-    assert transfer(fit("homography", a[:4], b[:4]), a) == pytest.approx(transfer(four, a), rel=1e-3)
+    assert transfer(fit("homography", a[:4], b[:4]), a) == pytest.approx(
+        transfer(four, a), rel=1e-3
+    )
 
 
 line = np.column_stack([np.linspace(0, 1000, 12), np.linspace(5, 800, 12)])
@@ -99,11 +118,21 @@ line = np.column_stack([np.linspace(0, 1000, 12), np.linspace(5, 800, 12)])
 
 @pytest.mark.parametrize(
     ("model", "a"),
-    [("homography", line), ("affine", line), ("homography", line[:4]), ("affine", line[:3]),
-     ("homography", np.r_[line[:3], [[700, 3.0]]]), ("similarity", np.ones((5, 2))), ("affine", np.ones((5, 2))),
-     ("homography", np.ones((5, 2))), ("homography", np.full((5, 2), np.nan)), ("affine", np.full((5, 2), np.inf)),
-     ("similarity", np.zeros((1, 2))), ("translation", np.zeros((0, 2)))],
-)  # fmt: skip
+    [
+        ("homography", line),
+        ("affine", line),
+        ("homography", line[:4]),
+        ("affine", line[:3]),
+        ("homography", np.r_[line[:3], [[700, 3.0]]]),
+        ("similarity", np.ones((5, 2))),
+        ("affine", np.ones((5, 2))),
+        ("homography", np.ones((5, 2))),
+        ("homography", np.full((5, 2), np.nan)),
+        ("affine", np.full((5, 2), np.inf)),
+        ("similarity", np.zeros((1, 2))),
+        ("translation", np.zeros((0, 2))),
+    ],
+)
 def test_what_points_do_not_determine_is_none(model, a):
     assert fit(model, a, a) is None
     other = np.random.default_rng(0).uniform(0, 1000, a.shape)
@@ -117,7 +146,9 @@ def test_a_point_without_weight_does_not_count():
         H = drawn(model, rng)
         b = transfer(H, a)
         b[0] = 7e4
-        assert transfer(fit(model, a, b, np.r_[0, np.ones(8)]), a[1:]) == pytest.approx(b[1:], abs=1e-6)
+        assert transfer(fit(model, a, b, np.r_[0, np.ones(8)]), a[1:]) == pytest.approx(
+            b[1:], abs=1e-6
+        )
 
 
 def test_inverse_and_horizon():
@@ -150,9 +181,12 @@ def test_refinement_reaches_scipys_minimum(model):
             M[2, :2] = p[6:] * 1e-3
         return M
 
-    first = {"translation": start[:2, 2], "similarity": np.r_[start[:2, 2], start[0, 0], start[1, 0]],
-             "affine": np.r_[start[:2, 2], start[:2, :2].ravel()],
-             "homography": np.r_[start[:2, 2], start[:2, :2].ravel(), start[2, :2] * 1e3]}[model]  # fmt: skip
+    first = {
+        "translation": start[:2, 2],
+        "similarity": np.r_[start[:2, 2], start[0, 0], start[1, 0]],
+        "affine": np.r_[start[:2, 2], start[:2, :2].ravel()],
+        "homography": np.r_[start[:2, 2], start[:2, :2].ravel(), start[2, :2] * 1e3],
+    }[model]
 
     def residuals(p):
         M = matrix(p)
@@ -162,4 +196,6 @@ def test_refinement_reaches_scipys_minimum(model):
     reached = symmetric_transfer_errors(ours, a, b).sum()
     assert reached == pytest.approx(2 * best.cost, rel=1e-5)
     assert reached <= symmetric_transfer_errors(start, a, b).sum()
-    assert fit(model, a, transfer(ours, a)) == pytest.approx(ours, rel=1e-5, abs=1e-8)  # still of the model
+    assert fit(model, a, transfer(ours, a)) == pytest.approx(
+        ours, rel=1e-5, abs=1e-8
+    )  # still of the model

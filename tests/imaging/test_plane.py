@@ -28,7 +28,9 @@ def grid_truth(flight, patch):
     smooth = flight.ground
     c, r = np.meshgrid(column.round().astype(int), row.round().astype(int))
     total = sum(
-        smooth[np.clip(r + dr, 0, None), np.clip(c + dc, 0, None)] for dr in (-1, 0, 1) for dc in (-1, 0, 1)
+        smooth[np.clip(r + dr, 0, None), np.clip(c + dc, 0, None)]
+        for dr in (-1, 0, 1)
+        for dc in (-1, 0, 1)
     )
     return total / 9
 
@@ -74,14 +76,22 @@ def test_the_centre_is_half_as_wide_as_the_photo(flight):
 
 def test_a_photo_of_the_horizon_is_no_patch():
     up = np.array([[1.0, 0, 0], [0, 0.2, 1], [0, 1, -0.2]])
-    assert to_grid(np.zeros((60, 80), np.uint8), Camera.ideal(width=80, height=60, focal=70), up) is None
+    assert (
+        to_grid(np.zeros((60, 80), np.uint8), Camera.ideal(width=80, height=60, focal=70), up)
+        is None
+    )
 
 
 def patch(value, row=0, column=0, size=8, centre=(3, 5)):
     central = np.zeros((size, size), bool)
     central[centre[0] : centre[1], centre[0] : centre[1]] = True
-    return Patch(row=row, column=column, pixels=np.full((size, size), value, np.float32), shown=np.ones((size, size), bool),
-                 central=central)  # fmt: skip
+    return Patch(
+        row=row,
+        column=column,
+        pixels=np.full((size, size), value, np.float32),
+        shown=np.ones((size, size), bool),
+        central=central,
+    )
 
 
 def test_the_centre_is_laid_over_the_rest_only_where_nothing_is():

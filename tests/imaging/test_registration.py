@@ -17,7 +17,9 @@ REAL = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "brighto
 
 
 def pairs(count, *, noise=2.0, seed=0, reach=26, roughness=1.0):
-    """Patches a, b and true shifts (dy, dx): b(x + d) shows a(x), under another gain, offset and noise."""
+    """Patches a, b and true shifts (dy, dx): b(x + d) shows a(x), under another gain, offset and
+    noise.
+    """
     rng = np.random.default_rng(seed)
     fine = texture(1200, 1200, seed, roughness)
     a, b, truth = [], [], []
@@ -26,7 +28,9 @@ def pairs(count, *, noise=2.0, seed=0, reach=26, roughness=1.0):
         s = rng.integers(-reach, reach + 1, 2)
         gain, offset = rng.uniform(0.6, 1.6), rng.uniform(-30, 30)
         a.append(seen(fine, row, column) + rng.normal(0, noise, (64, 64)))
-        b.append(seen(fine, row - s[0], column - s[1]) * gain + offset + rng.normal(0, noise, (64, 64)))
+        b.append(
+            seen(fine, row - s[0], column - s[1]) * gain + offset + rng.normal(0, noise, (64, 64))
+        )
         truth.append(s / FINE)
     return np.float32(a), np.float32(b), np.array(truth)
 
@@ -77,8 +81,12 @@ def test_gain_and_offset_change_nothing_and_exchange_negates(seed, gain, offset)
         shift_between(a[0], b[0] * gain + offset),
         shift_between(b[0], a[0]),
     )
-    assert (other.dx, other.dy, other.peak) == pytest.approx((shift.dx, shift.dy, shift.peak), abs=2e-3)
-    assert (-back.dx, -back.dy, back.peak) == pytest.approx((shift.dx, shift.dy, shift.peak), abs=2e-3)
+    assert (other.dx, other.dy, other.peak) == pytest.approx(
+        (shift.dx, shift.dy, shift.peak), abs=2e-3
+    )
+    assert (-back.dx, -back.dy, back.peak) == pytest.approx(
+        (shift.dx, shift.dy, shift.peak), abs=2e-3
+    )
 
 
 def test_equal_patches_correlate_fully():
@@ -112,7 +120,9 @@ def test_stripes_and_shifts_beyond_the_search_are_refused():
 def test_flat_patches_have_no_texture_and_no_shift():
     rng = np.random.default_rng(0)
     flat = np.full((2, 64, 64), 90, np.float32)
-    edge = np.tile(np.where(np.arange(64) < 32, 50, 200), (64, 1))[None] + rng.normal(0, 1.5, (1, 64, 64))
+    edge = np.tile(np.where(np.arange(64) < 32, 50, 200), (64, 1))[None] + rng.normal(
+        0, 1.5, (1, 64, 64)
+    )
     assert not has_texture(flat).any()
     assert not has_texture(rng.normal(90, 1.5, (20, 64, 64))).any()
     assert not has_texture(edge).any()  # fixes no shift along itself
@@ -125,7 +135,9 @@ def test_weakest_gradient_of_a_known_pattern():
     pattern = (0.5 * x + 2 * y)[None].astype(np.float32)
     assert weakest_gradient(pattern)[0] == pytest.approx(0, abs=1e-2)
     waves = 10 * np.sin(2 * np.pi * x / 32) + 20 * np.sin(2 * np.pi * y / 32)
-    assert weakest_gradient(waves[None])[0] == pytest.approx(10 * 2 * np.pi / 32 / np.sqrt(2), rel=0.1)
+    assert weakest_gradient(waves[None])[0] == pytest.approx(
+        10 * 2 * np.pi / 32 / np.sqrt(2), rel=0.1
+    )
 
 
 def test_wrong_shapes_are_named():

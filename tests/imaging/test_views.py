@@ -44,7 +44,9 @@ def test_a_footprint_climbs_a_slope():
     shot = view(0, 0, 0, yaw=90, surface=slope)
     z = 0.3 * shot.footprint[:, 0]
     px = project(CAMERA, shot.pose.to_camera(np.c_[shot.footprint, z]))
-    rim = np.min([np.abs(px[:, 0]), np.abs(px[:, 0] - 399), np.abs(px[:, 1]), np.abs(px[:, 1] - 299)], axis=0)
+    rim = np.min(
+        [np.abs(px[:, 0]), np.abs(px[:, 0] - 399), np.abs(px[:, 1]), np.abs(px[:, 1] - 299)], axis=0
+    )
     assert rim.max() < 0.6  # six rounds towards the slope
 
 
@@ -58,9 +60,9 @@ def test_nodes_are_exact_projections_and_in_between_nearly():
     nodes = project_nodes(shot, *node_places(GRID, FLAT, window))
     assert nodes.u.shape == (-(-100 // STEP) + 2, -(-130 // STEP) + 2)
     x, y = np.meshgrid(GRID.x(np.arange(320, 450)), GRID.y(np.arange(160, 260)))
-    exact = project(CAMERA, shot.pose.to_camera(np.stack([x, y, 0 * x], -1).reshape(-1, 3))).reshape(
-        100, 130, 2
-    )
+    exact = project(
+        CAMERA, shot.pose.to_camera(np.stack([x, y, 0 * x], -1).reshape(-1, 3))
+    ).reshape(100, 130, 2)
     dense = np.stack([densify(nodes.u, 100, 130), densify(nodes.v, 100, 130)], -1)
     assert np.abs(dense - exact).max() < 0.03
     # node 1 is the middle of the window's first cell
@@ -105,7 +107,9 @@ def test_no_node_has_a_smaller_score_than_the_least(row, column, size, rise):
 
 
 def test_folded_distortion_and_the_sky_show_nothing():
-    """Beyond the fold a polynomial brings far ground back into the image; behind the camera there is no ground."""
+    """Beyond the fold a polynomial brings far ground back into the image; behind the camera there
+    is no ground.
+    """
     camera = Camera(width=400, height=300, focal=350.0, cx=199.5, cy=149.5, k1=-0.25)
     shot = view(0, 0, 0, camera=camera)
     x = np.linspace(0, 200, 400)[None]
@@ -122,7 +126,10 @@ def test_folded_distortion_and_the_sky_show_nothing():
 def test_the_grid_covers_all_footprints_on_round_coordinates():
     views = block()
     grid = grid_of(views, 0.13)
-    low, high = np.min([v.footprint.min(0) for v in views], 0), np.max([v.footprint.max(0) for v in views], 0)
+    low, high = (
+        np.min([v.footprint.min(0) for v in views], 0),
+        np.max([v.footprint.max(0) for v in views], 0),
+    )
     west, south, east, north = grid.bounds
     assert (
         west <= low[0] < west + 0.13
@@ -130,9 +137,9 @@ def test_the_grid_covers_all_footprints_on_round_coordinates():
         and high[0] <= east < high[0] + 0.131
         and high[1] <= north
     )
-    assert (grid.west / 0.13) % 1 == pytest.approx(0, abs=1e-9) or (grid.west / 0.13) % 1 == pytest.approx(
-        1, abs=1e-9
-    )
+    assert (grid.west / 0.13) % 1 == pytest.approx(0, abs=1e-9) or (
+        grid.west / 0.13
+    ) % 1 == pytest.approx(1, abs=1e-9)
     asked = grid_of(views, 0.5, (-3.2, -2.0, 7.7, 4.1))
     assert asked == Grid(west=-3.5, north=4.5, gsd=0.5, width=23, height=13)
 
@@ -154,14 +161,20 @@ def test_boxes_that_meet():
 
 def test_many_photos_are_projected_as_each_by_itself():
     folded = replace(CAMERA, k1=-0.3, k2=0.0)
-    shots = [view(k, 9.0 * k - 20, 5 - 3.0 * k, z=30 + 4 * k, yaw=77 * k, pitch=8 * k) for k in range(5)]
+    shots = [
+        view(k, 9.0 * k - 20, 5 - 3.0 * k, z=30 + 4 * k, yaw=77 * k, pitch=8 * k) for k in range(5)
+    ]
     shots = [
         *shots[:3],
         replace(shots[3], camera=folded),
         replace(shots[4], camera=replace(CAMERA, width=320)),
     ]
     hill = Surface(
-        z=np.arange(400, dtype=np.float32).reshape(20, 20) / 40, x0=-30.0, y0=-30.0, cell=3.0, source="t"
+        z=np.arange(400, dtype=np.float32).reshape(20, 20) / 40,
+        x0=-30.0,
+        y0=-30.0,
+        cell=3.0,
+        source="t",
     )
     places = node_places(GRID, hill, Window(row=0, column=0, height=360, width=480))
     for some in (shots, shots[1:2]):

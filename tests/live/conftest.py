@@ -44,7 +44,9 @@ class Flight:
 
 def made(folder: Path, **settings: Any) -> Flight:
     """A flight of 480 x 360 px."""
-    for _ in simulate(FlightSettings(lens=Lens().scaled(480, 360), **settings), folder, overwrite=True):
+    for _ in simulate(
+        FlightSettings(lens=Lens().scaled(480, 360), **settings), folder, overwrite=True
+    ):
         pass
     return Flight(folder=folder, truth=json.loads((folder / "truth" / "truth.json").read_text()))
 
@@ -53,27 +55,40 @@ def made(folder: Path, **settings: Any) -> Flight:
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     """Six photos in two lines."""
     return made(
-        tmp_path_factory.mktemp("small"), seed=3, route=Route(photos=6), control=Control(points=0, checks=0)
+        tmp_path_factory.mktemp("small"),
+        seed=3,
+        route=Route(photos=6),
+        control=Control(points=0, checks=0),
     )
 
 
 @pytest.fixture(scope="session")
 def drones(tmp_path_factory: pytest.TempPathFactory) -> Flight:
-    """Eighteen photos from two drones whose clocks are 40 s apart; one line reports its yaw 180 degrees off."""
+    """Eighteen photos from two drones whose clocks are 40 s apart; one line reports its yaw 180
+    degrees off.
+    """
     return made(
-        tmp_path_factory.mktemp("drones"), seed=5, route=Route(photos=18, drones=2), control=Control(points=0, checks=0),
+        tmp_path_factory.mktemp("drones"),
+        seed=5,
+        route=Route(photos=18, drones=2),
+        control=Control(points=0, checks=0),
         reporting=Reporting(clock_offsets=(0.0, 40.0), yaw_lie="tag"),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="session")
 def both(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     """Six visible photos and the thermal frames of a second drone, whose files state their unit."""
-    thermal = Thermal(lens=Lens(width=320, height=256, focal=386.0, k1=-0.2, k2=0.05, p1=0.0, p2=0.0))
+    thermal = Thermal(
+        lens=Lens(width=320, height=256, focal=386.0, k1=-0.2, k2=0.05, p1=0.0, p2=0.0)
+    )
     return made(
-        tmp_path_factory.mktemp("thermal"), seed=3, route=Route(photos=6), control=Control(points=0, checks=0),
+        tmp_path_factory.mktemp("thermal"),
+        seed=3,
+        route=Route(photos=6),
+        control=Control(points=0, checks=0),
         thermal=thermal,
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +101,9 @@ class Served:
     folder: Path
 
     def send(self, path: Path, name: str | None = None, **more: Any) -> httpx.Response:
-        return self.web.post("/photos", params={"name": name or path.name}, content=path.read_bytes(), **more)
+        return self.web.post(
+            "/photos", params={"name": name or path.name}, content=path.read_bytes(), **more
+        )
 
     def until(self, holds: Callable[[], bool], seconds: float = 60.0) -> None:
         """Waits."""
@@ -112,10 +129,13 @@ def served(
     live = LiveMap(folder, settings)
     stop = threading.Event()
     mapping = threading.Thread(
-        target=lambda: [None for _ in iter_live([inbox] if inbox else [], live, stop=stop)], daemon=True
+        target=lambda: [None for _ in iter_live([inbox] if inbox else [], live, stop=stop)],
+        daemon=True,
     )
     guard = guard or Guard()
-    with Serving(survey=LiveSurvey(folder), guard=guard, folder=folder, writer=live, port=port) as serving:
+    with Serving(
+        survey=LiveSurvey(folder), guard=guard, folder=folder, writer=live, port=port
+    ) as serving:
         mapping.start()
         headers = {"X-Token": guard.token} if guard.token else {}
         with httpx.Client(base_url=serving.url, headers=headers, timeout=60) as web:

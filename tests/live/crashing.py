@@ -1,4 +1,6 @@
-"""A replay in a process of its own that kills itself: at a named point, at a write that is torn, or at a moment."""
+"""A replay in a process of its own that kills itself: at a named point, at a write that is torn, or
+at a moment.
+"""
 
 import json
 import os
@@ -20,7 +22,9 @@ def die(*_: object) -> None:
 
 
 def arm(point: str, count: int) -> None:
-    """Dies when a point is reached for the count-th time; `torn` dies in the middle of writing a photo's file."""
+    """Dies when a point is reached for the count-th time; `torn` dies in the middle of writing a
+    photo's file.
+    """
     left = [count]
 
     def watcher(name: str) -> None:
@@ -53,7 +57,8 @@ def main(folder: Path, photos: Path, point: str, count: int) -> None:
     watch = Watch(folder=photos, intake=live.intake)
     names = sorted(p.name for p in photos.glob("*.jpg"))
     while True:
-        # one file at a time, in order of names: the order of acceptance is then the same in every replay
+        # one file at a time, in order of names: the order of acceptance is then the same in every
+        # replay
         for _ in watch.look():
             break
         if live.work() is not None:
@@ -61,15 +66,22 @@ def main(folder: Path, photos: Path, point: str, count: int) -> None:
         if live.ledger.row("select count(*) from photo")[0] >= len(names) and live.work() is None:
             break
         time.sleep(0.01)
-    signal.setitimer(signal.ITIMER_REAL, 0)  # the work is done; dying while it is reported would mean nothing
+    signal.setitimer(
+        signal.ITIMER_REAL, 0
+    )  # the work is done; dying while it is reported would mean nothing
     Publishing(LiveSurvey(folder), folder).step(now=True)
-    poses = {m.photo.name: [m.pose.map_C.tolist(), m.pose.cam_R_map.tolist()] for m in live.members.on_map()}
+    poses = {
+        m.photo.name: [m.pose.map_C.tolist(), m.pose.cam_R_map.tolist()]
+        for m in live.members.on_map()
+    }
     for layer in live.tiles.layers():
         for level in range(9):
             for address in live.tiles.addresses(layer, level):
                 assert live.tiles.get(address) is not None
     sys.stdout.write(
-        json.dumps({"poses": poses, "states": live.ledger.counts(), "seconds": time.monotonic() - began})
+        json.dumps(
+            {"poses": poses, "states": live.ledger.counts(), "seconds": time.monotonic() - began}
+        )
     )
     live.close()
 

@@ -34,7 +34,9 @@ def answers(url):
 def test_photos_handed_to_it_are_mapped_and_it_comes_back_when_killed(flight, tmp_path):
     settings = LiveSettings(features=600, most_bytes=3_000_000)
     live, stop = LiveMap(tmp_path / "out", settings), threading.Event()
-    mapping = threading.Thread(target=lambda: [None for _ in iter_live([], live, stop=stop)], daemon=True)
+    mapping = threading.Thread(
+        target=lambda: [None for _ in iter_live([], live, stop=stop)], daemon=True
+    )
     asked = Asked(folder=tmp_path / "out", settings=settings, guard=Guard(token="long enough"))
     with ServingApart(asked=asked) as site, httpx.Client(base_url=site.url, timeout=30) as web:
         mapping.start()
@@ -43,13 +45,19 @@ def test_photos_handed_to_it_are_mapped_and_it_comes_back_when_killed(flight, tm
         assert web.post("/photos", content=data[0]).status_code == 401
         assert web.post("/photos", content=data[0], headers=token).status_code == 201
         assert (
-            web.post("/photos", content=b"\xff\xd8\xff" + b"0" * 3_000_000, headers=token).status_code == 413
+            web.post(
+                "/photos", content=b"\xff\xd8\xff" + b"0" * 3_000_000, headers=token
+            ).status_code
+            == 413
         )
         until(lambda: all(p["ring"] for p in web.get("/photos").json()["photos"]))
         first = site._parts["process"].pid
         os.kill(first, signal.SIGKILL)
         until(lambda: site._parts["process"].pid != first and answers(site.url))
-        assert httpx.post(site.url + "photos", content=data[1], headers=token, timeout=30).status_code == 201
+        assert (
+            httpx.post(site.url + "photos", content=data[1], headers=token, timeout=30).status_code
+            == 201
+        )
         until(lambda: len(list(live.members.on_map())) == 2)
         last = site._parts["process"]
     assert not last.is_alive()
@@ -62,7 +70,9 @@ def test_photos_handed_to_it_are_mapped_and_it_comes_back_when_killed(flight, tm
 def test_an_address_that_is_taken_and_a_base_that_is_no_map_are_told(tmp_path):
     live = LiveMap(tmp_path / "out", LiveSettings())
     (tmp_path / "no.tif").write_bytes(b"no map")
-    asked = Asked(folder=tmp_path / "out", settings=LiveSettings(), guard=Guard(), base=tmp_path / "no.tif")
+    asked = Asked(
+        folder=tmp_path / "out", settings=LiveSettings(), guard=Guard(), base=tmp_path / "no.tif"
+    )
     with pytest.raises(UsageError, match="--base"), ServingApart(asked=asked):
         pass
     import socket

@@ -22,7 +22,11 @@ SHOTS = os.environ.get("SKYQUILT_SCREENSHOTS")
 
 @pytest.fixture(scope="module")
 def browser():
-    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    path = (
+        shutil.which("chromium")
+        or shutil.which("chromium-browser")
+        or shutil.which("google-chrome")
+    )
     if path is None:
         pytest.skip("no Chromium is installed: apt install chromium")
     with sync_playwright() as play:
@@ -48,7 +52,9 @@ def shot(page, name):
 
 
 def holds(page, expression, seconds=30):
-    """Waits until an expression is true; the page's own policy forbids Playwright's way of waiting."""
+    """Waits until an expression is true; the page's own policy forbids Playwright's way of
+    waiting.
+    """
     for _ in range(seconds * 10):
         if page.evaluate(expression):
             return
@@ -71,7 +77,8 @@ def coloured(page):
 def dropped(page, name, content):
     """A file is let go over the map."""
     files = page.evaluate_handle(
-        "([name, text]) => { const d = new DataTransfer(); d.items.add(new File([text], name)); return d; }",
+        "([name, text]) => { const d = new DataTransfer(); d.items.add(new File([text], name));"
+        " return d; }",
         [name, json.dumps(content)],
     )
     for event in ("dragover", "drop"):
@@ -93,14 +100,16 @@ def test_the_map_appears_and_grows_and_everything_on_it_works(page, flight, tmp_
         site.until(lambda: set(site.states().values()) == {"refined"})
         holds(
             page,
-            "[...document.querySelectorAll('#photos .state')].filter(e => e.textContent == 'refined').length == 6",
+            "[...document.querySelectorAll('#photos .state')].filter(e => e.textContent =="
+            " 'refined').length == 6",
         )
         page.click("#fit")
         page.wait_for_timeout(1500)
         assert coloured(page) > 0.08
         shot(page, "grown")
 
-        # a click lists photos, the chosen one is marked, another can be chosen, full size is one click away
+        # a click lists photos, the chosen one is marked, another can be chosen, full size is one
+        # click away
         box = page.locator("#map").bounding_box()
         middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
         page.mouse.click(*middle)
@@ -123,8 +132,14 @@ def test_the_map_appears_and_grows_and_everything_on_it_works(page, flight, tmp_
         said = float(page.inner_text("#measured").split()[0])
         from pyproj import Geod
 
-        ends = [page.evaluate("(x) => { const p = skyquilt.map.containerPointToLatLng([x, 450]); return [p.lng, p.lat]; }",
-                              box["width"] / 2 + dx) for dx in (-100, 100)]  # fmt: skip
+        ends = [
+            page.evaluate(
+                "(x) => { const p = skyquilt.map.containerPointToLatLng([x, 450]); return [p.lng,"
+                " p.lat]; }",
+                box["width"] / 2 + dx,
+            )
+            for dx in (-100, 100)
+        ]
         true = Geod(ellps="WGS84").line_length(*zip(*ends, strict=True))
         assert said == pytest.approx(true, rel=2e-3)
         page.click("#area")
@@ -137,26 +152,40 @@ def test_the_map_appears_and_grows_and_everything_on_it_works(page, flight, tmp_
         page.click("#area")
 
         # a layer is chosen, shown, and its text stays text
-        layer = {"type": "Feature", "properties": {"what": "<img src=x onerror=alert(1)>"},
-                 "geometry": {"type": "Point", "coordinates": at}}  # fmt: skip
+        layer = {
+            "type": "Feature",
+            "properties": {"what": "<img src=x onerror=alert(1)>"},
+            "geometry": {"type": "Point", "coordinates": at},
+        }
         (tmp_path / "found.geojson").write_text(json.dumps(layer))
         page.set_input_files("#files", str(tmp_path / "found.geojson"))
         page.wait_for_selector("#overlays li")
         dropped(
             page,
             "area.geojson",
-            {**layer, "geometry": {"type": "LineString", "coordinates": [at, [at[0] + 1e-4, at[1]]]}},
+            {
+                **layer,
+                "geometry": {"type": "LineString", "coordinates": [at, [at[0] + 1e-4, at[1]]]},
+            },
         )
         holds(page, "document.querySelectorAll('#overlays li').length == 2")
-        assert site.web.get("/layers/area.geojson").json()["features"][0]["geometry"]["type"] == "LineString"
+        assert (
+            site.web.get("/layers/area.geojson").json()["features"][0]["geometry"]["type"]
+            == "LineString"
+        )
         page.mouse.click(*middle)
         page.wait_for_selector(".leaflet-popup")
         assert "<img src=x" in page.inner_text(".leaflet-popup")
         assert page.locator(".leaflet-popup img").count() == 0
 
         # two maps beside each other
-        site.until(lambda: "visible-newest" in [n["name"] for n in site.web.get("/info").json()["layers"]])
-        holds(page, "[...document.querySelector('#other').options].some(o => o.value == 'visible-newest')")
+        site.until(
+            lambda: "visible-newest" in [n["name"] for n in site.web.get("/info").json()["layers"]]
+        )
+        holds(
+            page,
+            "[...document.querySelector('#other').options].some(o => o.value == 'visible-newest')",
+        )
         page.click("#swipe")
         page.wait_for_selector("#handle:visible")
         before = page.evaluate("() => skyquilt.map.getPane('second').style.clip")
@@ -170,7 +199,9 @@ def test_the_map_appears_and_grows_and_everything_on_it_works(page, flight, tmp_
         page.click("#swipe")
         page.click("#rule")
         assert page.get_attribute("#rule", "aria-pressed") == "true"
-        page.evaluate("() => { const t = document.querySelector('#time'); t.value = 0; t.oninput(); }")
+        page.evaluate(
+            "() => { const t = document.querySelector('#time'); t.value = 0; t.oninput(); }"
+        )
         assert page.inner_text("#until") != "now"
         page.click("#export")
         assert page.errors == []
@@ -199,7 +230,9 @@ def test_two_spectra_lie_beside_each_other_on_either_side_of_the_handle(page, bo
             assert site.send(path).is_success
         site.until(lambda: all(p["ring"] for p in site.web.get("/photos").json()["photos"]))
         site.until(
-            lambda: not (site.live.queues.untried or site.live.showing.dirty or site.live.showing.later)
+            lambda: (
+                not (site.live.queues.untried or site.live.showing.dirty or site.live.showing.later)
+            )
         )
         page.goto(site.url)
         page.wait_for_selector("#link.live")
@@ -224,7 +257,8 @@ def test_two_spectra_lie_beside_each_other_on_either_side_of_the_handle(page, bo
         aside = round(handle["width"])
         assert 0.4 * box["width"] < middle < 0.6 * box["width"]
         for part, name in (
-            (np.s_[:, : middle - aside], "visible"), (np.s_[:, middle + aside :], "thermal")
-        ):  # fmt: skip
+            (np.s_[:, : middle - aside], "visible"),
+            (np.s_[:, middle + aside :], "thermal"),
+        ):
             assert (np.abs(both_shown[part] - alone[name][part]).max(-1) > 8).mean() < 0.002, name
         assert page.errors == []

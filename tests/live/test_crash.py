@@ -1,4 +1,6 @@
-"""Killed at any moment, the survey goes on where it was: nothing accepted is lost, nothing is half-written."""
+"""Killed at any moment, the survey goes on where it was: nothing accepted is lost, nothing is
+half-written.
+"""
 
 import json
 import os
@@ -20,9 +22,21 @@ OFTEN = 6
 
 
 def replay(out, photos, point="", count=1):
-    command = [sys.executable, "-m", "tests.live.crashing", str(out), str(photos), point, str(count)]
+    command = [
+        sys.executable,
+        "-m",
+        "tests.live.crashing",
+        str(out),
+        str(photos),
+        point,
+        str(count),
+    ]
     root = Path(__file__).resolve().parents[2]
-    env = {**os.environ, "PYTHONPATH": f"{root / 'src'}{os.pathsep}{root}", "OPENBLAS_NUM_THREADS": "1"}
+    env = {
+        **os.environ,
+        "PYTHONPATH": f"{root / 'src'}{os.pathsep}{root}",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
     return subprocess.run(
         command, cwd=root, env=env, capture_output=True, text=True, timeout=120, check=False
     )
@@ -30,7 +44,9 @@ def replay(out, photos, point="", count=1):
 
 @pytest.fixture(scope="module")
 def photos(flight, tmp_path_factory):
-    """Five photos, of which the second does not know where it was taken: it waits, is found and tried again."""
+    """Five photos, of which the second does not know where it was taken: it waits, is found and
+    tried again.
+    """
     folder = tmp_path_factory.mktemp("inbox")
     for path in flight.photos[:5]:
         shutil.copyfile(path, folder / path.name)
@@ -144,7 +160,9 @@ def small_disk(tmp_path):
     mount = shutil.which("mount")
     size = ["-t", "tmpfs", "-o", "size=3m", "tmpfs", str(folder)]
     if mount is None or subprocess.run([mount, *size], capture_output=True, check=False).returncode:
-        pytest.skip("no disk can be mounted here; a full one is played by failing writes in the tests above")
+        pytest.skip(
+            "no disk can be mounted here; a full one is played by failing writes in the tests above"
+        )
     yield folder
     subprocess.run([shutil.which("umount"), "--lazy", str(folder)], check=True)
 
@@ -183,7 +201,8 @@ def test_a_real_full_disk_refuses_and_loses_nothing(flight, small_disk):
             assert live.tiles.get(address) is not None
     order = [row[0] for row in live.ledger.rows("select name from photo order by id")]
     live.close()
-    # the disk has cost nothing but time: the same photos in the same order lie where they lie without it
+    # the disk has cost nothing but time: the same photos in the same order lie where they lie
+    # without it
     other = LiveMap(small_disk / "undisturbed", settings)
     for name in order:
         other.add(flight.folder / "photos" / name, "drone")

@@ -44,9 +44,25 @@ def finished(flight, tmp_path_factory):
     for path in flight.photos:
         shutil.copyfile(path, home / "in" / path.name)
     base = flight.folder / "truth" / "truth_ortho.tif"
-    words = ("live", home / "in", "-o", home / "out", "--finish", "--port", 0, "--json", "--features", 600)
+    words = (
+        "live",
+        home / "in",
+        "-o",
+        home / "out",
+        "--finish",
+        "--port",
+        0,
+        "--json",
+        "--features",
+        600,
+    )
     done = subprocess.run(
-        command(*words, "--base", base), capture_output=True, text=True, timeout=300, env=ENV, check=False
+        command(*words, "--base", base),
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=ENV,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     return [json.loads(line) for line in done.stdout.splitlines()], home / "out"
@@ -78,7 +94,9 @@ def warped(path, z, x, y):
     options = {"crs": "EPSG:3857", "transform": transform, "width": 256, "height": 256}
     with (
         rasterio.open(path) as raster,
-        WarpedVRT(raster, resampling=Resampling.bilinear, add_alpha=raster.count == 3, **options) as vrt,
+        WarpedVRT(
+            raster, resampling=Resampling.bilinear, add_alpha=raster.count == 3, **options
+        ) as vrt,
     ):
         return np.dstack([*vrt.read([1, 2, 3]), vrt.dataset_mask()]).astype(float)
 
@@ -113,7 +131,8 @@ def test_finish_ends_with_both_maps(finished, flight):
         assert not info["growing"]
         x, y = tile_of(*middle(Web(web)), 19)
         live, final = (shown(web, layer, 19, x, y) for layer in ("visible", "finished"))
-        # two ways to one map of one ground: they agree best where they lie on each other, to half a metre
+        # two ways to one map of one ground: they agree best where they lie on each other, to half a
+        # metre
         shifts = [(dy, dx) for dy in range(-12, 13, 3) for dx in range(-12, 13, 3)]
         fits = [alike(live, np.roll(final, shift, axis=(0, 1))) for shift in shifts]
         assert np.hypot(*shifts[int(np.argmax(fits))]) < 4
@@ -178,7 +197,11 @@ def test_view_is_a_command_that_only_looks(finished):
     assert process.returncode == 130
     assert before == {p: p.stat().st_mtime_ns for p in finished[1].rglob("*.tif")}
     nothing = subprocess.run(
-        command("view", Path(finished[1]) / "photos"), capture_output=True, text=True, env=ENV, check=False
+        command("view", Path(finished[1]) / "photos"),
+        capture_output=True,
+        text=True,
+        env=ENV,
+        check=False,
     )
     assert nothing.returncode not in (0, 1)
     assert "neither a live survey" in nothing.stderr
@@ -192,7 +215,9 @@ def test_the_button_makes_the_final_map_and_mapping_goes_on(flight, tmp_path):
         site.until(lambda: list(site.states().values()) == ["refined"] * 4)
         assert site.web.post("/finish").json() == {"state": "asked"}
         site.until(lambda: site.web.get("/info").json()["finish"] == "done", 120)
-        told = [json.loads(b)["state"] for _, k, b in site.live.ledger.told(0, 10000) if k == "finish"]
+        told = [
+            json.loads(b)["state"] for _, k, b in site.live.ledger.told(0, 10000) if k == "finish"
+        ]
         assert told == ["asked", "running", "done"]
         assert "finished" in [n["name"] for n in site.web.get("/info").json()["layers"]]
         site.send(flight.photos[4])
@@ -200,4 +225,7 @@ def test_the_button_makes_the_final_map_and_mapping_goes_on(flight, tmp_path):
         # asked again, the new photo takes part
         site.web.post("/finish")
         site.until(lambda: site.web.get("/info").json()["finish"] == "done", 120)
-        assert json.loads((tmp_path / "out" / "finished" / "metrics.json").read_text())["photos_used"] == 5
+        assert (
+            json.loads((tmp_path / "out" / "finished" / "metrics.json").read_text())["photos_used"]
+            == 5
+        )

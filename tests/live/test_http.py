@@ -47,7 +47,9 @@ def middle(site):
 
 def tile_of(lon, lat, z):
     n, phi = 2**z, np.radians(lat)
-    return int((lon + 180) / 360 * n), int((1 - np.log(np.tan(phi) + 1 / np.cos(phi)) / np.pi) / 2 * n)
+    return int((lon + 180) / 360 * n), int(
+        (1 - np.log(np.tan(phi) + 1 / np.cos(phi)) / np.pi) / 2 * n
+    )
 
 
 def test_tiles_tilejson_and_info(site):
@@ -93,8 +95,18 @@ def test_wms_as_a_desktop_gis_asks(site, version, crs):
     bbox = ",".join(box.get(k) for k in ("minx", "miny", "maxx", "maxy"))
     if crs == "EPSG:4326":  # 1.3.0 puts the latitude first
         assert (float(box.get("minx")) > 40) == (version == "1.3.0")
-    want = {**base, "REQUEST": "GetMap", "LAYERS": "visible", "STYLES": "", tag: crs, "BBOX": bbox, "WIDTH": 300,
-            "HEIGHT": 300, "FORMAT": "image/png", "TRANSPARENT": "TRUE"}  # fmt: skip
+    want = {
+        **base,
+        "REQUEST": "GetMap",
+        "LAYERS": "visible",
+        "STYLES": "",
+        tag: crs,
+        "BBOX": bbox,
+        "WIDTH": 300,
+        "HEIGHT": 300,
+        "FORMAT": "image/png",
+        "TRANSPARENT": "TRUE",
+    }
     answer = site.web.get("/wms", params=want)
     assert answer.headers["content-type"] == "image/png"
     with Image.open(io.BytesIO(answer.content)) as image:
@@ -118,7 +130,9 @@ def test_wms_as_a_desktop_gis_asks(site, version, crs):
 
 
 def recorded():
-    """(version, CRS) and queries, in order, of what a real QGIS asked; the first picture of a group is the whole map."""
+    """(version, CRS) and queries, in order, of what a real QGIS asked; the first picture of a group
+    is the whole map.
+    """
     groups = {}
     lines = (Path(__file__).parent / "qgis_3_22.txt").read_text().splitlines()
     for line in lines[1:]:
@@ -131,7 +145,9 @@ def recorded():
 
 @pytest.mark.parametrize(("version", "crs"), list(recorded()))
 def test_the_requests_of_a_real_qgis(site, version, crs):
-    """Replayed with this map's extent in place of the one that was recorded; closer views show a part of the whole."""
+    """Replayed with this map's extent in place of the one that was recorded; closer views show a
+    part of the whole.
+    """
     asked = {"SERVICE": "WMS", "REQUEST": "GetCapabilities"} | (
         {"VERSION": version} if version != "1.3.0" else {}
     )
@@ -147,9 +163,9 @@ def test_the_requests_of_a_real_qgis(site, version, crs):
     whole = np.array([float(v) for v in queries[0]["BBOX"].split(",")])
     pictures = []
     for query in queries:
-        part = (np.array([float(v) for v in query["BBOX"].split(",")]) - whole[[0, 1, 0, 1]]) / np.tile(
-            whole[2:] - whole[:2], 2
-        )
+        part = (
+            np.array([float(v) for v in query["BBOX"].split(",")]) - whole[[0, 1, 0, 1]]
+        ) / np.tile(whole[2:] - whole[:2], 2)
         bbox = own[[0, 1, 0, 1]] + part * np.tile(own[2:] - own[:2], 2)
         sent = {**query, tag: here, "LAYERS": "visible", "BBOX": ",".join(map(repr, bbox.tolist()))}
         answer = site.web.get("/wms", params=sent)
@@ -171,8 +187,9 @@ def test_the_requests_of_a_real_qgis(site, version, crs):
 
 
 def test_the_requests_of_mission_planner(site):
-    """As its source makes them and checks the answers (ArduPilot/MissionPlanner: ExtLibs/Maps/WMSProvider.cs and
-    GCSViews/FlightPlanner.cs): capabilities asked for as 1.1.0, then tiles in degrees, as 1.1.1.
+    """As its source makes them and checks the answers (ArduPilot/MissionPlanner:
+    ExtLibs/Maps/WMSProvider.cs and GCSViews/FlightPlanner.cs): capabilities asked for as 1.1.0,
+    then tiles in degrees, as 1.1.1.
     """
     answer = site.web.get("/wms?version=1.1.0&Request=GetCapabilities&service=WMS")
     root = ElementTree.fromstring(answer.content)
@@ -189,13 +206,15 @@ def test_the_requests_of_mission_planner(site):
     north, south = (
         math.degrees(math.atan(math.sinh(math.pi * (1 - n / 2 ** (zoom - 1))))) for n in (y, y + 1)
     )
-    query = (
-        f"VERSION=1.1.1&REQUEST=GetMap&SERVICE=WMS&layers=visible&styles=&bbox={west},{south},{east},{north}"
-    )
+    bbox = f"{west},{south},{east},{north}"
+    query = f"VERSION=1.1.1&REQUEST=GetMap&SERVICE=WMS&layers=visible&styles=&bbox={bbox}"
     answer = site.web.get(f"/wms?{query}&width=256&height=256&srs=EPSG:4326&format=image/png")
     assert answer.status_code == 200 and answer.headers["content-type"] == "image/png"
     tile = site.web.get(f"/tiles/{zoom}/{x}/{y}")
-    with Image.open(io.BytesIO(answer.content)) as image, Image.open(io.BytesIO(tile.content)) as like:
+    with (
+        Image.open(io.BytesIO(answer.content)) as image,
+        Image.open(io.BytesIO(tile.content)) as like,
+    ):
         seen, expected = (np.asarray(i.convert("RGBA")).astype(float) for i in (image, like))
     shown = expected[..., 3] == 255
     assert shown.mean() > 0.2
@@ -227,7 +246,9 @@ def test_files_for_other_programs(site):
     Publishing(survey, site.folder).step(now=True)
     with sqlite3.connect(site.folder / "map.mbtiles") as db:
         about = dict(db.execute("select name, value from metadata"))
-        z, x, y, data = db.execute("select * from tiles order by zoom_level desc limit 1").fetchone()
+        z, x, y, data = db.execute(
+            "select * from tiles order by zoom_level desc limit 1"
+        ).fetchone()
     assert about["format"] == "webp"
     assert z == int(about["maxzoom"])
     assert data == site.web.get(f"/tiles/{z}/{x}/{2**z - 1 - y}").content
@@ -259,13 +280,20 @@ def test_news_can_be_taken_up_where_they_were_lost(site):
 
 def test_resumable_uploads_go_on_after_a_lost_connection(site, flight):
     data = flight.photos[4].read_bytes()
-    held = site.web.post("/photos/uploads", params={"name": "r.jpg", "size": len(data)}).json()["id"]
+    held = site.web.post("/photos/uploads", params={"name": "r.jpg", "size": len(data)}).json()[
+        "id"
+    ]
     place = f"/photos/uploads/{held}"
     half = len(data) // 2
-    assert site.web.patch(place, content=data[:half], headers={"Upload-Offset": "0"}).json()["offset"] == half
+    assert (
+        site.web.patch(place, content=data[:half], headers={"Upload-Offset": "0"}).json()["offset"]
+        == half
+    )
     assert site.web.patch(place, content=data, headers={"Upload-Offset": "0"}).status_code == 409
     assert site.web.head(place).headers["upload-offset"] == str(half)
-    assert site.web.patch(place, content=data, headers={"Upload-Offset": str(half)}).status_code == 413
+    assert (
+        site.web.patch(place, content=data, headers={"Upload-Offset": str(half)}).status_code == 413
+    )
     offset = int(site.web.head(place).headers["upload-offset"])
     done = site.web.patch(place, content=data[offset:], headers={"Upload-Offset": str(offset)})
     assert done.status_code == 201
@@ -273,7 +301,8 @@ def test_resumable_uploads_go_on_after_a_lost_connection(site, flight):
     assert site.web.head("/photos/uploads/..%2F..%2Fetc").status_code in (404, 405)
 
 
-# -- bad input ------------------------------------------------------------------------------------------------
+# -- bad input
+# ------------------------------------------------------------------------------------------------
 
 
 def png_that_claims(width, height):
@@ -281,7 +310,9 @@ def png_that_claims(width, height):
     import zlib
 
     def chunk(kind, data):
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     return (
@@ -324,18 +355,23 @@ def test_too_large_is_refused_before_and_while_it_comes(site):
 
 
 @pytest.mark.parametrize(
-    "name", ["../../evil.jpg", "/etc/passwd", "..\\..\\evil.jpg", "a\x00b.jpg", "x" * 5000 + ".jpg", ""]
+    "name",
+    ["../../evil.jpg", "/etc/passwd", "..\\..\\evil.jpg", "a\x00b.jpg", "x" * 5000 + ".jpg", ""],
 )
 def test_names_are_never_paths(site, name, tmp_path):
     before = {
-        p for p in site.folder.parent.rglob("*") if p.suffix not in (".db-wal", ".db-shm", ".npz", ".partial")
+        p
+        for p in site.folder.parent.rglob("*")
+        if p.suffix not in (".db-wal", ".db-shm", ".npz", ".partial")
     }
     answer = site.web.post("/photos", params={"name": name}, content=b"nothing of the kind")
     assert answer.status_code == 422
     assert not re.search(r"[/\\\x00]", answer.json()["name"])
     assert len(answer.json()["name"]) <= 200
     after = {
-        p for p in site.folder.parent.rglob("*") if p.suffix not in (".db-wal", ".db-shm", ".npz", ".partial")
+        p
+        for p in site.folder.parent.rglob("*")
+        if p.suffix not in (".db-wal", ".db-shm", ".npz", ".partial")
     }
     assert after <= before
 
@@ -368,12 +404,18 @@ def test_other_sites_may_not_write_nor_point_here(site, flight):
 @pytest.mark.parametrize(
     ("body", "word"),
     [
-        (b"{", "no JSON"), (b"[1]", "no GeoJSON"), (b'{"type": "Topology"}', "FeatureCollection"),
-        (b'{"type": "Point", "coordinates": [1e9, 0]}', "degrees"), (b'{"type": "Point", "coordinates": [NaN, 0]}', "NaN"),
+        (b"{", "no JSON"),
+        (b"[1]", "no GeoJSON"),
+        (b'{"type": "Topology"}', "FeatureCollection"),
+        (b'{"type": "Point", "coordinates": [1e9, 0]}', "degrees"),
+        (b'{"type": "Point", "coordinates": [NaN, 0]}', "NaN"),
         (b'{"type": "Polygon", "coordinates": ' + b"[" * 50000 + b"]" * 50000 + b"}", ""),
-        (b'{"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": null}]}', "geometry"),
+        (
+            b'{"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": null}]}',
+            "geometry",
+        ),
     ],
-)  # fmt: skip
+)
 def test_layers_that_are_none(site, body, word):
     answer = site.web.post("/layers", params={"name": "x"}, content=body)
     assert answer.status_code == 422, answer.text
@@ -400,7 +442,9 @@ def test_a_flood_of_tiny_requests_is_answered_and_nothing_is_lost(site):
     bad = [b"", b"\xff\xd8\xff", b"\xff\xd8\xff\xd9", b"II*\x00"]
     codes = {site.web.post("/photos", content=bad[k % 4]).status_code for k in range(200)}
     assert codes == {422}
-    after = site.states()  # what was placed may be refined meanwhile, and nothing else may happen to it
+    after = (
+        site.states()
+    )  # what was placed may be refined meanwhile, and nothing else may happen to it
     assert all(after[k] == v or (v, after[k]) == ("placed", "refined") for k, v in before.items())
     assert site.web.get("/info").json()["counts"]["refused"] == refused + 200
 
@@ -408,7 +452,9 @@ def test_a_flood_of_tiny_requests_is_answered_and_nothing_is_lost(site):
 @pytest.mark.slow
 def test_ten_thousand_tiny_requests(site):
     before = site.states()
-    web = http.client.HTTPConnection("127.0.0.1", int(site.url.rsplit(":", 1)[1].strip("/")), timeout=30)
+    web = http.client.HTTPConnection(
+        "127.0.0.1", int(site.url.rsplit(":", 1)[1].strip("/")), timeout=30
+    )
     codes = set()
     for k in range(10_000):
         web.request(*(("GET", f"/photos/{k + 100}") if k % 2 else ("POST", "/layers?name=n", b"")))
@@ -426,10 +472,16 @@ def test_a_token_guards_writing_and_only_writing(flight, tmp_path):
     with pytest.raises(UsageError, match="at least 8"):
         Guard(host="0.0.0.0", token="short")
     with served(tmp_path / "out", QUICK, guard=Guard(token="long enough")) as site:
-        for headers in ({"X-Token": "wrong one"}, {"X-Token": ""}, {"Authorization": "Bearer nonsense"}):
+        for headers in (
+            {"X-Token": "wrong one"},
+            {"X-Token": ""},
+            {"Authorization": "Bearer nonsense"},
+        ):
             assert site.send(flight.photos[0], headers=headers).status_code == 401
             assert (
-                site.web.post("/layers", params={"name": "x"}, content=b"{}", headers=headers).status_code
+                site.web.post(
+                    "/layers", params={"name": "x"}, content=b"{}", headers=headers
+                ).status_code
                 == 401
             )
             assert site.web.post("/finish", headers=headers).status_code == 401

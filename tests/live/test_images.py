@@ -15,7 +15,9 @@ def test_tiles_that_touch_a_box_are_found_as_rectangles_say():
     slow = []
     for tile in tiles.astype(int).tolist():
         west, south, east, north = mercator(*tile)
-        slow.append(any(west < b[2] and east > b[0] and south < b[3] and north > b[1] for b in boxes))
+        slow.append(
+            any(west < b[2] and east > b[0] and south < b[3] and north > b[1] for b in boxes)
+        )
     found = _meet(tiles, boxes)
     assert found.tolist() == slow
     assert 0.01 < found.mean() < 0.9

@@ -24,7 +24,9 @@ def test_a_small_picture_is_made_once(live, monkeypatch):
     longest = canvas._pictures.longest(member, canvas.gsd, canvas.ground)
     assert max(first.shape) == longest < max(member.photo.width, member.photo.height)
     expected = shrink(read_color(member.photo), longest)[0]
-    assert np.sqrt(((first.astype(float) - expected) ** 2).mean()) < 4  # JPEG, and another way of halving
+    assert (
+        np.sqrt(((first.astype(float) - expected) ** 2).mean()) < 4
+    )  # JPEG, and another way of halving
     assert len(list((live.store.folder / STAGE).glob("*.npz"))) == 1
 
     monkeypatch.setattr(pictures, "read_color", None)  # a photo is not decoded again

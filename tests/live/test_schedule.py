@@ -19,7 +19,9 @@ def blocks_of(*sizes, closed=(), since=1, loop=None):
             by_id[i] = SimpleNamespace(links={i - 1, i + 1} & sets[first], pose=object())
         first += size
     block_of = {i: name for name, ids in sets.items() for i in ids}
-    members = SimpleNamespace(blocks=sets, by_id=by_id, block_of=block_of, block=lambda i: sets[block_of[i]])
+    members = SimpleNamespace(
+        blocks=sets, by_id=by_id, block_of=block_of, block=lambda i: sets[block_of[i]]
+    )
     schedule = Schedule(closed_at=dict(zip(sets, closed, strict=False)), since=since, loop=loop)
     parts = methods(MosaicSettings())
     blocks = Blocks(members, schedule, LiveSettings(), Path(), Path(), parts)
@@ -30,7 +32,9 @@ def blocks_of(*sizes, closed=(), since=1, loop=None):
 def test_every_block_is_bundled_as_it_grows_not_only_the_largest():
     blocks = blocks_of(13, 12, 7, closed=(10, 9, 6))
     ids, held = blocks.due(0.0, idle=False)
-    assert ids == list(range(14, 26)) and not held  # grown by 12 / 9; the largest by 13 / 10, just as due
+    assert (
+        ids == list(range(14, 26)) and not held
+    )  # grown by 12 / 9; the largest by 13 / 10, just as due
     assert blocks.schedule.closed_at == {1: 10, 14: 12, 26: 6}
     blocks.schedule.since = 1
     assert blocks.due(0.0, idle=False)[0] == list(range(1, 14))

@@ -50,7 +50,10 @@ def test_two_drones_a_yaw_lie_losses_and_disorder_make_one_coherent_map(drones, 
     assert (rms[:2] < 0.8).all()
     turns = [
         angle_difference_deg(
-            *(angles_from_cam_R_map(R)[0] for R in (m.pose.cam_R_map, drones.rotation(m.photo.name)))
+            *(
+                angles_from_cam_R_map(R)[0]
+                for R in (m.pose.cam_R_map, drones.rotation(m.photo.name))
+            )
         )
         for m in live.members.on_map()
     ]
@@ -208,7 +211,8 @@ def test_a_photo_without_position_waits_and_is_placed_by_its_links(flight, tmp_p
 @pytest.mark.slow
 def test_equal_photos_in_equal_order_give_equal_poses(flight, tmp_path):
     one, other = (
-        mapped(tmp_path / name, flight.photos, deterministic=True, features=600) for name in ("a", "b")
+        mapped(tmp_path / name, flight.photos, deterministic=True, features=600)
+        for name in ("a", "b")
     )
     for i, m in one.members.by_id.items():
         assert np.array_equal(m.pose.map_C, other.members.by_id[i].pose.map_C)

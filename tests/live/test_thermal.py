@@ -53,11 +53,14 @@ def measured(live, both):
     rows, columns = rows[chosen], columns[chosen]
     x, y = part.west + (columns + 0.5) * part.gsd, part.north - (rows + 0.5) * part.gsd
     with rasterio.open(both.folder / "truth" / "truth_thermal.tif") as truth:
-        true = np.array(list(truth.sample(zip(x, y, strict=True))))[:, 0].astype(float) / 100 - 273.15
+        true = (
+            np.array(list(truth.sample(zip(x, y, strict=True))))[:, 0].astype(float) / 100 - 273.15
+        )
     known = true > -100
     assert known.mean() > 0.5
     seen = part.pixels[rows, columns, 0].astype(float)
     off = seen[known] - true[known]
-    # places are off by the positions' 2 m, frames by 0.2 K: over fields, half of all points hardly notice
+    # places are off by the positions' 2 m, frames by 0.2 K: over fields, half of all points hardly
+    # notice
     assert abs(np.median(off)) < 0.4
     assert np.corrcoef(seen[known], true[known])[0, 1] > 0.6

@@ -12,7 +12,9 @@ from skyquilt.model.features import Features
 def features(descriptors, px=None, binary=False):
     n = len(descriptors)
     px = np.zeros((n, 2)) if px is None else px
-    return Features(px=px, size=np.ones(n, np.float32), descriptors=descriptors, scale=1.0, binary=binary)
+    return Features(
+        px=px, size=np.ones(n, np.float32), descriptors=descriptors, scale=1.0, binary=binary
+    )
 
 
 def pair(seed, binary=False, n=60):
@@ -34,7 +36,10 @@ def distances(a, b, binary):
     """Slowly, one pair at a time."""
     if binary:
         return np.array(
-            [[sum(bin(int(x ^ y)).count("1") for x, y in zip(p, q, strict=True)) for q in b] for p in a]
+            [
+                [sum(bin(int(x ^ y)).count("1") for x, y in zip(p, q, strict=True)) for q in b]
+                for p in a
+            ]
         )
     unit = [d / np.linalg.norm(d, axis=1, keepdims=True) for d in (a, b)]
     return np.array([[np.linalg.norm(p - q) for q in unit[1]] for p in unit[0]])
@@ -84,7 +89,9 @@ def test_guidance_finds_what_repeats():
     wrong = Guided(radius_px=30)(fa, fb, px + shift + 200)
     assert len(wrong) < 5
     unknown = np.where(np.arange(100)[:, None] < 50, px + shift, np.nan)
-    assert set(Guided(radius_px=30)(fa, fb, unknown).index_a) == set(found.index_a[found.index_a < 50])
+    assert set(Guided(radius_px=30)(fa, fb, unknown).index_a) == set(
+        found.index_a[found.index_a < 50]
+    )
 
 
 def test_nothing_and_kinds():

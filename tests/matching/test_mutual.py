@@ -12,9 +12,15 @@ from skyquilt.model.features import Features
 
 def unit(seed, count, dimension=32, base=None, noise=0.0):
     rng = np.random.default_rng(seed)
-    d = rng.normal(0, 1, (count, dimension)) if base is None else base + rng.normal(0, noise, base.shape)
+    d = (
+        rng.normal(0, 1, (count, dimension))
+        if base is None
+        else base + rng.normal(0, noise, base.shape)
+    )
     d = (d / np.linalg.norm(d, axis=1, keepdims=True)).astype(np.float32)
-    return Features(px=np.zeros((len(d), 2)), size=np.ones(len(d), np.float32), descriptors=d, scale=1.0)
+    return Features(
+        px=np.zeros((len(d), 2)), size=np.ones(len(d), np.float32), descriptors=d, scale=1.0
+    )
 
 
 def pairs(matches):
@@ -45,16 +51,20 @@ def test_against_opencv_with_cross_check():
     a = unit(0, 400, 128)
     b = unit(1, 400, 128, base=a.descriptors.astype(float), noise=0.06)
     b = Features(
-        px=b.px, size=b.size, scale=1.0, descriptors=np.r_[b.descriptors[::-1], unit(2, 200, 128).descriptors]
+        px=b.px,
+        size=b.size,
+        scale=1.0,
+        descriptors=np.r_[b.descriptors[::-1], unit(2, 200, 128).descriptors],
     )
     crossed = {
         (m.queryIdx, m.trainIdx)
         for m in cv2.BFMatcher(cv2.NORM_L2, crossCheck=True).match(a.descriptors, b.descriptors)
     }
     clear = {
-        (m.queryIdx, m.trainIdx) for m, n in cv2.BFMatcher(cv2.NORM_L2).knnMatch(a.descriptors, b.descriptors, k=2)
+        (m.queryIdx, m.trainIdx)
+        for m, n in cv2.BFMatcher(cv2.NORM_L2).knnMatch(a.descriptors, b.descriptors, k=2)
         if m.distance < 0.85 * n.distance
-    }  # fmt: skip
+    }
     found = pairs(Mutual(ratio=0.85)(a, b))
     assert found == crossed & clear
     assert len(found) > 300

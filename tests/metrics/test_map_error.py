@@ -19,7 +19,13 @@ def write(path, grey, *, gsd=GSD, west=WEST, north=NORTH, known=None, crs="EPSG:
     if known is not None:
         bands.append(np.uint8(known) * 255)
     height, width = grey.shape
-    profile = {"driver": "GTiff", "width": width, "height": height, "count": len(bands), "dtype": "uint8"}
+    profile = {
+        "driver": "GTiff",
+        "width": width,
+        "height": height,
+        "count": len(bands),
+        "dtype": "uint8",
+    }
     place = {"crs": crs, "transform": from_origin(west, north, gsd, gsd)}
     with rasterio.open(
         path, "w", **profile, **place, photometric="RGB", alpha="YES" if known is not None else "NO"
@@ -52,7 +58,9 @@ def test_identical_rasters_have_no_error(tmp_path, ground):
 def test_a_shifted_map_is_all_bias(tmp_path, ground, shift):
     rng = np.random.default_rng(0)
     moved = displaced(ground, *shift) * 0.8 + 20 + rng.normal(0, 2, ground.shape)
-    result = map_error(write(tmp_path / "m.tif", moved), write(tmp_path / "t.tif", ground), points=100)
+    result = map_error(
+        write(tmp_path / "m.tif", moved), write(tmp_path / "t.tif", ground), points=100
+    )
     assert result.measured > 0.9 * result.attempted > 50
     assert result.bias_x_m == pytest.approx(shift[0] * GSD, abs=0.05 * GSD)
     assert result.bias_y_m == pytest.approx(-shift[1] * GSD, abs=0.05 * GSD)  # rows run south
@@ -64,7 +72,9 @@ def test_a_warped_map_gives_back_its_field(tmp_path, ground):
     y, x = np.mgrid[: ground.shape[0], : ground.shape[1]]
     dx, dy = 30 + 12 * np.sin(x / 250), -10 + 0.012 * (y - 600)
     moved = displaced(ground, dx, dy)
-    result = map_error(write(tmp_path / "m.tif", moved), write(tmp_path / "t.tif", ground), points=150)
+    result = map_error(
+        write(tmp_path / "m.tif", moved), write(tmp_path / "t.tif", ground), points=150
+    )
     assert result.measured > 0.9 * result.attempted
     inner = [s for s in result.samples if s.ok and WEST + 6 < s.x < WEST + 74]
     column = np.array([(s.x - WEST) / GSD - 0.5 for s in inner])
@@ -82,7 +92,9 @@ def test_grids_may_differ_and_voids_are_left_out(tmp_path, ground):
     known[:, :500] = False
     mosaic = write(tmp_path / "m.tif", np.where(known, ground, 0), known=known)
     half = cv2.resize(ground, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)[40:, 60:]
-    truth = write(tmp_path / "t.tif", half, gsd=GSD / 2, west=WEST + 30 * GSD, north=NORTH - 20 * GSD)
+    truth = write(
+        tmp_path / "t.tif", half, gsd=GSD / 2, west=WEST + 30 * GSD, north=NORTH - 20 * GSD
+    )
     result = map_error(mosaic, truth, points=100)
     assert 50 < result.attempted < 75
     assert result.measured > 0.95 * result.attempted
@@ -91,7 +103,9 @@ def test_grids_may_differ_and_voids_are_left_out(tmp_path, ground):
 
 
 def test_another_place_altogether_is_not_given_figures(tmp_path, ground):
-    result = map_error(write(tmp_path / "m.tif", ground[::-1]), write(tmp_path / "t.tif", ground), points=64)
+    result = map_error(
+        write(tmp_path / "m.tif", ground[::-1]), write(tmp_path / "t.tif", ground), points=64
+    )
     assert result.attempted > 10
     assert result.measured <= 2
 

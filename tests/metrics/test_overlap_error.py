@@ -13,7 +13,9 @@ def shifted(x, y=0.0):
 def test_a_shift_is_its_length():
     assert overlap_error(shifted(13, 4), shifted(10), (100, 120), (100, 120)) == pytest.approx(5)
     assert overlap_error(np.eye(3), np.eye(3), (100, 120), (100, 120)) == 0
-    assert overlap_error(7 * shifted(13, 4), shifted(10), (100, 120), (100, 120)) == pytest.approx(5)
+    assert overlap_error(7 * shifted(13, 4), shifted(10), (100, 120), (100, 120)) == pytest.approx(
+        5
+    )
 
 
 def test_only_the_overlap_counts():

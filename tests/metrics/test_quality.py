@@ -11,7 +11,12 @@ from skyquilt.metrics.correlation import (
     lambda_spat_of_table,
 )
 from skyquilt.metrics.geolocation import geolocation_errors, gps_residuals
-from skyquilt.metrics.registration_quality import eta, four_lengths, mean_squared_error, spread_quality
+from skyquilt.metrics.registration_quality import (
+    eta,
+    four_lengths,
+    mean_squared_error,
+    spread_quality,
+)
 from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior, no_ties
 
 REFERENCE = (31, 37.9, 51.75)
@@ -100,18 +105,29 @@ def test_geolocation_errors_by_hand():
 
 def prior(C):
     return Prior(
-        map_C=np.array(C, float), sigma_C=np.ones(3), yaw_deg=0, pitch_deg=0, roll_deg=0, sigma_yaw_deg=5,
+        map_C=np.array(C, float),
+        sigma_C=np.ones(3),
+        yaw_deg=0,
+        pitch_deg=0,
+        roll_deg=0,
+        sigma_yaw_deg=5,
         sigma_tilt_deg=1,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize(("datum", "z"), [("takeoff", -1), ("control", 0)])
 def test_gps_residuals_are_of_photos_held_by_ties(datum, z):
     frame = MapFrame(crs=None, origin=(0, 0), vertical_datum=datum)
     alignment = Alignment(
-        method="bundle", why="", frame=frame, cameras={}, camera_of={}, blocks=((0, 1, 2), (3,)), ties=no_ties(),
+        method="bundle",
+        why="",
+        frame=frame,
+        cameras={},
+        camera_of={},
+        blocks=((0, 1, 2), (3,)),
+        ties=no_ties(),
         poses={k: Pose(cam_R_map=np.eye(3), map_C=np.full(3, float(k))) for k in range(4)},
-    )  # fmt: skip
+    )
     priors = [prior((0, 1, 1)), prior((np.nan,) * 3), prior((1, 2, np.nan)), prior((9, 9, 9))]
     expected = [(0, -1, z), (np.nan,) * 3, (1, 0, np.nan)]
     np.testing.assert_array_equal(gps_residuals(alignment, priors), expected)

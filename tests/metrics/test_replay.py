@@ -13,11 +13,18 @@ GROUND = texture(120, 300, seed=2)
 
 def photo(column, *, put=None, noise=0.0, seed=0):
     """A photo of columns `column` to `column + 100`, put where it belongs or elsewhere."""
-    pixels = GROUND[:, column : column + 100] + noise * np.random.default_rng(seed).normal(size=(120, 100))
+    pixels = GROUND[:, column : column + 100] + noise * np.random.default_rng(seed).normal(
+        size=(120, 100)
+    )
     central = np.zeros((120, 100), bool)
     central[30:90, 25:75] = True
-    return Patch(column=column if put is None else put, row=0, pixels=pixels.astype(np.float32),
-                 shown=np.ones((120, 100), bool), central=central)  # fmt: skip
+    return Patch(
+        column=column if put is None else put,
+        row=0,
+        pixels=pixels.astype(np.float32),
+        shown=np.ones((120, 100), bool),
+        central=central,
+    )
 
 
 def test_photos_in_their_place_correlate_fully():

@@ -19,8 +19,10 @@ def voronoi(count, size=300, seed=0):
 
 
 def neighbours(labels):
-    touching = [np.stack([labels[1:], labels[:-1]], -1).reshape(-1, 2),
-                np.stack([labels[:, 1:], labels[:, :-1]], -1).reshape(-1, 2)]  # fmt: skip
+    touching = [
+        np.stack([labels[1:], labels[:-1]], -1).reshape(-1, 2),
+        np.stack([labels[:, 1:], labels[:, :-1]], -1).reshape(-1, 2),
+    ]
     pairs = np.sort(np.concatenate(touching), axis=1)
     pairs = pairs[(pairs[:, 0] != pairs[:, 1]) & (pairs[:, 0] > 0)]
     return {tuple(p) for p in np.unique(pairs, axis=0).tolist()}
@@ -77,14 +79,18 @@ def points_of(count):
 
 
 def shifted(s, *, flat=0, unrelated=0, unseen=0, gain=0.8):
-    """A patch source whose photo b lies s = (dy, dx) quarter px beside photo a; some patches spoilt."""
+    """A patch source whose photo b lies s = (dy, dx) quarter px beside photo a; some patches
+    spoilt.
+    """
     fine = texture(1000, 1000)
     rng = np.random.default_rng(0)
 
     def cut(points):
         at = rng.integers(40, 700, (len(points), 2))
         a = np.array([seen(fine, r, c) for r, c in at])
-        b = np.array([seen(fine, r - s[0], c - s[1]) for r, c in at]) * gain + rng.normal(0, 1, a.shape)
+        b = np.array([seen(fine, r - s[0], c - s[1]) for r, c in at]) * gain + rng.normal(
+            0, 1, a.shape
+        )
         is_seen = np.ones(len(points), bool)
         b[:flat] = 50
         b[flat : flat + unrelated] = b[flat : flat + unrelated, ::-1, ::-1]

@@ -16,5 +16,7 @@ def test_coordinates_apart_are_those_together(cam_H_map):
     x, y = np.meshgrid(np.linspace(-50, 50, 7), np.linspace(-40, 40, 5))
     z = np.random.default_rng(0).uniform(-3, 3, (2, 5, 7))
     together = pose.to_camera(np.stack(np.broadcast_arrays(x, y, z), -1))
-    for apart, expected in zip(pose.planes_to_camera(x, y, z), np.moveaxis(together, -1, 0), strict=True):
+    for apart, expected in zip(
+        pose.planes_to_camera(x, y, z), np.moveaxis(together, -1, 0), strict=True
+    ):
         assert np.allclose(np.broadcast_to(apart, z.shape), expected, rtol=1e-12, atol=1e-12)

@@ -1,4 +1,6 @@
-"""Candidate pairs against brute force, and what retrieval finds of simulated photos that overlap."""
+"""Candidate pairs against brute force, and what retrieval finds of simulated photos that
+overlap.
+"""
 
 import numpy as np
 import pytest
@@ -53,14 +55,18 @@ def test_sequence():
 
 @pytest.fixture(scope="module")
 def flown():
-    """36 photos of 240 x 180 px in a grid over one ground, 60 % overlap, light and heading different."""
+    """36 photos of 240 x 180 px in a grid over one ground, 60 % overlap, light and heading
+    different.
+    """
     ground = texture(1000, 1200, seed=9)
     rng = np.random.default_rng(9)
     features, corner = [], []
     for row in range(6):
         for column in range(6):
             y, x = row * 72 + rng.integers(0, 10), column * 96 + rng.integers(0, 10)
-            view = ground[y : y + 180, x : x + 240] * rng.uniform(0.8, 1.2) + rng.normal(0, 3, (180, 240))
+            view = ground[y : y + 180, x : x + 240] * rng.uniform(0.8, 1.2) + rng.normal(
+                0, 3, (180, 240)
+            )
             if column % 2:
                 view = view[::-1, ::-1]
             features.append(Sift(count=300)(np.clip(view, 0, 255).astype(np.uint8)))
@@ -95,8 +101,16 @@ def test_retrieval_for_the_lost_only(flown):
 
 def test_small_surveys_are_paired_completely(flown):
     features, _ = flown
-    assert Retrieval(exhaustive_below=7)(features[:6]) == [(i, j) for i in range(6) for j in range(i + 1, 6)]
-    assert Retrieval(exhaustive_below=7)(features[:6], asked=[4]) == [(0, 4), (1, 4), (2, 4), (3, 4), (4, 5)]
+    assert Retrieval(exhaustive_below=7)(features[:6]) == [
+        (i, j) for i in range(6) for j in range(i + 1, 6)
+    ]
+    assert Retrieval(exhaustive_below=7)(features[:6], asked=[4]) == [
+        (0, 4),
+        (1, 4),
+        (2, 4),
+        (3, 4),
+        (4, 5),
+    ]
     assert len(Retrieval(exhaustive_below=7, neighbours=2)(features[:7])) < 21
 
 

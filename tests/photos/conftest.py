@@ -22,7 +22,9 @@ def pixels(width: int = 96, height: int = 64, seed: int = 0) -> np.ndarray:
     return np.clip(np.stack(bands, -1), 0, 255).astype(np.uint8)
 
 
-def jpeg_bytes(image: np.ndarray, exif: Mapping[str, Any] | None = None, xmp: str | None = None) -> bytes:
+def jpeg_bytes(
+    image: np.ndarray, exif: Mapping[str, Any] | None = None, xmp: str | None = None
+) -> bytes:
     """A JPEG with piexif's EXIF and an XMP packet in its own APP1 segment."""
     buffer = io.BytesIO()
     block = piexif.dump(dict(exif)) if exif else b""

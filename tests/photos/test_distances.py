@@ -22,10 +22,14 @@ def read(folder, text, control=()):
 
 def test_columns_of_pixels(tmp_path):
     (d,) = read(
-        tmp_path, LONG + "A,B,31.5,10,20,one.jpg,30.5,40,TWO.JPG\nA,B,31.5,11,21,three,30.5,40,two.jpg\n"
+        tmp_path,
+        LONG + "A,B,31.5,10,20,one.jpg,30.5,40,TWO.JPG\nA,B,31.5,11,21,three,30.5,40,two.jpg\n",
     )
     assert (d.a, d.b, d.metres) == ("A", "B", 31.5)
-    assert [(o.photo, o.x, o.y) for o in d.observations_a] == [("one.jpg", 10, 20), ("sub/three.jpg", 11, 21)]
+    assert [(o.photo, o.x, o.y) for o in d.observations_a] == [
+        ("one.jpg", 10, 20),
+        ("sub/three.jpg", 11, 21),
+    ]
     assert [(o.photo, o.x, o.y) for o in d.observations_b] == [("two.jpg", 30.5, 40)]
 
 
@@ -62,13 +66,22 @@ def test_several_distances_share_their_points(tmp_path):
         ("", "found '' and 0 lines"),
         ("point_a,point_b,metres\n", "0 lines"),
         ("a,b,c\n1,2,3\n", "expected a header"),
-        (LONG + "A,B,-3,1,1,one.jpg,2,2,one.jpg\n", "line 2: expected a length in m above 0, found '-3'"),
+        (
+            LONG + "A,B,-3,1,1,one.jpg,2,2,one.jpg\n",
+            "line 2: expected a length in m above 0, found '-3'",
+        ),
         (LONG + "A,B,far,1,1,one.jpg,2,2,one.jpg\n", "found 'far'"),
         (LONG + "A,B,nan,1,1,one.jpg,2,2,one.jpg\n", "found 'nan'"),
-        (LONG + "A,B,3,1,1,nine.jpg,2,2,ten.jpg\n", "names nine.jpg, ten.jpg; no photo of the survey"),
+        (
+            LONG + "A,B,3,1,1,nine.jpg,2,2,ten.jpg\n",
+            "names nine.jpg, ten.jpg; no photo of the survey",
+        ),
         (LONG + "A,B,3,x,1,one.jpg,2,2,one.jpg\n", "nothing tells where point 'A' is seen"),
         ("point_a,point_b,metres\nA,B,3\n", "nothing tells where point 'A' is seen"),
-        (LONG + "A,B,3,1,1,one.jpg,2,2,one.jpg\nA,B,4,1,1,one.jpg,2,2,one.jpg\n", "two different lengths"),
+        (
+            LONG + "A,B,3,1,1,one.jpg,2,2,one.jpg\nA,B,4,1,1,one.jpg,2,2,one.jpg\n",
+            "two different lengths",
+        ),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path, text, says):
@@ -81,7 +94,9 @@ def test_a_file_that_is_not_there(tmp_path):
         read_distances(tmp_path / "none.csv", NAMES)
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(text=st.text(alphabet='point_a,b metres12.-\n"\t;é', max_size=200))
 def test_no_text_raises_anything_else(tmp_path, text):
     with suppress(SideFileError):

@@ -51,7 +51,11 @@ def test_otherwise_it_is_native_or_guessed(make_jpeg, exif):
     if exif and exif["0th"][piexif.ImageIFD.Model] == "FC300S":
         assert (found.source, found.px) == ("sensor", pytest.approx(3.61 / 6.25 * 120))
     else:
-        assert (found.source, found.px, found.sigma_px) == ("guess", pytest.approx(102), pytest.approx(25.5))
+        assert (found.source, found.px, found.sigma_px) == (
+            "guess",
+            pytest.approx(102),
+            pytest.approx(25.5),
+        )
 
 
 def test_an_absurd_focal_length_is_passed_over(make_jpeg):
@@ -61,12 +65,20 @@ def test_an_absurd_focal_length_is_passed_over(make_jpeg):
 def test_dewarp_data(make_jpeg):
     data = "2018-09-04;100.0,100.4,2.0,-1.0,-0.26,0.11,0.0002,-0.0001,-0.05"
     photo = read_photo(
-        make_jpeg(image=pixels(120, 90), exif=dji_exif(), xmp=dji_xmp(DewarpData=data, DewarpFlag="0"))
+        make_jpeg(
+            image=pixels(120, 90), exif=dji_exif(), xmp=dji_xmp(DewarpData=data, DewarpFlag="0")
+        )
     )
     camera = photo.calibration
     assert camera.focal == pytest.approx(100.2)
     assert (camera.cx, camera.cy) == (pytest.approx(61.5), pytest.approx(43.5))
-    assert (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2) == (-0.26, 0.11, -0.05, 0.0002, -0.0001)
+    assert (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2) == (
+        -0.26,
+        0.11,
+        -0.05,
+        0.0002,
+        -0.0001,
+    )
     assert (photo.focal.source, photo.focal.px) == ("calibrated", camera.focal)
     flagged = dji_xmp(DewarpData=data, DewarpFlag="1")
     assert read_photo(make_jpeg(image=pixels(120, 90), xmp=flagged)).calibration.k1 == 0
@@ -75,11 +87,16 @@ def test_dewarp_data(make_jpeg):
 def test_calibrated_focal_length_of_a_reduced_copy(make_jpeg):
     size = {piexif.ExifIFD.PixelXDimension: 4000, piexif.ExifIFD.PixelYDimension: 3000}
     xmp = dji_xmp(
-        CalibratedFocalLength="3666.67", CalibratedOpticalCenterX="2000.0", CalibratedOpticalCenterY="1500.0"
+        CalibratedFocalLength="3666.67",
+        CalibratedOpticalCenterX="2000.0",
+        CalibratedOpticalCenterY="1500.0",
     )
     photo = read_photo(make_jpeg(image=pixels(120, 90), exif=dji_exif(Exif=size), xmp=xmp))
     assert photo.calibration.focal == pytest.approx(3666.67 * 0.03)
-    assert (photo.calibration.cx, photo.calibration.cy) == (pytest.approx(59.5), pytest.approx(44.5))
+    assert (photo.calibration.cx, photo.calibration.cy) == (
+        pytest.approx(59.5),
+        pytest.approx(44.5),
+    )
 
 
 def test_pix4d_lens_model_in_mm(make_jpeg):
@@ -100,7 +117,8 @@ def test_sensor_table_is_sane():
     assert len(rows) >= 60
     assert all(1.5 < row.width_mm < 60 for row in rows)
     assert all(
-        row.shutter in ("rolling", "global", "") and row.band in ("visible", "thermal") for row in rows
+        row.shutter in ("rolling", "global", "") and row.band in ("visible", "thermal")
+        for row in rows
     )
 
 
@@ -112,7 +130,9 @@ def test_two_eyes_of_one_model_are_told_apart_by_size():
 
 
 def test_digital_zoom_lengthens_the_lens(make_jpeg):
-    photo = read_photo(make_jpeg(exif=exif_of("FC300S", FocalLength=(361, 100), DigitalZoomRatio=(2, 1))))
+    photo = read_photo(
+        make_jpeg(exif=exif_of("FC300S", FocalLength=(361, 100), DigitalZoomRatio=(2, 1)))
+    )
     assert photo.focal.px == pytest.approx(2 * 3.61 / 6.25 * 96)
     assert any("digital zoom of 2" in n for n in photo.notes)
 

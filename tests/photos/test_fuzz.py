@@ -25,7 +25,11 @@ from .conftest import dji_exif, dji_xmp, jpeg_bytes, pixels
 from .test_thermal import flir_jpeg, planck_counts, scene
 
 XMP = dji_xmp(
-    GpsLatitude="46", GpsLongitude="9", DewarpData="d;1,2,3,4,5,6,7,8,9", RtkFlag="50", GimbalYawDegree="4"
+    GpsLatitude="46",
+    GpsLongitude="9",
+    DewarpData="d;1,2,3,4,5,6,7,8,9",
+    RtkFlag="50",
+    GimbalYawDegree="4",
 )
 GOOD = jpeg_bytes(pixels(), dji_exif(), XMP)
 FLIR = flir_jpeg(np.round(planck_counts(scene())).astype(np.uint16))
@@ -39,8 +43,12 @@ def encoded(write):
 
 TIFF = encoded(lambda b: tifffile.imwrite(b, pixels(), photometric="rgb", compression="deflate"))
 PNG = encoded(lambda b: Image.fromarray(pixels()).save(b, "PNG"))
-quick = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-flips = st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=30)
+quick = settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+flips = st.lists(
+    st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 255)), min_size=1, max_size=30
+)
 
 
 def spoil(data, flips, cut):
@@ -51,7 +59,9 @@ def spoil(data, flips, cut):
 
 
 def foreseen(path):
-    """A photo or a reason, and not by the last net, which is for what these tests have not found yet."""
+    """A photo or a reason, and not by the last net, which is for what these tests have not found
+    yet.
+    """
     photo = read_photo(path)
     assert isinstance(photo, (Photo, RejectedPhoto))
     assert isinstance(photo, Photo) or "not foreseen" not in photo.reason, photo.reason
@@ -73,7 +83,8 @@ def test_spoilt_images_are_photos_or_rejected(tmp_path, data, flips, cut):
 
 @quick
 @given(
-    st.binary(max_size=200), st.sampled_from([b"", b"\xff\xd8", b"II*\x00", b"MM\x00*", b"\x89PNG\r\n\x1a\n"])
+    st.binary(max_size=200),
+    st.sampled_from([b"", b"\xff\xd8", b"II*\x00", b"MM\x00*", b"\x89PNG\r\n\x1a\n"]),
 )
 def test_any_bytes_are_photos_or_rejected(tmp_path, data, magic):
     path = tmp_path / "x.jpg"
@@ -97,7 +108,9 @@ def test_spoilt_xmp(flips, cut):
 GEO = b"EPSG:4326\na.jpg 9.1 46.2 300 10 1 2 0.5 1\n"
 GCP = b"EPSG:4326\n9 46 300 10 20 a.jpg p1\n"
 CSV = b"name,lat,lon,alt\na.jpg,46,9,300\n"
-MRK = b"1\t26.5\t[2120]\t 12,N\t -5,E\t 190,V\t22.5,Lat\t113.9,Lon\t92.3,Ellh\t1.0, 1.1, 2.4\t50,Q\n"
+MRK = (
+    b"1\t26.5\t[2120]\t 12,N\t -5,E\t 190,V\t22.5,Lat\t113.9,Lon\t92.3,Ellh\t1.0, 1.1, 2.4\t50,Q\n"
+)
 SRT = b"1\n00:00:00,000 --> 00:00:01,000\n[latitude: 46] [longitude: 9] [rel_alt: 3 abs_alt: 4]\n"
 
 

@@ -53,9 +53,15 @@ def test_xmp_goes_before_exif_in_either_form_and_under_any_prefix(make_jpeg, for
 
 def test_rtk_fix_brings_its_deviations_and_the_ellipsoid(make_jpeg):
     xmp = dji_xmp(
-        GpsLatitude="46.6", GpsLongitude="-91.9", AbsoluteAltitude="+170.1", RelativeAltitude="+40.0",
-        RtkFlag="50", RtkStdLon="0.012", RtkStdLat="0.014", RtkStdHgt="0.03",
-    )  # fmt: skip
+        GpsLatitude="46.6",
+        GpsLongitude="-91.9",
+        AbsoluteAltitude="+170.1",
+        RelativeAltitude="+40.0",
+        RtkFlag="50",
+        RtkStdLon="0.012",
+        RtkStdLat="0.014",
+        RtkStdHgt="0.03",
+    )
     where = read_photo(make_jpeg(exif=dji_exif(), xmp=xmp)).position
     assert (where.altitude_m, where.datum, where.ellipsoid_m) == (170.1, "ellipsoid", 170.1)
     assert (where.sigma_xy_m, where.sigma_z_m) == (0.014, 0.03)
@@ -63,7 +69,8 @@ def test_rtk_fix_brings_its_deviations_and_the_ellipsoid(make_jpeg):
 
 def test_accuracy_tags_are_the_deviations(make_jpeg):
     camera = (
-        'xmlns:Camera="http://pix4d.com/camera/1.0/" Camera:GPSXYAccuracy="0.7" Camera:GPSZAccuracy="1.4"'
+        'xmlns:Camera="http://pix4d.com/camera/1.0/" Camera:GPSXYAccuracy="0.7"'
+        ' Camera:GPSZAccuracy="1.4"'
     )
     xmp = dji_xmp(RelativeAltitude="40").replace("xmlns:drone-dji", camera + " xmlns:drone-dji")
     where = read_photo(make_jpeg(exif=dji_exif(), xmp=xmp)).position
@@ -91,7 +98,9 @@ def test_void_positions_are_none_with_a_note(make_jpeg, gps, words):
 
 
 def test_void_xmp_position_falls_back_to_exif(make_jpeg):
-    photo = read_photo(make_jpeg(exif=dji_exif(), xmp=dji_xmp(GpsLatitude="0.0", GpsLongitude="0.0")))
+    photo = read_photo(
+        make_jpeg(exif=dji_exif(), xmp=dji_xmp(GpsLatitude="0.0", GpsLongitude="0.0"))
+    )
     assert photo.position.source == "exif"
     assert any("XMP is void" in note for note in photo.notes)
 
@@ -122,7 +131,9 @@ def test_time_falls_back_to_the_gps_clock(make_jpeg):
         piexif.GPSIFD.GPSDateStamp: "2014:10:19",
     }
     exif = dji_exif(GPS=clock, Exif={piexif.ExifIFD.DateTimeOriginal: "0000:00:00 00:00:00"})
-    assert read_photo(make_jpeg(exif=exif)).time == datetime(2014, 10, 19, 18, 20, 51, 500_000, tzinfo=UTC)
+    assert read_photo(make_jpeg(exif=exif)).time == datetime(
+        2014, 10, 19, 18, 20, 51, 500_000, tzinfo=UTC
+    )
 
 
 def test_editor_is_named_but_firmware_is_none(make_jpeg):
@@ -130,7 +141,8 @@ def test_editor_is_named_but_firmware_is_none(make_jpeg):
     assert read_photo(make_jpeg(exif=dji_exif(**{"0th": {305: viewer}}))).editor == viewer
     assert read_photo(make_jpeg(exif=dji_exif(**{"0th": {305: "v01.23.4920"}}))).editor is None
     creator = dji_xmp().replace(
-        "xmlns:drone-dji", 'xmlns:q="http://ns.adobe.com/xap/1.0/" q:CreatorTool="GIMP 2" xmlns:drone-dji'
+        "xmlns:drone-dji",
+        'xmlns:q="http://ns.adobe.com/xap/1.0/" q:CreatorTool="GIMP 2" xmlns:drone-dji',
     )
     assert read_photo(make_jpeg(exif=dji_exif(), xmp=creator)).editor == "GIMP 2"
 
@@ -141,7 +153,10 @@ def test_orientation_is_told_but_never_applied(make_jpeg):
 
 
 def test_pix4d_angles_count_from_nadir(make_jpeg):
-    angles = 'xmlns:Camera="http://pix4d.com/camera/1.0" Camera:Yaw="30" Camera:Pitch="2" Camera:Roll="-1"'
+    angles = (
+        'xmlns:Camera="http://pix4d.com/camera/1.0" Camera:Yaw="30" Camera:Pitch="2"'
+        ' Camera:Roll="-1"'
+    )
     xmp = dji_xmp().replace("xmlns:drone-dji", angles + " xmlns:drone-dji")
     attitude = read_photo(make_jpeg(xmp=xmp)).attitude
     assert (attitude.yaw_deg, attitude.pitch_deg, attitude.roll_deg) == (30, 2, -1)

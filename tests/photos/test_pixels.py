@@ -107,7 +107,12 @@ def test_multiband_tiff(tmp_path, planar, dtype):
     stored = bands if planar == "contig" else np.moveaxis(bands, -1, 0)
     tifffile.imwrite(tmp_path / "m.tif", stored, photometric="minisblack", planarconfig=planar)
     photo = read_photo(tmp_path / "m.tif")
-    assert (photo.width, photo.height, photo.channels, photo.dtype) == (96, 64, 5, np.dtype(dtype).name)
+    assert (photo.width, photo.height, photo.channels, photo.dtype) == (
+        96,
+        64,
+        5,
+        np.dtype(dtype).name,
+    )
     assert np.array_equal(read_color(photo), bands)
     assert read_color(photo, reduction=2).shape == (32, 48, 5)
     assert read_gray(photo).shape == (64, 96)

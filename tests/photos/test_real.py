@@ -16,13 +16,18 @@ def test_brighton(survey_data):
     survey = read_survey(survey_data("brighton"))
     assert (len(survey.photos), survey.rejected, survey.ignored) == (18, (), ("LICENSE",))
     assert all(
-        p.focal.px == pytest.approx(2310, rel=0.01) and p.focal.source == "sensor" for p in survey.photos
+        p.focal.px == pytest.approx(2310, rel=0.01) and p.focal.source == "sensor"
+        for p in survey.photos
     )
     edited = [p.name for p in survey.photos if p.editor]
     assert edited == [f"DJI_00{i}.JPG" for i in range(24, 30)]
     assert all("Microsoft Windows Photo Viewer" in p.editor for p in survey.photos if p.editor)
-    assert all(p.position.datum == "takeoff" and 38 < p.position.altitude_m < 42 for p in survey.photos)
-    assert all(abs(p.attitude.pitch_deg) < 1 and abs(p.attitude.roll_deg) < 1 for p in survey.photos)
+    assert all(
+        p.position.datum == "takeoff" and 38 < p.position.altitude_m < 42 for p in survey.photos
+    )
+    assert all(
+        abs(p.attitude.pitch_deg) < 1 and abs(p.attitude.roll_deg) < 1 for p in survey.photos
+    )
     assert survey.photos[0].attitude.yaw_deg == pytest.approx(45, abs=0.5)
     assert survey.photos[7].attitude.yaw_deg == pytest.approx(-132, abs=0.5)
     assert any("Rolling" in n for n in survey.notes)
@@ -41,14 +46,20 @@ def test_thermal_strip(survey_data):
     assert len(survey.photos) == 17
     photo = survey.photos[0]
     assert (photo.band, photo.unit, photo.dtype, photo.width, photo.height) == (
-        "thermal", "counts", "float32", 640, 512,
-    )  # fmt: skip
+        "thermal",
+        "counts",
+        "float32",
+        640,
+        512,
+    )
     assert photo.focal.px == pytest.approx(750, rel=0.05)
     assert any("no measurement" in n for n in photo.notes)
     assert all(abs(yaw_disagreement_deg(p)) > 30 for p in survey.photos)
     counts = read_color(photo)
     assert 15_000 < counts.min() < counts.max() < 25_000
-    assert np.corrcoef(counts[:-1].ravel(), counts[1:].ravel())[0, 1] > 0.95  # an image, rightly folded
+    assert (
+        np.corrcoef(counts[:-1].ravel(), counts[1:].ravel())[0, 1] > 0.95
+    )  # an image, rightly folded
     assert np.corrcoef(counts[:, :-1].ravel(), counts[:, 1:].ravel())[0, 1] > 0.95
 
 
@@ -57,7 +68,9 @@ def test_the_radiometric_frame_lies_on_the_picture(survey_data):
 
     photo = read_survey(survey_data("thermal-strip")).photos[0]
     picture = cv2.imread(str(photo.path), cv2.IMREAD_GRAYSCALE)
-    assert np.corrcoef(read_gray(photo).ravel(), picture.ravel())[0, 1] > 0.8  # the palette stretches locally
+    assert (
+        np.corrcoef(read_gray(photo).ravel(), picture.ravel())[0, 1] > 0.8
+    )  # the palette stretches locally
 
 
 def test_metadata_cost_milliseconds(survey_data):

@@ -30,10 +30,14 @@ def written(tmp_path, text, name="side.txt"):
 
 @pytest.fixture
 def photo(make_jpeg):
-    return read_photo(make_jpeg("DJI_0001.JPG", exif=dji_exif(), xmp=dji_xmp(RelativeAltitude="40")))
+    return read_photo(
+        make_jpeg("DJI_0001.JPG", exif=dji_exif(), xmp=dji_xmp(RelativeAltitude="40"))
+    )
 
 
-@pytest.mark.parametrize("crs", ["EPSG:32615", "WGS84 UTM 15N", "+proj=utm +zone=15 +datum=WGS84 +units=m"])
+@pytest.mark.parametrize(
+    "crs", ["EPSG:32615", "WGS84 UTM 15N", "+proj=utm +zone=15 +datum=WGS84 +units=m"]
+)
 def test_geo_txt_in_utm(tmp_path, crs):
     x, y = pyproj.Transformer.from_crs(4326, 32615, always_xy=True).transform(-92.0, 46.5)
     rows = read_geo_txt(
@@ -75,8 +79,12 @@ def test_void_row_is_an_error_and_missing_height_keeps_the_old_one(tmp_path, pho
 
 
 def test_rows_override_position_and_angles(photo):
-    row = SideRow(name="dji_0001", latitude_deg=46, longitude_deg=9, altitude_m=77, angles_deg=(10, -90, 0))
-    ((after,), notes) = apply_rows([photo], [row, SideRow(name="other")], file=photo.path, source="csv")
+    row = SideRow(
+        name="dji_0001", latitude_deg=46, longitude_deg=9, altitude_m=77, angles_deg=(10, -90, 0)
+    )
+    ((after,), notes) = apply_rows(
+        [photo], [row, SideRow(name="other")], file=photo.path, source="csv"
+    )
     assert (after.position.altitude_m, after.position.datum, after.position.takeoff_m) == (
         77,
         "sea_level",
@@ -167,7 +175,10 @@ def test_bad_csv(tmp_path, text, words):
 
 
 def test_mrk_moves_the_antenna_to_the_camera(tmp_path):
-    shot = "23\t264013.12\t[2120]\t  1000,N\t -2000,E\t 190,V\t46.50000000,Lat\t9.00000000,Lon\t92.345,Ellh"
+    shot = (
+        "23\t264013.12\t[2120]\t  1000,N\t -2000,E\t"
+        " 190,V\t46.50000000,Lat\t9.00000000,Lon\t92.345,Ellh"
+    )
     line = shot + "\t0.012, 0.011, 0.024\t50,Q\n"
     names = ["100_0001_0023.JPG", "100_0001_0024.JPG"]
     (row,) = read_mrk(written(tmp_path, line, "t.MRK"), names)
@@ -238,16 +249,28 @@ def test_srt_by_time_or_not_at_all(tmp_path, photo):
 
 
 def test_positions_by_the_files_ending(tmp_path, photo):
-    ((after,), _) = apply_positions([photo], written(tmp_path, "name,lat,lon\nDJI_0001,46,9\n", "p.CSV"))
+    ((after,), _) = apply_positions(
+        [photo], written(tmp_path, "name,lat,lon\nDJI_0001,46,9\n", "p.CSV")
+    )
     assert after.position.source == "csv"
 
 
 CAMERAS = {
     "v2 dji fc300s 96 64 brown 0.58": {
-        "projection_type": "brown", "width": 192, "height": 128, "focal_x": 0.58, "focal_y": 0.58,
-        "c_x": 0.01, "c_y": 0.0, "k1": -0.01, "k2": 0.02, "p1": 0.0, "p2": 0.0, "k3": 0.0,
+        "projection_type": "brown",
+        "width": 192,
+        "height": 128,
+        "focal_x": 0.58,
+        "focal_y": 0.58,
+        "c_x": 0.01,
+        "c_y": 0.0,
+        "k1": -0.01,
+        "k2": 0.02,
+        "p1": 0.0,
+        "p2": 0.0,
+        "k3": 0.0,
     }
-}  # fmt: skip
+}
 
 
 def test_cameras_json_is_scaled_to_the_photo(tmp_path, photo):
@@ -260,11 +283,20 @@ def test_cameras_json_is_scaled_to_the_photo(tmp_path, photo):
 
 
 def test_deviations_of_a_calibration_are_the_adjustment_s_priors(tmp_path, photo):
-    """Scaled with the photo; what states none, or too little to be true of a lens in flight, has the usual ones."""
+    """Scaled with the photo; what states none, or too little to be true of a lens in flight, has
+    the usual ones.
+    """
     record = camera_to_opensfm(
-        Camera(width=1500, height=1000, focal=1800, cx=750, cy=500, k1=-0.1,
-               sigmas=(9.0, 4.0, 5.0, 0.03, 0.04, 0.0, 0.0, 2e-3))
-    )  # fmt: skip
+        Camera(
+            width=1500,
+            height=1000,
+            focal=1800,
+            cx=750,
+            cy=500,
+            k1=-0.1,
+            sigmas=(9.0, 4.0, 5.0, 0.03, 0.04, 0.0, 0.0, 2e-3),
+        )
+    )
     path = written(tmp_path, json.dumps({"all": record}), "cameras.json")
     ((after,), _) = apply_cameras([photo], read_cameras_json(path), file=path)
     s = max(photo.width, photo.height) / 1500
@@ -281,7 +313,12 @@ def test_deviations_of_a_calibration_are_the_adjustment_s_priors(tmp_path, photo
 
 @pytest.mark.parametrize(
     ("text", "words"),
-    [("{", "no JSON"), ("[]", "cameras by name"), ('{"a": {"width": 3}}', "height"), ("{}", "by name")],
+    [
+        ("{", "no JSON"),
+        ("[]", "cameras by name"),
+        ('{"a": {"width": 3}}', "height"),
+        ("{}", "by name"),
+    ],
 )
 def test_bad_cameras_json(tmp_path, text, words):
     with pytest.raises(SideFileError, match=words):

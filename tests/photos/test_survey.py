@@ -14,7 +14,9 @@ from .conftest import dji_exif, dji_xmp, gps_exif, pixels
 
 
 def flight(make_jpeg, n=5):
-    """n photos ten metres apart towards the north, five seconds between them; names run backwards."""
+    """n photos ten metres apart towards the north, five seconds between them; names run
+    backwards.
+    """
     for i in range(n):
         exif = dji_exif(Exif={piexif.ExifIFD.DateTimeOriginal: f"2020:06:01 10:00:{5 * i:02d}"})
         exif["GPS"] = gps_exif(46.5 + i * 0.0001, -92.0, 150)
@@ -158,7 +160,10 @@ def test_contradictions_state_both_values(make_jpeg):
         exif = dji_exif(Exif={piexif.ExifIFD.DateTimeOriginal: f"2020:06:01 10:00:{5 * i:02d}"})
         exif["GPS"] = gps_exif(46.5 + i * 0.0001, -92.0, 150 + 20 * i)
         xmp = dji_xmp(
-            GimbalYawDegree="35", GimbalPitchDegree="-90", FlightYawDegree="90", RelativeAltitude="40"
+            GimbalYawDegree="35",
+            GimbalPitchDegree="-90",
+            FlightYawDegree="90",
+            RelativeAltitude="40",
         )
         folder = make_jpeg(f"p{i}.jpg", exif=exif, xmp=xmp, seed=i).parent
     said = " ".join(contradictions(read_survey(folder).photos))
@@ -205,9 +210,11 @@ def test_of_two_photos_far_apart_both_stay_and_the_note_says_so(make_jpeg):
 
 def test_a_flight_at_height_zero_counts_from_sea_level_instead(make_jpeg):
     for i in range(3):
-        folder = make_jpeg(f"{i}.jpg", exif=dji_exif(), xmp=dji_xmp(RelativeAltitude="+0.00"), seed=i).parent
+        folder = make_jpeg(
+            f"{i}.jpg", exif=dji_exif(), xmp=dji_xmp(RelativeAltitude="+0.00"), seed=i
+        ).parent
     survey = read_survey(folder)
-    assert {(p.position.altitude_m, p.position.datum, p.position.takeoff_m) for p in survey.photos} == {
-        (198.3, "sea_level", None)
-    }
+    assert {
+        (p.position.altitude_m, p.position.datum, p.position.takeoff_m) for p in survey.photos
+    } == {(198.3, "sea_level", None)}
     assert any("were not used" in n for n in survey.notes)

@@ -27,36 +27,65 @@ def planck_counts(celsius):
 def seen_counts(celsius):
     """Counts of a grey body behind air, with what it reflects: the forward radiance budget."""
     t = AIR_K - 273.15
-    water = math.sqrt(HUMIDITY * math.exp(1.5587 + 6.939e-2 * t - 2.7816e-4 * t * t + 6.8455e-7 * t**3))
+    water = math.sqrt(
+        HUMIDITY * math.exp(1.5587 + 6.939e-2 * t - 2.7816e-4 * t * t + 6.8455e-7 * t**3)
+    )
     d = math.sqrt(DISTANCE)
-    tau = X * math.exp(-d * (ALPHA1 + BETA1 * water)) + (1 - X) * math.exp(-d * (ALPHA2 + BETA2 * water))
+    tau = X * math.exp(-d * (ALPHA1 + BETA1 * water)) + (1 - X) * math.exp(
+        -d * (ALPHA2 + BETA2 * water)
+    )
     own = EMISSIVITY * tau * planck_counts(celsius)
-    return own + (1 - EMISSIVITY) * tau * planck_counts(REFLECTED_K - 273.15) + (1 - tau) * planck_counts(t)
+    return (
+        own
+        + (1 - EMISSIVITY) * tau * planck_counts(REFLECTED_K - 273.15)
+        + (1 - tau) * planck_counts(t)
+    )
 
 
 def camera_record():
     record = bytearray(0x400)
     struct.pack_into("<H", record, 0, 2)
     for offset, value in {
-        0x20: EMISSIVITY, 0x24: DISTANCE, 0x28: REFLECTED_K, 0x2C: AIR_K, 0x30: 293.15, 0x34: 1.0,
-        0x3C: HUMIDITY, 0x58: R1, 0x5C: B, 0x60: F, 0x30C: R2,
-        0x70: ALPHA1, 0x74: ALPHA2, 0x78: BETA1, 0x7C: BETA2, 0x80: X,
-    }.items():  # fmt: skip
+        0x20: EMISSIVITY,
+        0x24: DISTANCE,
+        0x28: REFLECTED_K,
+        0x2C: AIR_K,
+        0x30: 293.15,
+        0x34: 1.0,
+        0x3C: HUMIDITY,
+        0x58: R1,
+        0x5C: B,
+        0x60: F,
+        0x30C: R2,
+        0x70: ALPHA1,
+        0x74: ALPHA2,
+        0x78: BETA1,
+        0x7C: BETA2,
+        0x80: X,
+    }.items():
         struct.pack_into("<f", record, offset, value)
     struct.pack_into("<i", record, 0x308, OFFSET)
     return bytes(record)
 
 
 def flir_jpeg(counts, *, as_png=True, camera=True, chunk=3000):
-    """A FLIR radiometric JPEG by the published layout, its FFF block split over several segments."""
+    """A FLIR radiometric JPEG by the published layout, its FFF block split over several
+    segments.
+    """
     height, width = counts.shape
-    body = cv2.imencode(".png", counts.byteswap())[1].tobytes() if as_png else counts.astype("<u2").tobytes()
+    body = (
+        cv2.imencode(".png", counts.byteswap())[1].tobytes()
+        if as_png
+        else counts.astype("<u2").tobytes()
+    )
     raw = struct.pack("<HHH", 2, width, height).ljust(32, b"\0") + body
     records = [(1, raw)] + ([(0x20, camera_record())] if camera else [])
     offset = 64 + 32 * len(records)
     directory, bodies = b"", b""
     for kind, record in records:
-        directory += struct.pack(">HHIIIIIII", kind, 0, 0, 0, offset + len(bodies), len(record), 0, 0, 0)
+        directory += struct.pack(
+            ">HHIIIIIII", kind, 0, 0, 0, offset + len(bodies), len(record), 0, 0, 0
+        )
         bodies += record
     head = b"FFF\0" + b"test".ljust(16, b"\0") + struct.pack(">III", 101, 64, len(records))
     block = head.ljust(64, b"\0") + directory + bodies
@@ -77,7 +106,12 @@ def test_flir_counts_become_the_temperatures_they_came_from(tmp_path, as_png):
     counts = np.round(seen_counts(celsius)).astype(np.uint16)
     (tmp_path / "a.jpg").write_bytes(flir_jpeg(counts, as_png=as_png))
     photo = read_photo(tmp_path / "a.jpg")
-    assert (photo.band, photo.unit, photo.dtype, photo.channels) == ("thermal", "celsius", "float32", 1)
+    assert (photo.band, photo.unit, photo.dtype, photo.channels) == (
+        "thermal",
+        "celsius",
+        "float32",
+        1,
+    )
     assert (photo.width, photo.height) == (80, 60)
     values = read_color(photo)
     assert values.dtype == np.float32
@@ -193,15 +227,22 @@ def test_a_stated_unit_is_believed_whatever_the_values(tmp_path, stated, values,
 def test_gdal_says_the_unit_of_a_band(tmp_path):
     xml = '<GDALMetadata><Item name="UNITTYPE" sample="0" role="unittype">K</Item></GDALMetadata>'
     tifffile.imwrite(
-        tmp_path / "t.tif", np.full((60, 80), 300.15, np.float32), extratags=[(42112, "s", 0, xml, True)]
+        tmp_path / "t.tif",
+        np.full((60, 80), 300.15, np.float32),
+        extratags=[(42112, "s", 0, xml, True)],
     )
     assert read_color(read_photo(tmp_path / "t.tif"))[0, 0] == pytest.approx(27.0, abs=1e-3)
 
 
 def test_sixteen_bits_without_a_word_are_a_picture_until_somebody_says_what_they_are(tmp_path):
     tifffile.imwrite(tmp_path / "t.tif", np.full((60, 80), 29515, np.uint16))
-    assert (read_photo(tmp_path / "t.tif").band, read_photo(tmp_path / "t.tif").unit) == ("visible", "")
-    found = {u: read_photo(tmp_path / "t.tif", thermal_unit=u) for u in ("auto", "centikelvin", "counts")}
+    assert (read_photo(tmp_path / "t.tif").band, read_photo(tmp_path / "t.tif").unit) == (
+        "visible",
+        "",
+    )
+    found = {
+        u: read_photo(tmp_path / "t.tif", thermal_unit=u) for u in ("auto", "centikelvin", "counts")
+    }
     assert {u: p.unit for u, p in found.items()} == {
         "auto": "celsius",
         "centikelvin": "celsius",
@@ -212,7 +253,9 @@ def test_sixteen_bits_without_a_word_are_a_picture_until_somebody_says_what_they
 
 
 def test_frames_of_one_survey_are_read_alike(tmp_path):
-    """A hot frame's median lies where no temperature of tenths of a kelvin is; what was decided is what is read."""
+    """A hot frame's median lies where no temperature of tenths of a kelvin is; what was decided is
+    what is read.
+    """
     tifffile.imwrite(tmp_path / "t.tif", np.full((60, 80), 43000, np.uint16))
     assert read_photo(tmp_path / "t.tif", thermal_unit="auto").unit == "counts"
     hot = read_photo(tmp_path / "t.tif", thermal_unit="centikelvin")

@@ -16,10 +16,20 @@ def photo(name, seconds=None, east_m=None):
             latitude_deg=0, longitude_deg=east_m / 111319.5, altitude_m=50, datum="takeoff"
         )
     return Photo(
-        name=name, path=Path(name), digest=name, width=640, height=512, channels=1, dtype="uint8", band="visible",
-        camera_key="c", focal=Focal(px=700, sigma_px=70, source="guess"), position=position, attitude=None,
+        name=name,
+        path=Path(name),
+        digest=name,
+        width=640,
+        height=512,
+        channels=1,
+        dtype="uint8",
+        band="visible",
+        camera_key="c",
+        focal=Focal(px=700, sigma_px=70, source="guess"),
+        position=position,
+        attitude=None,
         time=None if seconds is None else NOON + timedelta(seconds=seconds),
-    )  # fmt: skip
+    )
 
 
 def test_by_names_that_differ_in_letters_only():
@@ -30,7 +40,9 @@ def test_by_names_that_differ_in_letters_only():
 
 def test_by_times_each_photo_once():
     a = [photo(f"DJI_{2 * k}.JPG", 2.0 * k) for k in range(4)]
-    b = [photo(f"DJI_{2 * k + 1}.JPG", 2.0 * k + 0.3) for k in range(4)] + [photo("DJI_99.JPG", 0.4)]
+    b = [photo(f"DJI_{2 * k + 1}.JPG", 2.0 * k + 0.3) for k in range(4)] + [
+        photo("DJI_99.JPG", 0.4)
+    ]
     assert taken_together(a, b) == [(0, 0), (1, 1), (2, 2), (3, 3)]
 
 
@@ -39,4 +51,6 @@ def test_equal_names_of_another_flight_are_chance():
     assert taken_together(a, [photo(f"SIM_{k}.jpg", 3.0 * k + 3600) for k in range(4)]) == []
     a = [photo(f"SIM_{k}.jpg", east_m=10.0 * k) for k in range(4)]
     assert taken_together(a, [photo(f"SIM_{k}.jpg", east_m=10.0 * k + 7) for k in range(4)]) == []
-    assert len(taken_together(a, [photo(f"SIM_{k}.jpg", east_m=10.0 * k + 1) for k in range(4)])) == 4
+    assert (
+        len(taken_together(a, [photo(f"SIM_{k}.jpg", east_m=10.0 * k + 1) for k in range(4)])) == 4
+    )

@@ -35,7 +35,10 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nine photos of 800 x 600 px, `gcp_list.txt` beside their folder `photos`, and `truth`."""
     folder = tmp_path_factory.mktemp("flight")
     settings = FlightSettings(
-        seed=3, lens=Lens().scaled(800, 600), route=Route(photos=9), control=Control(points=5, checks=3)
+        seed=3,
+        lens=Lens().scaled(800, 600),
+        route=Route(photos=9),
+        control=Control(points=5, checks=3),
     )
     for _ in simulate(settings, folder, overwrite=True):
         pass

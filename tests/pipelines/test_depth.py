@@ -16,16 +16,21 @@ SETTINGS = MosaicSettings(gsd_cm=25, features=3000, jobs=2)
 
 
 def against_truth(output, flight):
-    """Correlation with the true heights and the slope of the found ones over them, both without a general slope, where
-    they fit best within 3 m: photos are placed by positions that are off by as much.
+    """Correlation with the true heights and the slope of the found ones over them, both without a
+    general slope, where they fit best within 3 m: photos are placed by positions that are off by as
+    much.
     """
     truth_file = flight / "truth" / "truth_surface.tif"
     with rasterio.open(output / "depth.tif") as found, rasterio.open(truth_file) as truth:
         z, true = found.read(1), np.full(found.shape, np.nan, np.float32)
         reproject(
-            rasterio.band(truth, 1), true, dst_transform=found.transform, dst_crs=found.crs, dst_nodata=np.nan,
+            rasterio.band(truth, 1),
+            true,
+            dst_transform=found.transform,
+            dst_crs=found.crs,
+            dst_nodata=np.nan,
             resampling=Resampling.average,
-        )  # fmt: skip
+        )
     near = range(-12, 13, 2)  # px of 25 cm
     tried = [agreement(z, np.roll(true, (dy, dx), (0, 1))) for dy in near for dx in near]
     return (*max(tried), np.isfinite(z).mean())
@@ -62,7 +67,8 @@ def test_a_survey_shows_its_heights(flight, finished, tmp_path, route):
 
 
 def test_two_photos_show_their_heights_and_their_field(flight, tmp_path):
-    # of this flight's pairs the first hangs least on rounding: 0.75 and 0.46, where others change by 0.2
+    # of this flight's pairs the first hangs least on rounding: 0.75 and 0.46, where others change
+    # by 0.2
     photos = sorted((flight / "photos").glob("*.jpg"))[:2]
     result = depth(photos, tmp_path / "out", SETTINGS)
     r, slope, _ = against_truth(tmp_path / "out", flight)

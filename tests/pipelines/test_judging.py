@@ -19,13 +19,21 @@ def test_a_constant_between_two_height_datums_is_no_error(datum, controls, offse
     errors = np.array([(0.1, -0.2, 0.03), (0.0, 0.1, 0.0), (-0.3, 0.0, -0.05)])
     points = [
         ControlResidual(
-            name=f"p{k}", check=k >= controls, error_m=e + (0, 0, -440.0), reprojection_px=0.3, sightings=4
+            name=f"p{k}",
+            check=k >= controls,
+            error_m=e + (0, 0, -440.0),
+            reprojection_px=0.3,
+            sightings=4,
         )
         for k, e in enumerate(errors)
     ]
-    said = control_figures(SimpleNamespace(control=points, frame=SimpleNamespace(vertical_datum=datum)))
+    said = control_figures(
+        SimpleNamespace(control=points, frame=SimpleNamespace(vertical_datum=datum))
+    )
     assert said["control_height_offset_m"] == offset
-    assert [r["dz_m"] for r in said["control"]] == pytest.approx(errors[:, 2] - 440.0 - offset, abs=1e-9)
+    assert [r["dz_m"] for r in said["control"]] == pytest.approx(
+        errors[:, 2] - 440.0 - offset, abs=1e-9
+    )
     assert [r["dx_m"] for r in said["control"]] == pytest.approx(errors[:, 0])
 
 
@@ -33,7 +41,9 @@ def test_points_without_heights_have_no_offset():
     lone = ControlResidual(
         name="p", check=True, error_m=np.array([0.1, 0.2, np.nan]), reprojection_px=0.3, sightings=2
     )
-    said = control_figures(SimpleNamespace(control=[lone], frame=SimpleNamespace(vertical_datum="takeoff")))
+    said = control_figures(
+        SimpleNamespace(control=[lone], frame=SimpleNamespace(vertical_datum="takeoff"))
+    )
     assert (said["control"][0]["dz_m"], said["control_height_offset_m"]) == (None, 0.0)
     nobody = SimpleNamespace(control=[], frame=SimpleNamespace(vertical_datum="takeoff"))
     assert control_figures(nobody) == {"control": [], "control_height_offset_m": None}
@@ -53,7 +63,10 @@ def test_holes_against_scipy():
     for _ in range(20):
         seen = rng.random((40, 50)) > 0.4
         enclosed = ndimage.binary_fill_holes(seen) & ~seen
-        assert _holes(seen, 1.0) == {"holes": ndimage.label(enclosed)[1], "holes_m2": float(enclosed.sum())}
+        assert _holes(seen, 1.0) == {
+            "holes": ndimage.label(enclosed)[1],
+            "holes_m2": float(enclosed.sum()),
+        }
 
 
 def test_no_holes():

@@ -1,4 +1,6 @@
-"""Whose drift is balanced: temperatures unless values are wanted as recorded, counts only when asked, pictures never."""
+"""Whose drift is balanced: temperatures unless values are wanted as recorded, counts only when
+asked, pictures never.
+"""
 
 import numpy as np
 import pytest
@@ -11,11 +13,15 @@ from skyquilt.render.exposure import NEUTRAL, Exposure
 @pytest.mark.parametrize(
     ("unit", "asked", "balance", "done"),
     [
-        ("celsius", None, True, True), ("celsius", False, True, False), ("celsius", None, False, False),
-        ("celsius", True, False, True), ("counts", None, True, False), ("counts", True, True, True),
+        ("celsius", None, True, True),
+        ("celsius", False, True, False),
+        ("celsius", None, False, False),
+        ("celsius", True, False, True),
+        ("counts", None, True, False),
+        ("counts", True, True, True),
         ("", True, True, False),
     ],
-)  # fmt: skip
+)
 def test_whose_drift_is_balanced(unit, asked, balance, done):
     settings = MosaicSettings(balance_thermal=asked, balance=balance)
     assert balances_drift(settings, unit) is done

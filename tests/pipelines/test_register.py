@@ -41,7 +41,10 @@ def done(files, tmp_path_factory):
 
 def command(*words):
     """Exit code and what went to standard error."""
-    with mock.patch.object(sys, "argv", ["skyquilt", *map(str, words)]), pytest.raises(SystemExit) as end:
+    with (
+        mock.patch.object(sys, "argv", ["skyquilt", *map(str, words)]),
+        pytest.raises(SystemExit) as end,
+    ):
         run()
     return end.value.code
 
@@ -57,7 +60,9 @@ def test_the_record_tells_the_transform(done):
 
 
 def test_b_lies_on_a(done, files):
-    """Against OpenCV's warp by the truth: what is valid is right, and nearly all of the overlap is valid."""
+    """Against OpenCV's warp by the truth: what is valid is right, and nearly all of the overlap is
+    valid.
+    """
     output, _ = done
     _, a, b = files
     with rasterio.open(output / "b_on_a.tif") as raster:
@@ -80,7 +85,9 @@ def test_the_virtual_raster_shows_b_in_its_place(done, files):
     assert len(points) == 36
     for p in points[::7]:
         there = TRUTH @ [p.x - 0.5, -p.y - 0.5, 1]
-        assert np.hypot(there[0] / there[2] - (p.col - 0.5), there[1] / there[2] - (p.row - 0.5)) < 0.6
+        assert (
+            np.hypot(there[0] / there[2] - (p.col - 0.5), there[1] / there[2] - (p.row - 0.5)) < 0.6
+        )
 
 
 def test_pictures_and_page(done):
@@ -99,7 +106,8 @@ def test_a_refusal_is_written_down_and_has_its_exit_code(files, tmp_path, capsys
     assert command("register", folder / "a.jpg", folder / "other.png", "-o", output, "--quiet") == 7
     said = capsys.readouterr().err
     assert (
-        said.startswith("skyquilt: refused: the best place found is not confirmed") and said.count("\n") == 1
+        said.startswith("skyquilt: refused: the best place found is not confirmed")
+        and said.count("\n") == 1
     )
     record = json.loads((output / "registration.json").read_text())
     assert not record["accepted"] and record["b_H_a"] is None and record["q"] == 0
@@ -130,7 +138,9 @@ def dji_jpeg(path, counts, cut=0):
     from tests.photos.conftest import jpeg_bytes
 
     grey = cv2.normalize(counts, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
-    exif = {"0th": {piexif.ImageIFD.Make: "DJI", piexif.ImageIFD.Model: "MAVIC2-ENTERPRISE-ADVANCED"}}
+    exif = {
+        "0th": {piexif.ImageIFD.Make: "DJI", piexif.ImageIFD.Model: "MAVIC2-ENTERPRISE-ADVANCED"}
+    }
     data = jpeg_bytes(np.asarray(Image.fromarray(grey).convert("RGB")), exif)
     raw = counts.astype("<u2").tobytes()
     raw = raw[: len(raw) - cut]
@@ -170,9 +180,16 @@ def test_corrupt_files_are_refused_with_their_reason(files, tmp_path):
 
 def write_map(path, values, transform, crs="EPSG:32633"):
     with rasterio.open(
-        path, "w", driver="GTiff", width=values.shape[1], height=values.shape[0], count=1, dtype=values.dtype,
-        transform=transform, crs=crs,
-    ) as raster:  # fmt: skip
+        path,
+        "w",
+        driver="GTiff",
+        width=values.shape[1],
+        height=values.shape[0],
+        count=1,
+        dtype=values.dtype,
+        transform=transform,
+        crs=crs,
+    ) as raster:
         raster.write(values, 1)
 
 
@@ -183,7 +200,9 @@ def maps(tmp_path):
     a = np.clip(spectrum(labels, 1), 1, 255).astype(np.uint8)
     size_b = (600, 500)
     b_H_a = np.array([[0.625, 0, (0.625 - 1) / 2], [0, 0.625, (0.625 - 1) / 2], [0, 0, 1.0]])
-    b = cv2.warpPerspective(spectrum(labels, 2), b_H_a, size_b, flags=cv2.INTER_AREA).astype(np.float32)
+    b = cv2.warpPerspective(spectrum(labels, 2), b_H_a, size_b, flags=cv2.INTER_AREA).astype(
+        np.float32
+    )
     write_map(tmp_path / "a.tif", a, from_origin(500_000, 5_000_000, 0.5, 0.5))
     write_map(tmp_path / "b.tif", b, from_origin(500_006, 4_999_998, 0.8, 0.8))
     return tmp_path, a, b, b_H_a
@@ -194,14 +213,20 @@ def test_maps_are_registered_by_their_places_and_stay_georeferenced(maps):
     result = register(folder / "a.tif", folder / "b.tif", folder / "out").metrics
     assert result["accepted"] and result["guess"] == "the places of both maps"
     assert error(np.array(result["b_H_a"]), b_H_a, a.shape) < 0.5
-    with rasterio.open(folder / "out" / "b_on_a.tif") as raster, rasterio.open(folder / "a.tif") as reference:
+    with (
+        rasterio.open(folder / "out" / "b_on_a.tif") as raster,
+        rasterio.open(folder / "a.tif") as reference,
+    ):
         assert raster.crs == reference.crs and raster.transform == reference.transform
         assert raster.shape == reference.shape
     with rasterio.open(folder / "out" / "b.vrt") as raster:
         points, crs = raster.gcps
         assert crs.to_epsg() == 32633
         first = next(p for p in points if p.col < 1 and p.row < 1)
-        place = Affine(0.5, 0, 500_000, 0, -0.5, 5_000_000) @ (0.8, 0.8)  # b's first pixel's middle, on a
+        place = Affine(0.5, 0, 500_000, 0, -0.5, 5_000_000) @ (
+            0.8,
+            0.8,
+        )  # b's first pixel's middle, on a
         assert np.hypot(first.x - place[0], first.y - place[1]) < 0.7
 
 
@@ -215,9 +240,15 @@ def test_maps_in_other_systems_meet(maps):
         )
         moved = np.full((height, width), np.nan, np.float32)
         reproject(
-            raster.read(1), moved, src_transform=raster.transform, src_crs=raster.crs, dst_transform=transform,
-            dst_crs="EPSG:32632", dst_nodata=np.nan, init_dest_nodata=True,
-        )  # fmt: skip
+            raster.read(1),
+            moved,
+            src_transform=raster.transform,
+            src_crs=raster.crs,
+            dst_transform=transform,
+            dst_crs="EPSG:32632",
+            dst_nodata=np.nan,
+            init_dest_nodata=True,
+        )
     write_map(folder / "b32.tif", moved, transform, "EPSG:32632")
     result = register(folder / "a.tif", folder / "b32.tif", folder / "out").metrics
     assert result["accepted"] and result["guess"] == "the places of both maps"
@@ -242,7 +273,10 @@ def test_missing_files_and_words_that_are_none(files, tmp_path):
     with pytest.raises(UsageError, match=r"is no file"):
         register(folder / "none.jpg", folder / "b.png", tmp_path / "out")
     output = tmp_path / "out"
-    assert command("register", folder / "a.jpg", folder / "b.png", "-o", output, "--method", "magic") == 2
+    assert (
+        command("register", folder / "a.jpg", folder / "b.png", "-o", output, "--method", "magic")
+        == 2
+    )
 
 
 def test_events(files, tmp_path):
@@ -264,6 +298,8 @@ def test_help_names_every_method():
     from skyquilt.cli.app import app
     from skyquilt.config_register import REGISTRATIONS
 
-    told = CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(app, ["register", "--help"]).output
+    told = (
+        CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(app, ["register", "--help"]).output
+    )
     assert [name for name in REGISTRATIONS if name not in told] == []
     assert "Exit codes" in told

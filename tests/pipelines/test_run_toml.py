@@ -28,18 +28,35 @@ def test_defaults(tmp_path):
 
 def test_every_setting_comes_back(tmp_path):
     asked = MosaicSettings(
-        method="pose", gsd_cm=2.5, crs="EPSG:32633", gcp=Path("a b/gcp_list.txt"), geo=Path("geo.txt"),
-        cameras=Path("cameras.json"), bounds=(1.5, 2.0, 3.0, 4.0), boundary=Path("c.geojson"), surface="ties",
-        blend="multiband", balance=False, compress="zstd", quality=70, distortion="6t", height_m=60.0,
-        heading_deg=-90.0, repair=False, features=4000, jobs=2, memory_gb=4.0,
-    )  # fmt: skip
+        method="pose",
+        gsd_cm=2.5,
+        crs="EPSG:32633",
+        gcp=Path("a b/gcp_list.txt"),
+        geo=Path("geo.txt"),
+        cameras=Path("cameras.json"),
+        bounds=(1.5, 2.0, 3.0, 4.0),
+        boundary=Path("c.geojson"),
+        surface="ties",
+        blend="multiband",
+        balance=False,
+        compress="zstd",
+        quality=70,
+        distortion="6t",
+        height_m=60.0,
+        heading_deg=-90.0,
+        repair=False,
+        features=4000,
+        jobs=2,
+        memory_gb=4.0,
+    )
     found = written(tmp_path, asked)["settings"]
     assert found == {k: list(v) if isinstance(v, tuple) else v for k, v in asked.as_table().items()}
     assert found["bounds"] == [1.5, 2.0, 3.0, 4.0]
 
 
 @pytest.mark.parametrize(
-    "name", ["C:\\photos\\new", 'a "quoted" one', "línea", "\u822a\u7a7a", "\U0001f681 flight", "a\tb\x7f"]
+    "name",
+    ["C:\\photos\\new", 'a "quoted" one', "línea", "\u822a\u7a7a", "\U0001f681 flight", "a\tb\x7f"],
 )
 def test_any_name_of_a_folder(tmp_path, name):
     assert written(tmp_path, MosaicSettings(), name)["photos"] == name

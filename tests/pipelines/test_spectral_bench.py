@@ -22,7 +22,9 @@ def line(kind, source, a, b, tolerance, h):
 
 @pytest.fixture(scope="module")
 def listed(tmp_path_factory):
-    """Three pairs: one right, one whose truth in the list is wrong by 7 px, one without its picture."""
+    """Three pairs: one right, one whose truth in the list is wrong by 7 px, one without its
+    picture.
+    """
     folder = tmp_path_factory.mktemp("pairs")
     truth = turned(1.0, 10.0, SHAPE, SHAPE)
     a, b = pair(truth, seed=13)
@@ -56,8 +58,11 @@ def test_rows_are_held_against_the_truth(bench):
     output, _ = bench
     rows = json.loads((output / "bench.json").read_text())["pairs"]
     assert [(r["source"], r["method"]) for r in rows] == [
-        ("good", "auto"), ("good", "usurf"), ("lie", "auto"), ("lie", "usurf"),
-    ]  # fmt: skip
+        ("good", "auto"),
+        ("good", "usurf"),
+        ("lie", "auto"),
+        ("lie", "usurf"),
+    ]
     good, lie = rows[0], rows[2]
     wanted = {
         "class",
@@ -74,7 +79,9 @@ def test_rows_are_held_against_the_truth(bench):
     assert all(set(r) == wanted for r in rows)
     assert good["accepted"] and good["right"] and good["error_px"] < 0.3
     assert lie["accepted"] and not lie["right"] and lie["error_px"] == pytest.approx(7, abs=0.3)
-    assert all(r["accepted"] or (r["error_px"] is None and r["q"] == 0 and r["reason"]) for r in rows)
+    assert all(
+        r["accepted"] or (r["error_px"] is None and r["q"] == 0 and r["reason"]) for r in rows
+    )
     assert all(r["seconds"] > 0 for r in rows)
 
 
@@ -114,7 +121,9 @@ def test_unknown_methods_and_taken_outputs(listed, tmp_path):
 @pytest.mark.real
 @pytest.mark.slow
 def test_auto_on_the_real_pairs(tmp_path):
-    """What is asked for: four fifths right over all, nine tenths of the satellite classes, one wrong at most."""
+    """What is asked for: four fifths right over all, nine tenths of the satellite classes, one
+    wrong at most.
+    """
     if not REAL.is_file():
         pytest.skip(f"real pairs missing: {REAL}")
     list(iter_spectral_bench(REAL, tmp_path / "out", ("auto",)))
@@ -142,4 +151,6 @@ def test_mirrored_real_pairs_are_refused():
     auto = registration_method("auto")
     for listed in read_pairs(REAL)[::2]:
         a, b = (cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in (listed.a, listed.b))
-        assert not auto(Picture(values=a), Picture(values=np.ascontiguousarray(b[:, ::-1]))), listed.source
+        assert not auto(Picture(values=a), Picture(values=np.ascontiguousarray(b[:, ::-1]))), (
+            listed.source
+        )

@@ -1,4 +1,6 @@
-"""Y Fig. 6.5: what keeps a strip true to shape does, and each order of distortion is a fit of its own."""
+"""Y Fig. 6.5: what keeps a strip true to shape does, and each order of distortion is a fit of its
+own.
+"""
 
 import json
 import re
@@ -31,7 +33,9 @@ def test_the_order_of_the_thesis(finished):
     folder, events = finished
     (none, two, four, six, tangential, flat, similarity), found = ends(folder)
     assert similarity >= 0.97
-    assert none < 0.3 and none < two < tangential and four < tangential and six < tangential  # what decays
+    assert (
+        none < 0.3 and none < two < tangential and four < tangential and six < tangential
+    )  # what decays
     assert similarity > max(none, two, four, six) and flat <= 1
     rms = [v["calibration_rms_px"] for v in found["variants"][:5]]
     assert rms == sorted(rms, reverse=True) and rms[0] > 5 * rms[-1]
@@ -53,7 +57,9 @@ def test_the_page_is_whole(finished):
 
 
 def test_a_perfect_camera_over_level_boards_keeps_the_shape(tmp_path):
-    """Without noise, tilt and things, the right lens model ends at 1 but for the calibration's own error."""
+    """Without noise, tilt and things, the right lens model ends at 1 but for the calibration's own
+    error.
+    """
     settings = StripSettings(photos=6, noise=0.0, tilt=0.0, things=0.0, relief=0.0)
     *_, result = iter_strip_test(tmp_path / "o", settings, flights=1)
     etas = [v["eta_end"][0] for v in result.metrics["variants"]]
@@ -65,7 +71,9 @@ def test_equal_seeds_give_equal_results(tmp_path):
     found = [
         [
             v["eta"]
-            for v in list(iter_strip_test(tmp_path / name, settings, flights=1))[-1].metrics["variants"]
+            for v in list(iter_strip_test(tmp_path / name, settings, flights=1))[-1].metrics[
+                "variants"
+            ]
         ]
         for name in "ab"
     ]
@@ -94,11 +102,14 @@ def test_refusals(tmp_path, finished):
 
 
 def test_a_board_gives_the_camera_back():
-    """Without noise the full model is found exactly; lower orders are other fits, not the same with terms left out."""
+    """Without noise the full model is found exactly; lower orders are other fits, not the same with
+    terms left out.
+    """
     settings = StripSettings()
     strip, lens = fly_strip(settings), settings.lens
     fits = {
-        order: board_camera(strip.board, strip.views, (lens.width, lens.height), order)[0] for order in ORDERS
+        order: board_camera(strip.board, strip.views, (lens.width, lens.height), order)[0]
+        for order in ORDERS
     }
     full = fits["6t"]
     assert full.focal == pytest.approx(lens.focal, rel=2e-3)

@@ -27,9 +27,17 @@ def ground(seed):
 def write(path, values, gsd, west, north, unit=None):
     height, width = values.shape
     with rasterio.open(
-        path, "w", driver="GTiff", height=height, width=width, count=1, dtype=values.dtype, crs="EPSG:32633",
-        transform=from_origin(west, north, gsd, gsd), nodata=np.nan if values.dtype.kind == "f" else None,
-    ) as out:  # fmt: skip
+        path,
+        "w",
+        driver="GTiff",
+        height=height,
+        width=width,
+        count=1,
+        dtype=values.dtype,
+        crs="EPSG:32633",
+        transform=from_origin(west, north, gsd, gsd),
+        nodata=np.nan if values.dtype.kind == "f" else None,
+    ) as out:
         out.write(values, 1)
         if unit:
             out.set_band_unit(1, unit)
@@ -38,7 +46,9 @@ def write(path, values, gsd, west, north, unit=None):
 
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory):
-    """A visual map of 80 m at 0.1 m, and a thermal one of other contrast at 0.2 m, misplaced by TRUE_SHIFT."""
+    """A visual map of 80 m at 0.1 m, and a thermal one of other contrast at 0.2 m, misplaced by
+    TRUE_SHIFT.
+    """
     folder = tmp_path_factory.mktemp("maps")
     truth = ground(1)
     visual = np.clip(40 * truth[50:850, 50:850] + 20, 0, 255).astype(np.uint8)
@@ -48,8 +58,13 @@ def maps(tmp_path_factory):
     west, north = 500000.0, 5000000.0
     a = write(folder / "visual.tif", visual, GSD_A, west, north)
     b = write(
-        folder / "thermal.tif", thermal, GSD_B, west + 2.0 + TRUE_SHIFT[0], north - 2.0 + TRUE_SHIFT[1], "celsius"
-    )  # fmt: skip
+        folder / "thermal.tif",
+        thermal,
+        GSD_B,
+        west + 2.0 + TRUE_SHIFT[0],
+        north - 2.0 + TRUE_SHIFT[1],
+        "celsius",
+    )
     return opened(a), opened(b)
 
 
@@ -91,7 +106,9 @@ def test_values_are_resampled_only(maps, tmp_path):
 
 def test_maps_of_other_places_are_not_joined(maps, tmp_path):
     a, _ = maps
-    other = write(tmp_path / "other.tif", np.float32(280) + ground(9)[:400, :400], GSD_B, 500002.0, 4999998.0)
+    other = write(
+        tmp_path / "other.tif", np.float32(280) + ground(9)[:400, :400], GSD_B, 500002.0, 4999998.0
+    )
     with pytest.raises(RefusedError, match="both maps are in the output"):
         join(a, opened(other), (tmp_path / "no", tmp_path / "no"), "maps")
 
@@ -101,7 +118,11 @@ def test_heights_lie_on_the_grid_of_the_map_without_their_slope(maps, tmp_path):
     y, x = np.mgrid[0:80, 0:80].astype(np.float32)
     bump = 5 * np.exp(-((x - 40) ** 2 + (y - 20) ** 2) / 50)
     path = write(
-        tmp_path / "surface.tif", np.float32(100 + 0.3 * x - 0.1 * y + bump), 1.0, 500000.0, 5000000.0
+        tmp_path / "surface.tif",
+        np.float32(100 + 0.3 * x - 0.1 * y + bump),
+        1.0,
+        500000.0,
+        5000000.0,
     )
     picture = heights_on(a, path)
     assert picture.values.shape == a.picture.shape

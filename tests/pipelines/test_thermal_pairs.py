@@ -1,4 +1,6 @@
-"""Two blocks joined by pairs of their photos: one flight against itself, in reversed contrast, in another frame."""
+"""Two blocks joined by pairs of their photos: one flight against itself, in reversed contrast, in
+another frame.
+"""
 
 from dataclasses import replace
 
@@ -29,7 +31,9 @@ def other(scene):
     x, y = scene.alignment.frame.origin
     frame = replace(scene.alignment.frame, origin=(x + OFF[0], y + OFF[1]))
     return replace(
-        scene, alignment=replace(scene.alignment, frame=frame), pixels=lambda i: 255 - scene.pixels(i)
+        scene,
+        alignment=replace(scene.alignment, frame=frame),
+        pixels=lambda i: 255 - scene.pixels(i),
     )
 
 

@@ -1,4 +1,6 @@
-"""One drone, two cameras: thermal frames cut from simulated visual ones through a known rotation."""
+"""One drone, two cameras: thermal frames cut from simulated visual ones through a known
+rotation.
+"""
 
 import cv2
 import numpy as np
@@ -21,7 +23,9 @@ SETTINGS = MosaicSettings(gsd_cm=15, jobs=2)
 
 
 def heat_of(path, lens):
-    """A frame in degrees Celsius: the brightness, reversed and rounded off, as the turned camera sees it."""
+    """A frame in degrees Celsius: the brightness, reversed and rounded off, as the turned camera
+    sees it.
+    """
     grey = cv2.GaussianBlur(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), (0, 0), 1.0)
     x, y = np.meshgrid(np.arange(HEAT.width, dtype=float), np.arange(HEAT.height, dtype=float))
     px = project(lens, rays(HEAT, np.c_[x.ravel(), y.ravel()]) @ TURN).astype(np.float32)
@@ -40,10 +44,13 @@ def frames(flight, finished, tmp_path_factory):
     for path in sorted((flight / "photos").glob("*.jpg")):
         k = [float(lens.get(n, 0)) for n in ("k1", "k2", "k3", "p1", "p2")]
         camera = Camera(
-            width=lens["width"], height=lens["height"], focal=lens.get("focal_x", lens.get("focal")) * longest,
+            width=lens["width"],
+            height=lens["height"],
+            focal=lens.get("focal_x", lens.get("focal")) * longest,
             cx=lens.get("c_x", 0) * longest + (lens["width"] - 1) / 2,
-            cy=lens.get("c_y", 0) * longest + (lens["height"] - 1) / 2, **dict(zip(("k1", "k2", "k3", "p1", "p2"), k, strict=True)),
-        )  # fmt: skip
+            cy=lens.get("c_y", 0) * longest + (lens["height"] - 1) / 2,
+            **dict(zip(("k1", "k2", "k3", "p1", "p2"), k, strict=True)),
+        )
         target = folder / f"heat_{path.stem.split('_')[-1]}.tif"
         cv2.imwrite(str(target), heat_of(path, camera))
     return folder

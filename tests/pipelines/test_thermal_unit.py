@@ -41,7 +41,9 @@ def test_depth_reads_values_as_told(frames, tmp_path, unit):
 
 
 def test_compare_reads_values_as_told_in_every_run(frames, tmp_path, monkeypatch):
-    """The runs' own notes are overheard: frames without positions are refused by both methods later on."""
+    """The runs' own notes are overheard: frames without positions are refused by both methods later
+    on.
+    """
     overheard = []
 
     def overhearing(*args, **more):

@@ -32,7 +32,9 @@ FEATURES = {
     "type": "FeatureCollection",
     "features": [{"type": "Feature", "geometry": mapping(LONLAT), "properties": {}}],
 }
-LEGACY = mapping(UTM) | {"crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32615"}}}
+LEGACY = mapping(UTM) | {
+    "crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::32615"}}
+}
 
 
 def kml():
@@ -44,7 +46,8 @@ def kml():
         "innerBoundaryIs", LONLAT.interiors[0].coords
     )
     return (
-        f'<kml xmlns="http://www.opengis.net/kml/2.2"><Document><Polygon>{rings}</Polygon></Document></kml>'
+        "<kml"
+        f' xmlns="http://www.opengis.net/kml/2.2"><Document><Polygon>{rings}</Polygon></Document></kml>'
     )
 
 
@@ -52,7 +55,8 @@ def write_geopackage(path):
     with sqlite3.connect(path) as base:
         base.execute("CREATE TABLE gpkg_geometry_columns (table_name, column_name, srs_id)")
         base.execute(
-            "CREATE TABLE gpkg_spatial_ref_sys (srs_id, organization, organization_coordsys_id, definition)"
+            "CREATE TABLE gpkg_spatial_ref_sys (srs_id, organization, organization_coordsys_id,"
+            " definition)"
         )
         base.execute("INSERT INTO gpkg_geometry_columns VALUES ('my area', 'geom', 7)")
         base.execute("INSERT INTO gpkg_spatial_ref_sys VALUES (7, 'EPSG', 32615, '')")
@@ -64,8 +68,13 @@ def write_geopackage(path):
 
 def write_shapefile(path):
     rings = [np.array(UTM.exterior.coords)[::-1], np.array(UTM.interiors[0].coords)[::-1]]
-    body = struct.pack("<i4dii2i", 5, 0, 0, 0, 0, 2, 10, 0, 5) + np.vstack(rings).astype("<f8").tobytes()
-    path.write_bytes(struct.pack(">i", 9994).ljust(100, b"\0") + struct.pack(">ii", 1, len(body) // 2) + body)
+    body = (
+        struct.pack("<i4dii2i", 5, 0, 0, 0, 0, 2, 10, 0, 5)
+        + np.vstack(rings).astype("<f8").tobytes()
+    )
+    path.write_bytes(
+        struct.pack(">i", 9994).ljust(100, b"\0") + struct.pack(">ii", 1, len(body) // 2) + body
+    )
     path.with_suffix(".prj").write_text(pyproj.CRS(32615).to_wkt("WKT1_ESRI"))
 
 
@@ -107,7 +116,11 @@ def test_long_edges_bend_as_they_should(tmp_path):
         ("a.geojson", "{", "not a readable geojson"),
         ("a.kml", "<kml><Polygon/></kml>", "not a readable kml"),
         ("a.kml", "<!DOCTYPE x [<!ENTITY a 'b'>]><kml>&a;</kml>", "not a readable kml"),
-        ("a.geojson", '{"type": "Point", "coordinates": [1, 2]}', "at least one polygon, found Point"),
+        (
+            "a.geojson",
+            '{"type": "Point", "coordinates": [1, 2]}',
+            "at least one polygon, found Point",
+        ),
         ("a.kml", "<kml/>", "at least one polygon, found nothing"),
         ("a.gpkg", "no database", "not a readable gpkg"),
         ("a.shp", "none", "not a readable shp"),

@@ -88,17 +88,25 @@ def test_the_rim_keeps_its_colour(tmp_path, monkeypatch):
     array, valid = np.clip(picture(700, 900), 60, 255) // 3 + 120, disc(700, 900)
     rim = valid & ~np.roll(valid, 1, 0)
     write_array(tmp_path / "a.tif", array, spec_for(array, compress="jpeg", mask=True), valid)
-    monkeypatch.setattr("skyquilt.raster.codecs.smooth_fill", lambda pixels, v: pixels * v[..., None])
+    monkeypatch.setattr(
+        "skyquilt.raster.codecs.smooth_fill", lambda pixels, v: pixels * v[..., None]
+    )
     write_array(tmp_path / "b.tif", array, spec_for(array, compress="jpeg", mask=True), valid)
     filled, black = (psnr(read(tmp_path / name)[0][rim], array[rim]) for name in ("a.tif", "b.tif"))
     assert filled > black + 4
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.integers(1, 1500), st.integers(1, 700), st.sampled_from(["jpeg", "deflate"]), st.booleans())
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    st.integers(1, 1500), st.integers(1, 700), st.sampled_from(["jpeg", "deflate"]), st.booleans()
+)
 def test_any_size(tmp_path, width, height, compress, mask):
     array, valid = picture(height, width), disc(height, width) if mask else None
-    write_array(tmp_path / "a.tif", array, spec_for(array, compress=compress, mask=mask, tile=256), valid)
+    write_array(
+        tmp_path / "a.tif", array, spec_for(array, compress=compress, mask=mask, tile=256), valid
+    )
     pixels, seen = read(tmp_path / "a.tif")
     inside = np.ones((height, width), bool) if valid is None else valid
     np.testing.assert_array_equal(seen, inside)
@@ -116,10 +124,14 @@ def test_overviews_are_the_mean_of_the_valid(tmp_path):
     for number in range(2):
         level = np.pad(level, ((0, level.shape[0] % 2), (0, level.shape[1] % 2)), mode="edge")
         quads = (
-            level.reshape(level.shape[0] // 2, 2, -1, 2).swapaxes(1, 2).reshape(-1, level.shape[1] // 2, 4)
+            level.reshape(level.shape[0] // 2, 2, -1, 2)
+            .swapaxes(1, 2)
+            .reshape(-1, level.shape[1] // 2, 4)
         )
         count = np.isfinite(quads).sum(-1)
-        level = np.where(count, np.nansum(quads, -1) / np.maximum(count, 1), np.nan).astype(np.float32)
+        level = np.where(count, np.nansum(quads, -1) / np.maximum(count, 1), np.nan).astype(
+            np.float32
+        )
         got, mask = read(tmp_path / "a.tif", number)
         np.testing.assert_allclose(got[..., 0], level, rtol=1e-5, atol=1e-5)
         np.testing.assert_array_equal(mask, np.isfinite(level))
@@ -129,7 +141,12 @@ def test_overviews_are_the_mean_of_the_valid(tmp_path):
 def test_gdal_s_own_average_agrees(tmp_path):
     array = RNG.integers(0, 255, (1024, 1536, 3), dtype=np.uint8)
     write_array(tmp_path / "ours.tif", array, spec_for(array))
-    options = {"driver": "COG", "blocksize": 512, "overview_resampling": "average", "crs": "EPSG:32615"}
+    options = {
+        "driver": "COG",
+        "blocksize": 512,
+        "overview_resampling": "average",
+        "crs": "EPSG:32615",
+    }
     shape = {
         "width": 1536,
         "height": 1024,
@@ -167,7 +184,9 @@ def test_nothing_valid_at_all(tmp_path):
 
 def test_bigtiff(tmp_path):
     array, valid = picture(1300, 900), disc(1300, 900)
-    with CogWriter(tmp_path / "a.tif", spec_for(array, compress="jpeg", mask=True), bigtiff=True) as writer:
+    with CogWriter(
+        tmp_path / "a.tif", spec_for(array, compress="jpeg", mask=True), bigtiff=True
+    ) as writer:
         for block in writer.blocks():
             writer.write_block(block, array, valid)
     assert (tmp_path / "a.tif").read_bytes()[:4] == b"II\x2b\0"
@@ -194,7 +213,9 @@ def test_mistakes_state_both_sides(tmp_path):
     for nodata in (np.nan, -1, 256, 0.5):
         with pytest.raises(ValueError, match="uint8 cannot hold the nodata value"):
             spec_for(array, nodata=nodata)
-    with pytest.raises(ValueError, match=r"is \(100, 100, 3\) of uint8, got \(99, 100, 3\) of uint8"):
+    with pytest.raises(
+        ValueError, match=r"is \(100, 100, 3\) of uint8, got \(99, 100, 3\) of uint8"
+    ):
         write_array(tmp_path / "a.tif", array[1:], spec_for(array))
     with CogWriter(tmp_path / "b.tif", spec_for(array)) as writer:
         writer.write_tile(0, 0, array)

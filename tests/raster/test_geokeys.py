@@ -22,10 +22,14 @@ def test_epsg(tmp_path, code):
     write_array(tmp_path / "a.tif", ARRAY, spec_for(ARRAY, crs=f"EPSG:{code}"))
     with rasterio.open(tmp_path / "a.tif") as source:
         assert source.crs == CRS.from_epsg(code)
-        assert source.crs.linear_units == CRS.from_epsg(code).linear_units or source.crs.is_geographic
+        assert (
+            source.crs.linear_units == CRS.from_epsg(code).linear_units or source.crs.is_geographic
+        )
 
 
-@pytest.mark.parametrize("crs", [LAEA, LOCAL, "EPSG:32615+5773", "EPSG:5555", "ESRI:102003", "EPSG:4979"])
+@pytest.mark.parametrize(
+    "crs", [LAEA, LOCAL, "EPSG:32615+5773", "EPSG:5555", "ESRI:102003", "EPSG:4979"]
+)
 def test_others(tmp_path, crs):
     write_array(tmp_path / "a.tif", ARRAY, spec_for(ARRAY, crs=crs))
     with rasterio.open(tmp_path / "a.tif") as source:
@@ -34,7 +38,9 @@ def test_others(tmp_path, crs):
     wanted = pyproj.CRS.from_user_input(crs)
     ahead = pyproj.Transformer.from_crs(4326, wanted.to_2d(), always_xy=True).transform(*point)
     np.testing.assert_allclose(
-        pyproj.Transformer.from_crs(4326, ours.to_2d(), always_xy=True).transform(*point), ahead, atol=1e-3
+        pyproj.Transformer.from_crs(4326, ours.to_2d(), always_xy=True).transform(*point),
+        ahead,
+        atol=1e-3,
     )
     assert ours.is_compound == wanted.is_compound
 

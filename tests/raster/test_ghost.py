@@ -11,7 +11,9 @@ from .raster_cases import disc, picture, spec_for
 def test_tiles_lie_as_promised(tmp_path):
     array, valid = picture(1500, 1100), disc(1500, 1100)
     valid[:520, :520] = False
-    write_array(tmp_path / "a.tif", array, spec_for(array, compress="jpeg", mask=True, tile=256), valid)
+    write_array(
+        tmp_path / "a.tif", array, spec_for(array, compress="jpeg", mask=True, tile=256), valid
+    )
     data = (tmp_path / "a.tif").read_bytes()
     assert b"MASK_INTERLEAVED_WITH_IMAGERY=YES" in data[:300]
     with tifffile.TiffFile(tmp_path / "a.tif") as file:
@@ -22,7 +24,11 @@ def test_tiles_lie_as_promised(tmp_path):
     following = max(page.offset for page in pages)
     for image, mask in zip(reversed(images), reversed(masks), strict=True):
         for parts in zip(
-            image.dataoffsets, image.databytecounts, mask.dataoffsets, mask.databytecounts, strict=True
+            image.dataoffsets,
+            image.databytecounts,
+            mask.dataoffsets,
+            mask.databytecounts,
+            strict=True,
         ):
             if parts[1] == 0:
                 assert parts == (0, 0, 0, 0)

@@ -42,7 +42,11 @@ def test_halve(height, width, dtype, how, holes, seed):
     assert got.shape == ((height + 1) // 2, (width + 1) // 2, 2)
     assert got.dtype == values.dtype
     for row, col, band in np.ndindex(got.shape):
-        places = [(min(2 * row + i, height - 1), min(2 * col + j, width - 1)) for i in (0, 1) for j in (0, 1)]
+        places = [
+            (min(2 * row + i, height - 1), min(2 * col + j, width - 1))
+            for i in (0, 1)
+            for j in (0, 1)
+        ]
         inside = [values[(*place, band)] for place in places if valid is None or valid[place]]
         if valid is not None:
             assert got_valid[row, col] == bool(inside)

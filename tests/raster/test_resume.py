@@ -84,7 +84,10 @@ def test_lost_tiles_are_written_again(tmp_path, whole):
 
 @pytest.mark.parametrize("change", [{"digest": "y"}, {"digest": ""}])
 def test_a_spool_of_other_pixels_is_dropped(tmp_path, change):
-    with pytest.raises(KeyboardInterrupt), CogWriter(tmp_path / "a.tif", SPEC, digest="x") as writer:
+    with (
+        pytest.raises(KeyboardInterrupt),
+        CogWriter(tmp_path / "a.tif", SPEC, digest="x") as writer,
+    ):
         write_some(writer, 5)
         raise KeyboardInterrupt
     writer = CogWriter(tmp_path / "a.tif", SPEC, **change)
@@ -134,7 +137,9 @@ def test_radiometric_resume_keeps_nan(tmp_path):
 def test_threads(tmp_path):
     path = tmp_path / "a.tif"
     with CogWriter(path, SPEC, digest="x") as writer, ThreadPoolExecutor(8) as pool:
-        done = pool.map(lambda b: writer.write_block(b, ARRAY[cut(b)], VALID[cut(b)]), writer.blocks())
+        done = pool.map(
+            lambda b: writer.write_block(b, ARRAY[cut(b)], VALID[cut(b)]), writer.blocks()
+        )
         assert len(list(done)) == 6 * 8
     write_array(tmp_path / "b.tif", ARRAY, SPEC, VALID)
     for level in (None, 0, 1, 2, 3, 4):
@@ -179,7 +184,9 @@ def test_disk_fills_while_spooling(tmp_path):
 def test_disk_fills_while_assembling(tmp_path, monkeypatch, whole):
     monkeypatch.setattr("skyquilt.raster.assemble._framed", refuse)
     (tmp_path / "a.tif").write_bytes(b"the last good one")
-    with pytest.raises(OutputError, match=rf"a\.tif needs about {len(whole) / 1e6:.1f} MB in .* MB free"):
+    with pytest.raises(
+        OutputError, match=rf"a\.tif needs about {len(whole) / 1e6:.1f} MB in .* MB free"
+    ):
         write_array(tmp_path / "a.tif", ARRAY, SPEC, VALID)
     assert [p.name for p in tmp_path.iterdir()] == ["a.tif"]
     assert (tmp_path / "a.tif").read_bytes() == b"the last good one"

@@ -31,7 +31,9 @@ def test_polygons(tmp_path):
     assert not polygon.interiors[0].is_ccw
     back = pyproj.Transformer.from_crs(4326, 32615, always_xy=True).transform
     x, y = back(*np.array(polygon.exterior.coords).T)
-    assert {(round(e, 3), round(n, 3)) for e, n in zip(x, y, strict=True)} == {tuple(p) for p in SQUARE}
+    assert {(round(e, 3), round(n, 3)) for e, n in zip(x, y, strict=True)} == {
+        tuple(p) for p in SQUARE
+    }
 
 
 def test_points_and_lines_keep_heights(tmp_path):

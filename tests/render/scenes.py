@@ -1,4 +1,6 @@
-"""Flat textured ground, photographed exactly by ideal cameras, and the composer's parts around it."""
+"""Flat textured ground, photographed exactly by ideal cameras, and the composer's parts around
+it.
+"""
 
 from functools import cache
 
@@ -18,7 +20,9 @@ from skyquilt.render.exposure import NEUTRAL
 from tests.texture import texture
 
 FLAT = Surface(z=np.zeros((2, 2), np.float32), x0=0.0, y0=0.0, cell=1.0, source="plane")
-CAMERA = Camera(width=400, height=300, focal=350.0, cx=203.0, cy=148.0, k1=-0.06, k2=0.02, p1=5e-4, p2=-3e-4)
+CAMERA = Camera(
+    width=400, height=300, focal=350.0, cx=203.0, cy=148.0, k1=-0.06, k2=0.02, p1=5e-4, p2=-3e-4
+)
 FINE_M = 0.025
 """Ground size of a texture pixel in m."""
 GROUND = np.clip(texture(3200, 3200, seed=11, roughness=1.2), 5, 250).astype(np.float32)
@@ -57,11 +61,17 @@ def _sub_pixels(camera):
     """Undistorted coordinates of nine places in every pixel."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     thirds = (-1 / 3, 0, 1 / 3)
-    return [undistort(camera, np.c_[(u + du).ravel(), (v + dv).ravel()]) for du in thirds for dv in thirds]
+    return [
+        undistort(camera, np.c_[(u + du).ravel(), (v + dv).ravel()])
+        for du in thirds
+        for dv in thirds
+    ]
 
 
 def truth(grid, ground=GROUND):
-    """The ground averaged over the pixels of a grid whose resolution is a multiple of the texture's."""
+    """The ground averaged over the pixels of a grid whose resolution is a multiple of the
+    texture's.
+    """
     k = round(grid.gsd / FINE_M)
     top = round((ground.shape[0] / 2) - grid.north / FINE_M)
     left = round(ground.shape[1] / 2 + grid.west / FINE_M)
@@ -73,18 +83,32 @@ def block():
     """Six overlapping photos, tilted and turned."""
     rng = np.random.default_rng(4)
     return [
-        view(3 * k, 14.0 * (k % 3) - 14, 12.0 * (k // 3) - 6, yaw=rng.uniform(0, 360),
-             pitch=rng.normal(0, 3), roll=rng.normal(0, 3))
+        view(
+            3 * k,
+            14.0 * (k % 3) - 14,
+            12.0 * (k // 3) - 6,
+            yaw=rng.uniform(0, 360),
+            pitch=rng.normal(0, 3),
+            roll=rng.normal(0, 3),
+        )
         for k in range(6)
-    ]  # fmt: skip
+    ]
 
 
-def composer(views, pictures, grid, blend=None, *, exposure=NEUTRAL, surface=FLAT, dtype=np.uint8, bands=1):
+def composer(
+    views, pictures, grid, blend=None, *, exposure=NEUTRAL, surface=FLAT, dtype=np.uint8, bands=1
+):
     """`pictures`: photo -> pixels."""
     return Composer(
-        grid=grid, views=views, surface=surface, blend=blend or Feather(), pixels=lambda i: pictures[i], bands=bands,
-        dtype=np.dtype(dtype), exposure=exposure,
-    )  # fmt: skip
+        grid=grid,
+        views=views,
+        surface=surface,
+        blend=blend or Feather(),
+        pixels=lambda i: pictures[i],
+        bands=bands,
+        dtype=np.dtype(dtype),
+        exposure=exposure,
+    )
 
 
 GRID = Grid(west=-24.0, north=18.0, gsd=0.1, width=480, height=360)

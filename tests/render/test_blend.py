@@ -15,14 +15,20 @@ def layer(photo, x, value, *, y=0.0, hide=None, height=FLYING, dtype=np.uint8, b
     if hide is not None:
         score = np.where(hide, np.float32(np.inf), score)
     return Layer(
-        photo=photo, pixels=np.full((H, W, bands), value, dtype), score=score, centre=(x, y), height=height
+        photo=photo,
+        pixels=np.full((H, W, bands), value, dtype),
+        score=score,
+        centre=(x, y),
+        height=height,
     )
 
 
 @pytest.mark.parametrize("width", [4.0, 6.0, 12.0])
 @pytest.mark.parametrize("seam", [0.0, 1.23, -2.0])
 def test_a_seam_is_a_straight_ramp_of_the_stated_width(width, seam):
-    """Two photos of 0 and 200: the mix grows linearly from 0 to 1 over exactly `width` px about equal angles."""
+    """Two photos of 0 and 200: the mix grows linearly from 0 to 1 over exactly `width` px about
+    equal angles.
+    """
     a, b = layer(4, seam - 8, 0), layer(9, seam + 8, 200)
     pixels, photo = Feather(width_px=width).merge([a, b], GSD)
     distance = (np.arange(W) - (W - 1) / 2) - seam / GSD
@@ -52,7 +58,9 @@ def test_where_one_photo_ends_the_other_is_pure():
     pixels, photo = Feather(width_px=6).merge([a, b], GSD)
     assert (pixels[:, :40] == 50).all() and (photo[:, :40] == 0).all()
     everywhere = np.ones((H, W), bool)
-    pixels, photo = Feather().merge([layer(0, 0, 9, hide=everywhere), layer(1, 1, 9, hide=everywhere)], GSD)
+    pixels, photo = Feather().merge(
+        [layer(0, 0, 9, hide=everywhere), layer(1, 1, 9, hide=everywhere)], GSD
+    )
     assert (photo == -1).all() and not pixels.any()
 
 

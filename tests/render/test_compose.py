@@ -1,4 +1,6 @@
-"""Composition of exact photos of known ground against the ground, and its rules against brute force."""
+"""Composition of exact photos of known ground against the ground, and its rules against brute
+force.
+"""
 
 from dataclasses import replace
 
@@ -23,22 +25,31 @@ WHOLE = Window(row=0, column=0, height=GRID.height, width=GRID.width)
 @pytest.fixture(scope="module")
 def scene():
     views = block()
-    pictures = {v.photo: np.clip(np.rint(photograph(v)), 0, 255).astype(np.uint8)[..., None] for v in views}
+    pictures = {
+        v.photo: np.clip(np.rint(photograph(v)), 0, 255).astype(np.uint8)[..., None] for v in views
+    }
     return views, pictures
 
 
 def exact_pixels(views, grid=GRID):
-    """u, v (photos, h, w) of every map pixel in every photo, each projected by itself, and what decides between
-    photos.
+    """u, v (photos, h, w) of every map pixel in every photo, each projected by itself, and what
+    decides between photos.
     """
     x, y = np.meshgrid(grid.x(np.arange(grid.width)), grid.y(np.arange(grid.height)))
     xyz = np.stack([x, y, 0 * x], -1)
     px = np.stack(
-        [project(v.camera, v.pose.to_camera(xyz.reshape(-1, 3))).reshape(*x.shape, 2) for v in views]
+        [
+            project(v.camera, v.pose.to_camera(xyz.reshape(-1, 3))).reshape(*x.shape, 2)
+            for v in views
+        ]
     )
     C = np.array([v.pose.map_C for v in views])
-    tangent2 = ((x - C[:, 0, None, None]) ** 2 + (y - C[:, 1, None, None]) ** 2) / C[:, 2, None, None] ** 2
-    seen = np.stack([inside(v.camera, p[..., 0], p[..., 1]) for v, p in zip(views, px, strict=True)])
+    tangent2 = ((x - C[:, 0, None, None]) ** 2 + (y - C[:, 1, None, None]) ** 2) / C[
+        :, 2, None, None
+    ] ** 2
+    seen = np.stack(
+        [inside(v.camera, p[..., 0], p[..., 1]) for v, p in zip(views, px, strict=True)]
+    )
     return px, np.where(seen, tangent2, np.inf), seen
 
 
@@ -71,7 +82,9 @@ def test_a_shifted_camera_would_be_noticed(scene):
     bent = [replace(v, camera=replace(v.camera, cx=v.camera.cx + 0.5)) for v in views]
     made = composer(bent, pictures, GRID, First())(WHOLE)
     cut = np.s_[150:214, 200:264]
-    (shift,) = shifts_between(truth(GRID)[cut][None], made.pixels[cut][None, ..., 0].astype(np.float32))
+    (shift,) = shifts_between(
+        truth(GRID)[cut][None], made.pixels[cut][None, ..., 0].astype(np.float32)
+    )
     assert np.hypot(shift.dx, shift.dy) > 0.3
 
 
@@ -82,12 +95,20 @@ def test_the_most_vertical_view_wins(scene):
     numbers = np.array([v.photo for v in views])
     expected = np.where(seen.any(0), numbers[score.argmin(0)], -1)
     differs = made.photo != expected
-    # at seams nodes interpolate a parabola linearly: pixels that differ lie within a pixel of equal scores or of a rim
+    # at seams nodes interpolate a parabola linearly: pixels that differ lie within a pixel of equal
+    # scores or of a rim
     two = np.sort(score, axis=0)[:2]
     with np.errstate(invalid="ignore"):
         near_seam = two[1] - two[0] < 4e-3
     rims = [
-        np.stack([p[..., 0] - 2, p[..., 1] - 2, CAMERA.width - 3 - p[..., 0], CAMERA.height - 3 - p[..., 1]])
+        np.stack(
+            [
+                p[..., 0] - 2,
+                p[..., 1] - 2,
+                CAMERA.width - 3 - p[..., 0],
+                CAMERA.height - 3 - p[..., 1],
+            ]
+        )
         for p in px
     ]
     edge = np.min([np.abs(rim).min(0) for rim in rims], axis=0) < 1.0
@@ -107,7 +128,8 @@ def test_the_first_photo_stays(scene):
 def test_the_average_is_the_mean_of_all_that_see(scene):
     views, _ = scene
     levels = {
-        v.photo: np.full((CAMERA.height, CAMERA.width, 1), 20 + 31 * k, np.uint8) for k, v in enumerate(views)
+        v.photo: np.full((CAMERA.height, CAMERA.width, 1), 20 + 31 * k, np.uint8)
+        for k, v in enumerate(views)
     }
     made = composer(views, levels, GRID, Average())(WHOLE)
     _, _, seen = exact_pixels(views)
@@ -148,13 +170,17 @@ def test_pieces_fit_together(scene, blend):
             # nodes in float32 differ in the last digit; multiband sees a finite margin
             assert np.abs(part.pixels.astype(int) - whole.pixels[cut].astype(int)).max() <= 1
             assert (part.photo != whole.photo[cut]).mean() < 1e-3
-            k = np.s_[row // STEP : -(-(row + h) // STEP), column // STEP : -(-(column + w) // STEP)]
+            k = np.s_[
+                row // STEP : -(-(row + h) // STEP), column // STEP : -(-(column + w) // STEP)
+            ]
             assert (part.views == whole.views[k]).all()
 
 
 @pytest.mark.parametrize("blend", [Feather(), First(), Newest()], ids=lambda b: type(b).__name__)
 def test_photos_that_others_hide_need_not_be_looked_at(scene, blend):
-    """Each part of the map planned by itself, with as few photos as can show, is the part of the whole."""
+    """Each part of the map planned by itself, with as few photos as can show, is the part of the
+    whole.
+    """
     views, pictures = scene
     compose = composer(views, pictures, GRID, blend)
     planned = 0
@@ -166,16 +192,25 @@ def test_photos_that_others_hide_need_not_be_looked_at(scene, blend):
             assert len(plan.nodes) <= len(whole.nodes)
             planned += len(whole.nodes) - len(plan.nodes)
             made, expected = compose.drawn(plan), compose.drawn(whole)
-            assert np.array_equal(made.pixels, expected.pixels) and np.array_equal(made.photo, expected.photo)
+            assert np.array_equal(made.pixels, expected.pixels) and np.array_equal(
+                made.photo, expected.photo
+            )
             assert set(np.unique(expected.photo)) - {-1} <= set(plan.shown)
     assert planned > 0  # some were spared
 
 
-@pytest.mark.parametrize("blend", [Feather(width_px=2.0), First(), Newest()], ids=lambda b: type(b).__name__)
+@pytest.mark.parametrize(
+    "blend", [Feather(width_px=2.0), First(), Newest()], ids=lambda b: type(b).__name__
+)
 def test_what_changed_is_drawn_into_what_was_there(scene, blend):
-    """Photos come, move and go, and the ground rises: only some cells are drawn, and nobody can tell."""
+    """Photos come, move and go, and the ground rises: only some cells are drawn, and nobody can
+    tell.
+    """
     views, pictures = scene
-    away, moved = views[2], replace(views[1], pose=replace(views[1].pose, map_C=views[1].pose.map_C + 0.7))
+    away, moved = (
+        views[2],
+        replace(views[1], pose=replace(views[1].pose, map_C=views[1].pose.map_C + 0.7)),
+    )
     shots = [
         [v for v in views if v is not away],
         views,
@@ -203,7 +238,9 @@ def test_what_changed_is_drawn_into_what_was_there(scene, blend):
                     made.pixels, fresh.pixels
                 )
             off = np.abs(made.pixels.astype(int) - expected.pixels)
-            assert off.max() <= 1 and (off > 0).mean() < 1e-3  # ramps follow the height of the whole window
+            assert (
+                off.max() <= 1 and (off > 0).mean() < 1e-3
+            )  # ramps follow the height of the whole window
             plan = new
             touched[step] = touched[step] + (before.pixels != made.pixels).sum()
     assert all(t > 0 for t in touched[1:3]) and touched[4] > 0 and touched[5] > 0
@@ -214,13 +251,22 @@ def test_heights_that_shift_nothing_visibly_stay(scene):
     window = Window(row=32, column=0, height=256, width=256)
     flat = composer(views, pictures, GRID)
     plan = flat.plan(window)
-    steepest = np.sqrt(max(n.score[m].max() for n, m in zip(plan.nodes, plan.near, strict=True) if m.any()))
-    for rise, stays in ((0.9 * STILL * GRID.gsd / steepest, True), (4 * STILL * GRID.gsd / steepest, False)):
-        lifted = composer(views, pictures, GRID, surface=replace(FLAT, z=np.full((2, 2), rise, np.float32)))
+    steepest = np.sqrt(
+        max(n.score[m].max() for n, m in zip(plan.nodes, plan.near, strict=True) if m.any())
+    )
+    for rise, stays in (
+        (0.9 * STILL * GRID.gsd / steepest, True),
+        (4 * STILL * GRID.gsd / steepest, False),
+    ):
+        lifted = composer(
+            views, pictures, GRID, surface=replace(FLAT, z=np.full((2, 2), rise, np.float32))
+        )
         again = lifted.plan(window, earlier=plan)
         assert (again.z == plan.z).all() == stays
         kept = [
-            again.projected[v.photo] is plan.projected[v.photo] for v in views if v.photo in plan.projected
+            again.projected[v.photo] is plan.projected[v.photo]
+            for v in views
+            if v.photo in plan.projected
         ]
         assert all(kept) if stays else not any(kept)
         if stays:
@@ -228,7 +274,9 @@ def test_heights_that_shift_nothing_visibly_stay(scene):
 
 
 def test_measured_values_are_resampled_and_nothing_else():
-    """Float bands: a photo that shows a linear field of its own pixels gives exactly that field; gaps are NaN."""
+    """Float bands: a photo that shows a linear field of its own pixels gives exactly that field;
+    gaps are NaN.
+    """
     shot = view(5, 0, 0, yaw=30)
     u, v = np.meshgrid(np.arange(400, dtype=np.float32), np.arange(300, dtype=np.float32))
     picture = (0.25 * u - 0.5 * v - 273.0)[..., None]
@@ -246,21 +294,32 @@ def test_measured_values_are_resampled_and_nothing_else():
 
 def test_values_far_beyond_bytes_survive_blending():
     shots = [view(0, -5, 0), view(1, 5, 0)]
-    pictures = {0: np.full((300, 400, 1), 1e6, np.float32), 1: np.full((300, 400, 1), -40.0, np.float32)}
+    pictures = {
+        0: np.full((300, 400, 1), 1e6, np.float32),
+        1: np.full((300, 400, 1), -40.0, np.float32),
+    }
     made = composer(shots, pictures, GRID, Feather(width_px=0), dtype=np.float32)(WHOLE)
     assert set(np.unique(made.pixels[np.isfinite(made.pixels)])) == {-40.0, 1e6}
 
 
 def test_relief_is_taken_out():
-    """A slope of 20 %: photos of it, projected point by point, meet the true places of its texture."""
+    """A slope of 20 %: photos of it, projected point by point, meet the true places of its
+    texture.
+    """
     x = np.arange(0, 400.0, 1.0)
     slope = Surface(
-        z=np.tile((0.2 * (x - 200)).astype(np.float32), (400, 1)), x0=-200.0, y0=-200.0, cell=1.0, source="t"
+        z=np.tile((0.2 * (x - 200)).astype(np.float32), (400, 1)),
+        x0=-200.0,
+        y0=-200.0,
+        cell=1.0,
+        source="t",
     )
     shot = view(0, 2, 1, z=45, yaw=75, pitch=3, surface=slope)
     u, v = np.meshgrid(np.arange(400, dtype=np.float32), np.arange(300, dtype=np.float32))
     pictures = {0: np.dstack([u, v])}
-    made = composer([shot], pictures, GRID, Feather(), surface=slope, dtype=np.float32, bands=2)(WHOLE)
+    made = composer([shot], pictures, GRID, Feather(), surface=slope, dtype=np.float32, bands=2)(
+        WHOLE
+    )
     rows, columns = np.nonzero(made.photo >= 0)
     pick = np.random.default_rng(0).choice(len(rows), 500, replace=False)
     x, y = GRID.x(columns[pick]), GRID.y(rows[pick])
@@ -281,6 +340,8 @@ def test_a_fourth_band_on_the_way_changes_nothing(bands, dtype, cut):
     rng = np.random.default_rng(bands)
     image = rng.uniform(0, 255, (cut, cut, bands)).astype(dtype)
     u, v = rng.uniform(-3, cut + 3, (2, 48, 64)).astype(np.float32)
-    plain = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(48, 64, bands)
+    plain = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).reshape(
+        48, 64, bands
+    )
     found = _remapped(image, u, v)
     assert found.dtype == dtype and (found == plain).all()

@@ -1,4 +1,6 @@
-"""Offsets of known size are found again; the level stays; what overlaps cannot tell is left alone."""
+"""Offsets of known size are found again; the level stays; what overlaps cannot tell is left
+alone.
+"""
 
 import numpy as np
 import pytest
@@ -58,7 +60,10 @@ def test_the_map_has_one_level_afterwards(drifted):
 
     wanted = drawn(clean, NEUTRAL) + np.median(list(true.values()))
     offsets = Drift()(views, frames, FLAT, GRID.bounds)
-    raw, even = drawn(frames, NEUTRAL), drawn(frames, Exposure(gains={}, fields={}, offsets=offsets))
+    raw, even = (
+        drawn(frames, NEUTRAL),
+        drawn(frames, Exposure(gains={}, fields={}, offsets=offsets)),
+    )
     assert np.nanmedian(np.abs(raw - wanted)) > 0.4
     assert np.nanmedian(np.abs(even - wanted)) < 0.12  # the noise's own median is 0.07
 
@@ -72,9 +77,11 @@ def test_places_without_measurement_say_nothing(drifted):
 
 def test_every_part_that_hangs_together_keeps_its_own_level():
     edges = Overlaps(
-        first=np.array([0, 1, 3]), second=np.array([1, 2, 4]), difference=np.array([1.0, 1.0, -4.0]),
+        first=np.array([0, 1, 3]),
+        second=np.array([1, 2, 4]),
+        difference=np.array([1.0, 1.0, -4.0]),
         sigma=np.full(3, 0.01),
-    )  # fmt: skip
+    )
     found = solved(edges, 6, 12)
     assert found == pytest.approx([1, 0, -1, -2, 2, 0], abs=0.02)
 
@@ -92,11 +99,15 @@ def test_one_wrong_overlap_of_many_is_outvoted():
 
 
 def test_a_long_line_of_small_equal_errors_does_not_run_away():
-    """100 frames whose every overlap errs by +0.01 for drifts of 0.5: summed up, the ends would part by a degree."""
+    """100 frames whose every overlap errs by +0.01 for drifts of 0.5: summed up, the ends would
+    part by a degree.
+    """
     true = np.random.default_rng(2).normal(0, 0.5, 100)
     first = np.arange(99)
     found = solved(
-        Overlaps(first=first, second=first + 1, difference=np.diff(true) + 0.01, sigma=np.full(99, 0.05)),
+        Overlaps(
+            first=first, second=first + 1, difference=np.diff(true) + 0.01, sigma=np.full(99, 0.05)
+        ),
         100,
         12,
     )
@@ -111,7 +122,11 @@ def test_medians_of_overlaps():
     value = np.r_[np.arange(9.0), np.arange(9.0) + 2, np.arange(3.0)]
     value[12] = 99
     edges = overlaps(point, row, value, least=8)
-    assert (edges.first.tolist(), edges.second.tolist(), edges.difference.tolist()) == ([0], [1], [2.0])
+    assert (edges.first.tolist(), edges.second.tolist(), edges.difference.tolist()) == (
+        [0],
+        [1],
+        [2.0],
+    )
 
 
 def test_frames_without_company_are_left_alone():

@@ -25,7 +25,9 @@ def test_tables_scale_the_odds(g):
     table = odds_table(np.array(g, np.float32))
     assert table.shape == (1, 256, len(g)) and table.dtype == np.uint8
     for band, gain in enumerate(g):
-        assert np.abs(table[0, :, band] - odds_scaled(np.arange(256), np.float32(gain))).max() <= 0.51
+        assert (
+            np.abs(table[0, :, band] - odds_scaled(np.arange(256), np.float32(gain))).max() <= 0.51
+        )
         assert table[0, 0, band] == 0 and table[0, 255, band] == 255
         assert (np.diff(table[0, :, band].astype(int)) >= 0).all()
 
@@ -61,7 +63,9 @@ def lit():
     pictures = {}
     for v in views:
         grey = np.clip(photograph(v), 12, 240)
-        pictures[v.photo] = np.rint(np.dstack([odds_scaled(grey, g) for g in true[v.photo]])).astype(np.uint8)
+        pictures[v.photo] = np.rint(
+            np.dstack([odds_scaled(grey, g) for g in true[v.photo]])
+        ).astype(np.uint8)
     return views, pictures, true
 
 
@@ -82,7 +86,8 @@ def test_the_map_loses_its_patches(lit):
     views, pictures, _ = lit
     whole = Window(row=0, column=0, height=GRID.height, width=GRID.width)
     neutral = {
-        v.photo: np.rint(np.dstack([np.clip(photograph(v), 12, 240)] * 3)).astype(np.uint8) for v in views
+        v.photo: np.rint(np.dstack([np.clip(photograph(v), 12, 240)] * 3)).astype(np.uint8)
+        for v in views
     }
     target = composer(views, neutral, GRID, bands=3)(whole)
 
@@ -97,12 +102,16 @@ def test_the_map_loses_its_patches(lit):
 
 
 def test_vignetting_is_found_as_a_field(lit):
-    """Every photo falls by a quarter per x^2 and y^2; the prior of 0.15 holds back, the sign and no more is sure."""
+    """Every photo falls by a quarter per x^2 and y^2; the prior of 0.15 holds back, the sign and no
+    more is sure.
+    """
     views, _, _ = lit
     x, y = np.meshgrid(np.linspace(-1, 1, 400), np.linspace(-1, 1, 300))
     dark = -0.25 * (x * x + y * y)
     pictures = {
-        v.photo: np.rint(odds_scaled(np.clip(photograph(v), 12, 240), dark))[..., None].astype(np.uint8)
+        v.photo: np.rint(odds_scaled(np.clip(photograph(v), 12, 240), dark))[..., None].astype(
+            np.uint8
+        )
         for v in views
     }
     found = Balance()(views, pictures, FLAT, GRID.bounds)
@@ -146,7 +155,9 @@ def test_measured_values_are_never_touched(lit):
 
 
 def stated_plainly(terms, row, point, y, ridge, count):
-    """The robust solution by full matrices: of each point's samples the weighted mean is taken off, then least squares."""
+    """The robust solution by full matrices: of each point's samples the weighted mean is taken off,
+    then least squares.
+    """
     k = terms.shape[1]
     A = np.zeros((len(y), count * k))
     for sample, photo in enumerate(row):

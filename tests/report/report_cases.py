@@ -14,7 +14,14 @@ class Page(HTMLParser):
 
     def __init__(self, text):
         super().__init__(convert_charrefs=True)
-        self.open, self.ids, self.links, self.tags, self.words, self.attributes = [], [], [], [], [], []
+        self.open, self.ids, self.links, self.tags, self.words, self.attributes = (
+            [],
+            [],
+            [],
+            [],
+            [],
+            [],
+        )
         self.feed(text)
         self.close()
         assert not self.open, self.open
@@ -94,7 +101,11 @@ def run(n=18, *, sightings=6000, samples=800, **changes):
         "shots": taken,
         "residuals": [
             CameraResiduals(
-                camera="dji fc300s", width=4000, height=2250, px=px, residual_px=rng.normal(0, 0.5, px.shape)
+                camera="dji fc300s",
+                width=4000,
+                height=2250,
+                px=px,
+                residual_px=rng.normal(0, 0.5, px.shape),
             )
         ],
         "seams": [
@@ -128,7 +139,12 @@ def metrics(n):
         "seam_disparity_px": {"median": 0.9, "p95": 3.0, "measured": 640, "attempted": 800},
         "metadata_conflicts": [
             {"photo": "IMG_0003.JPG", "field": "yaw", "reported": -137.0, "estimated": 43.0},
-            {"photo": "IMG_0004.JPG", "field": "position", "reported": [1.0, 2.0], "estimated": [3.0, 4.0]},
+            {
+                "photo": "IMG_0004.JPG",
+                "field": "position",
+                "reported": [1.0, 2.0],
+                "estimated": [3.0, 4.0],
+            },
         ],
         "seconds": {"photos": 0.1, "features": 4.6, "render": 5.1, "total": 11.0},
         "cpu_seconds": 12.0,

@@ -125,7 +125,9 @@ def test_names_and_reasons_are_text_never_markup():
     figures |= {
         "method": NASTY,
         "photos_rejected": {NASTY: NASTY},
-        "metadata_conflicts": [{"photo": NASTY, "field": NASTY, "reported": NASTY, "estimated": NASTY}],
+        "metadata_conflicts": [
+            {"photo": NASTY, "field": NASTY, "reported": NASTY, "estimated": NASTY}
+        ],
         "control": [{"name": NASTY}],
         "cameras": {NASTY: {NASTY: {"value": NASTY}}},
         "notes": [NASTY],
@@ -143,7 +145,11 @@ def test_names_and_reasons_are_text_never_markup():
             shots=shots(5, name=NASTY + "{}"),
             residuals=[
                 CameraResiduals(
-                    camera=NASTY, width=100, height=80, px=np.full((20, 2), 5.0), residual_px=np.ones((20, 2))
+                    camera=NASTY,
+                    width=100,
+                    height=80,
+                    px=np.full((20, 2), 5.0),
+                    residual_px=np.ones((20, 2)),
                 )
             ],
         )
@@ -185,17 +191,26 @@ def test_figures_that_are_no_numbers_are_left_out():
                 shots=[*lost, *shots(3)],
                 surface=np.full((4, 4), np.nan, np.float32),
                 views=np.zeros((4, 4), int),
-                seams=[SeamMark(x=0.0, y=0.0, disparity_px=None), SeamMark(x=1.0, y=1.0, disparity_px=nan)],
+                seams=[
+                    SeamMark(x=0.0, y=0.0, disparity_px=None),
+                    SeamMark(x=1.0, y=1.0, disparity_px=nan),
+                ],
                 residuals=[
                     CameraResiduals(
-                        camera="a", width=9, height=9, px=np.full((4, 2), nan), residual_px=np.ones((4, 2))
+                        camera="a",
+                        width=9,
+                        height=9,
+                        px=np.full((4, 2), nan),
+                        residual_px=np.ones((4, 2)),
                     )
                 ],
             )
         )
     )
     assert not re.search(r"\b(nan|NaN|None|inf)\b", page.text)
-    Page(build_report(run(shots=lost, preview=None, bounds=None, views=None, surface=None, seams=())))
+    Page(
+        build_report(run(shots=lost, preview=None, bounds=None, views=None, surface=None, seams=()))
+    )
 
 
 def test_drawings_hold_finite_numbers_only():

@@ -20,7 +20,12 @@ def test_numbers_are_written_for_people():
     assert fixed(-0.0001, 2) == "0.00"
     assert significant(0.0123456) == "0.0123"
     assert significant(1.6) == "1.60"
-    assert [seconds(v) for v in (0.123, 12.34, 125, 7384)] == ["0.12 s", "12.3 s", "2 min 05 s", "2 h 03 min"]
+    assert [seconds(v) for v in (0.123, 12.34, 125, 7384)] == [
+        "0.12 s",
+        "12.3 s",
+        "2 min 05 s",
+        "2 h 03 min",
+    ]
 
 
 @pytest.mark.parametrize(("low", "high"), [(0, 1), (-3.2, 4.7), (1e-6, 2e-6), (0, 12345), (2, -2)])
@@ -37,7 +42,9 @@ def test_steps_are_round():
 
 
 def decode(uri):
-    return cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), cv2.IMREAD_UNCHANGED)
+    return cv2.imdecode(
+        np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), cv2.IMREAD_UNCHANGED
+    )
 
 
 def test_a_palette_png_decodes_to_its_colours():
@@ -77,7 +84,14 @@ def test_ground_holds_map_and_photos():
 
 def test_seam_colours():
     values = (0.1, 0.7, 1.5, 3.0, 9.0, None)
-    assert seam_kinds([SeamMark(x=0, y=0, disparity_px=v) for v in values]).tolist() == [0, 1, 2, 3, 4, 5]
+    assert seam_kinds([SeamMark(x=0, y=0, disparity_px=v) for v in values]).tolist() == [
+        0,
+        1,
+        2,
+        3,
+        4,
+        5,
+    ]
 
 
 def field(shift, n=20_000):

@@ -5,10 +5,16 @@ import numpy as np
 from skyquilt.report.thermal import thermal_section, with_section
 
 RECORD = {
-    "route": "heights", "routes_refused": {"rig": "no <thermal> photo was taken together"}, "unit": "celsius",
-    "photos_used": 4, "photos_total": 5, "inliers": 12, "residual_px": 1.5, "residual_m": 0.15,
+    "route": "heights",
+    "routes_refused": {"rig": "no <thermal> photo was taken together"},
+    "unit": "celsius",
+    "photos_used": 4,
+    "photos_total": 5,
+    "inliers": 12,
+    "residual_px": 1.5,
+    "residual_m": 0.15,
     "evidence": {"surprise": 9.5, "halves_apart_m": 0.04},
-}  # fmt: skip
+}
 PICTURES = [np.full((30, 40, 3), 40 * k, np.uint8) for k in range(4)]
 
 

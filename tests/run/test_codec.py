@@ -28,7 +28,9 @@ class Branch:
 REGISTRY = {"Leaf": Leaf, "Branch": Branch}
 DTYPES = st.sampled_from(["u1", "u2", "<i8", ">i4", "f2", "<f4", ">f8", "c8", "c16", "?", "<U5"])
 ARRAYS = DTYPES.flatmap(
-    lambda d: hnp.arrays(np.dtype(d), hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4))
+    lambda d: hnp.arrays(
+        np.dtype(d), hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4)
+    )
 )
 TEXT = st.text(max_size=8)
 HASHABLE = st.none() | st.booleans() | st.integers() | st.floats() | st.complex_numbers() | TEXT
@@ -46,7 +48,10 @@ def _nested(inner: st.SearchStrategy) -> st.SearchStrategy:
     lists = st.lists(inner, max_size=3)
     leaves = st.lists(LEAVES, max_size=2).map(tuple)
     records = st.builds(
-        Branch, leaves=leaves, by_number=st.dictionaries(st.integers(), inner, max_size=2), more=inner
+        Branch,
+        leaves=leaves,
+        by_number=st.dictionaries(st.integers(), inner, max_size=2),
+        more=inner,
     )
     sets = st.frozensets(st.integers(), max_size=3)
     return lists | lists.map(tuple) | st.dictionaries(keys, inner, max_size=3) | sets | records
@@ -61,7 +66,9 @@ def same(a: Any, b: Any) -> bool:
         return same(a.item(), b)
     if isinstance(a, np.ndarray):
         if a.dtype.kind in "fc":
-            return a.dtype == b.dtype and a.shape == b.shape and np.array_equal(a, b, equal_nan=True)
+            return (
+                a.dtype == b.dtype and a.shape == b.shape and np.array_equal(a, b, equal_nan=True)
+            )
         return a.dtype == b.dtype and np.array_equal(a, b)
     if type(a) is not type(b):
         return False
@@ -74,7 +81,9 @@ def same(a: Any, b: Any) -> bool:
     if isinstance(a, complex):
         return same(a.real, b.real) and same(a.imag, b.imag)
     if isinstance(a, float):
-        return (math.isnan(a) and math.isnan(b)) or (a == b and math.copysign(1, a) == math.copysign(1, b))
+        return (math.isnan(a) and math.isnan(b)) or (
+            a == b and math.copysign(1, a) == math.copysign(1, b)
+        )
     return a == b
 
 

@@ -19,7 +19,10 @@ def finish(path, key="k"):
 def test_a_new_folder_and_its_parents_are_made(tmp_path):
     run = open_run(tmp_path / "a" / "b", "k", overwrite=False)
     assert not run.done
-    assert json.loads((run.path / STATE / "run.json").read_text()) == {"key": "k", "state": "running"}
+    assert json.loads((run.path / STATE / "run.json").read_text()) == {
+        "key": "k",
+        "state": "running",
+    }
 
 
 def test_an_empty_folder_is_free(tmp_path):

@@ -23,10 +23,13 @@ print(full - before, before - resident())
 
 
 @pytest.mark.skipif(
-    platform.libc_ver()[0] != "glibc", reason="only glibc keeps free memory that it must be asked for"
+    platform.libc_ver()[0] != "glibc",
+    reason="only glibc keeps free memory that it must be asked for",
 )
 def test_holes_are_given_back():
-    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True
+    )
     alone, asked = map(int, done.stdout.split())
     assert alone < 20e6  # of 120 MB freed, hardly anything went back by itself
     assert asked > 80e6

@@ -71,7 +71,9 @@ def test_forgetting_concerns_only_the_stages_named(store):
 
 def test_a_digest_depends_on_values_only():
     array = np.arange(6.0).reshape(2, 3)
-    assert digest(array, (1, "a"), {"x": 1, "y": 2}) == digest(array.copy(), [1, "a"], {"y": 2, "x": 1})
+    assert digest(array, (1, "a"), {"x": 1, "y": 2}) == digest(
+        array.copy(), [1, "a"], {"y": 2, "x": 1}
+    )
     assert len({digest(v) for v in (1, 2, "1", None, True, (1,), array, -array)}) == 8
 
 

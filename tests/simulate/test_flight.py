@@ -81,7 +81,10 @@ def test_position_noise(correlation):
     assert (neighbours > 0.7) if correlation else (abs(neighbours) < 0.12)
     heights = np.array([r.sea_level for r in reports]) - 440 - true[:, 2]
     assert abs(heights.std() - 3.0) < (1.2 if correlation else 0.3)
-    assert abs(np.std([r.takeoff - z + 1.5 for r, z in zip(reports, true[:, 2], strict=True)]) - 0.3) < 0.05
+    assert (
+        abs(np.std([r.takeoff - z + 1.5 for r, z in zip(reports, true[:, 2], strict=True)]) - 0.3)
+        < 0.05
+    )
 
 
 def test_lies():
@@ -100,7 +103,9 @@ def test_lies():
     drift = report_all(flown, replace(noise, altitude_drift=100.0), place, START, 1333.0, 7)
     assert drift[-1].sea_level - honest[-1].sea_level == pytest.approx(100, abs=0.01)
     assert drift[0].lies == ("altitude",)
-    silent = report_all(flown, replace(noise, gps_missing=4, focal_missing=True), place, START, 1333.0, 7)
+    silent = report_all(
+        flown, replace(noise, gps_missing=4, focal_missing=True), place, START, 1333.0, 7
+    )
     assert sum(r.latitude is None for r in silent) == 4
     assert silent[0].focal is None
 

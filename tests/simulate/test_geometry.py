@@ -49,7 +49,11 @@ def hills_with_discs():
 def test_discs_are_where_opencv_projects_them():
     scene, points = hills_with_discs()
     where = shot()
-    photo = exposer(scene, LENS).visible(where, CLEAN, 1.0, np.random.default_rng(0))[..., 0].astype(float)
+    photo = (
+        exposer(scene, LENS)
+        .visible(where, CLEAN, 1.0, np.random.default_rng(0))[..., 0]
+        .astype(float)
+    )
     expected = opencv_pixels(points, where, LENS)
     assert np.abs(LENS.project(points, where.rotation, where.place) - expected).max() < 1e-6
     errors = []
@@ -59,7 +63,10 @@ def test_discs_are_where_opencv_projects_them():
             weight = photo[r - 12 : r + 13, c - 12 : c + 13] - 40
             rows, cols = np.mgrid[-12:13, -12:13]
             errors.append(
-                [c + (weight * cols).sum() / weight.sum() - u, r + (weight * rows).sum() / weight.sum() - v]
+                [
+                    c + (weight * cols).sum() / weight.sum() - u,
+                    r + (weight * rows).sum() / weight.sum() - v,
+                ]
             )
     errors = np.array(errors)
     assert len(errors) >= 15

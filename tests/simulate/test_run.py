@@ -1,4 +1,6 @@
-"""A small survey, written whole: same seed same bytes, metadata as reported, pictures as the orthophoto."""
+"""A small survey, written whole: same seed same bytes, metadata as reported, pictures as the
+orthophoto.
+"""
 
 import json
 from dataclasses import replace
@@ -51,7 +53,9 @@ def camera_of(truth, photo) -> Lens:
 
 
 def project(truth, photo, points):
-    return camera_of(truth, photo).project(points, np.array(photo["cam_R_map"]), np.array(photo["position"]))
+    return camera_of(truth, photo).project(
+        points, np.array(photo["cam_R_map"]), np.array(photo["position"])
+    )
 
 
 def test_same_seed_same_bytes(survey, tmp_path):
@@ -98,7 +102,9 @@ def test_photo_colours_are_those_of_the_orthophoto(survey, truth):
         at = np.round(project(truth, photo, centres)).astype(int)
         seen = (at[:, 0] >= 0) & (at[:, 1] >= 0) & (at[:, 0] < 400) & (at[:, 1] < 300)
         radius = ((at[seen] - [199.5, 149.5]) ** 2).sum(axis=1) / (199.5**2 + 149.5**2)
-        found = pixels[at[seen, 1], at[seen, 0]] / (photo["exposure"] * (1 - 0.15 * radius))[:, None]
+        found = (
+            pixels[at[seen, 1], at[seen, 0]] / (photo["exposure"] * (1 - 0.15 * radius))[:, None]
+        )
         true = colours[:, rows[seen], cols[seen]].T
         assert seen.sum() > 300
         assert np.median(np.abs(found - true)) < 8
@@ -143,10 +149,10 @@ def test_a_used_folder_is_refused(survey, tmp_path):
 
 
 def test_command_with_every_option(tmp_path):
-    words = """--preset demo --photos 6 --overlap 70 --sidelap 50 --height 70 --heading 75 --size 240x180
-    --gps-noise 1 --gps-missing 1 --yaw-lie tag --altitude-drift 20 --focal-error 2 --tilt-noise 0.5
-    --relief 3 --season winter --hour 12 --exposure-noise 0.1 --motion-blur 2 --no-thermal --drones 2 --lose 1
-    --gcp 2 --checks 1 --seed 4"""
+    words = """--preset demo --photos 6 --overlap 70 --sidelap 50 --height 70 --heading 75
+    --size 240x180 --gps-noise 1 --gps-missing 1 --yaw-lie tag --altitude-drift 20 --focal-error 2
+    --tilt-noise 0.5 --relief 3 --season winter --hour 12 --exposure-noise 0.1 --motion-blur 2
+    --no-thermal --drones 2 --lose 1 --gcp 2 --checks 1 --seed 4"""
     result = CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *words.split()])
     assert result.exit_code == 0, result.output
     truth = json.loads((tmp_path / "out" / "truth" / "truth.json").read_text())
@@ -158,7 +164,10 @@ def test_command_with_every_option(tmp_path):
 
 
 def test_chessboard_and_no_focal(tmp_path):
-    words = "--terrain chessboard --relief 0 --photos 2 --size 200x150 --no-focal --gcp 0 --checks 0 --quiet"
+    words = (
+        "--terrain chessboard --relief 0 --photos 2 --size 200x150 --no-focal --gcp 0 --checks"
+        " 0 --quiet"
+    )
     result = CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *words.split()])
     assert result.exit_code == 0, result.output
     exif = Image.open(tmp_path / "out" / "photos" / "SIM_0001.jpg").getexif()

@@ -1,4 +1,6 @@
-"""One layout seen in two spectra: edges in the same places, brightness on either side of them unrelated."""
+"""One layout seen in two spectra: edges in the same places, brightness on either side of them
+unrelated.
+"""
 
 import cv2
 import numpy as np

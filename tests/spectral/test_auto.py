@@ -26,11 +26,15 @@ def test_any_rotation_is_found_to_a_part_of_a_pixel(auto, scale, degrees):
     a, b = pair(truth, seed=int(degrees) % 7)
     found = auto(Picture(values=a), Picture(values=b))
     assert found, found.reason
-    assert 1e-4 < error(found.b_H_a, truth) < 0.3  # an error of exactly 0 would mean the truth had leaked
+    assert (
+        1e-4 < error(found.b_H_a, truth) < 0.3
+    )  # an error of exactly 0 would mean the truth had leaked
 
 
 def test_the_search_alone_finds_it_too(auto):
-    blind = replace(auto, propose=StructureMatches(estimate=lambda a, b: NoEstimate(reason="not asked")))
+    blind = replace(
+        auto, propose=StructureMatches(estimate=lambda a, b: NoEstimate(reason="not asked"))
+    )
     truth = turned(1.15, 251.0, SHAPE, SHAPE, (-20.0, 11.0))
     a, b = pair(truth, seed=3)
     found = blind(Picture(values=a), Picture(values=b))
@@ -115,7 +119,10 @@ BAD = {
     "nothing measured": (np.full(SHAPE, np.nan, np.float32), "blank or saturated"),
     "tiny": (SCENE[:40, :200], "200 x 40 px"),
     "flat 16 bits": (8000 + (np.indices(SHAPE).sum(0) % 2).astype(np.uint16), "no contrast"),
-    "flat degrees": ((20 + 0.01 * (np.indices(SHAPE).sum(0) % 3)).astype(np.float32), "no contrast"),
+    "flat degrees": (
+        (20 + 0.01 * (np.indices(SHAPE).sum(0) % 3)).astype(np.float32),
+        "no contrast",
+    ),
 }
 
 
@@ -142,7 +149,9 @@ def test_a_frame_of_noise_over_a_common_frame_is_refused(auto):
     """A black frame is no picture: two unrelated pictures turned by one angle have it in common."""
     turn = cv2.getRotationMatrix2D((240, 200), 30, 0.8)
     a, b = (
-        cv2.warpAffine(np.clip(spectrum(layout(seed=s), s), 10, 255).astype(np.uint8), turn, (480, 400))
+        cv2.warpAffine(
+            np.clip(spectrum(layout(seed=s), s), 10, 255).astype(np.uint8), turn, (480, 400)
+        )
         for s in (20, 21)
     )
     assert not auto(Picture(values=a), Picture(values=b))

@@ -1,4 +1,6 @@
-"""The thesis's methods: their equations against other libraries, their choices by Q, their nine inliers."""
+"""The thesis's methods: their equations against other libraries, their choices by Q, their nine
+inliers.
+"""
 
 import numpy as np
 import pytest
@@ -77,7 +79,10 @@ def registration(q):
 def test_the_highest_q_wins_and_refusals_lose():
     refused = RefusedRegistration(reason="none", evidence={"matches": 3.0})
     assert best([registration(0.2), refused, registration(0.5), registration(0.1)]).q == 0.5
-    assert best([refused, RefusedRegistration(reason="more", evidence={"matches": 8.0})]).reason == "more"
+    assert (
+        best([refused, RefusedRegistration(reason="more", evidence={"matches": 8.0})]).reason
+        == "more"
+    )
     methods = tuple(lambda a, b, g=None, q=q: registration(q) for q in (0.3, 0.6, 0.4))
     nothing = Picture(values=np.zeros((4, 4)))
     assert BetterByQ(methods=methods)(nothing, nothing).q == 0.6
@@ -91,22 +96,36 @@ def test_outliers_keep_the_estimator_with_the_higher_q():
         px = np.random.default_rng(seed).uniform(0, 100, (30, 2))
         unit = np.eye(30, dtype=np.float32) * DESCRIPTOR_UNIT
         return Features(
-            px=px, size=np.ones(30, np.float32), descriptors=np.minimum(unit, 255).astype(np.uint8), scale=1.0
+            px=px,
+            size=np.ones(30, np.float32),
+            descriptors=np.minimum(unit, 255).astype(np.uint8),
+            scale=1.0,
         )
 
     def estimator(count):
         def estimate(a, b):
             return Estimate(
-                model="similarity", b_H_a=np.eye(3) * count, inliers=np.arange(len(a)) < count, ste_per_inlier=0.0,
-                iterations=1, capped=False, method="",
-            )  # fmt: skip
+                model="similarity",
+                b_H_a=np.eye(3) * count,
+                inliers=np.arange(len(a)) < count,
+                ste_per_inlier=0.0,
+                iterations=1,
+                capped=False,
+                method="",
+            )
 
         return estimate
 
     relate = Outliers(
-        match=OneWay(), quality=spread_quality,
-        estimators=(estimator(9), lambda a, b: NoEstimate(reason="no"), estimator(25), estimator(12)),
-    )  # fmt: skip
+        match=OneWay(),
+        quality=spread_quality,
+        estimators=(
+            estimator(9),
+            lambda a, b: NoEstimate(reason="no"),
+            estimator(25),
+            estimator(12),
+        ),
+    )
     found = relate(features(0), features(1), (100, 100))
     assert len(found.px_a) == 25 and found.evidence["matches"] == 30
 

@@ -22,7 +22,9 @@ def tele():
             layout(*WIDE, seed=extra) > 0, layout(*WIDE, seed=extra) + 90 * (extra - 31), labels
         )
     a = np.clip(spectrum(labels, 1), 0, 255).astype(np.uint8)
-    b = cv2.warpPerspective(spectrum(labels, 2), truth, (NARROW[1], NARROW[0]), flags=cv2.INTER_AREA)
+    b = cv2.warpPerspective(
+        spectrum(labels, 2), truth, (NARROW[1], NARROW[0]), flags=cv2.INTER_AREA
+    )
     return Picture(values=a), Picture(values=np.clip(b, 0, 255).astype(np.uint8)), truth
 
 

@@ -35,7 +35,9 @@ def test_side_by_side_joins_inliers():
     a, b = np.zeros((40, 50), np.uint8), np.zeros((30, 60), np.uint8)
     canvas = side_by_side(a, b, np.array([[10.0, 20.0]]), np.array([[30.0, 20.0]]))
     assert canvas.shape == (40, 50 + 8 + 60, 3)
-    assert (np.abs(canvas[20, 20:80].astype(int) - (64, 200, 255)) < 40).all()  # the line, at one height
+    assert (
+        np.abs(canvas[20, 20:80].astype(int) - (64, 200, 255)) < 40
+    ).all()  # the line, at one height
     assert not (canvas[:10, :50]).any()
     assert (canvas[35, 60:] == 255).all()  # below the smaller picture
     none = np.zeros((0, 2))

@@ -1,4 +1,6 @@
-"""Fields of heights of one invented ground, moved by a known similarity, leaning, with gaps and things of one season."""
+"""Fields of heights of one invented ground, moved by a known similarity, leaning, with gaps and
+things of one season.
+"""
 
 import numpy as np
 import pytest
@@ -31,7 +33,9 @@ def field(z, known=None):
 
 
 def moved(z, scale=1.006, plane=(0.0, 0.0), lean=(0.0, 0.0)):
-    """What b's block makes of the ground: moved by TRUTH, its heights scaled and tilted, what stands up leaning."""
+    """What b's block makes of the ground: moved by TRUTH, its heights scaled and tilted, what
+    stands up leaning.
+    """
     back = np.linalg.inv(TRUTH)
     y, x = np.mgrid[0:SIZE, 0:SIZE] * CELL
     px = back[0, 0] * x + back[0, 1] * y + back[0, 2]
@@ -75,7 +79,9 @@ def test_gaps_and_what_only_one_season_has_draw_it_nowhere():
 
 
 def test_a_block_that_leans_moves_what_stands_up():
-    """By three degrees: the top of a dome of 6 m lies 0.3 m aside; the ground must be hit nevertheless."""
+    """By three degrees: the top of a dome of 6 m lies 0.3 m aside; the ground must be hit
+    nevertheless.
+    """
     z, slope = ground(4), 0.05
     leaning = field(moved(z, plane=(slope, 0.0), lean=(slope, 0.0)))
     found = AlignHeights()(field(z), leaning, start())
@@ -113,6 +119,8 @@ def test_coarser_cells_keep_their_place(cell):
     row, column = np.nonzero(plane.known[:-1, :-1])
     wanted = 2 * (plane.x0 + plane.cell * column) - 3 * (plane.y0 + plane.cell * row) + 1
     whole = row > row.min() + 1
-    assert np.abs(plane.z[row, column] - wanted)[whole].max() < 0.02  # to the far corner: cells are square
+    assert (
+        np.abs(plane.z[row, column] - wanted)[whole].max() < 0.02
+    )  # to the far corner: cells are square
     assert plane.cell == pytest.approx(cell, rel=1e-6)
     assert not plane.known[: int(4.5 / cell)].any()

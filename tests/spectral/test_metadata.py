@@ -15,19 +15,32 @@ METRES = np.pi / 180 * 6378137
 
 def photo(east, north, height, yaw, focal, width, rows, source="sensor"):
     return Photo(
-        name="x", path=Path("x.jpg"), digest="", width=width, height=rows, channels=1, dtype="uint8",
-        band="visible", camera_key="", focal=Focal(px=focal, sigma_px=1, source=source),
+        name="x",
+        path=Path("x.jpg"),
+        digest="",
+        width=width,
+        height=rows,
+        channels=1,
+        dtype="uint8",
+        band="visible",
+        camera_key="",
+        focal=Focal(px=focal, sigma_px=1, source=source),
         position=GeoPosition(
             latitude_deg=LATITUDE + north / METRES,
-            longitude_deg=LONGITUDE + east / METRES / np.cos(np.radians(LATITUDE)), altitude_m=height,
-            datum="takeoff", takeoff_m=height,
+            longitude_deg=LONGITUDE + east / METRES / np.cos(np.radians(LATITUDE)),
+            altitude_m=height,
+            datum="takeoff",
+            takeoff_m=height,
         ),
-        attitude=Attitude(yaw_deg=yaw, pitch_deg=0, roll_deg=0), time=None,
-    )  # fmt: skip
+        attitude=Attitude(yaw_deg=yaw, pitch_deg=0, roll_deg=0),
+        time=None,
+    )
 
 
 def seen(ground, camera, at):
-    """Pixels of ground points (n, 2: east, north) of a camera that looks straight down; top along the yaw."""
+    """Pixels of ground points (n, 2: east, north) of a camera that looks straight down; top along
+    the yaw.
+    """
     east, north, height, yaw, focal, width, rows = camera
     off, y = ground - [east, north], np.radians(yaw)
     right, up = off @ [np.cos(y), -np.sin(y)], off @ [np.sin(y), np.cos(y)]

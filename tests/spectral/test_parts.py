@@ -67,7 +67,9 @@ def test_spectra_are_those_of_complex_fields(scene):
 
 @pytest.mark.parametrize("turn", [0.0, np.pi])
 def test_a_correlation_is_the_sum_over_the_overlap(scene, turn):
-    """One place of the FFT's surface against the warp and the sum written out, both halves of the turn."""
+    """One place of the FFT's surface against the warp and the sum written out, both halves of the
+    turn.
+    """
     a, b = of(scene, 60.0), of(scene[30:, 20:], 60.0)
     plane, scale, angle = _Plane.of(a, b), 1.1, 0.4
     fields = {t > angle: (f, o) for t, f, o in plane.correlations(a, scale, angle)}
@@ -91,7 +93,10 @@ def test_everywhere_has_the_truth_among_its_best(degrees):
     best = distinct(Everywhere(smallest=0.93, largest=1.08)(a, b), a.shape, 3, 3)
     small = between(a, b, truth)
     assert (
-        min(np.linalg.norm(corners(c.b_H_a, a.shape) - corners(small, a.shape), axis=1).max() for c in best)
+        min(
+            np.linalg.norm(corners(c.b_H_a, a.shape) - corners(small, a.shape), axis=1).max()
+            for c in best
+        )
         < 4
     )
 
@@ -182,7 +187,9 @@ def test_distinctness_of_a_picture_on_itself_and_beside(scene):
 def test_a_frame_is_no_picture(scene):
     bright = np.clip(scene, 30, 220)
     framed = cv2.warpAffine(bright, cv2.getRotationMatrix2D((240, 200), 25, 0.9), (480, 400))
-    whole = cv2.warpAffine(np.ones_like(scene), cv2.getRotationMatrix2D((240, 200), 25, 0.9), (480, 400))
+    whole = cv2.warpAffine(
+        np.ones_like(scene), cv2.getRotationMatrix2D((240, 200), 25, 0.9), (480, 400)
+    )
     found = usable(Picture(values=framed))
     assert (found.valid != (whole > 0)).mean() < 0.01
     bright[:3], bright[-3:], bright[:, :3], bright[:, -3:] = 100, 100, 100, 100
@@ -197,7 +204,9 @@ def test_what_is_given_as_invalid_stays_so(scene):
 
 def test_colour_is_brightness(scene):
     rgb = np.dstack([scene, scene, scene])
-    assert np.abs(usable(Picture(values=rgb)).grey - usable(Picture(values=scene)).grey).max() < 0.01
+    assert (
+        np.abs(usable(Picture(values=rgb)).grey - usable(Picture(values=scene)).grey).max() < 0.01
+    )
 
 
 def test_fishers_tail_is_scipys():

@@ -42,7 +42,9 @@ def worst(h):
 
 
 def test_a_correspondence_of_one_pair_is_one_of_every_other():
-    """(5.7): carried into the frames of photos 4 and 4, points of pair (0, 0) obey pair (4, 4)'s relation."""
+    """(5.7): carried into the frames of photos 4 and 4, points of pair (0, 0) obey pair (4, 4)'s
+    relation.
+    """
     a_H, b_H = block(1), block(2)
     pair = pairs_of(a_H, b_H, 20, noise=0.0)[0]
     to_a4, to_b4 = ({0: np.linalg.inv(h[4]) @ h[0]} for h in (a_H, b_H))
@@ -65,19 +67,25 @@ def test_all_pairs_together_are_better_than_one():
     for seed in range(8):
         for n in errors:
             photos = [4] if n == 1 else None
-            errors[n].append(worst(Propagate()(pairs_of(a_H, b_H, 25, seed, 0.8, photos), a_H, b_H).b_H_a))
+            errors[n].append(
+                worst(Propagate()(pairs_of(a_H, b_H, 25, seed, 0.8, photos), a_H, b_H).b_H_a)
+            )
     assert np.median(errors[9]) < 0.25 * np.median(errors[1])
     assert np.median(errors[9]) < 1.5
 
 
 def test_points_seen_in_several_pairs_do_not_count_double():
-    """One corner is seen by ten pairs that share an error; balanced, the rest of the block outweighs it."""
+    """One corner is seen by ten pairs that share an error; balanced, the rest of the block
+    outweighs it.
+    """
     a_H, b_H = block(1), block(2)
     pairs = pairs_of(a_H, b_H, 30, noise=0.3)
     for k in range(10):
         px_a = rng(0).uniform(20, 60, (30, 2))  # the same places each time
         there = transfer(TRUTH, transfer(a_H[0], px_a)) + 2.5
-        pairs.append(PairPoints(a=0, b=0, px_a=px_a + 0.01 * k, px_b=transfer(np.linalg.inv(b_H[0]), there)))
+        pairs.append(
+            PairPoints(a=0, b=0, px_a=px_a + 0.01 * k, px_b=transfer(np.linalg.inv(b_H[0]), there))
+        )
     balanced = Propagate(model="affine", scale_px=50)(pairs, a_H, b_H)
     counted = Propagate(model="affine", scale_px=50, radius=1e-9)(pairs, a_H, b_H)
     assert worst(balanced.b_H_a) < 0.6 * worst(counted.b_H_a)
@@ -106,5 +114,9 @@ def test_refusals():
     assert "0 correspondences" in Propagate()(pairs, {}, b_H).reason
     few = Propagate()(pairs_of(a_H, b_H, 8, photos=[0]), a_H, b_H)
     assert not few and "8 correspondences" in few.reason
-    wild = [PairPoints(a=0, b=0, px_a=rng(1).uniform(0, 500, (40, 2)), px_b=rng(2).uniform(0, 500, (40, 2)))]
+    wild = [
+        PairPoints(
+            a=0, b=0, px_a=rng(1).uniform(0, 500, (40, 2)), px_b=rng(2).uniform(0, 500, (40, 2))
+        )
+    ]
     assert "agree on no" in Propagate()(wild, a_H, b_H).reason

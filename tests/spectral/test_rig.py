@@ -58,6 +58,8 @@ def test_too_few_and_quarrelling_pairs_are_refused():
 
 def test_the_median_of_rotations_bears_outliers():
     rng = np.random.default_rng(6)
-    near = [cam_R_map_from_angles(*(np.array([10, 2, -1]) + rng.normal(0, 0.1, 3))) for _ in range(8)]
+    near = [
+        cam_R_map_from_angles(*(np.array([10, 2, -1]) + rng.normal(0, 0.1, 3))) for _ in range(8)
+    ]
     far = [cam_R_map_from_angles(*rng.uniform(-90, 90, 3)) for _ in range(5)]
     assert angle_deg(median_rotation(near + far), cam_R_map_from_angles(10, 2, -1)) < 0.15

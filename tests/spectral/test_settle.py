@@ -1,4 +1,6 @@
-"""Exact places under light that misleads; the truth and a light model of the tests' own are the oracle."""
+"""Exact places under light that misleads; the truth and a light model of the tests' own are the
+oracle.
+"""
 
 import cv2
 import numpy as np
@@ -20,7 +22,9 @@ START = turned(1.0, 0.0, SHAPE, SHAPE, (2, -1))
 
 def believed(b_H_a):
     none = np.zeros((0, 2))
-    return Registration(model="similarity", b_H_a=b_H_a, px_a=none, px_b=none, evidence={"surprise": 9.0})
+    return Registration(
+        model="similarity", b_H_a=b_H_a, px_a=none, px_b=none, evidence={"surprise": 9.0}
+    )
 
 
 def warm(values, truth=TRUTH):
@@ -38,7 +42,8 @@ def off(outcome):
 def test_colours_find_the_place_that_shading_hides(seed, sky):
     """On rough ground under two suns, brightness is drawn aside by pixels and colours are not.
 
-    Of eight such grounds it is on four, by 2 to 7 px; colours are right on all eight, by 0.2 to 0.9 px.
+    Of eight such grounds it is on four, by 2 to 7 px; colours are right on all eight, by 0.2 to 0.9
+    px.
     """
     a, b = rough_ground(seed, TRUTH, sky=sky)
     found = Settle()(Picture(values=a), warm(b), believed(START))
@@ -56,7 +61,9 @@ def test_colours_that_confirm_nothing_leave_it_to_brightness():
     strange, _ = rough_ground(11, TRUTH)
     tint = strange / np.maximum(strange.mean(2, keepdims=True), 1)
     noise = np.random.default_rng(0).normal(0, 4, a.shape)
-    right = off(Settle(side=300.0)(Picture(values=a.mean(2).astype(np.uint8)), warm(b), believed(START)))
+    right = off(
+        Settle(side=300.0)(Picture(values=a.mean(2).astype(np.uint8)), warm(b), believed(START))
+    )
     assert right < 1.5
     for picture in (grey, grey + noise, grey * tint):
         found = Settle(side=300.0)(
@@ -71,7 +78,9 @@ def test_what_runs_away_is_left_where_it_was_believed():
     wrong = turned(1.0, 0.0, SHAPE, SHAPE, (9, 6))
     assert off(Settle(side=300.0, reach=0.1)(Picture(values=a), warm(b), believed(wrong))) < 1
     kept = Settle(side=300.0, reach=0.001)(Picture(values=a), warm(b), believed(wrong))
-    assert error(kept.b_H_a, wrong, SHAPE) < 1  # colours found the place, too far off to be believed
+    assert (
+        error(kept.b_H_a, wrong, SHAPE) < 1
+    )  # colours found the place, too far off to be believed
     blank = Settle(side=300.0)(Picture(values=np.full_like(a, 90)), warm(b), believed(wrong))
     assert np.array_equal(blank.b_H_a, wrong)
 

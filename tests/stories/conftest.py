@@ -62,7 +62,9 @@ class Told:
         return self
 
     def refused(self, code: int, *words: str) -> "Told":
-        """The command said why in one sentence on standard error, and left nothing like a result."""
+        """The command said why in one sentence on standard error, and left nothing like a
+        result.
+        """
         assert self.code == code, self.err or self.out
         assert "Traceback" not in self.err + self.out
         last = self.err.strip().splitlines()[-1] if self.err.strip() else ""
@@ -81,8 +83,15 @@ def leftovers(folder: Path) -> list[str]:
 
 
 def skyquilt(*words: str | Path) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error; what a user would see as a traceback escapes."""
-    out, err, argv, on_interrupt = io.StringIO(), io.StringIO(), sys.argv, signal.getsignal(signal.SIGINT)
+    """Exit code, standard output and standard error; what a user would see as a traceback
+    escapes.
+    """
+    out, err, argv, on_interrupt = (
+        io.StringIO(),
+        io.StringIO(),
+        sys.argv,
+        signal.getsignal(signal.SIGINT),
+    )
     sys.argv = ["skyquilt", *map(str, words)]
     try:
         with (
@@ -107,7 +116,9 @@ Mosaic = Callable[..., Told]
 def mosaic(tmp_path: Path) -> Mosaic:
     """`skyquilt mosaic PHOTOS -o OUT` with quick options; later options win."""
 
-    def command(photos: Path, *options: str | Path, output: Path | None = None, quick: bool = True) -> Told:
+    def command(
+        photos: Path, *options: str | Path, output: Path | None = None, quick: bool = True
+    ) -> Told:
         output = output or tmp_path / "out"
         words = ("mosaic", photos, "-o", output, *(QUICK if quick else ()), *options)
         code, out, err = skyquilt(*words)
@@ -121,7 +132,10 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nine photos of WIDE x HIGH px with `gcp_list.txt` beside their folder `photos`."""
     folder = tmp_path_factory.mktemp("flight")
     settings = FlightSettings(
-        seed=3, lens=Lens().scaled(WIDE, HIGH), route=Route(photos=9), control=Control(points=5, checks=1)
+        seed=3,
+        lens=Lens().scaled(WIDE, HIGH),
+        route=Route(photos=9),
+        control=Control(points=5, checks=1),
     )
     for _ in simulate(settings, folder, overwrite=True):
         pass
@@ -179,10 +193,16 @@ def taken_apart(data: bytes) -> tuple[bytes, str, bytes]:
 
 
 def relabel(
-    path: Path, *, place: tuple[float, float] | None = None, heights: float | None = None,
-    drop: Sequence[str] = (), xmp: dict[str, str] | None = None, strip: bool = False,
-) -> None:  # fmt: skip
-    """Rewrites metadata: another place (latitude, longitude), heights moved by metres, parts dropped.
+    path: Path,
+    *,
+    place: tuple[float, float] | None = None,
+    heights: float | None = None,
+    drop: Sequence[str] = (),
+    xmp: dict[str, str] | None = None,
+    strip: bool = False,
+) -> None:
+    """Rewrites metadata: another place (latitude, longitude), heights moved by metres, parts
+    dropped.
 
     `drop` names `position`, `altitude`, `focal`, `xmp`.
     """
@@ -206,8 +226,12 @@ def relabel(
             exif["GPS"].pop(tag, None)
         packet = re.sub(r'drone-dji:\w+Altitude="[^"]*"', "", packet)
     if "focal" in drop:
-        for tag in (piexif.ExifIFD.FocalLength, piexif.ExifIFD.FocalLengthIn35mmFilm,
-                    piexif.ExifIFD.FocalPlaneXResolution, piexif.ExifIFD.FocalPlaneYResolution):  # fmt: skip
+        for tag in (
+            piexif.ExifIFD.FocalLength,
+            piexif.ExifIFD.FocalLengthIn35mmFilm,
+            piexif.ExifIFD.FocalPlaneXResolution,
+            piexif.ExifIFD.FocalPlaneYResolution,
+        ):
             exif["Exif"].pop(tag, None)
     for name, value in (xmp or {}).items():
         packet = packet.replace('rdf:about=""', f'rdf:about="" drone-dji:{name}="{value}"', 1)
@@ -220,7 +244,10 @@ def relabel(
 def _raised(exif: dict[str, Any], packet: str, metres: float) -> tuple[dict[str, Any], str]:
     tag, sign = piexif.GPSIFD.GPSAltitude, piexif.GPSIFD.GPSAltitudeRef
     old = exif["GPS"][tag][0] / exif["GPS"][tag][1] * (-1 if exif["GPS"].get(sign) else 1)
-    exif["GPS"][tag], exif["GPS"][sign] = (round(abs(old + metres) * 1000), 1000), int(old + metres < 0)
+    exif["GPS"][tag], exif["GPS"][sign] = (
+        (round(abs(old + metres) * 1000), 1000),
+        int(old + metres < 0),
+    )
 
     def moved(found: re.Match[str]) -> str:
         return f'{found[1]}="{float(found[2]) + metres:+.3f}"'
@@ -236,13 +263,16 @@ def other_camera(flight: Path, folder: Path, *, model: str = "Simulated 3:2") ->
         exif = piexif.load(block)
         exif["0th"][piexif.ImageIFD.Model] = model
         exif["Exif"][piexif.ExifIFD.FocalLength] = tuple(
-            int(v * f) for v, f in zip(exif["Exif"][piexif.ExifIFD.FocalLength], (0.75, 1), strict=True)
+            int(v * f)
+            for v, f in zip(exif["Exif"][piexif.ExifIFD.FocalLength], (0.75, 1), strict=True)
         )
         buffer = io.BytesIO()
-        Image.fromarray(pixels_of(source)).resize((WIDE * 3 // 4, HIGH * 3 // 4), Image.Resampling.BOX).save(
-            buffer, "JPEG", quality=92
+        Image.fromarray(pixels_of(source)).resize(
+            (WIDE * 3 // 4, HIGH * 3 // 4), Image.Resampling.BOX
+        ).save(buffer, "JPEG", quality=92)
+        data = with_segment(
+            buffer.getvalue(), 0xE1, b"http://ns.adobe.com/xap/1.0/\x00" + packet.encode()
         )
-        data = with_segment(buffer.getvalue(), 0xE1, b"http://ns.adobe.com/xap/1.0/\x00" + packet.encode())
         target = folder / f"B_{source.name}"
         target.write_bytes(with_segment(data, 0xE1, piexif.dump(exif)))
         made.append(target)

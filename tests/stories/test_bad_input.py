@@ -1,4 +1,6 @@
-"""Photos that are missing, broken, foreign or lying: a clear sentence each, and no good photo lost."""
+"""Photos that are missing, broken, foreign or lying: a clear sentence each, and no good photo
+lost.
+"""
 
 import os
 import shutil
@@ -12,9 +14,20 @@ from PIL import Image
 
 from skyquilt.errors import UnreadablePhotoError
 from tests.photos.conftest import jpeg_bytes, with_segment
-from tests.stories.conftest import HIGH, WIDE, keep, named, other_camera, pixels_of, relabel, taken_apart
+from tests.stories.conftest import (
+    HIGH,
+    WIDE,
+    keep,
+    named,
+    other_camera,
+    pixels_of,
+    relabel,
+    taken_apart,
+)
 
-pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning", "error::scipy.linalg.LinAlgWarning")
+pytestmark = pytest.mark.filterwarnings(
+    "error::RuntimeWarning", "error::scipy.linalg.LinAlgWarning"
+)
 
 # nothing to map
 
@@ -58,7 +71,9 @@ def garble(path: Path) -> None:
     """Random bytes in place of the scan; header, length and end marker stay."""
     data = bytearray(path.read_bytes())
     start = data.rindex(b"\xff\xda") + 14
-    data[start:-2] = np.random.default_rng(1).integers(0, 255, len(data) - start - 2, np.uint8).tobytes()
+    data[start:-2] = (
+        np.random.default_rng(1).integers(0, 255, len(data) - start - 2, np.uint8).tobytes()
+    )
     path.write_bytes(bytes(data))
 
 
@@ -85,10 +100,13 @@ def renamed_text(path: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
-        (truncated, "cut off"), (garble, "damaged"), late(cut_but_ended, "damaged"), late(emptied, "0 bytes"),
+        (truncated, "cut off"),
+        (garble, "damaged"),
+        late(cut_but_ended, "damaged"),
+        late(emptied, "0 bytes"),
         late(renamed_text, "neither JPEG, TIFF nor PNG"),
     ],
-)  # fmt: skip
+)
 def test_one_bad_photo_costs_that_photo_only(mosaic, photos, spoil, reason):
     bad = named(photos)[4]
     spoil(bad)
@@ -312,7 +330,10 @@ def test_gps_of_one_photo_300_km_away(mosaic, photos, finished):
     assert f"{far.name} claims to lie" in told.notes
     w, h = told.metrics["size_px"]
     assert max(w, h) < 1000
-    assert any(c["photo"] == far.name for c in told.metrics["metadata_conflicts"]) or far.name in told.notes
+    assert (
+        any(c["photo"] == far.name for c in told.metrics["metadata_conflicts"])
+        or far.name in told.notes
+    )
 
 
 @pytest.mark.slow
@@ -476,7 +497,9 @@ def test_two_control_points_are_too_few_without_metadata(mosaic, photos, flight)
     lines = (flight / "gcp_list.txt").read_text().splitlines()
     names = list(dict.fromkeys(line.split("\t")[6] for line in lines[1:] if "chk" not in line))[:2]
     few = photos.parent / "few.txt"
-    few.write_text("\n".join([lines[0], *(line for line in lines[1:] if line.split("\t")[6] in names)]))
+    few.write_text(
+        "\n".join([lines[0], *(line for line in lines[1:] if line.split("\t")[6] in names)])
+    )
     mosaic(photos, "--gcp", few).refused(4, "3 control points", "2")
 
 

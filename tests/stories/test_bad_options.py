@@ -10,7 +10,9 @@ import rasterio
 
 from tests.stories.conftest import QUICK, named, relabel, skyquilt
 
-pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning", "error::scipy.linalg.LinAlgWarning")
+pytestmark = pytest.mark.filterwarnings(
+    "error::RuntimeWarning", "error::scipy.linalg.LinAlgWarning"
+)
 
 
 @pytest.mark.parametrize(
@@ -20,7 +22,10 @@ pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning", "error::scipy.l
             ("--method", "magic"),
             ("--method 'magic'", "auto, bundle, position, pose, image, hybrid, flightline"),
         ),
-        (("--transform", "shear"), ("--transform 'shear'", "translation, similarity, affine, homography")),
+        (
+            ("--transform", "shear"),
+            ("--transform 'shear'", "translation, similarity, affine, homography"),
+        ),
         (("--image-search", "all"), ("--image-search 'all'", "chain, overview")),
         (("--optimiser", "luck"), ("--optimiser 'luck'", "anneal, surfaces")),
         (("--lines", "eye"), ("--lines 'eye'", "heading, distance")),
@@ -70,7 +75,9 @@ def test_a_wrong_option(mosaic, flight, options, words):
 
 @pytest.mark.parametrize("words", [("--gsd", "wide"), ("--nonsense",), ("--jobs", "two"), ()])
 def test_usage_errors_end_with_2(flight, tmp_path, words):
-    code, _, err = skyquilt("mosaic", flight / "photos", *(["-o", tmp_path / "out"] if words else []), *words)
+    code, _, err = skyquilt(
+        "mosaic", flight / "photos", *(["-o", tmp_path / "out"] if words else []), *words
+    )
     assert code == 2
     assert "Traceback" not in err
     assert not (tmp_path / "out").exists()
@@ -163,7 +170,9 @@ def test_a_side_file_that_does_not_exist(mosaic, flight, tmp_path, option):
 
 def test_a_malformed_geo_txt(mosaic, flight, tmp_path):
     (tmp_path / "geo.txt").write_text("EPSG:4326\nSIM_0001.jpg fourteen 46.6\n")
-    mosaic(flight / "photos", "--geo", tmp_path / "geo.txt").refused(6, "geo.txt, line 2", "expected")
+    mosaic(flight / "photos", "--geo", tmp_path / "geo.txt").refused(
+        6, "geo.txt, line 2", "expected"
+    )
     (tmp_path / "geo.txt").write_text("EPSG:4326\nDJI_0001.jpg 14.3 46.6\n")
     mosaic(flight / "photos", "--geo", tmp_path / "geo.txt").refused(6, "geo.txt")
 
@@ -182,7 +191,11 @@ def square(west, south, east, north):
     ("name", "content", "words"),
     [
         ("area.geojson", "{ nonsense", ("area.geojson", "not a readable")),
-        ("area.geojson", '{"type": "Point", "coordinates": [14.3, 46.6]}', ("at least one polygon", "Point")),
+        (
+            "area.geojson",
+            '{"type": "Point", "coordinates": [14.3, 46.6]}',
+            ("at least one polygon", "Point"),
+        ),
         ("area.docx", "hello", ("a boundary is one of", ".geojson")),
         pytest.param(
             "area.geojson",
@@ -214,7 +227,16 @@ def test_json_is_one_object_per_line(mosaic, flight):
     assert names[-1] == "Result"
     assert {"StageStarted", "StageProgress", "StageFinished"} <= set(names)
     stages = [e["stage"] for e in told.events if e["event"] == "StageFinished"]
-    assert stages == ["features", "links", "align", "surface", "balance", "mosaic", "measure", "report"]
+    assert stages == [
+        "features",
+        "links",
+        "align",
+        "surface",
+        "balance",
+        "mosaic",
+        "measure",
+        "report",
+    ]
     assert told.events[-1]["metrics"]["photos_used"] == 9
     assert told.err == ""
 
@@ -261,7 +283,9 @@ def test_the_module_runs_and_a_reader_that_leaves_is_no_error(flight, tmp_path):
         "--json",
         *QUICK,
     ]
-    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=dict(os.environ))
+    process = subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=dict(os.environ)
+    )
     assert process.stdout is not None
     assert process.stderr is not None
     process.stdout.readline()

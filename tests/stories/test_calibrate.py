@@ -98,7 +98,12 @@ def test_no_frames_and_wrong_words(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(NoPhotosError):
         calibrate(tmp_path / "empty", tmp_path / "out", SETTINGS)
-    for wrong in ({"columns": 2}, {"square_m": 0.0}, {"square_m": float("nan")}, {"series": "often"}):
+    for wrong in (
+        {"columns": 2},
+        {"square_m": 0.0},
+        {"square_m": float("nan")},
+        {"series": "often"},
+    ):
         with pytest.raises(UsageError):
             CalibrateSettings(**{"columns": 7, "rows": 6, "square_m": 0.1, **wrong})
     from skyquilt.cli.calibrate import parse_board
@@ -121,5 +126,7 @@ def test_the_real_thermal_board(tmp_path):
     assert 0.3 < centres["rms_px"] < 0.6
     assert centres["held_out_px"]["centres"] < 0.8 * corners["held_out_px"]["corners"]
     focal = [c["parameters"]["focal"] for c in (centres, corners)]
-    assert abs(focal[0]["value"] - focal[1]["value"]) < 2 * np.hypot(focal[0]["sigma"], focal[1]["sigma"])
+    assert abs(focal[0]["value"] - focal[1]["value"]) < 2 * np.hypot(
+        focal[0]["sigma"], focal[1]["sigma"]
+    )
     assert m["registration"]["reduction_percent"] > 5

@@ -50,7 +50,9 @@ def test_every_method_makes_a_map(mosaic, lines, method):
     m, q = told.metrics, told.metrics["quality"]
     n = len(named(lines / "photos"))
     assert m["method"] == method and m["photos_used"] == n and m["crs"] == "EPSG:32633"
-    assert 0.5 < q["lambda_corr"] <= 1 and len(q["correlation_with_last_of_photo"]) == n == len(q["photos"])
+    assert 0.5 < q["lambda_corr"] <= 1 and len(q["correlation_with_last_of_photo"]) == n == len(
+        q["photos"]
+    )
     truth, found = places(lines), solved(told)
     off = np.array([found[k][:2] - truth[k][:2] for k in found])
     # positions are reported with 2 m; an alignment may average or keep that, and no more is lost
@@ -87,9 +89,20 @@ def test_options_of_methods(mosaic, lines, options):
 @pytest.mark.slow
 def test_equal_seeds_give_equal_maps(mosaic, lines, tmp_path):
     found = [
-        solved(mosaic(lines / "photos", "--method", "hybrid", "--optimiser", "anneal", "--seed", seed, output=tmp_path / k).made())
+        solved(
+            mosaic(
+                lines / "photos",
+                "--method",
+                "hybrid",
+                "--optimiser",
+                "anneal",
+                "--seed",
+                seed,
+                output=tmp_path / k,
+            ).made()
+        )
         for k, seed in (("a", "1"), ("b", "1"), ("c", "2"))
-    ]  # fmt: skip
+    ]
     a, b, c = (np.array([f[k] for k in sorted(f)]) for f in found)
     assert np.array_equal(a, b) and not np.array_equal(a, c)
 
@@ -106,7 +119,10 @@ def test_known_distances_are_measured_on_the_map(mosaic, lines, tmp_path):
         text += f"{a},{b},{metres:.4f},{p[3]},{p[4]},{p[5]},{q[3]},{q[4]},{q[5]}\n"
     (tmp_path / "known.csv").write_text(text)
     q = mosaic(lines / "photos", "--distances", tmp_path / "known.csv").made().metrics["quality"]
-    assert all(abs(d["on_map"] / d["metres"] - 1) < 0.05 for d in q["distances"]) and len(q["distances"]) == 2
+    assert (
+        all(abs(d["on_map"] / d["metres"] - 1) < 0.05 for d in q["distances"])
+        and len(q["distances"]) == 2
+    )
     assert 0.9 < q["lambda_spat_of_table"] < q["lambda_spat"] < 1
     assert q["lambda"] == pytest.approx((q["lambda_spat"] + q["lambda_corr"]) / 2, abs=1e-4)
 
@@ -164,12 +180,14 @@ def test_headings_missing(mosaic, photos):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("point_a,point_b,metres,px_a,py_a,image_a,px_b,py_b,image_b\nA,B,3,1,1,nine.jpg,2,2,SIM_0001.jpg\n",
-         ("names nine.jpg", "no photo of the survey")),
+        (
+            "point_a,point_b,metres,px_a,py_a,image_a,px_b,py_b,image_b\nA,B,3,1,1,nine.jpg,2,2,SIM_0001.jpg\n",
+            ("names nine.jpg", "no photo of the survey"),
+        ),
         ("point_a,point_b,metres\nA,B,3\n", ("nothing tells where point 'A' is seen",)),
         ("hello\n", ("expected a header with point_a, point_b, metres",)),
     ],
-)  # fmt: skip
+)
 def test_distances_that_cannot_be_used(mosaic, flight, tmp_path, text, words):
     (tmp_path / "known.csv").write_text(text)
     mosaic(flight / "photos", "--distances", tmp_path / "known.csv").refused(6, *words)
@@ -187,7 +205,9 @@ def test_a_sequence_that_cannot_be_used(mosaic, flight, tmp_path):
 
 def test_photos_that_a_sequence_does_not_name_are_left_out(mosaic, flight, tmp_path):
     (tmp_path / "order.txt").write_text("".join(f"SIM_000{k}.jpg\n" for k in (3, 2, 1)))
-    told = mosaic(flight / "photos", "--method", "image", "--sequence", tmp_path / "order.txt").made()
+    told = mosaic(
+        flight / "photos", "--method", "image", "--sequence", tmp_path / "order.txt"
+    ).made()
     assert told.metrics["photos_used"] == 3
     assert told.metrics["photos_rejected"]["SIM_0005.jpg"] == "the sequence does not name it"
 
@@ -196,9 +216,19 @@ def test_photos_that_a_sequence_does_not_name_are_left_out(mosaic, flight, tmp_p
 def test_compare_sets_methods_side_by_side(lines, tmp_path):
     out = tmp_path / "out"
     code, told, err = skyquilt(
-        "compare", lines / "photos", "-o", out, "--methods", "pose,image,hybrid,bundle", "--gsd", "30",
-        "--known", lines / "gcp_list.txt", "--jobs", "2",
-    )  # fmt: skip
+        "compare",
+        lines / "photos",
+        "-o",
+        out,
+        "--methods",
+        "pose,image,hybrid,bundle",
+        "--gsd",
+        "30",
+        "--known",
+        lines / "gcp_list.txt",
+        "--jobs",
+        "2",
+    )
     assert code == 0, err
     record = json.loads((out / "compare.json").read_text())
     assert list(record["methods"]) == ["pose", "image", "hybrid", "bundle"]
@@ -218,9 +248,19 @@ def test_compare_sets_methods_side_by_side(lines, tmp_path):
 @pytest.mark.slow
 def test_compare_judges_by_the_bundle_where_nothing_is_known(lines, tmp_path):
     code, _, err = skyquilt(
-        "compare", lines / "photos", "-o", tmp_path / "out", "--methods", "pose,flightline,bundle", "--gsd", "30",
-        "--first", "8", "--lines", "distance",
-    )  # fmt: skip
+        "compare",
+        lines / "photos",
+        "-o",
+        tmp_path / "out",
+        "--methods",
+        "pose,flightline,bundle",
+        "--gsd",
+        "30",
+        "--first",
+        "8",
+        "--lines",
+        "distance",
+    )
     assert code == 0, err
     record = json.loads((tmp_path / "out" / "compare.json").read_text())
     assert "measured in a model" in record["judged_by"] and len(record["photos"]) == 8

@@ -1,4 +1,6 @@
-"""The output folder: who may write there, what full disks, Ctrl-C and kill -9 leave, what is made again."""
+"""The output folder: who may write there, what full disks, Ctrl-C and kill -9 leave, what is made
+again.
+"""
 
 import errno
 import json
@@ -19,7 +21,9 @@ from skyquilt.run.folder import CONTRACT
 from tests.interrupts import hears_interrupts
 from tests.stories.conftest import leftovers, named
 
-pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning", "error::scipy.linalg.LinAlgWarning")
+pytestmark = pytest.mark.filterwarnings(
+    "error::RuntimeWarning", "error::scipy.linalg.LinAlgWarning"
+)
 SLOWER = ("--features", "800", "--gsd", "11", "--jobs", "2")
 """Options with which each stage lasts long enough to be interrupted."""
 RASTERS = ("mosaic.tif", "provenance.tif", "views.tif", "surface.tif")
@@ -75,7 +79,15 @@ def small_disk(tmp_path):
     def mount(size: str, *options: str) -> Path:
         place = tmp_path / "disk"
         place.mkdir(exist_ok=True)
-        words = ["mount", "-t", "tmpfs", "-o", ",".join([f"size={size}", *options]), "tmpfs", str(place)]
+        words = [
+            "mount",
+            "-t",
+            "tmpfs",
+            "-o",
+            ",".join([f"size={size}", *options]),
+            "tmpfs",
+            str(place),
+        ]
         try:
             subprocess.run(words, check=True, capture_output=True)
         except (OSError, subprocess.CalledProcessError):
@@ -89,12 +101,16 @@ def small_disk(tmp_path):
 
 
 def remount(place: Path, options: str) -> None:
-    subprocess.run(["mount", "-o", f"remount,{options}", str(place)], check=True, capture_output=True)
+    subprocess.run(
+        ["mount", "-o", f"remount,{options}", str(place)], check=True, capture_output=True
+    )
 
 
 def test_output_on_a_read_only_disk(mosaic, flight, small_disk):
     disk = small_disk("2m", "ro")
-    mosaic(flight / "photos", output=disk / "out").refused(5, "cannot write to", "Read-only file system")
+    mosaic(flight / "photos", output=disk / "out").refused(
+        5, "cannot write to", "Read-only file system"
+    )
 
 
 @pytest.mark.slow
@@ -113,7 +129,9 @@ def test_results_that_may_not_be_replaced(mosaic, flight, small_disk):
 
 @pytest.mark.parametrize("size", ["700k", *map(late, ("8k", "100k", "1200k", "1600k", "2m"))])
 def test_a_full_disk(mosaic, flight, small_disk, finished, size):
-    """Wherever it fills up: a sentence, no half file, and with more room the same command goes on."""
+    """Wherever it fills up: a sentence, no half file, and with more room the same command goes
+    on.
+    """
     disk = small_disk(size)
     told = mosaic(flight / "photos", output=disk / "out")
     if told.code == 0:
@@ -131,7 +149,9 @@ def test_a_full_disk(mosaic, flight, small_disk, finished, size):
     same_result(mosaic(flight / "photos", output=disk / "out").made().output, finished)
 
 
-@pytest.mark.parametrize("stage", ["alignment", *map(late, ("features", "links", "surface", "blocks"))])
+@pytest.mark.parametrize(
+    "stage", ["alignment", *map(late, ("features", "links", "surface", "blocks"))]
+)
 def test_a_disk_that_fills_up_while_intermediate_results_are_stored(
     mosaic, flight, finished, monkeypatch, stage
 ):
@@ -202,7 +222,9 @@ def test_other_threads_and_memory_are_the_same_run(mosaic, flight):
     assert "nothing to do" in mosaic(flight / "photos", "--jobs", "1", "--memory", "2").made().err
 
 
-@pytest.mark.parametrize("lost", [*map(late, ("report.html", "mosaic.tif", "metrics.json", "run.toml"))])
+@pytest.mark.parametrize(
+    "lost", [*map(late, ("report.html", "mosaic.tif", "metrics.json", "run.toml"))]
+)
 def test_a_file_that_was_deleted_is_made_again(mosaic, flight, finished, lost):
     output = mosaic(flight / "photos").made().output
     (output / lost).unlink()
@@ -228,7 +250,9 @@ def test_damaged_intermediate_results_are_made_again(mosaic, flight, finished):
     output = mosaic(flight / "photos").made().output
     for number, path in enumerate(sorted((output / ".skyquilt" / "store").rglob("*.npz"))):
         data = path.read_bytes()
-        path.write_bytes((b"", data[:100], data[: len(data) // 2], data[:-1], bytes(len(data)))[number % 5])
+        path.write_bytes(
+            (b"", data[:100], data[: len(data) // 2], data[:-1], bytes(len(data)))[number % 5]
+        )
     (output / "report.html").unlink()
     mosaic(flight / "photos").made()
     same_result(output, finished)
@@ -272,7 +296,9 @@ def test_an_output_inside_the_folder_of_photos_is_no_input(mosaic, photos):
 
 
 @pytest.mark.slow
-def test_an_unfinished_output_inside_the_folder_of_photos_is_no_input_either(mosaic, photos, monkeypatch):
+def test_an_unfinished_output_inside_the_folder_of_photos_is_no_input_either(
+    mosaic, photos, monkeypatch
+):
     from skyquilt.pipelines import mosaic as story
 
     def interrupted(*args, **words):
@@ -307,9 +333,13 @@ class Running:
             *options,
         ]
         self.process = subprocess.Popen(
-            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ),
+            words,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=dict(os.environ),
             preexec_fn=hears_interrupts,
-        )  # fmt: skip
+        )
 
     def until(self, event: str, stage: str, count: int = 1) -> None:
         assert self.process.stdout is not None
@@ -342,20 +372,30 @@ def undisturbed(flight, tmp_path_factory) -> Path:
 
 
 MOMENTS = [
-    ("StageStarted", "features", 1), ("StageProgress", "features", 3), ("StageStarted", "links", 1),
-    ("StageStarted", "align", 1), ("StageStarted", "surface", 1), ("StageStarted", "mosaic", 1),
-    ("StageStarted", "measure", 1), ("StageStarted", "report", 1),
-]  # fmt: skip
+    ("StageStarted", "features", 1),
+    ("StageProgress", "features", 3),
+    ("StageStarted", "links", 1),
+    ("StageStarted", "align", 1),
+    ("StageStarted", "surface", 1),
+    ("StageStarted", "mosaic", 1),
+    ("StageStarted", "measure", 1),
+    ("StageStarted", "report", 1),
+]
 
 
 @pytest.mark.parametrize("moment", [MOMENTS[1], *map(late, (MOMENTS[0], *MOMENTS[2:]))])
-def test_ctrl_c_ends_soon_and_the_same_command_resumes(mosaic, flight, tmp_path, undisturbed, moment):
+def test_ctrl_c_ends_soon_and_the_same_command_resumes(
+    mosaic, flight, tmp_path, undisturbed, moment
+):
     running = Running(flight / "photos", tmp_path / "out", *SLOWER)
     running.until(*moment)
     code, seconds, err = running.signalled(signal.SIGINT)
     assert code == 130, err
     assert seconds < 3, f"it took {seconds:.1f} s to end"
-    assert err.strip().splitlines()[-1] == "skyquilt: interrupted; run the same command again to resume"
+    assert (
+        err.strip().splitlines()[-1]
+        == "skyquilt: interrupted; run the same command again to resume"
+    )
     assert "Traceback" not in err
     assert not (tmp_path / "out" / "metrics.json").exists()
     same_result(mosaic(flight / "photos", *SLOWER, quick=False).made().output, undisturbed)

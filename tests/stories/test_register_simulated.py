@@ -1,4 +1,6 @@
-"""Visible photos of summer noon and thermal ones of a winter morning, of two drones over one simulated terrain."""
+"""Visible photos of summer noon and thermal ones of a winter morning, of two drones over one
+simulated terrain.
+"""
 
 import json
 
@@ -19,18 +21,25 @@ pytestmark = pytest.mark.slow
 def flight(tmp_path_factory):
     folder = tmp_path_factory.mktemp("flight")
     settings = FlightSettings(
-        seed=5, lens=Lens().scaled(1000, 750), route=Route(photos=4), control=Control(points=5, checks=0),
+        seed=5,
+        lens=Lens().scaled(1000, 750),
+        route=Route(photos=4),
+        control=Control(points=5, checks=0),
         thermal=Thermal(weather=Weather(season="winter", hour=6.0)),
-    )  # fmt: skip
+    )
     for _ in simulate(settings, folder, overwrite=True):
         pass
     return folder, json.loads((folder / "truth" / "truth.json").read_text())
 
 
 def px_H_ground(photo, cameras, origin):
-    """Takes (east, north, 1), m from `origin` (3,), on the level ground through it to pixels; lens left out."""
+    """Takes (east, north, 1), m from `origin` (3,), on the level ground through it to pixels; lens
+    left out.
+    """
     camera, R = cameras[photo["camera"]], np.array(photo["cam_R_map"])
-    K = np.array([[camera["focal"], 0, camera["cx"]], [0, camera["focal"], camera["cy"]], [0, 0, 1]])
+    K = np.array(
+        [[camera["focal"], 0, camera["cx"]], [0, camera["focal"], camera["cy"]], [0, 0, 1]]
+    )
     return K @ np.c_[R[:, 0], R[:, 1], R @ (origin - np.array(photo["position"]))]
 
 
@@ -41,7 +50,9 @@ def test_seasons_and_hours_apart(flight, tmp_path):
     thermal = [p for p in truth["photos"] if p["band"] != "visible"]
     errors = []
     for a in visible:
-        b = min(thermal, key=lambda p: np.linalg.norm(np.subtract(p["position"], a["position"])[:2]))
+        b = min(
+            thermal, key=lambda p: np.linalg.norm(np.subtract(p["position"], a["position"])[:2])
+        )
         record = register(folder / a["file"], folder / b["file"], tmp_path / a["name"]).metrics
         assert record["accepted"], (a["name"], b["name"], record["reason"])
         assert "metadata" in record["guess"]

@@ -1,4 +1,6 @@
-"""`mosaic --thermal` on two simulated flights over one terrain, drones and hours apart; the truth is the oracle."""
+"""`mosaic --thermal` on two simulated flights over one terrain, drones and hours apart; the truth
+is the oracle.
+"""
 
 import json
 from dataclasses import replace
@@ -27,9 +29,12 @@ def flights(tmp_path_factory):
     """12 visible photos of the morning, thermal ones of the afternoon that drift by 0.4 K."""
     folder = tmp_path_factory.mktemp("flights")
     settings = FlightSettings(
-        seed=7, lens=Lens().scaled(1200, 900), route=Route(photos=12), control=Control(points=0, checks=0),
+        seed=7,
+        lens=Lens().scaled(1200, 900),
+        route=Route(photos=12),
+        control=Control(points=0, checks=0),
         thermal=Thermal(weather=Weather(hour=15.0), drift=DRIFT_K, overlap=0.75, sidelap=0.6),
-    )  # fmt: skip
+    )
     for _ in simulate(settings, folder, overwrite=True):
         pass
     return folder
@@ -49,7 +54,9 @@ def joined(flights, output, route, settings=SETTINGS):
 
 def displacements(raster, truth):
     good = [s for s in map_error(raster, truth, points=300).samples if s.ok]
-    return np.array([(s.x, s.y) for s in good]), np.array([(s.error_x_m, s.error_y_m) for s in good])
+    return np.array([(s.x, s.y) for s in good]), np.array(
+        [(s.error_x_m, s.error_y_m) for s in good]
+    )
 
 
 def plane(places, off):
@@ -93,10 +100,14 @@ def test_positions_alone_are_a_route_too_and_a_worse_one(flights, output):
 
 @pytest.mark.slow
 def test_values_are_degrees_and_their_drift_is_balanced(flights, output):
-    """Against the true temperatures of the ground, and against the offsets that frames were given."""
+    """Against the true temperatures of the ground, and against the offsets that frames were
+    given.
+    """
     told = joined(flights, output, "auto")["thermal_values"]
     truth = json.loads((flights / "truth" / "truth.json").read_text())
-    true = {p["file"].split("/")[-1]: p["exposure"] for p in truth["photos"] if p["band"] == "thermal"}
+    true = {
+        p["file"].split("/")[-1]: p["exposure"] for p in truth["photos"] if p["band"] == "thermal"
+    }
     assert told["balanced"] and told["unit"] == "celsius" and len(told["offsets"]) == len(true)
     left = np.array([told["offsets"][n] + true[n] for n in told["offsets"]])
     assert np.std(list(true.values())) > 0.25
@@ -113,7 +124,9 @@ def test_values_are_degrees_and_their_drift_is_balanced(flights, output):
 
 @pytest.mark.slow
 def test_raw_values_on_request(flights, tmp_path):
-    told = joined(flights, tmp_path / "out", "positions", replace(SETTINGS, balance_thermal=False, gsd_cm=15))
+    told = joined(
+        flights, tmp_path / "out", "positions", replace(SETTINGS, balance_thermal=False, gsd_cm=15)
+    )
     assert not told["thermal_values"]["balanced"] and told["thermal_values"]["offsets"] == {}
     with rasterio.open(tmp_path / "out" / "thermal.tif") as out:
         assert out.tags()["DRIFT"] == "as recorded"

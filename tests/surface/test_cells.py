@@ -33,8 +33,9 @@ def test_later_points_move_a_cell_part_of_the_way_or_replace_it():
 
 @given(
     st.lists(st.tuples(st.integers(-70, 70), st.integers(-70, 70), st.floats(-9, 9)), max_size=60),
-    st.tuples(*[st.integers(-80, 80)] * 2), st.tuples(*[st.integers(0, 90)] * 2),
-)  # fmt: skip
+    st.tuples(*[st.integers(-80, 80)] * 2),
+    st.tuples(*[st.integers(0, 90)] * 2),
+)
 def test_any_part_of_the_cells_is_what_was_put_there(entries, corner, size):
     known = {(c, r): z for c, r, z in entries}
     cells = HeightCells(cell=1.0)

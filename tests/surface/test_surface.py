@@ -45,9 +45,11 @@ def test_between_nodes_heights_are_bilinear(seed):
     column, row = rng.integers(0, 8, 20), rng.integers(0, 5, 20)
     u, v = rng.random((2, 20))
     expected = (
-        z[row, column] * (1 - u) * (1 - v) + z[row, column + 1] * u * (1 - v)
-        + z[row + 1, column] * (1 - u) * v + z[row + 1, column + 1] * u * v
-    )  # fmt: skip
+        z[row, column] * (1 - u) * (1 - v)
+        + z[row, column + 1] * u * (1 - v)
+        + z[row + 1, column] * (1 - u) * v
+        + z[row + 1, column + 1] * u * v
+    )
     found = s.at(100 + 2 * (column + u), -50 + 2 * (row + v))
     assert found == pytest.approx(expected, abs=40 / 32)  # positions are rounded to 1/32 of a cell
     assert s.at(100 + 2.0 * column, -50 + 2.0 * row) == pytest.approx(z[row, column], abs=1e-5)
@@ -55,7 +57,12 @@ def test_between_nodes_heights_are_bilinear(seed):
 
 def test_beyond_the_rim_heights_go_on_level():
     s = Surface(z=np.array([[1, 2], [3, 4]], np.float32), x0=0.0, y0=0.0, cell=1.0, source="t")
-    assert s.at(np.array([-9.0, 9.0, -9.0, 9.0]), np.array([-9.0, -9.0, 9.0, 9.0])).tolist() == [1, 2, 3, 4]
+    assert s.at(np.array([-9.0, 9.0, -9.0, 9.0]), np.array([-9.0, -9.0, 9.0, 9.0])).tolist() == [
+        1,
+        2,
+        3,
+        4,
+    ]
     assert s.at(np.zeros((3, 4, 5)), np.zeros((3, 4, 5))).shape == (3, 4, 5)
     assert s.at(np.full(70000, 1.0), np.full(70000, 1.0))[-1] == 4.0
 
@@ -110,7 +117,10 @@ def test_too_few_points_are_level(count):
 def test_the_grid_covers_its_bounds_within_reason():
     s = FromTiePoints()(points(lambda x, y: 0 * x, count=300), BOUNDS)
     assert s.x0 == BOUNDS[0] and s.y0 == BOUNDS[1]
-    assert s.x0 + (s.z.shape[1] - 1) * s.cell >= BOUNDS[2] and s.y0 + (s.z.shape[0] - 1) * s.cell >= BOUNDS[3]
+    assert (
+        s.x0 + (s.z.shape[1] - 1) * s.cell >= BOUNDS[2]
+        and s.y0 + (s.z.shape[0] - 1) * s.cell >= BOUNDS[3]
+    )
     clumped = np.column_stack([np.random.default_rng(0).normal(0, 1e-3, (50, 2)), np.zeros(50)])
     assert 10000**2 / grid_spacing(clumped, (-5000, -5000, 5000, 5000)) ** 2 < 4.01e6
 
@@ -127,10 +137,15 @@ def relief(x, y):
 
 
 def render(view, ground):
-    """The picture of the scene: every ray marched to where it meets ground or box (its walls are the ground's)."""
+    """The picture of the scene: every ray marched to where it meets ground or box (its walls are
+    the ground's).
+    """
     w, h = SIZE
     u, v = np.meshgrid(np.arange(w), np.arange(h))
-    d = np.c_[undistort(view.camera, np.c_[u.ravel(), v.ravel()]), np.ones(w * h)] @ view.pose.cam_R_map
+    d = (
+        np.c_[undistort(view.camera, np.c_[u.ravel(), v.ravel()]), np.ones(w * h)]
+        @ view.pose.cam_R_map
+    )
     C = view.pose.map_C
 
     def meet(z):
@@ -139,9 +154,16 @@ def render(view, ground):
     top, bottom = meet(BOX), meet(0.0)
     xy = np.where((relief(*top.T) > 0)[:, None], top, bottom)
     n = ground.shape[0]
-    column, row = (xy[:, 0] / FINE + n / 2).astype(np.float32), (n / 2 - xy[:, 1] / FINE).astype(np.float32)
+    column, row = (
+        (xy[:, 0] / FINE + n / 2).astype(np.float32),
+        (n / 2 - xy[:, 1] / FINE).astype(np.float32),
+    )
     image = cv2.remap(
-        ground, column.reshape(h, w), row.reshape(h, w), cv2.INTER_AREA, borderMode=cv2.BORDER_REFLECT
+        ground,
+        column.reshape(h, w),
+        row.reshape(h, w),
+        cv2.INTER_AREA,
+        borderMode=cv2.BORDER_REFLECT,
     )
     return np.clip(cv2.GaussianBlur(image, (0, 0), 0.6), 0, 255).astype(np.uint8)
 
@@ -152,8 +174,12 @@ def scene():
     ground = texture(2400, 2400, seed=21, roughness=1.1)
     views = []
     for k, (x, y) in enumerate([(-10.0, -2.0), (1.0, 3.0), (11.0, -1.0)]):
-        pose = Pose(cam_R_map=cam_R_map_from_angles(40.0 * k, 1.0, -1.0), map_C=np.array([x, y, FLYING]))
-        views.append(View(photo=k, camera=camera, pose=pose, footprint=footprint(camera, pose, level(0.0))))
+        pose = Pose(
+            cam_R_map=cam_R_map_from_angles(40.0 * k, 1.0, -1.0), map_C=np.array([x, y, FLYING])
+        )
+        views.append(
+            View(photo=k, camera=camera, pose=pose, footprint=footprint(camera, pose, level(0.0)))
+        )
     return views, [render(v, ground) for v in views]
 
 
@@ -181,7 +207,9 @@ def test_where_pictures_do_not_agree_the_surface_stays(scene):
     views, _ = scene
     rng = np.random.default_rng(0)
     noise = [rng.integers(0, 255, SIZE[::-1]).astype(np.uint8) for _ in views]
-    known = Surface(z=np.full((50, 50), 1.25, np.float32), x0=-25.0, y0=-25.0, cell=1.0, source="tie points")
+    known = Surface(
+        z=np.full((50, 50), 1.25, np.float32), x0=-25.0, y0=-25.0, cell=1.0, source="tie points"
+    )
     found = Sweep()(known, views, GRID, shrunk(noise))
     assert found.z == pytest.approx(1.25, abs=0.02)
     blank = [np.full(SIZE[::-1], 90, np.uint8)] * 3
@@ -189,7 +217,9 @@ def test_where_pictures_do_not_agree_the_surface_stays(scene):
 
 
 def test_what_is_higher_than_the_search_is_left_alone(scene):
-    """At the end of the search no height is believed: the roof stays on the ground instead of halfway up."""
+    """At the end of the search no height is believed: the roof stays on the ground instead of
+    halfway up.
+    """
     views, pictures = scene
     found = Sweep(above=0.02)(level(0.0), views, GRID, shrunk(pictures))
     x, y = np.meshgrid(np.linspace(-4, 4, 30), np.linspace(-3, 3, 30))

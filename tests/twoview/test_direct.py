@@ -17,7 +17,9 @@ SIZE = (300, 400)
 
 
 def pair(*parameters, seed=0, negative=False):
-    """Two cuts (300, 400) of one texture; b's content is a's moved by b_H_a (3, 3) about the centre, other light, noise."""
+    """Two cuts (300, 400) of one texture; b's content is a's moved by b_H_a (3, 3) about the
+    centre, other light, noise.
+    """
     ground = texture(900, 1200, seed=seed, roughness=1.3)
     rng = np.random.default_rng(seed)
     H = motion(np.array(parameters), SIZE)
@@ -38,12 +40,20 @@ def error(found, H):
 
 @pytest.mark.parametrize(
     ("method", "parameters", "within"),
-    [(Ncc(), (130.3, -71.8), 0.1), (Ncc(), (-210.0, 40.5), 0.15), (Ncc(turn=20, zoom=1.1), (60.2, 31.7, 0.3, 0.08), 0.3),
-     pytest.param(Ncc(turn=180), (-40.4, 12.0, 2.6), 0.3, marks=pytest.mark.slow), (PhaseCorrelation(), (90.3, -51.8), 0.15),
-     (PhaseCorrelation(similarity=True), (20.3, -11.0, 0.5, 0.1), 1.5), (PhaseCorrelation(similarity=True), (5.0, 9.0, 3.0), 1.5),
-     (Ecc(), (5.2, -4.4, 0.02, 0.01), 0.1), (Ecc(model="translation"), (6.3, 5.5), 0.05), (Ecc(model="affine"), (5.2, -4.4, 0.03), 0.1),
-     pytest.param(MutualInformation(), (5.2, -4.4, 0.02, 0.01), 0.25, marks=pytest.mark.slow)],
-)  # fmt: skip
+    [
+        (Ncc(), (130.3, -71.8), 0.1),
+        (Ncc(), (-210.0, 40.5), 0.15),
+        (Ncc(turn=20, zoom=1.1), (60.2, 31.7, 0.3, 0.08), 0.3),
+        pytest.param(Ncc(turn=180), (-40.4, 12.0, 2.6), 0.3, marks=pytest.mark.slow),
+        (PhaseCorrelation(), (90.3, -51.8), 0.15),
+        (PhaseCorrelation(similarity=True), (20.3, -11.0, 0.5, 0.1), 1.5),
+        (PhaseCorrelation(similarity=True), (5.0, 9.0, 3.0), 1.5),
+        (Ecc(), (5.2, -4.4, 0.02, 0.01), 0.1),
+        (Ecc(model="translation"), (6.3, 5.5), 0.05),
+        (Ecc(model="affine"), (5.2, -4.4, 0.03), 0.1),
+        pytest.param(MutualInformation(), (5.2, -4.4, 0.02, 0.01), 0.25, marks=pytest.mark.slow),
+    ],
+)
 def test_known_motions(method, parameters, within):
     (a, b), H = pair(*parameters)
     found = method(a, b)
@@ -67,7 +77,9 @@ def test_a_start_brings_the_refinements_near():
 
 
 def test_mutual_information_where_correlation_fails():
-    """Bright and dark of one are dark in the other, grey is bright: no correlation, but much in common."""
+    """Bright and dark of one are dark in the other, grey is bright: no correlation, but much in
+    common.
+    """
     (a, b), H = pair(3.2, -2.4, 0.015, seed=1, negative=True)
     found = MutualInformation(finest=2)(a, b)
     assert found and error(found, H) < 0.5
@@ -94,7 +106,9 @@ def test_unrelated_and_blank_pictures_are_refused(method):
 
 
 def test_stripes_are_ambiguous():
-    stripes = np.tile((120 + 100 * np.sin(np.arange(400) * 2 * np.pi / 80)).astype(np.uint8), (300, 1))
+    stripes = np.tile(
+        (120 + 100 * np.sin(np.arange(400) * 2 * np.pi / 80)).astype(np.uint8), (300, 1)
+    )
     noise = np.random.default_rng(0).normal(0, 3, (2, *SIZE))
     found = Ncc()(*(np.clip(stripes + n, 0, 255).astype(np.uint8) for n in noise))
     assert not found and found.reason.startswith("ambiguous")

@@ -1,4 +1,6 @@
-"""Each estimator finds a known transformation among outliers, to what noise allows, and says when it cannot."""
+"""Each estimator finds a known transformation among outliers, to what noise allows, and says when
+it cannot.
+"""
 
 import numpy as np
 import pytest
@@ -33,10 +35,7 @@ def error(found, H):
 
 
 @pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize(
-    ("estimator", "outliers"),
-    [(Ransac, 0.6), (Magsac, 0.6), (Lmeds, 0.4)],
-)
+@pytest.mark.parametrize(("estimator", "outliers"), [(Ransac, 0.6), (Magsac, 0.6), (Lmeds, 0.4)])
 def test_among_outliers(estimator, outliers, model):
     for seed in range(5):
         a, b, H, right = matches(model, seed, outliers)
@@ -89,7 +88,9 @@ def test_samples_are_distinct_and_even():
     assert np.bincount(drawn_.ravel(), minlength=6) / drawn_.size == pytest.approx(
         np.full(6, 1 / 6), abs=0.003
     )
-    assert np.bincount(drawn_[:, 3], minlength=6) / 60000 == pytest.approx(np.full(6, 1 / 6), abs=0.01)
+    assert np.bincount(drawn_[:, 3], minlength=6) / 60000 == pytest.approx(
+        np.full(6, 1 / 6), abs=0.01
+    )
 
 
 def test_needed_samples_are_the_textbooks():
@@ -124,14 +125,19 @@ def test_distant_matches_are_the_longest_of_random_pairs():
     for _ in range(50):
         index = _distant(rng, a, 4)
         assert len(set(index.tolist())) == 4
-        spans += [np.linalg.norm(a[index[0]] - a[index[1]]), np.linalg.norm(a[index[2]] - a[index[3]])]
+        spans += [
+            np.linalg.norm(a[index[0]] - a[index[1]]),
+            np.linalg.norm(a[index[2]] - a[index[3]]),
+        ]
     # of 75 pairs the second longest is beyond the 95 % quantile of all distances
     everything = np.linalg.norm(a[:, None] - a[None], axis=-1)[np.triu_indices(150, 1)]
     assert np.mean(np.array(spans) > np.quantile(everything, 0.9)) > 0.95
 
 
 def test_ste_accepts_clean_matches_at_once():
-    """A 2.4 gives it the 150 best: 0.1 px of noise has an STE of 0.04 px^2 before its tail is cut off."""
+    """A 2.4 gives it the 150 best: 0.1 px of noise has an STE of 0.04 px^2 before its tail is cut
+    off.
+    """
     for seed in range(5):
         a, b, H, _ = matches("translation", seed, 0.0, 150)
         b = transfer(H, a) + np.random.default_rng(seed).normal(0, 0.1, (150, 2))
@@ -139,7 +145,9 @@ def test_ste_accepts_clean_matches_at_once():
         assert found.method == "RANSAC-1-OPT" and found.ste_per_inlier < 0.2 and found.share > 0.75
         assert error(found, H) < 0.1
         true = symmetric_transfer_errors(H, a, b)  # cut off at (9), as the estimator does
-        assert found.ste_per_inlier == pytest.approx(true[true < np.sqrt(5.99) * true.std()].mean(), rel=0.12)
+        assert found.ste_per_inlier == pytest.approx(
+            true[true < np.sqrt(5.99) * true.std()].mean(), rel=0.12
+        )
 
 
 def test_ste_falls_back_to_its_second_half():
@@ -154,7 +162,9 @@ def test_ste_falls_back_to_its_second_half():
 
 
 def test_ste_as_printed_breaks_where_the_extension_holds():
-    """(9) grows with the outliers: a quarter of gross ones is enough. A fixed threshold mends it."""
+    """(9) grows with the outliers: a quarter of gross ones is enough. A fixed threshold mends
+    it.
+    """
     a, b, H, _ = matches("homography", 0, 0.25, 150)
     assert error(RansacSte()(a, b), H) > 10
     mended = RansacSte(threshold_px2=4.0, max_iterations=300)(a, b)

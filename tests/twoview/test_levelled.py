@@ -1,4 +1,6 @@
-"""Simulated relief: what stands on the plane is removed, and the plane's transformation comes out better."""
+"""Simulated relief: what stands on the plane is removed, and the plane's transformation comes out
+better.
+"""
 
 from dataclasses import replace
 
@@ -14,7 +16,8 @@ GRID = np.stack(np.meshgrid(np.linspace(0, 1500, 7), np.linspace(0, 1000, 5)), -
 
 
 def relief_pair(seed, share=0.35, relief=1.5):
-    """Two nadir photos 12 m apart from 40 m over level ground with things up to `relief` on it: a, b, heights.
+    """Two nadir photos 12 m apart from 40 m over level ground with things up to `relief` on it: a,
+    b, heights.
 
     Level ground moves by F * BASE / HEIGHT = 351 px between them.
     """
@@ -50,7 +53,9 @@ def test_things_on_the_plane_are_removed(model):
             ~inside
         ].any()
         assert np.linalg.norm(found.d_px[found.level], axis=1).max() <= 2
-        assert found.level[z[inside] == 0].mean() > 0.9 and found.level[z[inside] > 0.8].mean() < 0.1
+        assert (
+            found.level[z[inside] == 0].mean() > 0.9 and found.level[z[inside] > 0.8].mean() < 0.1
+        )
         better.append((error(found.estimate.b_H_a), error(first.b_H_a)))
     after, before = np.array(better).T
     assert np.median(after) < 0.6 * np.median(before)

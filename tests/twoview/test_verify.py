@@ -13,7 +13,10 @@ from tests.alignment.blocks import FLYING, HEIGHT, LENS, WIDTH, ground, seen_by
 
 def features(px, scale=1.0):
     return Features(
-        px=px, size=np.ones(len(px), np.float32), descriptors=np.zeros((len(px), 4), np.float32), scale=scale
+        px=px,
+        size=np.ones(len(px), np.float32),
+        descriptors=np.zeros((len(px), 4), np.float32),
+        scale=scale,
     )
 
 
@@ -28,14 +31,18 @@ def view_pair(
     noise=0.4,
     tilt=2.0,
 ):
-    """Sightings of rolling ground by two tilted cameras; returns pixels of both and which matches are right."""
+    """Sightings of rolling ground by two tilted cameras; returns pixels of both and which matches
+    are right.
+    """
     rng = np.random.default_rng(seed)
     C = np.array([[0, 0, FLYING * height[0]], [*base, FLYING * height[1]]])
     R = [cam_R_map_from_angles(y, *rng.normal(0, tilt, 2)) for y in yaw]
     X = rng.uniform(-40, 60, (6000, 2))
     X = np.column_stack([X, ground(X)])
     px = [seen_by(R[k], C[k], LENS, X) for k in range(2)]
-    both = np.flatnonzero(np.all([(p > 0).all(1) & (p < (WIDTH, HEIGHT)).all(1) for p in px], axis=0))[:count]
+    both = np.flatnonzero(
+        np.all([(p > 0).all(1) & (p < (WIDTH, HEIGHT)).all(1) for p in px], axis=0)
+    )[:count]
     pa, pb = (p[both] + rng.normal(0, noise, (len(both), 2)) for p in px)
     right = rng.random(len(both)) >= outliers
     pb[~right] = rng.uniform(0, (WIDTH, HEIGHT), ((~right).sum(), 2))
@@ -48,7 +55,13 @@ def verified(pa, pb, **options):
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.integers(0, 10**6), st.floats(0, 360), st.floats(0, 360), st.floats(0.75, 1.3), st.floats(0, 0.5))
+@given(
+    st.integers(0, 10**6),
+    st.floats(0, 360),
+    st.floats(0, 360),
+    st.floats(0.75, 1.3),
+    st.floats(0, 0.5),
+)
 def test_links_of_tilted_views_of_rolling_ground(seed, yaw_a, yaw_b, ratio, outliers):
     pa, pb, right = view_pair(seed, yaw=(yaw_a, yaw_b), height=(1.0, ratio), outliers=outliers)
     link = verified(pa, pb)
@@ -62,7 +75,9 @@ def test_links_of_tilted_views_of_rolling_ground(seed, yaw_a, yaw_b, ratio, outl
 
 
 def test_the_similarity_maps_y_up_points():
-    """Exactly: 200 points turned by 30 degrees counter-clockwise as seen on the image, 1.2 times as far apart."""
+    """Exactly: 200 points turned by 30 degrees counter-clockwise as seen on the image, 1.2 times as
+    far apart.
+    """
     rng = np.random.default_rng(0)
     pa = rng.uniform(200, 400, (200, 2))
     s = 1.2 * np.exp(1j * np.radians(30))

@@ -1,8 +1,10 @@
-"""Bundle adjustment: Levenberg-Marquardt on the Schur complement, with priors on everything that has one.
+"""Bundle adjustment: Levenberg-Marquardt on the Schur complement, with priors on everything that
+has one.
 
-Robust losses are iteratively reweighted (Cauchy). Libraries were weighed first: see docs/decisions.md; the
-wheel of pycolmap offers priors on positions only, and a strip without loops needs them on tilt and on every
-intrinsic as well. The tests hold this code against pycolmap's Ceres on problems that both can state.
+Robust losses are iteratively reweighted (Cauchy). Libraries were weighed first: see
+docs/decisions.md; the wheel of pycolmap offers priors on positions only, and a strip without loops
+needs them on tilt and on every intrinsic as well. The tests hold this code against pycolmap's Ceres
+on problems that both can state.
 """
 
 from dataclasses import dataclass, replace
@@ -26,7 +28,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 SMALL = 500
-"""Unknowns up to which NumPy's solver does: SciPy's halves the work, but takes longer to load than that saves."""
+"""Unknowns up to which NumPy's solver does: SciPy's halves the work, but takes longer to load than
+that saves.
+"""
 DENSE_LIMIT = 4000
 """Unknowns of the reduced system up to which dense Cholesky is used."""
 
@@ -81,10 +85,11 @@ def _cauchy(squared: Array, scale: float) -> tuple[Array, Array]:
 
 
 def _pseudo_huber(squared: Array, scale: float) -> tuple[Array, Array]:
-    """Weights and costs under the pseudo-Huber loss: what lies counts less, but it never stops counting.
+    """Weights and costs under the pseudo-Huber loss: what lies counts less, but it never stops
+    counting.
 
-    A strip that bends away from its positions and angles does so with all of them together; a loss that
-    forgets outliers would forget them all.
+    A strip that bends away from its positions and angles does so with all of them together; a loss
+    that forgets outliers would forget them all.
     """
     root = np.sqrt(1 + squared / scale**2)
     # the cost is 2 scale^2 (root - 1), written without its cancellation at large scales
@@ -92,7 +97,9 @@ def _pseudo_huber(squared: Array, scale: float) -> tuple[Array, Array]:
 
 
 def _by_point(problem: Problem, values: Array, count: int) -> Array:
-    """Sums of values (N, ...) of each point's sightings: (count, ...). Sightings are sorted by point."""
+    """Sums of values (N, ...) of each point's sightings: (count, ...). Sightings are sorted by
+    point.
+    """
     flat = values.reshape(len(values), -1)
     starts = np.searchsorted(problem.point, np.arange(count))
     total = np.add.reduceat(flat, np.minimum(starts, len(flat) - 1), axis=0)
@@ -161,9 +168,17 @@ def normal_equations(problem: Problem, state: State) -> Normal:
     _add_diagonal(V, 0, px)
     gp = by_photo[:, :6, -1] + np.concatenate([gr, gc], 1)
     return Normal(
-        U=U, Uc=Uc, Upc=by_photo[:, :6, 6 : 6 + q], V=V, Wp=W[:, :6], Wc=W[:, 6:],
-        gp=gp, gc=by_camera[:, :, q] + gk[:, :q], gv=by_point[:, :, 3] + gx, cost=cost + terms[1],
-    )  # fmt: skip
+        U=U,
+        Uc=Uc,
+        Upc=by_photo[:, :6, 6 : 6 + q],
+        V=V,
+        Wp=W[:, :6],
+        Wc=W[:, 6:],
+        gp=gp,
+        gc=by_camera[:, :, q] + gk[:, :q],
+        gv=by_point[:, :, 3] + gx,
+        cost=cost + terms[1],
+    )
 
 
 def robust_cost(problem: Problem, state: State) -> float:
@@ -230,7 +245,9 @@ class Reduced:
         return S
 
     def _chunk(self, lo: int, hi: int) -> tuple[NDArray[np.int64], Array, slice]:
-        """Unknowns touched by sightings [lo, hi), their rows of W L^-T (u, 3p), and the points' slice."""
+        """Unknowns touched by sightings [lo, hi), their rows of W L^-T (u, 3p), and the points'
+        slice.
+        """
         p, N, q = self.problem, self.normal, self.q
         point, photo = p.point[lo:hi], p.photo[lo:hi]
         first, last = int(point[0]), int(point[-1]) + 1
@@ -309,7 +326,12 @@ def polish_points(problem: Problem, state: State) -> State:
 
 
 def adjust(
-    problem: Problem, state: State, *, iterations: int = 30, tolerance: float = 1e-5, damping: float = 1e-4
+    problem: Problem,
+    state: State,
+    *,
+    iterations: int = 30,
+    tolerance: float = 1e-5,
+    damping: float = 1e-4,
 ) -> Adjusted:
     """Minimises the robust cost.
 
@@ -329,7 +351,9 @@ def adjust(
         cost, new_cost, accepted, candidate = normal.cost, np.inf, False, state
         while not accepted and damping < 1e8:
             try:
-                candidate = polish_points(problem, state.moved(*Reduced(problem, normal, damping).step()))
+                candidate = polish_points(
+                    problem, state.moved(*Reduced(problem, normal, damping).step())
+                )
                 new_cost = robust_cost(problem, candidate)
             except np.linalg.LinAlgError:
                 new_cost = np.inf
@@ -354,7 +378,9 @@ def covariance(problem: Problem, state: State) -> Array | None:
     if not isinstance(reduced.S, np.ndarray):
         return None
     S = reduced.S + np.diag(np.full(reduced.size, 1e-9))
-    scale = 1 / np.sqrt(np.maximum(np.diag(S), 1e-9))  # radians and metres differ by orders of magnitude
+    scale = 1 / np.sqrt(
+        np.maximum(np.diag(S), 1e-9)
+    )  # radians and metres differ by orders of magnitude
     scale = scale[:, None] * scale
     try:
         inverse = np.linalg.inv(S * scale) * scale

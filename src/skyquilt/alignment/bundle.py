@@ -1,4 +1,6 @@
-"""`bundle`: similarity graph -> adjustment with self-calibration and priors -> points of the ground."""
+"""`bundle`: similarity graph -> adjustment with self-calibration and priors -> points of the
+ground.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -34,16 +36,24 @@ class Bundle:
     per_photo: int = 400
     """Sightings per photo in the adjustment; all the others are triangulated afterwards."""
     repair: bool = True
-    """Treat metadata as measurements that may lie; False believes them to their stated deviations."""
+    """Treat metadata as measurements that may lie; False believes them to their stated deviations.
+    """
     sharpen: Sharpen | None = field(default_factory=Sharpen)
     """Registration of sightings in larger pictures; None leaves keypoints as they were found."""
     version: ClassVar[int] = 4
 
     def __call__(
-        self, photos: Sequence[Photo], frame: MapFrame, priors: Sequence[Prior], features: Sequence[Features],
-        links: Sequence[Link], control: Sequence[Control] = (), grey: GreyPicture | None = None,
-    ) -> Alignment:  # fmt: skip
-        """Aligns the photos that hang together by links; `grey` gives pictures to sharpen sightings in.
+        self,
+        photos: Sequence[Photo],
+        frame: MapFrame,
+        priors: Sequence[Prior],
+        features: Sequence[Features],
+        links: Sequence[Link],
+        control: Sequence[Control] = (),
+        grey: GreyPicture | None = None,
+    ) -> Alignment:
+        """Aligns the photos that hang together by links; `grey` gives pictures to sharpen sightings
+        in.
 
         Raises:
             AlignmentError: no two photos are linked.
@@ -69,9 +79,14 @@ class Bundle:
 
 
 def _sharpened(
-    tracks: Tracks, photos: Sequence[Photo], setup: Setup, problem: Problem, state: State, sharpen: Sharpen,
+    tracks: Tracks,
+    photos: Sequence[Photo],
+    setup: Setup,
+    problem: Problem,
+    state: State,
+    sharpen: Sharpen,
     grey: GreyPicture,
-) -> Tracks:  # fmt: skip
+) -> Tracks:
     """Tracks (sensor pixels) with sightings registered in larger pictures."""
     everything, _ = setup.problem(tracks)
     xyz = triangulated(everything, state).X
@@ -96,11 +111,15 @@ def _fine(problem: Problem, state: State) -> tuple[Problem, State]:
     problem, state = prune(problem, state, 20.0)
     state = adjust(problem.with_loss(2.5), state, iterations=20, tolerance=2e-3, damping=1e-6).state
     problem, state = prune(problem, state, 5.0)
-    return problem, adjust(problem.with_loss(2.0), state, iterations=15, tolerance=3e-4, damping=1e-6).state
+    return problem, adjust(
+        problem.with_loss(2.0), state, iterations=15, tolerance=3e-4, damping=1e-6
+    ).state
 
 
 def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]:
-    """Without the sightings off by more than `limit` deviations, and points then seen once; control stays."""
+    """Without the sightings off by more than `limit` deviations, and points then seen once; control
+    stays.
+    """
     error = np.linalg.norm(residuals_px(problem, state), axis=1) / problem.sigma_px
     pinned = np.asarray(np.isfinite(problem.X0).any(1))
     good = (error < limit) | pinned[problem.point]
@@ -108,17 +127,23 @@ def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]
     good &= enough[problem.point] | pinned[problem.point]
     points, renumbered = np.unique(problem.point[good], return_inverse=True)
     thinner = replace(
-        problem, point=renumbered.astype(np.int64), photo=problem.photo[good], px=problem.px[good],
-        sigma_px=problem.sigma_px[good], X0=problem.X0[points], sigma_X=problem.sigma_X[points],
-    )  # fmt: skip
+        problem,
+        point=renumbered.astype(np.int64),
+        photo=problem.photo[good],
+        px=problem.px[good],
+        sigma_px=problem.sigma_px[good],
+        X0=problem.X0[points],
+        sigma_X=problem.sigma_X[points],
+    )
     return thinner, replace(state, X=state.X[points])
 
 
 def _believe_positions_less(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
     """Where neighbours contradict the stated horizontal accuracy, their scatter takes its place.
 
-    Only what changes from photo to photo counts: a smooth misfit may as well be the block's own bending, and
-    believing positions less would let it bend. (Heights are judged by image scale, before the adjustment.)
+    Only what changes from photo to photo counts: a smooth misfit may as well be the block's own
+    bending, and believing positions less would let it bend. (Heights are judged by image scale,
+    before the adjustment.)
     """
     for _ in range(2):
         error = state.C - problem.C0
@@ -147,7 +172,8 @@ def position_noise(error: Array) -> float:
 def leave_one_out(
     problem: Problem, state: State, C_covariance: Array | None
 ) -> tuple[float, float, float] | None:
-    """RMS per axis in m of each measured position against the position that everything else predicts.
+    """RMS per axis in m of each measured position against the position that everything else
+    predicts.
 
     From the covariance of the full solution (the usual identity for linear least squares), not by n
     solutions.
@@ -193,24 +219,39 @@ def ground_points(tracks: Tracks, setup: Setup, problem: Problem, state: State) 
 
 
 def _outcome(
-    photos: Sequence[Photo], frame: MapFrame, setup: Setup, start: Start, tracks: Tracks,
-    problem: Problem, state: State, control: Sequence[Control],
-) -> Alignment:  # fmt: skip
+    photos: Sequence[Photo],
+    frame: MapFrame,
+    setup: Setup,
+    start: Start,
+    tracks: Tracks,
+    problem: Problem,
+    state: State,
+    control: Sequence[Control],
+) -> Alignment:
     ties = ground_points(tracks, setup, problem, state)
     seen = np.bincount(ties.photo, minlength=len(photos))
     weak = {int(i): f"only {seen[i]} tie points hold it" for i in setup.members if seen[i] < 8}
     full = covariance(problem, state)
     variance = _variance_factor(problem, state)
-    cameras, camera_of = camera_records(photos, setup, state, None if full is None else full * variance)
+    cameras, camera_of = camera_records(
+        photos, setup, state, None if full is None else full * variance
+    )
     poses = {i: p for i, p in pose_records(setup, state).items() if i not in weak}
     blocks = tuple(tuple(i for i in b if i not in weak) for b in start.blocks)
     metric = frame.metric and (start.metric or any(not c.check for c in control))
     return Alignment(
-        method="bundle", why="", frame=replace(frame, metric=metric), poses=poses,
-        cameras=cameras, camera_of=camera_of, blocks=tuple(b for b in blocks if b), ties=ties, rejected=weak,
+        method="bundle",
+        why="",
+        frame=replace(frame, metric=metric),
+        poses=poses,
+        cameras=cameras,
+        camera_of=camera_of,
+        blocks=tuple(b for b in blocks if b),
+        ties=ties,
+        rejected=weak,
         control=residuals_of_control(control, frame, setup, problem, state),
         loo_rms_m=leave_one_out(problem, state, full) if setup.georeferenced else None,
-    )  # fmt: skip
+    )
 
 
 def _variance_factor(problem: Problem, state: State) -> float:

@@ -1,4 +1,6 @@
-"""`flightline`: mosaics of flight lines, joined, and laid on the map by regression (Arteaga et al. 2019)."""
+"""`flightline`: mosaics of flight lines, joined, and laid on the map by regression (Arteaga et al.
+2019).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +10,13 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.flightlines import by_distance, by_heading, middle_out, pairs_across, reversals
+from skyquilt.alignment.flightlines import (
+    by_distance,
+    by_heading,
+    middle_out,
+    pairs_across,
+    reversals,
+)
 from skyquilt.alignment.joining import Estimator, Matcher, implausible, plane_alignment
 from skyquilt.alignment.lens import of_order, to_working, working_K
 from skyquilt.alignment.planar import planar_pose
@@ -26,7 +34,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class ByFlightline:
-    """A's whole method: lines, pairs across lines, homographies by STE per inlier, middle-out, affine regression."""
+    """A's whole method: lines, pairs across lines, homographies by STE per inlier, middle-out,
+    affine regression.
+    """
 
     within: Matcher
     """Matches inside a line: the 150 best."""
@@ -35,20 +45,27 @@ class ByFlightline:
     estimate: Estimator
     """RANSAC by the symmetric transfer error per inlier; A's transformation is the homography."""
     split: Literal["heading", "distance"] = "heading"
-    """How lines are told apart: `distance` is A's; `heading` also ends a line where the course turns."""
+    """How lines are told apart: `distance` is A's; `heading` also ends a line where the course
+    turns.
+    """
     distortion: str = "none"
     """Order of the lens model; A corrects none."""
     version: ClassVar[int] = 2
     name: ClassVar[str] = "flightline"
 
     def __call__(
-        self, photos: Sequence[Photo], frame: MapFrame, priors: Sequence[Prior], features: Sequence[Features],
+        self,
+        photos: Sequence[Photo],
+        frame: MapFrame,
+        priors: Sequence[Prior],
+        features: Sequence[Features],
         order: Sequence[int],
-    ) -> Alignment:  # fmt: skip
+    ) -> Alignment:
         """Aligns photos in the order of capture given (indices).
 
         Raises:
-            AlignmentError: no positions, fewer than two lines, or (by distance) lines that run back on themselves.
+            AlignmentError: no positions, fewer than two lines, or (by distance) lines that run back
+                on themselves.
         """
         xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
         lost = {
@@ -82,9 +99,11 @@ class ByFlightline:
     def _pairs(
         self, order: Sequence[int], xy: Array, strips: Sequence[dict[int, Array]]
     ) -> list[tuple[int, int]]:
-        """Photos of different strips that may share ground: A's, and by heading also those on both sides of a turn.
+        """Photos of different strips that may share ground: A's, and by heading also those on both
+        sides of a turn.
 
-        Lines that only meet at their ends, around a field, have no triangles between them but obtuse ones.
+        Lines that only meet at their ends, around a field, have no triangles between them but
+        obtuse ones.
         """
         pairs = pairs_across(xy, [list(s) for s in strips])
         if self.split == "distance":
@@ -99,7 +118,8 @@ class ByFlightline:
         """Lines of two or more photos (indices), and what to say about them."""
         if len(order) < 4:
             raise AlignmentError(
-                f"method flightline needs positions of at least two flight lines, and {len(order)} photos have one;"
+                f"method flightline needs positions of at least two flight lines, and {len(order)}"
+                " photos have one;"
                 " give positions with --geo, or use --method image"
             )
         cut = by_distance if self.split == "distance" else by_heading
@@ -108,19 +128,25 @@ class ByFlightline:
         if self.split == "distance" and turned:
             worst = max(turned, key=len)
             raise AlignmentError(
-                f"by shooting distance alone the photos {photos[worst[0]].name} to {photos[worst[-1]].name} form one"
+                f"by shooting distance alone the photos {photos[worst[0]].name} to"
+                f" {photos[worst[-1]].name} form one"
                 f" flight line that turns back {reversals(xy, worst)} times; use --lines heading"
             )
         whole = [line for line in lines if len(line) > 1]
         if len(whole) < 2:
             raise AlignmentError(
-                f"method flightline joins flight lines, and {len(order)} positions show {len(whole)};"
+                f"method flightline joins flight lines, and {len(order)} positions show"
+                f" {len(whole)};"
                 " use --method image or --method bundle"
             )
         single = [photos[line[0]].name for line in lines if len(line) == 1]
-        notes = [f"{len(whole)} flight lines: {', '.join(str(len(line)) for line in whole)} photos."]
+        notes = [
+            f"{len(whole)} flight lines: {', '.join(str(len(line)) for line in whole)} photos."
+        ]
         notes += (
-            [f"between flight lines, each taken as a line of its own: {', '.join(single)}."] if single else []
+            [f"between flight lines, each taken as a line of its own: {', '.join(single)}."]
+            if single
+            else []
         )
         return lines, notes
 
@@ -139,7 +165,9 @@ class _Work:
         self.joins: list[Join] = []
 
     def strips(self, line: Sequence[int]) -> list[dict[int, Array]]:
-        """Mosaics of a line, one where nothing breaks it: plane_H_work (3, 3) of each photo's working image."""
+        """Mosaics of a line, one where nothing breaks it: plane_H_work (3, 3) of each photo's
+        working image.
+        """
         strips: list[list[int]] = [[line[0]]]
         step: dict[int, Array] = {}  # photo -> before_H_photo
         for before, photo in pairwise(line):
@@ -168,16 +196,27 @@ class _Work:
             return NoEstimate(reason=reason)
         kept = found.inliers
         self.joins.append(
-            Join(photo=photo, onto=onto, matches=len(matches), inliers=int(kept.sum()), ste_px2=found.ste_per_inlier,
-                 score=np.nan, moved_m=np.nan, px=px[kept], d_px=b[kept] - transfer(found.b_H_a, a[kept]),
-                 levelled=np.ones(int(kept.sum()), bool))
-        )  # fmt: skip
+            Join(
+                photo=photo,
+                onto=onto,
+                matches=len(matches),
+                inliers=int(kept.sum()),
+                ste_px2=found.ste_per_inlier,
+                score=np.nan,
+                moved_m=np.nan,
+                px=px[kept],
+                d_px=b[kept] - transfer(found.b_H_a, a[kept]),
+                levelled=np.ones(int(kept.sum()), bool),
+            )
+        )
         return found.b_H_a
 
     def joined(
         self, strips: Sequence[dict[int, Array]], pairs: Sequence[tuple[int, int]]
     ) -> dict[int, Array]:
-        """All strips in the plane of the middle one: plane_H_work per photo; strips that nothing links are left out."""
+        """All strips in the plane of the middle one: plane_H_work per photo; strips that nothing
+        links are left out.
+        """
         strip_of = {i: k for k, s in enumerate(strips) for i in s}
         matched: dict[tuple[int, int], list[tuple[Array, Array]]] = {}
         for i, j in pairs:
@@ -204,9 +243,14 @@ class _Work:
         return {i: H @ strips[k][i] for k, H in whole.items() for i in strips[k]}
 
     def _attach(
-        self, k: int, whole: dict[int, Array], matched: dict[tuple[int, int], list[tuple[Array, Array]]]
+        self,
+        k: int,
+        whole: dict[int, Array],
+        matched: dict[tuple[int, int], list[tuple[Array, Array]]],
     ) -> bool:
-        """Places strip k on those already placed, by the matches with all of them; False where that fails."""
+        """Places strip k on those already placed, by the matches with all of them; False where that
+        fails.
+        """
         a, b = [], []
         for other, H in whole.items():
             for low, high in matched.get((min(k, other), max(k, other)), []):
@@ -224,7 +268,9 @@ class _Work:
         return True
 
     def _between(self, a: int, b: int, plane_H_a: Array, plane_H_b: Array) -> tuple[Array, Array]:
-        """The 50 best matches of two photos of neighbouring lines, each on the plane of its own strip."""
+        """The 50 best matches of two photos of neighbouring lines, each on the plane of its own
+        strip.
+        """
         matches = self.method.across(self.features[a], self.features[b])
         pa = to_working(self.lens[a], self.features[a].px[matches.index_a])
         pb = to_working(self.lens[b], self.features[b].px[matches.index_b])
@@ -232,7 +278,9 @@ class _Work:
 
 
 def _from_middle(strip: Sequence[int], before_H_photo: dict[int, Array]) -> dict[int, Array]:
-    """plane_H_work of every photo of a strip on the working image of its middle one, products taken middle-out."""
+    """plane_H_work of every photo of a strip on the working image of its middle one, products taken
+    middle-out.
+    """
     order = middle_out(strip)
     place = {photo: k for k, photo in enumerate(strip)}
     plane = {order[0]: np.eye(3)}
@@ -251,16 +299,17 @@ def _on_map(
 ) -> tuple[dict[int, Pose], dict[int, str]]:
     """Poses by the affine regression of the photos' middles on their positions (A 16-21).
 
-    A turns the mosaic first, by the angle between the first two photos of the central line on both sides, so that
-    the regression starts near the identity; a linear regression has one solution wherever it starts, so the turn is
-    part of the affinity here. The inversion of y (A 16) is, too.
+    A turns the mosaic first, by the angle between the first two photos of the central line on both
+    sides, so that the regression starts near the identity; a linear regression has one solution
+    wherever it starts, so the turn is part of the affinity here. The inversion of y (A 16) is, too.
     """
     used = list(whole)
     middle = np.array([transfer(whole[i], working_K(lens[i])[None, :2, 2])[0] for i in used])
     map_H_plane = fit("affine", middle, xy[used])
     if map_H_plane is None:
         raise AlignmentError(
-            "the positions of the photos lie on one line, so that no regression can place the mosaic;"
+            "the positions of the photos lie on one line, so that no regression can place the"
+            " mosaic;"
             " use --method image"
         )
     poses, lost = {}, {}

@@ -22,7 +22,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """The loop-independent mosaic: pairwise against the last photo, no repositioning, no metadata."""
+    """The loop-independent mosaic: pairwise against the last photo, no repositioning, no
+    metadata.
+    """
 
     match: Matcher
     """Matching."""
@@ -38,10 +40,16 @@ class Chain:
     name: ClassVar[str] = "image"
 
     def __call__(
-        self, photos: Sequence[Photo], frame: MapFrame, priors: Sequence[Prior], features: Sequence[Features],
+        self,
+        photos: Sequence[Photo],
+        frame: MapFrame,
+        priors: Sequence[Prior],
+        features: Sequence[Features],
         order: Sequence[int],
-    ) -> Alignment:  # fmt: skip
-        """Registers photos (indices) in the order given; where two do not match, a new piece begins."""
+    ) -> Alignment:
+        """Registers photos (indices) in the order given; where two do not match, a new piece
+        begins.
+        """
         cameras = {p.camera_key: of_order(reported_camera(p), self.distortion) for p in photos}
         lens = [cameras[p.camera_key] for p in photos]
         pieces: list[dict[int, Array]] = []
@@ -72,7 +80,9 @@ class Chain:
         a = to_working(lens[photo], px)
         b = to_working(lens[onto], features[onto].px[matches.index_b])
         centre = working_K(lens[photo])[:2, 2]
-        found = registered(photo, onto, px, a, b, estimate=self.estimate, level=self.level, centre=centre)
+        found = registered(
+            photo, onto, px, a, b, estimate=self.estimate, level=self.level, centre=centre
+        )
         if isinstance(found, NoEstimate):
             return found
         H = np.linalg.inv(working_K(lens[onto])) @ found[0] @ working_K(lens[photo])
@@ -81,4 +91,7 @@ class Chain:
 
 def broken(photo: str, before: str, reason: str) -> str:
     """The sentence about a break of the sequence."""
-    return f"{photo} does not match {before}, the photo before it ({reason}): a new piece begins there."
+    return (
+        f"{photo} does not match {before}, the photo before it ({reason}): a new piece begins"
+        " there."
+    )

@@ -20,7 +20,9 @@ def conflicts(
     held = alignment.held or (tuple(sorted(alignment.poses)) if alignment.method == "pose" else ())
     found = [c for i in held for c in _yaw(photos[i], priors[i], alignment, i)]
     if alignment.frame.crs is not None:
-        found += _altitudes(photos, priors, alignment, held) + _positions(photos, priors, alignment, held)
+        found += _altitudes(photos, priors, alignment, held) + _positions(
+            photos, priors, alignment, held
+        )
     return found + _focals(photos, alignment, held)
 
 
@@ -49,7 +51,8 @@ def _yaw(photo: Photo, prior: Prior, alignment: Alignment, i: int) -> list[Metad
 def _altitudes(
     photos: Sequence[Photo], priors: Sequence[Prior], alignment: Alignment, held: Sequence[int]
 ) -> list[MetadataConflict]:
-    """Altitudes that differ from the solution by more than three deviations and 5 % of the flying height.
+    """Altitudes that differ from the solution by more than three deviations and 5 % of the flying
+    height.
 
     The common offset of a survey is its datum's, not a contradiction.
     """
@@ -95,12 +98,16 @@ def _positions(
     return out
 
 
-def _focals(photos: Sequence[Photo], alignment: Alignment, held: Sequence[int]) -> list[MetadataConflict]:
+def _focals(
+    photos: Sequence[Photo], alignment: Alignment, held: Sequence[int]
+) -> list[MetadataConflict]:
     out, seen = [], set()
     for i in held:
         photo, camera = photos[i], alignment.camera(i)
         off = abs(camera.focal - photo.focal.px)
-        if photo.camera_key not in seen and off > max(3 * photo.focal.sigma_px, 0.05 * photo.focal.px):
+        if photo.camera_key not in seen and off > max(
+            3 * photo.focal.sigma_px, 0.05 * photo.focal.px
+        ):
             seen.add(photo.camera_key)
             out.append(
                 MetadataConflict(
@@ -108,7 +115,8 @@ def _focals(photos: Sequence[Photo], alignment: Alignment, held: Sequence[int]) 
                     field="focal",
                     reported=round(photo.focal.px, 1),
                     estimated=round(camera.focal, 1),
-                    meaning=f"self-calibration of {photo.camera_key} finds another focal length (in px)",
+                    meaning=f"self-calibration of {photo.camera_key} finds another focal length (in"
+                    " px)",
                 )
             )
     return out

@@ -1,7 +1,10 @@
-"""Connected components and spanning trees of small and of large graphs, without the half second SciPy takes to load."""
+"""Connected components and spanning trees of small and of large graphs, without the half second
+SciPy takes to load.
+"""
 
 from collections import deque
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,10 +12,12 @@ from numpy.typing import NDArray
 Index = NDArray[np.int64]
 
 
-def connected(count: int, a: NDArray, b: NDArray) -> Index:
-    """Component (count,) of each node of a graph with edges a-b, numbered in order of their first nodes.
+def connected(count: int, a: NDArray[Any], b: NDArray[Any]) -> Index:
+    """Component (count,) of each node of a graph with edges a-b, numbered in order of their first
+    nodes.
 
-    Labels sink to the least one in reach, and each round follows them to their ends (Shiloach and Vishkin 1982).
+    Labels sink to the least one in reach, and each round follows them to their ends (Shiloach and
+    Vishkin 1982).
     """
     label = np.arange(count)
     while (label[a] != label[b]).any():
@@ -24,8 +29,10 @@ def connected(count: int, a: NDArray, b: NDArray) -> Index:
     return np.asarray(np.unique(label, return_inverse=True)[1], np.int64)
 
 
-def spanning_tree(count: int, a: NDArray, b: NDArray, cost: NDArray) -> list[int]:
-    """The edges (their indices) of the cheapest tree, or forest, that spans the nodes (Kruskal 1956)."""
+def spanning_tree(count: int, a: NDArray[Any], b: NDArray[Any], cost: NDArray[Any]) -> list[int]:
+    """The edges (their indices) of the cheapest tree, or forest, that spans the nodes (Kruskal
+    1956).
+    """
     parent = list(range(count))
 
     def root(node: int) -> int:
@@ -42,7 +49,9 @@ def spanning_tree(count: int, a: NDArray, b: NDArray, cost: NDArray) -> list[int
     return tree
 
 
-def outwards(count: int, a: NDArray, b: NDArray, edges: list[int]) -> Iterator[tuple[int, int]]:
+def outwards(
+    count: int, a: NDArray[Any], b: NDArray[Any], edges: list[int]
+) -> Iterator[tuple[int, int]]:
     """(parent, node) of a tree's nodes, breadth first from node 0."""
     beside: list[list[int]] = [[] for _ in range(count)]
     for edge in edges:

@@ -1,4 +1,6 @@
-"""Control points: observations that hold the block to the ground; check points: the judges kept out."""
+"""Control points: observations that hold the block to the ground; check points: the judges kept
+out.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -39,18 +41,33 @@ class Control:
 def control_in_frame(
     points: Sequence[ControlPoint], photos: Sequence[Photo], frame: MapFrame
 ) -> tuple[Control, ...]:
-    """Control points in map coordinates; sightings in unknown photos are left out, points never seen too."""
-    index = {p.name: i for i, p in enumerate(photos)} | {p.path.name: i for i, p in enumerate(photos)}
+    """Control points in map coordinates; sightings in unknown photos are left out, points never
+    seen too.
+    """
+    index = {p.name: i for i, p in enumerate(photos)} | {
+        p.path.name: i for i, p in enumerate(photos)
+    }
     found = []
     for point in points:
         seen = [(index[o.photo], o.x, o.y) for o in point.observations if o.photo in index]
         if not seen or frame.crs is None:
             continue
-        x, y = Transformer.from_crs(point.crs, frame.crs, always_xy=True).transform(point.x, point.y)
-        xyz = np.array([x - frame.origin[0], y - frame.origin[1], np.nan if point.z is None else point.z])
+        x, y = Transformer.from_crs(point.crs, frame.crs, always_xy=True).transform(
+            point.x, point.y
+        )
+        xyz = np.array(
+            [x - frame.origin[0], y - frame.origin[1], np.nan if point.z is None else point.z]
+        )
         photo, px = np.array([s[0] for s in seen]), np.array([s[1:] for s in seen], float)
         found.append(
-            Control(name=point.name, check=point.check, xyz=xyz, sigma_m=point.sigma_m, photo=photo, px=px)
+            Control(
+                name=point.name,
+                check=point.check,
+                xyz=xyz,
+                sigma_m=point.sigma_m,
+                photo=photo,
+                px=px,
+            )
         )
     return tuple(found)
 
@@ -72,7 +89,9 @@ def _sightings(
     return point, row, np.concatenate([px for _, px in parts] or [np.zeros((0, 2))])
 
 
-def _alone(control: Sequence[Control], setup: Setup, problem: Problem, state: State) -> tuple[Problem, State]:
+def _alone(
+    control: Sequence[Control], setup: Setup, problem: Problem, state: State
+) -> tuple[Problem, State]:
     """The control points alone, seen by the poses as they are, intersected from their rays."""
     point, row, px = _sightings(control, setup)
     empty = np.full((len(control), 3), np.nan)
@@ -99,7 +118,9 @@ def intersected(
 
 
 def fit_similarity_3d(x: Array, y: Array) -> tuple[float, Array, Array]:
-    """s, R, t that minimise |y - (s R x + t)|^2 (Umeyama 1991); points (k, 3), k >= 3, not on a line."""
+    """s, R, t that minimise |y - (s R x + t)|^2 (Umeyama 1991); points (k, 3), k >= 3, not on a
+    line.
+    """
     xm, ym = x.mean(0), y.mean(0)
     U, D, Vt = np.linalg.svd((y - ym).T @ (x - xm))
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
@@ -120,7 +141,8 @@ def hold_to_control(
 ) -> tuple[Problem, State, MapFrame, Sequence[Control]]:
     """The adjustment once more with control points as observations.
 
-    GPS positions share an offset (datum of heights, base station); the control points take it out first.
+    GPS positions share an offset (datum of heights, base station); the control points take it out
+    first.
 
     Raises:
         AlignmentError: no position and fewer than three usable control points.
@@ -138,7 +160,8 @@ def hold_to_control(
     seen, _ = intersected(fit, setup, problem, state)
     if not setup.georeferenced:
         level = np.nan_to_num(
-            surveyed, nan=float(np.nanmean(surveyed[:, 2])) if np.isfinite(surveyed).all(1).any() else 0.0
+            surveyed,
+            nan=float(np.nanmean(surveyed[:, 2])) if np.isfinite(surveyed).all(1).any() else 0.0,
         )
         problem, state = _moved(problem, state, *fit_similarity_3d(seen, level))
     else:
@@ -149,13 +172,19 @@ def hold_to_control(
         problem = replace(problem, sigma_C=np.full_like(problem.sigma_C, 1e4))
     state = adjust(problem, state, iterations=25, tolerance=1e-5).state
     if setup.georeferenced and len(fit) >= 3:
-        # the positions' common offset was taken from a solution that they still held: control knows it better
+        # the positions' common offset was taken from a solution that they still held: control knows
+        # it better
         for _ in range(3):
             offset = np.nan_to_num(np.nanmedian(state.C - problem.C0, axis=0))
             problem = replace(problem, C0=problem.C0 + offset)
             state = adjust(problem, state, iterations=15, tolerance=1e-5, damping=1e-6).state
     heights = np.isfinite(surveyed[:, 2]).any()
-    return problem, state, replace(frame, vertical_datum="control", metric=True) if heights else frame, usable
+    return (
+        problem,
+        state,
+        replace(frame, vertical_datum="control", metric=True) if heights else frame,
+        usable,
+    )
 
 
 def _with_points(
@@ -168,19 +197,22 @@ def _with_points(
     X, _ = intersected(fit, setup, problem, state)
     joined = replace(
         problem,
-        point=np.concatenate([problem.point, P + point]), photo=np.concatenate([problem.photo, row]),
+        point=np.concatenate([problem.point, P + point]),
+        photo=np.concatenate([problem.photo, row]),
         px=np.concatenate([problem.px, px]),
         sigma_px=np.concatenate([problem.sigma_px, np.full(len(px), 0.7)]),
         X0=np.concatenate([problem.X0, surveyed]),
         sigma_X=np.concatenate([problem.sigma_X, np.array([[c.sigma_m] * 3 for c in fit])]),
-    )  # fmt: skip
+    )
     return joined, replace(state, X=np.concatenate([state.X, X]))
 
 
 def residuals_of_control(
     control: Sequence[Control], frame: MapFrame, setup: Setup, problem: Problem, state: State
 ) -> tuple[ControlResidual, ...]:
-    """Errors of all control and check points at the solution, intersected from the final poses alone."""
+    """Errors of all control and check points at the solution, intersected from the final poses
+    alone.
+    """
     if not control or frame.crs is None:
         return ()
     X, rms = intersected(control, setup, problem, state)

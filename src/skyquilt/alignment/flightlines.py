@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,9 @@ def shooting_distances(xy: Array) -> Shooting:
 
 
 def by_distance(xy: Array) -> list[list[int]]:
-    """Lines of photos (n, 2) m in order of capture: a new one wherever a distance lies out of range."""
+    """Lines of photos (n, 2) m in order of capture: a new one wherever a distance lies out of
+    range.
+    """
     shooting = shooting_distances(xy)
     low, high = shooting.range_m
     slack = 1e-9 * max(high, 1.0)
@@ -56,9 +59,10 @@ def by_distance(xy: Array) -> list[list[int]]:
 def by_heading(xy: Array) -> list[list[int]]:
     """Lines where the course must stay within 45 degrees of the line's: an extension of the method.
 
-    A step belongs to a line when it is not longer than A's range allows and runs along the line so far. That it is
-    not shorter either is not asked: positions err by metres, and a step back shows in the course. At a turn, the
-    photo that ends one line does not begin the next: that one begins with the step's end.
+    A step belongs to a line when it is not longer than A's range allows and runs along the line so
+    far. That it is not shorter either is not asked: positions err by metres, and a step back shows
+    in the course. At a turn, the photo that ends one line does not begin the next: that one begins
+    with the step's end.
     """
     shooting = shooting_distances(xy)
     # where all distances are alike, their range is no wider than the noise of positions
@@ -80,23 +84,28 @@ def by_heading(xy: Array) -> list[list[int]]:
     return lines
 
 
-def _cut(count: int, starts: NDArray) -> list[list[int]]:
+def _cut(count: int, starts: NDArray[Any]) -> list[list[int]]:
     return [part.tolist() for part in np.split(np.arange(count), starts)]
 
 
 def reversals(xy: Array, line: Sequence[int]) -> int:
-    """How often the course along a line turns back by more than a right angle: what distance alone does not see."""
+    """How often the course along a line turns back by more than a right angle: what distance alone
+    does not see.
+    """
     step = np.diff(xy[list(line)], axis=0)
     return int(((step[1:] * step[:-1]).sum(1) < 0).sum())
 
 
 def pairs_across(xy: Array, lines: Sequence[Sequence[int]]) -> list[tuple[int, int]]:
-    """Pairs of photos (i < j) of different lines: edges of the Delaunay triangulation, those of triangles with an
-    obtuse angle removed (A 2.2).
+    """Pairs of photos (i < j) of different lines: edges of the Delaunay triangulation, those of
+    triangles with an obtuse angle removed (A 2.2).
 
     An edge goes when any triangle it belongs to is obtuse, as A prints it.
     """
-    from scipy.spatial import Delaunay, QhullError  # few ask for flight lines, and all would wait for it
+    from scipy.spatial import (
+        Delaunay,
+        QhullError,
+    )  # few ask for flight lines, and all would wait for it
 
     line_of = {i: k for k, line in enumerate(lines) for i in line}
     used = np.array(sorted(line_of))
@@ -107,7 +116,9 @@ def pairs_across(xy: Array, lines: Sequence[Sequence[int]]) -> list[tuple[int, i
     kept: set[tuple[int, ...]] = set()
     gone: set[tuple[int, ...]] = set()
     for triangle in triangles:
-        edges = {tuple(sorted((int(triangle[a]), int(triangle[b])))) for a, b in ((0, 1), (1, 2), (0, 2))}
+        edges = {
+            tuple(sorted((int(triangle[a]), int(triangle[b])))) for a, b in ((0, 1), (1, 2), (0, 2))
+        }
         (gone if _obtuse(xy[triangle]) else kept).update(edges)
     return sorted((e[0], e[1]) for e in kept - gone if line_of[e[0]] != line_of[e[1]])
 
@@ -122,7 +133,9 @@ def _obtuse(corners: Array) -> bool:
 
 
 def middle_out(items: Sequence[int]) -> list[int]:
-    """The middle one first, then its neighbours, alternating between both directions (A 2.4, Fig. 6b)."""
+    """The middle one first, then its neighbours, alternating between both directions (A 2.4, Fig.
+    6b).
+    """
     middle = (len(items) - 1) // 2
     order = [items[middle]]
     for k in range(1, len(items)):

@@ -1,4 +1,6 @@
-"""`hybrid`: metadata place every photo, pixels correct it inside its error range (Y 4.1.2, 6.1.3)."""
+"""`hybrid`: metadata place every photo, pixels correct it inside its error range (Y 4.1.2,
+6.1.3).
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -24,7 +26,9 @@ NEIGHBOURS = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Hybrid:
-    """Photos in order of capture; each is moved and turned to where lambda is largest, and then stays."""
+    """Photos in order of capture; each is moved and turned to where lambda is largest, and then
+    stays.
+    """
 
     optimise: Optimiser
     """How lambda is maximised."""
@@ -40,9 +44,13 @@ class Hybrid:
     name: ClassVar[str] = "hybrid"
 
     def __call__(
-        self, placed: Alignment, photos: Sequence[Photo], priors: Sequence[Prior], order: Sequence[int],
+        self,
+        placed: Alignment,
+        photos: Sequence[Photo],
+        priors: Sequence[Prior],
+        order: Sequence[int],
         grey: GreyPicture,
-    ) -> Alignment:  # fmt: skip
+    ) -> Alignment:
         """Corrects an alignment by metadata, the photos taken in the order given (indices)."""
         order = [i for i in order if i in placed.poses]
         gsd = self._gsd(placed)
@@ -59,20 +67,25 @@ class Hybrid:
             if patch is not None:
                 overview.merge(patch)
         return replace(
-            placed, method=self.name, poses=done, blocks=(tuple(sorted(done)),), joins=tuple(joins),
-        )  # fmt: skip
+            placed, method=self.name, poses=done, blocks=(tuple(sorted(done)),), joins=tuple(joins)
+        )
 
     def reach(self, prior: Prior, height_m: float) -> tuple[float, float]:
-        """Error range of a photo: m on the ground, GPS error plus tan(tilt) times height (Y Fig. 4.2), and degrees."""
+        """Error range of a photo: m on the ground, GPS error plus tan(tilt) times height (Y Fig.
+        4.2), and degrees.
+        """
         k = self.deviations
         sigma = float(prior.sigma_C[0]) if np.isfinite(prior.sigma_C[0]) else 0.25 * height_m
         tilt = np.tan(np.radians(min(k * prior.sigma_tilt_deg, 60.0)))
-        return k * sigma + float(tilt) * height_m, float(np.clip(k * prior.sigma_yaw_deg, 1.0, 45.0))
+        return k * sigma + float(tilt) * height_m, float(
+            np.clip(k * prior.sigma_yaw_deg, 1.0, 45.0)
+        )
 
     def _gsd(self, placed: Alignment) -> float:
         """Ground size in m of the overview's pixels: photos `across` px wide."""
         sizes = [
-            p.map_C[2] * placed.camera(i).width / placed.camera(i).focal for i, p in placed.poses.items()
+            p.map_C[2] * placed.camera(i).width / placed.camera(i).focal
+            for i, p in placed.poses.items()
         ]
         return float(np.median(sizes)) / self.across
 
@@ -85,9 +98,15 @@ class Hybrid:
         return to_grid(grey(photo, int(1.25 * self.across)), camera, cam_H_grid)
 
     def _moved(
-        self, photo: int, placed: Alignment, prior: Prior, done: dict[int, Pose], overview: Overview, gsd: float,
+        self,
+        photo: int,
+        placed: Alignment,
+        prior: Prior,
+        done: dict[int, Pose],
+        overview: Overview,
+        gsd: float,
         grey: GreyPicture,
-    ) -> tuple[Join | None, Pose]:  # fmt: skip
+    ) -> tuple[Join | None, Pose]:
         """The photo where lambda is largest."""
         pose = placed.poses[photo]
         patch = self._patch(photo, pose, placed, gsd, grey)
@@ -99,15 +118,25 @@ class Hybrid:
         objective = Objective(
             levels=levels, distances=distances(nadir, placed, done), nadir=nadir, alpha=self.alpha
         )
-        if not np.isfinite(objective.levels[-1].correlation(np.zeros(3))) and not levels[-1].filled.any():
+        if (
+            not np.isfinite(objective.levels[-1].correlation(np.zeros(3)))
+            and not levels[-1].filled.any()
+        ):
             return None, pose
         best = self.optimise(objective, reach_m, turn_deg, self.seed + photo)
         moved = turned(pose, best.move)
         return Join(
-            photo=photo, onto=-1, matches=0, inliers=0, ste_px2=np.nan, score=best.quality,
-            moved_m=float(np.hypot(*best.move[:2])), px=np.zeros((0, 2)), d_px=np.zeros((0, 2)),
+            photo=photo,
+            onto=-1,
+            matches=0,
+            inliers=0,
+            ste_px2=np.nan,
+            score=best.quality,
+            moved_m=float(np.hypot(*best.move[:2])),
+            px=np.zeros((0, 2)),
+            d_px=np.zeros((0, 2)),
             levelled=np.zeros(0, bool),
-        ), moved  # fmt: skip
+        ), moved
 
 
 def distances(nadir: Array, placed: Alignment, done: dict[int, Pose]) -> Distances:
@@ -124,4 +153,6 @@ def distances(nadir: Array, placed: Alignment, done: dict[int, Pose]) -> Distanc
 def turned(pose: Pose, move: Array) -> Pose:
     """The pose moved east and north in m and turned clockwise in degrees about the vertical."""
     turn = rotation_from_vector(np.array([0.0, 0.0, -np.radians(move[2])]))
-    return Pose(cam_R_map=pose.cam_R_map @ turn.T, map_C=pose.map_C + np.array([move[0], move[1], 0.0]))
+    return Pose(
+        cam_R_map=pose.cam_R_map @ turn.T, map_C=pose.map_C + np.array([move[0], move[1], 0.0])
+    )

@@ -1,8 +1,9 @@
-"""One photo more: placed by its links to photos that are placed already, its neighbourhood settling around it.
+"""One photo more: placed by its links to photos that are placed already, its neighbourhood settling
+around it.
 
-The work is bounded whatever the size of the map (part D of the methods): a window of the new photo, the photos it
-is linked to, and a ring of others that are held where they are. Calibrations stay; a bundle of the whole block,
-in the background, changes those.
+The work is bounded whatever the size of the map (part D of the methods): a window of the new photo,
+the photos it is linked to, and a ring of others that are held where they are. Calibrations stay; a
+bundle of the whole block, in the background, changes those.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,10 +29,12 @@ from skyquilt.model.poses import Pose, Prior
 HELD_M, HELD_RAD = 1e-3, 1e-5
 """Deviations of photos that are held."""
 DISAGREE = 0.12
-"""Links that put a photo further apart than this share of the flying height contradict each other."""
+"""Links that put a photo further apart than this share of the flying height contradict each other.
+"""
 STAGES = ((2.0, 20.0, 40.0, 3e-2), (0.8, 6.0, 12.0, 1e-2), (0.0, 2.5, 5.0, 1e-2))
-"""Rounds of an adjustment: from which median misfit in px of the new photo on, width of the loss in px, residual in
-px beyond which sightings go, and tolerance."""
+"""Rounds of an adjustment: from which median misfit in px of the new photo on, width of the loss in
+px, residual in px beyond which sightings go, and tolerance.
+"""
 TURNED = "/turned"
 """End of the names of calibrations of files that were rewritten upside down."""
 
@@ -127,9 +130,12 @@ class Incremental:
         moved = {i: p for i, p in pose_records(setup, state).items() if i not in window.held}
         key = window.photos[window.new].camera_key
         return Settled(
-            poses=moved, camera=key + TURNED if setup.turned[window.new] else key, sightings=sightings,
-            xyz=state.X, dropped=dropped,
-        )  # fmt: skip
+            poses=moved,
+            camera=key + TURNED if setup.turned[window.new] else key,
+            sightings=sightings,
+            xyz=state.X,
+            dropped=dropped,
+        )
 
 
 def _useful(tracks: Tracks, window: Window) -> Tracks:
@@ -140,7 +146,9 @@ def _useful(tracks: Tracks, window: Window) -> Tracks:
 
 
 def _adjusted(problem: Problem, state: State, new: int) -> tuple[Problem, State]:
-    """Ever narrower losses, pruning between; the wide ones only where the new photo, of that row, starts far off."""
+    """Ever narrower losses, pruning between; the wide ones only where the new photo, of that row,
+    starts far off.
+    """
     off = np.hypot(*residuals_px(problem, state)[problem.photo == new].T)
     start = float(np.nanmedian(off)) if np.isfinite(off).any() else np.inf
     for beyond, loss, limit, tolerance in STAGES:
@@ -149,7 +157,9 @@ def _adjusted(problem: Problem, state: State, new: int) -> tuple[Problem, State]
                 problem.with_loss(loss), state, iterations=8, tolerance=tolerance, damping=1e-5
             ).state
             problem, state = prune(problem, state, limit)
-    return problem, adjust(problem.with_loss(2.0), state, iterations=6, tolerance=3e-3, damping=1e-6).state
+    return problem, adjust(
+        problem.with_loss(2.0), state, iterations=6, tolerance=3e-3, damping=1e-6
+    ).state
 
 
 def _similarity(window: Window, i: int) -> tuple[complex, complex]:
@@ -158,7 +168,9 @@ def _similarity(window: Window, i: int) -> tuple[complex, complex]:
     centre = np.array([[(photo.width - 1) / 2, (photo.height - 1) / 2]])
     step = np.array([[photo.focal.px / 4, 0.0]])
     camera = window.cameras.get(window.camera_of.get(i, "")) or _ideal(photo)
-    direction = rays(camera, np.concatenate([centre, centre + step, centre - step])) @ pose.cam_R_map
+    direction = (
+        rays(camera, np.concatenate([centre, centre + step, centre - step])) @ pose.cam_R_map
+    )
     down = np.minimum(direction[:, 2], -0.1)
     reach = (window.ground - pose.map_C[2]) / down
     xy = pose.map_C[:2] + direction[:, :2] * reach[:, None]
@@ -194,29 +206,48 @@ def _guess(
 
     def near(x: tuple[complex, complex, float, tuple[int, int]]) -> list[int]:
         limit = DISAGREE * abs(x[0])
-        return [n for n, y in enumerate(found) if abs(x[1] - y[1]) < limit and abs(x[0] - y[0]) < 2 * limit]
+        return [
+            n
+            for n, y in enumerate(found)
+            if abs(x[1] - y[1]) < limit and abs(x[0] - y[0]) < 2 * limit
+        ]
 
     group = max((near(x) for x in found), key=lambda g: sum(found[n][2] for n in g))
     weight = np.array([found[n][2] for n in group])
-    a = complex(np.exp(np.average(np.log([found[n][0] / found[group[0]][0] for n in group]), weights=weight)))
+    a = complex(
+        np.exp(
+            np.average(np.log([found[n][0] / found[group[0]][0] for n in group]), weights=weight)
+        )
+    )
     t = complex(np.average([found[n][1] for n in group], weights=weight))
     return (a * found[group[0]][0], t), {found[n][3] for n in group}
 
 
-def _setup(window: Window, plane: Mapping[int, tuple[complex, complex]], links: Sequence[Link]) -> Setup:
+def _setup(
+    window: Window, plane: Mapping[int, tuple[complex, complex]], links: Sequence[Link]
+) -> Setup:
     """The adjustment's arrays: placed photos start where they are, held ones stay there."""
     members = tuple(sorted(plane))
     start = Start(
-        placed=dict(plane), blocks=(members,), links=tuple(links),
-        sigma_xy=dict.fromkeys(members, window.sigma_xy), georeferenced=frozenset(members), metric=True,
-    )  # fmt: skip
+        placed=dict(plane),
+        blocks=(members,),
+        links=tuple(links),
+        sigma_xy=dict.fromkeys(members, window.sigma_xy),
+        georeferenced=frozenset(members),
+        metric=True,
+    )
     setup = set_up(window.photos, window.priors, start, distortion="none", repair=True)
     turned = setup.turned.copy()
     for i in window.poses:  # what a photo was found to be, it stays
         turned[i] = window.camera_of.get(i, "").endswith(TURNED)
     base = setup.base
     R, C = setup.start_R.copy(), setup.start_C.copy()
-    R0, C0, sigma_R, sigma_C = base.R0.copy(), base.C0.copy(), base.sigma_R.copy(), base.sigma_C.copy()
+    R0, C0, sigma_R, sigma_C = (
+        base.R0.copy(),
+        base.C0.copy(),
+        base.sigma_R.copy(),
+        base.sigma_C.copy(),
+    )
     for row, i in enumerate(setup.members.tolist()):
         C[row, 2] += window.ground - setup.z_ground
         if i in window.poses:
@@ -229,5 +260,7 @@ def _setup(window: Window, plane: Mapping[int, tuple[complex, complex]], links: 
     for row, key in enumerate(setup.camera_keys):
         if key in window.cameras:
             K0[row] = window.cameras[key].vector
-    base = replace(base, R0=R0, C0=C0, sigma_R=sigma_R, sigma_C=sigma_C, K0=K0, free=np.zeros_like(base.free))
+    base = replace(
+        base, R0=R0, C0=C0, sigma_R=sigma_R, sigma_C=sigma_C, K0=K0, free=np.zeros_like(base.free)
+    )
     return replace(setup, base=base, start_R=R, start_C=C, turned=turned, z_ground=window.ground)

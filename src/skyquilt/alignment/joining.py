@@ -1,4 +1,6 @@
-"""A photo registered to another, or to a map, in the plane: what `chain`, `overview` and `flightline` share."""
+"""A photo registered to another, or to a map, in the plane: what `chain`, `overview` and
+`flightline` share.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +14,7 @@ from skyquilt.model.camera import Camera
 from skyquilt.model.estimate import Estimate, NoEstimate
 from skyquilt.model.features import Features, Matches
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Alignment, Join, MapFrame, no_ties
+from skyquilt.model.poses import Alignment, Join, MapFrame, Pose, no_ties
 
 Array = NDArray[np.float64]
 LARGEST_SCALE = 1.7
@@ -63,13 +65,22 @@ class Levelled(Protocol):
 
 
 def registered(
-    photo: int, onto: int, px: Array, a: Array, b: Array, *, estimate: Estimator, level: Leveller | None,
+    photo: int,
+    onto: int,
+    px: Array,
+    a: Array,
+    b: Array,
+    *,
+    estimate: Estimator,
+    level: Leveller | None,
     centre: Array,
-) -> tuple[Array, Join] | NoEstimate:  # fmt: skip
-    """b_H_a (3, 3), by features of the dominant plane where there is a leveller, and how well, or why there is none.
+) -> tuple[Array, Join] | NoEstimate:
+    """b_H_a (3, 3), by features of the dominant plane where there is a leveller, and how well, or
+    why there is none.
 
-    a, b (N, 2) px of the working images are matches of the photo's `px` (N, 2) with what it is joined onto (a photo, or
-    -1 for the map); the photo's `centre` (2,) is where a registration must be plausible.
+    a, b (N, 2) px of the working images are matches of the photo's `px` (N, 2) with what it is
+    joined onto (a photo, or -1 for the map); the photo's `centre` (2,) is where a registration must
+    be plausible.
     """
     found = estimate(a, b)
     if isinstance(found, NoEstimate):
@@ -82,13 +93,23 @@ def registered(
         levelled = level(a, b, found)
         found, disparity, on_plane = levelled.estimate, levelled.d_px, levelled.level
     return found.b_H_a, Join(
-        photo=photo, onto=onto, matches=len(a), inliers=int(found.inliers.sum()),
-        ste_px2=found.ste_per_inlier, score=np.nan, moved_m=np.nan, px=px[inner], d_px=disparity, levelled=on_plane,
-    )  # fmt: skip
+        photo=photo,
+        onto=onto,
+        matches=len(a),
+        inliers=int(found.inliers.sum()),
+        ste_px2=found.ste_per_inlier,
+        score=np.nan,
+        moved_m=np.nan,
+        px=px[inner],
+        d_px=disparity,
+        levelled=on_plane,
+    )
 
 
 def implausible(H: Array, at: Array) -> str:
-    """Why a registration of two aerial photos cannot be; empty where it can. `at` (2,) is where it is judged."""
+    """Why a registration of two aerial photos cannot be; empty where it can. `at` (2,) is where it
+    is judged.
+    """
     w = H[2] @ np.array([*at, 1.0])
     mapped = H[:2] @ np.array([*at, 1.0]) / w
     J = (H[:2, :2] - np.outer(mapped, H[2, :2])) / w
@@ -100,15 +121,33 @@ def implausible(H: Array, at: Array) -> str:
 
 
 def plane_alignment(
-    method: str, frame: MapFrame, photos: Sequence[Photo], poses: dict, metric: bool, cameras: dict[str, Camera],
-    pieces: Sequence[dict[int, Array]], joins: Sequence[Join], notes: Sequence[str],
-) -> Alignment:  # fmt: skip
+    method: str,
+    frame: MapFrame,
+    photos: Sequence[Photo],
+    poses: dict[int, Pose],
+    metric: bool,
+    cameras: dict[str, Camera],
+    pieces: Sequence[dict[int, Array]],
+    joins: Sequence[Join],
+    notes: Sequence[str],
+) -> Alignment:
     """The alignment of a method that places photos in the plane."""
     used = [i for p in pieces for i in p]
     rejected = {i: "its registration is degenerate" for i in used if i not in poses}
     return Alignment(
-        method=method, why="", frame=replace(frame, metric=metric), poses=poses, cameras=cameras,
+        method=method,
+        why="",
+        frame=replace(frame, metric=metric),
+        poses=poses,
+        cameras=cameras,
         camera_of={i: photos[i].camera_key for i in poses},
-        blocks=tuple(sorted((tuple(sorted(i for i in p if i in poses)) for p in pieces), key=len, reverse=True)),
-        ties=no_ties(), rejected=rejected, joins=tuple(joins), notes=tuple(notes),
-    )  # fmt: skip
+        blocks=tuple(
+            sorted(
+                (tuple(sorted(i for i in p if i in poses)) for p in pieces), key=len, reverse=True
+            )
+        ),
+        ties=no_ties(),
+        rejected=rejected,
+        joins=tuple(joins),
+        notes=tuple(notes),
+    )

@@ -1,4 +1,6 @@
-"""Lens models of lower order, and pixels on the working plane that methods in the plane register on."""
+"""Lens models of lower order, and pixels on the working plane that methods in the plane register
+on.
+"""
 
 from dataclasses import replace
 
@@ -15,13 +17,17 @@ WORKING_WIDTH = 1500
 
 
 def of_order(camera: Camera, order: str) -> Camera:
-    """The lens model of an order (`none`, `2`, `4`, `6`, `6t`) that fits a calibration best over the whole image.
+    """The lens model of an order (`none`, `2`, `4`, `6`, `6t`) that fits a calibration best over
+    the whole image.
 
-    Fitted by itself, focal length and principal point included, never cut from the higher one: what the left-out
-    terms did is taken over by the others as far as they can (linear least squares over a grid of pixels).
+    Fitted by itself, focal length and principal point included, never cut from the higher one: what
+    the left-out terms did is taken over by the others as far as they can (linear least squares over
+    a grid of pixels).
     """
     kept, steps = order_named(order), 25
-    grid = np.meshgrid(np.linspace(0, camera.width - 1, steps), np.linspace(0, camera.height - 1, steps))
+    grid = np.meshgrid(
+        np.linspace(0, camera.width - 1, steps), np.linspace(0, camera.height - 1, steps)
+    )
     px = np.stack(grid, -1).reshape(-1, 2)
     x, y = undistort(camera, px).T
     r2, n, zero = x * x + y * y, kept.radial, np.zeros_like(x)
@@ -34,14 +40,23 @@ def of_order(camera: Camera, order: str) -> Camera:
     radial[:n] = solved[3 : 3 + n] / solved[0]
     tangential = solved[3 + n :] / solved[0] if kept.tangential else np.zeros(2)
     return replace(
-        camera, focal=float(solved[0]), cx=float(solved[1]), cy=float(solved[2]),
-        k1=float(radial[0]), k2=float(radial[1]), k3=float(radial[2]),
-        p1=float(tangential[0]), p2=float(tangential[1]), sigmas=None,
-    )  # fmt: skip
+        camera,
+        focal=float(solved[0]),
+        cx=float(solved[1]),
+        cy=float(solved[2]),
+        k1=float(radial[0]),
+        k2=float(radial[1]),
+        k3=float(radial[2]),
+        p1=float(tangential[0]),
+        p2=float(tangential[1]),
+        sigmas=None,
+    )
 
 
 def working_K(camera: Camera) -> Array:
-    """(3, 3) from the undistorted image plane (units of the focal length) to the working image, in px."""
+    """(3, 3) from the undistorted image plane (units of the focal length) to the working image, in
+    px.
+    """
     scale = min(1.0, WORKING_WIDTH / camera.width)
     return np.array(
         [

@@ -1,4 +1,6 @@
-"""What `hybrid` maximises: lambda = alpha lambda_spat + (1 - alpha) lambda_corr of a photo on the map (Y 4.6)."""
+"""What `hybrid` maximises: lambda = alpha lambda_spat + (1 - alpha) lambda_corr of a photo on the
+map (Y 4.6).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +30,9 @@ class Distances:
     """(n,) 1, or 0 where the distance is too short to be compared relatively."""
 
     def quality(self, nadir: Array) -> Array:
-        """lambda_spat (6.1) of nadirs (..., 2) in m: mean of 1 / (1 + |relative error|); 1 without neighbours."""
+        """lambda_spat (6.1) of nadirs (..., 2) in m: mean of 1 / (1 + |relative error|); 1 without
+        neighbours.
+        """
         if not self.weight.any():
             return np.ones(np.shape(nadir)[:-1])
         d = np.linalg.norm(np.asarray(nadir)[..., None, :] - self.placed, axis=-1)
@@ -56,7 +60,9 @@ class Level:
     """(2,) column and row of the patch's first pixel in the window, at the metadata's place."""
 
     def correlation(self, move: Array) -> float:
-        """CC (6.1) of photo and map in their overlap for a move (east m, north m, degrees); NaN without one."""
+        """CC (6.1) of photo and map in their overlap for a move (east m, north m, degrees); NaN
+        without one.
+        """
         place = self._placement(move)
         h, w = self.window.shape
         warped = cv2.warpAffine(self.patch, place, (w, h), flags=cv2.INTER_LINEAR)
@@ -72,7 +78,9 @@ class Level:
 
     def _placement(self, move: Array) -> Array:
         """(2, 3) patch pixels to window pixels."""
-        turn = np.radians(move[2])  # rows run south: a clockwise turn on the ground is one in the picture
+        turn = np.radians(
+            move[2]
+        )  # rows run south: a clockwise turn on the ground is one in the picture
         c, s = np.cos(turn), np.sin(turn)
         R = np.array([[c, -s], [s, c]])
         target = self.pivot + self.offset + np.array([move[0], -move[1]]) / self.gsd
@@ -93,14 +101,22 @@ class Objective:
     """Weight of distances against looks."""
 
     def __call__(self, move: Array, level: int) -> float:
-        """lambda for a move (east m, north m, clockwise degrees); looks count nothing where nothing overlaps."""
+        """lambda for a move (east m, north m, clockwise degrees); looks count nothing where nothing
+        overlaps.
+        """
         cc = self.levels[level].correlation(move)
         looks = (1 + cc) / 2 if np.isfinite(cc) else 0.0
-        return self.alpha * float(self.distances.quality(self.nadir + move[:2])) + (1 - self.alpha) * looks
+        return (
+            self.alpha * float(self.distances.quality(self.nadir + move[:2]))
+            + (1 - self.alpha) * looks
+        )
 
 
-def pyramid(patch: Patch, overview: Overview, gsd: float, reach_m: float, nadir_px: Array) -> list[Level]:
-    """Levels of a photo (on the overview's grid) and of the overview around it, as far as it may move.
+def pyramid(
+    patch: Patch, overview: Overview, gsd: float, reach_m: float, nadir_px: Array
+) -> list[Level]:
+    """Levels of a photo (on the overview's grid) and of the overview around it, as far as it may
+    move.
 
     `nadir_px` (2,): column and row of its nadir on the grid.
     """
@@ -118,9 +134,16 @@ def pyramid(patch: Patch, overview: Overview, gsd: float, reach_m: float, nadir_
             (photo, seen), (window, known) = _halved(photo, seen), _halved(window, known)
             pivot, offset, gsd = (pivot + 0.5) / 2 - 0.5, offset / 2, 2 * gsd
         levels.append(
-            Level(gsd=gsd, patch=photo, shown=(seen > 0.99).astype(np.float32), pivot=pivot, window=window,
-                  filled=(known > 0.99).astype(np.float32), offset=offset)
-        )  # fmt: skip
+            Level(
+                gsd=gsd,
+                patch=photo,
+                shown=(seen > 0.99).astype(np.float32),
+                pivot=pivot,
+                window=window,
+                filled=(known > 0.99).astype(np.float32),
+                offset=offset,
+            )
+        )
     return levels
 
 

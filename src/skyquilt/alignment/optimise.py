@@ -1,7 +1,9 @@
-"""Two ways to maximise the objective of `hybrid` inside a photo's error range: annealing, and correlation surfaces."""
+"""Two ways to maximise the objective of `hybrid` inside a photo's error range: annealing, and
+correlation surfaces.
+"""
 
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import cv2
 import numpy as np
@@ -34,9 +36,11 @@ class Optimiser(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Anneal:
-    """Simulated annealing (Kirkpatrick et al. 1983) over an image pyramid, as the thesis has it (Y 4.1.2).
+    """Simulated annealing (Kirkpatrick et al. 1983) over an image pyramid, as the thesis has it (Y
+    4.1.2).
 
-    The coarsest level searches the whole range, each finer one what its coarser neighbour cannot tell.
+    The coarsest level searches the whole range, each finer one what its coarser neighbour cannot
+    tell.
     """
 
     tries: tuple[int, ...] = (120, 160, 500)
@@ -60,14 +64,23 @@ class Anneal:
             spread = np.array([reach_m, reach_m, turn_deg]) if coarsest else slack
             floor = np.array([scale.gsd / 2, scale.gsd / 2, slack[2] / 8])
             heat = self.hot if coarsest else self.hot / 10
-            move = self._level(objective, level, move, spread, floor, (reach_m, turn_deg), heat, rng)
+            move = self._level(
+                objective, level, move, spread, floor, (reach_m, turn_deg), heat, rng
+            )
             spent += self.tries[level]
         return Best(move=move, quality=objective(move, 0), evaluations=spent)
 
     def _level(
-        self, objective: Objective, level: int, move: Array, spread: Array, floor: Array,
-        limits: tuple[float, float], heat: float, rng: np.random.Generator,
-    ) -> Array:  # fmt: skip
+        self,
+        objective: Objective,
+        level: int,
+        move: Array,
+        spread: Array,
+        floor: Array,
+        limits: tuple[float, float],
+        heat: float,
+        rng: np.random.Generator,
+    ) -> Array:
         """One level: steps and temperature fall geometrically."""
         tries = self.tries[level]
         value = objective(move, level)
@@ -89,10 +102,12 @@ class Anneal:
 
 @dataclass(frozen=True, kw_only=True)
 class Surfaces:
-    """Correlation surfaces: every shift of the coarsest level at once for each of a fan of turns, then a descent.
+    """Correlation surfaces: every shift of the coarsest level at once for each of a fan of turns,
+    then a descent.
 
-    Masked normalised correlation by Fourier transforms (Padfield 2012) gives lambda of all shifts; the best of them
-    climb the finer levels by a pattern search that ends in a parabola through the last step's neighbours.
+    Masked normalised correlation by Fourier transforms (Padfield 2012) gives lambda of all shifts;
+    the best of them climb the finer levels by a pattern search that ends in a parabola through the
+    last step's neighbours.
     """
 
     turn_step_deg: float = 2.0
@@ -101,10 +116,14 @@ class Surfaces:
     """Peaks that climb to the next level."""
     version: ClassVar[int] = 1
 
-    def __call__(self, objective: Objective, reach_m: float, turn_deg: float, seed: int = 0) -> Best:
+    def __call__(
+        self, objective: Objective, reach_m: float, turn_deg: float, seed: int = 0
+    ) -> Best:
         """The best move; nothing here is random."""
         coarse = len(objective.levels) - 1
-        turns = np.linspace(-turn_deg, turn_deg, 2 * int(np.ceil(turn_deg / self.turn_step_deg)) + 1)
+        turns = np.linspace(
+            -turn_deg, turn_deg, 2 * int(np.ceil(turn_deg / self.turn_step_deg)) + 1
+        )
         peaks = [self._peak(objective, coarse, float(t), reach_m) for t in turns]
         spent = len(peaks)
         moves = [m for _, m in sorted(peaks, key=lambda found: -found[0])[: self.keep]]
@@ -123,7 +142,9 @@ class Surfaces:
         value, best = climbed[0]
         return Best(move=best, quality=value, evaluations=spent)
 
-    def _peak(self, objective: Objective, level: int, turn: float, reach_m: float) -> tuple[float, Array]:
+    def _peak(
+        self, objective: Objective, level: int, turn: float, reach_m: float
+    ) -> tuple[float, Array]:
         """The best shift for one turn on the coarsest level: (lambda, move)."""
         here = objective.levels[level]
         cc, columns, rows = masked_correlation(here, turn, reach_m)
@@ -139,7 +160,9 @@ class Surfaces:
 def _climb(
     objective: Objective, level: int, move: Array, step: Array, limits: tuple[float, float]
 ) -> tuple[Array, float, int]:
-    """Pattern search with halving steps down to a tenth of a pixel: the move, lambda, evaluations."""
+    """Pattern search with halving steps down to a tenth of a pixel: the move, lambda,
+    evaluations.
+    """
     value, spent = objective(move, level), 1
     for scale in (1.0, 0.4, 0.15):
         for _ in range(12):
@@ -163,18 +186,22 @@ def _within(move: Array, limits: tuple[float, float]) -> bool:
 
 
 def masked_correlation(level: Level, turn_deg: float, reach_m: float) -> tuple[Array, Array, Array]:
-    """CC of photo and map in their overlap for all whole-pixel shifts within reach, NaN where they hardly overlap.
+    """CC of photo and map in their overlap for all whole-pixel shifts within reach, NaN where they
+    hardly overlap.
 
-    The surface (rows, columns), shifts along columns and along rows in px from the metadata's place (Padfield 2012).
+    The surface (rows, columns), shifts along columns and along rows in px from the metadata's place
+    (Padfield 2012).
     """
     place = level._placement(np.array([0.0, 0.0, turn_deg]))
     h, w = level.window.shape
     patch = cv2.warpAffine(level.patch, place, (w, h), flags=cv2.INTER_LINEAR)
-    seen = (cv2.warpAffine(level.shown, place, (w, h), flags=cv2.INTER_LINEAR) > 0.99).astype(np.float32)
+    seen = (cv2.warpAffine(level.shown, place, (w, h), flags=cv2.INTER_LINEAR) > 0.99).astype(
+        np.float32
+    )
     reach = int(np.floor(reach_m / level.gsd))
     size = cv2.getOptimalDFTSize(h + reach + 1), cv2.getOptimalDFTSize(w + reach + 1)
 
-    def transform(image: NDArray) -> NDArray:
+    def transform(image: NDArray[Any]) -> NDArray[Any]:
         return np.fft.rfft2(image, size)
 
     middle = float(patch[seen > 0].mean()) if seen.any() else 0.0
@@ -183,7 +210,7 @@ def masked_correlation(level: Level, turn_deg: float, reach_m: float) -> tuple[A
     B, B2, MB = transform(b), transform(b * b), transform(level.filled)
     shifts = np.arange(-reach, reach + 1)
 
-    def all_shifts(product: NDArray) -> NDArray:
+    def all_shifts(product: NDArray[Any]) -> NDArray[Any]:
         full = np.fft.irfft2(product, size)
         return np.asarray(full[np.ix_(shifts % size[0], shifts % size[1])])
 

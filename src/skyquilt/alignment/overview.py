@@ -1,8 +1,10 @@
-"""`image`, search `overview`: each photo registered to the whole map so far, whose cost grows with it (Y 4.1.2)."""
+"""`image`, search `overview`: each photo registered to the whole map so far, whose cost grows with
+it (Y 4.1.2).
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import cv2
 import numpy as np
@@ -30,7 +32,7 @@ RIM_PX = 12
 class Detector(Protocol):
     """Features of a picture."""
 
-    def __call__(self, image: NDArray) -> Features:
+    def __call__(self, image: NDArray[Any]) -> Features:
         """Keypoints and descriptors."""
         ...
 
@@ -41,7 +43,9 @@ class Detector(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class ByOverview:
-    """The basic image-based method of Y 4.1.2: features of the whole overview are sought anew for every photo."""
+    """The basic image-based method of Y 4.1.2: features of the whole overview are sought anew for
+    every photo.
+    """
 
     detect: Detector
     """Features of the overview."""
@@ -63,10 +67,17 @@ class ByOverview:
     name: ClassVar[str] = "image"
 
     def __call__(
-        self, photos: Sequence[Photo], frame: MapFrame, priors: Sequence[Prior], features: Sequence[Features],
-        order: Sequence[int], grey: GreyPicture,
-    ) -> Alignment:  # fmt: skip
-        """Registers photos (indices) in the order given; one that matches nothing begins a new piece."""
+        self,
+        photos: Sequence[Photo],
+        frame: MapFrame,
+        priors: Sequence[Prior],
+        features: Sequence[Features],
+        order: Sequence[int],
+        grey: GreyPicture,
+    ) -> Alignment:
+        """Registers photos (indices) in the order given; one that matches nothing begins a new
+        piece.
+        """
         cameras = {p.camera_key: of_order(reported_camera(p), self.distortion) for p in photos}
         pieces: list[dict[int, Array]] = []
         joins, notes = [], []
@@ -81,7 +92,8 @@ class ByOverview:
                 if joined is not None:
                     name = photos[photo].name
                     notes.append(
-                        f"{name} does not match the map so far ({joined.reason}): a new piece begins."
+                        f"{name} does not match the map so far ({joined.reason}): a new piece"
+                        " begins."
                     )
                 overview, K = Overview(), self._grid(camera)
                 pieces.append({})
@@ -109,18 +121,25 @@ class ByOverview:
         px = features.px[matches.index_a]
         a = undistort(camera, px) * K[0, 0]
         b = known.px[matches.index_b] + (overview.column, overview.row)
-        found = registered(photo, -1, px, a, b, estimate=self.estimate, level=self.level, centre=np.zeros(2))
+        found = registered(
+            photo, -1, px, a, b, estimate=self.estimate, level=self.level, centre=np.zeros(2)
+        )
         return found if isinstance(found, NoEstimate) else (found[0] @ K, found[1])
 
     def _features(self, overview: Overview) -> Features:
         """Features of the overview, those at its rim left out."""
         area = overview.shown.sum() / (0.6 * self.longest**2)
-        found = self.detect.counted(int(self.per_photo * max(1.0, area)))(overview.pixels.astype(np.uint8))
+        found = self.detect.counted(int(self.per_photo * max(1.0, area)))(
+            overview.pixels.astype(np.uint8)
+        )
         inside = cv2.erode(
             overview.shown.astype(np.uint8), np.ones((2 * RIM_PX + 1,) * 2, np.uint8), borderValue=0
         )
         at = np.rint(found.px).astype(int).T
         keep = inside[at[1].clip(0, inside.shape[0] - 1), at[0].clip(0, inside.shape[1] - 1)] > 0
         return Features(
-            px=found.px[keep], size=found.size[keep], descriptors=found.descriptors[keep], scale=found.scale
+            px=found.px[keep],
+            size=found.size[keep],
+            descriptors=found.descriptors[keep],
+            scale=found.scale,
         )

@@ -21,7 +21,9 @@ class Piece:
     """Photos registered to one another."""
 
     plane_H_cam: dict[int, Array]
-    """By photo: homography (3, 3) from its undistorted image plane to the plane of the piece (x right, y down)."""
+    """By photo: homography (3, 3) from its undistorted image plane to the plane of the piece (x
+    right, y down).
+    """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,11 +37,13 @@ class Laid:
 
 
 def lay(pieces: Sequence[Piece], priors: Sequence[Prior], height_m: float | None) -> Laid:
-    """Every piece by one similarity, 4 degrees of freedom, that takes the photos' middles to their positions.
+    """Every piece by one similarity, 4 degrees of freedom, that takes the photos' middles to their
+    positions.
 
-    That tells where on Earth the mosaic lies and changes nothing inside a piece. A piece without two positions is
-    scaled by the height above ground (`height_m`, else heights above take-off, else a nominal one) and turned as
-    its photos report; without any position it is put beside the others.
+    That tells where on Earth the mosaic lies and changes nothing inside a piece. A piece without
+    two positions is scaled by the height above ground (`height_m`, else heights above take-off,
+    else a nominal one) and turned as its photos report; without any position it is put beside the
+    others.
     """
     poses: dict[int, Pose] = {}
     metric = True
@@ -70,8 +74,12 @@ def centre(H: Array) -> complex:
     return complex(H[0, 2] / H[2, 2], H[1, 2] / H[2, 2])
 
 
-def _similarity(piece: Piece, priors: Sequence[Prior], height_m: float | None) -> tuple[Array, bool, bool]:
-    """(3, 3) from the piece's plane to the map; whether its scale and whether its place are known."""
+def _similarity(
+    piece: Piece, priors: Sequence[Prior], height_m: float | None
+) -> tuple[Array, bool, bool]:
+    """(3, 3) from the piece's plane to the map; whether its scale and whether its place are
+    known.
+    """
     photos = list(piece.plane_H_cam)
     # a map's y runs north where a plane's runs down: conjugate
     plane = np.conj([centre(piece.plane_H_cam[i]) for i in photos])
@@ -95,7 +103,9 @@ def _matrix(g: complex, c: complex) -> Array:
 
 
 def _height(piece: Piece, priors: Sequence[Prior], height_m: float | None) -> tuple[float, bool]:
-    """Metres per unit of the plane, in which a photo of scale 1 hangs one focal length above the ground."""
+    """Metres per unit of the plane, in which a photo of scale 1 hangs one focal length above the
+    ground.
+    """
     heights = np.array([priors[i].map_C[2] for i in piece.plane_H_cam])
     if height_m is not None:
         return height_m, True
@@ -112,7 +122,11 @@ def _turn(piece: Piece, priors: Sequence[Prior]) -> complex:
             top = -(H[:2, 1] * H[2, 2] - H[:2, 2] * H[2, 1])
             seen = np.conj(complex(top[0], top[1]))
             units.append(1j * np.exp(-1j * np.radians(priors[photo].yaw_deg)) / (seen / abs(seen)))
-    return complex(np.mean(units) / abs(np.mean(units))) if units and abs(np.mean(units)) > 1e-6 else 1 + 0j
+    return (
+        complex(np.mean(units) / abs(np.mean(units)))
+        if units and abs(np.mean(units)) > 1e-6
+        else 1 + 0j
+    )
 
 
 def _beside(

@@ -1,4 +1,6 @@
-"""Photos placed in the plane: a homography from the image plane to the map, and the vertical view nearest to it."""
+"""Photos placed in the plane: a homography from the image plane to the map, and the vertical view
+nearest to it.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +12,11 @@ Array = NDArray[np.float64]
 
 
 def planar_pose(map_H_cam: Array) -> Pose:
-    """The pose of a photo whose undistorted image plane (units of the focal length) `map_H_cam` (3, 3) takes to the
-    map in m.
+    """The pose of a photo whose undistorted image plane (units of the focal length) `map_H_cam` (3,
+    3) takes to the map in m.
 
-    The vertical view beside it looks down on where the optical axis meets the ground, from the height that gives
-    its scale there, its top where the homography has it.
+    The vertical view beside it looks down on where the optical axis meets the ground, from the
+    height that gives its scale there, its top where the homography has it.
 
     Raises:
         ValueError: the homography is degenerate, or mirrors the picture.
@@ -25,11 +27,14 @@ def planar_pose(map_H_cam: Array) -> Pose:
     H = H / H[2, 2]
     ground = H[:2, 2]
     J = H[:2, :2] - np.outer(ground, H[2, :2])
-    # x of the image runs right and y down, x of the map east and y north: a true view turns the sense round
+    # x of the image runs right and y down, x of the map east and y north: a true view turns the
+    # sense round
     if np.linalg.det(J) >= 0:
         raise ValueError(f"a homography that mirrors the picture: {H}")
     height = float(np.sqrt(-np.linalg.det(J)))
-    top = -J[:, 1] / np.linalg.norm(J[:, 1]) + np.array([-J[1, 0], J[0, 0]]) / np.linalg.norm(J[:, 0])
+    top = -J[:, 1] / np.linalg.norm(J[:, 1]) + np.array([-J[1, 0], J[0, 0]]) / np.linalg.norm(
+        J[:, 0]
+    )
     cam_H_map = np.linalg.inv(H)
     cam_H_map *= height / (cam_H_map[2] @ np.array([*ground, 1.0]))
     return Pose(
@@ -40,7 +45,9 @@ def planar_pose(map_H_cam: Array) -> Pose:
 
 
 def map_H_cam_of(pose: Pose) -> Array:
-    """The homography (3, 3) from the undistorted image plane to level ground at height 0, scaled to 1 at its end."""
+    """The homography (3, 3) from the undistorted image plane to level ground at height 0, scaled to
+    1 at its end.
+    """
     if pose.cam_H_map is not None:
         cam_H_map = pose.cam_H_map
     else:

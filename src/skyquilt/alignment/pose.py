@@ -33,12 +33,17 @@ class ByMetadata:
     name: ClassVar[str] = "pose"
 
     def __call__(
-        self, photos: Sequence[Photo], frame: MapFrame, priors: Sequence[Prior],
+        self,
+        photos: Sequence[Photo],
+        frame: MapFrame,
+        priors: Sequence[Prior],
         heights_m: NDArray[np.float64] | None = None,
-    ) -> Alignment:  # fmt: skip
-        """Places all photos that have a position; one without any survives alone in a frame of its own.
+    ) -> Alignment:
+        """Places all photos that have a position; one without any survives alone in a frame of its
+        own.
 
-        `heights_m` (n,): heights above ground known better than from metadata, NaN where they are not.
+        `heights_m` (n,): heights above ground known better than from metadata, NaN where they are
+        not.
 
         Raises:
             AlignmentError: positions or the height above ground are missing.
@@ -47,7 +52,8 @@ class ByMetadata:
         poses: dict[int, Pose] = {}
         if len(photos) == 1 and frame.crs is None:
             poses[0] = Pose(
-                cam_R_map=cam_R_map_from_angles(0.0), map_C=np.array([0.0, 0.0, self.height_m or 50.0])
+                cam_R_map=cam_R_map_from_angles(0.0),
+                map_C=np.array([0.0, 0.0, self.height_m or 50.0]),
             )
         else:
             heights = self._heights(frame, priors, heights_m)
@@ -55,13 +61,16 @@ class ByMetadata:
         if not poses:
             raise AlignmentError(_nothing_placed(self.name, len(photos), rejected))
         return Alignment(
-            method=self.name, why="",
+            method=self.name,
+            why="",
             frame=replace(frame, metric=frame.crs is not None or self.height_m is not None),
-            poses=poses, cameras={p.camera_key: reported_camera(p) for p in photos},
+            poses=poses,
+            cameras={p.camera_key: reported_camera(p) for p in photos},
             camera_of={i: p.camera_key for i, p in enumerate(photos)},
             blocks=tuple((i,) for i in sorted(poses)),
-            ties=no_ties(), rejected=rejected,
-        )  # fmt: skip
+            ties=no_ties(),
+            rejected=rejected,
+        )
 
     def _heights(
         self, frame: MapFrame, priors: Sequence[Prior], known: NDArray[np.float64] | None
@@ -78,7 +87,9 @@ class ByMetadata:
             )
         if frame.vertical_datum != "takeoff":
             told = frame.vertical_datum != "unknown"
-            given = f"heights above {frame.vertical_datum.replace('_', ' ')}" if told else "no heights"
+            given = (
+                f"heights above {frame.vertical_datum.replace('_', ' ')}" if told else "no heights"
+            )
             raise AlignmentError(
                 f"method {self.name} needs heights above ground, and the photos give {given};"
                 " add --height METRES"
@@ -129,8 +140,8 @@ class ByPosition(ByMetadata):
     """`position`: translations only, one common scale and one survey heading (Y 4.2)."""
 
     heading_deg: float | None = None
-    """Grid heading of every photo's image top in degrees clockwise from north; None = the commonest reported one,
-    north where none is reported.
+    """Grid heading of every photo's image top in degrees clockwise from north; None = the commonest
+    reported one, north where none is reported.
     """
     name: ClassVar[str] = "position"
 
@@ -147,7 +158,9 @@ class ByPosition(ByMetadata):
         return poses, {i: "it has no position" for i in range(len(photos)) if i not in poses}
 
     def _heading(self, priors: Sequence[Prior]) -> float:
-        """The survey's heading in degrees: the reported one that most others agree with, and their mean."""
+        """The survey's heading in degrees: the reported one that most others agree with, and their
+        mean.
+        """
         if self.heading_deg is not None:
             return self.heading_deg
         yaw = np.array([p.yaw_deg for p in priors])

@@ -19,7 +19,9 @@ def utm_epsg(latitude_deg: float, longitude_deg: float) -> str:
     return f"EPSG:{32600 + zone if latitude_deg >= 0 else 32700 + zone}"
 
 
-def choose_frame(photos: Sequence[Photo], crs: str | None, control: Sequence[ControlPoint] = ()) -> MapFrame:
+def choose_frame(
+    photos: Sequence[Photo], crs: str | None, control: Sequence[ControlPoint] = ()
+) -> MapFrame:
     """The frame of a survey: `crs` if asked for, else the UTM zone of the median position.
 
     Without any position it is that of the control points; without those it stays ungeoreferenced.
@@ -64,7 +66,9 @@ def _checked_crs(crs: str) -> str:
 
 def _datum(photos: Sequence[Photo]) -> Datum:
     """The most trustworthy datum that most positions state."""
-    count = Counter(p.position.datum for p in photos if p.position and p.position.altitude_m is not None)
+    count = Counter(
+        p.position.datum for p in photos if p.position and p.position.altitude_m is not None
+    )
     return count.most_common(1)[0][0] if count else "unknown"
 
 
@@ -74,8 +78,10 @@ def _altitude(photo: Photo, datum: Datum) -> float:
     if position is None:
         return np.nan
     by_datum = {
-        "takeoff": position.takeoff_m, "sea_level": position.sea_level_m, "ellipsoid": position.ellipsoid_m,
-    }  # fmt: skip
+        "takeoff": position.takeoff_m,
+        "sea_level": position.sea_level_m,
+        "ellipsoid": position.ellipsoid_m,
+    }
     height = position.altitude_m if position.datum == datum else by_datum.get(datum)
     return np.nan if height is None else float(height)
 

@@ -76,9 +76,10 @@ class Problem:
     loss_R: float = 2.0
     """Scale of the pseudo-Huber loss on attitudes: a gimbal may lie."""
     trust: float = 1.0
-    """Factor on the cost of sightings. Errors of neighbouring sightings are correlated (lens model, rolling
-    shutter, features of one kind); a photo's hundreds of sightings weigh like some dozens of independent
-    ones."""
+    """Factor on the cost of sightings. Errors of neighbouring sightings are correlated (lens model,
+    rolling shutter, features of one kind); a photo's hundreds of sightings weigh like some dozens
+    of independent ones.
+    """
 
     def with_loss(self, loss_px: float) -> "Problem":
         """The same problem with another scale of the loss on sightings."""
@@ -121,9 +122,17 @@ def linearise(problem: Problem, state: State) -> Linearised:
     J_photo[:, :, :3] = np.cross(local[:, None, :], d_point)  # d . (w x local) = (local x d) . w
     J_point = d_point @ state.R[problem.photo]
     J_photo[:, :, 3:] = -J_point
-    J_camera = p.d_intrinsics * w[..., None] * problem.free[cameras][:, None, :] if some else p.d_intrinsics
+    J_camera = (
+        p.d_intrinsics * w[..., None] * problem.free[cameras][:, None, :]
+        if some
+        else p.d_intrinsics
+    )
     return Linearised(
-        residual=(p.px - problem.px) * w, J_photo=J_photo, J_camera=J_camera, J_point=J_point, behind=behind
+        residual=(p.px - problem.px) * w,
+        J_photo=J_photo,
+        J_camera=J_camera,
+        J_point=J_point,
+        behind=behind,
     )
 
 
@@ -146,7 +155,10 @@ def residuals_px(problem: Problem, state: State) -> Array:
 def attitude_error(R: Array, R0: Array) -> Array:
     """Rotation vectors (n, 3) in rad, in camera axes, that take R0 to R."""
     E = R @ np.swapaxes(R0, -1, -2)
-    v = np.stack([E[:, 2, 1] - E[:, 1, 2], E[:, 0, 2] - E[:, 2, 0], E[:, 1, 0] - E[:, 0, 1]], -1) / 2
+    v = (
+        np.stack([E[:, 2, 1] - E[:, 1, 2], E[:, 0, 2] - E[:, 2, 0], E[:, 1, 0] - E[:, 0, 1]], -1)
+        / 2
+    )
     sine = np.linalg.norm(v, axis=-1)
     angle = np.arctan2(sine, (np.trace(E, axis1=1, axis2=2) - 1) / 2)
     scale = np.where(sine > 1e-9, angle / np.maximum(sine, 1e-12), 1.0)

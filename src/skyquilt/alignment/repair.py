@@ -26,16 +26,22 @@ class Repaired:
     priors: tuple[Prior, ...]
     """One per photo."""
     heights_m: NDArray[np.float64]
-    """(n,) heights above ground from image scale; NaN for photos without links, or where no position gives metres."""
+    """(n,) heights above ground from image scale; NaN for photos without links, or where no
+    position gives metres.
+    """
     notes: tuple[str, ...]
     """What was corrected, by photo, both values."""
 
 
 def repair(
-    photos: Sequence[Photo], priors: Sequence[Prior], features: Sequence[Features], links: Sequence[Link],
+    photos: Sequence[Photo],
+    priors: Sequence[Prior],
+    features: Sequence[Features],
+    links: Sequence[Link],
     convergence_deg: float = 0.0,
-) -> Repaired:  # fmt: skip
-    """Headings that contradict the links replaced, missing ones filled, heights above ground from image scale.
+) -> Repaired:
+    """Headings that contradict the links replaced, missing ones filled, heights above ground from
+    image scale.
 
     Positions stay, with the scatter that their block shows where it is worse than stated.
     """
@@ -50,12 +56,18 @@ def repair(
         notes += told
         spread = start.sigma_xy.get(i, 0.0)
         if spread > repaired[i].sigma_C[0]:
-            repaired[i] = replace(repaired[i], sigma_C=np.array([spread, spread, priors[i].sigma_C[2]]))
+            repaired[i] = replace(
+                repaired[i], sigma_C=np.array([spread, spread, priors[i].sigma_C[2]])
+            )
     return Repaired(priors=tuple(repaired), heights_m=heights, notes=tuple(notes))
 
 
-def _heading(photo: Photo, prior: Prior, found_deg: float, convergence_deg: float) -> tuple[Prior, list[str]]:
-    """The prior with the heading that the pixels show, where the reported one is missing or contradicts it."""
+def _heading(
+    photo: Photo, prior: Prior, found_deg: float, convergence_deg: float
+) -> tuple[Prior, list[str]]:
+    """The prior with the heading that the pixels show, where the reported one is missing or
+    contradicts it.
+    """
     known = np.isfinite(prior.yaw_deg)
     off = angle_difference_deg(prior.yaw_deg, found_deg) if known else np.nan
     if known and abs(off) < max(YAW_DEG, 3 * prior.sigma_yaw_deg):
@@ -63,7 +75,13 @@ def _heading(photo: Photo, prior: Prior, found_deg: float, convergence_deg: floa
     better = replace(prior, yaw_deg=found_deg, sigma_yaw_deg=SIGMA_YAW_DEG, yaw_source="pixels")
     if not known:
         return better, []
-    if abs(abs(off) - 180) < 20 and photo.editor:  # the file was turned upside down, and its axes with it
+    if (
+        abs(abs(off) - 180) < 20 and photo.editor
+    ):  # the file was turned upside down, and its axes with it
         better = replace(better, pitch_deg=-prior.pitch_deg, roll_deg=-prior.roll_deg)
-    said, shows = (angle_difference_deg(y + convergence_deg, 0.0) for y in (prior.yaw_deg, found_deg))
-    return better, [f"{photo.name} reports a heading of {said:.0f} degrees, its pixels show {shows:.0f}."]
+    said, shows = (
+        angle_difference_deg(y + convergence_deg, 0.0) for y in (prior.yaw_deg, found_deg)
+    )
+    return better, [
+        f"{photo.name} reports a heading of {said:.0f} degrees, its pixels show {shows:.0f}."
+    ]

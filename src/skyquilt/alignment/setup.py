@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +58,9 @@ class Setup:
     """(n,) translations of the start."""
 
     def file_px(self, photo: NDArray[np.int64], px: Array) -> Array:
-        """Sensor pixels to file pixels, and back: the two differ by a half turn for turned files."""
+        """Sensor pixels to file pixels, and back: the two differ by a half turn for turned
+        files.
+        """
         return np.where(self.turned[photo][:, None], self.size[photo] - 1 - px, px)
 
     def file_sign(self, photo: NDArray[np.int64]) -> Array:
@@ -71,7 +74,9 @@ class Setup:
         return replace(own, px=self.file_px(own.photo, own.px))
 
     def problem(self, tracks: Tracks) -> tuple[Problem, State]:
-        """The problem of these tracks (sensor pixels), and where to start: points on the ground plane."""
+        """The problem of these tracks (sensor pixels), and where to start: points on the ground
+        plane.
+        """
         row = np.searchsorted(self.members, tracks.photo)
         K = self.base.K0[self.camera[row]]
         p = ((tracks.px[:, 0] - K[:, 1]) - 1j * (tracks.px[:, 1] - K[:, 2])) / K[:, 0]
@@ -82,10 +87,15 @@ class Setup:
         X[:, 0] = np.bincount(tracks.point, ground.real, tracks.count) / number
         X[:, 1] = np.bincount(tracks.point, ground.imag, tracks.count) / number
         problem = replace(
-            self.base, point=tracks.point, photo=row, px=tracks.px, sigma_px=tracks.sigma_px,
-            X0=np.full(X.shape, np.nan), sigma_X=np.ones(X.shape),
+            self.base,
+            point=tracks.point,
+            photo=row,
+            px=tracks.px,
+            sigma_px=tracks.sigma_px,
+            X0=np.full(X.shape, np.nan),
+            sigma_X=np.ones(X.shape),
             trust=min(1.0, INDEPENDENT * len(self.members) / max(len(row), 1)),
-        )  # fmt: skip
+        )
         return problem, State(R=self.start_R, C=self.start_C, K=self.base.K0.copy(), X=X)
 
 
@@ -108,22 +118,47 @@ def set_up(
     R0, sigma_R = _attitudes(members, priors, yaw, lies, repair, turned)
     start_C = np.column_stack([t.real, t.imag, z_ground + np.abs(a)])
     start_R = np.array(
-        [_start_R(priors[m], y, bool(turned[m])) for m, y in zip(members.tolist(), yaw, strict=True)]
+        [
+            _start_R(priors[m], y, bool(turned[m]))
+            for m, y in zip(members.tolist(), yaw, strict=True)
+        ]
     )
     K0, sigma_K, free = intrinsic_priors([photos[m] for m in first], distortion)
     base = Problem(
-        point=np.zeros(0, np.int64), photo=np.zeros(0, np.int64), px=np.zeros((0, 2)), sigma_px=np.zeros(0),
-        camera=camera, free=free, K0=K0, sigma_K=sigma_K, C0=C0, sigma_C=sigma_C, R0=R0, sigma_R=sigma_R,
-        X0=np.zeros((0, 3)), sigma_X=np.zeros((0, 3)), loss_px=2.0,
-        loss_C=3.0 if repair else 1e6, loss_R=2.0 if repair else 1e6,
-    )  # fmt: skip
+        point=np.zeros(0, np.int64),
+        photo=np.zeros(0, np.int64),
+        px=np.zeros((0, 2)),
+        sigma_px=np.zeros(0),
+        camera=camera,
+        free=free,
+        K0=K0,
+        sigma_K=sigma_K,
+        C0=C0,
+        sigma_C=sigma_C,
+        R0=R0,
+        sigma_R=sigma_R,
+        X0=np.zeros((0, 3)),
+        sigma_X=np.zeros((0, 3)),
+        loss_px=2.0,
+        loss_C=3.0 if repair else 1e6,
+        loss_R=2.0 if repair else 1e6,
+    )
     return Setup(
-        members=members, camera=camera, camera_keys=keys, turned=turned,
-        size=np.array([(p.width, p.height) for p in photos], float), stated_sigma_C=stated,
-        block_rows=tuple(np.searchsorted(members, b) for b in start.blocks), z_ground=z_ground, base=base,
+        members=members,
+        camera=camera,
+        camera_keys=keys,
+        turned=turned,
+        size=np.array([(p.width, p.height) for p in photos], float),
+        stated_sigma_C=stated,
+        block_rows=tuple(np.searchsorted(members, b) for b in start.blocks),
+        z_ground=z_ground,
+        base=base,
         georeferenced=bool(start.georeferenced),
-        start_R=start_R, start_C=start_C, plane_a=a, plane_t=t,
-    )  # fmt: skip
+        start_R=start_R,
+        start_C=start_C,
+        plane_a=a,
+        plane_t=t,
+    )
 
 
 def _yaw_lie(prior: Prior, yaw_deg: float) -> float:
@@ -138,7 +173,7 @@ def _start_R(prior: Prior, yaw_deg: float, turned: bool) -> Array:
 
 
 def _positions(
-    members: NDArray, priors: Sequence[Prior], start: Start, height: Array, repair: bool
+    members: NDArray[Any], priors: Sequence[Prior], start: Start, height: Array, repair: bool
 ) -> tuple[Array, Array, Array, float]:
     """Measured centres, deviations used, deviations stated, and the height of the ground plane."""
     C0 = np.array([priors[m].map_C for m in members])
@@ -150,20 +185,34 @@ def _positions(
     if repair and known.any():
         scatter = 1.48 * float(np.median(np.abs(ground[known] - z_ground)))
         sigma[:, 2] = np.maximum(sigma[:, 2], scatter)
-        sigma[:, :2] = np.maximum(sigma[:, :2], [[start.sigma_xy.get(int(m), 0.0)] for m in members])
+        sigma[:, :2] = np.maximum(
+            sigma[:, :2], [[start.sigma_xy.get(int(m), 0.0)] for m in members]
+        )
     free = ~np.isfinite(C0[:, 0])
     if free.all():  # nothing holds the block: its own start does, softly
-        a_t = np.array([[start.placed[int(m)][1].real, start.placed[int(m)][1].imag] for m in members])
+        a_t = np.array(
+            [[start.placed[int(m)][1].real, start.placed[int(m)][1].imag] for m in members]
+        )
         C0 = np.column_stack([a_t, z_ground + height])
         sigma = stated = np.full(C0.shape, 0.1 * float(np.median(height)))
     elif not known.any():  # nor does anything hold its height
         C0[:, 2] = z_ground + height
         sigma[:, 2] = stated[:, 2] = 0.1 * float(np.median(height))
-    return C0, np.where(np.isfinite(C0), sigma, 1.0), np.where(np.isfinite(C0), stated, 1.0), z_ground
+    return (
+        C0,
+        np.where(np.isfinite(C0), sigma, 1.0),
+        np.where(np.isfinite(C0), stated, 1.0),
+        z_ground,
+    )
 
 
 def _attitudes(
-    members: NDArray, priors: Sequence[Prior], yaw: Array, lies: Array, repair: bool, turned: NDArray
+    members: NDArray[Any],
+    priors: Sequence[Prior],
+    yaw: Array,
+    lies: Array,
+    repair: bool,
+    turned: NDArray[Any],
 ) -> tuple[Array, Array]:
     """Prior attitudes and deviations in rad; a yaw that lies takes its tilt's direction with it."""
     R0, sigma = [], []
@@ -176,11 +225,15 @@ def _attitudes(
         else:
             R0.append(cam_R_map_from_angles(y, prior.pitch_deg, prior.roll_deg))
         tilt = prior.sigma_tilt_deg
-        sigma.append(np.radians([tilt, tilt, prior.sigma_yaw_deg if trusted or turned[m] else 90.0]))
+        sigma.append(
+            np.radians([tilt, tilt, prior.sigma_yaw_deg if trusted or turned[m] else 90.0])
+        )
     return np.array(R0), np.array(sigma)
 
 
-def intrinsic_priors(photos: Sequence[Photo], distortion: str) -> tuple[Array, Array, NDArray[np.bool_]]:
+def intrinsic_priors(
+    photos: Sequence[Photo], distortion: str
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Priors, deviations and freedom of each camera's intrinsics."""
     K0: list[Array] = []
     sigma: list[Array | list[float]] = []
@@ -192,13 +245,17 @@ def intrinsic_priors(photos: Sequence[Photo], distortion: str) -> tuple[Array, A
         else:
             ideal = Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
             K0.append(ideal.vector)
-            sigma.append([photo.focal.sigma_px, 0.01 * wide, 0.01 * wide, 0.1, 0.1, 0.05, 2e-3, 2e-3])
+            sigma.append(
+                [photo.focal.sigma_px, 0.01 * wide, 0.01 * wide, 0.1, 0.1, 0.05, 2e-3, 2e-3]
+            )
     free = np.tile(np.array((True, True, True, *order_named(distortion).terms)), (len(photos), 1))
     return np.array(K0), np.array(sigma), free
 
 
 def _calibrated_sigma(camera: Camera, sigma_focal: float) -> Array:
-    """Deviations of a known calibration: its own where it states them, never less than flying changes a lens."""
+    """Deviations of a known calibration: its own where it states them, never less than flying
+    changes a lens.
+    """
     wide = max(camera.width, camera.height)
     usual = [sigma_focal, 0.003 * wide, 0.003 * wide, 0.01, 0.01, 0.01, 1e-3, 1e-3]
     least = [5e-4 * camera.focal, 5e-4 * wide, 5e-4 * wide, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4]

@@ -1,8 +1,8 @@
 """Sightings made sharper: keypoints found in small pictures, moved to where larger pictures agree.
 
-With poses nearly right, every sighting of a point is a patch of the same ground: rectified to the ground, the
-patches differ by a translation, which is what the sightings' errors are. One sighting stays and the others
-follow it.
+With poses nearly right, every sighting of a point is a patch of the same ground: rectified to the
+ground, the patches differ by a translation, which is what the sightings' errors are. One sighting
+stays and the others follow it.
 """
 
 from collections.abc import Callable, Mapping
@@ -50,7 +50,9 @@ class Sharpen:
         cameras: Mapping[int, Camera],
         grey: GreyPicture,
     ) -> Tracks:
-        """Tracks (file pixels) with sharper sightings; `xyz` (count, 3): their points in the map frame."""
+        """Tracks (file pixels) with sharper sightings; `xyz` (count, 3): their points in the map
+        frame.
+        """
         anchor = self._anchors(tracks, cameras)
         patches, scale = self._patches(tracks, xyz, poses, cameras, grey)
         others = np.flatnonzero(anchor[tracks.point] != np.arange(len(tracks.point)))
@@ -74,14 +76,18 @@ class Sharpen:
         for k in range(0, len(others), BATCH):
             part = slice(k, k + BATCH)
             reference = patches[first[part]][:, inner, inner].astype(np.float32)
-            parts.append(translate(reference, patches[others[part]].astype(np.float32), margin=MARGIN))
+            parts.append(
+                translate(reference, patches[others[part]].astype(np.float32), margin=MARGIN)
+            )
         if not parts:
             return np.zeros((0, 2)), np.zeros(0)
         return np.concatenate([s for s, _ in parts]), np.concatenate([c for _, c in parts])
 
     def _anchors(self, tracks: Tracks, cameras: Mapping[int, Camera]) -> NDArray[np.int64]:
         """The most central sighting of each track (count,)."""
-        size = np.array([(cameras[p].width, cameras[p].height) for p in tracks.photo.tolist()], float)
+        size = np.array(
+            [(cameras[p].width, cameras[p].height) for p in tracks.photo.tolist()], float
+        )
         off = np.linalg.norm(tracks.px / size - 0.5, axis=1)
         order = np.lexsort((off, tracks.point))
         return order[np.searchsorted(tracks.point[order], np.arange(tracks.count))]
@@ -94,8 +100,8 @@ class Sharpen:
         cameras: Mapping[int, Camera],
         grey: GreyPicture,
     ) -> tuple[NDArray[np.uint8], Array]:
-        """Patches (N, s + 2 margin, ...) of all sightings rectified to the level ground of their point,
-        centred where each was seen, and the pictures' scales (N,): sensor px per px.
+        """Patches (N, s + 2 margin, ...) of all sightings rectified to the level ground of their
+        point, centred where each was seen, and the pictures' scales (N,): sensor px per px.
         """
         full = self.side + 2 * MARGIN
         out = np.zeros((len(tracks.point), full, full), np.uint8)
@@ -108,21 +114,39 @@ class Sharpen:
             gx, gy = ground_axes(xyz[tracks.point[own]], poses[photo], camera, scale[own[0]])
             # the ground around a point is nearly affine in the picture over a few pixels
             centre = (tracks.px[own] + 0.5) / scale[own[0]] - 0.5
-            u = centre[:, 0, None, None] + gx[:, 0, None, None] * step + gy[:, 0, None, None] * step[:, None]
-            v = centre[:, 1, None, None] + gx[:, 1, None, None] * step + gy[:, 1, None, None] * step[:, None]
+            u = (
+                centre[:, 0, None, None]
+                + gx[:, 0, None, None] * step
+                + gy[:, 0, None, None] * step[:, None]
+            )
+            v = (
+                centre[:, 1, None, None]
+                + gx[:, 1, None, None] * step
+                + gy[:, 1, None, None] * step[:, None]
+            )
             flat_u, flat_v = (m.reshape(len(own), -1).astype(np.float32) for m in (u, v))
             for k in range(0, len(own), 30000):
                 part = slice(k, k + 30000)
                 warped = cv2.remap(
-                    picture, flat_u[part], flat_v[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+                    picture,
+                    flat_u[part],
+                    flat_v[part],
+                    cv2.INTER_LINEAR,
+                    borderMode=cv2.BORDER_REPLICATE,
                 )
                 out[own[part]] = warped.reshape(-1, full, full)
         return out, scale
 
     def _on_image(
-        self, tracks: Tracks, xyz: Array, poses: Mapping[int, Pose], cameras: Mapping[int, Camera],
-        rows: NDArray[np.int64], shift: Array, scale: Array,
-    ) -> Array:  # fmt: skip
+        self,
+        tracks: Tracks,
+        xyz: Array,
+        poses: Mapping[int, Pose],
+        cameras: Mapping[int, Camera],
+        rows: NDArray[np.int64],
+        shift: Array,
+        scale: Array,
+    ) -> Array:
         """Sensor pixels (m, 2) of sightings moved by shifts (m, 2) in patch px."""
         moved = tracks.px[rows].copy()
         for photo in np.unique(tracks.photo[rows]).tolist():

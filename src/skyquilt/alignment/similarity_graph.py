@@ -1,12 +1,14 @@
-"""A first solution for all photos: every photo a similarity x = a p + t of the plane, from links alone.
+"""A first solution for all photos: every photo a similarity x = a p + t of the plane, from links
+alone.
 
-p = (x - cx) - i (y - cy) over the focal length (y up), a = height * exp(-i yaw). A linear least-squares fit
-of points shrinks the map to lower its cost; therefore scales and angles are averaged first and translations
-come after (B/C of the methods). Positions join last, robustly.
+p = (x - cx) - i (y - cy) over the focal length (y up), a = height * exp(-i yaw). A linear
+least-squares fit of points shrinks the map to lower its cost; therefore scales and angles are
+averaged first and translations come after (B/C of the methods). Positions join last, robustly.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,18 +57,30 @@ class PlaneSolution:
 
 def components(count: int, links: Sequence[PlaneLink]) -> list[NDArray[np.int64]]:
     """Connected groups of photos, largest first (single photos included)."""
-    label = connected(count, np.array([k.a for k in links], int), np.array([k.b for k in links], int))
+    label = connected(
+        count, np.array([k.a for k in links], int), np.array([k.b for k in links], int)
+    )
     groups = [np.flatnonzero(label == g) for g in range(label.max() + 1)]
     return sorted(groups, key=lambda g: (-len(g), int(g[0])))
 
 
-def _spanning_start(members: NDArray, links: Sequence[PlaneLink], index: dict[int, int]) -> Complex:
+def _spanning_start(
+    members: NDArray[Any], links: Sequence[PlaneLink], index: dict[int, int]
+) -> Complex:
     """log a of each member along the strongest spanning tree; root 0."""
-    i, j = (np.array([index[m] for m in ends], int) for ends in ([k.a for k in links], [k.b for k in links]))
+    i, j = (
+        np.array([index[m] for m in ends], int)
+        for ends in ([k.a for k in links], [k.b for k in links])
+    )
     step: dict[tuple[int, int], complex] = {}
     for link, a, b in zip(links, i.tolist(), j.tolist(), strict=True):
-        step[a, b], step[b, a] = -np.log(link.b_S_a), np.log(link.b_S_a)  # log a_b = log a_a - log S
-    tree = spanning_tree(len(members), i, j, np.array([1.0 / (1e-6 + link.weight) for link in links]))
+        step[a, b], step[b, a] = (
+            -np.log(link.b_S_a),
+            np.log(link.b_S_a),
+        )  # log a_b = log a_a - log S
+    tree = spanning_tree(
+        len(members), i, j, np.array([1.0 / (1e-6 + link.weight) for link in links])
+    )
     log_a = np.zeros(len(members), complex)
     for parent, node in outwards(len(members), i, j, tree):
         log_a[node] = log_a[parent] + step[parent, node]
@@ -89,8 +103,12 @@ def _solve_differences(
     return np.asarray(sparse_linalg.splu(normal.astype(complex)).solve(rhs))
 
 
-def _solve_small(i: Array, j: Array, d: Complex, w: Array, count: int, anchor: Complex, wa: Array) -> Complex:
-    """The same by a full matrix: for few photos the book-keeping of sparse ones costs fifty times as much."""
+def _solve_small(
+    i: Array, j: Array, d: Complex, w: Array, count: int, anchor: Complex, wa: Array
+) -> Complex:
+    """The same by a full matrix: for few photos the book-keeping of sparse ones costs fifty times
+    as much.
+    """
     normal, rhs = np.diag(wa**2), (wa**2 * anchor).astype(complex)
     np.add.at(normal, (np.r_[i, j, i, j], np.r_[i, j, j, i]), np.r_[w**2, w**2, -(w**2), -(w**2)])
     np.add.at(rhs, np.r_[j, i], np.r_[w**2 * d, -(w**2) * d])
@@ -98,9 +116,17 @@ def _solve_small(i: Array, j: Array, d: Complex, w: Array, count: int, anchor: C
 
 
 def _robust_differences(
-    i: Array, j: Array, d: Complex, weight: Array, start: Complex, anchor: Complex, sigma_anchor: Array,
-    unit: float, *, angular: bool = False,
-) -> Complex:  # fmt: skip
+    i: Array,
+    j: Array,
+    d: Complex,
+    weight: Array,
+    start: Complex,
+    anchor: Complex,
+    sigma_anchor: Array,
+    unit: float,
+    *,
+    angular: bool = False,
+) -> Complex:
     """Iteratively reweighted solution; `unit` is the misfit at which a link counts half."""
     x = start
     for _ in range(15):
@@ -133,7 +159,9 @@ def solve_block(members: NDArray[np.int64], links: Sequence[PlaneLink]) -> Plane
     a = np.exp(log_a - log_a[0])
     pa, pb = np.array([link.p_a for link in links]), np.array([link.p_b for link in links])
     d = a[i] * pa - a[j] * pb
-    t = _robust_differences(i, j, d, weight, np.zeros(len(a), complex), np.zeros(len(a), complex), none, 0.03)
+    t = _robust_differences(
+        i, j, d, weight, np.zeros(len(a), complex), np.zeros(len(a), complex), none, 0.03
+    )
     error = np.abs(a[i] * pa + t[i] - a[j] * pb - t[j])
     turn = np.abs(np.array([link.b_S_a for link in links]) * a[j] / a[i] - 1)
     return PlaneSolution(members=members, a=a, t=t - t[0], link_error=np.maximum(error, 0.5 * turn))
@@ -144,8 +172,8 @@ def fit_similarity(
 ) -> tuple[complex, complex, float]:
     """g, c and the robust misfit of y = g x + c; `turn` fixes g's direction when points cannot.
 
-    Started from the two points whose similarity fits the better half of all best (least median of squares), so
-    somewhat less than half of the positions may lie.
+    Started from the two points whose similarity fits the better half of all best (least median of
+    squares), so somewhat less than half of the positions may lie.
     """
     g, c = _least_median(x, y)
     if turn is not None:
@@ -166,7 +194,9 @@ def _median(z: Complex) -> complex:
 
 
 def _least_median(x: Complex, y: Complex) -> tuple[complex, complex]:
-    """g and c through two of the points, of several hundred pairs the one that most points agree with."""
+    """g and c through two of the points, of several hundred pairs the one that most points agree
+    with.
+    """
     k, m = np.triu_indices(len(x), 1)
     reach = np.abs(x[k] - x[m])
     if len(k) > MOST_PAIRS:  # pairs far apart tell most
@@ -190,7 +220,8 @@ def tie_to_positions(
 ) -> PlaneSolution:
     """Moves a georeferenced solution so that links and positions agree: strips stop bending away.
 
-    `position` (k,) in m, NaN where unknown; `sigma` (k,) in m. Links count to about 2 % of the height.
+    `position` (k,) in m, NaN where unknown; `sigma` (k,) in m. Links count to about 2 % of the
+    height.
     """
     index = {int(m): k for k, m in enumerate(solution.members)}
     i = np.array([index[link.a] for link in links], int)

@@ -1,7 +1,10 @@
-"""The start of an adjustment: every linked photo a similarity of the ground plane, in metres of the map."""
+"""The start of an adjustment: every linked photo a similarity of the ground plane, in metres of the
+map.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +22,8 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Prior
 
 NOMINAL_HEIGHT_M = 50.0
-"""Height above ground assumed where nothing gives a scale; the result is then marked as not metric."""
+"""Height above ground assumed where nothing gives a scale; the result is then marked as not metric.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,7 +37,9 @@ class Start:
     links: tuple[Link, ...]
     """Links that agree with the blocks."""
     sigma_xy: dict[int, float]
-    """Photo -> deviation of its measured position in m as its block sees it, where worse than stated."""
+    """Photo -> deviation of its measured position in m as its block sees it, where worse than
+    stated.
+    """
     georeferenced: frozenset[int]
     """Photos of blocks that positions placed."""
     metric: bool
@@ -43,20 +49,26 @@ class Start:
 def plane_link(link: Link, photos: Sequence[Photo], features: Sequence[Features]) -> PlaneLink:
     """The link in image coordinates over the focal length, y up."""
 
-    def mean(photo: Photo, px: NDArray) -> complex:
+    def mean(photo: Photo, px: NDArray[Any]) -> complex:
         x, y = px.mean(0)
         return complex(x - (photo.width - 1) / 2, -(y - (photo.height - 1) / 2)) / photo.focal.px
 
     a, b = photos[link.a], photos[link.b]
     return PlaneLink(
-        a=link.a, b=link.b, b_S_a=link.b_S_a * a.focal.px / b.focal.px,
-        p_a=mean(a, features[link.a].px[link.index_a]), p_b=mean(b, features[link.b].px[link.index_b]),
+        a=link.a,
+        b=link.b,
+        b_S_a=link.b_S_a * a.focal.px / b.focal.px,
+        p_a=mean(a, features[link.a].px[link.index_a]),
+        p_b=mean(b, features[link.b].px[link.index_b]),
         weight=min(float(len(link)), 300.0),
-    )  # fmt: skip
+    )
 
 
 def find_start(
-    photos: Sequence[Photo], priors: Sequence[Prior], features: Sequence[Features], links: Sequence[Link]
+    photos: Sequence[Photo],
+    priors: Sequence[Prior],
+    features: Sequence[Features],
+    links: Sequence[Link],
 ) -> Start:
     """Solves every block, drops links that contradict it, and places it by its own positions."""
     plane = {(k.a, k.b): plane_link(k, photos, features) for k in links}
@@ -67,7 +79,9 @@ def find_start(
     metric = True
     for solution in solutions:
         inner = [plane[key] for key in kept if key[0] in set(solution.members.tolist())]
-        solution, spread, scaled = georeference(solution, inner, [priors[m] for m in solution.members])
+        solution, spread, scaled = georeference(
+            solution, inner, [priors[m] for m in solution.members]
+        )
         metric &= scaled
         for m, a, t in zip(solution.members.tolist(), solution.a, solution.t, strict=True):
             placed[m] = (complex(a), complex(t))
@@ -87,7 +101,9 @@ def find_start(
 def _consistent_blocks(
     count: int, plane: dict[tuple[int, int], PlaneLink]
 ) -> tuple[list[PlaneSolution], set[tuple[int, int]]]:
-    """Solutions of the blocks, and the links that agree with them within a tenth of the flying height."""
+    """Solutions of the blocks, and the links that agree with them within a tenth of the flying
+    height.
+    """
     kept = set(plane)
     solutions: list[PlaneSolution] = []
     for _ in range(4):

@@ -43,7 +43,9 @@ class Tracks:
         )
 
 
-def build_tracks(features: Sequence[Features], links: Sequence[Link], *, sigma: float = 0.25) -> Tracks:
+def build_tracks(
+    features: Sequence[Features], links: Sequence[Link], *, sigma: float = 0.25
+) -> Tracks:
     """Chains of matches; one that visits a photo twice is wrong somewhere and dropped.
 
     `sigma`: standard deviation of a keypoint in px of the image it was found in.
@@ -71,12 +73,16 @@ def build_tracks(features: Sequence[Features], links: Sequence[Link], *, sigma: 
     _, point = np.unique(track, return_inverse=True)
     px = np.concatenate([f.px for f in features])[used]
     scale = np.array([f.scale for f in features])[photo]
-    return Tracks(point=point.astype(np.int64), photo=photo, px=px, sigma_px=np.maximum(sigma * scale, 0.3))
+    return Tracks(
+        point=point.astype(np.int64), photo=photo, px=px, sigma_px=np.maximum(sigma * scale, 0.3)
+    )
 
 
-def thin(tracks: Tracks, sizes: Sequence[tuple[int, int]], *, per_photo: int, cells: int = 8) -> Tracks:
-    """The tracks an adjustment needs: long ones first, until every photo has `per_photo` spread over its
-    area.
+def thin(
+    tracks: Tracks, sizes: Sequence[tuple[int, int]], *, per_photo: int, cells: int = 8
+) -> Tracks:
+    """The tracks an adjustment needs: long ones first, until every photo has `per_photo` spread
+    over its area.
 
     `sizes`: (width, height) of each photo.
     """

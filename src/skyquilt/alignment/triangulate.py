@@ -13,7 +13,9 @@ Array = NDArray[np.float64]
 
 
 def intersect(point: NDArray[np.int64], origin: Array, direction: Array, count: int) -> Array:
-    """Least-squares intersections (count, 3) of rays: origins (N, 3), directions (N, 3), by point (N,)."""
+    """Least-squares intersections (count, 3) of rays: origins (N, 3), directions (N, 3), by point
+    (N,).
+    """
     d = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     M = np.eye(3) - d[:, :, None] * d[:, None, :]
     A, b = np.zeros((count, 3, 3)), np.zeros((count, 3))
@@ -37,7 +39,9 @@ def triangulated(problem: Problem, state: State) -> State:
 
 
 def polish(problem: Problem, state: State, *, iterations: int = 5) -> tuple[State, Array]:
-    """Gauss-Newton on the points alone; returns the state and each point's height deviation (P,) in m."""
+    """Gauss-Newton on the points alone; returns the state and each point's height deviation (P,) in
+    m.
+    """
     sigma_z = np.full(len(state.X), np.inf)
     for _ in range(iterations):
         residual, J = linearised_points(problem, state)

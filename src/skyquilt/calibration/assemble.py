@@ -1,8 +1,10 @@
-"""A series of frames of one pose, heated part by part -> one picture of the greatest contrast [Y 5.1.2]."""
+"""A series of frames of one pose, heated part by part -> one picture of the greatest contrast [Y
+5.1.2].
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -19,17 +21,19 @@ Image = NDArray[np.float32]
 class Assemble:
     """Weighted mean of the frames (5.3), cell by cell, the weight growing with bimodality.
 
-    As printed, (5.3) weighs by phi, which is low where black and white part well; the weight here is phi to the
-    power of -`power`. See docs/methods.md for what each power does to simulated sweeps.
+    As printed, (5.3) weighs by phi, which is low where black and white part well; the weight here
+    is phi to the power of -`power`. See docs/methods.md for what each power does to simulated
+    sweeps.
     """
 
     version: ClassVar[int] = 1
     power: float = 0.5
     """Exponent of 1 / phi."""
     cell_px: int | None = None
-    """Side of a cell in px; None = two of the largest squares that the board can have in the frame."""
+    """Side of a cell in px; None = two of the largest squares that the board can have in the frame.
+    """
 
-    def __call__(self, frames: Iterable[NDArray], board: Board) -> Image:
+    def __call__(self, frames: Iterable[NDArray[Any]], board: Board) -> Image:
         """The assembled picture (H, W) of frames (H, W) of equal size."""
         total, weights = np.zeros(1), np.zeros(1)
         for frame in frames:
@@ -46,13 +50,15 @@ class Assemble:
         rows = (np.arange(image.shape[0]) - (side - 1) / 2) / step
         columns = (np.arange(image.shape[1]) - (side - 1) / 2) / step
         x, y = np.meshgrid(columns.astype(np.float32), rows.astype(np.float32))
-        smooth = cv2.remap(cells.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        smooth = cv2.remap(
+            cells.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
         return np.asarray(smooth + np.float32(1e-6 * max(float(cells.max()), 1e-20)), np.float32)
 
 
 def cell_of(shape: tuple[int, ...], board: Board) -> int:
-    """Two squares (the thesis's least width of a cell) of a board that fills the frame, in px: smaller ones
-    make cells that are wider than that.
+    """Two squares (the thesis's least width of a cell) of a board that fills the frame, in px:
+    smaller ones make cells that are wider than that.
     """
     short, long = sorted((board.columns, board.rows))
     return max(4, int(2 * min(min(shape[:2]) / short, max(shape[:2]) / long)))

@@ -1,12 +1,15 @@
 """How well black and white part in a cell [Yahyanejad 2013, (5.1), (5.2)]."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 
-def bimodality(cell: NDArray) -> float:
-    """phi of (5.1): spread of the pixels below the mean plus spread of those above it, over the squared distance
-    of the two means. Low is well separated; infinite for a cell without contrast. Unit: 1 / unit of the cell.
+def bimodality(cell: NDArray[Any]) -> float:
+    """phi of (5.1): spread of the pixels below the mean plus spread of those above it, over the
+    squared distance of the two means. Low is well separated; infinite for a cell without contrast.
+    Unit: 1 / unit of the cell.
     """
     values = np.asarray(cell, np.float64).ravel()
     values = values[np.isfinite(values)]
@@ -20,7 +23,8 @@ def bimodality(cell: NDArray) -> float:
 
 
 def separation(image: NDArray[np.float32], cell_px: int) -> NDArray[np.float64]:
-    """1 / phi (m, n) on overlapping cells of an image (H, W), `cell_px` wide at steps of half of it.
+    """1 / phi (m, n) on overlapping cells of an image (H, W), `cell_px` wide at steps of half of
+    it.
 
     phi is low where black and white part well, so its inverse is what a weight must grow with.
     """

@@ -1,6 +1,9 @@
-"""Squares as blobs: erosion and dilation, contours, convex hulls, centroids [Yahyanejad 2013, 5.1.3]."""
+"""Squares as blobs: erosion and dilation, contours, convex hulls, centroids [Yahyanejad 2013,
+5.1.3].
+"""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,8 +21,9 @@ class Blobs:
     centre: Array
     """Centroids (n, 2) in px."""
     sides: Array
-    """(n, 4, 2) in px: from the centroid to the middle of each side of the square before erosion, clockwise as
-    seen."""
+    """(n, 4, 2) in px: from the centroid to the middle of each side of the square before erosion,
+    clockwise as seen.
+    """
     white: NDArray[np.bool_]
     """(n,) whether the square is a white one."""
 
@@ -30,14 +34,19 @@ class Blobs:
 def blobs(binary: NDArray[np.uint8], erosion_px: int, *, largest: float) -> Blobs:
     """Black and white blobs of a binary image (H, W) that may be squares of at most `largest` px^2.
 
-    Eroding the white parts separates white squares, eroding the black ones (a dilation) black squares.
+    Eroding the white parts separates white squares, eroding the black ones (a dilation) black
+    squares.
     """
     kernel = np.ones((2 * erosion_px + 1,) * 2, np.uint8)
     found = []
     for white in (True, False):
         parts = cv2.erode(binary if white else cv2.bitwise_not(binary), kernel)
         outlines = cv2.findContours(parts, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
-        found += [(*s, white) for s in (_square(c, erosion_px, largest) for c in outlines) if s is not None]
+        found += [
+            (*s, white)
+            for s in (_square(c, erosion_px, largest) for c in outlines)
+            if s is not None
+        ]
     return Blobs(
         centre=np.array([f[0] for f in found]).reshape(-1, 2),
         sides=np.array([f[1] for f in found]).reshape(-1, 4, 2),
@@ -45,7 +54,7 @@ def blobs(binary: NDArray[np.uint8], erosion_px: int, *, largest: float) -> Blob
     )
 
 
-def _square(outline: NDArray, erosion_px: int, largest: float) -> tuple[Array, Array] | None:
+def _square(outline: NDArray[Any], erosion_px: int, largest: float) -> tuple[Array, Array] | None:
     """Centroid and sides of a convex blob of four corners."""
     hull = cv2.convexHull(outline)
     area = cv2.contourArea(hull)
@@ -63,8 +72,10 @@ def _square(outline: NDArray, erosion_px: int, largest: float) -> tuple[Array, A
     return centre, middle * (length + erosion_px + 0.5) / length
 
 
-def four_corners(hull: NDArray) -> Array | None:
-    """Four corners (4, 2) in px of a convex outline, clockwise as seen; None where it has no four."""
+def four_corners(hull: NDArray[Any]) -> Array | None:
+    """Four corners (4, 2) in px of a convex outline, clockwise as seen; None where it has no
+    four.
+    """
     around = cv2.arcLength(hull, True)
     for share in (0.04, 0.06, 0.08, 0.1, 0.13):
         corners = cv2.approxPolyDP(hull, share * around, True)[:, 0].astype(np.float64)

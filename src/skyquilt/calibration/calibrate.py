@@ -1,4 +1,6 @@
-"""Views of a board -> a calibrated lens, from centres of squares or from corners [Yahyanejad 2013, 6.3]."""
+"""Views of a board -> a calibrated lens, from centres of squares or from corners [Yahyanejad 2013,
+6.3].
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +18,9 @@ from skyquilt.model.camera import PARAMETERS, Camera
 
 Array = NDArray[np.float64]
 _OPTIONAL = (("k3",), ("p1", "p2"), ("k2",), ("k1",))
-"""Coefficients in the order in which they are dropped: the highest order first, both tangential ones at once."""
+"""Coefficients in the order in which they are dropped: the highest order first, both tangential
+ones at once.
+"""
 
 
 _LENGTHS = ("focal", "cx", "cy")
@@ -24,7 +28,9 @@ _LENGTHS = ("focal", "cx", "cy")
 
 @dataclass(frozen=True, kw_only=True)
 class Calibrate:
-    """Least squares; coefficients smaller than their tolerance are dropped and the rest is fitted again."""
+    """Least squares; coefficients smaller than their tolerance are dropped and the rest is fitted
+    again.
+    """
 
     version: ClassVar[int] = 1
     marks: Marks = "centres"
@@ -32,7 +38,9 @@ class Calibrate:
     tolerance: float = 3.0
     """A coefficient's tolerance in standard deviations, as in the toolbox that the thesis used."""
     rounds: int = 3
-    """How often centroids are corrected for perspective and distortion with the camera found so far."""
+    """How often centroids are corrected for perspective and distortion with the camera found so
+    far.
+    """
 
     def __call__(self, views: Sequence[BoardView], board: Board) -> Calibration:
         """The camera of at least two views of equal size.
@@ -41,7 +49,8 @@ class Calibrate:
         """
         if len(views) < 2 or len({(v.width, v.height) for v in views}) != 1:
             raise ValueError(
-                f"two views or more of one size expected, got {[(v.width, v.height) for v in views]}"
+                "two views or more of one size expected, got"
+                f" {[(v.width, v.height) for v in views]}"
             )
         seen = [self.sightings(v, board) for v in views]
         start = start_camera(seen, width=views[0].width, height=views[0].height)
@@ -53,15 +62,19 @@ class Calibrate:
     def sightings(self, view: BoardView, board: Board) -> Sightings:
         """The marks of a view that count."""
         points, px = (
-            (board.corners, view.corners) if self.marks == "corners" else (board.centres, view.centroids)
+            (board.corners, view.corners)
+            if self.marks == "corners"
+            else (board.centres, view.centroids)
         )
         known = np.isfinite(px[..., 0])
         if self.marks == "centres":
             known &= board.inner  # what lies beside the others may be anything [Y 5.1.3]
         return Sightings(
-            name=view.name, board=points[known], px=px[known],
+            name=view.name,
+            board=points[known],
+            px=px[known],
             rounding_px=view.rounding_px[known] if self.marks == "centres" else 0.0,
-        )  # fmt: skip
+        )
 
     def _reduced(self, seen: Sequence[Sightings], rough: Solution, board: Board) -> Calibration:
         """Fits all parameters, and again without those that are smaller than their tolerance."""
@@ -70,7 +83,8 @@ class Calibrate:
         full = solution.camera
         for names in _OPTIONAL:
             found = [
-                (n, getattr(solution.camera, n), self.tolerance * _sigma(solution.camera, n)) for n in names
+                (n, getattr(solution.camera, n), self.tolerance * _sigma(solution.camera, n))
+                for n in names
             ]
             if any(abs(value) >= tolerance for _, value, tolerance in found):
                 if names == ("p1", "p2"):
@@ -81,9 +95,14 @@ class Calibrate:
             held = _without(solution.camera, names)
             solution, used = self._fit(seen, replace(solution, camera=held), free, board)
         return Calibration(
-            marks=self.marks, camera=_widened(solution.camera, full, free), free=tuple(free),
-            dropped=tuple(dropped), sightings=tuple(used), poses=solution.poses, residuals=solution.residuals,
-        )  # fmt: skip
+            marks=self.marks,
+            camera=_widened(solution.camera, full, free),
+            free=tuple(free),
+            dropped=tuple(dropped),
+            sightings=tuple(used),
+            poses=solution.poses,
+            residuals=solution.residuals,
+        )
 
     def _fit(
         self, seen: Sequence[Sightings], start: Solution, free: Sequence[str], board: Board
@@ -102,12 +121,16 @@ class Calibrate:
         if self.marks == "corners":
             return list(seen)
         return [
-            replace(s, px=s.px - centroid_bias(camera, pose, s.board, board.square_m, s.rounding_px))
+            replace(
+                s, px=s.px - centroid_bias(camera, pose, s.board, board.square_m, s.rounding_px)
+            )
             for s, pose in zip(seen, poses, strict=True)
         ]
 
     def left_over(self, view: BoardView, camera: Camera, board: Board) -> Array:
-        """Residuals (n, 2) in px of a view that had no part in a camera: only its pose is fitted."""
+        """Residuals (n, 2) in px of a view that had no part in a camera: only its pose is
+        fitted.
+        """
         seen = [self.sightings(view, board)]
         poses: Sequence[BoardPose] = [start_pose(seen[0], camera)]
         residuals = np.zeros((0, 2))
@@ -128,15 +151,22 @@ def _without(camera: Camera, names: Sequence[str]) -> Camera:
 
 
 def _widened(camera: Camera, full: Camera, free: Sequence[str]) -> Camera:
-    """The camera, the deviations of its lengths grown by what dropping coefficients moved: below the tolerance is
-    not zero. Coefficients of other orders are other quantities, whatever their names.
+    """The camera, the deviations of its lengths grown by what dropping coefficients moved: below
+    the tolerance is not zero. Coefficients of other orders are other quantities, whatever their
+    names.
     """
-    moved = np.where([n in free and n in _LENGTHS for n in PARAMETERS], camera.vector - full.vector, 0.0)
-    return replace(camera, sigmas=tuple(np.hypot(camera.sigmas or np.zeros(len(moved)), moved).tolist()))
+    moved = np.where(
+        [n in free and n in _LENGTHS for n in PARAMETERS], camera.vector - full.vector, 0.0
+    )
+    return replace(
+        camera, sigmas=tuple(np.hypot(camera.sigmas or np.zeros(len(moved)), moved).tolist())
+    )
 
 
 def strangers(calibration: Calibration, *, times: float = 4.0) -> dict[str, float]:
-    """Views whose RMS error in px is so many times the median view's: the board was moved, or is another one."""
+    """Views whose RMS error in px is so many times the median view's: the board was moved, or is
+    another one.
+    """
     each = np.array([rms(r) for r in calibration.residuals])
     limit = times * float(np.median(each))
     return {s.name: float(e) for s, e in zip(calibration.sightings, each, strict=True) if e > limit}

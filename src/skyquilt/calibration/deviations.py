@@ -16,12 +16,14 @@ _FEWEST = 4
 def sigmas(
     views: Sequence[Sightings], camera: Camera, poses: Sequence[BoardPose], columns: Sequence[int]
 ) -> tuple[float, ...]:
-    """Standard deviations in the order of `PARAMETERS`, 0 for what was held (`columns` says what was not).
+    """Standard deviations in the order of `PARAMETERS`, 0 for what was held (`columns` says what
+    was not).
 
-    The largest of three: that of independent errors with the variance that the residuals show; one that lets
-    errors repeat in every view at the same mark of the board [the sandwich, clustered by mark], because a board
-    that is not quite flat or evenly heated is wrong in the same way in all views, and more views do not make it
-    right; and the jackknife over views, because errors of neighbouring squares of one view are akin.
+    The largest of three: that of independent errors with the variance that the residuals show; one
+    that lets errors repeat in every view at the same mark of the board [the sandwich, clustered by
+    mark], because a board that is not quite flat or evenly heated is wrong in the same way in all
+    views, and more views do not make it right; and the jackknife over views, because errors of
+    neighbouring squares of one view are akin.
     """
     own = len(columns)
     size = own + 6 * len(views)
@@ -40,7 +42,9 @@ def sigmas(
     scale = 1 / np.sqrt(
         np.maximum(np.diag(normal), 1e-300)
     )  # the parameters' units differ by many powers of ten
-    inverse = np.linalg.pinv(normal * scale * scale[:, None], hermitian=True) * scale * scale[:, None]
+    inverse = (
+        np.linalg.pinv(normal * scale * scale[:, None], hermitian=True) * scale * scale[:, None]
+    )
     spare = max(count - size, 1)
     independent = np.diag(inverse)[:own] * total / spare
     moved = inverse[:own] @ np.array(list(scores.values())).T
@@ -55,8 +59,8 @@ def sigmas(
 def _jackknife(
     views: Sequence[Sightings], camera: Camera, poses: Sequence[BoardPose], columns: Sequence[int]
 ) -> Array:
-    """Variances of the intrinsics from what leaving out one view after the other moves, to first order; zero for
-    fewer than four views.
+    """Variances of the intrinsics from what leaving out one view after the other moves, to first
+    order; zero for fewer than four views.
     """
     own = len(columns)
     if len(views) < _FEWEST or not own:

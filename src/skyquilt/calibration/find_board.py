@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -21,15 +21,18 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True)
 class FindBoard:
-    """Squares as blobs at several sizes, counted out by their neighbours, checked against the pattern.
+    """Squares as blobs at several sizes, counted out by their neighbours, checked against the
+    pattern.
 
-    Nothing is asked of what lies around the board; of the squares themselves, six that touch are enough to
-    find the others.
+    Nothing is asked of what lies around the board; of the squares themselves, six that touch are
+    enough to find the others.
     """
 
     version: ClassVar[int] = 1
     longest_px: int = 960
-    """Frames are searched at this size or less; centroids and corners are measured in the frame itself."""
+    """Frames are searched at this size or less; centroids and corners are measured in the frame
+    itself.
+    """
     smallest_px: float = 7.0
     """Side of the smallest squares looked for, in px of the searched picture."""
     erosions: tuple[float, ...] = (0.06, 0.12, 0.18)
@@ -38,7 +41,7 @@ class FindBoard:
     """Sub-pixel measurement."""
 
     def __call__(
-        self, name: str, image: NDArray, board: Board, *, frames: int = 1
+        self, name: str, image: NDArray[Any], board: Board, *, frames: int = 1
     ) -> BoardView | RejectedView:
         """The board in a frame (H, W) of any type, NaN where nothing was measured."""
         whole = grey_float(image)
@@ -51,17 +54,27 @@ class FindBoard:
         height, width = whole.shape
         up = np.array([[scale, 0, (scale - 1) / 2], [0, scale, (scale - 1) / 2], [0, 0, 1]])
         placed = Placed(
-            px_H_cell=up @ found.px_H_cell, white_first=found.white_first, contrast=found.contrast,
+            px_H_cell=up @ found.px_H_cell,
+            white_first=found.white_first,
+            contrast=found.contrast,
             texture=found.texture,
-        )  # fmt: skip
+        )
         centroids, H, rounding = self.measure.centroids(whole, placed, board)
         inner = np.isfinite(centroids[board.inner][:, 0]).mean()
         if inner < 0.5:
-            return RejectedView(name=name, reason=f"only {inner:.0%} of its inner squares could be measured")
+            return RejectedView(
+                name=name, reason=f"only {inner:.0%} of its inner squares could be measured"
+            )
         return BoardView(
-            name=name, width=width, height=height, centroids=centroids, corners=corners(whole, H, board),
-            rounding_px=rounding,            contrast=found.contrast / max(found.texture, 1e-9), frames=frames,
-        )  # fmt: skip
+            name=name,
+            width=width,
+            height=height,
+            centroids=centroids,
+            corners=corners(whole, H, board),
+            rounding_px=rounding,
+            contrast=found.contrast / max(found.texture, 1e-9),
+            frames=frames,
+        )
 
     def _search(self, image: Image, board: Board) -> Placed | Misplaced:
         best = Misplaced(reason="no chess pattern was found in it", squares=0)
@@ -80,17 +93,23 @@ class FindBoard:
         short, long = sorted((board.columns, board.rows))
         side = min(min(width, height) / short, max(width, height) / long) / 1.3
         while side >= self.smallest_px:
-            smooth: Image = np.asarray(cv2.GaussianBlur(image, (0, 0), max(0.04 * side, 0.5)), np.float32)
+            smooth: Image = np.asarray(
+                cv2.GaussianBlur(image, (0, 0), max(0.04 * side, 0.5)), np.float32
+            )
             binary = Wellner(window_px=round(2 * side))(smooth)
             for erosion in dict.fromkeys(max(1, round(e * side)) for e in self.erosions):
                 yield blobs(binary, erosion, largest=4 * side * side)
             side *= 0.7
 
 
-def grey_float(image: NDArray) -> Image:
+def grey_float(image: NDArray[Any]) -> Image:
     """(H, W) float32 of a frame of one band or three; what was not measured becomes the median."""
     if image.ndim == 3:
-        image = image[..., 0] if image.shape[2] == 1 else cv2.cvtColor(image[..., :3], cv2.COLOR_RGB2GRAY)
+        image = (
+            image[..., 0]
+            if image.shape[2] == 1
+            else cv2.cvtColor(image[..., :3], cv2.COLOR_RGB2GRAY)
+        )
     grey = np.array(image, np.float32)
     finite = np.isfinite(grey)
     if not finite.all():

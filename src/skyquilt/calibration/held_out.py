@@ -24,19 +24,26 @@ class HeldOut:
     """Indices of the views kept out of each camera."""
 
 
-def hold_out(calibrate: Calibrate, views: Sequence[BoardView], board: Board, *, parts: int = 5) -> HeldOut:
-    """Calibrates once per part without the views of that part; with fewer than two views a part, one view a part."""
+def hold_out(
+    calibrate: Calibrate, views: Sequence[BoardView], board: Board, *, parts: int = 5
+) -> HeldOut:
+    """Calibrates once per part without the views of that part; with fewer than two views a part,
+    one view a part.
+    """
     count = len(views)
     parts = parts if count >= 2 * parts else count
     kept_out = tuple(tuple(range(k, count, parts)) for k in range(parts))
     cameras = tuple(
-        calibrate([v for i, v in enumerate(views) if i not in out], board).camera for out in kept_out
+        calibrate([v for i, v in enumerate(views) if i not in out], board).camera
+        for out in kept_out
     )
     return HeldOut(cameras=cameras, parts=kept_out)
 
 
 def error_px(held: HeldOut, judge: Calibrate, views: Sequence[BoardView], board: Board) -> float:
-    """RMS error in px of the views kept out, by the marks of `judge` (not always those calibrated from)."""
+    """RMS error in px of the views kept out, by the marks of `judge` (not always those calibrated
+    from).
+    """
     return rms(
         np.concatenate(
             [

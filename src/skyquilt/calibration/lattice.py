@@ -45,7 +45,9 @@ def lattices(found: Blobs) -> list[Lattice]:
 
 
 def _links(found: Blobs) -> dict[int, list[tuple[int, int, int]]]:
-    """Blob -> (its side, neighbour, the neighbour's side): opposite colours that point at each other."""
+    """Blob -> (its side, neighbour, the neighbour's side): opposite colours that point at each
+    other.
+    """
     links: dict[int, list[tuple[int, int, int]]] = {i: [] for i in range(len(found))}
     if len(found) < _FEWEST:
         return links
@@ -68,7 +70,9 @@ def _links(found: Blobs) -> dict[int, list[tuple[int, int, int]]]:
     return links
 
 
-def _counted(start: int, links: dict[int, list[tuple[int, int, int]]]) -> dict[int, tuple[int, int]]:
+def _counted(
+    start: int, links: dict[int, list[tuple[int, int, int]]]
+) -> dict[int, tuple[int, int]]:
     """Blob -> (column, row), walking from neighbour to neighbour."""
     cell, turn = {start: (0, 0)}, {start: 0}
     queue = deque([start])

@@ -15,8 +15,8 @@ Array = NDArray[np.float64]
 def linearised(
     view: Sightings, camera: Camera, pose: BoardPose, columns: Sequence[int]
 ) -> tuple[Array, Array]:
-    """Derivatives (n, 2, columns + 6) of a view's points by intrinsics (columns of `PARAMETERS`) and pose, and
-    residuals (n, 2) in px.
+    """Derivatives (n, 2, columns + 6) of a view's points by intrinsics (columns of `PARAMETERS`)
+    and pose, and residuals (n, 2) in px.
     """
     turned = view.board @ pose.cam_R_board.T
     vector = np.broadcast_to(camera.vector, (len(turned), len(PARAMETERS)))

@@ -1,4 +1,6 @@
-"""Centroids of squares and inner corners to a fraction of a pixel, once the board's place is known."""
+"""Centroids of squares and inner corners to a fraction of a pixel, once the board's place is
+known.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,7 +19,9 @@ _ROUNDS = 2
 _FEWEST = 6
 _AREA = (0.6, 1.45)
 _SMOOTH, _BESIDE, _AROUND = 0.03, 0.12, 0.6
-"""Radii in sides of a square: of smoothing, of what lies beside an edge, of what surely holds black and white."""
+"""Radii in sides of a square: of smoothing, of what lies beside an edge, of what surely holds black
+and white.
+"""
 _STEP = 0.6
 """Share of the contrast around that an edge must have."""
 _MARGIN = 0.3
@@ -26,21 +30,28 @@ _MARGIN = 0.3
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """Where squares lie: blobs, parted where they touch at corners, and the centroids of their hulls."""
+    """Where squares lie: blobs, parted where they touch at corners, and the centroids of their
+    hulls.
+    """
 
     version: ClassVar[int] = 1
     side_px: float = 100.0
     """Pictures are enlarged until a square has about this side: blobs have whole pixels."""
     openings: tuple[float, ...] = (0.12, 0.25)
-    """Radii of erosion and dilation in sides of a square: the larger one for squares that still cling to others
-    at their corners, by heat or blur. Corners are rounded off by it; `square_image` knows that."""
+    """Radii of erosion and dilation in sides of a square: the larger one for squares that still
+    cling to others at their corners, by heat or blur. Corners are rounded off by it; `square_image`
+    knows that.
+    """
 
     def centroids(self, image: Image, placed: Placed, board: Board) -> tuple[Array, Array, Array]:
-        """Centroids (rows, columns, 2) in px, NaN where none was measured, the refined px_H_cell, and the radii
-        (rows, columns) in px by which corners were rounded off.
+        """Centroids (rows, columns, 2) in px, NaN where none was measured, the refined px_H_cell,
+        and the radii (rows, columns) in px by which corners were rounded off.
         """
         H = placed.px_H_cell
-        px, rounding = np.full((board.rows, board.columns, 2), np.nan), np.zeros((board.rows, board.columns))
+        px, rounding = (
+            np.full((board.rows, board.columns, 2), np.nan),
+            np.zeros((board.rows, board.columns)),
+        )
         for _ in range(_ROUNDS):
             px, rounding = self._once(image, H, placed.white_first, board)
             known = np.isfinite(px[..., 0])
@@ -56,7 +67,9 @@ class Measure:
         factor = int(np.clip(round(self.side_px / side), 1, 8))
         part, px_H_part = _enlarged(image, H, board, factor)
         cell = _cell_of(part.shape, px_H_part, H)
-        threshold = half_way(part, middle_levels(cell_levels(image, H, board)[0]), cell, side * factor)
+        threshold = half_way(
+            part, middle_levels(cell_levels(image, H, board)[0]), cell, side * factor
+        )
         size = np.array([board.columns, board.rows], np.float32)
         near = np.all((cell > -0.5 - _MARGIN) & (cell < size - 0.5 + _MARGIN), -1)
         out = np.full((board.rows, board.columns, 2), np.nan)
@@ -80,12 +93,15 @@ class Measure:
 
 
 def half_way(image: Image, middle: Image, cell: Image, side: float) -> Image:
-    """Between black and white (h, w) at every pixel: at an edge half-way between what lies on both sides of it,
-    so that uneven heat does not move it; elsewhere between the levels of whole squares, `middle` (rows, columns).
+    """Between black and white (h, w) at every pixel: at an edge half-way between what lies on both
+    sides of it, so that uneven heat does not move it; elsewhere between the levels of whole
+    squares, `middle` (rows, columns).
 
     `cell` (h, w, 2) says which square a pixel is of, `side` is that of a square in px.
     """
-    whole = cv2.remap(middle, cell[..., 0], cell[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    whole = cv2.remap(
+        middle, cell[..., 0], cell[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     smooth: Image = np.asarray(cv2.GaussianBlur(image, (0, 0), _SMOOTH * side), np.float32)
     low, high = _extremes(smooth, _BESIDE * side)
     darkest, brightest = _extremes(smooth, _AROUND * side)
@@ -96,26 +112,34 @@ def half_way(image: Image, middle: Image, cell: Image, side: float) -> Image:
 def _extremes(image: Image, radius: float) -> tuple[Image, Image]:
     """Least and largest value around every pixel (h, w)."""
     kernel = np.ones((2 * max(1, round(radius)) + 1,) * 2, np.uint8)
-    return np.asarray(cv2.erode(image, kernel), np.float32), np.asarray(cv2.dilate(image, kernel), np.float32)
+    return np.asarray(cv2.erode(image, kernel), np.float32), np.asarray(
+        cv2.dilate(image, kernel), np.float32
+    )
 
 
 def opened(mask: NDArray[np.bool_], radius: float) -> NDArray[np.uint8]:
-    """Erosion and dilation by a disc (radius in px), by distances: exact for any radius and equally fast."""
+    """Erosion and dilation by a disc (radius in px), by distances: exact for any radius and equally
+    fast.
+    """
     parts = cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) > radius
     away = cv2.distanceTransform((~parts).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(away < radius, np.uint8)
 
 
 def coverage(above: Image) -> Image:
-    """Share (h, w) of every pixel that is above the threshold, from its value and the slope there."""
+    """Share (h, w) of every pixel that is above the threshold, from its value and the slope
+    there.
+    """
     slope_y, slope_x = np.gradient(above)
     slope = np.maximum(np.hypot(slope_x, slope_y), 1e-12)
     return np.asarray(np.clip(0.5 + above / slope, 0, 1), np.float32)
 
 
-def _centroids(blobs: NDArray[np.uint8], covered: Image, px_H_part: Array) -> Iterator[tuple[Array, float]]:
-    """Centroid (2,) in px and area in px^2 of each blob within its convex hull [outlines: Suzuki]; pixels on the
-    outline count by their share.
+def _centroids(
+    blobs: NDArray[np.uint8], covered: Image, px_H_part: Array
+) -> Iterator[tuple[Array, float]]:
+    """Centroid (2,) in px and area in px^2 of each blob within its convex hull [outlines: Suzuki];
+    pixels on the outline count by their share.
     """
     scale = float(px_H_part[0, 0])
     around = np.ones((3, 3), np.uint8)
@@ -137,12 +161,15 @@ def _centroids(blobs: NDArray[np.uint8], covered: Image, px_H_part: Array) -> It
                 share.sum(0) @ np.arange(share.shape[1]) / total,
                 share.sum(1) @ np.arange(share.shape[0]) / total,
             ]
-            yield through(px_H_part, np.array([middle]) + np.array([left, top]))[0], total * scale * scale
+            yield (
+                through(px_H_part, np.array([middle]) + np.array([left, top]))[0],
+                total * scale * scale,
+            )
 
 
 def corners(image: Image, px_H_cell: Array, board: Board) -> Array:
-    """Inner corners (rows - 1, columns - 1, 2) in px by the gradients around them [Forstner]; NaN where
-    they ran away.
+    """Inner corners (rows - 1, columns - 1, 2) in px by the gradients around them [Forstner]; NaN
+    where they ran away.
     """
     y, x = np.mgrid[0 : board.rows - 1, 0 : board.columns - 1] + 0.5
     guess = through(px_H_cell, np.column_stack([x.ravel(), y.ravel()]))
@@ -151,15 +178,20 @@ def corners(image: Image, px_H_cell: Array, board: Board) -> Array:
     low, high = np.percentile(image, [0.5, 99.5])
     grey = np.clip((image - low) / max(float(high - low), 1e-6) * 255, 0, 255).astype(np.float32)
     found = cv2.cornerSubPix(
-        grey, guess.astype(np.float32).reshape(-1, 1, 2), (reach, reach), (-1, -1),
+        grey,
+        guess.astype(np.float32).reshape(-1, 1, 2),
+        (reach, reach),
+        (-1, -1),
         (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3),
-    )[:, 0].astype(np.float64)  # fmt: skip
+    )[:, 0].astype(np.float64)
     found[np.linalg.norm(found - guess, axis=1) > 0.25 * side] = np.nan
     return np.asarray(found.reshape(board.rows - 1, board.columns - 1, 2))
 
 
 def middle_levels(level: Array) -> Image:
-    """Between black and white at every square (rows, columns): half its own level, half its neighbours'."""
+    """Between black and white at every square (rows, columns): half its own level, half its
+    neighbours'.
+    """
     total, count = np.zeros_like(level), np.zeros_like(level)
     for axis in (0, 1):
         for a, b in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
@@ -198,5 +230,6 @@ def _cell_of(shape: tuple[int, ...], px_H_part: Array, px_H_cell: Array) -> Imag
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]]
     cell_H_part = np.linalg.inv(px_H_cell) @ px_H_part
     return np.asarray(
-        through(cell_H_part, np.column_stack([x.ravel(), y.ravel()])).reshape(*shape[:2], 2), np.float32
+        through(cell_H_part, np.column_stack([x.ravel(), y.ravel()])).reshape(*shape[:2], 2),
+        np.float32,
     )

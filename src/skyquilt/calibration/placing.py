@@ -20,7 +20,9 @@ _ABOVE_TEXTURE = 2.0
 
 
 _INNER = 0.75
-"""From the middle of the outermost square but one to the end of the middle half of the outermost one."""
+"""From the middle of the outermost square but one to the end of the middle half of the outermost
+one.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -53,8 +55,8 @@ class Misplaced:
 def place(image: Image, grid: Lattice, board: Board) -> Placed | Misplaced:
     """The board's place on a grid found in an image (H, W).
 
-    Every square must differ from its neighbours as the pattern says, and only one place may fit: a pattern
-    that goes on is another board.
+    Every square must differ from its neighbours as the pattern says, and only one place may fit: a
+    pattern that goes on is another board.
     """
     windows = list(_windows(grid, board))
     inside = [w for w in windows if _in_frame(grid.px_H_grid @ w, board, image.shape)]
@@ -76,8 +78,8 @@ def place(image: Image, grid: Lattice, board: Board) -> Placed | Misplaced:
 
 
 def _windows(grid: Lattice, board: Board) -> Iterator[Array]:
-    """grid_H_board (3, 3) of every way to lay the board over the grid so that all squares found, or all but
-    an outer row, are covered; four turns each.
+    """grid_H_board (3, 3) of every way to lay the board over the grid so that all squares found, or
+    all but an outer row, are covered; four turns each.
     """
     low, high = grid.cells.min(0), grid.cells.max(0)
     for quarter in range(4):
@@ -116,14 +118,16 @@ def _judged(image: Image, grid: Lattice, window: Array, board: Board) -> Placed 
 
 
 def _in_frame(H: Array, board: Board, shape: tuple[int, ...]) -> bool:
-    """Whether the middle halves of all squares lie in the image: a lens bends the outer sides inwards, and the
-    homography does not know that.
+    """Whether the middle halves of all squares lie in the image: a lens bends the outer sides
+    inwards, and the homography does not know that.
     """
     c, r = board.columns - _INNER, board.rows - _INNER
     ends = np.array([[_INNER - 1, _INNER - 1], [c, _INNER - 1], [c, r], [_INNER - 1, r]])
     outline, depth = through(H, ends), np.column_stack([ends, np.ones(4)]) @ H[2]
     in_front = bool(np.all(depth * depth[0] > 0))
-    return in_front and bool(np.all((outline > -0.5) & (outline < np.array([shape[1], shape[0]]) - 0.5)))
+    return in_front and bool(
+        np.all((outline > -0.5) & (outline < np.array([shape[1], shape[0]]) - 0.5))
+    )
 
 
 def cell_levels(image: Image, H: Array, board: Board) -> tuple[Array, Array]:
@@ -139,10 +143,15 @@ def cell_levels(image: Image, H: Array, board: Board) -> tuple[Array, Array]:
 
 
 def pattern_contrast(level: Array, white_first: bool) -> float | None:
-    """Median difference of neighbours (rows, columns); None where one pair contradicts the pattern."""
+    """Median difference of neighbours (rows, columns); None where one pair contradicts the
+    pattern.
+    """
     rows, columns = np.indices(level.shape)
     sign = np.where((rows + columns) % 2 == 0, 1.0, -1.0) * (1 if white_first else -1)
-    across, down = (level[:, :-1] - level[:, 1:]) * sign[:, :-1], (level[:-1] - level[1:]) * sign[:-1]
+    across, down = (
+        (level[:, :-1] - level[:, 1:]) * sign[:, :-1],
+        (level[:-1] - level[1:]) * sign[:-1],
+    )
     pairs = np.concatenate([across.ravel(), down.ravel()])
     middle = float(np.median(pairs))
     return middle if middle > 0 and pairs.min() > _WEAKEST * middle else None

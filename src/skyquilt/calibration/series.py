@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -16,7 +16,9 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True)
 class StoodStill:
-    """Whether the camera moved between two frames: their fine structure correlates where it lies, or does not."""
+    """Whether the camera moved between two frames: their fine structure correlates where it lies,
+    or does not.
+    """
 
     version: ClassVar[int] = 1
     correlation: float = 0.8
@@ -24,7 +26,7 @@ class StoodStill:
     longest_px: int = 320
     """Size at which frames are compared."""
 
-    def structure(self, image: NDArray) -> Image:
+    def structure(self, image: NDArray[Any]) -> Image:
         """A frame's structure of 2 to 8 px, reduced (h, w)."""
         small = shrink(grey_float(image), self.longest_px)[0]
         return np.asarray(
@@ -56,6 +58,8 @@ def runs(structures: Iterable[Image], still: StoodStill) -> list[list[int]]:
 
 
 def mostly_still(groups: Sequence[Sequence[int]]) -> bool:
-    """Whether more than half of the steps between frames kept the pose: a series with a few bad frames."""
+    """Whether more than half of the steps between frames kept the pose: a series with a few bad
+    frames.
+    """
     frames = sum(len(g) for g in groups)
     return frames > 2 and frames - len(groups) > (frames - 1) / 2

@@ -1,4 +1,6 @@
-"""Intrinsics and board poses that leave the least squared reprojection error, with their covariance."""
+"""Intrinsics and board poses that leave the least squared reprojection error, with their
+covariance.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -38,7 +40,10 @@ def moved(pose: BoardPose, step: Array) -> BoardPose:
 
 
 def solve(
-    views: Sequence[Sightings], camera: Camera, poses: Sequence[BoardPose], free: Sequence[str] = PARAMETERS
+    views: Sequence[Sightings],
+    camera: Camera,
+    poses: Sequence[BoardPose],
+    free: Sequence[str] = PARAMETERS,
 ) -> Solution:
     """Levenberg and Marquardt over the intrinsics named in `free` and six parameters of each pose.
 
@@ -48,7 +53,9 @@ def solve(
     best, damping = _state(views, camera, poses), 1e-3
     normal, gradient = _normal(views, best, columns)
     for _ in range(_ROUNDS):
-        step = np.asarray(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient), np.float64)
+        step = np.asarray(
+            np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient), np.float64
+        )
         tried = _state(views, *_moved(best, step, columns))
         if tried.cost < best.cost:
             gain = 1 - tried.cost / best.cost
@@ -83,7 +90,9 @@ def _state(views: Sequence[Sightings], camera: Camera, poses: Sequence[BoardPose
     return _State(camera=camera, poses=poses, predicted=predicted, cost=cost)
 
 
-def _normal(views: Sequence[Sightings], state: _State, columns: Sequence[int]) -> tuple[Array, Array]:
+def _normal(
+    views: Sequence[Sightings], state: _State, columns: Sequence[int]
+) -> tuple[Array, Array]:
     """Normal matrix and right-hand side: intrinsics first, then six per view."""
     own = len(columns)
     size = own + 6 * len(views)
@@ -103,4 +112,6 @@ def _moved(state: _State, step: Array, columns: Sequence[int]) -> tuple[Camera, 
     vector[list(columns)] += step[:own]
     changed: dict[str, Any] = dict(zip(PARAMETERS, vector.tolist(), strict=True))
     rest = step[own:].reshape(-1, 6)
-    return replace(state.camera, **changed), [moved(p, s) for p, s in zip(state.poses, rest, strict=True)]
+    return replace(state.camera, **changed), [
+        moved(p, s) for p, s in zip(state.poses, rest, strict=True)
+    ]

@@ -16,9 +16,9 @@ def centroid_bias(
 ) -> Array:
     """Centroid of each square's image less the image of its centre (n, 2) in px.
 
-    Squares (n, 3) in m on the board, projected with perspective and distortion; the outline is followed in
-    short straight pieces, so its area and moments are exact for a pinhole and close for a lens. `rounding_px`
-    (n,) is the radius by which the corners of the images were rounded off.
+    Squares (n, 3) in m on the board, projected with perspective and distortion; the outline is
+    followed in short straight pieces, so its area and moments are exact for a pinhole and close for
+    a lens. `rounding_px` (n,) is the radius by which the corners of the images were rounded off.
     """
     t = np.arange(_PER_SIDE) / _PER_SIDE - 0.5
     half = np.full(_PER_SIDE, 0.5)
@@ -28,7 +28,10 @@ def centroid_bias(
     px -= project(camera, pose(centres))[:, None]
     centroid, area = polygon_centroids(px)
     lost, where = _rounded_off(px, np.broadcast_to(rounding_px, len(px))[:, None])
-    return (centroid * area[:, None] - (lost[..., None] * where).sum(1)) / (area - lost.sum(1))[:, None]
+    return np.asarray(
+        (centroid * area[:, None] - (lost[..., None] * where).sum(1))
+        / (area - lost.sum(1))[:, None]
+    )
 
 
 def polygon_centroids(points: Array) -> tuple[Array, Array]:
@@ -36,12 +39,14 @@ def polygon_centroids(points: Array) -> tuple[Array, Array]:
     following = np.roll(points, -1, axis=1)
     cross = points[..., 0] * following[..., 1] - points[..., 1] * following[..., 0]
     twice = cross.sum(1)
-    return ((points + following) * cross[..., None]).sum(1) / (3 * twice[:, None]), np.abs(twice) / 2
+    return ((points + following) * cross[..., None]).sum(1) / (3 * twice[:, None]), np.abs(
+        twice
+    ) / 2
 
 
 def _rounded_off(outline: Array, radius: Array) -> tuple[Array, Array]:
-    """Area (n, 4) and centroid (n, 4, 2) of what lies between a corner of an outline (n, 4 k, 2) and a disc that
-    touches both of its sides: a kite less a sector.
+    """Area (n, 4) and centroid (n, 4, 2) of what lies between a corner of an outline (n, 4 k, 2)
+    and a disc that touches both of its sides: a kite less a sector.
     """
     corner = outline[:, ::_PER_SIDE]
     one = outline[:, 1::_PER_SIDE] - corner

@@ -1,4 +1,6 @@
-"""A first camera and first poses from homographies [Zhang 2000], the principal point in the middle."""
+"""A first camera and first poses from homographies [Zhang 2000], the principal point in the
+middle.
+"""
 
 from collections.abc import Sequence
 
@@ -13,8 +15,8 @@ Array = NDArray[np.float64]
 
 
 def start_camera(views: Sequence[Sightings], *, width: int, height: int) -> Camera:
-    """An ideal camera whose focal length in px follows from the tilt of the boards; the longer side where
-    no board is tilted.
+    """An ideal camera whose focal length in px follows from the tilt of the boards; the longer side
+    where no board is tilted.
     """
     rows, right = [], []
     middle = np.array([[1, 0, -(width - 1) / 2], [0, 1, -(height - 1) / 2], [0, 0, 1]])

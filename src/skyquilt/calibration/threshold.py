@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 class Wellner:
     """Adaptive threshold: a pixel is white where it exceeds the moving average around it.
 
-    Wellner averages along the scan line and lowers the mean by some percent of its level. The level of thermal
-    values is arbitrary (counts, kelvin), so the plain mean decides here, taken over a square, which has no
-    direction: as wide as two squares of the board, it lies half-way between black and white.
+    Wellner averages along the scan line and lowers the mean by some percent of its level. The level
+    of thermal values is arbitrary (counts, kelvin), so the plain mean decides here, taken over a
+    square, which has no direction: as wide as two squares of the board, it lies half-way between
+    black and white.
     """
 
     window_px: int

@@ -19,7 +19,8 @@ from skyquilt.cli import strip_test as strip_test_command
 from skyquilt.cli import view as view_command
 
 EXIT_CODES = (
-    "Exit codes: 0 done, 1 other errors, 2 wrong options, 3 no readable photo, 4 photos cannot be aligned,"
+    "Exit codes: 0 done, 1 other errors, 2 wrong options, 3 no readable photo, 4 photos cannot be"
+    " aligned,"
     " 5 output cannot be written, 6 malformed side file, 7 refused with a reason, 130 interrupted."
 )
 
@@ -47,7 +48,10 @@ def _version(asked: bool) -> None:
 @app.callback(epilog=EXIT_CODES)
 def skyquilt(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and end.")
+        bool,
+        typer.Option(
+            "--version", callback=_version, is_eager=True, help="Print the version and end."
+        ),
     ] = False,
 ) -> None:
     """Drone photos to a georeferenced, orthorectified mosaic."""

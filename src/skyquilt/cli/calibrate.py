@@ -24,8 +24,10 @@ def command(
     series: Annotated[
         str,
         typer.Option(
-            help="Frames of one pose, as when a lamp heats the board part by part, make one picture: auto (frames"
-            " between which the camera stood still), folders (each folder is a pose), views (never)."
+            help="Frames of one pose, as when a lamp heats the board part by part, make one"
+            " picture: auto (frames"
+            " between which the camera stood still), folders (each folder is a pose), views"
+            " (never)."
         ),
     ] = "auto",
     jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.", min=0)] = 0,
@@ -33,14 +35,18 @@ def command(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Calibrate a lens from views of a chess-board; writes cameras.json as `mosaic --cameras` reads it."""
+    """Calibrate a lens from views of a chess-board; writes cameras.json as `mosaic --cameras` reads
+    it.
+    """
     with ends_at_once():
         from skyquilt.cli.progress import show
         from skyquilt.pipelines.calibrate import CalibrateSettings, iter_calibrate
 
     mode = mode_of(quiet=quiet, json=json)
     columns, rows = parse_board(board)
-    settings = CalibrateSettings(columns=columns, rows=rows, square_m=square, series=series, jobs=jobs)
+    settings = CalibrateSettings(
+        columns=columns, rows=rows, square_m=square, series=series, jobs=jobs
+    )
     events = iter_calibrate(frames, output, settings, overwrite=overwrite)
     show(events, mode=mode, summary=summary)
 
@@ -64,18 +70,27 @@ def summary(result: "Result") -> str:
     held, held_corners = (m[k]["held_out_px"] for k in ("centres", "corners"))
     values = found["parameters"]
     terms = [
-        f"{n} {values[n]['value']:+.4f} ± {values[n]['sigma']:.4f}" for n in values if values[n]["free"]
+        f"{n} {values[n]['value']:+.4f} ± {values[n]['sigma']:.4f}"
+        for n in values
+        if values[n]["free"]
     ][3:]
     return "\n".join(
         (
             f"{m['views_used']} views ({m['frames']} frames), {found['points']} centres of squares",
-            f"focal length {values['focal']['value']:.2f} ± {values['focal']['sigma']:.2f} px, principal point"
-            f" ({values['cx']['value']:.1f}, {values['cy']['value']:.1f}), {', '.join(terms) or 'no distortion'}",
-            f"reprojection error from centres {found['rms_px']:.3f} px (RMS), from corners {other['rms_px']:.3f} px",
+            f"focal length {values['focal']['value']:.2f} ± {values['focal']['sigma']:.2f} px,"
+            " principal point"
+            f" ({values['cx']['value']:.1f}, {values['cy']['value']:.1f}),"
+            f" {', '.join(terms) or 'no distortion'}",
+            f"reprojection error from centres {found['rms_px']:.3f} px (RMS), from corners"
+            f" {other['rms_px']:.3f} px",
             f"on views kept out, each by its own marks: {held['centres']:.3f} px, from corners"
-            f" {held_corners['corners']:.3f} px; both judged by the corners: {held['corners']:.3f} px, from corners"
+            f" {held_corners['corners']:.3f} px; both judged by the corners: {held['corners']:.3f}"
+            " px, from corners"
             f" {held_corners['corners']:.3f} px",
-            *(f"left out: {name}: {reason}" for name, reason in list(m["views_rejected"].items())[:10]),
+            *(
+                f"left out: {name}: {reason}"
+                for name, reason in list(m["views_rejected"].items())[:10]
+            ),
             f"camera: {result.output / 'cameras.json'}",
             f"report: {result.output / 'report.html'}",
         )

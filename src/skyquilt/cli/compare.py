@@ -31,7 +31,8 @@ def command(
     methods: Annotated[
         str | None,
         typer.Option(
-            help="Columns, separated by commas: position, pose, image, image-overview, hybrid, hybrid-anneal,"
+            help="Columns, separated by commas: position, pose, image, image-overview, hybrid,"
+            " hybrid-anneal,"
             " flightline, bundle.",
             show_default="all",
         ),
@@ -79,9 +80,18 @@ def command(
 
     mode = mode_of(quiet=quiet, json=json)
     shared = MosaicSettings(
-        gsd_cm=gsd, geo=geo, cameras=cameras, thermal_unit=thermal_unit, height_m=height, alpha=alpha,
-        lines=lines, repair=repair, seed=seed, jobs=jobs, distances=distances,
-    )  # fmt: skip
+        gsd_cm=gsd,
+        geo=geo,
+        cameras=cameras,
+        thermal_unit=thermal_unit,
+        height_m=height,
+        alpha=alpha,
+        lines=lines,
+        repair=repair,
+        seed=seed,
+        jobs=jobs,
+        distances=distances,
+    )
     asked = tuple(m.strip() for m in methods.split(",")) if methods is not None else tuple(VARIANTS)
     settings = CompareSettings(mosaic=shared, variants=asked, first=first, known=known)
     events = iter_compare(photos, output, settings, overwrite=overwrite)
@@ -110,7 +120,11 @@ def summary(result: "Result") -> str:
         for r in rows
     ]
     return "\n".join(
-        [*lines, f"judged by {result.metrics['judged_by']}", f"report: {result.output / 'report.html'}"]
+        [
+            *lines,
+            f"judged by {result.metrics['judged_by']}",
+            f"report: {result.output / 'report.html'}",
+        ]
     )
 
 

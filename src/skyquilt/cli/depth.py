@@ -24,13 +24,17 @@ if TYPE_CHECKING:
 
 
 def command(
-    photos: Annotated[list[Path], typer.Argument(help="A folder of photos, or two photos and more.")],
+    photos: Annotated[
+        list[Path], typer.Argument(help="A folder of photos, or two photos and more.")
+    ],
     output: Output,
     route: Annotated[
         str,
         typer.Option(
-            help="pair (two photos, or the first two in sequence that match), disparities (of all linked pairs,"
-            " merged), reconstruction (heights of the whole adjustment), auto (pair for two photos)."
+            help="pair (two photos, or the first two in sequence that match), disparities (of all"
+            " linked pairs,"
+            " merged), reconstruction (heights of the whole adjustment), auto (pair for two"
+            " photos)."
         ),
     ] = "auto",
     gsd: Gsd = None,
@@ -59,7 +63,9 @@ def command(
         from skyquilt.pipelines.depth import iter_depth
 
     mode = mode_of(quiet=quiet, json=json)
-    settings = MosaicSettings(gsd_cm=gsd, crs=crs, thermal_unit=thermal_unit, features=features, jobs=jobs)
+    settings = MosaicSettings(
+        gsd_cm=gsd, crs=crs, thermal_unit=thermal_unit, features=features, jobs=jobs
+    )
     source = photos[0] if len(photos) == 1 else photos
     events = iter_depth(source, output, settings, route=route, relief_m=relief, overwrite=overwrite)
     show(events, mode=mode, summary=summary)
@@ -71,7 +77,8 @@ def summary(result: "Result") -> str:
     p = m["percentiles"]
     return "\n".join(
         (
-            f"{m['route']}: {m['photos_used']} of {m['photos_total']} photos, {len(m['pairs'])} pairs measured",
+            f"{m['route']}: {m['photos_used']} of {m['photos_total']} photos, {len(m['pairs'])}"
+            " pairs measured",
             f"heights {p['1']:.1f} to {p['99']:.1f} {m['unit']} from {m['counted_from']}",
             f"depth:  {result.output / 'depth.tif'}",
             f"report: {result.output / 'report.html'}",

@@ -11,12 +11,17 @@ from skyquilt.cli.options import Quiet
 
 def command(
     flight: Annotated[
-        Path, typer.Argument(metavar="FLIGHT", help="A simulated flight's folder, or one of photos.")
+        Path,
+        typer.Argument(metavar="FLIGHT", help="A simulated flight's folder, or one of photos."),
     ],
-    to: Annotated[str, typer.Option("--to", help="Folder that is watched, or address of the live map.")],
+    to: Annotated[
+        str, typer.Option("--to", help="Folder that is watched, or address of the live map.")
+    ],
     rate: Annotated[float, typer.Option(help="Photos per second, all drones together.")] = 1.0,
     drones: Annotated[int, typer.Option(help="Drones that share the flight.")] = 1,
-    loss: Annotated[float, typer.Option(help="Share of photos that never arrive, 0 to 0.95.")] = 0.0,
+    loss: Annotated[
+        float, typer.Option(help="Share of photos that never arrive, 0 to 0.95.")
+    ] = 0.0,
     reorder: Annotated[float, typer.Option(help="Share of photos that arrive late, 0 to 1.")] = 0.0,
     previews: Annotated[
         bool, typer.Option("--previews", help="Small pictures first, full ones later.")
@@ -30,11 +35,19 @@ def command(
     seed: Annotated[int, typer.Option(help="Of losses and order.")] = 0,
     quiet: Quiet = False,
 ) -> None:
-    """Send the photos of a flight as drones in the air would: in time, with losses, disorder, previews first."""
+    """Send the photos of a flight as drones in the air would: in time, with losses, disorder,
+    previews first.
+    """
     with ends_at_once():
         from skyquilt.pipelines.live.flying import FlySettings, fly
     settings = FlySettings(
-        rate=rate, drones=drones, loss=loss, reorder=reorder, previews=previews, burst=burst, seed=seed
+        rate=rate,
+        drones=drones,
+        loss=loss,
+        reorder=reorder,
+        previews=previews,
+        burst=burst,
+        seed=seed,
     )
     count = 0
     for sent in fly(flight, to, settings, token):

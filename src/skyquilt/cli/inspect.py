@@ -13,11 +13,15 @@ if TYPE_CHECKING:
 
 
 def command(
-    photos: Annotated[Path, typer.Argument(help="Folder of photos (subfolders included), or one photo.")],
+    photos: Annotated[
+        Path, typer.Argument(help="Folder of photos (subfolders included), or one photo.")
+    ],
     geo: Annotated[
         Path | None, typer.Option(help="Side file of positions: geo.txt, CSV, DJI .SRT or .MRK.")
     ] = None,
-    cameras: Annotated[Path | None, typer.Option(help="Calibrations: cameras.json of OpenDroneMap.")] = None,
+    cameras: Annotated[
+        Path | None, typer.Option(help="Calibrations: cameras.json of OpenDroneMap.")
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
     """Say what photos tell about themselves, and what is missing or contradictory."""

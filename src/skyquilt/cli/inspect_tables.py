@@ -7,7 +7,12 @@ from rich.table import Table
 from skyquilt.model.photo import GeoPosition, Photo, Survey
 
 _SHUTTERS = {True: "rolling (not modelled)", False: "global or mechanical", None: "unknown"}
-_DATUMS = {"takeoff": "take-off", "sea_level": "sea level", "ellipsoid": "ellipsoid", "unknown": "?"}
+_DATUMS = {
+    "takeoff": "take-off",
+    "sea_level": "sea level",
+    "ellipsoid": "ellipsoid",
+    "unknown": "?",
+}
 
 
 def camera_table(survey: Survey) -> Table:
@@ -65,10 +70,14 @@ def sentences(survey: Survey, findings: tuple[str, ...]) -> Iterator[str]:
 def _cells(photo: Photo) -> tuple[str, ...]:
     attitude, yaw = photo.attitude, photo.flight_yaw_deg
     angles = (
-        f"{attitude.yaw_deg:.1f} / {attitude.pitch_deg:.1f} / {attitude.roll_deg:.1f}" if attitude else "-"
+        f"{attitude.yaw_deg:.1f} / {attitude.pitch_deg:.1f} / {attitude.roll_deg:.1f}"
+        if attitude
+        else "-"
     )
     return (
-        photo.time.isoformat(sep=" ", timespec="milliseconds").removesuffix(".000") if photo.time else "-",
+        photo.time.isoformat(sep=" ", timespec="milliseconds").removesuffix(".000")
+        if photo.time
+        else "-",
         _focal(photo),
         _place(photo.position),
         _height(photo.position),

@@ -8,9 +8,13 @@ import typer
 from skyquilt.cli.interrupt import ends_at_once
 from skyquilt.cli.options import Features, Json, Quiet, ThermalUnit
 
-Output = Annotated[Path, typer.Option("--output", "-o", help="Folder of the survey; the same again goes on.")]
+Output = Annotated[
+    Path, typer.Option("--output", "-o", help="Folder of the survey; the same again goes on.")
+]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the viewer; 0 = a free one.")]
-Host = Annotated[str, typer.Option(help="Address to listen on; others than this machine's own need --token.")]
+Host = Annotated[
+    str, typer.Option(help="Address to listen on; others than this machine's own need --token.")
+]
 
 
 def command(
@@ -19,32 +23,43 @@ def command(
     port: Port = 8080,
     host: Host = "127.0.0.1",
     token: Annotated[
-        str | None, typer.Option(envvar="SKYQUILT_TOKEN", help="Secret that uploads and layers must carry.")
+        str | None,
+        typer.Option(envvar="SKYQUILT_TOKEN", help="Secret that uploads and layers must carry."),
     ] = None,
     gsd: Annotated[
         float | None,
         typer.Option(
-            help="Ground size of a pixel of the growing map in cm.", show_default="three times the photos'"
+            help="Ground size of a pixel of the growing map in cm.",
+            show_default="three times the photos'",
         ),
     ] = None,
-    crs: Annotated[str | None, typer.Option(help="CRS of the map.", show_default="local UTM")] = None,
+    crs: Annotated[
+        str | None, typer.Option(help="CRS of the map.", show_default="local UTM")
+    ] = None,
     reposition: Annotated[
-        bool, typer.Option("--reposition/--no-reposition", help="Whether later photos may move earlier ones.")
+        bool,
+        typer.Option(
+            "--reposition/--no-reposition", help="Whether later photos may move earlier ones."
+        ),
     ] = True,
     deterministic: Annotated[
         bool,
         typer.Option(
-            "--deterministic", help="Equal photos in equal order give equal poses, bit for bit; slower."
+            "--deterministic",
+            help="Equal photos in equal order give equal poses, bit for bit; slower.",
         ),
     ] = False,
     finish: Annotated[
         bool,
         typer.Option(
-            "--finish", help="End when no photo comes any more, with the final map in OUTPUT/finished."
+            "--finish",
+            help="End when no photo comes any more, with the final map in OUTPUT/finished.",
         ),
     ] = False,
     thermal_unit: ThermalUnit = None,
-    base: Annotated[Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")] = None,
+    base: Annotated[
+        Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")
+    ] = None,
     features: Features = 1200,
     max_mb: Annotated[float, typer.Option(help="Largest photo file in MB.")] = 500,
     max_photos: Annotated[int, typer.Option(help="Most photos taken.")] = 100_000,
@@ -63,10 +78,15 @@ def command(
         from skyquilt.viewer.apart import Asked, ServingApart
         from skyquilt.viewer.guard import Guard
     settings = LiveSettings(
-        gsd_cm=gsd, crs=crs, reposition=reposition, deterministic=deterministic,
-        thermal_unit=thermal_unit, features=features,
-        most_bytes=int(max_mb * 1e6), most_photos=max_photos,
-    )  # fmt: skip
+        gsd_cm=gsd,
+        crs=crs,
+        reposition=reposition,
+        deterministic=deterministic,
+        thermal_unit=thermal_unit,
+        features=features,
+        most_bytes=int(max_mb * 1e6),
+        most_photos=max_photos,
+    )
     guard = Guard(host=host, token=token)
     live = LiveMap(output, settings)
     try:

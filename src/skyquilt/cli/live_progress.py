@@ -49,6 +49,10 @@ def sentence(happened: Event | Update) -> str:
         "refused",
         "closed",
     ):
-        told = f"photo {happened.photo} {happened.what}" if happened.photo is not None else happened.what
+        told = (
+            f"photo {happened.photo} {happened.what}"
+            if happened.photo is not None
+            else happened.what
+        )
         return f"{told}{': ' + happened.text if happened.text else ''}"
     return ""

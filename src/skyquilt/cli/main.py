@@ -12,8 +12,8 @@ from skyquilt.errors import SkyquiltError
 def run() -> None:
     """Entry point; a mendable error is one sentence on standard error and its own exit code.
 
-    Wrong options end with 2 (as all usage errors), an interrupt with 130. What is left is a mistake of the
-    program: its traceback is shown, and the exit code is 1.
+    Wrong options end with 2 (as all usage errors), an interrupt with 130. What is left is a mistake
+    of the program: its traceback is shown, and the exit code is 1.
     """
     # threads work on photos, not inside one product of matrices: it would only spin
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

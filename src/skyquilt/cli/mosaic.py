@@ -34,7 +34,9 @@ def command(
     output: Output,
     method: Annotated[
         str,
-        typer.Option(help="How photos are aligned: auto, bundle, position, pose, image, hybrid, flightline."),
+        typer.Option(
+            help="How photos are aligned: auto, bundle, position, pose, image, hybrid, flightline."
+        ),
     ] = "auto",
     gsd: Gsd = None,
     crs: Crs = None,
@@ -45,16 +47,21 @@ def command(
     geo: Annotated[
         Path | None,
         typer.Option(
-            help="Positions: geo.txt, CSV, .MRK or .SRT.", show_default="geo.txt among the photos, if any"
+            help="Positions: geo.txt, CSV, .MRK or .SRT.",
+            show_default="geo.txt among the photos, if any",
         ),
     ] = None,
     cameras: Cameras = None,
-    bounds: Annotated[str | None, typer.Option(help="west,south,east,north in the output CRS.")] = None,
+    bounds: Annotated[
+        str | None, typer.Option(help="west,south,east,north in the output CRS.")
+    ] = None,
     boundary: Annotated[
-        Path | None, typer.Option(help="Polygon to cut the map to: GeoJSON, KML, GeoPackage, Shapefile.")
+        Path | None,
+        typer.Option(help="Polygon to cut the map to: GeoJSON, KML, GeoPackage, Shapefile."),
     ] = None,
     surface: Annotated[
-        str, typer.Option(help="Heights: ties (tie points alone) or sweep (refined from the pictures).")
+        str,
+        typer.Option(help="Heights: ties (tie points alone) or sweep (refined from the pictures)."),
     ] = "sweep",
     blend: Annotated[
         str, typer.Option(help="Where photos meet: auto, feather, first, average, multiband.")
@@ -67,7 +74,8 @@ def command(
         bool | None,
         typer.Option(
             "--balance-thermal/--raw-thermal",
-            help="Balance the drift between thermal frames on their overlaps, or leave values as recorded.",
+            help="Balance the drift between thermal frames on their overlaps, or leave values as"
+            " recorded.",
             show_default="temperatures balanced, counts raw",
         ),
     ] = None,
@@ -78,7 +86,8 @@ def command(
     distortion: Annotated[
         str | None,
         typer.Option(
-            help="Lens terms to calibrate, or, for methods that do not, to keep of a known calibration: none, 2, 4,"
+            help="Lens terms to calibrate, or, for methods that do not, to keep of a known"
+            " calibration: none, 2, 4,"
             " 6 (radial order), 6t (and tangential).",
             show_default="4 to calibrate, 6t to keep",
         ),
@@ -93,13 +102,15 @@ def command(
     levelled: Annotated[
         bool,
         typer.Option(
-            "--levelled/--no-levelled", help="Register by features of the dominant plane, for method image."
+            "--levelled/--no-levelled",
+            help="Register by features of the dominant plane, for method image.",
         ),
     ] = True,
     image_search: Annotated[
         str,
         typer.Option(
-            help="What method image registers a photo to: chain (the last photo), overview (the whole map so far)."
+            help="What method image registers a photo to: chain (the last photo), overview (the"
+            " whole map so far)."
         ),
     ] = "chain",
     relief: Annotated[
@@ -118,20 +129,27 @@ def command(
             help="How method hybrid searches: surfaces (correlation), anneal (simulated annealing)."
         ),
     ] = "surfaces",
-    seed: Annotated[int, typer.Option(help="Of everything random; equal seeds give equal maps.")] = 0,
+    seed: Annotated[
+        int, typer.Option(help="Of everything random; equal seeds give equal maps.")
+    ] = 0,
     sequence: Annotated[
         str,
         typer.Option(
-            help="Order that methods image, hybrid and flightline take photos in: time, name, or a file of names."
+            help="Order that methods image, hybrid and flightline take photos in: time, name, or a"
+            " file of names."
         ),
     ] = "time",
     lines: Annotated[
         str,
-        typer.Option(help="How method flightline tells lines apart: heading, or distance (as in the paper)."),
+        typer.Option(
+            help="How method flightline tells lines apart: heading, or distance (as in the paper)."
+        ),
     ] = "heading",
     distances: Annotated[
         Path | None,
-        typer.Option(help="Known distances (CSV: point_a, point_b, metres) by which the map is judged."),
+        typer.Option(
+            help="Known distances (CSV: point_a, point_b, metres) by which the map is judged."
+        ),
     ] = None,
     height: Annotated[
         float | None,
@@ -148,7 +166,9 @@ def command(
     features: Features = 1200,
     thermal: Annotated[
         Path | None,
-        typer.Option(help="Folder of thermal photos: their map is laid on the visual one as thermal.tif."),
+        typer.Option(
+            help="Folder of thermal photos: their map is laid on the visual one as thermal.tif."
+        ),
     ] = None,
     thermal_unit: Annotated[
         str | None,
@@ -157,8 +177,10 @@ def command(
     thermal_route: Annotated[
         str,
         typer.Option(
-            help="How the thermal map finds its place: rig (both cameras on one drone: on the visual poses), maps (the"
-            " pictures of both), pairs (of photos), heights (the surfaces under them), positions (GPS alone), auto (the"
+            help="How the thermal map finds its place: rig (both cameras on one drone: on the"
+            " visual poses), maps (the"
+            " pictures of both), pairs (of photos), heights (the surfaces under them), positions"
+            " (GPS alone), auto (the"
             " first that can be believed)."
         ),
     ] = "auto",
@@ -169,7 +191,8 @@ def command(
     rerun_from: Annotated[
         str | None,
         typer.Option(
-            help="Make everything anew from this stage on: features, links, align, surface, balance, mosaic,"
+            help="Make everything anew from this stage on: features, links, align, surface,"
+            " balance, mosaic,"
             " measure, report."
         ),
     ] = None,
@@ -191,26 +214,55 @@ def command(
         raise UsageError(f"--rerun-from {rerun_from!r} is not one of {', '.join(STAGES[1:])}")
     mode = mode_of(quiet=quiet, json=json, verbose=verbose)
     settings = MosaicSettings(
-        method=method, gsd_cm=gsd, crs=crs, gcp=gcp, geo=geo, cameras=cameras, bounds=parse_bounds(bounds),
-        boundary=boundary, surface=surface, blend=blend, feather_px=feather, balance=balance,
-        balance_thermal=balance_thermal, thermal_unit=thermal_unit, compress=compress, quality=quality,
-        distortion=distortion, transform=transform, levelled=levelled, image_search=image_search,
-        relief_m=relief, alpha=alpha, optimiser=optimiser, seed=seed, sequence=sequence, lines=lines,
-        distances=distances, height_m=height, heading_deg=heading, repair=repair, features=features,
-        jobs=jobs, memory_gb=memory,
-    )  # fmt: skip
+        method=method,
+        gsd_cm=gsd,
+        crs=crs,
+        gcp=gcp,
+        geo=geo,
+        cameras=cameras,
+        bounds=parse_bounds(bounds),
+        boundary=boundary,
+        surface=surface,
+        blend=blend,
+        feather_px=feather,
+        balance=balance,
+        balance_thermal=balance_thermal,
+        thermal_unit=thermal_unit,
+        compress=compress,
+        quality=quality,
+        distortion=distortion,
+        transform=transform,
+        levelled=levelled,
+        image_search=image_search,
+        relief_m=relief,
+        alpha=alpha,
+        optimiser=optimiser,
+        seed=seed,
+        sequence=sequence,
+        lines=lines,
+        distances=distances,
+        height_m=height,
+        heading_deg=heading,
+        repair=repair,
+        features=features,
+        jobs=jobs,
+        memory_gb=memory,
+    )
     if thermal is None:
         events = iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
     else:
         from skyquilt.pipelines.thermal import iter_thermal
 
         events = iter_thermal(
-            photos, thermal, output, settings, route=thermal_route, overwrite=overwrite, rerun_from=rerun_from
+            photos,
+            thermal,
+            output,
+            settings,
+            route=thermal_route,
+            overwrite=overwrite,
+            rerun_from=rerun_from,
         )
-    show(
-        events, mode=mode,
-        summary=None if thermal is None else with_thermal,
-    )  # fmt: skip
+    show(events, mode=mode, summary=None if thermal is None else with_thermal)
 
 
 def with_thermal(result: "Result") -> str:
@@ -240,5 +292,7 @@ def parse_bounds(text: str | None) -> tuple[float, float, float, float] | None:
     try:
         west, south, east, north = (float(part) for part in text.split(","))
     except ValueError as error:
-        raise UsageError(f"--bounds is west,south,east,north, four numbers; got {text!r}") from error
+        raise UsageError(
+            f"--bounds is west,south,east,north, four numbers; got {text!r}"
+        ) from error
     return west, south, east, north

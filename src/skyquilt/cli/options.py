@@ -1,4 +1,6 @@
-"""Options that several commands have, each said once, and what `--quiet`, `--verbose` and `--json` together mean."""
+"""Options that several commands have, each said once, and what `--quiet`, `--verbose` and `--json`
+together mean.
+"""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -12,22 +14,28 @@ Mode = Literal["quiet", "normal", "verbose", "json"]
 Photos = Annotated[Path, typer.Argument(help="Folder of photos (subfolders included).")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")]
 Gsd = Annotated[
-    float | None, typer.Option(help="Ground size of a map pixel in cm.", show_default="the photos' own")
+    float | None,
+    typer.Option(help="Ground size of a map pixel in cm.", show_default="the photos' own"),
 ]
-Crs = Annotated[str | None, typer.Option(help="Output CRS, e.g. EPSG:32633.", show_default="local UTM")]
+Crs = Annotated[
+    str | None, typer.Option(help="Output CRS, e.g. EPSG:32633.", show_default="local UTM")
+]
 Cameras = Annotated[Path | None, typer.Option(help="Calibrations (cameras.json).")]
 Repair = Annotated[
     bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")
 ]
 Features = Annotated[int, typer.Option(help="Features per photo.")]
 Jobs = Annotated[int, typer.Option(help="Threads; 0 = all processors.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the results of another run in OUTPUT.")]
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace the results of another run in OUTPUT.")
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more: every stage's time.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")]
 
 THERMAL_UNITS = (
-    "What values of single-band TIFFs mean: auto (they are thermal; the unit is stated in them or found from the"
+    "What values of single-band TIFFs mean: auto (they are thermal; the unit is stated in them or"
+    " found from the"
     " values), celsius, kelvin, decikelvin, centikelvin, counts."
 )
 UNIT_UNSAID = "files of thermal cameras, or that state a unit, are read as auto"

@@ -9,7 +9,9 @@ from typing import Any
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
 
 
-def show(events: Iterable[Event], *, mode: str, summary: Callable[[Result], str] | None = None) -> None:
+def show(
+    events: Iterable[Event], *, mode: str, summary: Callable[[Result], str] | None = None
+) -> None:
     """Consumes a story and tells it: mode `normal`, `verbose`, `quiet` or `json`.
 
     `summary` puts the result in a few lines; that of a mosaic if none is given.
@@ -28,26 +30,42 @@ def show(events: Iterable[Event], *, mode: str, summary: Callable[[Result], str]
 def as_record(happened: Event) -> dict[str, Any]:
     """The event with its name, ready for JSON."""
     if isinstance(happened, Result):
-        return {"event": "Result", "output": str(happened.output), "metrics": dict(happened.metrics)}
+        return {
+            "event": "Result",
+            "output": str(happened.output),
+            "metrics": dict(happened.metrics),
+        }
     return {"event": type(happened).__name__, **asdict(happened)}
 
 
 def _bars(events: Iterable[Event], summary: Callable[[Result], str], *, verbose: bool) -> None:
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     console = Console(stderr=True)
     columns = (
-        TextColumn("{task.description:<9}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"),
-        TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
-    )  # fmt: skip
+        TextColumn("{task.description:<9}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         tasks: dict[str, Any] = {}
         for happened in events:
             if isinstance(happened, StageStarted):
                 tasks[happened.stage] = progress.add_task(happened.stage, total=None)
             elif isinstance(happened, StageProgress):
-                progress.update(tasks[happened.stage], completed=happened.done, total=happened.total)
+                progress.update(
+                    tasks[happened.stage], completed=happened.done, total=happened.total
+                )
             elif isinstance(happened, StageFinished):
                 progress.update(tasks[happened.stage], completed=1, total=1)
                 if verbose:
@@ -83,14 +101,20 @@ def mosaic_summary(result: Result) -> str:
     if m["reprojection_error_px"]:
         seam = m["seam_disparity_px"]
         lines.append(
-            f"reprojection error {m['reprojection_error_px']['mean']:.2f} px, seams {seam['median']} px"
+            f"reprojection error {m['reprojection_error_px']['mean']:.2f} px, seams"
+            f" {seam['median']} px"
             f" (median; {seam['measured']} of {seam['attempted']} measured)"
         )
-    lines += [f"left out: {name}: {reason}" for name, reason in list(m["photos_rejected"].items())[:10]]
+    lines += [
+        f"left out: {name}: {reason}" for name, reason in list(m["photos_rejected"].items())[:10]
+    ]
     if m["metadata_conflicts"]:
         lines.append(
-            f"{len(m['metadata_conflicts'])} contradictions between metadata and pixels: see the report"
+            f"{len(m['metadata_conflicts'])} contradictions between metadata and pixels: see the"
+            " report"
         )
-    lines.append(f"{m['seconds']['total']:.1f} s, {m['cpu_seconds']:.1f} s of CPU, {m['peak_memory_mb']} MB")
+    lines.append(
+        f"{m['seconds']['total']:.1f} s, {m['cpu_seconds']:.1f} s of CPU, {m['peak_memory_mb']} MB"
+    )
     lines += [f"map:    {result.output / 'mosaic.tif'}", f"report: {result.output / 'report.html'}"]
     return "\n".join(lines)

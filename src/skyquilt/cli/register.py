@@ -19,14 +19,16 @@ def command(
     method: Annotated[
         str,
         typer.Option(
-            help="auto (structure, believed only where independent patches agree), or a published method, which"
+            help="auto (structure, believed only where independent patches agree), or a published"
+            " method, which"
             " believes nine inliers: sift, surf, usurf, rfae, rfae-sift, surf+rfae; or structure."
         ),
     ] = "auto",
     metadata: Annotated[
         bool,
         typer.Option(
-            "--use-metadata/--ignore-metadata", help="Try first what metadata and places say beforehand."
+            "--use-metadata/--ignore-metadata",
+            help="Try first what metadata and places say beforehand.",
         ),
     ] = True,
     overwrite: Overwrite = False,

@@ -18,7 +18,9 @@ PresetName = Literal["default", "demo", "strip", "roundtrip", "thermal", "drones
 
 
 def command(
-    out: Annotated[Path, typer.Argument(metavar="OUT", help="folder for photos/, gcp_list.txt and truth/")],
+    out: Annotated[
+        Path, typer.Argument(metavar="OUT", help="folder for photos/, gcp_list.txt and truth/")
+    ],
     preset: Annotated[
         PresetName, typer.Option(help="flight to start from; the options change it")
     ] = "default",
@@ -26,7 +28,9 @@ def command(
     overlap: Annotated[float | None, typer.Option(help="forward overlap, percent")] = None,
     sidelap: Annotated[float | None, typer.Option(help="sideways overlap, percent")] = None,
     height: Annotated[float | None, typer.Option(help="above take-off, m")] = None,
-    heading: Annotated[float | None, typer.Option(help="of the first line, degrees from north")] = None,
+    heading: Annotated[
+        float | None, typer.Option(help="of the first line, degrees from north")
+    ] = None,
     size: Annotated[str | None, typer.Option(help="photo size in px, such as 1600x1200")] = None,
     gps_noise: Annotated[float | None, typer.Option(help="standard deviation, m")] = None,
     gps_missing: Annotated[int | None, typer.Option(help="photos without position")] = None,
@@ -40,15 +44,23 @@ def command(
     focal_error: Annotated[
         float | None, typer.Option(help="of the focal length in the EXIF, percent")
     ] = None,
-    no_focal: Annotated[bool, typer.Option("--no-focal", help="leave the focal length out")] = False,
+    no_focal: Annotated[
+        bool, typer.Option("--no-focal", help="leave the focal length out")
+    ] = False,
     tilt_noise: Annotated[float | None, typer.Option(help="standard deviation, degrees")] = None,
-    relief: Annotated[float | None, typer.Option(help="height between low and high ground, m")] = None,
+    relief: Annotated[
+        float | None, typer.Option(help="height between low and high ground, m")
+    ] = None,
     terrain: Annotated[
         Literal["landscape", "chessboard"] | None, typer.Option(help="what is flown over")
     ] = None,
-    season: Annotated[Literal["summer", "winter"] | None, typer.Option(help="of the photos")] = None,
+    season: Annotated[
+        Literal["summer", "winter"] | None, typer.Option(help="of the photos")
+    ] = None,
     hour: Annotated[float | None, typer.Option(help="solar time of the photos, 0-24")] = None,
-    exposure_noise: Annotated[float | None, typer.Option(help="relative, from photo to photo")] = None,
+    exposure_noise: Annotated[
+        float | None, typer.Option(help="relative, from photo to photo")
+    ] = None,
     motion_blur: Annotated[float | None, typer.Option(help="length, px")] = None,
     thermal: Annotated[
         bool | None, typer.Option("--thermal/--no-thermal", help="a thermal flight as well")
@@ -56,7 +68,9 @@ def command(
     thermal_season: Annotated[
         Literal["summer", "winter"] | None, typer.Option(help="of the thermal flight")
     ] = None,
-    thermal_hour: Annotated[float | None, typer.Option(help="solar time of the thermal flight")] = None,
+    thermal_hour: Annotated[
+        float | None, typer.Option(help="solar time of the thermal flight")
+    ] = None,
     drones: Annotated[int | None, typer.Option(help="flying at once")] = None,
     lose: Annotated[int | None, typer.Option(help="photos lost on the way")] = None,
     gcp: Annotated[int | None, typer.Option(help="control points")] = None,
@@ -99,7 +113,9 @@ def command(
     base = _with(base, "weather", season=season, hour=hour)
     base = _with(base, "pictures", exposure_noise=exposure_noise, motion_blur=motion_blur)
     base = _with(base, "control", points=gcp, checks=checks)
-    base = _thermal(base, thermal, Weather(season=thermal_season or "summer", hour=thermal_hour or 13.0))
+    base = _thermal(
+        base, thermal, Weather(season=thermal_season or "summer", hour=thermal_hour or 13.0)
+    )
     base = replace(base, seed=base.seed if seed is None else seed, lens=_lens(base, size))
     _show(sim.simulate(base, out, overwrite=overwrite), quiet)
     if not quiet:
@@ -117,7 +133,9 @@ def _with(settings: "FlightSettings", part: str, **values: Any) -> "FlightSettin
     return replace(settings, **changed)
 
 
-def _thermal(settings: "FlightSettings", wanted: bool | None, weather: "Weather") -> "FlightSettings":
+def _thermal(
+    settings: "FlightSettings", wanted: bool | None, weather: "Weather"
+) -> "FlightSettings":
     flight = settings.thermal
     if wanted is not None:
         from skyquilt.simulate.settings import Thermal
@@ -142,9 +160,21 @@ def _show(events: "Iterable[sim.Progress]", quiet: bool) -> None:
         for _ in events:
             pass
         return
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TaskID,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
-    columns = (TextColumn("{task.description:16}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description:16}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns) as bars:
         tasks: dict[str, TaskID] = {}
         for event in events:

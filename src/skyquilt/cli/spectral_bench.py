@@ -17,7 +17,8 @@ def command(
     pairs: Annotated[
         Path,
         typer.Argument(
-            metavar="PAIRS.csv", help="Pairs: class, source, a, b, tolerance_px, h11 to h33 (b_H_a)."
+            metavar="PAIRS.csv",
+            help="Pairs: class, source, a, b, tolerance_px, h11 to h33 (b_H_a).",
         ),
     ],
     output: Output,

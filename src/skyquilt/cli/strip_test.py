@@ -13,20 +13,30 @@ if TYPE_CHECKING:
 
 
 def command(
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for strip.json and report.html.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder for strip.json and report.html.")
+    ],
     photos: Annotated[int, typer.Option(help="Along the strip.")] = 21,
     overlap: Annotated[float, typer.Option(help="From photo to photo, percent.")] = 70,
     height: Annotated[float, typer.Option(help="Flight height above the boards, m.")] = 30,
-    relief: Annotated[float, typer.Option(help="Height of the highest thing on the boards, m.")] = 1.2,
-    tilt: Annotated[float, typer.Option(help="Standard deviation of pitch and roll, degrees.")] = 0.3,
+    relief: Annotated[
+        float, typer.Option(help="Height of the highest thing on the boards, m.")
+    ] = 1.2,
+    tilt: Annotated[
+        float, typer.Option(help="Standard deviation of pitch and roll, degrees.")
+    ] = 0.3,
     noise: Annotated[float, typer.Option(help="Standard deviation of a sighting, px.")] = 0.3,
-    flights: Annotated[int, typer.Option(help="Strips flown with different seeds; curves are medians.")] = 5,
+    flights: Annotated[
+        int, typer.Option(help="Strips flown with different seeds; curves are medians.")
+    ] = 5,
     seed: Annotated[int, typer.Option(help="Equal seeds give equal results.")] = 1,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """How true to shape a strip of photos stays: eta under seven lens models, features and transformations."""
+    """How true to shape a strip of photos stays: eta under seven lens models, features and
+    transformations.
+    """
     with ends_at_once():
         from skyquilt.cli.progress import show
         from skyquilt.pipelines.strip_test import iter_strip_test
@@ -34,7 +44,13 @@ def command(
 
     mode = mode_of(quiet=quiet, json=json)
     settings = StripSettings(
-        photos=photos, overlap=overlap / 100, height=height, relief=relief, tilt=tilt, noise=noise, seed=seed
+        photos=photos,
+        overlap=overlap / 100,
+        height=height,
+        relief=relief,
+        tilt=tilt,
+        noise=noise,
+        seed=seed,
     )
     events = iter_strip_test(output, settings, flights=flights, overwrite=overwrite)
     show(events, mode=mode, summary=_summary)
@@ -42,5 +58,7 @@ def command(
 
 def _summary(result: "Result") -> str:
     """The ends of the curves in a few lines."""
-    lines = [f"{v['name']:36} eta at the end {v['eta'][-1]:.3f}" for v in result.metrics["variants"]]
+    lines = [
+        f"{v['name']:36} eta at the end {v['eta'][-1]:.3f}" for v in result.metrics["variants"]
+    ]
     return "\n".join([*lines, f"report: {result.output / 'report.html'}"])

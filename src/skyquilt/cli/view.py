@@ -1,4 +1,6 @@
-"""`skyquilt view`: the viewer on a finished run, or on a survey that was or is being mapped live."""
+"""`skyquilt view`: the viewer on a finished run, or on a survey that was or is being mapped
+live.
+"""
 
 import threading
 from pathlib import Path
@@ -16,7 +18,9 @@ def command(
     ],
     port: Port = 8080,
     host: Host = "127.0.0.1",
-    base: Annotated[Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")] = None,
+    base: Annotated[
+        Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")
+    ] = None,
 ) -> None:
     """Show a map in a browser, with all photos that cover any point. Nothing is changed."""
     with ends_at_once():

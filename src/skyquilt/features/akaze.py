@@ -26,16 +26,21 @@ class Akaze:
     upright: bool = False
     """No orientation."""
     cells: int = 10
-    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare."""
+    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare.
+    """
     version: ClassVar[int] = 1
 
-    def __call__(self, image: NDArray) -> Features:
+    def __call__(self, image: NDArray[Any]) -> Features:
         """Features of pixels (H, W[, C]) of a full sensor image."""
         return self.of_shrunken(shrink(image, self.longest)[0], image.shape[:2])
 
-    def of_shrunken(self, small: NDArray, full: tuple[int, int]) -> Features:
-        """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer to."""
+    def of_shrunken(self, small: NDArray[Any], full: tuple[int, int]) -> Features:
+        """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer
+        to.
+        """
         x: Any = cv2.xfeatures2d
         kind = x.AKAZE_DESCRIPTOR_MLDB_UPRIGHT if self.upright else x.AKAZE_DESCRIPTOR_MLDB
-        detector = x.AKAZE_create(descriptor_type=kind, threshold=self.threshold, nOctaves=self.octaves)
+        detector = x.AKAZE_create(
+            descriptor_type=kind, threshold=self.threshold, nOctaves=self.octaves
+        )
         return binary_features(detector, to_grey8(small), full, count=self.count, cells=self.cells)

@@ -13,10 +13,14 @@ from skyquilt.model.features import Features
 def binary_features(
     detector: Any, grey: NDArray[np.uint8], full: tuple[int, int], *, count: int, cells: int
 ) -> Features:
-    """At most `count` keypoints of an OpenCV detector with binary descriptors, spread over the image (H, W)."""
+    """At most `count` keypoints of an OpenCV detector with binary descriptors, spread over the
+    image (H, W).
+    """
     points, found = detector.detectAndCompute(grey, None)
     bits = (
-        np.zeros((0, detector.descriptorSize()), np.uint8) if found is None else np.asarray(found, np.uint8)
+        np.zeros((0, detector.descriptorSize()), np.uint8)
+        if found is None
+        else np.asarray(found, np.uint8)
     )
     xy = np.array([p.pt for p in points], np.float64).reshape(-1, 2)
     keep = spread(xy, np.array([p.response for p in points]), grey.shape, count, cells)

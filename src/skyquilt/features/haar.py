@@ -1,11 +1,14 @@
-"""SURF's description of keypoints: orientation and descriptor from Haar wavelets (Bay et al. 2008, section 4).
+"""SURF's description of keypoints: orientation and descriptor from Haar wavelets (Bay et al. 2008,
+section 4).
 
-The wavelets are differences of the means of squares that stand upright in each keypoint's own frame: a pyramid of area
-means holds the means, and one lookup takes a turned grid of them out of it.
+The wavelets are differences of the means of squares that stand upright in each keypoint's own
+frame: a pyramid of area means holds the means, and one lookup takes a turned grid of them out of
+it.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,7 +26,9 @@ _SECTORS = 72
 
 @dataclass(frozen=True, eq=False)
 class Means:
-    """An image's area means: level 2 o is reduced by 2**o, level 2 o + 1 the same a little smoother."""
+    """An image's area means: level 2 o is reduced by 2**o, level 2 o + 1 the same a little
+    smoother.
+    """
 
     grey: NDArray[np.uint8]
     """(H, W)."""
@@ -48,10 +53,18 @@ class Means:
             )
             image = np.asarray(cv2.resize(even, size, interpolation=cv2.INTER_AREA), np.float32)
 
-    def grids(self, xy: NDArray, sigma: NDArray, angle: NDArray, size: int) -> Floats:
-        """(N, size, size) means of squares of about sigma px, sigma apart, around xy (N, 2), turned by angle (N,)."""
+    def grids(
+        self, xy: NDArray[Any], sigma: NDArray[Any], angle: NDArray[Any], size: int
+    ) -> Floats:
+        """(N, size, size) means of squares of about sigma px, sigma apart, around xy (N, 2), turned
+        by angle (N,).
+        """
         # one level smoother than sigma asks for: blurred photos match better, others as well
-        level = np.floor(2 * np.log2(np.maximum(sigma, 1)) + 1).astype(int).clip(0, len(self.levels) - 1)
+        level = (
+            np.floor(2 * np.log2(np.maximum(sigma, 1)) + 1)
+            .astype(int)
+            .clip(0, len(self.levels) - 1)
+        )
         out = np.empty((len(xy), size, size), np.float32)
         for k in np.unique(level):
             factor, image = self.levels[k]
@@ -62,7 +75,9 @@ class Means:
         return out
 
 
-def _lookup(image: Floats, xy: Floats, sigma: NDArray, angle: NDArray, size: int) -> Floats:
+def _lookup(
+    image: Floats, xy: Floats, sigma: NDArray[Any], angle: NDArray[Any], size: int
+) -> Floats:
     ticks = np.arange(size, dtype=np.float32) - np.float32((size - 1) / 2)
     c, s = ((sigma * f(angle)).astype(np.float32)[:, None, None] for f in (np.cos, np.sin))
     across, down = ticks[None, None, :], ticks[None, :, None]
@@ -72,8 +87,10 @@ def _lookup(image: Floats, xy: Floats, sigma: NDArray, angle: NDArray, size: int
     return np.asarray(values, np.float32).reshape(-1, size, size)
 
 
-def orientations(means: Means, xy: NDArray, sigma: NDArray) -> NDArray[np.float64]:
-    """(N,) rad, from x towards y: wavelets of 4 sigma within 6 sigma, the strongest sum in a window of 60 degrees."""
+def orientations(means: Means, xy: NDArray[Any], sigma: NDArray[Any]) -> NDArray[np.float64]:
+    """(N,) rad, from x towards y: wavelets of 4 sigma within 6 sigma, the strongest sum in a window
+    of 60 degrees.
+    """
     g = means.grids(xy, sigma, np.zeros(len(xy)), 16)
     columns, rows = g[:, :, 1:] + g[:, :, :-1], g[:, 1:] + g[:, :-1]
     dx = _four(columns[:, :, 2:] - columns[:, :, :-2], 1)  # (N, 13, 13) at -6..6
@@ -96,7 +113,9 @@ def _dominant(dx: Floats, dy: Floats) -> NDArray[np.float64]:
     if not len(dx):
         return np.zeros(0)
     sector = (
-        np.floor(np.asarray(cv2.phase(dx, dy)) * np.float32(_SECTORS / (2 * np.pi))).astype(np.int32)
+        np.floor(np.asarray(cv2.phase(dx, dy)) * np.float32(_SECTORS / (2 * np.pi))).astype(
+            np.int32
+        )
         % _SECTORS
     )
     index = (sector + np.arange(len(dx), dtype=np.int32)[:, None] * _SECTORS).ravel()
@@ -112,23 +131,37 @@ def _dominant(dx: Floats, dy: Floats) -> NDArray[np.float64]:
     return np.asarray(np.arctan2(sums[1][rows, best], sums[0][rows, best]))
 
 
-def descriptors(means: Means, xy: NDArray, sigma: NDArray, angle: NDArray, *, extended: bool) -> Floats:
-    """(N, 64) of unit length, (N, 128) if `extended`: sums of wavelets and of their absolute values in 4 x 4 fields."""
+def descriptors(
+    means: Means, xy: NDArray[Any], sigma: NDArray[Any], angle: NDArray[Any], *, extended: bool
+) -> Floats:
+    """(N, 64) of unit length, (N, 128) if `extended`: sums of wavelets and of their absolute values
+    in 4 x 4 fields.
+    """
     g = means.grids(xy, sigma, angle, _GRID + 1)
     columns, rows = g[:, :, 1:] - g[:, :, :-1], g[:, 1:] - g[:, :-1]
     dx = (columns[:, 1:] + columns[:, :-1]).reshape(-1, _GRID * _GRID)
     dy = (rows[:, :, 1:] + rows[:, :, :-1]).reshape(-1, _GRID * _GRID)
     if extended:  # the sums of one direction separately for each sign of the other
         right, down = dx >= 0, dy >= 0
-        parts = [np.where(sign, d, 0) for d, other in ((dx, down), (dy, right)) for sign in (other, ~other)]
+        parts = [
+            np.where(sign, d, 0)
+            for d, other in ((dx, down), (dy, right))
+            for sign in (other, ~other)
+        ]
     else:
         parts = [dx, dy]
-    fields = np.stack([p @ _FIELDS for q in parts for p in (q, np.abs(q))], -1).reshape(-1, 32 * len(parts))
-    return fields / np.maximum(np.linalg.norm(fields, axis=1, keepdims=True), np.float32(1e-12))
+    fields = np.stack([p @ _FIELDS for q in parts for p in (q, np.abs(q))], -1).reshape(
+        -1, 32 * len(parts)
+    )
+    return np.asarray(
+        fields / np.maximum(np.linalg.norm(fields, axis=1, keepdims=True), np.float32(1e-12))
+    )
 
 
 def _fields() -> Floats:
-    """(400, 16) weight of each wavelet in each field: a Gaussian of 3.3 sigma, and shared by neighbouring fields."""
+    """(400, 16) weight of each wavelet in each field: a Gaussian of 3.3 sigma, and shared by
+    neighbouring fields.
+    """
     ticks = np.arange(_GRID) - (_GRID - 1) / 2
     centres = (np.arange(4) - 1.5) * 5
     share = np.maximum(1 - np.abs(ticks[:, None] - centres) / 5, 0)  # (20, 4)

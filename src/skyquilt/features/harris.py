@@ -1,7 +1,7 @@
 """Corners (Harris and Stephens 1988), described as upright or turned SURF at one fixed scale."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -16,7 +16,9 @@ from skyquilt.model.features import Features
 
 @dataclass(frozen=True, kw_only=True)
 class Harris:
-    """Maxima of det - k trace^2 of the structure tensor. Corners have no scale: photos must not differ in theirs."""
+    """Maxima of det - k trace^2 of the structure tensor. Corners have no scale: photos must not
+    differ in theirs.
+    """
 
     count: int = 1500
     """Most keypoints kept per photo."""
@@ -33,15 +35,18 @@ class Harris:
     upright: bool = True
     """No orientation: photos must not be turned against each other."""
     cells: int = 10
-    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare."""
+    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare.
+    """
     version: ClassVar[int] = 1
 
-    def __call__(self, image: NDArray) -> Features:
+    def __call__(self, image: NDArray[Any]) -> Features:
         """Features of pixels (H, W[, C]) of a full sensor image."""
         return self.of_shrunken(shrink(image, self.longest)[0], image.shape[:2])
 
-    def of_shrunken(self, small: NDArray, full: tuple[int, int]) -> Features:
-        """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer to."""
+    def of_shrunken(self, small: NDArray[Any], full: tuple[int, int]) -> Features:
+        """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer
+        to.
+        """
         grey = to_grey8(small)
         xy, response = self._corners(grey)
         xy = xy[spread(xy, response, grey.shape, self.count, self.cells)]
@@ -55,17 +60,24 @@ class Harris:
 
     def _corners(self, grey: NDArray[np.uint8]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
         """(N, 2) px to parts of a pixel, by parabolas through the maxima, and (N,) responses."""
-        field = np.asarray(cv2.cornerHarris(grey.astype(np.float32), self.block, 3, self.k), np.float32)
+        field = np.asarray(
+            cv2.cornerHarris(grey.astype(np.float32), self.block, 3, self.k), np.float32
+        )
         top = max(float(field.max(initial=0.0)) * self.quality, 1e-6)
         summit = (field >= cv2.dilate(field, np.ones((3, 3), np.uint8))) & (field > top)
         summit[[0, -1]] = False
         summit[:, [0, -1]] = False
         y, x = np.nonzero(summit)
-        off = [_vertex(field[y - j, x - i], field[y, x], field[y + j, x + i]) for i, j in ((1, 0), (0, 1))]
+        off = [
+            _vertex(field[y - j, x - i], field[y, x], field[y + j, x + i])
+            for i, j in ((1, 0), (0, 1))
+        ]
         return np.column_stack([x + off[0], y + off[1]]).astype(np.float64), field[y, x]
 
 
-def _vertex(before: NDArray, at: NDArray, after: NDArray) -> NDArray[np.float64]:
-    """Where a parabola through three neighbouring values is highest, from the middle one, within half a step."""
+def _vertex(before: NDArray[Any], at: NDArray[Any], after: NDArray[Any]) -> NDArray[np.float64]:
+    """Where a parabola through three neighbouring values is highest, from the middle one, within
+    half a step.
+    """
     bend = 2.0 * at - before - after
     return np.where(bend > 0, (after - before) / 2 / np.maximum(bend, 1e-30), 0).clip(-0.5, 0.5)

@@ -1,11 +1,14 @@
-"""Blobs by the determinant of box-filtered second derivatives: SURF's fast Hessian (Bay et al. 2008, section 3).
+"""Blobs by the determinant of box-filtered second derivatives: SURF's fast Hessian (Bay et al.
+2008, section 3).
 
-A lobe of l px makes a filter of side 3 l, which stands for a Gaussian of sigma 1.2 * 3 l / 9. In each octave four
-filters are compared; lobes grow by 2, 4, 8, ... px from filter to filter, from octave to octave, and so do the steps.
+A lobe of l px makes a filter of side 3 l, which stands for a Gaussian of sigma 1.2 * 3 l / 9. In
+each octave four filters are compared; lobes grow by 2, 4, 8, ... px from filter to filter, from
+octave to octave, and so do the steps.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -33,15 +36,21 @@ class Blobs:
 
 
 def octave_lobes(initial: int, octaves: int) -> Iterator[tuple[int, list[int]]]:
-    """(growth, lobes) of each octave: 3, 5, 7, 9; 5, 9, 13, 17; 9, 17, ... for an initial lobe of 3."""
+    """(growth, lobes) of each octave: 3, 5, 7, 9; 5, 9, 13, 17; 9, 17, ... for an initial lobe of
+    3.
+    """
     first, growth = initial, 2
     for _ in range(octaves):
         yield growth, [first + k * growth for k in range(_LAYERS)]
         first, growth = first + growth, 2 * growth
 
 
-def blobs(grey: NDArray[np.uint8], *, octaves: int, lobe: int, step: int, threshold: float) -> Blobs:
-    """Blobs of an image (H, W). `lobe` and `step` in px are those of the first octave, both grow from there."""
+def blobs(
+    grey: NDArray[np.uint8], *, octaves: int, lobe: int, step: int, threshold: float
+) -> Blobs:
+    """Blobs of an image (H, W). `lobe` and `step` in px are those of the first octave, both grow
+    from there.
+    """
     integral = np.asarray(
         cv2.integral(grey, sdepth=cv2.CV_32S), np.int32
     )  # wraps beyond 8 Mpx: differences stay right
@@ -50,8 +59,12 @@ def blobs(grey: NDArray[np.uint8], *, octaves: int, lobe: int, step: int, thresh
         if 3 * lobes[2] >= min(grey.shape):
             break
         stack = [determinants(integral, size, step << k) for size in lobes]
-        found += [_maxima(stack[i - 1 : i + 2], lobes[i], growth, step << k, threshold) for i in (1, 2)]
-    xy, sigma, response = (np.concatenate(parts) for parts in zip(*found, strict=True)) if found else _NONE
+        found += [
+            _maxima(stack[i - 1 : i + 2], lobes[i], growth, step << k, threshold) for i in (1, 2)
+        ]
+    xy, sigma, response = (
+        (np.concatenate(parts) for parts in zip(*found, strict=True)) if found else _NONE
+    )
     return Blobs(xy=xy, sigma=sigma, response=response)
 
 
@@ -59,7 +72,8 @@ _NONE = (np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.float32))
 
 
 def determinants(integral: NDArray[np.int32], lobe: int, step: int) -> Floats:
-    """Determinant at each step-th pixel, (ceil(H / step), ceil(W / step)); 0 where the filter does not fit.
+    """Determinant at each step-th pixel, (ceil(H / step), ceil(W / step)); 0 where the filter does
+    not fit.
 
     Each lobe counts as its mean grey level, so that values do not depend on the filter's size.
     """
@@ -79,7 +93,9 @@ def determinants(integral: NDArray[np.int32], lobe: int, step: int) -> Floats:
 class _Boxes:
     """Differences of an integral image around a grid of centres."""
 
-    def __init__(self, integral: NDArray, y: int, rows: int, x: int, columns: int, step: int) -> None:
+    def __init__(
+        self, integral: NDArray[Any], y: int, rows: int, x: int, columns: int, step: int
+    ) -> None:
         self.integral, self.y, self.rows, self.x, self.columns, self.step = (
             integral,
             y,
@@ -90,9 +106,13 @@ class _Boxes:
         )
 
     def band(self, low: int, high: int, left: int, right: int) -> NDArray[np.int32]:
-        """Sums of rows low..high - 1 off the centres, integrated along columns from `left` to `right` off them."""
+        """Sums of rows low..high - 1 off the centres, integrated along columns from `left` to
+        `right` off them.
+        """
         columns = slice(self.x + left, self.x + (self.columns - 1) * self.step + right + 1)
-        return np.asarray(self.integral[self._rows(high), columns] - self.integral[self._rows(low), columns])
+        return np.asarray(
+            self.integral[self._rows(high), columns] - self.integral[self._rows(low), columns]
+        )
 
     def pillar(self, left: int, right: int, low: int, high: int) -> NDArray[np.int32]:
         """The same with rows and columns exchanged."""
@@ -107,11 +127,11 @@ class _Boxes:
     def _columns(self, off: int) -> slice:
         return slice(self.x + off, self.x + off + (self.columns - 1) * self.step + 1, self.step)
 
-    def across(self, band: NDArray, off: int) -> NDArray[np.int32]:
+    def across(self, band: NDArray[Any], off: int) -> NDArray[np.int32]:
         """A band at columns `off` from its first."""
         return band[:, off : off + (self.columns - 1) * self.step + 1 : self.step]
 
-    def along(self, pillar: NDArray, off: int) -> NDArray[np.int32]:
+    def along(self, pillar: NDArray[Any], off: int) -> NDArray[np.int32]:
         """A pillar at rows `off` from its first."""
         return pillar[off : off + (self.rows - 1) * self.step + 1 : self.step]
 
@@ -138,19 +158,25 @@ def _determinant(at: _Boxes, lobe: int) -> Floats:
     return np.asarray(product)
 
 
-def _second(a: NDArray, b: NDArray, c: NDArray, d: NDArray) -> NDArray[np.int32]:
-    """Outer lobes less twice the inner one, from running sums at their four edges: (d - a) - 3 (c - b)."""
+def _second(
+    a: NDArray[Any], b: NDArray[Any], c: NDArray[Any], d: NDArray[Any]
+) -> NDArray[np.int32]:
+    """Outer lobes less twice the inner one, from running sums at their four edges: (d - a) - 3 (c -
+    b).
+    """
     inner = c - b
     inner *= -3
     inner += d
     inner -= a
-    return inner
+    return np.asarray(inner)
 
 
 def _maxima(
     stack: list[Floats], lobe: int, growth: int, step: int, threshold: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], Floats]:
-    """(xy, sigma, response) of the maxima of a middle layer among 26 neighbours, to parts of a step and of a layer."""
+    """(xy, sigma, response) of the maxima of a middle layer among 26 neighbours, to parts of a step
+    and of a layer.
+    """
     kernel = np.ones((3, 3), np.uint8)
     middle = stack[1]
     summit = middle > threshold
@@ -160,7 +186,10 @@ def _maxima(
     summit[:, [0, -1]] = False
     rows, columns = np.nonzero(summit)
     cube = np.stack(
-        [layer[rows[:, None, None] + _AROUND[:, None], columns[:, None, None] + _AROUND] for layer in stack],
+        [
+            layer[rows[:, None, None] + _AROUND[:, None], columns[:, None, None] + _AROUND]
+            for layer in stack
+        ],
         1,
     )
     off, inside = summits(cube)
@@ -174,13 +203,18 @@ _AROUND = np.arange(-1, 2)
 
 
 def summits(cube: Floats) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Where quadratics through (N, 3, 3, 3) values (scale, y, x) have their summits: offsets (N, 3) from the middle,
-    and whether those are near enough to be meant (Brown and Lowe 2002).
+    """Where quadratics through (N, 3, 3, 3) values (scale, y, x) have their summits: offsets (N, 3)
+    from the middle, and whether those are near enough to be meant (Brown and Lowe 2002).
     """
     c = cube.astype(np.float64)
     slope = (
         np.stack(
-            [c[:, 2, 1, 1] - c[:, 0, 1, 1], c[:, 1, 2, 1] - c[:, 1, 0, 1], c[:, 1, 1, 2] - c[:, 1, 1, 0]], 1
+            [
+                c[:, 2, 1, 1] - c[:, 0, 1, 1],
+                c[:, 1, 2, 1] - c[:, 1, 0, 1],
+                c[:, 1, 1, 2] - c[:, 1, 1, 0],
+            ],
+            1,
         )
         / 2
     )
@@ -190,9 +224,15 @@ def summits(cube: Floats) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         c[:, 1, 2, 1] + c[:, 1, 0, 1] - 2 * c[:, 1, 1, 1],
         c[:, 1, 1, 2] + c[:, 1, 1, 0] - 2 * c[:, 1, 1, 1],
     )
-    bend[:, 0, 1] = bend[:, 1, 0] = (c[:, 2, 2, 1] - c[:, 2, 0, 1] - c[:, 0, 2, 1] + c[:, 0, 0, 1]) / 4
-    bend[:, 0, 2] = bend[:, 2, 0] = (c[:, 2, 1, 2] - c[:, 2, 1, 0] - c[:, 0, 1, 2] + c[:, 0, 1, 0]) / 4
-    bend[:, 1, 2] = bend[:, 2, 1] = (c[:, 1, 2, 2] - c[:, 1, 2, 0] - c[:, 1, 0, 2] + c[:, 1, 0, 0]) / 4
+    bend[:, 0, 1] = bend[:, 1, 0] = (
+        c[:, 2, 2, 1] - c[:, 2, 0, 1] - c[:, 0, 2, 1] + c[:, 0, 0, 1]
+    ) / 4
+    bend[:, 0, 2] = bend[:, 2, 0] = (
+        c[:, 2, 1, 2] - c[:, 2, 1, 0] - c[:, 0, 1, 2] + c[:, 0, 1, 0]
+    ) / 4
+    bend[:, 1, 2] = bend[:, 2, 1] = (
+        c[:, 1, 2, 2] - c[:, 1, 2, 0] - c[:, 1, 0, 2] + c[:, 1, 0, 0]
+    ) / 4
     usable = np.abs(np.linalg.det(bend)) > 1e-12
     bend[~usable] = np.eye(3)
     off = np.linalg.solve(bend, -slope[..., None])[..., 0]

@@ -1,7 +1,7 @@
 """ORB (Rublee et al. 2011) as OpenCV has it: fast, binary."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 from numpy.typing import NDArray
@@ -26,15 +26,18 @@ class Orb:
     corner: int = 10
     """FAST's threshold, grey levels of 255."""
     cells: int = 10
-    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare."""
+    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare.
+    """
     version: ClassVar[int] = 1
 
-    def __call__(self, image: NDArray) -> Features:
+    def __call__(self, image: NDArray[Any]) -> Features:
         """Features of pixels (H, W[, C]) of a full sensor image."""
         return self.of_shrunken(shrink(image, self.longest)[0], image.shape[:2])
 
-    def of_shrunken(self, small: NDArray, full: tuple[int, int]) -> Features:
-        """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer to."""
+    def of_shrunken(self, small: NDArray[Any], full: tuple[int, int]) -> Features:
+        """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer
+        to.
+        """
         detector = cv2.ORB.create(
             2 * self.count, scaleFactor=self.factor, nlevels=self.levels, fastThreshold=self.corner
         )

@@ -1,7 +1,7 @@
 """SIFT with RootSIFT descriptors, spread over the image."""
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -17,7 +17,9 @@ SPARE = 1.2
 
 @dataclass(frozen=True, kw_only=True)
 class Sift:
-    """SIFT (Lowe 2004) on a shrunken image, descriptors as RootSIFT (Arandjelovic and Zisserman 2012)."""
+    """SIFT (Lowe 2004) on a shrunken image, descriptors as RootSIFT (Arandjelovic and Zisserman
+    2012).
+    """
 
     count: int = 1200
     """Most keypoints kept per photo."""
@@ -30,10 +32,11 @@ class Sift:
     root: bool = True
     """RootSIFT; False keeps Lowe's descriptors, as the thesis used them."""
     cells: int = 10
-    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare."""
+    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare.
+    """
     version: ClassVar[int] = 5
 
-    def __call__(self, image: NDArray) -> Features:
+    def __call__(self, image: NDArray[Any]) -> Features:
         """Features of pixels (H, W[, C]) of a full sensor image."""
         return self.of_shrunken(shrink(image, self.longest)[0], image.shape[:2])
 
@@ -41,18 +44,27 @@ class Sift:
         """The same with another number of keypoints at most."""
         return replace(self, count=count)
 
-    def of_shrunken(self, small: NDArray, full: tuple[int, int]) -> Features:
-        """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer to."""
+    def of_shrunken(self, small: NDArray[Any], full: tuple[int, int]) -> Features:
+        """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer
+        to.
+        """
         grey = to_grey8(small)
-        # without precise upscaling OpenCV reports every keypoint a quarter pixel down and to the right
+        # without precise upscaling OpenCV reports every keypoint a quarter pixel down and to the
+        # right
         detector = cv2.SIFT.create(
-            int(SPARE * self.count), nOctaveLayers=self.levels, contrastThreshold=self.contrast,
+            int(SPARE * self.count),
+            nOctaveLayers=self.levels,
+            contrastThreshold=self.contrast,
             enable_precise_upscale=True,
-        )  # fmt: skip
+        )
         points, found = detector.detectAndCompute(grey, None)
-        descriptors = np.zeros((0, 128), np.float32) if found is None else np.asarray(found, np.float32)
+        descriptors = (
+            np.zeros((0, 128), np.float32) if found is None else np.asarray(found, np.float32)
+        )
         xy = np.array([p.pt for p in points], np.float64).reshape(-1, 2)
-        keep = spread(xy, np.array([p.response for p in points]), grey.shape, self.count, self.cells)
+        keep = spread(
+            xy, np.array([p.response for p in points]), grey.shape, self.count, self.cells
+        )
         scale = full[1] / grey.shape[1]
         size = np.array([p.size for p in points], np.float32)[keep] * scale
         px = full_px(xy[keep], grey.shape, full)
@@ -61,12 +73,18 @@ class Sift:
 
 
 def _root(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """RootSIFT: L1-normalised, then the square root, which has unit length; 8 bits hold it (see Features)."""
+    """RootSIFT: L1-normalised, then the square root, which has unit length; 8 bits hold it (see
+    Features).
+    """
     total = np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
-    return np.clip(np.rint(DESCRIPTOR_UNIT * np.sqrt(descriptors / total)), 0, 255).astype(np.uint8)
+    return np.asarray(
+        np.clip(np.rint(DESCRIPTOR_UNIT * np.sqrt(descriptors / total)), 0, 255).astype(np.uint8)
+    )
 
 
 def _plain(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Lowe's descriptors at unit length, stored the same way."""
     length = np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9)
-    return np.clip(np.rint(DESCRIPTOR_UNIT * descriptors / length), 0, 255).astype(np.uint8)
+    return np.asarray(
+        np.clip(np.rint(DESCRIPTOR_UNIT * descriptors / length), 0, 255).astype(np.uint8)
+    )

@@ -1,13 +1,17 @@
 """Keypoints spread over the image, so that no corner stays bare."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 
 def spread(
-    xy: NDArray, response: NDArray, shape: tuple[int, ...], count: int, cells: int
+    xy: NDArray[Any], response: NDArray[Any], shape: tuple[int, ...], count: int, cells: int
 ) -> NDArray[np.int64]:
-    """Indices of `count` points: round after round the strongest left in every cell of the image."""
+    """Indices of `count` points: round after round the strongest left in every cell of the
+    image.
+    """
     if len(xy) <= count:
         return np.arange(len(xy))
     column, row = (xy / (shape[1], shape[0]) * cells).astype(int).clip(0, cells - 1).T

@@ -1,7 +1,7 @@
 """SURF and upright SURF of our own (Bay, Ess, Tuytelaars and Van Gool 2008)."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,9 @@ class Surf:
     longest: int = 1000
     """Longest side in px of the image searched; smaller photos are searched as they are."""
     lobe: int = 3
-    """Initial lobe in px, odd: the first filter's side is three times it. 3 is Bay's, 1 finds smaller blobs."""
+    """Initial lobe in px, odd: the first filter's side is three times it. 3 is Bay's, 1 finds
+    smaller blobs.
+    """
     step: int = 1
     """Sampling step of the first octave in px; it doubles from octave to octave."""
     octaves: int = 4
@@ -33,11 +35,14 @@ class Surf:
     threshold: float = 50.0
     """Least determinant of a blob, grey levels (of 255) squared."""
     upright: bool = False
-    """No orientation: faster and more distinctive where photos are hardly turned against each other."""
+    """No orientation: faster and more distinctive where photos are hardly turned against each
+    other.
+    """
     length: Literal[64, 128] = 64
     """Of the descriptor; 128 keeps the sums apart by the sign of the other direction."""
     cells: int = 10
-    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare."""
+    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare.
+    """
     version: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
@@ -46,14 +51,18 @@ class Surf:
         if self.length not in (64, 128):
             raise ValueError(f"a length of 64 or 128 expected, got {self.length}")
 
-    def __call__(self, image: NDArray) -> Features:
+    def __call__(self, image: NDArray[Any]) -> Features:
         """Features of pixels (H, W[, C]) of a full sensor image."""
         return self.of_shrunken(shrink(image, self.longest)[0], image.shape[:2])
 
-    def of_shrunken(self, small: NDArray, full: tuple[int, int]) -> Features:
-        """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer to."""
+    def of_shrunken(self, small: NDArray[Any], full: tuple[int, int]) -> Features:
+        """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer
+        to.
+        """
         grey = to_grey8(small)
-        found = blobs(grey, octaves=self.octaves, lobe=self.lobe, step=self.step, threshold=self.threshold)
+        found = blobs(
+            grey, octaves=self.octaves, lobe=self.lobe, step=self.step, threshold=self.threshold
+        )
         keep = spread(found.xy, found.response, grey.shape, self.count, self.cells)
         xy, sigma = found.xy[keep], found.sigma[keep]
         means = Means(grey)
@@ -61,9 +70,11 @@ class Surf:
         vectors = descriptors(means, xy, sigma, angle, extended=self.length == 128)
         scale = full[1] / grey.shape[1]
         return Features(
-            px=full_px(xy, grey.shape, full), size=(20 * sigma * scale).astype(np.float32), scale=scale,
+            px=full_px(xy, grey.shape, full),
+            size=(20 * sigma * scale).astype(np.float32),
+            scale=scale,
             descriptors=signed_bytes(vectors),
-        )  # fmt: skip
+        )
 
 
 def signed_bytes(vectors: NDArray[np.float32]) -> NDArray[np.int8]:

@@ -1,7 +1,7 @@
 """Projection with Brown's distortion, its inverse and its derivatives.
 
-One convention inside the project: OpenCV's, from undistorted to distorted coordinates. The thesis prints the
-other direction (Y 2.1); conversions live at the edges (`geometry.camera_formats`).
+One convention inside the project: OpenCV's, from undistorted to distorted coordinates. The thesis
+prints the other direction (Y 2.1); conversions live at the edges (`geometry.camera_formats`).
 """
 
 from functools import lru_cache
@@ -23,7 +23,9 @@ class Projection(NamedTuple):
     d_point: Array
     """(N, 2, 3): by the point in camera coordinates."""
     d_intrinsics: Array
-    """(N, 2, 8): by the intrinsics in the order of `model.camera.PARAMETERS`; (N, 2, 0) where they are fixed."""
+    """(N, 2, 8): by the intrinsics in the order of `model.camera.PARAMETERS`; (N, 2, 0) where they
+    are fixed.
+    """
 
 
 def distort(xy: Array, k: Array) -> Array:
@@ -55,7 +57,8 @@ def project(camera: Camera, xyz_cam: Array) -> Array:
 
 
 def project_with_derivatives(k: Array, xyz_cam: Array, *, intrinsics: bool = True) -> Projection:
-    """Pixels and derivatives; `k` (N, 8) holds each point's intrinsics, `xyz_cam` is (N, 3) with z > 0.
+    """Pixels and derivatives; `k` (N, 8) holds each point's intrinsics, `xyz_cam` is (N, 3) with z
+    > 0.
 
     `intrinsics`: False = they are fixed, and `d_intrinsics` is (N, 2, 0).
     """

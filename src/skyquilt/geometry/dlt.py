@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 Doubles = NDArray[np.float64]
 
 _SINGULAR = 1e-7
-"""Of normalised coordinates: determinants and gaps of singular values below this mean that points determine nothing."""
+"""Of normalised coordinates: determinants and gaps of singular values below this mean that points
+determine nothing.
+"""
 
 
 def normalisation(points: Doubles, weights: Doubles) -> Doubles:
-    """(M, 3, 3) that move points (M, N, 2) to their weighted centre and to a mean square distance of 2.
+    """(M, 3, 3) that move points (M, N, 2) to their weighted centre and to a mean square distance
+    of 2.
 
     NaN where all points coincide.
     """
@@ -30,7 +33,9 @@ def normalisation(points: Doubles, weights: Doubles) -> Doubles:
 
 
 def homographies(a: Doubles, b: Doubles, weights: Doubles) -> Doubles:
-    """b_H_a (M, 3, 3), last element 1, of points (M, N >= 4, 2) and weights (M, N); NaN where undetermined."""
+    """b_H_a (M, 3, 3), last element 1, of points (M, N >= 4, 2) and weights (M, N); NaN where
+    undetermined.
+    """
     Ta, Tb = normalisation(a, weights), normalisation(b, weights)
     na, nb = (p * T[:, :1, :1] + T[:, None, :2, 2] for p, T in ((a, Ta), (b, Tb)))
     with np.errstate(all="ignore"):
@@ -48,17 +53,27 @@ def homographies(a: Doubles, b: Doubles, weights: Doubles) -> Doubles:
 
 
 def _of_four(a: Doubles, b: Doubles) -> Doubles:
-    """Exactly, over the projective basis that four points are; many times cheaper than the SVD it equals."""
+    """Exactly, over the projective basis that four points are; many times cheaper than the SVD it
+    equals.
+    """
     basis_a, basis_b = _basis(a), _basis(b)
     cross = [np.cross(basis_a[:, :, i], basis_a[:, :, j]) for i, j in ((1, 2), (2, 0), (0, 1))]
     return np.asarray(basis_b @ np.stack(cross, 1))  # up to a factor the inverse of basis_a
 
 
 def _basis(p: Doubles) -> Doubles:
-    """(M, 3, 3) that takes the unit vectors and their sum to four points (M, 4, 2); NaN if three are on a line."""
+    """(M, 3, 3) that takes the unit vectors and their sum to four points (M, 4, 2); NaN if three
+    are on a line.
+    """
     x = np.concatenate([p, np.ones((*p.shape[:2], 1))], -1)
-    coordinates = np.stack([_det(x[:, 3], x[:, 1], x[:, 2]), _det(x[:, 0], x[:, 3], x[:, 2]),
-                            _det(x[:, 0], x[:, 1], x[:, 3])], -1)  # fmt: skip
+    coordinates = np.stack(
+        [
+            _det(x[:, 3], x[:, 1], x[:, 2]),
+            _det(x[:, 0], x[:, 3], x[:, 2]),
+            _det(x[:, 0], x[:, 1], x[:, 3]),
+        ],
+        -1,
+    )
     whole = _det(x[:, 0], x[:, 1], x[:, 2])
     bad = (np.abs(coordinates).min(-1) < _SINGULAR) | (np.abs(whole) < _SINGULAR)
     basis = np.swapaxes(x[:, :3], 1, 2) * coordinates[:, None, :]
@@ -75,11 +90,17 @@ def _of_more(a: Doubles, b: Doubles, weights: Doubles) -> Doubles:
     x = np.concatenate([a, np.ones((*a.shape[:2], 1))], -1)
     zero = np.zeros_like(x)
     rows = np.concatenate(
-        [np.concatenate([x, zero, -b[..., :1] * x], -1), np.concatenate([zero, x, -b[..., 1:] * x], -1)], 1
+        [
+            np.concatenate([x, zero, -b[..., :1] * x], -1),
+            np.concatenate([zero, x, -b[..., 1:] * x], -1),
+        ],
+        1,
     )
     rows = rows * np.sqrt(np.concatenate([weights, weights], 1))[..., None]
     usable = np.isfinite(rows).all((1, 2))  # LAPACK raises where a number is not finite
-    _, values, vectors = np.linalg.svd(np.where(usable[:, None, None], rows, 0.0), full_matrices=False)
+    _, values, vectors = np.linalg.svd(
+        np.where(usable[:, None, None], rows, 0.0), full_matrices=False
+    )
     H = vectors[:, 8].reshape(-1, 3, 3).copy()
     H[~usable | (values[:, 7] <= _SINGULAR * values[:, 0])] = np.nan
     return H

@@ -1,8 +1,9 @@
 """Frames and angles.
 
-*map*: x east, y north, z up, in m: the output CRS less an origin. *camera*: x right, y down, z forward.
-*ned*: north, east, down. *body*: x nose, y right, z down; the belly camera's image top points along the nose.
-`a_R_b` takes coordinates in b to coordinates in a, so chains cancel visually.
+*map*: x east, y north, z up, in m: the output CRS less an origin. *camera*: x right, y down, z
+forward. *ned*: north, east, down. *body*: x nose, y right, z down; the belly camera's image top
+points along the nose. `a_R_b` takes coordinates in b to coordinates in a, so chains cancel
+visually.
 """
 
 import numpy as np
@@ -36,26 +37,34 @@ def _zyx_angles(R: Matrix) -> tuple[float, float, float]:
 def cam_R_map_from_angles(yaw_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Matrix:
     """Rotation (3, 3) from map to camera for belly angles in degrees (see `model.photo.Attitude`).
 
-    The yaw counts from the map's north (+y): subtract the meridian convergence from a true-north yaw first.
+    The yaw counts from the map's north (+y): subtract the meridian convergence from a true-north
+    yaw first.
     """
     ned_R_body = _euler_zyx(yaw_deg, pitch_deg, roll_deg)
     return np.asarray(CAM_R_BODY @ ned_R_body.T @ MAP_R_NED.T)
 
 
 def angles_from_cam_R_map(cam_R_map: Matrix) -> tuple[float, float, float]:
-    """Belly angles (yaw, pitch, roll) in degrees of a map-to-camera rotation; inverse of the above."""
+    """Belly angles (yaw, pitch, roll) in degrees of a map-to-camera rotation; inverse of the
+    above.
+    """
     ned_R_body = MAP_R_NED.T @ cam_R_map.T @ CAM_R_BODY
     return _zyx_angles(ned_R_body)
 
 
-def belly_from_gimbal(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
+def belly_from_gimbal(
+    yaw_deg: float, pitch_deg: float, roll_deg: float
+) -> tuple[float, float, float]:
     """Belly angles in degrees from gimbal angles of a camera that looks along the body's nose.
 
-    Gimbals (DJI's `GimbalYaw/Pitch/RollDegree`, Rz Ry Rx in NED) report pitch -90 at nadir and roll about the
-    optical axis; the belly camera looks down instead, so the two bodies differ by a quarter turn about y.
+    Gimbals (DJI's `GimbalYaw/Pitch/RollDegree`, Rz Ry Rx in NED) report pitch -90 at nadir and roll
+    about the optical axis; the belly camera looks down instead, so the two bodies differ by a
+    quarter turn about y.
     """
     gimbal = _euler_zyx(yaw_deg, pitch_deg, roll_deg)
-    quarter = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # belly axes in gimbal axes
+    quarter = np.array(
+        [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
+    )  # belly axes in gimbal axes
     return _zyx_angles(gimbal @ quarter)
 
 

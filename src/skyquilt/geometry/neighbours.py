@@ -1,4 +1,8 @@
-"""Nearest points in the plane, exactly, by OpenCV: for few photos SciPy's tree takes longer to load than to ask."""
+"""Nearest points in the plane, exactly, by OpenCV: for few photos SciPy's tree takes longer to load
+than to ask.
+"""
+
+from typing import Any
 
 import cv2
 import numpy as np
@@ -9,21 +13,30 @@ _SINGLE_TREE = 4
 _TO_THE_END = -1
 
 
-def nearest(points: NDArray, at: NDArray, k: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The k points (n, 2) next to each place `at` (m, 2): distances (m, k), ascending, and indices (m, k).
+def nearest(
+    points: NDArray[Any], at: NDArray[Any], k: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The k points (n, 2) next to each place `at` (m, 2): distances (m, k), ascending, and indices
+    (m, k).
 
     Neighbours are told apart in single precision about the points' middle; k may not exceed n.
     """
     if not 0 < k <= len(points):
-        raise ValueError(f"1 to {len(points)} neighbours of {len(points)} points can be asked for, not {k}")
+        raise ValueError(
+            f"1 to {len(points)} neighbours of {len(points)} points can be asked for, not {k}"
+        )
     points, at = np.asarray(points, np.float64), np.asarray(at, np.float64)
     middle = points.mean(0)
-    tree = cv2.flann.Index(_single(points - middle), {"algorithm": _SINGLE_TREE, "leaf_max_size": 10})
+    tree = cv2.flann.Index(
+        _single(points - middle), {"algorithm": _SINGLE_TREE, "leaf_max_size": 10}
+    )
     index, _ = tree.knnSearch(_single(at - middle), k, params={"checks": _TO_THE_END})
     distance = np.linalg.norm(points[index] - at[:, None], axis=2)
     order = np.argsort(distance, axis=1, kind="stable")
-    return np.take_along_axis(distance, order, 1), np.take_along_axis(index, order, 1).astype(np.int64)
+    return np.take_along_axis(distance, order, 1), np.take_along_axis(index, order, 1).astype(
+        np.int64
+    )
 
 
-def _single(xy: NDArray) -> NDArray[np.float32]:
+def _single(xy: NDArray[Any]) -> NDArray[np.float32]:
     return np.ascontiguousarray(xy, np.float32)

@@ -1,4 +1,6 @@
-"""The least symmetric transfer error: a transformation refined over all of its matches [A (7), (12)]."""
+"""The least symmetric transfer error: a transformation refined over all of its matches [A (7),
+(12)].
+"""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,11 +31,12 @@ _DIRECTIONS = {
 
 
 def refine(model: str, H: Doubles, a: ArrayLike, b: ArrayLike, *, steps: int = 20) -> Doubles:
-    """b_H_a (3, 3) of `model` with a locally least sum of symmetric transfer errors over points a, b (N, 2).
+    """b_H_a (3, 3) of `model` with a locally least sum of symmetric transfer errors over points a,
+    b (N, 2).
 
-    Levenberg and Marquardt with analytic derivatives, at most `steps` steps, from H, which must be of the model; it is
-    never left for a worse one. The points are moved and scaled, both images by one factor, so that errors keep their
-    ratio.
+    Levenberg and Marquardt with analytic derivatives, at most `steps` steps, from H, which must be
+    of the model; it is never left for a worse one. The points are moved and scaled, both images by
+    one factor, so that errors keep their ratio.
     """
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     both = normalisation(np.stack([a, b]), np.ones((2, len(a))))
@@ -48,7 +51,9 @@ def refine(model: str, H: Doubles, a: ArrayLike, b: ArrayLike, *, steps: int = 2
     found = _descend(_DIRECTIONS[model], start / start[2, 2], na, nb, steps)
     refined = inverse(Tb) @ found @ Ta
     refined = refined / refined[2, 2]
-    better = symmetric_transfer_errors(refined, a, b).sum() <= symmetric_transfer_errors(H, a, b).sum()
+    better = (
+        symmetric_transfer_errors(refined, a, b).sum() <= symmetric_transfer_errors(H, a, b).sum()
+    )
     return np.asarray(refined) if better else H
 
 

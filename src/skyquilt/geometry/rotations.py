@@ -9,7 +9,9 @@ Array = NDArray[np.float64]
 
 
 def turning(a: Array, b: Array) -> Array:
-    """b_R_a (3, 3) that takes directions a (n, 3) best to b (n, 3): Wahba's problem (Markley 1988)."""
+    """b_R_a (3, 3) that takes directions a (n, 3) best to b (n, 3): Wahba's problem (Markley
+    1988).
+    """
     a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (a, b))
     return nearest_rotation(b.T @ a)
 
@@ -26,7 +28,9 @@ def angle_deg(a: Array, b: Array) -> float:
 
 
 def median_rotation(rotations: Sequence[Array], *, rounds: int = 50) -> Array:
-    """The chordal L1 mean (Hartley et al. 2013) by Weiszfeld's reweighting: up to half of them may be wrong."""
+    """The chordal L1 mean (Hartley et al. 2013) by Weiszfeld's reweighting: up to half of them may
+    be wrong.
+    """
     stack = np.stack(rotations)
     mean = nearest_rotation(np.median(stack, axis=0))
     for _ in range(rounds):

@@ -1,7 +1,8 @@
 """Plane transformations between two images, as matrices b_H_a that take a's pixels to b's.
 
-Four models: translation (2 degrees of freedom), similarity (4), affine (6), homography (8). Everything works on
-one set of points as on many at once, because a random search in Python is fast only when it tries hundreds at a time.
+Four models: translation (2 degrees of freedom), similarity (4), affine (6), homography (8).
+Everything works on one set of points as on many at once, because a random search in Python is fast
+only when it tries hundreds at a time.
 """
 
 from typing import Literal
@@ -25,9 +26,10 @@ _FLAT = 1e-9
 def fit(model: str, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None) -> Doubles | None:
     """The b_H_a (3, 3) that takes points a (N, 2) to b (N, 2) best, N at least MINIMAL[model].
 
-    Least squares of the distances in b; of a homography the algebraic error of the normalised DLT (Hartley and
-    Zisserman, Multiple View Geometry, 4.1, 4.4). `weights` (N,), not negative, multiply the squares; None is all alike.
-    None where the points do not determine the model (too few, coincident, on one line) or are not finite.
+    Least squares of the distances in b; of a homography the algebraic error of the normalised DLT
+    (Hartley and Zisserman, Multiple View Geometry, 4.1, 4.4). `weights` (N,), not negative,
+    multiply the squares; None is all alike. None where the points do not determine the model (too
+    few, coincident, on one line) or are not finite.
     """
     a, b = np.asarray(a, np.float64).reshape(-1, 2), np.asarray(b, np.float64).reshape(-1, 2)
     if weights is None:
@@ -42,11 +44,15 @@ def fit(model: str, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None
 
 
 def fit_many(model: str, a: Doubles, b: Doubles, weights: Doubles | None = None) -> Doubles:
-    """b_H_a (M, 3, 3) of M sets of points, a and b (M, N, 2), weights (M, N) or None; NaN where undetermined."""
+    """b_H_a (M, 3, 3) of M sets of points, a and b (M, N, 2), weights (M, N) or None; NaN where
+    undetermined.
+    """
     if model not in MINIMAL:
         raise ValueError(f"one of {', '.join(MODELS)} expected, got '{model}'")
     if a.shape != b.shape or a.ndim != 3 or a.shape[1] < MINIMAL[model]:
-        raise ValueError(f"two equal (M, at least {MINIMAL[model]}, 2) expected, got {a.shape} and {b.shape}")
+        raise ValueError(
+            f"two equal (M, at least {MINIMAL[model]}, 2) expected, got {a.shape} and {b.shape}"
+        )
     w = np.ones(a.shape[:2]) if weights is None else weights
     if model == "homography":
         return homographies(a, b, w)
@@ -66,7 +72,9 @@ def _identity(a: Doubles, b: Doubles, w: Doubles) -> Doubles:
 
 
 def _similarity(a: Doubles, b: Doubles, w: Doubles) -> Doubles:
-    """(M, 2, 2) rotation times scale about the centres, in closed form: sum conj(a) b / sum |a|^2."""
+    """(M, 2, 2) rotation times scale about the centres, in closed form: sum conj(a) b / sum
+    |a|^2.
+    """
     za, zb = a[..., 0] + 1j * a[..., 1], b[..., 0] + 1j * b[..., 1]
     spread = (w * np.abs(za) ** 2).sum(1)
     with np.errstate(all="ignore"):
@@ -109,7 +117,9 @@ _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
 def inverse(H: Doubles) -> Doubles:
-    """Inverses of (..., 3, 3), in closed form; not finite where there is none. Their last element is not made 1."""
+    """Inverses of (..., 3, 3), in closed form; not finite where there is none. Their last element
+    is not made 1.
+    """
     # the cross products of its rows; NumPy's own function takes five times as long for few matrices
     a, b = H[..., _NEXT, :], H[..., _LAST, :]
     rows = a[..., _NEXT] * b[..., _LAST] - a[..., _LAST] * b[..., _NEXT]

@@ -11,7 +11,8 @@ def translate(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where the content of reference patches lies in moving ones.
 
-    Lucas and Kanade (1981), inverse compositional, gain and offset taken out by normalising both patches.
+    Lucas and Kanade (1981), inverse compositional, gain and offset taken out by normalising both
+    patches.
 
     Args:
         reference: (n, s, s).
@@ -20,8 +21,8 @@ def translate(
         iterations: Gauss-Newton steps.
 
     Returns:
-        Shifts (n, 2) in px, x then y, and the correlation (n,) reached; both NaN where a shift ran out of the
-        margin or a patch is blank.
+        Shifts (n, 2) in px, x then y, and the correlation (n,) reached; both NaN where a shift ran
+        out of the margin or a patch is blank.
     """
     n, s, _ = reference.shape
     if not n:
@@ -59,7 +60,9 @@ def _sampled(moving: Float, shift: NDArray[np.float64], margin: int, s: int) -> 
     y0 = np.clip(margin + whole[:, 1], 0, 2 * margin - 1)
     span = np.arange(s + 1)
     block = moving[
-        np.arange(n)[:, None, None], (y0[:, None] + span)[:, :, None], (x0[:, None] + span)[:, None, :]
+        np.arange(n)[:, None, None],
+        (y0[:, None] + span)[:, :, None],
+        (x0[:, None] + span)[:, None, :],
     ]
     fx, fy = part[:, 0, None, None], part[:, 1, None, None]
     rows = block[:, :, :-1] * (1 - fx) + block[:, :, 1:] * fx

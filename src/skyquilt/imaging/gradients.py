@@ -1,6 +1,7 @@
 """Gradients of patches, and whether there is enough of them to tell one place from another."""
 
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,23 +20,30 @@ Stack = NDArray[np.float32]
 Spectra = NDArray[np.complex64]
 
 
-def gradients(patches: NDArray) -> Spectra:
-    """Complex gradients (n, S, S), gx + i gy per px, of patches (n, S, S), lightly smoothed; rim 0."""
+def gradients(patches: NDArray[Any]) -> Spectra:
+    """Complex gradients (n, S, S), gx + i gy per px, of patches (n, S, S), lightly smoothed;
+    rim 0.
+    """
     n, size, _ = patches.shape
     if not n:
         return np.zeros(patches.shape, np.complex64)
     tall = np.ascontiguousarray(patches, np.float32).reshape(n * size, size)
     g = np.zeros((n, size, size), np.complex64)
     inner = (slice(None), slice(RIM, -RIM), slice(RIM, -RIM))
-    g.real[inner] = cv2.sepFilter2D(tall, cv2.CV_32F, _DERIVE, _SMOOTH).reshape(n, size, size)[inner]
-    g.imag[inner] = cv2.sepFilter2D(tall, cv2.CV_32F, _SMOOTH, _DERIVE).reshape(n, size, size)[inner]
+    g.real[inner] = cv2.sepFilter2D(tall, cv2.CV_32F, _DERIVE, _SMOOTH).reshape(n, size, size)[
+        inner
+    ]
+    g.imag[inner] = cv2.sepFilter2D(tall, cv2.CV_32F, _SMOOTH, _DERIVE).reshape(n, size, size)[
+        inner
+    ]
     return g
 
 
-def weakest_gradient(patches: NDArray) -> NDArray[np.float64]:
+def weakest_gradient(patches: NDArray[Any]) -> NDArray[np.float64]:
     """RMS gradient (n,) per px of patches (n, S, S) along the direction in which each varies least.
 
-    A patch that holds one straight edge varies along one direction only and fixes no shift along the other.
+    A patch that holds one straight edge varies along one direction only and fixes no shift along
+    the other.
     """
     g = gradients(patches) * np.sqrt(window(patches.shape[1]))
     xx, yy = (g.real**2).sum((1, 2)), (g.imag**2).sum((1, 2))
@@ -44,7 +52,7 @@ def weakest_gradient(patches: NDArray) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(np.maximum(least, 0) / window(patches.shape[1]).sum()), np.float64)
 
 
-def has_texture(patches: NDArray, *, noise: float = NOISE) -> NDArray[np.bool_]:
+def has_texture(patches: NDArray[Any], *, noise: float = NOISE) -> NDArray[np.bool_]:
     """Whether each of n patches (n, S, S) varies enough in every direction to fix a shift.
 
     `noise` is the standard deviation of a value's noise in the patches' own unit.

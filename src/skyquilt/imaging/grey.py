@@ -1,38 +1,44 @@
 """Pictures for feature detection: small, grey, 8 bit, whatever came from the sensor."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 
-def shrink(image: NDArray, longest: int) -> tuple[NDArray, float]:
-    """The image area-averaged so that its longest side is at most `longest` px, and the scale it lost.
+def shrink(image: NDArray[Any], longest: int) -> tuple[NDArray[Any], float]:
+    """The image area-averaged so that its longest side is at most `longest` px, and the scale it
+    lost.
 
-    The scale is full-size px per px of the result, exact for both axes to within rounding of the size.
+    The scale is full-size px per px of the result, exact for both axes to within rounding of the
+    size.
     """
     width, size = image.shape[1], _fitting(image, longest)
     return (image, 1.0) if size is None else (averaged(image, size), width / size[0])
 
 
-def halved(image: NDArray, longest: int) -> NDArray:
-    """The image, averaged over 2 x 2 px as often as `shrink` to the longest side does; it shrinks to the same."""
+def halved(image: NDArray[Any], longest: int) -> NDArray[Any]:
+    """The image, averaged over 2 x 2 px as often as `shrink` to the longest side does; it shrinks
+    to the same.
+    """
     size = _fitting(image, longest)
     return image if size is None else _halved(image, size)
 
 
-def _fitting(image: NDArray, longest: int) -> tuple[int, int] | None:
+def _fitting(image: NDArray[Any], longest: int) -> tuple[int, int] | None:
     """(width, height) with the longest side as asked for; None where it is no longer."""
     height, width = image.shape[:2]
     scale = max(width, height) / longest
     return (round(width / scale), round(height / scale)) if scale > 1 else None
 
 
-def averaged(image: NDArray, size: tuple[int, int]) -> NDArray:
+def averaged(image: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
     """Area averages: the image (h, w[, bands]) at a smaller size (width, height)."""
     return np.asarray(cv2.resize(_halved(image, size), size, interpolation=cv2.INTER_AREA))
 
 
-def _halved(image: NDArray, size: tuple[int, int]) -> NDArray:
+def _halved(image: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
     # averages of 2 x 2 have a path of their own in OpenCV, ten times as fast as any other ratio
     while image.shape[1] >= 3 * size[0] and image.shape[0] % 2 == 0 and image.shape[1] % 2 == 0:
         half = (image.shape[1] // 2, image.shape[0] // 2)
@@ -40,12 +46,16 @@ def _halved(image: NDArray, size: tuple[int, int]) -> NDArray:
     return image
 
 
-def to_grey8(image: NDArray) -> NDArray[np.uint8]:
+def to_grey8(image: NDArray[Any]) -> NDArray[np.uint8]:
     """Grey, 8 bit (H, W). Radiometric input is stretched between its 1st and 99th percentile, then
     equalised locally, because a scene's few degrees fill a small part of a thermal sensor's range.
     """
     if image.ndim == 3:
-        image = image[..., 0] if image.shape[2] == 1 else cv2.cvtColor(image[..., :3], cv2.COLOR_RGB2GRAY)
+        image = (
+            image[..., 0]
+            if image.shape[2] == 1
+            else cv2.cvtColor(image[..., :3], cv2.COLOR_RGB2GRAY)
+        )
     if image.dtype == np.uint8:
         return image
     values = image.astype(np.float32)
@@ -58,7 +68,9 @@ def to_grey8(image: NDArray) -> NDArray[np.uint8]:
     return np.asarray(cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(grey))
 
 
-def full_px(px: NDArray, shape: tuple[int, int], full: tuple[int, int]) -> NDArray[np.float64]:
-    """Pixels (N, 2) of a shrunken image of `shape` (H, W) in the full image's (H, W), centres at integers."""
+def full_px(px: NDArray[Any], shape: tuple[int, int], full: tuple[int, int]) -> NDArray[np.float64]:
+    """Pixels (N, 2) of a shrunken image of `shape` (H, W) in the full image's (H, W), centres at
+    integers.
+    """
     factor = np.array([full[1] / shape[1], full[0] / shape[0]])
     return np.asarray((np.asarray(px, np.float64) + 0.5) * factor - 0.5)

@@ -1,4 +1,8 @@
-"""Normalised cross-correlation of pictures with gaps: of two that lie on each other, and over all shifts at once."""
+"""Normalised cross-correlation of pictures with gaps: of two that lie on each other, and over all
+shifts at once.
+"""
+
+from typing import Any
 
 import cv2
 import numpy as np
@@ -7,8 +11,10 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-def ncc(a: NDArray, b: NDArray, mask: NDArray[np.bool_] | None = None) -> float:
-    """Zero-mean correlation in [-1, 1] of two pictures (H, W) where `mask` holds; 0 if one is flat or none is left."""
+def ncc(a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float:
+    """Zero-mean correlation in [-1, 1] of two pictures (H, W) where `mask` holds; 0 if one is flat
+    or none is left.
+    """
     x, y = (np.asarray(p, np.float64)[... if mask is None else mask].ravel() for p in (a, b))
     if x.size < 2:
         return 0.0
@@ -18,32 +24,39 @@ def ncc(a: NDArray, b: NDArray, mask: NDArray[np.bool_] | None = None) -> float:
 
 
 def ncc_of_shifts(
-    a: NDArray, b: NDArray, mask_a: NDArray[np.bool_] | None = None, mask_b: NDArray[np.bool_] | None = None,
-    *, overlap: float = 0.2,
-) -> tuple[Floats, tuple[int, int]]:  # fmt: skip
-    """The correlation of a (Ha, Wa) and b (Hb, Wb) at every shift, and the (row, column) of no shift in it.
+    a: NDArray[Any],
+    b: NDArray[Any],
+    mask_a: NDArray[np.bool_] | None = None,
+    mask_b: NDArray[np.bool_] | None = None,
+    *,
+    overlap: float = 0.2,
+) -> tuple[Floats, tuple[int, int]]:
+    """The correlation of a (Ha, Wa) and b (Hb, Wb) at every shift, and the (row, column) of no
+    shift in it.
 
-    At [r + dy, c + dx] b(x + dx, y + dy) lies on a(x, y). -1 where fewer than `overlap` of the smaller picture's pixels
-    meet. By FFT, means and norms over the pixels that meet at each shift (Padfield, IEEE TIP 2012).
+    At [r + dy, c + dx] b(x + dx, y + dy) lies on a(x, y). -1 where fewer than `overlap` of the
+    smaller picture's pixels meet. By FFT, means and norms over the pixels that meet at each shift
+    (Padfield, IEEE TIP 2012).
     """
     import scipy.fft  # few ask for all shifts, and all would wait for it
 
     masks = [np.ones(p.shape, bool) if m is None else m for p, m in ((a, mask_a), (b, mask_b))]
     centred = [
-        np.where(m, p - (p[m].mean() if m.any() else 0.0), 0.0) for p, m in zip((a, b), masks, strict=True)
+        np.where(m, p - (p[m].mean() if m.any() else 0.0), 0.0)
+        for p, m in zip((a, b), masks, strict=True)
     ]
     shape = tuple(
         scipy.fft.next_fast_len(p + q - 1, real=True) for p, q in zip(a.shape, b.shape, strict=True)
     )
 
-    def spectrum(x: NDArray) -> NDArray:
+    def spectrum(x: NDArray[Any]) -> NDArray[Any]:
         return np.asarray(scipy.fft.rfft2(x, shape))
 
     ma, mb = (spectrum(m.astype(np.float64)) for m in masks)
     fa, fb = (spectrum(p) for p in centred)
     pa, pb = (spectrum(p * p) for p in centred)
 
-    def correlated(x: NDArray, y: NDArray) -> Floats:
+    def correlated(x: NDArray[Any], y: NDArray[Any]) -> Floats:
         field = scipy.fft.irfft2(np.conj(x) * y, shape)
         rows = np.arange(-(a.shape[0] - 1), b.shape[0])
         columns = np.arange(-(a.shape[1] - 1), b.shape[1])
@@ -65,8 +78,8 @@ def ncc_of_shifts(
 
 
 def summit(field: Floats, *, apart: int = 4) -> tuple[float, float, float, float]:
-    """(row, column, value, second) of the highest value, the place to parts of a pixel by parabolas; `second` is the
-    highest value at least `apart` px from it.
+    """(row, column, value, second) of the highest value, the place to parts of a pixel by
+    parabolas; `second` is the highest value at least `apart` px from it.
     """
     row, column = np.unravel_index(int(field.argmax()), field.shape)
     value = float(field[row, column])
@@ -75,12 +88,14 @@ def summit(field: Floats, *, apart: int = 4) -> tuple[float, float, float, float
     off = []
     for line, k in ((field[:, column], row), (field[row], column)):
         bend = 2 * line[k] - line[k - 1] - line[k + 1] if 0 < k < len(line) - 1 else 0.0
-        off.append(float(np.clip((line[k + 1] - line[k - 1]) / 2 / bend, -0.5, 0.5)) if bend > 0 else 0.0)
+        off.append(
+            float(np.clip((line[k + 1] - line[k - 1]) / 2 / bend, -0.5, 0.5)) if bend > 0 else 0.0
+        )
     return float(row) + off[0], float(column) + off[1], value, float(rest.max())
 
 
 def warped(
-    b: NDArray, b_H_a: Floats, shape: tuple[int, ...]
+    b: NDArray[Any], b_H_a: Floats, shape: tuple[int, ...]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """b (H, W) seen in a's pixels (`shape`), and where it reaches."""
     size = (shape[1], shape[0])

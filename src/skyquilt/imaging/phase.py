@@ -1,15 +1,20 @@
 """Shifts, rotations and scales from phases: Kuglin and Hines (1975), Reddy and Chatterji (1996)."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 _LOWEST = 0.03
-"""Share of the spectrum's radius, next to its middle, that says nothing about rotation: shading and window."""
+"""Share of the spectrum's radius, next to its middle, that says nothing about rotation: shading and
+window.
+"""
 
 
-def phase_shift(a: NDArray, b: NDArray) -> tuple[float, float, float]:
-    """(dx, dy, response): b(x + dx, y + dy) shows what a(x, y) shows; response 0 to 1, the peak's share of the energy.
+def phase_shift(a: NDArray[Any], b: NDArray[Any]) -> tuple[float, float, float]:
+    """(dx, dy, response): b(x + dx, y + dy) shows what a(x, y) shows; response 0 to 1, the peak's
+    share of the energy.
 
     Both (H, W), equal shapes; shifts up to half of the size.
     """
@@ -20,11 +25,11 @@ def phase_shift(a: NDArray, b: NDArray) -> tuple[float, float, float]:
     return float(dx), float(dy), float(response)
 
 
-def rotation_and_scale(a: NDArray, b: NDArray) -> tuple[float, float, float]:
+def rotation_and_scale(a: NDArray[Any], b: NDArray[Any]) -> tuple[float, float, float]:
     """(degrees, scale, response) of b against a from the log-polar amplitudes of both spectra.
 
-    b's content is a's turned by `degrees` from x towards y and magnified by `scale`; a turn by 180 degrees more fits
-    as well.
+    b's content is a's turned by `degrees` from x towards y and magnified by `scale`; a turn by 180
+    degrees more fits as well.
     """
     size = 256
     radius = min(a.shape) / 2
@@ -48,8 +53,10 @@ def _window(shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 
 def _highpass(size: int) -> NDArray[np.float32]:
-    """Rises from the middle of a spectrum (Reddy and Chatterji, (12)); nothing below _LOWEST and beyond the circle."""
+    """Rises from the middle of a spectrum (Reddy and Chatterji, (12)); nothing below _LOWEST and
+    beyond the circle.
+    """
     f = (np.arange(size) - size / 2) / size
     x = np.cos(np.pi * f)[:, None] * np.cos(np.pi * f)
     far = np.hypot(f[:, None], f)
-    return ((1 - x) * (2 - x) * ((far > _LOWEST / 2) & (far < 0.5))).astype(np.float32)
+    return np.asarray(((1 - x) * (2 - x) * ((far > _LOWEST / 2) & (far < 0.5))).astype(np.float32))

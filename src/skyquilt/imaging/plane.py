@@ -1,6 +1,7 @@
 """Photos warped onto a plane, and the overview that they build up, centre first."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +15,9 @@ from skyquilt.model.surface import Surface
 NODES = 4
 """Pixels between the points at which a view is projected exactly."""
 CENTRE = 0.5
-"""Side of the central region of a photo that is laid over what is there, over that of the photo (Y 6.1.3)."""
+"""Side of the central region of a photo that is laid over what is there, over that of the photo (Y
+6.1.3).
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,16 +37,21 @@ class Patch:
 
 
 def to_grid(
-    picture: NDArray[np.uint8], camera: Camera, cam_H_grid: NDArray, *, margin: int = 0
+    picture: NDArray[np.uint8], camera: Camera, cam_H_grid: NDArray[Any], *, margin: int = 0
 ) -> Patch | None:
-    """A grey picture (h, w) of a photo of any size on a grid, or None if it sees the horizon or nothing.
+    """A grey picture (h, w) of a photo of any size on a grid, or None if it sees the horizon or
+    nothing.
 
-    `cam_H_grid` (3, 3) takes (column, row, 1) of the grid to the undistorted image plane (units of the focal length).
+    `cam_H_grid` (3, 3) takes (column, row, 1) of the grid to the undistorted image plane (units of
+    the focal length).
     """
     rim = _rim(camera, np.linalg.inv(cam_H_grid))
     if rim is None:
         return None
-    (c0, r0), (c1, r1) = np.floor(rim.min(0)).astype(int) - margin, np.ceil(rim.max(0)).astype(int) + margin
+    (c0, r0), (c1, r1) = (
+        np.floor(rim.min(0)).astype(int) - margin,
+        np.ceil(rim.max(0)).astype(int) + margin,
+    )
     if not 0 < (c1 - c0) * (r1 - r0) < 1e8:
         return None
     c, r = np.meshgrid(np.arange(c0, c1 + 1.0), np.arange(r0, r1 + 1.0))
@@ -56,8 +64,11 @@ def to_grid(
     return _seen(picture, camera, u, v, real, column=int(c0), row=int(r0))
 
 
-def view_patch(picture: NDArray[np.uint8], view: View, surface: Surface, gsd: float) -> Patch | None:
-    """A grey picture (h, w) of a placed photo, of any size, orthorectified; column = east / gsd, row = -north / gsd.
+def view_patch(
+    picture: NDArray[np.uint8], view: View, surface: Surface, gsd: float
+) -> Patch | None:
+    """A grey picture (h, w) of a placed photo, of any size, orthorectified; column = east / gsd,
+    row = -north / gsd.
 
     Projected exactly at every `NODES`-th pixel and interpolated between.
     """
@@ -80,22 +91,39 @@ def view_patch(picture: NDArray[np.uint8], view: View, surface: Surface, gsd: fl
 
 
 def _seen(
-    picture: NDArray[np.uint8], camera: Camera, u: NDArray, v: NDArray, real: NDArray[np.bool_], *, column: int,
+    picture: NDArray[np.uint8],
+    camera: Camera,
+    u: NDArray[Any],
+    v: NDArray[Any],
+    real: NDArray[np.bool_],
+    *,
+    column: int,
     row: int,
-) -> Patch:  # fmt: skip
-    """What a grey picture (h, w) of a photo shows at the photo's pixels u, v, where those are real."""
+) -> Patch:
+    """What a grey picture (h, w) of a photo shows at the photo's pixels u, v, where those are
+    real.
+    """
     places, shown, central = [], real, real
-    for px, size, small in ((u, camera.width, picture.shape[1]), (v, camera.height, picture.shape[0])):
+    for px, size, small in (
+        (u, camera.width, picture.shape[1]),
+        (v, camera.height, picture.shape[0]),
+    ):
         places.append(((px + 0.5) * px.dtype.type(small / size) - 0.5).astype(np.float32))
         off = np.abs((px + 0.5) / size - 0.5)
         shown, central = shown & (off < 0.5 - 1.5 / small), central & (off < CENTRE / 2)
-    pixels = cv2.remap(picture, places[0], places[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    pixels = cv2.remap(
+        picture, places[0], places[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     return Patch(
-        column=column, row=row, pixels=pixels.astype(np.float32), shown=shown, central=shown & central
+        column=column,
+        row=row,
+        pixels=pixels.astype(np.float32),
+        shown=shown,
+        central=shown & central,
     )
 
 
-def _rim(camera: Camera, grid_H_cam: NDArray, per_side: int = 8) -> NDArray[np.float64] | None:
+def _rim(camera: Camera, grid_H_cam: NDArray[Any], per_side: int = 8) -> NDArray[np.float64] | None:
     """Outline of the photo on the grid (n, 2)."""
     s = np.linspace(-0.5, 0.5, per_side)
     o = s * 0 + 0.5
@@ -112,7 +140,8 @@ def _rim(camera: Camera, grid_H_cam: NDArray, per_side: int = 8) -> NDArray[np.f
 class Overview:
     """The map so far, grey, on a grid without end: O_i = Merge(O_(i-1), I'_i) (Y 4.1).
 
-    The central region of a photo is laid over what is there, the rest only where nothing is (Y 6.1.3).
+    The central region of a photo is laid over what is there, the rest only where nothing is (Y
+    6.1.3).
     """
 
     def __init__(self) -> None:

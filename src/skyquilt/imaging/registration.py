@@ -1,15 +1,19 @@
 """Sub-pixel translation between patches that show the same ground under different light.
 
-The weighted normalised correlation of two complex gradient images, ga and gb (gx + i gy), for a shift d:
+The weighted normalised correlation of two complex gradient images, ga and gb (gx + i gy), for a
+shift d:
 
-    ncc(d) = Re sum W conj(ga(x)) gb(x + d) / sqrt(sum W |ga(x)|^2 * sum W |gb(x + d)|^2),  W = w(x) w(x + d)
+    ncc(d) = Re sum W conj(ga(x)) gb(x + d) / sqrt(sum W |ga(x)|^2 * sum W |gb(x + d)|^2)
+    W = w(x) w(x + d)
 
-By Cauchy-Schwarz it is 1 at the true shift of equal patches and less elsewhere, so the window pulls nothing
-towards zero; gradients drop the offset, the norm drops the gain; exchanging the patches negates the shift.
-All sums are correlations, found by FFT; the summit is found by Newton's method on their Fourier series.
+By Cauchy-Schwarz it is 1 at the true shift of equal patches and less elsewhere, so the window pulls
+nothing towards zero; gradients drop the offset, the norm drops the gain; exchanging the patches
+negates the shift. All sums are correlations, found by FFT; the summit is found by Newton's method
+on their Fourier series.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,18 +24,26 @@ from skyquilt.imaging.gradients import Spectra, Stack, gradients, window
 RADIUS = 8
 """Largest shift in px looked for along each axis."""
 MIN_PEAK = 0.35
-"""Correlation below which a summit is weak: that of 3000 pairs of unrelated real patches stays below."""
+"""Correlation below which a summit is weak: that of 3000 pairs of unrelated real patches stays
+below.
+"""
 BROAD_PEAK = 0.7
-"""Correlation below which a broad summit is weak: smooth patches have few details, which chance can match."""
+"""Correlation below which a broad summit is weak: smooth patches have few details, which chance can
+match.
+"""
 APART = 4
-"""Px from a summit at which the correlation has fallen below MAX_RATIO of it, or the summit is broad."""
+"""Px from a summit at which the correlation has fallen below MAX_RATIO of it, or the summit is
+broad.
+"""
 MAX_RATIO = 0.8
 """Second summit over the first above which the place is ambiguous."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shift:
-    """How far a second patch's content lies from the first's: b(x + dx, y + dy) shows what a(x, y) shows."""
+    """How far a second patch's content lies from the first's: b(x + dx, y + dy) shows what a(x, y)
+    shows.
+    """
 
     dx: float
     """Px along columns, rightwards."""
@@ -53,12 +65,12 @@ class Shift:
         return self.ok
 
 
-def shift_between(a: NDArray, b: NDArray, *, radius: int = RADIUS) -> Shift:
+def shift_between(a: NDArray[Any], b: NDArray[Any], *, radius: int = RADIUS) -> Shift:
     """The shift between two patches (S, S); see `shifts_between`."""
     return shifts_between(np.asarray(a)[None], np.asarray(b)[None], radius=radius)[0]
 
 
-def shifts_between(a: NDArray, b: NDArray, *, radius: int = RADIUS) -> list[Shift]:
+def shifts_between(a: NDArray[Any], b: NDArray[Any], *, radius: int = RADIUS) -> list[Shift]:
     """The shift of each of n pairs of patches, a and b both (n, S, S), any unit, without gaps.
 
     Shifts reach `radius` px along each axis, S must be at least four times that.
@@ -67,7 +79,8 @@ def shifts_between(a: NDArray, b: NDArray, *, radius: int = RADIUS) -> list[Shif
         raise ValueError(f"two equal stacks (n, S, S) expected, got {a.shape} and {b.shape}")
     if a.shape[1] < 4 * radius:
         raise ValueError(
-            f"patches of at least {4 * radius} px expected for a radius of {radius}, got {a.shape[1]}"
+            f"patches of at least {4 * radius} px expected for a radius of {radius}, got"
+            f" {a.shape[1]}"
         )
     shifts = []
     for k in range(0, len(a), 32):  # a block's arrays stay within the processor's cache
@@ -106,23 +119,28 @@ def _block(ga: Spectra, gb: Spectra, radius: int) -> list[Shift]:
 
 
 def _near(field: Stack, radius: int) -> Stack:
-    """Values (n, 2 radius + 1, 2 radius + 1) at shifts -radius..radius of circular correlations (n, S, S)."""
+    """Values (n, 2 radius + 1, 2 radius + 1) at shifts -radius..radius of circular correlations (n,
+    S, S).
+    """
     index = np.arange(-radius, radius + 1)
     return field[:, index[:, None], index[None, :]]
 
 
 def _energies(ga: Spectra, gb: Spectra, w: Stack, radius: int) -> Stack:
-    """Product of both patches' weighted gradient energies at each shift, (n, 2 radius + 1, 2 radius + 1)."""
+    """Product of both patches' weighted gradient energies at each shift, (n, 2 radius + 1, 2 radius
+    + 1).
+    """
     power = np.empty_like(ga)
     power.real = (ga.real**2 + ga.imag**2) * w
-    # the window is symmetric, so a's energy at d equals that of the turned field: one transform serves both
+    # the window is symmetric, so a's energy at d equals that of the turned field: one transform
+    # serves both
     power.imag = (gb.real**2 + gb.imag**2) * w
     both = ifft2(np.conj(fft2(w[None])) * fft2(power))
     a, b = _near(both.real, radius)[:, ::-1, ::-1], _near(both.imag, radius)
     return np.maximum(a, 0) * np.maximum(b, 0) + np.float32(1e-20)
 
 
-def _slope(values: Stack, row: NDArray, column: NDArray) -> NDArray[np.float64]:
+def _slope(values: Stack, row: NDArray[Any], column: NDArray[Any]) -> NDArray[np.float64]:
     """(n, 2) derivative along rows and columns at one place of each field."""
     k = np.arange(len(values))
     along_rows = values[k, row + 1, column] - values[k, row - 1, column]
@@ -131,10 +149,10 @@ def _slope(values: Stack, row: NDArray, column: NDArray) -> NDArray[np.float64]:
 
 
 def _summit(
-    cross: Spectra, start: NDArray, slope: NDArray[np.float64], *, steps: int = 4
+    cross: Spectra, start: NDArray[Any], slope: NDArray[np.float64], *, steps: int = 4
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Shifts (n, 2: row, column) where log correlation minus its slowly varying norm is highest, and whether
-    each was reached within a pixel of `start`.
+    """Shifts (n, 2: row, column) where log correlation minus its slowly varying norm is highest,
+    and whether each was reached within a pixel of `start`.
     """
     d = start.astype(np.float64)
     good = np.ones(len(d), bool)
@@ -143,7 +161,9 @@ def _summit(
         c = t[:, 0, 0]
         with np.errstate(all="ignore"):
             gradient = np.stack([t[:, 1, 0], t[:, 0, 1]], 1) / c[:, None]
-            hessian = np.stack([t[:, 2, 0], t[:, 1, 1], t[:, 1, 1], t[:, 0, 2]], 1).reshape(-1, 2, 2)
+            hessian = np.stack([t[:, 2, 0], t[:, 1, 1], t[:, 1, 1], t[:, 0, 2]], 1).reshape(
+                -1, 2, 2
+            )
             hessian = hessian / c[:, None, None] - gradient[:, :, None] * gradient[:, None, :]
             determinant = np.linalg.det(hessian)
             good &= (c > 0) & (determinant > 0) & (hessian[:, 0, 0] < 0)
@@ -155,25 +175,30 @@ def _summit(
 
 
 def _taylor(cross: Spectra, d: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives (n, 3, 3) of order (i, j) along rows and columns of the correlation at shifts d (n, 2)."""
+    """Derivatives (n, 3, 3) of order (i, j) along rows and columns of the correlation at shifts d
+    (n, 2).
+    """
     size = cross.shape[1]
     k = 2j * np.pi * np.fft.fftfreq(size)
     order = np.arange(3)
     wave = np.exp(k * d[..., None])[..., None] * k[:, None] ** order
     wave = wave.astype(np.complex64)
-    return np.asarray((wave[:, 0].transpose(0, 2, 1) @ (cross @ wave[:, 1])).real / size**2, np.float64)
+    return np.asarray(
+        (wave[:, 0].transpose(0, 2, 1) @ (cross @ wave[:, 1])).real / size**2, np.float64
+    )
 
 
-def _farther(inner: Stack, start: NDArray) -> Stack:
+def _farther(inner: Stack, start: NDArray[Any]) -> Stack:
     """(n,) the highest correlation APART px or more from the summits at shifts `start` (n, 2)."""
     shift = np.arange(inner.shape[1]) - inner.shape[1] // 2
     rows, columns = np.abs(shift - start[:, :1]), np.abs(shift - start[:, 1:])
     away = np.maximum(rows[:, :, None], columns[:, None, :]) >= APART
-    return np.where(away, inner, -1).max((1, 2)).astype(np.float32)
+    return np.asarray(np.where(away, inner, -1).max((1, 2)).astype(np.float32))
 
 
-def _second(field: Stack, row: NDArray, column: NDArray) -> Stack:
-    """(n,) the highest local maximum but the one at (row, column), which count without the field's margin.
+def _second(field: Stack, row: NDArray[Any], column: NDArray[Any]) -> Stack:
+    """(n,) the highest local maximum but the one at (row, column), which count without the field's
+    margin.
 
     The flank of a broad summit is no second summit: smooth patches with one clear place have such.
     """
@@ -182,4 +207,4 @@ def _second(field: Stack, row: NDArray, column: NDArray) -> Stack:
     for i, j in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2)):
         summit &= inner >= field[:, i : i + inner.shape[1], j : j + inner.shape[2]]
     summit[np.arange(len(field)), row, column] = False
-    return np.where(summit, inner, 0).max((1, 2)).astype(np.float32)
+    return np.asarray(np.where(summit, inner, 0).max((1, 2)).astype(np.float32))

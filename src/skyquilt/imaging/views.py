@@ -1,7 +1,10 @@
-"""What each photo sees of the map: footprints and coarse grids of where a map pixel lies in a photo."""
+"""What each photo sees of the map: footprints and coarse grids of where a map pixel lies in a
+photo.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,10 +17,11 @@ from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 
 STEP = 16
-"""Map pixels between the nodes at which photos are projected; in between, positions are interpolated.
+"""Map pixels between the nodes at which photos are projected; in between, positions are
+interpolated.
 
-Nodes are the centres of STEP x STEP cells, with one ring of cells around a window: then OpenCV's resize, ten
-times as fast as a general warp, interpolates them exactly.
+Nodes are the centres of STEP x STEP cells, with one ring of cells around a window: then OpenCV's
+resize, ten times as fast as a general warp, interpolates them exactly.
 """
 BORDER_PX = 2.0
 """Photo pixels at the border that are not used."""
@@ -39,7 +43,12 @@ class View:
     def overlaps(self, bounds: tuple[float, float, float, float]) -> bool:
         """Whether the footprint's box meets bounds (west, south, east, north)."""
         low, high = self.footprint.min(0), self.footprint.max(0)
-        return bool(low[0] < bounds[2] and high[0] > bounds[0] and low[1] < bounds[3] and high[1] > bounds[1])
+        return bool(
+            low[0] < bounds[2]
+            and high[0] > bounds[0]
+            and low[1] < bounds[3]
+            and high[1] > bounds[1]
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,12 +73,21 @@ class Nodes:
     """Median height of the camera above the window's ground in m."""
 
 
-def footprint(camera: Camera, pose: Pose, surface: Surface, *, per_side: int = 8) -> NDArray[np.float64]:
-    """Outline (4 * per_side, 2) in m of the image's rim on the surface; empty if the rim sees the horizon."""
+def footprint(
+    camera: Camera, pose: Pose, surface: Surface, *, per_side: int = 8
+) -> NDArray[np.float64]:
+    """Outline (4 * per_side, 2) in m of the image's rim on the surface; empty if the rim sees the
+    horizon.
+    """
     s = np.linspace(0, 1, per_side, endpoint=False)
     w, h = camera.width - 1.0, camera.height - 1.0
     rim = np.concatenate(
-        [np.c_[s * w, 0 * s], np.c_[0 * s + w, s * h], np.c_[w - s * w, 0 * s + h], np.c_[0 * s, h - s * h]]
+        [
+            np.c_[s * w, 0 * s],
+            np.c_[0 * s + w, s * h],
+            np.c_[w - s * w, 0 * s + h],
+            np.c_[0 * s, h - s * h],
+        ]
     )
     if pose.cam_H_map is not None:
         return _planar_footprint(rays(camera, rim), pose.cam_H_map)
@@ -79,8 +97,10 @@ def footprint(camera: Camera, pose: Pose, surface: Surface, *, per_side: int = 8
     return _meet(pose, direction, surface)
 
 
-def _planar_footprint(rim: NDArray, cam_H_map: NDArray) -> NDArray[np.float64]:
-    """Rim (n, 3) of the image plane on the map (n, 2) in m; empty if some of it lies beyond the horizon."""
+def _planar_footprint(rim: NDArray[Any], cam_H_map: NDArray[Any]) -> NDArray[np.float64]:
+    """Rim (n, 3) of the image plane on the map (n, 2) in m; empty if some of it lies beyond the
+    horizon.
+    """
     xyw = rim @ np.linalg.inv(cam_H_map).T
     if (xyw[:, 2] * np.sign(np.median(xyw[:, 2])) <= 1e-9).any():
         return np.zeros((0, 2))
@@ -93,25 +113,38 @@ def make_views(alignment: Alignment, surface: Surface) -> list[View]:
     for photo, pose in sorted(alignment.poses.items()):
         outline = footprint(alignment.camera(photo), pose, surface)
         if len(outline):
-            views.append(View(photo=photo, camera=alignment.camera(photo), pose=pose, footprint=outline))
+            views.append(
+                View(photo=photo, camera=alignment.camera(photo), pose=pose, footprint=outline)
+            )
     return views
 
 
-def project_nodes(view: View, x: NDArray, y: NDArray, z: NDArray) -> Nodes:
-    """Nodes at map coordinates (r, c), or at k heights z (k, r, c) over them: photo pixels and scores."""
+def project_nodes(view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> Nodes:
+    """Nodes at map coordinates (r, c), or at k heights z (k, r, c) over them: photo pixels and
+    scores.
+    """
     camera, C = view.camera, view.pose.map_C
     planes = view.pose.planes_to_camera(x, y, z)
     u, v, real = _photo_pixels(planes, camera.vector, monotone_radius(camera))
     real = np.broadcast_to(real, np.broadcast_shapes(x.shape, z.shape))
     drop = z - C[2]
     return Nodes(
-        view=view, u=u, v=v, seen=inside(camera, u, v), real=real, score=_scores(x - C[0], y - C[1], drop),
+        view=view,
+        u=u,
+        v=v,
+        seen=inside(camera, u, v),
+        real=real,
+        score=_scores(x - C[0], y - C[1], drop),
         height=float(np.median(-drop)),
-    )  # fmt: skip
+    )
 
 
-def project_all(views: Sequence[View], x: NDArray, y: NDArray, z: NDArray) -> list[Nodes]:
-    """`project_nodes` of many views at the same nodes (r, c): where those are few, several times as fast."""
+def project_all(
+    views: Sequence[View], x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]
+) -> list[Nodes]:
+    """`project_nodes` of many views at the same nodes (r, c): where those are few, several times as
+    fast.
+    """
     if len(views) < 2 or any(v.pose.cam_H_map is not None for v in views):
         return [project_nodes(v, x, y, z) for v in views]
     R = np.array([v.pose.cam_R_map for v in views]).transpose(1, 2, 0)[..., None, None]
@@ -125,19 +158,26 @@ def project_all(views: Sequence[View], x: NDArray, y: NDArray, z: NDArray) -> li
     seen, score = _within(u, v, width, height), _scores(dx, dy, dz)
     above = np.median(-dz.reshape(len(views), -1), axis=1).tolist()
     return [
-        Nodes(view=view, u=u[n], v=v[n], score=score[n], seen=seen[n], real=real[n], height=above[n])
+        Nodes(
+            view=view, u=u[n], v=v[n], score=score[n], seen=seen[n], real=real[n], height=above[n]
+        )
         for n, view in enumerate(views)
     ]
 
 
 def _photo_pixels(
-    planes: tuple[NDArray, NDArray, NDArray], k: NDArray, limit: NDArray | float
+    planes: tuple[NDArray[Any], NDArray[Any], NDArray[Any]],
+    k: NDArray[Any],
+    limit: NDArray[Any] | float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Columns, rows of places in camera coordinates, and which are real; `k` (..., 8), `limit`: the lens's radius."""
+    """Columns, rows of places in camera coordinates, and which are real; `k` (..., 8), `limit`: the
+    lens's radius.
+    """
     across, down, depth = planes
     ahead = np.maximum(depth, 1e-3)
     px, py = across / ahead, down / ahead
-    # behind the camera, or where the distortion polynomial folds back, a point is nowhere in the photo
+    # behind the camera, or where the distortion polynomial folds back, a point is nowhere in the
+    # photo
     real = (depth > 0.1) & (px * px + py * py < limit**2)
     u, v = (
         np.where(real, k[..., 0] * p + k[..., i], -1e4).astype(np.float32)
@@ -146,26 +186,30 @@ def _photo_pixels(
     return u, v, real
 
 
-def _scores(dx: NDArray, dy: NDArray, dz: NDArray) -> NDArray[np.float32]:
+def _scores(dx: NDArray[Any], dy: NDArray[Any], dz: NDArray[Any]) -> NDArray[np.float32]:
     """Squared tangents of the angle off the vertical of places that far from a camera in m."""
-    return ((dx**2 + dy**2) / np.maximum(dz**2, 1e-6)).astype(np.float32)
+    return np.asarray(((dx**2 + dy**2) / np.maximum(dz**2, 1e-6)).astype(np.float32))
 
 
-def inside(camera: Camera, u: NDArray, v: NDArray) -> NDArray[np.bool_]:
+def inside(camera: Camera, u: NDArray[Any], v: NDArray[Any]) -> NDArray[np.bool_]:
     """Whether photo pixels lie in the photo, its border excluded."""
     return _within(u, v, camera.width, camera.height)
 
 
-def _within(u: NDArray, v: NDArray, width: NDArray | int, height: NDArray | int) -> NDArray[np.bool_]:
+def _within(
+    u: NDArray[Any], v: NDArray[Any], width: NDArray[Any] | int, height: NDArray[Any] | int
+) -> NDArray[np.bool_]:
     edge = BORDER_PX
     return np.asarray((u > edge) & (v > edge) & (u < width - 1 - edge) & (v < height - 1 - edge))
 
 
-def inside_everywhere(nodes: Nodes, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[np.bool_]:
+def inside_everywhere(
+    nodes: Nodes, u: NDArray[np.float32], v: NDArray[np.float32]
+) -> NDArray[np.bool_]:
     """Whether each pixel lies in the photo, from dense photo pixels u, v (h, w) of these nodes.
 
-    Next to a node without a real projection the interpolated u and v sweep over the whole photo: those do not
-    count.
+    Next to a node without a real projection the interpolated u and v sweep over the whole photo:
+    those do not count.
     """
     within = inside(nodes.view.camera, u, v)
     if nodes.real.all():
@@ -173,7 +217,9 @@ def inside_everywhere(nodes: Nodes, u: NDArray[np.float32], v: NDArray[np.float3
     return within & (densify(nodes.real.astype(np.float32), *u.shape) > 0.999)
 
 
-def node_places(grid: Grid, surface: Surface, window: Window) -> tuple[NDArray, NDArray, NDArray]:
+def node_places(
+    grid: Grid, surface: Surface, window: Window
+) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """x, y, z in m, each (r + 2, c + 2), of the nodes of a window of r x c cells."""
     columns = window.column + STEP * (np.arange(-1, -(-window.width // STEP) + 1) + 0.5) - 0.5
     rows = window.row + STEP * (np.arange(-1, -(-window.height // STEP) + 1) + 0.5) - 0.5
@@ -181,14 +227,18 @@ def node_places(grid: Grid, surface: Surface, window: Window) -> tuple[NDArray, 
     return x, y, surface.at(x, y)
 
 
-def overlapping(views: Sequence[View], x: NDArray, y: NDArray) -> list[View]:
+def overlapping(views: Sequence[View], x: NDArray[Any], y: NDArray[Any]) -> list[View]:
     """The views whose footprint's box meets that of nodes at x, y (r, c) in m, rows southwards."""
     bounds = (float(x[0, 0]), float(y[-1, 0]), float(x[0, -1]), float(y[0, 0]))
     return [view for view in views if view.overlaps(bounds)]
 
 
-def least_scores(views: Sequence[View], x: NDArray, y: NDArray, z: NDArray) -> NDArray[np.float32]:
-    """(views,) no node at x, y, z (r, c) in m, rows southwards, has a smaller score in that view."""
+def least_scores(
+    views: Sequence[View], x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]
+) -> NDArray[np.float32]:
+    """(views,) no node at x, y, z (r, c) in m, rows southwards, has a smaller score in that
+    view.
+    """
     east, north, up = np.array([v.pose.map_C for v in views]).reshape(-1, 3).T
     aside = np.maximum(np.maximum(x[0, 0] - east, east - x[0, -1]), 0.0)
     along = np.maximum(np.maximum(y[-1, 0] - north, north - y[0, 0]), 0.0)
@@ -201,10 +251,14 @@ def cut(nodes: Nodes, row: int, column: int, height: int, width: int) -> Nodes:
     rows = slice(row // STEP, row // STEP - (-height // STEP) + 2)
     columns = slice(column // STEP, column // STEP - (-width // STEP) + 2)
     return Nodes(
-        view=nodes.view, u=nodes.u[rows, columns], v=nodes.v[rows, columns],
-        score=nodes.score[rows, columns], seen=nodes.seen[rows, columns], real=nodes.real[rows, columns],
+        view=nodes.view,
+        u=nodes.u[rows, columns],
+        v=nodes.v[rows, columns],
+        score=nodes.score[rows, columns],
+        seen=nodes.seen[rows, columns],
+        real=nodes.real[rows, columns],
         height=nodes.height,
-    )  # fmt: skip
+    )
 
 
 def densify(values: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
@@ -214,7 +268,7 @@ def densify(values: NDArray[np.float32], height: int, width: int) -> NDArray[np.
     return np.asarray(whole[STEP : STEP + height, STEP : STEP + width])
 
 
-def on_ground(view: View, px: NDArray, surface: Surface) -> NDArray[np.float64]:
+def on_ground(view: View, px: NDArray[Any], surface: Surface) -> NDArray[np.float64]:
     """Where pixels (n, 2) of a placed photo lie on the surface: (n, 3) in m (map frame)."""
     ray, pose = rays(view.camera, np.asarray(px, np.float64).reshape(-1, 2)), view.pose
     if pose.cam_H_map is not None:
@@ -225,7 +279,7 @@ def on_ground(view: View, px: NDArray, surface: Surface) -> NDArray[np.float64]:
     return np.column_stack([xy, surface.at(xy[:, 0], xy[:, 1])])
 
 
-def _meet(pose: Pose, direction: NDArray, surface: Surface) -> NDArray[np.float64]:
+def _meet(pose: Pose, direction: NDArray[Any], surface: Surface) -> NDArray[np.float64]:
     """Where rays from a pose, directions (n, 3) in the map frame, meet the surface: (n, 2) in m."""
     xy = np.repeat(pose.map_C[None, :2], len(direction), 0)
     for _ in range(6):

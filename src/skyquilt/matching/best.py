@@ -16,8 +16,8 @@ class Best:
     count: int = 150
     """Most matches."""
     ratio: float | None = None
-    """Largest distance to the nearest over distance to the second nearest; None asks for no ratio. VLFeat's matcher,
-    which A's matches come from, accepts 1.5 d1^2 < d2^2: a ratio of 0.816.
+    """Largest distance to the nearest over distance to the second nearest; None asks for no ratio.
+    VLFeat's matcher, which A's matches come from, accepts 1.5 d1^2 < d2^2: a ratio of 0.816.
     """
     version: ClassVar[int] = 2
 

@@ -19,15 +19,19 @@ class Guided:
     ratio: float = 0.9
     """Largest distance to the nearest over distance to the second nearest within the radius."""
     distance: float = 0.8
-    """Largest distance of two unit descriptors (0 equal, sqrt 2 unrelated): a circle may hold no second to
-    compare with. Of binary ones, half of it is the largest share of bits that differ.
+    """Largest distance of two unit descriptors (0 equal, sqrt 2 unrelated): a circle may hold no
+    second to compare with. Of binary ones, half of it is the largest share of bits that differ.
     """
     version: ClassVar[int] = 1
 
     def __call__(self, a: Features, b: Features, predicted: NDArray[np.float64]) -> Matches:
-        """Putative matches; `predicted` (len(a), 2) px of b, NaN where nothing is known, which matches nothing."""
+        """Putative matches; `predicted` (len(a), 2) px of b, NaN where nothing is known, which
+        matches nothing.
+        """
         if predicted.shape != (len(a), 2):
-            raise ValueError(f"a place for each of {len(a)} keypoints expected, got {predicted.shape}")
+            raise ValueError(
+                f"a place for each of {len(a)} keypoints expected, got {predicted.shape}"
+            )
         if not len(a) or not len(b):
             return no_matches()
         off = predicted[:, None] - b.px[None]

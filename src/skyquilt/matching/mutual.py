@@ -14,7 +14,9 @@ class Mutual:
     """Each other's nearest, and clearly nearer than the second nearest."""
 
     ratio: float = 0.85
-    """Largest distance to the nearest over distance to the second nearest; Hamming's of binary descriptors."""
+    """Largest distance to the nearest over distance to the second nearest; Hamming's of binary
+    descriptors.
+    """
     version: ClassVar[int] = 3
 
     def __call__(self, a: Features, b: Features) -> Matches:

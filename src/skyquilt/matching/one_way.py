@@ -11,10 +11,13 @@ from skyquilt.model.features import Features, Matches
 
 @dataclass(frozen=True, kw_only=True)
 class OneWay:
-    """Each feature of a with its nearest in b, where the second nearest is clearly farther [Y 5.2.1]."""
+    """Each feature of a with its nearest in b, where the second nearest is clearly farther [Y
+    5.2.1].
+    """
 
     threshold: float = 1.2
-    """A match is kept when this times its squared distance is less than that of the second nearest."""
+    """A match is kept when this times its squared distance is less than that of the second nearest.
+    """
     version: ClassVar[int] = 1
 
     def __call__(self, a: Features, b: Features) -> Matches:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +27,12 @@ class AxisErrors:
     """Positions compared."""
 
 
-def geolocation_errors(estimated: NDArray, reference: NDArray) -> AxisErrors:
+def geolocation_errors(estimated: NDArray[Any], reference: NDArray[Any]) -> AxisErrors:
     """Errors of positions (n, 3) in m against a reference (n, 3); NaN where either says nothing."""
     if np.shape(estimated) != np.shape(reference) or np.shape(estimated)[1:] != (3,):
-        raise ValueError(f"two (n, 3) arrays expected, got {np.shape(estimated)} and {np.shape(reference)}")
+        raise ValueError(
+            f"two (n, 3) arrays expected, got {np.shape(estimated)} and {np.shape(reference)}"
+        )
     error = np.asarray(estimated, np.float64) - np.asarray(reference, np.float64)
     return AxisErrors(
         mae_m=_axes(np.abs(error)),
@@ -40,12 +43,15 @@ def geolocation_errors(estimated: NDArray, reference: NDArray) -> AxisErrors:
 
 
 def gps_residuals(alignment: Alignment, priors: Sequence[Prior]) -> Array:
-    """(n, 3) solution minus reported position in m (map frame) of the photos held by tie points, in the order of
-    `alignment.held`; NaN where none was reported.
+    """(n, 3) solution minus reported position in m (map frame) of the photos held by tie points, in
+    the order of `alignment.held`; NaN where none was reported.
 
-    Where control points give the heights, the offset of their datum from the photos' is no residual.
+    Where control points give the heights, the offset of their datum from the photos' is no
+    residual.
     """
-    residual = np.array([alignment.poses[i].map_C - priors[i].map_C for i in alignment.held]).reshape(-1, 3)
+    residual = np.array(
+        [alignment.poses[i].map_C - priors[i].map_C for i in alignment.held]
+    ).reshape(-1, 3)
     if alignment.frame.vertical_datum == "control" and np.isfinite(residual[:, 2]).any():
         residual[:, 2] -= np.nanmedian(residual[:, 2])
     return residual
@@ -53,7 +59,9 @@ def gps_residuals(alignment: Alignment, priors: Sequence[Prior]) -> Array:
 
 def _axes(values: Array) -> Axes:
     """Mean of each column, leaving out NaN."""
-    means = [float(v[np.isfinite(v)].mean()) if np.isfinite(v).any() else float("nan") for v in values.T]
+    means = [
+        float(v[np.isfinite(v)].mean()) if np.isfinite(v).any() else float("nan") for v in values.T
+    ]
     return means[0], means[1], means[2]
 
 

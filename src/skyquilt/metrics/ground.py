@@ -32,7 +32,8 @@ class Ground:
     """Height of a pixel in m."""
 
     def patch(self, x: float, y: float, gsd: float, size: int) -> tuple[NDArray[np.float32], float]:
-        """A patch (size, size) of pixels of `gsd` m centred on (x, y), and the share of it that is known.
+        """A patch (size, size) of pixels of `gsd` m centred on (x, y), and the share of it that is
+        known.
 
         What is unknown gets the mean of the rest.
         """
@@ -41,30 +42,38 @@ class Ground:
         rows = np.float32((self.north - y + step) / self.px_y - 0.5)
         u, v = np.meshgrid(columns, rows)
         grey = cv2.remap(self.grey, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
-        known = cv2.remap(self.known, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) > 0.999
+        known = (
+            cv2.remap(self.known, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT) > 0.999
+        )
         if not known.any():
             return np.zeros((size, size), np.float32), 0.0
         return np.where(known, grey, grey[known].mean()).astype(np.float32), float(known.mean())
 
 
-def read_ground(raster: rasterio.DatasetReader, factor: int, window: Window | None = None) -> Ground:
+def read_ground(
+    raster: rasterio.DatasetReader, factor: int, window: Window | None = None
+) -> Ground:
     """A raster, or a window of it, averaged over `factor` px."""
     if window is None:
         window = Window(0, 0, raster.width, raster.height)
     shape = max(1, round(window.height / factor)), max(1, round(window.width / factor))
     bands = min(raster.count, 3) if raster.count != 2 else 1
     values = raster.read(
-        list(range(1, bands + 1)), window=window, out_shape=(bands, *shape), resampling=Resampling.average
+        list(range(1, bands + 1)),
+        window=window,
+        out_shape=(bands, *shape),
+        resampling=Resampling.average,
     ).astype(np.float32)
     known = raster.dataset_mask(window=window, out_shape=shape) > 0
     known &= np.isfinite(values).all(0)
     return Ground(
-        grey=np.where(known, values.mean(0), 0).astype(np.float32), known=known.astype(np.float32),
+        grey=np.where(known, values.mean(0), 0).astype(np.float32),
+        known=known.astype(np.float32),
         west=raster.transform.c + window.col_off * raster.transform.a,
         north=raster.transform.f + window.row_off * raster.transform.e,
         px_x=raster.transform.a * window.width / shape[1],
         px_y=-raster.transform.e * window.height / shape[0],
-    )  # fmt: skip
+    )
 
 
 def patches(
@@ -77,12 +86,16 @@ def patches(
     factor = max(1, round(gsd / raster.transform.a))
     whole = read_ground(raster, factor) if factor > 1 else None
     for x, y in places:
-        ground = whole or read_ground(raster, 1, _around(raster, float(x), float(y), gsd * size / 2))
+        ground = whole or read_ground(
+            raster, 1, _around(raster, float(x), float(y), gsd * size / 2)
+        )
         yield ground.patch(float(x), float(y), gsd, size)
 
 
 def _around(raster: rasterio.DatasetReader, x: float, y: float, half: float) -> Window:
-    """The window that holds a square of `half` m to each side, and a margin; cut at the raster's edges."""
+    """The window that holds a square of `half` m to each side, and a margin; cut at the raster's
+    edges.
+    """
     px = raster.transform.a
     column, row = (x - raster.transform.c) / px, (raster.transform.f - y) / px
     reach = half / px + MARGIN

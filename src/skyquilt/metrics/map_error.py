@@ -87,10 +87,12 @@ class _Level:
 def map_error(
     mosaic: Path, truth: Path, *, points: int = 400, search_m: float = 10.0, noise: float = NOISE
 ) -> MapError:
-    """Errors of a GeoTIFF against another in the same CRS, at about `points` places on a regular grid.
+    """Errors of a GeoTIFF against another in the same CRS, at about `points` places on a regular
+    grid.
 
     Found from coarse to fine: first wherever the truth may lie within `search_m`, then around what
-    the neighbourhood agrees on. `noise`: standard deviation of a value's noise, in the rasters' unit.
+    the neighbourhood agrees on. `noise`: standard deviation of a value's noise, in the rasters'
+    unit.
     """
     with rasterio.open(mosaic) as m, rasterio.open(truth) as t:
         _check(m, t)
@@ -99,7 +101,13 @@ def map_error(
         guess = np.zeros_like(places)
         for factor in (factors := _factors(gsd, search_m)):
             level = _compare(
-                m, t, places, guess, factor, radius=16 if factor == factors[0] else RADIUS, noise=noise
+                m,
+                t,
+                places,
+                guess,
+                factor,
+                radius=16 if factor == factors[0] else RADIUS,
+                noise=noise,
             )
             if factor > 1:
                 guess = _agreed(places, level, guess)
@@ -117,21 +125,29 @@ def _check(m: rasterio.DatasetReader, t: rasterio.DatasetReader) -> None:
 
 
 def _places(m: rasterio.DatasetReader, t: rasterio.DatasetReader, points: int) -> Array:
-    """About `points` pixel corners (n, 2) of the mosaic, on a regular grid over the common area, in m."""
+    """About `points` pixel corners (n, 2) of the mosaic, on a regular grid over the common area, in
+    m.
+    """
     west, south = max(m.bounds.left, t.bounds.left), max(m.bounds.bottom, t.bounds.bottom)
     east, north = min(m.bounds.right, t.bounds.right), min(m.bounds.top, t.bounds.top)
     if west >= east or south >= north:
-        raise ValueError(f"the mosaic {tuple(m.bounds)} and the truth {tuple(t.bounds)} share no ground")
+        raise ValueError(
+            f"the mosaic {tuple(m.bounds)} and the truth {tuple(t.bounds)} share no ground"
+        )
     spacing = np.sqrt((east - west) * (north - south) / points)
-    x, y = (low + (np.arange(n := max(1, round((high - low) / spacing))) + 0.5) * (high - low) / n
-            for low, high in ((west, east), (south, north)))  # fmt: skip
+    x, y = (
+        low + (np.arange(n := max(1, round((high - low) / spacing))) + 0.5) * (high - low) / n
+        for low, high in ((west, east), (south, north))
+    )
     place = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     corner = np.array([m.bounds.left, m.bounds.top])
     return np.asarray(corner + np.round((place - corner) / m.transform.a) * m.transform.a)
 
 
 def _factors(gsd: float, search_m: float) -> list[int]:
-    """Pixel sizes of the levels in px of the mosaic: the first reaches `search_m` in 16, the last is 1."""
+    """Pixel sizes of the levels in px of the mosaic: the first reaches `search_m` in 16, the last
+    is 1.
+    """
     factors = [max(1, int(np.ceil(search_m / (16 * gsd))))]
     while factors[-1] > 1:
         factors.append(max(1, factors[-1] // 4))
@@ -139,9 +155,15 @@ def _factors(gsd: float, search_m: float) -> list[int]:
 
 
 def _compare(
-    m: rasterio.DatasetReader, t: rasterio.DatasetReader, places: Array, guess: Array,
-    factor: int, *, radius: int, noise: float,
-) -> _Level:  # fmt: skip
+    m: rasterio.DatasetReader,
+    t: rasterio.DatasetReader,
+    places: Array,
+    guess: Array,
+    factor: int,
+    *,
+    radius: int,
+    noise: float,
+) -> _Level:
     """Looks for the mosaic's patches in the truth around places + guess."""
     gsd = m.transform.a * factor
     a, known_a = zip(*patches(m, places, gsd, SIZE), strict=True)
@@ -163,7 +185,9 @@ def _metres(shift: Shift, gsd: float) -> Array:
 
 
 def _agreed(places: Array, level: _Level, guess: Array) -> Array:
-    """(n, 2) what the five nearest points that were found agree on (their median); the guess if none was."""
+    """(n, 2) what the five nearest points that were found agree on (their median); the guess if
+    none was.
+    """
     if not level.found.any():
         return guess
     at, offset = places[level.found], level.offset[level.found]
@@ -176,12 +200,15 @@ def _report(places: Array, level: _Level, gsd: float) -> MapError:
     """Figures of the last level."""
     samples = tuple(
         MapSample(
-            x=float(places[k, 0]), y=float(places[k, 1]),
-            error_x_m=float(-level.offset[k, 0]), error_y_m=float(-level.offset[k, 1]),
-            ok=bool(level.found[k]), reason=level.reason[k],
+            x=float(places[k, 0]),
+            y=float(places[k, 1]),
+            error_x_m=float(-level.offset[k, 0]),
+            error_y_m=float(-level.offset[k, 1]),
+            ok=bool(level.found[k]),
+            reason=level.reason[k],
         )
         for k in np.flatnonzero(level.attempted)
-    )  # fmt: skip
+    )
     error = -level.offset[level.found]
     bias = np.median(error, axis=0) if len(error) else None
     return MapError(
@@ -189,8 +216,10 @@ def _report(places: Array, level: _Level, gsd: float) -> MapError:
         relative=None if bias is None else _figures(error - bias, gsd),
         bias_x_m=None if bias is None else float(bias[0]),
         bias_y_m=None if bias is None else float(bias[1]),
-        measured=len(error), attempted=len(samples), samples=samples,
-    )  # fmt: skip
+        measured=len(error),
+        attempted=len(samples),
+        samples=samples,
+    )
 
 
 def _figures(error: Array, gsd: float) -> ErrorFigures:

@@ -1,5 +1,7 @@
 """How far a registration lies from the truth."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,10 +10,10 @@ _ACROSS = 64
 
 
 def overlap_error(
-    b_H_a: NDArray, truth: NDArray, shape_a: tuple[int, int], shape_b: tuple[int, int]
+    b_H_a: NDArray[Any], truth: NDArray[Any], shape_a: tuple[int, int], shape_b: tuple[int, int]
 ) -> float:
-    """RMS distance in px of b between where two transforms (3, 3) put the points of a (H, W) that truly lie
-    in b (H, W); infinite where none does, or where the transform sends one to infinity.
+    """RMS distance in px of b between where two transforms (3, 3) put the points of a (H, W) that
+    truly lie in b (H, W); infinite where none does, or where the transform sends one to infinity.
     """
     step = max(max(shape_a) / _ACROSS, 1.0)
     y, x = np.mgrid[0 : shape_a[0] - 1 : step, 0 : shape_a[1] - 1 : step]
@@ -24,6 +26,6 @@ def overlap_error(
     return float(np.sqrt(distance.mean())) if np.isfinite(distance).all() else float("inf")
 
 
-def _projected(points: NDArray) -> NDArray[np.float64]:
+def _projected(points: NDArray[Any]) -> NDArray[np.float64]:
     with np.errstate(all="ignore"):
         return np.asarray(points[:, :2] / points[:, 2:], np.float64)

@@ -6,7 +6,8 @@ from numpy.typing import ArrayLike, NDArray
 
 
 def four_lengths(corners: ArrayLike) -> NDArray[np.float64]:
-    """Width, height and both diagonals (4,) of a quadrilateral (4, 2), its corners in order around it.
+    """Width, height and both diagonals (4,) of a quadrilateral (4, 2), its corners in order around
+    it.
 
     Where opposite sides differ, their mean is the width and the height.
     """
@@ -16,7 +17,8 @@ def four_lengths(corners: ArrayLike) -> NDArray[np.float64]:
 
 
 def eta(lengths: ArrayLike, reference: ArrayLike) -> float:
-    """(4.7): orthorectification quality, 4 / sum of max(l, l') / min(l, l'), in (0, 1], 1 = undeformed.
+    """(4.7): orthorectification quality, 4 / sum of max(l, l') / min(l, l'), in (0, 1], 1 =
+    undeformed.
 
     Both (4,): width, height and both diagonals of a target as mapped and as it is.
     """
@@ -33,11 +35,11 @@ def mean_squared_error(estimated: ArrayLike, points: ArrayLike) -> float:
 
 
 def spread_quality(inliers: ArrayLike, width: int, height: int, *, delta: float) -> float:
-    """Q of (6.3): share of the image nearer than `delta` px to an inlier, times the largest distance between
-    two inliers over the image's diagonal; in [0, 1], 0 for fewer than two.
+    """Q of (6.3): share of the image nearer than `delta` px to an inlier, times the largest
+    distance between two inliers over the image's diagonal; in [0, 1], 0 for fewer than two.
 
-    `inliers` (n, 2) in px, centres at integers; the diagonal runs between the corner pixels' centres, so
-    that 1 can be reached. Only what lies in the image counts as covered.
+    `inliers` (n, 2) in px, centres at integers; the diagonal runs between the corner pixels'
+    centres, so that 1 can be reached. Only what lies in the image counts as covered.
     """
     px = np.asarray(inliers, np.float64).reshape(-1, 2)
     if len(px) < 2:

@@ -1,4 +1,6 @@
-"""How photos agree where they are placed, one after the other in order of capture (Y 6.1, Fig. 6.4)."""
+"""How photos agree where they are placed, one after the other in order of capture (Y 6.1, Fig.
+6.4).
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -24,7 +26,9 @@ class Replay:
 
 
 def replay(patches: Iterable[Patch | None]) -> Replay:
-    """Adds photos, all on one grid, to an overview, centre first; None is a photo that is not placed."""
+    """Adds photos, all on one grid, to an overview, centre first; None is a photo that is not
+    placed.
+    """
     overview, last = Overview(), None
     whole, pair = [], []
     for patch in patches:
@@ -43,7 +47,11 @@ def replay(patches: Iterable[Patch | None]) -> Replay:
 
 def _agreement(patch: Patch, pixels: NDArray[np.float32], shown: NDArray[np.bool_]) -> float:
     mask = patch.shown & shown
-    return correlation(patch.pixels, pixels, mask) if np.count_nonzero(mask) >= LEAST_PX else float("nan")
+    return (
+        correlation(patch.pixels, pixels, mask)
+        if np.count_nonzero(mask) >= LEAST_PX
+        else float("nan")
+    )
 
 
 def _alone(last: Patch, patch: Patch) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

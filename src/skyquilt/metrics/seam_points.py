@@ -1,6 +1,9 @@
-"""Points spread along the seams of a mosaic, from the raster that says which photo each pixel shows."""
+"""Points spread along the seams of a mosaic, from the raster that says which photo each pixel
+shows.
+"""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,11 +37,14 @@ class _Edges:
     """(k, 2) labels, the smaller first."""
 
 
-def seam_points(labels: NDArray, *, spacing_px: float = 16.0, limit: int = 300) -> list[SeamPoint]:
+def seam_points(
+    labels: NDArray[Any], *, spacing_px: float = 16.0, limit: int = 300
+) -> list[SeamPoint]:
     """Points spread evenly along all seams of a label raster (H, W) of integers, 0 = no photo.
 
-    A point about every `spacing_px`, or less often to keep to `limit`; every pair of photos that share a
-    seam has at least one, as long as there are no more pairs than `limit` (else the longest seams have).
+    A point about every `spacing_px`, or less often to keep to `limit`; every pair of photos that
+    share a seam has at least one, as long as there are no more pairs than `limit` (else the longest
+    seams have).
     """
     edges = _edges(labels)
     if limit < 1 or not len(edges.length):
@@ -52,10 +58,13 @@ def seam_points(labels: NDArray, *, spacing_px: float = 16.0, limit: int = 300) 
     return points
 
 
-def _edges(labels: NDArray) -> _Edges:
+def _edges(labels: NDArray[Any]) -> _Edges:
     """Edges between pixels of two photos, by pair."""
     places, pairs = [], []
-    below, right = (labels[1:], labels[:-1], (0.5, 0.0)), (labels[:, 1:], labels[:, :-1], (0.0, 0.5))
+    below, right = (
+        (labels[1:], labels[:-1], (0.5, 0.0)),
+        (labels[:, 1:], labels[:, :-1], (0.0, 0.5)),
+    )
     for there, here, middle in (below, right):
         pixels = np.argwhere((there != here) & (there != 0) & (here != 0))
         a, b = here[tuple(pixels.T)].astype(np.int64), there[tuple(pixels.T)].astype(np.int64)
@@ -66,16 +75,22 @@ def _edges(labels: NDArray) -> _Edges:
     place, pair = place[order], pair[order]
     unlike = (pair[1:] != pair[:-1]).any(1)
     first = np.flatnonzero(np.r_[len(pair) > 0, unlike])
-    return _Edges(place=place, first=first, length=np.diff(np.r_[first, len(pair)]), pair=pair[first])
+    return _Edges(
+        place=place, first=first, length=np.diff(np.r_[first, len(pair)]), pair=pair[first]
+    )
 
 
 def _shares(length: NDArray[np.int64], spacing_px: float, limit: int) -> NDArray[np.int64]:
     """Number of points per seam: one each, the rest by length, `limit` in all at most."""
     if len(length) >= limit:
-        return np.isin(np.arange(len(length)), np.argsort(-length, kind="stable")[:limit]).astype(np.int64)
+        return np.isin(np.arange(len(length)), np.argsort(-length, kind="stable")[:limit]).astype(
+            np.int64
+        )
     wanted = np.maximum(length / spacing_px, 1) - 1
     spare = limit - len(length)
-    return 1 + np.floor(wanted * min(1.0, spare / max(float(wanted.sum()), 1e-9)) + 1e-9).astype(np.int64)
+    return 1 + np.floor(wanted * min(1.0, spare / max(float(wanted.sum()), 1e-9)) + 1e-9).astype(
+        np.int64
+    )
 
 
 def _spread(place: NDArray[np.float64], count: int) -> NDArray[np.float64]:

@@ -1,4 +1,6 @@
-"""Seam disparity: how far two photos disagree about the ground where the mosaic changes between them."""
+"""Seam disparity: how far two photos disagree about the ground where the mosaic changes between
+them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +19,9 @@ LEAST_MEASURED = 0.6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PatchPairs:
-    """What two photos show around each of n points, each orthorectified at the native resolution."""
+    """What two photos show around each of n points, each orthorectified at the native
+    resolution.
+    """
 
     a: NDArray[np.float32]
     """(n, S, S) grey patches of the points' first photos; S about 64."""
@@ -91,23 +95,31 @@ def seam_disparity(
 ) -> SeamReport:
     """Measures the displacement at points of seams.
 
-    `gsd_m` is the ground size of a patch's pixel in m, `radius` the largest displacement looked for in px and
-    `noise` the standard deviation of a value in the patches' unit. A weak summit is a failure, not absent:
-    it counts as attempted.
+    `gsd_m` is the ground size of a patch's pixel in m, `radius` the largest displacement looked for
+    in px and `noise` the standard deviation of a value in the patches' unit. A weak summit is a
+    failure, not absent: it counts as attempted.
     """
     if not points:
         return _report([], gsd_m)
     pairs = patches(points)
     attempt = np.flatnonzero(pairs.seen)
-    attempt = attempt[has_texture(pairs.a[attempt], noise=noise) & has_texture(pairs.b[attempt], noise=noise)]
+    attempt = attempt[
+        has_texture(pairs.a[attempt], noise=noise) & has_texture(pairs.b[attempt], noise=noise)
+    ]
     shifts = shifts_between(pairs.a[attempt], pairs.b[attempt], radius=radius)
     samples = [
         SeamSample(
-            row=points[k].row, column=points[k].column, a=points[k].a, b=points[k].b,
-            dx=shift.dx, dy=shift.dy, ok=shift.ok, reason=shift.reason,
+            row=points[k].row,
+            column=points[k].column,
+            a=points[k].a,
+            b=points[k].b,
+            dx=shift.dx,
+            dy=shift.dy,
+            ok=shift.ok,
+            reason=shift.reason,
         )
         for k, shift in zip(attempt.tolist(), shifts, strict=True)
-    ]  # fmt: skip
+    ]
     return _report(samples, gsd_m)
 
 
@@ -116,8 +128,11 @@ def _report(samples: list[SeamSample], gsd_m: float) -> SeamReport:
     length = np.array([np.hypot(s.dx, s.dy) for s in samples if s.ok])
     median, p95 = np.percentile(length, [50, 95]).tolist() if length.size else (None, None)
     return SeamReport(
-        median_px=median, p95_px=p95,
+        median_px=median,
+        p95_px=p95,
         median_cm=None if median is None else median * gsd_m * 100,
         p95_cm=None if p95 is None else p95 * gsd_m * 100,
-        measured=len(length), attempted=len(samples), samples=tuple(samples),
-    )  # fmt: skip
+        measured=len(length),
+        attempted=len(samples),
+        samples=tuple(samples),
+    )

@@ -1,6 +1,7 @@
 """A chess-board, and what a frame shows of it."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +11,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Board:
-    """A flat chess-board, counted in squares. *board*: x along a row, y along a column, z away from the viewer,
-    in m; the origin is the outer corner of the first square.
+    """A flat chess-board, counted in squares. *board*: x along a row, y along a column, z away from
+    the viewer, in m; the origin is the outer corner of the first square.
     """
 
     columns: int
@@ -42,7 +43,7 @@ class Board:
         inside[1:-1, 1:-1] = True
         return inside
 
-    def _points(self, x: NDArray, y: NDArray) -> Array:
+    def _points(self, x: NDArray[Any], y: NDArray[Any]) -> Array:
         xx, yy = np.meshgrid(x, y)
         return np.stack([xx, yy, np.zeros_like(xx)], -1) * self.square_m
 
@@ -58,13 +59,15 @@ class BoardView:
     height: int
     """Of the frame in px."""
     centroids: Array
-    """Centroids of the squares' images (rows, columns, 2) in px, not yet corrected for perspective; NaN where
-    a square could not be measured."""
+    """Centroids of the squares' images (rows, columns, 2) in px, not yet corrected for perspective;
+    NaN where a square could not be measured.
+    """
     corners: Array
     """Inner corners (rows - 1, columns - 1, 2) in px."""
     rounding_px: Array
-    """Radii (rows, columns) by which the corners of the squares' images were rounded off before their centroids
-    were taken."""
+    """Radii (rows, columns) by which the corners of the squares' images were rounded off before
+    their centroids were taken.
+    """
     contrast: float
     """White less black squares, in units of the frame's own noise."""
     frames: int = 1

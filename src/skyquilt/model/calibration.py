@@ -52,7 +52,9 @@ class Calibration:
     free: tuple[str, ...]
     """The parameters that were determined, in the order of `PARAMETERS`."""
     dropped: tuple[tuple[str, float, float], ...]
-    """Name, value and tolerance of each coefficient that was smaller than its tolerance, in the order of dropping."""
+    """Name, value and tolerance of each coefficient that was smaller than its tolerance, in the
+    order of dropping.
+    """
     sightings: tuple[Sightings, ...]
     """One per view, px of centres corrected for perspective and distortion."""
     poses: tuple[BoardPose, ...]

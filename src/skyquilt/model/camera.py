@@ -13,7 +13,8 @@ PARAMETERS = ("focal", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
 class Camera:
     """Pinhole with Brown's distortion in OpenCV's direction (undistorted -> distorted).
 
-    Pixel centres lie at integer coordinates: the image spans [-0.5, width - 0.5] x [-0.5, height - 0.5].
+    Pixel centres lie at integer coordinates: the image spans [-0.5, width - 0.5] x [-0.5, height -
+    0.5].
     """
 
     width: int
@@ -37,7 +38,9 @@ class Camera:
     p2: float = 0.0
     """Tangential coefficient, OpenCV's p2."""
     sigmas: tuple[float, ...] | None = field(default=None, compare=False)
-    """Standard deviations of `PARAMETERS` in that order, where an adjustment or a source gives them."""
+    """Standard deviations of `PARAMETERS` in that order, where an adjustment or a source gives
+    them.
+    """
 
     @property
     def vector(self) -> NDArray[np.float64]:
@@ -47,7 +50,9 @@ class Camera:
     @property
     def matrix(self) -> NDArray[np.float64]:
         """The (3, 3) matrix K in px."""
-        return np.array([[self.focal, 0, self.cx], [0, self.focal, self.cy], [0, 0, 1]], dtype=np.float64)
+        return np.array(
+            [[self.focal, 0, self.cx], [0, self.focal, self.cy], [0, 0, 1]], dtype=np.float64
+        )
 
     @classmethod
     def ideal(cls, *, width: int, height: int, focal: float) -> "Camera":

@@ -1,4 +1,6 @@
-"""The orders of distortion that lens models come in: one table for all who fit, fix or name them."""
+"""The orders of distortion that lens models come in: one table for all who fit, fix or name
+them.
+"""
 
 from dataclasses import dataclass
 
@@ -20,10 +22,12 @@ class Order:
 
 
 ORDERS = {
-    "none": Order(radial=0, tangential=False), "2": Order(radial=1, tangential=False),
-    "4": Order(radial=2, tangential=False), "6": Order(radial=3, tangential=False),
+    "none": Order(radial=0, tangential=False),
+    "2": Order(radial=1, tangential=False),
+    "4": Order(radial=2, tangential=False),
+    "6": Order(radial=3, tangential=False),
     "6t": Order(radial=3, tangential=True),
-}  # fmt: skip
+}
 """By name: radial terms up to r^0, r^2, r^4, r^6, and r^6 with tangential ones."""
 
 

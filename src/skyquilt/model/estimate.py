@@ -41,7 +41,8 @@ class NoEstimate:
     """No transformation that could be trusted: false in `if`, carries its reason."""
 
     reason: str
-    """`too few matches (7 of 8)`, `weak inliers (5 of 80 matches)`, `weak peak (0.12 of 0.3)`, ..."""
+    """`too few matches (7 of 8)`, `weak inliers (5 of 80 matches)`, `weak peak (0.12 of 0.3)`, ...
+    """
 
     def __bool__(self) -> bool:
         return False
@@ -56,8 +57,8 @@ class Registration:
     b_H_a: NDArray[np.float64]
     """(3, 3) takes a's pixels to b's; last element 1."""
     score: float
-    """What was maximised, where it is highest: a correlation (at most 1), normalised mutual information, or the
-    response of a phase correlation.
+    """What was maximised, where it is highest: a correlation (at most 1), normalised mutual
+    information, or the response of a phase correlation.
     """
     overlap: float
     """Share of a's pixels that lie on b."""

@@ -1,4 +1,6 @@
-"""What a story says while it runs: progress bars, journals, viewers and tests read the same events."""
+"""What a story says while it runs: progress bars, journals, viewers and tests read the same
+events.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

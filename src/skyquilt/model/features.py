@@ -18,13 +18,15 @@ class Features:
     size: NDArray[np.float32]
     """(N,) diameter in px of the full sensor image."""
     descriptors: NDArray[np.uint8 | np.int8 | np.float32]
-    """(N, D), any multiple of a vector of unit length: DESCRIPTOR_UNIT times it as uint8 (signed: int8), a quarter of
-    the memory of floats, or floats. Where `binary`, uint8 whose bits are the descriptor.
+    """(N, D), any multiple of a vector of unit length: DESCRIPTOR_UNIT times it as uint8 (signed:
+    int8), a quarter of the memory of floats, or floats. Where `binary`, uint8 whose bits are the
+    descriptor.
     """
     scale: float
     """Full-resolution px per px of the image the keypoints were found in."""
     binary: bool = False
-    """True where descriptors are bits, to be compared by the number of those that differ (Hamming)."""
+    """True where descriptors are bits, to be compared by the number of those that differ (Hamming).
+    """
 
     def __len__(self) -> int:
         return len(self.px)
@@ -33,13 +35,19 @@ class Features:
     def unit(self) -> NDArray[np.float32]:
         """(N, D) descriptors of unit length: the dot product of two is their similarity.
 
-        Bits become -1 and 1, (N, 8 D), so that 1 - similarity is twice the share of bits that differ.
+        Bits become -1 and 1, (N, 8 D), so that 1 - similarity is twice the share of bits that
+        differ.
         """
         if self.binary:
-            signs = np.unpackbits(np.asarray(self.descriptors, np.uint8), axis=1).astype(np.float32) * 2 - 1
+            signs = (
+                np.unpackbits(np.asarray(self.descriptors, np.uint8), axis=1).astype(np.float32) * 2
+                - 1
+            )
             return signs / np.float32(np.sqrt(max(signs.shape[1], 1)))
         d = self.descriptors.astype(np.float32)
-        return d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), np.float32(1e-6))
+        return np.asarray(
+            d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), np.float32(1e-6))
+        )
 
     def __sizeof__(self) -> int:
         return self.px.nbytes + self.size.nbytes + self.descriptors.nbytes

@@ -12,7 +12,9 @@ Datum = Literal["takeoff", "sea_level", "ellipsoid", "control", "unknown"]
 
 
 Stored = Literal["", "celsius", "kelvin", "decikelvin", "centikelvin", "counts"]
-"""What a value of a thermal TIFF may mean: degrees Celsius, (tenths, hundredths of a) kelvin, or sensor counts."""
+"""What a value of a thermal TIFF may mean: degrees Celsius, (tenths, hundredths of a) kelvin, or
+sensor counts.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -24,7 +26,9 @@ class GeoPosition:
     longitude_deg: float
     """Degrees, east positive."""
     altitude_m: float | None
-    """Height in m above `datum`; None where the photo gives none. The most trustworthy of those found."""
+    """Height in m above `datum`; None where the photo gives none. The most trustworthy of those
+    found.
+    """
     datum: Datum
     """Zero of `altitude_m`."""
     sigma_xy_m: float = 1.5
@@ -43,12 +47,13 @@ class GeoPosition:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attitude:
-    """A measured camera attitude: R_ned_body = Rz(yaw) Ry(pitch) Rx(roll) of a body whose belly camera looks
-    down.
+    """A measured camera attitude: R_ned_body = Rz(yaw) Ry(pitch) Rx(roll) of a body whose belly
+    camera looks down.
 
-    The image top points along the body's nose, so yaw 0 = image top to true north, clockwise positive;
-    pitch 0 = nadir, positive = looking ahead; roll positive = right wing down. Gimbal angles of other
-    conventions are converted where they are read (`geometry.frames.belly_from_gimbal`).
+    The image top points along the body's nose, so yaw 0 = image top to true north, clockwise
+    positive; pitch 0 = nadir, positive = looking ahead; roll positive = right wing down. Gimbal
+    angles of other conventions are converted where they are read
+    (`geometry.frames.belly_from_gimbal`).
     """
 
     yaw_deg: float
@@ -74,7 +79,9 @@ class Focal:
     sigma_px: float
     """Standard deviation in px."""
     source: Literal["calibrated", "sensor", "focal-plane", "35mm", "guess"]
-    """Calibrated value, mm with the sensor database, focal-plane resolution, 35 mm equivalent, guess."""
+    """Calibrated value, mm with the sensor database, focal-plane resolution, 35 mm equivalent,
+    guess.
+    """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,13 +119,17 @@ class Photo:
     attitude: Attitude | None
     """The camera's attitude as reported."""
     flight_yaw_deg: float | None = None
-    """Heading of the aircraft as reported, degrees clockwise from true north; a second opinion on the yaw."""
+    """Heading of the aircraft as reported, degrees clockwise from true north; a second opinion on
+    the yaw.
+    """
     time: datetime | None
     """Capture time with sub-seconds; naive local time unless the photo states an offset."""
     orientation_tag: int = 1
     """EXIF Orientation as written; never applied."""
     rolling_shutter: bool | None = None
-    """True for known electronic (rolling) shutters, False for known global/mechanical ones, None unknown."""
+    """True for known electronic (rolling) shutters, False for known global/mechanical ones, None
+    unknown.
+    """
     editor: str | None = None
     """Software that rewrote the file after the camera, where the metadata name one."""
     notes: tuple[str, ...] = ()

@@ -24,12 +24,16 @@ class MapFrame:
     convergence_deg: float = 0.0
     """Meridian convergence: grid yaw = true yaw - convergence."""
     metric: bool = True
-    """False when even the scale is unknown (no positions, no height): then 1 m is an arbitrary unit."""
+    """False when even the scale is unknown (no positions, no height): then 1 m is an arbitrary
+    unit.
+    """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prior:
-    """What the metadata say about one photo's pose, in the map frame; NaN where they say nothing."""
+    """What the metadata say about one photo's pose, in the map frame; NaN where they say
+    nothing.
+    """
 
     map_C: Array
     """(3,) camera centre in m."""
@@ -58,18 +62,23 @@ class Pose:
     map_C: Array
     """(3,) centre of projection in m in the map frame."""
     cam_H_map: Array | None = None
-    """(3, 3) for methods that place photos in the plane, not in space: takes (x, y, 1) of the map to the
-    undistorted image plane, whatever the height; rotation and centre are then those of the nearest vertical view.
+    """(3, 3) for methods that place photos in the plane, not in space: takes (x, y, 1) of the map
+    to the undistorted image plane, whatever the height; rotation and centre are then those of the
+    nearest vertical view.
     """
 
     def to_camera(self, xyz_map: Array) -> Array:
-        """Points (..., 3) in the map frame in camera coordinates (for a photo placed in the plane: up to scale)."""
+        """Points (..., 3) in the map frame in camera coordinates (for a photo placed in the plane:
+        up to scale).
+        """
         if self.cam_H_map is not None:
             return np.asarray(xyz_map[..., :2] @ self.cam_H_map[:, :2].T + self.cam_H_map[:, 2])
         return np.asarray((xyz_map - self.map_C) @ self.cam_R_map.T)
 
     def planes_to_camera(self, x: Array, y: Array, z: Array) -> tuple[Array, Array, Array]:
-        """`to_camera` of coordinates that lie apart, in arrays that broadcast: for many points three times as fast."""
+        """`to_camera` of coordinates that lie apart, in arrays that broadcast: for many points
+        three times as fast.
+        """
         if self.cam_H_map is not None:
             a, b, c = (row[0] * x + row[1] * y + row[2] for row in self.cam_H_map)
             return a, b, c
@@ -123,7 +132,9 @@ class Join:
     inliers: int
     """Those that agree with the transformation."""
     ste_px2: float
-    """Symmetric transfer error per inlier in px^2 (A 15) of the working image; NaN where pixels were compared."""
+    """Symmetric transfer error per inlier in px^2 (A 15) of the working image; NaN where pixels
+    were compared.
+    """
     score: float
     """Quality of the placement (Y 4.6) where pixels were compared, else NaN."""
     moved_m: float
@@ -149,11 +160,15 @@ class Alignment:
     poses: dict[int, Pose]
     """By index of the photo."""
     cameras: dict[str, Camera]
-    """Calibrations by name: `Photo.camera_key`, or that plus `/turned` for files rewritten upside down."""
+    """Calibrations by name: `Photo.camera_key`, or that plus `/turned` for files rewritten upside
+    down.
+    """
     camera_of: dict[int, str]
     """Photo index -> name of its calibration."""
     blocks: tuple[tuple[int, ...], ...]
-    """Photos that hang together by tie points, largest block first; single photos placed by metadata last."""
+    """Photos that hang together by tie points, largest block first; single photos placed by
+    metadata last.
+    """
     ties: TiePoints
     """Tie points; empty for methods without."""
     rejected: dict[int, str] = field(default_factory=dict)
@@ -170,7 +185,9 @@ class Alignment:
     @property
     def held(self) -> tuple[int, ...]:
         """Placed photos that tie points hold to others, ascending."""
-        return tuple(sorted(i for block in self.blocks if len(block) > 1 for i in block if i in self.poses))
+        return tuple(
+            sorted(i for block in self.blocks if len(block) > 1 for i in block if i in self.poses)
+        )
 
     def camera(self, photo: int) -> Camera:
         """The calibration of a photo."""

@@ -1,6 +1,7 @@
 """The pixel grid of a map, and pixels with their place."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,29 +22,43 @@ class Grid:
     height: int
     """Rows."""
 
-    def x(self, columns: NDArray) -> NDArray[np.float64]:
+    def x(self, columns: NDArray[Any]) -> NDArray[np.float64]:
         """Eastings in m of pixel centres."""
         return self.west + (np.asarray(columns, np.float64) + 0.5) * self.gsd
 
-    def y(self, rows: NDArray) -> NDArray[np.float64]:
+    def y(self, rows: NDArray[Any]) -> NDArray[np.float64]:
         """Northings in m of pixel centres."""
         return self.north - (np.asarray(rows, np.float64) + 0.5) * self.gsd
 
-    def pixel(self, x: NDArray, y: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def pixel(
+        self, x: NDArray[Any], y: NDArray[Any]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Columns and rows (centres at integers) of map coordinates."""
-        return (np.asarray(x) - self.west) / self.gsd - 0.5, (self.north - np.asarray(y)) / self.gsd - 0.5
+        return (np.asarray(x) - self.west) / self.gsd - 0.5, (
+            self.north - np.asarray(y)
+        ) / self.gsd - 0.5
 
     def coarser(self, factor: int) -> "Grid":
-        """The same area in pixels `factor` times as large; the last row and column may reach beyond it."""
+        """The same area in pixels `factor` times as large; the last row and column may reach beyond
+        it.
+        """
         return Grid(
-            west=self.west, north=self.north, gsd=self.gsd * factor,
-            width=-(-self.width // factor), height=-(-self.height // factor),
-        )  # fmt: skip
+            west=self.west,
+            north=self.north,
+            gsd=self.gsd * factor,
+            width=-(-self.width // factor),
+            height=-(-self.height // factor),
+        )
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
         """West, south, east, north in m (map frame)."""
-        return self.west, self.north - self.height * self.gsd, self.west + self.width * self.gsd, self.north
+        return (
+            self.west,
+            self.north - self.height * self.gsd,
+            self.west + self.width * self.gsd,
+            self.north,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +77,8 @@ class Window:
     def grown(self, margin: int) -> "Window":
         """With `margin` px more on each side; may reach beyond the grid."""
         return Window(
-            row=self.row - margin, column=self.column - margin,
-            height=self.height + 2 * margin, width=self.width + 2 * margin,
-        )  # fmt: skip
+            row=self.row - margin,
+            column=self.column - margin,
+            height=self.height + 2 * margin,
+            width=self.width + 2 * margin,
+        )

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,10 @@ Model = Literal["identity", "similarity", "affine", "homography"]
 class Picture:
     """What is to be registered."""
 
-    values: NDArray
-    """(H, W) or (H, W, 3), as recorded: 8 bit, 16 bit or real numbers, NaN where nothing was measured."""
+    values: NDArray[Any]
+    """(H, W) or (H, W, 3), as recorded: 8 bit, 16 bit or real numbers, NaN where nothing was
+    measured.
+    """
     valid: NDArray[np.bool_] | None = None
     """(H, W) where there is a picture at all; None = to be found out."""
 
@@ -51,7 +53,9 @@ class Registration:
     b_H_a: Matrix
     """(3, 3) takes a's pixels (x, y, centres at integers) to b's."""
     px_a: NDArray[np.float64]
-    """(n, 2) inliers in px of a: features, or middles of patches that find their place by themselves."""
+    """(n, 2) inliers in px of a: features, or middles of patches that find their place by
+    themselves.
+    """
     px_b: NDArray[np.float64]
     """(n, 2) where they lie in b."""
     evidence: Mapping[str, float] = field(default_factory=dict)

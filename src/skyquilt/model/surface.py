@@ -1,6 +1,7 @@
 """The height surface that photos are orthorectified over."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +23,7 @@ class Surface:
     source: str
     """What it was made from: `tie points` or `plane`."""
 
-    def at(self, x: NDArray, y: NDArray) -> NDArray[np.float32]:
+    def at(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float32]:
         """Heights in m at map coordinates of any shape, bilinear; the rim is continued outwards."""
         shape = np.shape(x)
         column = ((np.asarray(x) - self.x0) / self.cell).astype(np.float32)
@@ -45,7 +46,9 @@ class Surface:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeightField:
-    """Heights as measured, gaps left open, on a regular grid in the map frame; row 0 is the southernmost."""
+    """Heights as measured, gaps left open, on a regular grid in the map frame; row 0 is the
+    southernmost.
+    """
 
     z: NDArray[np.float32]
     """(rows, cols) heights in m above the frame's vertical datum; meaningless where not known."""
@@ -59,14 +62,21 @@ class HeightField:
     """Spacing in m."""
 
     def coarser(self, cell: float) -> "HeightField":
-        """Means over cells of about the size asked for; known where three in five of the heights in it are."""
-        factor = min(1.0, self.cell / cell)  # one for both axes, so that cells stay square: see `shrunken`
+        """Means over cells of about the size asked for; known where three in five of the heights in
+        it are.
+        """
+        factor = min(
+            1.0, self.cell / cell
+        )  # one for both axes, so that cells stay square: see `shrunken`
         share, total = (
             np.asarray(cv2.resize(one, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
             for one in (self.known.astype(np.float32), np.where(self.known, self.z, np.float32(0)))
         )
         size = self.cell / factor
         return HeightField(
-            z=(total / np.maximum(share, 1e-3)).astype(np.float32), known=share > 0.6,
-            x0=self.x0 + (size - self.cell) / 2, y0=self.y0 + (size - self.cell) / 2, cell=size,
-        )  # fmt: skip
+            z=(total / np.maximum(share, 1e-3)).astype(np.float32),
+            known=share > 0.6,
+            x0=self.x0 + (size - self.cell) / 2,
+            y0=self.y0 + (size - self.cell) / 2,
+            cell=size,
+        )

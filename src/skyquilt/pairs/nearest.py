@@ -1,7 +1,9 @@
-"""Candidate pairs from positions: near neighbours, neighbours in time, and retrieval for the lost."""
+"""Candidate pairs from positions: near neighbours, neighbours in time, and retrieval for the
+lost.
+"""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,21 +17,23 @@ Pair = tuple[int, int]
 class Nearest:
     """Photos whose footprints can overlap by the measured positions.
 
-    Altitudes lie (A2 of the methods), so the footprint is not computed from them here: the caller gives the
-    ground distance within which photos overlap, learnt from links already found, or None to take neighbours
-    only.
+    Altitudes lie (A2 of the methods), so the footprint is not computed from them here: the caller
+    gives the ground distance within which photos overlap, learnt from links already found, or None
+    to take neighbours only.
     """
 
     neighbours: int = 12
     """Most neighbours by distance per photo."""
     version: ClassVar[int] = 1
 
-    def __call__(self, map_xy: NDArray, reach_m: float | None = None) -> list[Pair]:
+    def __call__(self, map_xy: NDArray[Any], reach_m: float | None = None) -> list[Pair]:
         """Pairs i < j of photos with positions (n, 2) in m (NaN where unknown), nearest first."""
         known = np.flatnonzero(np.isfinite(map_xy).all(1))
         if len(known) < 2:
             return []
-        distance, index = nearest(map_xy[known], map_xy[known], min(self.neighbours + 1, len(known)))
+        distance, index = nearest(
+            map_xy[known], map_xy[known], min(self.neighbours + 1, len(known))
+        )
         found: dict[Pair, float] = {}
         for row, (ds, js) in enumerate(zip(distance, index, strict=True)):
             for d, j in zip(ds, js, strict=True):

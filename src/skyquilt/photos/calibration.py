@@ -16,12 +16,17 @@ _SIGMA_RADIAL, _SIGMA_TANGENTIAL = 0.01, 0.001
 def read_calibration(
     *, exif: Exif, xmp: Xmp, sensor: Sensor | None, width: int, height: int, scale: float
 ) -> Camera | None:
-    """The first of DJI's `DewarpData`, Pix4D's `Camera:Perspective*` and DJI's `CalibratedFocalLength`.
+    """The first of DJI's `DewarpData`, Pix4D's `Camera:Perspective*` and DJI's
+    `CalibratedFocalLength`.
 
     `scale` is this file's px per px as taken (`focal.native_scale`): makers calibrate the latter.
     """
     native = (round(width / scale), round(height / scale))
-    found = _dewarp(xmp, native) or _perspective(exif, xmp, sensor, native) or _calibrated_focal(xmp, native)
+    found = (
+        _dewarp(xmp, native)
+        or _perspective(exif, xmp, sensor, native)
+        or _calibrated_focal(xmp, native)
+    )
     return found and rescaled(found, width=width, height=height)
 
 
@@ -43,7 +48,9 @@ def rescaled(camera: Camera, *, width: int, height: int) -> Camera:
 
 
 def _dewarp(xmp: Xmp, size: tuple[int, int]) -> Camera | None:
-    """`date;fx,fy,cx,cy,k1,k2,p1,p2,k3`, cx and cy from the image centre; flag 1: already undistorted."""
+    """`date;fx,fy,cx,cy,k1,k2,p1,p2,k3`, cx and cy from the image centre; flag 1: already
+    undistorted.
+    """
     _, _, numbers = xmp.text("DewarpData").partition(";")
     try:
         fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(n) for n in numbers.split(","))
@@ -54,7 +61,9 @@ def _dewarp(xmp: Xmp, size: tuple[int, int]) -> Camera | None:
     return _camera(size, (fx + fy) / 2, (cx + size[0] / 2, cy + size[1] / 2), (k1, k2, k3, p1, p2))
 
 
-def _perspective(exif: Exif, xmp: Xmp, sensor: Sensor | None, size: tuple[int, int]) -> Camera | None:
+def _perspective(
+    exif: Exif, xmp: Xmp, sensor: Sensor | None, size: tuple[int, int]
+) -> Camera | None:
     """Lengths in mm on the sensor, from its corner; distortion as OpenCV's k1, k2, k3, p1, p2."""
     mm = xmp.number("Camera:PerspectiveFocalLength")
     if not mm or xmp.text("Camera:ModelType").lower() == "fisheye":
@@ -65,7 +74,11 @@ def _perspective(exif: Exif, xmp: Xmp, sensor: Sensor | None, size: tuple[int, i
     if px_per_mm is None:
         return None
     point = xmp.numbers("Camera:PrincipalPoint")
-    centre = (point[0] * px_per_mm, point[1] * px_per_mm) if len(point) == 2 else (size[0] / 2, size[1] / 2)
+    centre = (
+        (point[0] * px_per_mm, point[1] * px_per_mm)
+        if len(point) == 2
+        else (size[0] / 2, size[1] / 2)
+    )
     distortion = xmp.numbers("Camera:PerspectiveDistortion")
     return _camera(size, mm * px_per_mm, centre, distortion if len(distortion) == 5 else None)
 
@@ -87,12 +100,17 @@ def _calibrated_focal(xmp: Xmp, size: tuple[int, int]) -> Camera | None:
 
 
 def _camera(
-    size: tuple[int, int], focal: float, centre: tuple[float, float], distortion: tuple[float, ...] | None
+    size: tuple[int, int],
+    focal: float,
+    centre: tuple[float, float],
+    distortion: tuple[float, ...] | None,
 ) -> Camera | None:
     """A camera from corner-counted px; None where the numbers are no lens."""
     long = max(size)
     inside = all(0.25 * s < c < 0.75 * s for c, s in zip(centre, size, strict=True))
-    if not (0.2 * long < focal < 60 * long and inside and all(abs(k) < 10 for k in distortion or ())):
+    if not (
+        0.2 * long < focal < 60 * long and inside and all(abs(k) < 10 for k in distortion or ())
+    ):
         return None
     k1, k2, k3, p1, p2 = distortion or (0.0,) * 5
     sigmas = (
@@ -104,5 +122,15 @@ def _camera(
     w, h = size
     cx, cy = centre[0] - 0.5, centre[1] - 0.5
     return Camera(
-        width=w, height=h, focal=focal, cx=cx, cy=cy, k1=k1, k2=k2, k3=k3, p1=p1, p2=p2, sigmas=sigmas
+        width=w,
+        height=h,
+        focal=focal,
+        cx=cx,
+        cy=cy,
+        k1=k1,
+        k2=k2,
+        k3=k3,
+        p1=p1,
+        p2=p2,
+        sigmas=sigmas,
     )

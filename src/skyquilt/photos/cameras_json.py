@@ -20,10 +20,18 @@ def read_cameras_json(path: Path) -> dict[str, Camera]:
     try:
         records = json.loads(path.read_text("utf-8-sig"))
     except OSError as error:
-        raise SideFileError(f"{path} cannot be read ({error.strerror or error}); check the path.") from error
+        raise SideFileError(
+            f"{path} cannot be read ({error.strerror or error}); check the path."
+        ) from error
     except ValueError as error:
-        raise SideFileError(f"{path.name} is no JSON ({error}). Give the file as it was written.") from error
-    if not isinstance(records, dict) or not records or not all(isinstance(r, dict) for r in records.values()):
+        raise SideFileError(
+            f"{path.name} is no JSON ({error}). Give the file as it was written."
+        ) from error
+    if (
+        not isinstance(records, dict)
+        or not records
+        or not all(isinstance(r, dict) for r in records.values())
+    ):
         raise SideFileError(f"{path.name} should hold cameras by name, as OpenDroneMap writes it.")
     try:
         return {key: camera_from_opensfm(record) for key, record in records.items()}
@@ -34,11 +42,14 @@ def read_cameras_json(path: Path) -> dict[str, Camera]:
 def apply_cameras(
     photos: Sequence[Photo], cameras: Mapping[str, Camera], *, file: Path
 ) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """The photos with the calibrations that fit them, and notes; raises `SideFileError` where none fits."""
+    """The photos with the calibrations that fit them, and notes; raises `SideFileError` where none
+    fits.
+    """
     fitting = {p.camera_key: _fitting(p, cameras) for p in photos}
     if not any(fitting.values()):
         raise SideFileError(
-            f"{file.name} has cameras {', '.join(cameras)}; the photos are by {', '.join(fitting)}. "
+            f"{file.name} has cameras {', '.join(cameras)}; the photos are by {', '.join(fitting)}."
+            " "
             "Rename a camera to 'all', or give a calibration of this camera."
         )
     without = [key for key, camera in fitting.items() if camera is None]
@@ -47,13 +58,20 @@ def apply_cameras(
 
 
 def _fitting(photo: Photo, cameras: Mapping[str, Camera]) -> Camera | None:
-    """By equal key, else by a key that holds the photo's model words, else `all` or the only one."""
+    """By equal key, else by a key that holds the photo's model words, else `all` or the only
+    one.
+    """
     exact = [c for key, c in cameras.items() if key == photo.camera_key]
     words = set(re.split(r"[\s_]+", photo.camera_key.lower().rpartition(f" {photo.width}x")[0]))
-    similar = [c for key, c in cameras.items() if words and words <= set(re.split(r"[\s_]+", key.lower()))]
+    similar = [
+        c for key, c in cameras.items() if words and words <= set(re.split(r"[\s_]+", key.lower()))
+    ]
     generic = [c for key, c in cameras.items() if key == "all" or len(cameras) == 1]
     shape = photo.width / photo.height
-    return next((c for c in (*exact, *similar, *generic) if abs(c.width / c.height / shape - 1) < 0.02), None)
+    return next(
+        (c for c in (*exact, *similar, *generic) if abs(c.width / c.height / shape - 1) < 0.02),
+        None,
+    )
 
 
 def _calibrated(photo: Photo, camera: Camera | None) -> Photo:

@@ -13,12 +13,16 @@ _MOMENT = re.compile(
 
 
 def read_time(exif: Exif, xmp: Xmp) -> datetime | None:
-    """EXIF DateTimeOriginal with sub-seconds and offset, else the GPS clock (UTC), else XMP; None if none."""
+    """EXIF DateTimeOriginal with sub-seconds and offset, else the GPS clock (UTC), else XMP; None
+    if none.
+    """
     moment = parse_moment(exif.text(tag.TAKEN), exif.text(tag.SUBSEC), exif.text(tag.OFFSET))
     if moment is None:
         moment = _gps_time(exif)
     if moment is None:
-        moment = parse_moment(xmp.text("exif:DateTimeOriginal", "xmp:CreateDate", "photoshop:DateCreated"))
+        moment = parse_moment(
+            xmp.text("exif:DateTimeOriginal", "xmp:CreateDate", "photoshop:DateCreated")
+        )
     return moment or parse_moment(exif.text(tag.MODIFIED))
 
 
@@ -28,7 +32,9 @@ def modified_time(exif: Exif) -> datetime | None:
 
 
 def parse_moment(text: str, subseconds: str = "", offset: str = "") -> datetime | None:
-    """`2016:06:23 16:31:59` (also ISO 8601) with sub-seconds and `+02:00` inside or apart; else None."""
+    """`2016:06:23 16:31:59` (also ISO 8601) with sub-seconds and `+02:00` inside or apart; else
+    None.
+    """
     found = _MOMENT.match(text.strip())
     if not found:
         return None

@@ -23,7 +23,9 @@ def contradictions(photos: Sequence[Photo]) -> tuple[str, ...]:
 
 
 def yaw_disagreement_deg(photo: Photo) -> float | None:
-    """Camera yaw less flight yaw in [-180, 180) degrees; None where one is missing or the view is oblique."""
+    """Camera yaw less flight yaw in [-180, 180) degrees; None where one is missing or the view is
+    oblique.
+    """
     if photo.attitude is None or photo.flight_yaw_deg is None:
         return None
     if max(abs(photo.attitude.pitch_deg), abs(photo.attitude.roll_deg)) > _NADIR_DEG:
@@ -39,14 +41,17 @@ def _yaws(photos: Sequence[Photo]) -> Iterator[str]:
     camera = [p.attitude.yaw_deg for p in found if p.attitude]
     flight = [p.flight_yaw_deg for p in found if p.flight_yaw_deg is not None]
     yield (
-        f"Camera yaw and flight yaw differ by more than {_YAW_APART_DEG:.0f} deg in {len(found)} photos "
+        f"Camera yaw and flight yaw differ by more than {_YAW_APART_DEG:.0f} deg in {len(found)}"
+        " photos "
         f"(camera {_range(camera)}, aircraft {_range(flight)} deg): {sentence_of(names)}. "
         "The camera may have been turned, or one of the two is wrong."
     )
 
 
 def _tracks(photos: Sequence[Photo]) -> Iterator[str]:
-    """The way from the last photo against the aircraft's heading: a sideways flight, or a wrong heading."""
+    """The way from the last photo against the aircraft's heading: a sideways flight, or a wrong
+    heading.
+    """
     apart = []
     for before, after in pairwise(photos):
         heading = after.flight_yaw_deg if after.flight_yaw_deg is not None else _camera_yaw(after)
@@ -57,8 +62,10 @@ def _tracks(photos: Sequence[Photo]) -> Iterator[str]:
     if len(odd) > max(2, len(apart) // 4):
         median = float(np.median([d for _, d in apart]))
         yield (
-            f"The way flown (from GPS) and the heading differ by more than {_YAW_APART_DEG:.0f} deg at "
-            f"{len(odd)} of {len(apart)} steps, by {median:.0f} deg in the median: {sentence_of(odd)}."
+            f"The way flown (from GPS) and the heading differ by more than {_YAW_APART_DEG:.0f} deg"
+            " at "
+            f"{len(odd)} of {len(apart)} steps, by {median:.0f} deg in the median:"
+            f" {sentence_of(odd)}."
         )
 
 
@@ -70,28 +77,42 @@ def _track_deg(a: GeoPosition | None, b: GeoPosition | None) -> float | None:
     if a is None or b is None:
         return None
     north = (b.latitude_deg - a.latitude_deg) * _METRES_PER_DEGREE
-    east = (b.longitude_deg - a.longitude_deg) * _METRES_PER_DEGREE * np.cos(np.radians(a.latitude_deg))
-    return float(np.degrees(np.arctan2(east, north))) if np.hypot(north, east) > _SHORT_MOVE_M else None
+    east = (
+        (b.longitude_deg - a.longitude_deg)
+        * _METRES_PER_DEGREE
+        * np.cos(np.radians(a.latitude_deg))
+    )
+    return (
+        float(np.degrees(np.arctan2(east, north)))
+        if np.hypot(north, east) > _SHORT_MOVE_M
+        else None
+    )
 
 
 def _altitudes(photos: Sequence[Photo]) -> Iterator[str]:
-    datums = sorted({p.position.datum for p in photos if p.position and p.position.altitude_m is not None})
+    datums = sorted(
+        {p.position.datum for p in photos if p.position and p.position.altitude_m is not None}
+    )
     if len(datums) > 1:
         yield f"The heights count from different zeros: {', '.join(datums)}."
     placed = [p.position for p in photos if p.position]
     both = [
-        p.sea_level_m - p.takeoff_m for p in placed if p.sea_level_m is not None and p.takeoff_m is not None
+        p.sea_level_m - p.takeoff_m
+        for p in placed
+        if p.sea_level_m is not None and p.takeoff_m is not None
     ]
     if both and max(both) - min(both) > _ALTITUDE_APART_M:
         yield (
-            f"Height above sea level less height above take-off should be one number, but runs from "
+            "Height above sea level less height above take-off should be one number, but runs from"
+            " "
             f"{min(both):.0f} to {max(both):.0f} m: one of the two drifts."
         )
     for datum in datums:
         heights = [p.altitude_m for p in placed if p.datum == datum and p.altitude_m is not None]
         if max(heights) - min(heights) > _ALTITUDE_RANGE_M:
             yield (
-                f"Heights ({datum.replace('_', ' ')}) run from {min(heights):.0f} to {max(heights):.0f} m: "
+                f"Heights ({datum.replace('_', ' ')}) run from {min(heights):.0f} to"
+                f" {max(heights):.0f} m: "
                 "the flight climbed, or the altitude drifts."
             )
 
@@ -100,7 +121,10 @@ def _focals(photos: Sequence[Photo]) -> Iterator[str]:
     for key in sorted({p.camera_key for p in photos}):
         focals = [p.focal.px for p in photos if p.camera_key == key]
         if max(focals) > 1.05 * min(focals):
-            yield f"Photos of {key} claim focal lengths from {min(focals):.0f} to {max(focals):.0f} px."
+            yield (
+                f"Photos of {key} claim focal lengths from {min(focals):.0f} to {max(focals):.0f}"
+                " px."
+            )
 
 
 def _range(values: Sequence[float]) -> str:

@@ -1,8 +1,9 @@
 """Known distances on the ground: a CSV with the header `point_a,point_b,metres`.
 
-Where the points are seen is told in one of three ways: by further columns `px_a,py_a,image_a,px_b,py_b,image_b`,
-several rows for several sightings; by writing a point as `px py image`; or by the names of points in gcp_list.txt.
-Pixels have their centres at integers, as there.
+Where the points are seen is told in one of three ways: by further columns
+`px_a,py_a,image_a,px_b,py_b,image_b`, several rows for several sightings; by writing a point as `px
+py image`; or by the names of points in gcp_list.txt. Pixels have their centres at integers, as
+there.
 """
 
 import csv
@@ -25,7 +26,8 @@ def read_distances(
     """Distances between points seen in the photos of a survey.
 
     Raises:
-        SideFileError: the header, a number or a point is wrong, or a photo named is not in the survey.
+        SideFileError: the header, a number or a point is wrong, or a photo named is not in the
+            survey.
     """
     rows = _rows(path)
     names, known = PhotoNames(photo_names), {c.name: c.observations for c in control}
@@ -37,11 +39,13 @@ def read_distances(
         metres = finite(number(row["metres"]))
         if metres is None or metres <= 0:
             raise SideFileError(
-                f"{place}: expected a length in m above 0, found '{row['metres']}'. Correct that cell."
+                f"{place}: expected a length in m above 0, found '{row['metres']}'. Correct that"
+                " cell."
             )
         if lengths.setdefault((ends[0], ends[1]), metres) != metres:
             raise SideFileError(
-                f"{place}: {ends[0]} to {ends[1]} has two different lengths. Correct one of its rows."
+                f"{place}: {ends[0]} to {ends[1]} has two different lengths. Correct one of its"
+                " rows."
             )
         for end, label in zip(_ENDS, ends, strict=True):
             for seen in _observations(row, end, label, known, place):
@@ -54,16 +58,20 @@ def read_distances(
                     )
     if strangers:
         raise SideFileError(
-            f"{path.name} names {sentence_of(sorted(set(strangers)))}; no photo of the survey is called that."
+            f"{path.name} names {sentence_of(sorted(set(strangers)))}; no photo of the survey is"
+            " called that."
             " Correct the image names or take the rows out."
         )
     return tuple(
         KnownDistance(
-            a=a, b=b, metres=metres, observations_a=tuple(sightings[a].values()),
+            a=a,
+            b=b,
+            metres=metres,
+            observations_a=tuple(sightings[a].values()),
             observations_b=tuple(sightings[b].values()),
         )
         for (a, b), metres in lengths.items()
-    )  # fmt: skip
+    )
 
 
 def _rows(path: Path) -> list[tuple[str, Mapping[str, str]]]:
@@ -75,10 +83,16 @@ def _rows(path: Path) -> list[tuple[str, Mapping[str, str]]]:
     if missing or len(table) < 2:
         raise SideFileError(
             f"{path.name}: expected a header with {', '.join(_NEEDED)} and a line per distance,"
-            f" found '{', '.join(header)}' and {max(0, len(table) - 1)} lines. See the documentation of --distances."
+            f" found '{', '.join(header)}' and {max(0, len(table) - 1)} lines. See the"
+            " documentation of --distances."
         )
-    cells = ((f"{path.name}, line {i}", row) for (i, _), row in zip(lines[1:], table[1:], strict=True))
-    return [(place, dict(zip(header, [*row, *[""] * len(header)], strict=False))) for place, row in cells]
+    cells = (
+        (f"{path.name}, line {i}", row) for (i, _), row in zip(lines[1:], table[1:], strict=True)
+    )
+    return [
+        (place, dict(zip(header, [*row, *[""] * len(header)], strict=False)))
+        for place, row in cells
+    ]
 
 
 def _label(text: str) -> str:
@@ -86,7 +100,11 @@ def _label(text: str) -> str:
 
 
 def _observations(
-    row: Mapping[str, str], end: str, label: str, known: Mapping[str, Sequence[PointObservation]], place: str
+    row: Mapping[str, str],
+    end: str,
+    label: str,
+    known: Mapping[str, Sequence[PointObservation]],
+    place: str,
 ) -> Sequence[PointObservation]:
     """Sightings that a row tells of one end."""
     words = [row.get(f"{c}_{end}", "").strip() for c in ("px", "py", "image")]
@@ -97,7 +115,8 @@ def _observations(
     x, y = finite(number(words[0])), finite(number(words[1]))
     if x is None or y is None or not words[2]:
         raise SideFileError(
-            f"{place}: nothing tells where point '{label}' is seen; add columns px_{end}, py_{end}, image_{end},"
+            f"{place}: nothing tells where point '{label}' is seen; add columns px_{end}, py_{end},"
+            f" image_{end},"
             " or name a point of gcp_list.txt"
         )
     return (PointObservation(photo=words[2], x=x, y=y),)

@@ -7,9 +7,12 @@ from skyquilt.photos.exif import Exif
 from skyquilt.photos.xmp import Xmp
 
 _PROGRAMS = re.compile(
-    r"photo ?viewer|photoshop|lightroom|camera raw|adobe|gimp|paint|microsoft|windows|picasa|snapseed|acdsee|"
-    r"xnview|irfanview|faststone|imagemagick|graphicsmagick|darktable|rawtherapee|capture one|affinity|"
-    r"pixelmator|digikam|gthumb|shotwell|photos \d|preview|mac os|macos|luminar|dxo|corel|photoscape|"
+    r"photo ?viewer|photoshop|lightroom|camera"
+    r" raw|adobe|gimp|paint|microsoft|windows|picasa|snapseed|acdsee|"
+    r"xnview|irfanview|faststone|imagemagick|graphicsmagick|darktable|rawtherapee|capture"
+    r" one|affinity|"
+    r"pixelmator|digikam|gthumb|shotwell|photos \d|preview|mac"
+    r" os|macos|luminar|dxo|corel|photoscape|"
     r"google|instagram|pix4d|agisoft|metashape|opencv|matlab|ffmpeg|dji photo|silkypix|topaz",
     re.IGNORECASE,
 )

@@ -24,7 +24,9 @@ GPS_TIME, GPS_ERROR, GPS_DATE = 7, 0x1F, 0x1D
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Exif:
-    """Tags by number: of the image and photo directories in `tags`, of the GPS directory in `gps`."""
+    """Tags by number: of the image and photo directories in `tags`, of the GPS directory in
+    `gps`.
+    """
 
     tags: Mapping[int, Any] = field(default_factory=dict)
     """IFD0 and the Exif directory in one (their numbers do not clash)."""
@@ -77,7 +79,9 @@ def read_tiff_tags(file: BinaryIO) -> Exif:
             exif.load_from_fp(file)
             tags = {**dict(exif), **_directory(exif, EXIF_IFD)}
             return Exif(tags=tags, gps=_directory(exif, GPS_IFD))
-    except Exception:  # Pillow raises a dozen kinds on garbage, and a broken block must not stop a survey
+    except (
+        Exception
+    ):  # Pillow raises a dozen kinds on garbage, and a broken block must not stop a survey
         return Exif(broken=True)
 
 

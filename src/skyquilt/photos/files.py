@@ -30,9 +30,9 @@ class FoundFiles:
 def find_files(source: Path | Sequence[Path]) -> FoundFiles:
     """Photos by their endings below a folder, or among files given one by one.
 
-    Hidden files and folders are passed over, and so are folders of earlier runs (they hold `run.toml`, or
-    `.skyquilt` while they are under way).
-    Raises `UsageError` where something named does not exist.
+    Hidden files and folders are passed over, and so are folders of earlier runs (they hold
+    `run.toml`, or `.skyquilt` while they are under way). Raises `UsageError` where something named
+    does not exist.
     """
     if isinstance(source, (str, Path)) and Path(source).is_dir():
         return _in_folder(Path(source))
@@ -69,7 +69,9 @@ def _listed(paths: Sequence[Path]) -> FoundFiles:
     unique = list(dict.fromkeys(p.absolute() for p in files))
     top = Path(os.path.commonpath([p.parent for p in unique])) if unique else Path()
     bare = len({p.name for p in unique}) == len(unique)
-    return _sorted([(_text(p.name if bare else p.relative_to(top).as_posix()), p) for p in unique], None, ())
+    return _sorted(
+        [(_text(p.name if bare else p.relative_to(top).as_posix()), p) for p in unique], None, ()
+    )
 
 
 def _text(name: str) -> str:
@@ -77,7 +79,9 @@ def _text(name: str) -> str:
     return name.encode("utf-8", "backslashreplace").decode()
 
 
-def _sorted(files: Sequence[tuple[str, Path]], geo: Path | None, runs: tuple[str, ...]) -> FoundFiles:
+def _sorted(
+    files: Sequence[tuple[str, Path]], geo: Path | None, runs: tuple[str, ...]
+) -> FoundFiles:
     photos = sorted((n, p) for n, p in files if p.suffix.lower() in _PHOTO_ENDINGS)
     known = {n for n, _ in photos}
     ignored = sorted(n for n, p in files if n not in known and p.name.lower() not in _SIDE_NAMES)

@@ -1,7 +1,8 @@
-"""FLIR's radiometric JPEG: the FFF block in APP1 segments, and Planck's law as FLIR parametrises it.
+"""FLIR's radiometric JPEG: the FFF block in APP1 segments, and Planck's law as FLIR parametrises
+it.
 
-Layout and radiometry follow the public descriptions of the format (record directory, raw image record 1,
-camera record 0x20; radiance budget object, reflection, atmosphere, window).
+Layout and radiometry follow the public descriptions of the format (record directory, raw image
+record 1, camera record 0x20; radiance budget object, reflection, atmosphere, window).
 """
 
 import io
@@ -22,7 +23,9 @@ _ZERO_CELSIUS = 273.15
 
 @dataclass(frozen=True, kw_only=True)
 class FlirCamera:
-    """The radiometric constants of one frame; temperatures in K, distance in m, the rest without unit."""
+    """The radiometric constants of one frame; temperatures in K, distance in m, the rest without
+    unit.
+    """
 
     planck_r1: float
     planck_b: float
@@ -44,9 +47,9 @@ class FlirCamera:
 
     def signal(self, kelvin: float) -> float:
         """Counts that a black body of this temperature yields."""
-        return self.planck_r1 / (self.planck_r2 * (math.exp(self.planck_b / kelvin) - self.planck_f)) - (
-            self.planck_o
-        )
+        return self.planck_r1 / (
+            self.planck_r2 * (math.exp(self.planck_b / kelvin) - self.planck_f)
+        ) - (self.planck_o)
 
     @property
     def transmission(self) -> float:
@@ -62,9 +65,14 @@ class FlirCamera:
         """Object temperature in deg C, shape as given; NaN where the counts are no radiance."""
         tau, e, w = self.transmission, self.emissivity, self.window_transmission
         seen = (counts.astype(np.float64) - (1 - w) * self.signal(self.window_k)) / w
-        seen -= (1 - tau) * self.signal(self.atmosphere_k) + (1 - e) * tau * self.signal(self.reflected_k)
+        seen -= (1 - tau) * self.signal(self.atmosphere_k) + (1 - e) * tau * self.signal(
+            self.reflected_k
+        )
         with np.errstate(all="ignore"):
-            ratio = self.planck_r1 / (self.planck_r2 * (seen / (e * tau) + self.planck_o)) + self.planck_f
+            ratio = (
+                self.planck_r1 / (self.planck_r2 * (seen / (e * tau) + self.planck_o))
+                + self.planck_f
+            )
             celsius = self.planck_b / np.log(ratio) - _ZERO_CELSIUS
         celsius[~np.isfinite(celsius) | (celsius < -_ZERO_CELSIUS)] = np.nan
         return celsius.astype(np.float32)
@@ -90,7 +98,9 @@ def read_flir(jpeg: JpegHeader) -> FlirFrame | None:
         records = _records(block)
         counts = _counts(records[_RAW_IMAGE])
         return FlirFrame(counts=counts, camera=_camera(records.get(_CAMERA, b"")))
-    except Exception:  # struct, Pillow and numpy raise many kinds on garbage; all mean that there is no frame
+    except (
+        Exception
+    ):  # struct, Pillow and numpy raise many kinds on garbage; all mean that there is no frame
         return None
 
 
@@ -120,7 +130,9 @@ def _counts(record: bytes) -> NDArray[np.uint16]:
             if image.size != (width, height) or not image.mode.startswith("I"):
                 raise ValueError("its raw PNG is no 16-bit image of the size the record states")
             swapped = np.asarray(image, dtype=np.uint16)
-        return np.asarray(swapped.byteswap(), dtype=np.uint16)  # little-endian words in a big-endian format
+        return np.asarray(
+            swapped.byteswap(), dtype=np.uint16
+        )  # little-endian words in a big-endian format
     data = np.frombuffer(body, dtype=order + "u2", count=width * height)
     return np.asarray(data.reshape(height, width), dtype=np.uint16)
 
@@ -164,7 +176,11 @@ def _is_thermometer(camera: FlirCamera) -> bool:
     """Whether hotter means more counts, through air that lets something pass."""
     try:
         steps = [camera.signal(kelvin) for kelvin in (150.0, 250.0, 350.0, 1000.0)]
-        return steps == sorted(steps) and math.isfinite(sum(steps)) and 0.05 < camera.transmission < 1.5
+        return (
+            steps == sorted(steps)
+            and math.isfinite(sum(steps))
+            and 0.05 < camera.transmission < 1.5
+        )
     except ArithmeticError:
         return False
 

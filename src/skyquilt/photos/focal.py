@@ -14,13 +14,17 @@ _PLAUSIBLE = (0.2, 60.0)
 """A focal length outside these multiples of the long side is a slip of the pen, not a lens."""
 _MOST_ZOOM = 16.0
 _APART = 1.2
-"""Focal lengths that differ by more than this factor contradict each other; 35 mm values are rounded."""
+"""Focal lengths that differ by more than this factor contradict each other; 35 mm values are
+rounded.
+"""
 
 
 def native_scale(exif: Exif, width: int, height: int) -> tuple[float, str]:
-    """How many px of the file stand for one px as taken, and a note where the sizes disagree in shape.
+    """How many px of the file stand for one px as taken, and a note where the sizes disagree in
+    shape.
 
-    EXIF keeps the size the camera wrote; a reduced copy still carries it. 1.0 where EXIF says nothing.
+    EXIF keeps the size the camera wrote; a reduced copy still carries it. 1.0 where EXIF says
+    nothing.
     """
     x, y = exif.number(tag.PIXELS_X), exif.number(tag.PIXELS_Y)
     if not x or not y or x < 1 or y < 1:
@@ -29,7 +33,8 @@ def native_scale(exif: Exif, width: int, height: int) -> tuple[float, str]:
     scale = max(width, height) / long
     if abs(min(width, height) / short / scale - 1) > 0.02:
         return scale, (
-            f"EXIF says {x:.0f}x{y:.0f} px, the file has {width}x{height}: cropped or padded, so the focal "
+            f"EXIF says {x:.0f}x{y:.0f} px, the file has {width}x{height}: cropped or padded, so"
+            " the focal "
             "length and any calibration in the metadata are uncertain."
         )
     return scale, ""
@@ -44,7 +49,9 @@ def find_focal(
     height: int,
     thermal: bool = False,
 ) -> Focal:
-    """The first of: calibrated, mm on the sensor, focal-plane resolution, 35 mm equivalent, a guess."""
+    """The first of: calibrated, mm on the sensor, focal-plane resolution, 35 mm equivalent, a
+    guess.
+    """
     candidates = (
         _calibrated(calibration),
         _on_sensor(exif, sensor, width, height),
@@ -69,13 +76,16 @@ def focal_notes(exif: Exif, sensor: Sensor | None, width: int, height: int) -> t
     """Where EXIF's ways to the focal length disagree, and a digital zoom."""
     zoom = digital_zoom(exif)
     zoomed = (
-        f"It was taken with a digital zoom of {zoom:g}; the focal length counts it in." if zoom > 1 else ""
+        f"It was taken with a digital zoom of {zoom:g}; the focal length counts it in."
+        if zoom > 1
+        else ""
     )
     direct = _on_sensor(exif, sensor, width, height) or _on_plane(exif, width, height)
     rounded = _from_35mm(exif, width, height)
     if direct and rounded and not 1 / _APART < direct.px / rounded.px < _APART:
         return zoomed, (
-            f"Its focal length in mm means {direct.px:.0f} px, its 35 mm equivalent {rounded.px:.0f} px; "
+            f"Its focal length in mm means {direct.px:.0f} px, its 35 mm equivalent"
+            f" {rounded.px:.0f} px; "
             "one of them is wrong."
         )
     return (zoomed,)

@@ -1,8 +1,9 @@
 """OpenDroneMap's `gcp_list.txt`: a coordinate system, then `x y z px py image [name] [check]`.
 
-Rows with one name, or without names the same x, y and z, are sightings of one point. z may be NaN. Pixels
-have their centres at integers. A check point, kept out of the adjustment, has a name that starts with `check`
-or the word `check` in the eighth column: both are extensions that OpenDroneMap reads over.
+Rows with one name, or without names the same x, y and z, are sightings of one point. z may be NaN.
+Pixels have their centres at integers. A check point, kept out of the adjustment, has a name that
+starts with `check` or the word `check` in the eighth column: both are extensions that OpenDroneMap
+reads over.
 """
 
 from collections.abc import Iterable
@@ -31,16 +32,20 @@ class _Sighting:
         return self.name or f"{self.x!r} {self.y!r} {self.z!r}"
 
 
-def read_gcp_list(path: Path, photo_names: Iterable[str]) -> tuple[tuple[ControlPoint, ...], tuple[str, ...]]:
-    """Control points seen in the photos of a survey, and notes on rows of photos that are not in it.
+def read_gcp_list(
+    path: Path, photo_names: Iterable[str]
+) -> tuple[tuple[ControlPoint, ...], tuple[str, ...]]:
+    """Control points seen in the photos of a survey, and notes on rows of photos that are not in
+    it.
 
-    `photo_names` are `Photo.name`s. Raises `SideFileError` where a line is malformed, one point has two
-    places, or no row names a photo of the survey.
+    `photo_names` are `Photo.name`s. Raises `SideFileError` where a line is malformed, one point has
+    two places, or no row names a photo of the survey.
     """
     lines = read_lines(path)
     if len(lines) < 2:
         raise SideFileError(
-            f"{path.name} has {len(lines)} lines; expected a coordinate system and one line per sighting."
+            f"{path.name} has {len(lines)} lines; expected a coordinate system and one line per"
+            " sighting."
         )
     crs = read_crs(lines[0][1], file=path.name)
     epsg = crs.to_epsg()
@@ -62,8 +67,14 @@ def read_gcp_list(path: Path, photo_names: Iterable[str]) -> tuple[tuple[Control
 
 def _notes(path: Path, strangers: list[str], points: list[ControlPoint]) -> tuple[str, ...]:
     unseen = [p.name for p in points if not p.observations]
-    missing = f"{path.name} names photos that are not there: {sentence_of(strangers)}." if strangers else ""
-    lost = f"Control points seen in no photo of the survey: {sentence_of(unseen)}." if unseen else ""
+    missing = (
+        f"{path.name} names photos that are not there: {sentence_of(strangers)}."
+        if strangers
+        else ""
+    )
+    lost = (
+        f"Control points seen in no photo of the survey: {sentence_of(unseen)}." if unseen else ""
+    )
     return tuple(n for n in (missing, lost) if n)
 
 
@@ -75,7 +86,8 @@ def _sighting(line: str, place: str) -> _Sighting:
     wanted = (finite(v) for v in (x, y, column, row))
     if len(words) < 6 or z is None or any(v is None for v in wanted):
         raise SideFileError(
-            f"{place}: expected 'x y z px py image [name] [check]', found '{line}'. Correct that line."
+            f"{place}: expected 'x y z px py image [name] [check]', found '{line}'. Correct that"
+            " line."
         )
     name = words[6] if len(words) > 6 else ""
     check = name.lower().startswith("check") or (len(words) > 7 and words[7].lower() == "check")
@@ -95,7 +107,9 @@ def _point(i: int, group: list[_Sighting], crs: str, names: PhotoNames, path: Pa
     first = group[0]
     label = first.name or f"point {i}"
     if len({(s.x, s.y, s.z) for s in group}) > 1:
-        raise SideFileError(f"{path.name}: point {label} has two different places. Correct one of its rows.")
+        raise SideFileError(
+            f"{path.name}: point {label} has two different places. Correct one of its rows."
+        )
     seen = ((names.find(s.image), s) for s in group)
     return ControlPoint(
         name=label,

@@ -1,8 +1,8 @@
 """OpenDroneMap's `geo.txt`: a coordinate system, then `name x y [z] [yaw pitch roll [hacc vacc]]`.
 
-x is easting or longitude, y northing or latitude, whatever the axis order of the system. Angles in degrees:
-yaw clockwise from north, pitch 0 = nadir, roll. z counts from sea level unless the system is ellipsoidal
-(3D).
+x is easting or longitude, y northing or latitude, whatever the axis order of the system. Angles in
+degrees: yaw clockwise from north, pitch 0 = nadir, roll. z counts from sea level unless the system
+is ellipsoidal (3D).
 """
 
 from pathlib import Path
@@ -22,7 +22,8 @@ def read_geo_txt(path: Path) -> tuple[SideRow, ...]:
     lines = read_lines(path)
     if len(lines) < 2:
         raise SideFileError(
-            f"{path.name} has {len(lines)} lines; expected a coordinate system and one line per photo."
+            f"{path.name} has {len(lines)} lines; expected a coordinate system and one line per"
+            " photo."
         )
     crs = read_crs(lines[0][1], file=path.name)
     to_degrees = _to_degrees(crs)

@@ -57,13 +57,16 @@ def read_header(path: Path) -> Header:
     except OSError as error:
         raise UnreadablePhotoError(f"it cannot be read ({error.strerror or error})") from error
     except Exception as error:  # tifffile and Pillow raise many kinds on garbage
-        raise UnreadablePhotoError(f"its header is broken ({type(error).__name__}: {error})") from error
+        raise UnreadablePhotoError(
+            f"its header is broken ({type(error).__name__}: {error})"
+        ) from error
 
 
 def content_digest(path: Path) -> str:
     """BLAKE2b of the file (hex); of a JPEG over 1 MiB of its size, first and last 256 KiB.
 
-    Coded pixels shift everything behind a change, so the ends betray it; other formats are hashed whole.
+    Coded pixels shift everything behind a change, so the ends betray it; other formats are hashed
+    whole.
     """
     digest = hashlib.blake2b(digest_size=16)
     with path.open("rb") as file:
@@ -133,10 +136,14 @@ def _tiff(file: BinaryIO) -> Header:
 
 
 def _check_extent(page: "tifffile.TiffPage", file: BinaryIO) -> None:
-    need = max((o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=False)), default=0)
+    need = max(
+        (o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=False)), default=0
+    )
     have = file.seek(0, io.SEEK_END)
     if need > have:
-        raise UnreadablePhotoError(f"it is cut off: its pixels need {need} bytes, the file has {have}")
+        raise UnreadablePhotoError(
+            f"it is cut off: its pixels need {need} bytes, the file has {have}"
+        )
 
 
 def _stored_as(dtype: "np.dtype[np.generic]") -> Dtype:

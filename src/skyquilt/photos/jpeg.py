@@ -40,14 +40,20 @@ class JpegHeader:
     def xmp(self) -> tuple[bytes, ...]:
         """XMP packets: the main one and the extended one joined from its parts."""
         main = [p[len(_XMP) :] for m, p in self.segments if m == APP1 and p.startswith(_XMP)]
-        parts = [p[len(_XMP_MORE) :] for m, p in self.segments if m == APP1 and p.startswith(_XMP_MORE)]
+        parts = [
+            p[len(_XMP_MORE) :] for m, p in self.segments if m == APP1 and p.startswith(_XMP_MORE)
+        ]
         parts.sort(key=lambda p: int.from_bytes(p[36:40], "big"))  # GUID 32, length 4, offset 4
         more = b"".join(p[40:] for p in parts)
         return (*main, more) if more else tuple(main)
 
     def joined(self, marker: int, prefix: bytes = b"") -> bytes:
-        """Payloads of one marker that start with `prefix`, the prefix dropped, one after another."""
-        return b"".join(p[len(prefix) :] for m, p in self.segments if m == marker and p.startswith(prefix))
+        """Payloads of one marker that start with `prefix`, the prefix dropped, one after
+        another.
+        """
+        return b"".join(
+            p[len(prefix) :] for m, p in self.segments if m == marker and p.startswith(prefix)
+        )
 
 
 def _next_marker(file: BinaryIO) -> int:
@@ -84,7 +90,11 @@ def read_jpeg_header(file: BinaryIO) -> JpegHeader:
             raise UnreadablePhotoError("it is a JPEG without an image in it")
         payload = _payload(file)
         if marker in _FRAMES and len(payload) >= 6:
-            frame = (int.from_bytes(payload[3:5], "big"), int.from_bytes(payload[1:3], "big"), payload[5])
+            frame = (
+                int.from_bytes(payload[3:5], "big"),
+                int.from_bytes(payload[1:3], "big"),
+                payload[5],
+            )
         elif 0xE0 <= marker <= 0xEF:
             segments.append((marker, payload))
     if frame is None or 0 in frame:
@@ -101,8 +111,9 @@ def read_jpeg_header(file: BinaryIO) -> JpegHeader:
 def has_end(file: BinaryIO, scan_offset: int) -> bool:
     """Whether the pixels are closed by an end-of-image marker.
 
-    Inside the coded pixels FF D9 cannot occur (FF is stuffed), so the first one after the scan's start is the
-    image's own end, whatever previews or padding follow it. The tail is tried first, as it mostly lies there.
+    Inside the coded pixels FF D9 cannot occur (FF is stuffed), so the first one after the scan's
+    start is the image's own end, whatever previews or padding follow it. The tail is tried first,
+    as it mostly lies there.
     """
     size = file.seek(0, io.SEEK_END)
     file.seek(max(scan_offset, size - 2))

@@ -1,7 +1,8 @@
 """DJI's `.MRK`: one line per shot of an RTK flight.
 
-`index, GPS seconds, [week], N,E,V offsets in mm from antenna to camera, Lat, Lon, Ellh, deviations, quality`.
-V counts downwards. The index is the last four digits in the photo's name (`100_0001_0023.JPG`).
+`index, GPS seconds, [week], N,E,V offsets in mm from antenna to camera, Lat, Lon, Ellh, deviations,
+quality`. V counts downwards. The index is the last four digits in the photo's name
+(`100_0001_0023.JPG`).
 """
 
 import math
@@ -29,7 +30,8 @@ def read_mrk(path: Path, photo_names: Sequence[str]) -> tuple[SideRow, ...]:
         found = _LINE.match(line)
         if not found:
             raise SideFileError(
-                f"{path.name}, line {i}: expected a DJI shot record (index, time, [week], N, E, V, Lat, Lon, "
+                f"{path.name}, line {i}: expected a DJI shot record (index, time, [week], N, E, V,"
+                " Lat, Lon, "
                 f"Ellh ...), found '{line[:60]}'. Give the file as the drone wrote it."
             )
         shots[int(found[1])] = [float(v) if v else None for v in found.groups()[1:]]
@@ -37,8 +39,10 @@ def read_mrk(path: Path, photo_names: Sequence[str]) -> tuple[SideRow, ...]:
     rows = tuple(_row(name, shot) for name, shot in pairs if shot)
     if not rows:
         raise SideFileError(
-            f"{path.name} has shots {min(shots, default=0)} to {max(shots, default=0)}; no photo's name ends "
-            "in one of these numbers. Photos must keep the drone's names, such as 100_0001_0023.JPG."
+            f"{path.name} has shots {min(shots, default=0)} to {max(shots, default=0)}; no photo's"
+            " name ends "
+            "in one of these numbers. Photos must keep the drone's names, such as"
+            " 100_0001_0023.JPG."
         )
     return rows
 

@@ -1,8 +1,8 @@
 """Pixels of a photo: sensor coordinates everywhere, EXIF Orientation never applied.
 
-At `reduction` r a reduced pixel covers r x r full ones and the size is rounded up: pixel (i, j) of the
-reduced image has its centre at (r * i + (r - 1) / 2, r * j + (r - 1) / 2) of the full one. Reduced JPEGs are
-decoded at that scale (no full decode takes place).
+At `reduction` r a reduced pixel covers r x r full ones and the size is rounded up: pixel (i, j) of
+the reduced image has its centre at (r * i + (r - 1) / 2, r * j + (r - 1) / 2) of the full one.
+Reduced JPEGs are decoded at that scale (no full decode takes place).
 """
 
 import io
@@ -24,14 +24,17 @@ from skyquilt.photos.thermal import thermal_frame_of_jpeg, thermal_frame_of_valu
 
 Pixels = NDArray[Any]
 Reduction = Literal[1, 2, 4, 8]
-_HARMLESS = re.compile(r"\b\d{1,2} extraneous bytes before marker|JFIF|Inconsistent progression|Invalid SOS")
+_HARMLESS = re.compile(
+    r"\b\d{1,2} extraneous bytes before marker|JFIF|Inconsistent progression|Invalid SOS"
+)
 
 
 def read_color(photo: Photo, *, reduction: Reduction = 1) -> Pixels:
-    """Pixels as recorded: (height, width, 3) uint8 RGB, or (height, width) of a single band, or all bands.
+    """Pixels as recorded: (height, width, 3) uint8 RGB, or (height, width) of a single band, or all
+    bands.
 
-    Type and unit are `photo.dtype` and `photo.unit`; thermal frames are float32 with NaN for no measurement.
-    Raises `UnreadablePhotoError` where the data are broken.
+    Type and unit are `photo.dtype` and `photo.unit`; thermal frames are float32 with NaN for no
+    measurement. Raises `UnreadablePhotoError` where the data are broken.
     """
     return _read(photo, reduction, gray=False)
 
@@ -62,7 +65,9 @@ def to_gray(pixels: Pixels) -> NDArray[np.uint8]:
 
 
 def reduce_pixels(pixels: Pixels, reduction: int) -> Pixels:
-    """Area mean over reduction x reduction px, the size rounded up, type and shape of bands kept."""
+    """Area mean over reduction x reduction px, the size rounded up, type and shape of bands
+    kept.
+    """
     if reduction == 1:
         return pixels
     height, width = pixels.shape[:2]
@@ -82,7 +87,9 @@ def _read(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
     want = (-(-photo.height // reduction), -(-photo.width // reduction))
     if pixels.shape[:2] != want:
         found = f"{pixels.shape[1]}x{pixels.shape[0]}"
-        raise UnreadablePhotoError(f"its pixels are {found} where its header promised {want[1]}x{want[0]}")
+        raise UnreadablePhotoError(
+            f"its pixels are {found} where its header promised {want[1]}x{want[0]}"
+        )
     return pixels
 
 

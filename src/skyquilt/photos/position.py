@@ -11,7 +11,9 @@ _HEIGHTS = (-500.0, 9500.0)
 _RTK_FLOAT, _RTK_FIXED = 34, 50
 _DRONE_SIGMA = (1.5, 3.0)
 _CAMERA_SIGMA = (5.0, 15.0)
-"""Horizontal and vertical deviation in m where nothing says more; a camera's receiver is no autopilot's."""
+"""Horizontal and vertical deviation in m where nothing says more; a camera's receiver is no
+autopilot's.
+"""
 
 
 def read_position(exif: Exif, xmp: Xmp) -> tuple[GeoPosition | None, tuple[str, ...]]:
@@ -88,10 +90,12 @@ def _sexagesimal(value: object, reference: str) -> float | None:
     degrees = sum((n or 0.0) / 60**i for i, n in enumerate(numbers))
     if any(n is None for n in numbers) or not math.isfinite(degrees):
         return None
-    return -degrees if reference.upper()[:1] in ("S", "W") else degrees
+    return float(-degrees if reference.upper()[:1] in ("S", "W") else degrees)
 
 
-def _heights(exif: Exif, xmp: Xmp, notes: list[str]) -> tuple[float | None, float | None, float | None]:
+def _heights(
+    exif: Exif, xmp: Xmp, notes: list[str]
+) -> tuple[float | None, float | None, float | None]:
     """Heights above take-off, sea level and the ellipsoid in m."""
     written = as_number(exif.gps.get(tag.GPS_ALT))
     if written is not None and as_number(exif.gps.get(tag.GPS_ALT_REF)) == 1:
@@ -133,7 +137,9 @@ def _best_height(
 
 
 def _sigmas(exif: Exif, xmp: Xmp, *, drone: bool) -> tuple[float, float]:
-    """Horizontal and vertical standard deviation in m: RTK's own, an accuracy tag, or what is usual."""
+    """Horizontal and vertical standard deviation in m: RTK's own, an accuracy tag, or what is
+    usual.
+    """
     xy, z = _DRONE_SIGMA if drone else _CAMERA_SIGMA
     error = as_number(exif.gps.get(tag.GPS_ERROR))
     xy = xmp.number("Camera:GPSXYAccuracy", "GPSXYAccuracy") or error or xy

@@ -19,7 +19,14 @@ _COLUMNS = {
     "yaw": ("yaw", "heading", "yawdeg", "gimbalyaw", "gimbalyawdegree"),
     "pitch": ("pitch", "pitchdeg", "gimbalpitch", "gimbalpitchdegree"),
     "roll": ("roll", "rolldeg", "gimbalroll", "gimbalrolldegree"),
-    "sigma_xy": ("accuracy", "horizontalaccuracy", "hacc", "accuracyhorz", "sigmaxym", "xyaccuracy"),
+    "sigma_xy": (
+        "accuracy",
+        "horizontalaccuracy",
+        "hacc",
+        "accuracyhorz",
+        "sigmaxym",
+        "xyaccuracy",
+    ),
     "sigma_z": ("verticalaccuracy", "vacc", "accuracyvert", "sigmazm", "zaccuracy"),
 }
 _DATUMS: tuple[Datum, ...] = ("ellipsoid", "takeoff", "sea_level")
@@ -28,9 +35,10 @@ _DATUMS: tuple[Datum, ...] = ("ellipsoid", "takeoff", "sea_level")
 def read_positions_csv(path: Path) -> tuple[SideRow, ...]:
     """One row per photo; raises `SideFileError` where the header or a number is wrong.
 
-    Columns (case, blanks and underscores do not matter): name or filename; lat, lon in degrees; alt (above
-    sea level), rel_alt (above take-off) or ellipsoid in m; yaw, pitch, roll in degrees (pitch 0 = nadir;
-    below -45 it is read as a gimbal's); accuracy, vertical_accuracy in m. Only the name is obligatory.
+    Columns (case, blanks and underscores do not matter): name or filename; lat, lon in degrees; alt
+    (above sea level), rel_alt (above take-off) or ellipsoid in m; yaw, pitch, roll in degrees
+    (pitch 0 = nadir; below -45 it is read as a gimbal's); accuracy, vertical_accuracy in m. Only
+    the name is obligatory.
     """
     lines = [line for _, line in read_lines(path)]
     if not lines:
@@ -38,7 +46,9 @@ def read_positions_csv(path: Path) -> tuple[SideRow, ...]:
     delimiter = max(",;\t", key=lines[0].count)
     table = list(csv.reader(lines, delimiter=delimiter))
     columns = _columns(table[0], path)
-    return tuple(_row(cells, columns, f"{path.name}, row {i}") for i, cells in enumerate(table[1:], 1))
+    return tuple(
+        _row(cells, columns, f"{path.name}, row {i}") for i, cells in enumerate(table[1:], 1)
+    )
 
 
 def _columns(header: list[str], path: Path) -> dict[str, int]:
@@ -50,7 +60,8 @@ def _columns(header: list[str], path: Path) -> dict[str, int]:
     }
     if "name" not in found or ("latitude" in found) != ("longitude" in found) or len(found) < 2:
         raise SideFileError(
-            f"{path.name}: its header is '{', '.join(header)}'; expected at least 'name' with 'lat' and "
+            f"{path.name}: its header is '{', '.join(header)}'; expected at least 'name' with 'lat'"
+            " and "
             "'lon', or 'name' with 'yaw'. Add a header line."
         )
     return found
@@ -66,7 +77,9 @@ def _row(cells: list[str], columns: dict[str, int], place: str) -> SideRow:
         longitude_deg=values.get("longitude"),
         altitude_m=values.get(datum),
         datum=datum,
-        angles_deg=None if yaw is None else (yaw, values.get("pitch") or 0.0, values.get("roll") or 0.0),
+        angles_deg=None
+        if yaw is None
+        else (yaw, values.get("pitch") or 0.0, values.get("roll") or 0.0),
         sigma_xy_m=values.get("sigma_xy"),
         sigma_z_m=values.get("sigma_z") or values.get("sigma_xy"),
     )
@@ -76,5 +89,7 @@ def _cell(cells: list[str], column: int, field: str, place: str) -> float | None
     text = cells[column].strip() if column < len(cells) else ""
     value = number(text)
     if text and value is None:
-        raise SideFileError(f"{place}: expected a number for {field}, found '{text}'. Correct that cell.")
+        raise SideFileError(
+            f"{place}: expected a number for {field}, found '{text}'. Correct that cell."
+        )
     return finite(value)

@@ -37,8 +37,9 @@ def read_photo(
 ) -> Photo | RejectedPhoto:
     """What a file says of itself, its pixels not decoded; a bad file is a `RejectedPhoto`.
 
-    `thermal_unit`: what values of a single-band TIFF mean (`model.photo.Stored`); `auto` = it is thermal, its unit is
-    stated in it or found from its values; None = whether it is thermal at all is found out too.
+    `thermal_unit`: what values of a single-band TIFF mean (`model.photo.Stored`); `auto` = it is
+    thermal, its unit is stated in it or found from its values; None = whether it is thermal at all
+    is found out too.
     """
     name = name or path.name
     try:
@@ -65,7 +66,9 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
     frame = _thermal_frame(path, header, thermal_unit)
     height, width = frame.values.shape if frame else (header.height, header.width)
     if min(width, height) < _SMALLEST:
-        raise UnreadablePhotoError(f"it has only {width}x{height} px; at least {_SMALLEST} a side are needed")
+        raise UnreadablePhotoError(
+            f"it has only {width}x{height} px; at least {_SMALLEST} a side are needed"
+        )
     lens = _lens(header, width, height, thermal=frame is not None)
     position, place_notes = read_position(header.exif, header.xmp)
     attitude, angle_notes = read_attitude(header.xmp)
@@ -104,7 +107,12 @@ def _lens(header: Header, width: int, height: int, *, thermal: bool) -> _Lens:
         exif=exif, xmp=header.xmp, sensor=sensor, width=width, height=height, scale=scale
     )
     focal = find_focal(
-        exif=exif, sensor=sensor, calibration=calibration, width=width, height=height, thermal=thermal
+        exif=exif,
+        sensor=sensor,
+        calibration=calibration,
+        width=width,
+        height=height,
+        thermal=thermal,
     )
     notes = (note, *focal_notes(exif, sensor, width, height))
     return _Lens(sensor=sensor, thermal=thermal, calibration=calibration, focal=focal, notes=notes)
@@ -113,10 +121,16 @@ def _lens(header: Header, width: int, height: int, *, thermal: bool) -> _Lens:
 def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame | None:
     if header.jpeg:
         return thermal_frame_of_jpeg(header.jpeg, make=header.exif.text(tag.MAKE))
-    if header.kind != "tiff" or header.channels != 1 or (said is None and header.width > _LARGEST_THERMAL):
+    if (
+        header.kind != "tiff"
+        or header.channels != 1
+        or (said is None and header.width > _LARGEST_THERMAL)
+    ):
         return None
     stored = cast(Stored, said) if said not in (None, "auto") else _stated(header)
-    sensor = find_sensor(model=header.exif.text(tag.MODEL), long_side=max(header.width, header.height))
+    sensor = find_sensor(
+        model=header.exif.text(tag.MODEL), long_side=max(header.width, header.height)
+    )
     known = said is not None or bool(stored) or _is_lwir(header)
     known = known or (sensor is not None and sensor.band == "thermal")
     if not known and header.dtype != "float32":
@@ -161,7 +175,11 @@ def _rolling(header: Header, sensor: Sensor | None) -> bool | None:
 
 def _broken_notes(header: Header) -> tuple[str, ...]:
     exif = "Its EXIF block is broken and was read as far as it went." if header.exif.broken else ""
-    xmp = "Its XMP packet is broken XML; values were searched in it as text." if header.xmp.broken else ""
+    xmp = (
+        "Its XMP packet is broken XML; values were searched in it as text."
+        if header.xmp.broken
+        else ""
+    )
     return exif, xmp
 
 
@@ -181,8 +199,15 @@ def _focal_note(source: str, model: str) -> str:
 def _edit_note(header: Header) -> str:
     editor = find_editor(header.exif, header.xmp)
     if editor:
-        return f"It was rewritten by '{editor}': rotation, size and metadata may no longer fit the pixels."
+        return (
+            f"It was rewritten by '{editor}': rotation, size and metadata may no longer fit the"
+            " pixels."
+        )
     taken, written = read_time(header.exif, header.xmp), modified_time(header.exif)
-    if taken and written and written.replace(tzinfo=None) - taken.replace(tzinfo=None) > timedelta(minutes=1):
+    if (
+        taken
+        and written
+        and written.replace(tzinfo=None) - taken.replace(tzinfo=None) > timedelta(minutes=1)
+    ):
         return f"It was written again at {written:%Y-%m-%d %H:%M:%S}, after the capture."
     return ""

@@ -54,7 +54,8 @@ def _table() -> dict[str, tuple[Sensor, ...]]:
 
 
 def find_sensor(*, model: str, long_side: int) -> Sensor | None:
-    """The row for an EXIF model name and the long side in px of its images as taken; None if unknown.
+    """The row for an EXIF model name and the long side in px of its images as taken; None if
+    unknown.
 
     A model with rows for several image sizes (a visible and a thermal eye) needs the right size.
     """

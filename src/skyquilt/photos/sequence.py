@@ -10,7 +10,8 @@ from skyquilt.photos.side_text import read_lines
 
 
 def sequence_of(names: Sequence[str], how: str) -> list[int]:
-    """Indices of photos (names in order of capture) in the order of `how`: `time`, `name`, or a file's path.
+    """Indices of photos (names in order of capture) in the order of `how`: `time`, `name`, or a
+    file's path.
 
     A file has one photo's name a line; photos that it does not name are left out.
 
@@ -28,13 +29,17 @@ def sequence_of(names: Sequence[str], how: str) -> list[int]:
     strangers = [w for w, f in zip(wanted, found, strict=True) if f is None]
     if strangers or not wanted:
         what = (
-            f"names {sentence_of(strangers)}, which are no photos of the survey" if strangers else "is empty"
+            f"names {sentence_of(strangers)}, which are no photos of the survey"
+            if strangers
+            else "is empty"
         )
         raise SideFileError(f"{path.name} {what}; expected one photo's name a line.")
     order = [index[f] for f in found if f is not None]
     if len(set(order)) < len(order):
         twice = sorted({names[i] for i in order if order.count(i) > 1})
-        raise SideFileError(f"{path.name} names {sentence_of(twice)} more than once. Take one line out.")
+        raise SideFileError(
+            f"{path.name} names {sentence_of(twice)} more than once. Take one line out."
+        )
     return order
 
 

@@ -11,7 +11,9 @@ from skyquilt.photos.side_rows import apply_rows
 from skyquilt.photos.srt import read_srt
 
 
-def apply_positions(photos: Sequence[Photo], file: Path) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+def apply_positions(
+    photos: Sequence[Photo], file: Path
+) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
     """The photos as `.csv`, `.mrk`, `.srt` or (any other ending) `geo.txt` places them, and notes.
 
     Raises `SideFileError` where the file is malformed or knows none of the photos.

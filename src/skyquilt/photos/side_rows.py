@@ -36,7 +36,9 @@ class SideRow:
 
 
 class PhotoNames:
-    """Finds the photo a side file means: by path, by file name, by name without ending, whatever the case."""
+    """Finds the photo a side file means: by path, by file name, by name without ending, whatever
+    the case.
+    """
 
     def __init__(self, names: Iterable[str]) -> None:
         self._by_key: dict[str, list[str]] = {}
@@ -66,23 +68,30 @@ def apply_rows(
 ) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
     """The photos with the rows' positions and angles in place of their own, and notes.
 
-    Raises `SideFileError` where not one row names a photo of the survey, or a row's position is void.
+    Raises `SideFileError` where not one row names a photo of the survey, or a row's position is
+    void.
     """
     names = PhotoNames(p.name for p in photos)
     found = {names.find(row.name): row for row in rows}
     strangers = [row.name for row in rows if names.find(row.name) is None]
     if rows and len(strangers) == len(rows):
         raise SideFileError(
-            f"{file.name} names {sentence_of(strangers)}; none of the {len(photos)} photos is called that "
-            f"(they are {sentence_of([p.name for p in photos])}). Correct the names or leave the file away."
+            f"{file.name} names {sentence_of(strangers)}; none of the {len(photos)} photos is"
+            " called that "
+            f"(they are {sentence_of([p.name for p in photos])}). Correct the names or leave the"
+            " file away."
         )
     _check(rows, file)
     changed = tuple(_override(p, found, source) for p in photos)
     without = [p.name for p in photos if p.name not in found]
     notes = (
         f"{file.name} placed {len(photos) - len(without)} of {len(photos)} photos.",
-        f"{file.name} names photos that are not there: {sentence_of(strangers)}." if strangers else "",
-        f"{file.name} says nothing of {sentence_of(without)}; their own metadata count." if without else "",
+        f"{file.name} names photos that are not there: {sentence_of(strangers)}."
+        if strangers
+        else "",
+        f"{file.name} says nothing of {sentence_of(without)}; their own metadata count."
+        if without
+        else "",
     )
     return changed, tuple(n for n in notes if n)
 
@@ -120,7 +129,9 @@ def _position(old: GeoPosition | None, row: SideRow, source: str) -> GeoPosition
     )
     if row.altitude_m is None:
         return placed
-    field = {"takeoff": "takeoff_m", "sea_level": "sea_level_m", "ellipsoid": "ellipsoid_m"}.get(row.datum)
+    field = {"takeoff": "takeoff_m", "sea_level": "sea_level_m", "ellipsoid": "ellipsoid_m"}.get(
+        row.datum
+    )
     placed = replace(placed, altitude_m=row.altitude_m, datum=row.datum)
     placed = replace(placed, sigma_z_m=row.sigma_z_m or base.sigma_z_m)
     return replace(placed, **{field: row.altitude_m}) if field else placed  # type: ignore[arg-type]

@@ -1,4 +1,6 @@
-"""What the text side files have in common: lines, numbers, and coordinate systems as people write them."""
+"""What the text side files have in common: lines, numbers, and coordinate systems as people write
+them.
+"""
 
 import math
 import re
@@ -22,7 +24,8 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
         text = path.read_bytes().decode("utf-8-sig", "replace")
     except OSError as error:
         raise SideFileError(
-            f"{path} cannot be read ({error.strerror or error}); check the path and its permissions."
+            f"{path} cannot be read ({error.strerror or error}); check the path and its"
+            " permissions."
         ) from error
     if "\x00" in text:
         raise SideFileError(f"{path.name} is no text file; expected lines of words and numbers.")
@@ -44,7 +47,9 @@ def finite(value: float | None) -> float | None:
 
 
 def read_crs(text: str, *, file: str) -> "CRS":
-    """`EPSG:32615`, a PROJ string, WKT, or OpenDroneMap's `WGS84 UTM 15N`; raises `SideFileError`."""
+    """`EPSG:32615`, a PROJ string, WKT, or OpenDroneMap's `WGS84 UTM 15N`; raises
+    `SideFileError`.
+    """
     from pyproj import CRS
     from pyproj.exceptions import CRSError
 
@@ -56,6 +61,7 @@ def read_crs(text: str, *, file: str) -> "CRS":
         return CRS.from_user_input(text)
     except CRSError as error:
         raise SideFileError(
-            f"{file}: the first line must name a coordinate system such as 'EPSG:4326' or 'WGS84 UTM 15N', "
+            f"{file}: the first line must name a coordinate system such as 'EPSG:4326' or 'WGS84"
+            " UTM 15N', "
             f"but it is '{text}'. Put one there."
         ) from error

@@ -1,7 +1,7 @@
 """DJI's `.SRT`: telemetry of a video as subtitles, for frames taken from it.
 
-Old form `GPS(lon,lat,satellites) BAROMETER:12.3` or `GPS (...), D .., H 6.00m`; new form `[latitude: ..]
-[longitude: ..] [rel_alt: .. abs_alt: ..] [gb_yaw: .. gb_pitch: .. gb_roll: ..]`.
+Old form `GPS(lon,lat,satellites) BAROMETER:12.3` or `GPS (...), D .., H 6.00m`; new form
+`[latitude: ..] [longitude: ..] [rel_alt: .. abs_alt: ..] [gb_yaw: .. gb_pitch: .. gb_roll: ..]`.
 """
 
 import re
@@ -34,8 +34,8 @@ class _Sample:
 def read_srt(path: Path, photos: Sequence[Photo]) -> tuple[SideRow, ...]:
     """Positions for photos that are frames of the video; raises `SideFileError`.
 
-    Matched by capture time within 0.5 s where both state one; else by the frame number that ends the name,
-    when every photo's name ends in a number that the file has.
+    Matched by capture time within 0.5 s where both state one; else by the frame number that ends
+    the name, when every photo's name ends in a number that the file has.
     """
     samples = _samples(path)
     if not samples:
@@ -45,8 +45,10 @@ def read_srt(path: Path, photos: Sequence[Photo]) -> tuple[SideRow, ...]:
     rows = _by_time(samples, photos) or _by_frame(samples, photos)
     if not rows:
         raise SideFileError(
-            f"{path.name} has {len(samples)} positions, but neither capture times nor numbers at the end of "
-            "the photos' names say which is which. Name the frames by their number (frame_000123.jpg)."
+            f"{path.name} has {len(samples)} positions, but neither capture times nor numbers at"
+            " the end of "
+            "the photos' names say which is which. Name the frames by their number"
+            " (frame_000123.jpg)."
         )
     return rows
 
@@ -54,7 +56,9 @@ def read_srt(path: Path, photos: Sequence[Photo]) -> tuple[SideRow, ...]:
 def _samples(path: Path) -> list[_Sample]:
     """Blocks start with their number and a line `00:00:01,000 --> 00:00:02,000`."""
     lines = [line for _, line in read_lines(path)]
-    starts = [i for i, line in enumerate(lines) if "-->" in line and i > 0 and lines[i - 1].isdigit()]
+    starts = [
+        i for i, line in enumerate(lines) if "-->" in line and i > 0 and lines[i - 1].isdigit()
+    ]
     ends = [*(s - 1 for s in starts[1:]), len(lines)]
     samples = []
     for start, end in zip(starts, ends, strict=False):

@@ -16,16 +16,19 @@ from skyquilt.photos.voids import without_ground_heights, without_outliers, with
 
 
 def read_survey(
-    folder: Path | Sequence[Path], *, geo: Path | None = None, cameras: Path | None = None,
+    folder: Path | Sequence[Path],
+    *,
+    geo: Path | None = None,
+    cameras: Path | None = None,
     thermal_unit: str | None = None,
-) -> Survey:  # fmt: skip
-    """All photos below a folder (or those given) in order of capture, without decoding their pixels.
+) -> Survey:
+    """All photos below a folder (or those given) in order of capture, without decoding their
+    pixels.
 
-    `geo` is a side file of positions (`geo.txt`, CSV, `.SRT`, `.MRK`); without one, a `geo.txt` at the top of
-    the folder counts. `cameras` is a `cameras.json`, `thermal_unit` as in `read_photo`.
-    A bad photo becomes a `RejectedPhoto`.
-    Raises `UsageError` for a folder that does not exist, `NoPhotosError` where no photo can be read,
-    `SideFileError` for a bad side file.
+    `geo` is a side file of positions (`geo.txt`, CSV, `.SRT`, `.MRK`); without one, a `geo.txt` at
+    the top of the folder counts. `cameras` is a `cameras.json`, `thermal_unit` as in `read_photo`.
+    A bad photo becomes a `RejectedPhoto`. Raises `UsageError` for a folder that does not exist,
+    `NoPhotosError` where no photo can be read, `SideFileError` for a bad side file.
     """
     found = find_files(folder)
     read = [read_photo(path, name=name, thermal_unit=thermal_unit) for name, path in found.photos]
@@ -47,7 +50,14 @@ def read_survey(
         photos=photos,
         rejected=tuple(sorted((*rejected, *copies), key=lambda r: r.name)),
         ignored=found.ignored,
-        notes=(*notes, *_run_notes(found), *grounded, *stuck, *far, *survey_notes(photos, len(copies))),
+        notes=(
+            *notes,
+            *_run_notes(found),
+            *grounded,
+            *stuck,
+            *far,
+            *survey_notes(photos, len(copies)),
+        ),
     )
 
 
@@ -63,12 +73,16 @@ def _without_copies(photos: Iterable[Photo]) -> tuple[tuple[Photo, ...], tuple[R
     for photo in sorted(photos, key=lambda p: p.name):
         original = first.setdefault(photo.digest, photo)
         if original is not photo:
-            copies.append(RejectedPhoto(name=photo.name, reason=f"same file content as {original.name}"))
+            copies.append(
+                RejectedPhoto(name=photo.name, reason=f"same file content as {original.name}")
+            )
     return tuple(first.values()), tuple(copies)
 
 
 def _run_notes(found: FoundFiles) -> tuple[str, ...]:
-    return tuple(f"The folder {run} holds an earlier run and was passed over." for run in found.runs)
+    return tuple(
+        f"The folder {run} holds an earlier run and was passed over." for run in found.runs
+    )
 
 
 def _nothing_sentence(
@@ -77,6 +91,11 @@ def _nothing_sentence(
     where = str(folder) if isinstance(folder, (str, Path)) else f"the {len(folder)} files given"
     if rejected:
         reasons = "; ".join(f"{r.name}: {r.reason}" for r in rejected[:5])
-        return f"None of the {len(rejected)} image files in {where} can be read ({reasons}). Copy them again."
+        return (
+            f"None of the {len(rejected)} image files in {where} can be read ({reasons}). Copy"
+            " them again."
+        )
     held = f"only other files ({sentence_of(found.ignored)})" if found.ignored else "nothing"
-    return f"There is no photo in {where}: it holds {held}. Give a folder of JPEG, TIFF or PNG photos."
+    return (
+        f"There is no photo in {where}: it holds {held}. Give a folder of JPEG, TIFF or PNG photos."
+    )

@@ -11,8 +11,16 @@ _LONG_GAP_H = 12.0
 
 
 def survey_notes(photos: Sequence[Photo], copies: int = 0) -> tuple[str, ...]:
-    """Plain sentences: several cameras or bands, rolling shutters, clocks, what most photos lack."""
-    return (*_cameras(photos), *_thermal_units(photos), *_gaps(photos), *_clocks(photos), *_copies(copies))
+    """Plain sentences: several cameras or bands, rolling shutters, clocks, what most photos
+    lack.
+    """
+    return (
+        *_cameras(photos),
+        *_thermal_units(photos),
+        *_gaps(photos),
+        *_clocks(photos),
+        *_copies(copies),
+    )
 
 
 def _cameras(photos: Sequence[Photo]) -> Iterator[str]:
@@ -33,7 +41,10 @@ def _thermal_units(photos: Sequence[Photo]) -> Iterator[str]:
     units = Counter(p.stored for p in photos if p.stored)
     listed = " and ".join(f"{n} as {unit}" for unit, n in units.most_common())
     if len(units) > 1:
-        yield f"Thermal TIFFs are read in different units, {listed}; --thermal-unit says which is right for all."
+        yield (
+            f"Thermal TIFFs are read in different units, {listed}; --thermal-unit says which is"
+            " right for all."
+        )
     elif units:
         yield f"Thermal TIFFs are read as {listed.split(' as ')[1]} ({sum(units.values())})."
 
@@ -42,7 +53,9 @@ def _gaps(photos: Sequence[Photo]) -> Iterator[str]:
     void = [p.name for p in photos if p.position is None]
     if void:
         which = (
-            "No photo carries" if len(void) == len(photos) else f"{len(void)} of {len(photos)} photos lack"
+            "No photo carries"
+            if len(void) == len(photos)
+            else f"{len(void)} of {len(photos)} photos lack"
         )
         yield f"{which} a usable GPS position" + (
             f": {sentence_of(void)}." if len(void) < len(photos) else "."
@@ -64,7 +77,10 @@ def _clocks(photos: Sequence[Photo]) -> Iterator[str]:
     times = sorted(p.time.replace(tzinfo=None) for p in photos if p.time)
     gap = max(((b - a).total_seconds() / 3600 for a, b in pairwise(times)), default=0.0)
     if gap > _LONG_GAP_H:
-        yield f"The capture times have a gap of {gap:.0f} h: several flights, or clocks that disagree."
+        yield (
+            f"The capture times have a gap of {gap:.0f} h: several flights, or clocks that"
+            " disagree."
+        )
 
 
 def _copies(copies: int) -> tuple[str, ...]:

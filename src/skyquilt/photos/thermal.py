@@ -21,10 +21,19 @@ _STATED = re.compile(
     r"""\bunit\s*[:=]\s*["']?([a-z]+)|role=["']unittype["'][^>]*>\s*([^<]+?)\s*<""", re.IGNORECASE
 )
 _WORDS: dict[str, Stored] = {
-    "celsius": "celsius", "degc": "celsius", "c": "celsius", "\u00b0c": "celsius", "degreescelsius": "celsius",
-    "kelvin": "kelvin", "k": "kelvin", "decikelvin": "decikelvin", "centikelvin": "centikelvin", "ck": "centikelvin",
-    "counts": "counts", "dn": "counts",
-}  # fmt: skip
+    "celsius": "celsius",
+    "degc": "celsius",
+    "c": "celsius",
+    "\u00b0c": "celsius",
+    "degreescelsius": "celsius",
+    "kelvin": "kelvin",
+    "k": "kelvin",
+    "decikelvin": "decikelvin",
+    "centikelvin": "centikelvin",
+    "ck": "centikelvin",
+    "counts": "counts",
+    "dn": "counts",
+}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,16 +54,23 @@ def thermal_frame_of_jpeg(jpeg: JpegHeader, *, make: str) -> ThermalFrame | None
     """The radiometric frame inside a FLIR or DJI JPEG; None where there is none."""
     flir = read_flir(jpeg)
     if flir is not None and flir.camera is not None:
-        note = f"Temperatures follow from FLIR's constants with emissivity {flir.camera.emissivity:.2f}."
+        note = (
+            "Temperatures follow from FLIR's constants with emissivity"
+            f" {flir.camera.emissivity:.2f}."
+        )
         return ThermalFrame(values=flir.camera.celsius(flir.counts), unit="celsius", note=note)
     if flir is not None:
-        note = "It is a FLIR frame without radiometric constants: values are counts, no temperatures."
+        note = (
+            "It is a FLIR frame without radiometric constants: values are counts, no temperatures."
+        )
         return ThermalFrame(values=flir.counts.astype(np.float32), unit="counts", note=note)
     return _dji(jpeg) if "dji" in make.lower() else None
 
 
 def _dji(jpeg: JpegHeader) -> ThermalFrame | None:
-    """DJI's R-JPEG: the joined APP3 segments are width * height little-endian 16-bit counts, nothing else."""
+    """DJI's R-JPEG: the joined APP3 segments are width * height little-endian 16-bit counts,
+    nothing else.
+    """
     raw = jpeg.joined(APP3)
     sizes = ((jpeg.width, jpeg.height), *_DJI_SIZES)
     size = next((s for s in sizes if 2 * s[0] * s[1] == len(raw)), None)
@@ -78,8 +94,8 @@ def stated_unit(text: str) -> Stored:
 def thermal_frame_of_values(values: NDArray[np.generic], stored: Stored = "") -> ThermalFrame:
     """Degrees Celsius from a single-band thermal TIFF whose values mean `stored`.
 
-    Where nobody says it, the median value does. Whole numbers: hundredths or tenths of a kelvin; real numbers: kelvin
-    or degrees Celsius; else counts.
+    Where nobody says it, the median value does. Whole numbers: hundredths or tenths of a kelvin;
+    real numbers: kelvin or degrees Celsius; else counts.
     """
     real = values.astype(np.float32)
     whole = values.dtype.kind in "iu"
@@ -92,7 +108,10 @@ def thermal_frame_of_values(values: NDArray[np.generic], stored: Stored = "") ->
     middle = float(np.median(finite)) if finite.size else float("nan")
     found = _likely(middle, whole=whole)
     if found == "counts":
-        words = "fits no unit of temperature: values are counts, unless --thermal-unit says what they are."
+        words = (
+            "fits no unit of temperature: values are counts, unless --thermal-unit says what"
+            " they are."
+        )
     else:
         words = f"reads as {found}; no unit is stated (--thermal-unit says it)."
     return _frame(real, found, f"Its median value {middle:g} {words}")

@@ -11,7 +11,9 @@ from skyquilt.model.photo import Photo
 SECONDS = 0.75
 """Longest time between two shots of one release."""
 CONTRADICTION_S = 5.0
-"""Time between shots of equal names from which these are chance: stamps of whole seconds, cameras that write late."""
+"""Time between shots of equal names from which these are chance: stamps of whole seconds, cameras
+that write late.
+"""
 APART_M = 5.0
 """Distance of reported positions from which two photos are not of one drone."""
 _EARTH_M = 6371008.8
@@ -20,8 +22,8 @@ _EARTH_M = 6371008.8
 def taken_together(a: Sequence[Photo], b: Sequence[Photo]) -> list[tuple[int, int]]:
     """Pairs (index of a, index of b), each photo in one at most, by ascending index of b.
 
-    By equal numbers in the names, where neither times nor positions contradict; for photos that have no partner by
-    name, by the nearest time.
+    By equal numbers in the names, where neither times nor positions contradict; for photos that
+    have no partner by name, by the nearest time.
     """
     named: dict[tuple[str, ...], list[int]] = {}
     for i, photo in enumerate(a):
@@ -34,7 +36,12 @@ def taken_together(a: Sequence[Photo], b: Sequence[Photo]) -> list[tuple[int, in
     left = [i for i in range(len(a)) if i not in found.values()]
     for j, photo in enumerate(b):
         gaps = [(gap, i) for i in left if (gap := _gap_s(a[i], photo)) is not None]
-        if j in found or not gaps or min(gaps)[0] > SECONDS or not _possible(a[min(gaps)[1]], photo):
+        if (
+            j in found
+            or not gaps
+            or min(gaps)[0] > SECONDS
+            or not _possible(a[min(gaps)[1]], photo)
+        ):
             continue
         found[j] = min(gaps)[1]
         left.remove(found[j])

@@ -1,4 +1,6 @@
-"""Positions that cannot be: one far from all others, all in one place, a whole flight at height zero."""
+"""Positions that cannot be: one far from all others, all in one place, a whole flight at height
+zero.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -19,8 +21,9 @@ _STUCK_PHOTOS = 4
 def without_outliers(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
     """The photos, with positions taken off those that lie absurdly far away, and a note for each.
 
-    Absurd is more than 5 km from the median and more than 20 times the median distance to it; three positions
-    are the least that can tell which one is wrong. The photo stays, and its note keeps the value.
+    Absurd is more than 5 km from the median and more than 20 times the median distance to it; three
+    positions are the least that can tell which one is wrong. The photo stays, and its note keeps
+    the value.
     """
     placed = [p for p in photos if p.position]
     if len(placed) < 3:
@@ -28,16 +31,21 @@ def without_outliers(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[
     distance = dict(zip((p.name for p in placed), distances_to_median(placed), strict=True))
     limit = max(_FAR_M, _FAR_SPREADS * float(np.median(list(distance.values()))))
     far = {name: d for name, d in distance.items() if d > limit}
-    notes = tuple(f"{name} claims to lie {d / 1000:.0f} km from the others." for name, d in far.items())
+    notes = tuple(
+        f"{name} claims to lie {d / 1000:.0f} km from the others." for name, d in far.items()
+    )
     return tuple(_unplaced(p, far[p.name]) if p.name in far else p for p in photos), notes
 
 
 def without_ground_heights(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """Heights above sea level in place of heights above take-off that stay at zero through a whole flight.
+    """Heights above sea level in place of heights above take-off that stay at zero through a whole
+    flight.
 
     Some firmware writes `RelativeAltitude` 0 throughout; nobody maps from below 2 m.
     """
-    heights = [p.position.takeoff_m for p in photos if p.position and p.position.takeoff_m is not None]
+    heights = [
+        p.position.takeoff_m for p in photos if p.position and p.position.takeoff_m is not None
+    ]
     if not heights or max(map(abs, heights)) > _GROUND_M:
         return tuple(photos), ()
     note = f"The heights above take-off stay within {_GROUND_M:.0f} m of zero and were not used."
@@ -45,7 +53,8 @@ def without_ground_heights(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], 
 
 
 def without_stuck(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """The photos, without positions where four or more report one and the same: a receiver that stood still.
+    """The photos, without positions where four or more report one and the same: a receiver that
+    stood still.
 
     Believed, they would shrink the map to a point.
     """
@@ -55,7 +64,8 @@ def without_stuck(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str
     place = placed[0].position
     note = (
         f"All {len(placed)} positions are one and the same"
-        f" ({place.latitude_deg:.6f}, {place.longitude_deg:.6f}): the receiver stood still, and they were not"
+        f" ({place.latitude_deg:.6f}, {place.longitude_deg:.6f}): the receiver stood still, and"
+        " they were not"
         " used. Give positions in a geo.txt, or control points."
         if place
         else ""
@@ -97,5 +107,8 @@ def _unplaced(photo: Photo, distance_m: float) -> Photo:
     if photo.position is None:
         return photo
     place = f"{photo.position.latitude_deg:.6f}, {photo.position.longitude_deg:.6f}"
-    note = f"Its position ({place}) lies {distance_m / 1000:.0f} km from the other photos and was not used."
+    note = (
+        f"Its position ({place}) lies {distance_m / 1000:.0f} km from the other photos and was"
+        " not used."
+    )
     return replace(photo, position=None, notes=(*photo.notes, note))

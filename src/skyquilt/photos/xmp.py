@@ -18,7 +18,9 @@ _KNOWN = {
     "http://ns.adobe.com/tiff/1.0": "tiff",
     "http://www.w3.org/1999/02/22-rdf-syntax-ns#": "rdf",
 }
-_PACKET = re.compile(rb"<(?:\w+:)?xmpmeta\b.*?</(?:\w+:)?xmpmeta\s*>|<rdf:RDF\b.*?</rdf:RDF\s*>", re.DOTALL)
+_PACKET = re.compile(
+    rb"<(?:\w+:)?xmpmeta\b.*?</(?:\w+:)?xmpmeta\s*>|<rdf:RDF\b.*?</rdf:RDF\s*>", re.DOTALL
+)
 _ATTRIBUTE = re.compile(r"([\w-]+:[\w-]+)\s*=\s*(?:\"([^\"<]*)\"|'([^'<]*)')")
 _ELEMENT = re.compile(r"<([\w-]+:[\w-]+)[^<>]*>([^<>]*)</\1\s*>")
 
@@ -35,7 +37,9 @@ class Xmp:
     def text(self, *names: str) -> str:
         """The first of `names` that is there and not empty; `Name` alone means any prefix."""
         for name in names:
-            keys = [name] if ":" in name else [k for k in self.values if k.partition(":")[2] == name]
+            keys = (
+                [name] if ":" in name else [k for k in self.values if k.partition(":")[2] == name]
+            )
             for key in keys:
                 if found := self.values.get(key, "").strip():
                     return found
@@ -71,7 +75,9 @@ def parse_xmp(packets: Sequence[bytes]) -> Xmp:
     for packet in packets:
         try:
             found = dict(_properties(ElementTree.fromstring(_body(packet))))
-        except Exception:  # not XML, or forbidden XML: a search still finds plain name="value" pairs
+        except (
+            Exception
+        ):  # not XML, or forbidden XML: a search still finds plain name="value" pairs
             found, broken = _searched(packet), True
         values = {**found, **values}
     return Xmp(values=values, broken=broken)

@@ -1,9 +1,12 @@
-"""Frames in: one view of the board per pose, from single frames or from the frames of a heated sweep."""
+"""Frames in: one view of the board per pose, from single frames or from the frames of a heated
+sweep.
+"""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from typing import Any
 
 from numpy.typing import NDArray
 
@@ -31,7 +34,7 @@ class Seen:
     """Poses with the board."""
     rejected: tuple[RejectedView, ...]
     """Poses without."""
-    pictures: dict[str, NDArray]
+    pictures: dict[str, NDArray[Any]]
     """Name of a view -> its picture (H, W), single or assembled."""
     frames: int
     """Frames looked at."""
@@ -59,16 +62,18 @@ def one_camera(photos: Sequence[Photo]) -> None:
         )
 
 
-def look(photos: Sequence[Photo], board: Board, find: FindBoard, series: str, jobs: int) -> Steps[Seen]:
+def look(
+    photos: Sequence[Photo], board: Board, find: FindBoard, series: str, jobs: int
+) -> Steps[Seen]:
     """Finds the board in every pose."""
     yield 0, len(photos)
     poses, unreadable = grouped(photos, series)
     views: list[BoardView] = []
     rejected = [RejectedView(name=r.name, reason=r.reason) for r in unreadable]
-    pictures: dict[str, NDArray] = {}
+    pictures: dict[str, NDArray[Any]] = {}
     done = 0
 
-    def one(pose: Sequence[Photo]) -> tuple[BoardView | RejectedView, NDArray | None]:
+    def one(pose: Sequence[Photo]) -> tuple[BoardView | RejectedView, NDArray[Any] | None]:
         return _view(pose, board, find)
 
     for pose, (found, picture) in zip(poses, in_order(one, poses, jobs=jobs), strict=True):
@@ -103,7 +108,7 @@ def grouped(photos: Sequence[Photo], series: str) -> tuple[list[list[Photo]], li
 
 def _structures(
     folder: Sequence[Photo], unreadable: list[RejectedPhoto]
-) -> tuple[list[Photo], list[NDArray]]:
+) -> tuple[list[Photo], list[NDArray[Any]]]:
     still, kept, structures = StoodStill(), [], []
     for photo in folder:
         try:
@@ -120,7 +125,7 @@ def _folder(photo: Photo) -> str:
 
 def _view(
     pose: Sequence[Photo], board: Board, find: FindBoard
-) -> tuple[BoardView | RejectedView, NDArray | None]:
+) -> tuple[BoardView | RejectedView, NDArray[Any] | None]:
     """The board in one pose: in the frame, or in what its frames are assembled to."""
     name = pose[0].name if len(pose) == 1 else f"{pose[0].name} and {len(pose) - 1} more"
     try:
@@ -131,6 +136,6 @@ def _view(
     return find(name, picture, board, frames=len(pose)), picture
 
 
-def _read(pose: Sequence[Photo]) -> Iterator[NDArray]:
+def _read(pose: Sequence[Photo]) -> Iterator[NDArray[Any]]:
     for photo in pose:
         yield read_color(photo)

@@ -46,7 +46,9 @@ class CalibrateSettings:
         if self.series not in SERIES:
             raise UsageError(f"--series {self.series!r} is not one of {', '.join(SERIES)}")
         if not (min(self.columns, self.rows) >= 3 and max(self.columns, self.rows) <= 100):
-            raise UsageError(f"--board {self.columns}x{self.rows}: 3 to 100 squares a side are expected")
+            raise UsageError(
+                f"--board {self.columns}x{self.rows}: 3 to 100 squares a side are expected"
+            )
         if not 1e-4 <= self.square_m <= 100:
             raise UsageError(
                 f"--square {self.square_m:g}: the side of a square in m, 0.0001 to 100, is expected"
@@ -61,7 +63,8 @@ class CalibrateSettings:
 def iter_calibrate(
     frames: Path | str, output: Path | str, settings: CalibrateSettings, *, overwrite: bool = False
 ) -> Iterator[Event]:
-    """Calibrates the camera that took the frames, telling its progress; the last event is the `Result`.
+    """Calibrates the camera that took the frames, telling its progress; the last event is the
+    `Result`.
 
     Raises:
         RefusedError: mixed cameras, too few boards, or boards that do not determine the lens.
@@ -77,12 +80,15 @@ def iter_calibrate(
     claim(output, calibrate_files.CONTRACT, overwrite=overwrite)
     clock = Clock(store=Store(folder=output, registry={}), began=began)
     board, jobs = settings.board, settings.jobs or os.cpu_count() or 1
-    seen = yield from clock.stage("boards", look(survey.photos, board, FindBoard(), settings.series, jobs))
+    seen = yield from clock.stage(
+        "boards", look(survey.photos, board, FindBoard(), settings.series, jobs)
+    )
     unread = (RejectedView(name=r.name, reason=r.reason) for r in survey.rejected)
     seen = replace(seen, rejected=(*unread, *seen.rejected))
     _enough(seen)
     yield Note(
-        text=f"the board was found in {len(seen.views)} of {len(seen.views) + len(seen.rejected)} views"
+        text=f"the board was found in {len(seen.views)} of {len(seen.views) + len(seen.rejected)}"
+        " views"
     )
     centres, corners = Calibrate(), Calibrate(marks="corners")
     seen, by_centres, by_corners = yield from clock.stage(
@@ -91,10 +97,13 @@ def iter_calibrate(
     yield from (Note(text=f"{r.name} was left out: {r.reason}") for r in seen.rejected)
     _determined(by_centres)
     judged = yield from clock.stage(
-        "judge", calibrate_judging.judge(seen.views, board, (centres, corners), (by_centres, by_corners))
+        "judge",
+        calibrate_judging.judge(seen.views, board, (centres, corners), (by_centres, by_corners)),
     )
     key = survey.photos[0].camera_key
-    work = calibrate_files.finish(output, seen, board, key, by_centres, by_corners, judged, clock, frames)
+    work = calibrate_files.finish(
+        output, seen, board, key, by_centres, by_corners, judged, clock, frames
+    )
     figures = yield from clock.stage("report", work)
     yield Result(output=output, metrics=figures)
 
@@ -116,19 +125,25 @@ def calibrate(
 def _calibrated(
     seen: Seen, board: Board, centres: Calibrate, corners: Calibrate
 ) -> Steps[tuple[Seen, Calibration, Calibration]]:
-    """From centres and, on the same views, from corners; views that do not belong are left out first."""
+    """From centres and, on the same views, from corners; views that do not belong are left out
+    first.
+    """
     yield 0, 2
     by_centres = centres(seen.views, board)
     odd = strangers(by_centres)
     if odd:
         reasons = [
             RejectedView(
-                name=n, reason=f"its squares lie {e:.1f} px (RMS) off, far more than those of the other views"
+                name=n,
+                reason=f"its squares lie {e:.1f} px (RMS) off, far more than those of the other"
+                " views",
             )
             for n, e in odd.items()
         ]
         seen = replace(
-            seen, views=tuple(v for v in seen.views if v.name not in odd), rejected=(*seen.rejected, *reasons)
+            seen,
+            views=tuple(v for v in seen.views if v.name not in odd),
+            rejected=(*seen.rejected, *reasons),
         )
         _enough(seen)
         by_centres = centres(seen.views, board)
@@ -147,14 +162,18 @@ def _enough(seen: Seen) -> None:
     if len(seen.views) >= FEWEST_VIEWS:
         return
     raise RefusedError(
-        f"the board was found in {len(seen.views)} of {len(seen.views) + len(seen.rejected)} views, and"
-        f" {FEWEST_VIEWS} or more are needed{_reasons(seen.rejected)}; take more, tilted by 20 to 40 degrees in"
+        f"the board was found in {len(seen.views)} of {len(seen.views) + len(seen.rejected)} views,"
+        " and"
+        f" {FEWEST_VIEWS} or more are needed{_reasons(seen.rejected)}; take more, tilted by 20 to"
+        " 40 degrees in"
         " different directions, the whole board in the frame"
     )
 
 
 def _reasons(rejected: Sequence[RejectedView]) -> str:
-    return "".join(f"; {r.name}: {r.reason}" for r in rejected[:5]) + ("; ..." if len(rejected) > 5 else "")
+    return "".join(f"; {r.name}: {r.reason}" for r in rejected[:5]) + (
+        "; ..." if len(rejected) > 5 else ""
+    )
 
 
 def _determined(found: Calibration) -> None:
@@ -166,6 +185,7 @@ def _determined(found: Calibration) -> None:
     focal, sigma = found.camera.focal, found.sigma("focal")
     if not sigma < _UNKNOWN * focal:
         raise RefusedError(
-            f"the focal length remains unknown ({focal:.0f} px with a deviation of {sigma:.0f}): all boards are seen"
+            f"the focal length remains unknown ({focal:.0f} px with a deviation of {sigma:.0f}):"
+            " all boards are seen"
             " at much the same angle; tilt the board by 20 to 40 degrees in different directions"
         )

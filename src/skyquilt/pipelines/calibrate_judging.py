@@ -1,4 +1,6 @@
-"""How good a calibration is: on frames kept out, against corners, and by what undistortion does to registration."""
+"""How good a calibration is: on frames kept out, against corners, and by what undistortion does to
+registration.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -37,28 +39,37 @@ class Judged:
 
 
 def judge(
-    views: Sequence[BoardView], board: Board, ways: tuple[Calibrate, Calibrate],
+    views: Sequence[BoardView],
+    board: Board,
+    ways: tuple[Calibrate, Calibrate],
     found: tuple[Calibration, Calibration],
-) -> Steps[Judged]:  # fmt: skip
-    """Of the calibrations from centres and from corners; with three views, each is judged by the other two."""
+) -> Steps[Judged]:
+    """Of the calibrations from centres and from corners; with three views, each is judged by the
+    other two.
+    """
     yield 0, 3
     held: dict[Marks, HeldOut] = {}
     for done, way in enumerate(ways):
         held[way.marks] = hold_out(way, views, board)
         yield done + 1, 3
     errors: dict[Marks, Mapping[Marks, float]] = {
-        marks: {way.marks: error_px(h, way, views, board) for way in ways} for marks, h in held.items()
+        marks: {way.marks: error_px(h, way, views, board) for way in ways}
+        for marks, h in held.items()
     }
     pairs = _pairs(held["centres"])
     errors_of = [
-        _registered(views[a], views[b], camera) for camera, a, b in pairs or _all(len(views), found[0].camera)
+        _registered(views[a], views[b], camera)
+        for camera, a, b in pairs or _all(len(views), found[0].camera)
     ]
     raw, undistorted = np.array(errors_of).mean(0)
     yield 3, 3
     return Judged(
-        held_out_px=errors, pairs=len(errors_of), unseen=bool(pairs), mse_raw_px2=float(raw),
+        held_out_px=errors,
+        pairs=len(errors_of),
+        unseen=bool(pairs),
+        mse_raw_px2=float(raw),
         mse_undistorted_px2=float(undistorted),
-    )  # fmt: skip
+    )
 
 
 def _pairs(held: HeldOut) -> list[tuple[Camera, int, int]]:
@@ -75,7 +86,9 @@ def _all(count: int, camera: Camera) -> list[tuple[Camera, int, int]]:
 
 
 def _registered(a: BoardView, b: BoardView, camera: Camera) -> tuple[float, float]:
-    """MSE (6.2) in px^2 of b registered to a by a homography through the corners: raw, and undistorted."""
+    """MSE (6.2) in px^2 of b registered to a by a homography through the corners: raw, and
+    undistorted.
+    """
     known = np.isfinite(a.corners[..., 0]) & np.isfinite(b.corners[..., 0])
     px_a, px_b = a.corners[known], b.corners[known]
     flat_a, flat_b = (undistort(camera, px) * camera.focal for px in (px_a, px_b))

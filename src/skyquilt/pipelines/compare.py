@@ -1,4 +1,6 @@
-"""The comparing story: every method of alignment on one survey, side by side (Y Table 6.1, Fig. 6.4; A Tables 1, 2)."""
+"""The comparing story: every method of alignment on one survey, side by side (Y Table 6.1, Fig.
+6.4; A Tables 1, 2).
+"""
 
 import csv
 import io
@@ -60,7 +62,9 @@ class CompareSettings:
     def __post_init__(self) -> None:
         strange = [v for v in self.variants if v not in VARIANTS]
         if strange or not self.variants:
-            raise UsageError(f"--methods {','.join(strange) or 'nothing'}: choose of {', '.join(VARIANTS)}")
+            raise UsageError(
+                f"--methods {','.join(strange) or 'nothing'}: choose of {', '.join(VARIANTS)}"
+            )
         if self.first is not None and self.first < 2:
             raise UsageError(f"--first {self.first}: a comparison needs two photos or more")
 
@@ -68,15 +72,18 @@ class CompareSettings:
 def iter_compare(
     folder: Path, output: Path, settings: CompareSettings, *, overwrite: bool = False
 ) -> Iterator[Event]:
-    """Runs every method into a folder of its own below `output`, then writes compare.json and report.html.
+    """Runs every method into a folder of its own below `output`, then writes compare.json and
+    report.html.
 
     Raises:
-        SkyquiltError: the photos, the output or an option is wrong; a method that cannot place the photos is no error
-            but a row with its reason.
+        SkyquiltError: the photos, the output or an option is wrong; a method that cannot place the
+            photos is no error but a row with its reason.
     """
     _checked(output, overwrite)
     shared = settings.mosaic
-    survey = read_survey(folder, geo=shared.geo, cameras=shared.cameras, thermal_unit=shared.thermal_unit)
+    survey = read_survey(
+        folder, geo=shared.geo, cameras=shared.cameras, thermal_unit=shared.thermal_unit
+    )
     photos = survey.photos[: settings.first] if settings.first else survey.photos
     source: Path | Sequence[Path] = [p.path for p in photos] if settings.first else folder
     base, says = _judged_by(photos, output, settings)
@@ -86,8 +93,12 @@ def iter_compare(
         rows[name] = yield from _run(name, source, output / name, asked, overwrite)
         if name == "bundle" and base.distances is None and "metrics" in rows[name]:
             base, says = _by_bundle(photos, output, base)
-            if base.distances is not None:  # judge bundle itself too: only the end of its run is made anew
-                again = yield from _run(name, source, output / name, replace(base, **VARIANTS[name]), True)
+            if (
+                base.distances is not None
+            ):  # judge bundle itself too: only the end of its run is made anew
+                again = yield from _run(
+                    name, source, output / name, replace(base, **VARIANTS[name]), True
+                )
                 times = {k: rows[name]["metrics"][k] for k in ("seconds", "cpu_seconds")}
                 rows[name] = {**again, "metrics": {**again["metrics"], **times}}
         if (
@@ -112,7 +123,8 @@ def _checked(output: Path, overwrite: bool) -> None:
         raise OutputError(f"{output} is a file; the output is a folder")
     if taken and not overwrite:
         raise OutputError(
-            f"{output} already holds a comparison; add --overwrite to replace it, or choose another folder"
+            f"{output} already holds a comparison; add --overwrite to replace it, or choose another"
+            " folder"
         )
 
 
@@ -124,7 +136,11 @@ def _in_turn(variants: Sequence[str], needs_bundle: bool) -> list[str]:
 
 
 def _run(
-    name: str, source: Path | Sequence[Path], output: Path, settings: MosaicSettings, overwrite: bool
+    name: str,
+    source: Path | Sequence[Path],
+    output: Path,
+    settings: MosaicSettings,
+    overwrite: bool,
 ) -> Generator[Event, None, dict[str, Any]]:
     """One method: its stages are told under its name."""
     told: list[str] = []
@@ -156,7 +172,9 @@ def _judged_by(
     if len(seen) < 2:
         return base, f"fewer than two points of {settings.known.name} are seen"
     path = _write_distances(output / "distances.csv", _between(seen))
-    return replace(base, distances=path), f"distances between {len(seen)} points of {settings.known.name}"
+    return replace(
+        base, distances=path
+    ), f"distances between {len(seen)} points of {settings.known.name}"
 
 
 Row = tuple[str, str, float, Any, Any]
@@ -168,14 +186,18 @@ def _between(points: Sequence[ControlPoint]) -> list[Row]:
     for k, a in enumerate(points):
         for b in points[k + 1 :]:
             metres = math.hypot(a.x - b.x, a.y - b.y)
-            rows += [(a.name, b.name, metres, oa, ob) for oa in a.observations for ob in b.observations]
+            rows += [
+                (a.name, b.name, metres, oa, ob) for oa in a.observations for ob in b.observations
+            ]
     return rows
 
 
 def _write_distances(path: Path, rows: Sequence[Row]) -> Path:
     text = io.StringIO()
     table = csv.writer(text)
-    table.writerow(["point_a", "point_b", "metres", "px_a", "py_a", "image_a", "px_b", "py_b", "image_b"])
+    table.writerow(
+        ["point_a", "point_b", "metres", "px_a", "py_a", "image_a", "px_b", "py_b", "image_b"]
+    )
     for a, b, metres, oa, ob in rows:
         table.writerow(
             [
@@ -195,7 +217,9 @@ def _write_distances(path: Path, rows: Sequence[Row]) -> Path:
     return path
 
 
-def _by_bundle(photos: Sequence[Photo], output: Path, base: MosaicSettings) -> tuple[MosaicSettings, str]:
+def _by_bundle(
+    photos: Sequence[Photo], output: Path, base: MosaicSettings
+) -> tuple[MosaicSettings, str]:
     """Distances between tie points of the bundle run: measured in its model, not on the ground."""
     alignment = alignment_of(output / "bundle")
     points = tie_targets(alignment, [p.name for p in photos]) if alignment is not None else []
@@ -211,15 +235,19 @@ def _by_bundle(photos: Sequence[Photo], output: Path, base: MosaicSettings) -> t
 def alignment_of(run: Path) -> Alignment | None:
     """The alignment of a run just made."""
     store = Store(folder=run / STATE / "store", registry=REGISTRY)
-    found = sorted((run / STATE / "store" / "alignment").glob("*.npz"), key=lambda p: p.stat().st_mtime)
+    found = sorted(
+        (run / STATE / "store" / "alignment").glob("*.npz"), key=lambda p: p.stat().st_mtime
+    )
     kept = store.get("alignment", found[-1].stem) if found else None
     return kept if isinstance(kept, Alignment) else None
 
 
 def tie_targets(alignment: Alignment, names: Sequence[str]) -> list[ControlPoint]:
-    """Tie points on the ground, seen three times or more, far from one another, as points with sightings.
+    """Tie points on the ground, seen three times or more, far from one another, as points with
+    sightings.
 
-    Low ones: a point on a roof or a crown lies elsewhere in a map over level ground, whoever made it.
+    Low ones: a point on a roof or a crown lies elsewhere in a map over level ground, whoever made
+    it.
     """
     ties = alignment.ties
     count = np.bincount(ties.point, minlength=len(ties.xyz))
@@ -232,27 +260,40 @@ def tie_targets(alignment: Alignment, names: Sequence[str]) -> list[ControlPoint
     xy = ties.xyz[good][:, :2]
     chosen = [int(np.argmin(np.linalg.norm(xy - np.median(xy, axis=0), axis=1)))]
     while len(chosen) < min(MOST_POINTS, len(good)):
-        chosen.append(int(np.min([np.linalg.norm(xy - xy[c], axis=1) for c in chosen], axis=0).argmax()))
+        chosen.append(
+            int(np.min([np.linalg.norm(xy - xy[c], axis=1) for c in chosen], axis=0).argmax())
+        )
     return [
         ControlPoint(
-            name=f"P{k + 1}", x=float(xy[c, 0]), y=float(xy[c, 1]), z=None, crs=alignment.frame.crs or "",
+            name=f"P{k + 1}",
+            x=float(xy[c, 0]),
+            y=float(xy[c, 1]),
+            z=None,
+            crs=alignment.frame.crs or "",
             observations=tuple(
-                PointObservation(photo=names[int(ties.photo[s])], x=float(ties.px[s, 0]), y=float(ties.px[s, 1]))
+                PointObservation(
+                    photo=names[int(ties.photo[s])], x=float(ties.px[s, 0]), y=float(ties.px[s, 1])
+                )
                 for s in np.flatnonzero(ties.point == good[c])
             ),
         )
         for k, c in enumerate(chosen)
-    ]  # fmt: skip
+    ]
 
 
 def _record(
     rows: Mapping[str, Mapping[str, Any]], photos: Sequence[str], says: str, folder: Path
 ) -> dict[str, Any]:
-    """What compare.json says: a column per method, after the columns of Y Table 6.1 and A Tables 1 and 2."""
+    """What compare.json says: a column per method, after the columns of Y Table 6.1 and A Tables 1
+    and 2.
+    """
     return {
-        "title": folder.name, "version": __version__, "photos": list(photos), "judged_by": says,
+        "title": folder.name,
+        "version": __version__,
+        "photos": list(photos),
+        "judged_by": says,
         "methods": {name: _column(row) for name, row in rows.items()},
-    }  # fmt: skip
+    }
 
 
 def _column(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -261,21 +302,29 @@ def _column(row: Mapping[str, Any]) -> dict[str, Any]:
     m = row["metrics"]
     q = m["quality"]
     return {
-        "placed": m["photos_used"], "blocks": m["blocks"],
+        "placed": m["photos_used"],
+        "blocks": m["blocks"],
         "distances": [
             {**d, "error_m": None if d["on_map"] is None else round(d["on_map"] - d["metres"], 4)}
             for d in q.get("distances", [])
         ],
-        **{k: q[k] for k in ("alpha", "lambda_spat", "lambda_spat_of_table", "lambda_corr", "lambda")},
-        "geolocation_mae_m": q.get("geolocation_mae_m"), "geolocation_rms_m": q.get("geolocation_rms_m"),
+        **{
+            k: q[k]
+            for k in ("alpha", "lambda_spat", "lambda_spat_of_table", "lambda_corr", "lambda")
+        },
+        "geolocation_mae_m": q.get("geolocation_mae_m"),
+        "geolocation_rms_m": q.get("geolocation_rms_m"),
         "ste_per_inlier_px2": q.get("ste_per_inlier_px2"),
         "seam_disparity_px": m["seam_disparity_px"],
-        "seconds": m["seconds"]["total"], "align_seconds": m["seconds"].get("align"), "cpu_seconds": m["cpu_seconds"],
-        "photos": q["photos"], "correlation_with_last_of_photo": q["correlation_with_last_of_photo"],
+        "seconds": m["seconds"]["total"],
+        "align_seconds": m["seconds"].get("align"),
+        "cpu_seconds": m["cpu_seconds"],
+        "photos": q["photos"],
+        "correlation_with_last_of_photo": q["correlation_with_last_of_photo"],
         "correlation_with_map_of_photo": q["correlation_with_map_of_photo"],
         "off_position_over_width": q["off_position_over_width"],
         "notes": [*m["notes"]],
-    }  # fmt: skip
+    }
 
 
 def _previews(output: Path, names: Sequence[str]) -> dict[str, Any]:
@@ -300,8 +349,8 @@ def _rgba(bands: np.ndarray, mask: np.ndarray) -> np.ndarray:
     if bands.dtype != np.uint8:
         values = bands.astype(np.float32)
         low, high = np.nanpercentile(np.where(mask > 0, values, np.nan), [1, 99])
-        bands = np.clip((np.nan_to_num(values, nan=low) - low) / max(high - low, 1e-6) * 255, 0, 255).astype(
-            np.uint8
-        )
+        bands = np.clip(
+            (np.nan_to_num(values, nan=low) - low) / max(high - low, 1e-6) * 255, 0, 255
+        ).astype(np.uint8)
     grey_or_rgb = bands[:3] if len(bands) >= 3 else np.repeat(bands[:1], 3, 0)
     return np.dstack([*grey_or_rgb, mask.astype(np.uint8)])

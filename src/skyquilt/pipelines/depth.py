@@ -1,4 +1,5 @@
-"""The story of `depth`: heights on the map grid, by one of the thesis's three ways [Yahyanejad 2013, 5.2.3].
+"""The story of `depth`: heights on the map grid, by one of the thesis's three ways [Yahyanejad
+2013, 5.2.3].
 
     pair             two photos: disparities after the homography, signed along the baseline
     disparities      the same of all linked pairs, normalised by their baselines, merged on the map
@@ -45,7 +46,9 @@ from skyquilt.run.store import Store
 from skyquilt.surface.disparities import OnePlane
 
 FEATURE_PX = 640
-"""Longest side in px of the pictures searched for features: their disparities are the map, so they lie dense."""
+"""Longest side in px of the pictures searched for features: their disparities are the map, so they
+lie dense.
+"""
 ROUTES = ("auto", "pair", "disparities", "reconstruction")
 """auto: pair for two photos, reconstruction for more."""
 
@@ -63,12 +66,18 @@ class Depth:
 
 
 def iter_depth(
-    photos: Path | str | Sequence[Path], output: Path | str, settings: MosaicSettings | None = None, *,
-    route: str = "auto", relief_m: float | None = None, overwrite: bool = False,
-) -> Iterator[Event]:  # fmt: skip
+    photos: Path | str | Sequence[Path],
+    output: Path | str,
+    settings: MosaicSettings | None = None,
+    *,
+    route: str = "auto",
+    relief_m: float | None = None,
+    overwrite: bool = False,
+) -> Iterator[Event]:
     """Makes depth.tif, its pictures and figures; the last event is the `Result`.
 
-    `relief_m`: largest height variation on the ground, which tells what counts as the dominant plane (Y 4.9).
+    `relief_m`: largest height variation on the ground, which tells what counts as the dominant
+    plane (Y 4.9).
 
     Raises:
         RefusedError: no two photos tell a height.
@@ -101,15 +110,22 @@ def iter_depth(
 
 
 def depth(
-    photos: Path | str | Sequence[Path], output: Path | str, settings: MosaicSettings | None = None, *,
-    route: str = "auto", relief_m: float | None = None, overwrite: bool = False,
-) -> Result:  # fmt: skip
+    photos: Path | str | Sequence[Path],
+    output: Path | str,
+    settings: MosaicSettings | None = None,
+    *,
+    route: str = "auto",
+    relief_m: float | None = None,
+    overwrite: bool = False,
+) -> Result:
     """Makes a depth map and returns when it is finished.
 
     Raises:
         SkyquiltError: anything a user can mend.
     """
-    for happened in iter_depth(photos, output, settings, route=route, relief_m=relief_m, overwrite=overwrite):
+    for happened in iter_depth(
+        photos, output, settings, route=route, relief_m=relief_m, overwrite=overwrite
+    ):
         if isinstance(happened, Result):
             return happened
     raise RuntimeError("the story ended without a result")
@@ -166,11 +182,15 @@ def _disparities(
         (fields if found else without).append(found)  # type: ignore[arg-type]
     if not fields:
         if refuse:
-            raise RefusedError("no pair of photos tells a height: none is linked over a sufficient baseline")
+            raise RefusedError(
+                "no pair of photos tells a height: none is linked over a sufficient baseline"
+            )
         return Depth(surface=scene.ground.surface, without=tuple(without))
     xyz = OnePlane()([f.xyz for f in fields])
     surface = parts.surface(xyz, scene.ground.grid.bounds)
-    return Depth(surface=replace(surface, source="disparities"), fields=tuple(fields), without=tuple(without))
+    return Depth(
+        surface=replace(surface, source="disparities"), fields=tuple(fields), without=tuple(without)
+    )
 
 
 def _drawn(output: Path, route: str, scene: Scene, depth: Depth) -> Steps[dict[str, Any]]:
@@ -180,7 +200,9 @@ def _drawn(output: Path, route: str, scene: Scene, depth: Depth) -> Steps[dict[s
     counted = alignment.frame.vertical_datum if route == "reconstruction" else "the dominant plane"
     unit = "m" if alignment.frame.metric else "arbitrary"
     tags = {"UNIT": unit, "ROUTE": route, "VERTICAL_DATUM": counted}
-    z, known = write_depth(output / "depth.tif", depth.surface, ground.views, ground.grid, alignment, tags)
+    z, known = write_depth(
+        output / "depth.tif", depth.surface, ground.views, ground.grid, alignment, tags
+    )
     if not known.any():
         raise RefusedError("no place is seen by two placed photos, so nothing tells heights there")
     picture = false_colour(z, known)
@@ -202,18 +224,32 @@ def _record(
     photos, grid, alignment = scene.taken.photos, scene.ground.grid, scene.alignment
     pairs = [
         {
-            "a": photos[f.a].name, "b": photos[f.b].name, "points": len(f.px), "level": f.level,
+            "a": photos[f.a].name,
+            "b": photos[f.b].name,
+            "points": len(f.px),
+            "level": f.level,
             "field": field_name(photos[f.a], photos[f.b]),
-            "baseline_m": round(f.baseline_m, 3), "height_m": round(f.height_m, 3),
+            "baseline_m": round(f.baseline_m, 3),
+            "height_m": round(f.height_m, 3),
             "largest_disparity_px": round(float(np.linalg.norm(f.d_px, axis=1).max()), 2),
         }
         for f in depth.fields
-    ]  # fmt: skip
+    ]
     return {
-        "version": __version__, "route": route, "unit": unit, "counted_from": counted,
-        "crs": alignment.frame.crs, "gsd_m": grid.gsd, "size_px": [grid.width, grid.height],
-        "photos_used": len(scene.ground.views), "method": alignment.method, "cell_m": round(depth.surface.cell, 4),
+        "version": __version__,
+        "route": route,
+        "unit": unit,
+        "counted_from": counted,
+        "crs": alignment.frame.crs,
+        "gsd_m": grid.gsd,
+        "size_px": [grid.width, grid.height],
+        "photos_used": len(scene.ground.views),
+        "method": alignment.method,
+        "cell_m": round(depth.surface.cell, 4),
         "percentiles": {str(p): round(float(np.percentile(z, p)), 3) for p in (1, 50, 99)},
         "pairs": pairs,
-        "pairs_without": [{"a": photos[f.a].name, "b": photos[f.b].name, "reason": f.reason} for f in depth.without],
-    }  # fmt: skip
+        "pairs_without": [
+            {"a": photos[f.a].name, "b": photos[f.b].name, "reason": f.reason}
+            for f in depth.without
+        ],
+    }

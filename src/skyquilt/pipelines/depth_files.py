@@ -26,8 +26,12 @@ FIELD_PX = 750
 """Width of their pictures."""
 
 
-def seen_twice(views: Sequence[View], grid: Grid) -> Callable[[int, int, int, int], NDArray[np.bool_]]:
-    """(row, column, height, width) -> (height, width): pixels in the footprints of two photos at least."""
+def seen_twice(
+    views: Sequence[View], grid: Grid
+) -> Callable[[int, int, int, int], NDArray[np.bool_]]:
+    """(row, column, height, width) -> (height, width): pixels in the footprints of two photos at
+    least.
+    """
     outlines = [np.stack(grid.pixel(v.footprint[:, 0], v.footprint[:, 1]), 1) for v in views]
 
     def inside(row: int, column: int, height: int, width: int) -> NDArray[np.bool_]:
@@ -49,20 +53,33 @@ def write_depth(
     alignment: Alignment,
     tags: dict[str, str],
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Writes depth.tif in blocks; returns a preview (h, w) of it and which of its pixels are known."""
+    """Writes depth.tif in blocks; returns a preview (h, w) of it and which of its pixels are
+    known.
+    """
     spec = RasterSpec(
-        width=grid.width, height=grid.height, bands=1, dtype="float32",
-        transform=geotransform(grid, alignment), crs=alignment.frame.crs, compress="zstd",
-        nodata=float("nan"), tags={"SOFTWARE": "Skyquilt"} | tags, band_units=(tags["UNIT"],),
-    )  # fmt: skip
+        width=grid.width,
+        height=grid.height,
+        bands=1,
+        dtype="float32",
+        transform=geotransform(grid, alignment),
+        crs=alignment.frame.crs,
+        compress="zstd",
+        nodata=float("nan"),
+        tags={"SOFTWARE": "Skyquilt"} | tags,
+        band_units=(tags["UNIT"],),
+    )
     inside = seen_twice(views, grid)
     with CogWriter(path, spec) as writer:
         for block in writer.blocks():
             known = inside(block.row0, block.col0, block.height, block.width)
-            writer.write_block(block, np.where(known, _heights(surface, grid, block), np.nan), known)
+            writer.write_block(
+                block, np.where(known, _heights(surface, grid, block), np.nan), known
+            )
     small = grid.coarser(preview_factor(grid))
     whole = Block(row0=0, col0=0, height=small.height, width=small.width, tile=spec.tile)
-    return _heights(surface, small, whole), seen_twice(views, small)(0, 0, small.height, small.width)
+    return _heights(surface, small, whole), seen_twice(views, small)(
+        0, 0, small.height, small.width
+    )
 
 
 def _heights(surface: Surface, grid: Grid, block: Block) -> NDArray[np.float32]:
@@ -73,11 +90,16 @@ def _heights(surface: Surface, grid: Grid, block: Block) -> NDArray[np.float32]:
 
 
 def false_colour(z: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """RGBA (h, w, 4): low blue, high red (turbo) between the 1st and 99th percentile; clear where unknown."""
+    """RGBA (h, w, 4): low blue, high red (turbo) between the 1st and 99th percentile; clear where
+    unknown.
+    """
     low, high = np.percentile(z[known], [1, 99]) if known.any() else (0.0, 1.0)
     index = np.clip((z - low) / max(float(high - low), 1e-6) * 255, 0, 255).astype(np.uint8)
     return np.dstack(
-        [cv2.applyColorMap(index, cv2.COLORMAP_TURBO)[..., ::-1], known.astype(np.uint8) * np.uint8(255)]
+        [
+            cv2.applyColorMap(index, cv2.COLORMAP_TURBO)[..., ::-1],
+            known.astype(np.uint8) * np.uint8(255),
+        ]
     )
 
 
@@ -90,7 +112,10 @@ def field_picture(field: PairField, photo: Photo) -> NDArray[np.uint8]:
 
 def field_name(a: Photo, b: Photo) -> str:
     """File of a pair's picture, below PAIRS."""
-    return "__".join(Path(p.name).with_suffix("").as_posix().replace("/", "_") for p in (a, b)) + ".png"
+    return (
+        "__".join(Path(p.name).with_suffix("").as_posix().replace("/", "_") for p in (a, b))
+        + ".png"
+    )
 
 
 def former_fields(output: Path) -> list[Path]:

@@ -1,6 +1,9 @@
-"""Disparities of linked photos after their homography, signed along the baseline: heights above the dominant plane."""
+"""Disparities of linked photos after their homography, signed along the baseline: heights above the
+dominant plane.
+"""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +21,9 @@ from skyquilt.twoview.ransac import Ransac
 LEAST_BASE = 0.05
 """Baseline over height below which disparities tell nothing."""
 ACROSS_PX = 2.0
-"""Disparity across the baseline, px at the working width, from which a match is taken for a wrong one."""
+"""Disparity across the baseline, px at the working width, from which a match is taken for a wrong
+one.
+"""
 LEAST_POINTS = 12
 """Fewest points of a pair that counts."""
 
@@ -67,9 +72,11 @@ def pair_field(
     z: float,
     relief_m: float | None,
 ) -> PairField | NoField:
-    """Heights from the disparities of one linked pair; `z`: level in m of the ground in the map frame.
+    """Heights from the disparities of one linked pair; `z`: level in m of the ground in the map
+    frame.
 
-    All matches of the link are asked, which obey one epipolar geometry, not only those on the plane.
+    All matches of the link are asked, which obey one epipolar geometry, not only those on the
+    plane.
     """
     a, b = views
     px = features[0].px[link.index_a], features[1].px[link.index_b]
@@ -78,10 +85,13 @@ def pair_field(
     if baseline < LEAST_BASE * height:
         return NoField(a=link.a, b=link.b, reason=f"its baseline of {baseline:.2f} m is too short")
     unit = b.camera.focal * WORKING_WIDTH / b.camera.width
-    u = [r[:, :2] / r[:, 2:] * unit for r in (rays(v.camera, p) for v, p in zip(views, px, strict=True))]
-    found = Ransac(model="homography", threshold_px=threshold_px(relief_m, height), minimum=LEAST_POINTS)(
-        u[0], u[1]
-    )
+    u = [
+        r[:, :2] / r[:, 2:] * unit
+        for r in (rays(v.camera, p) for v, p in zip(views, px, strict=True))
+    ]
+    found = Ransac(
+        model="homography", threshold_px=threshold_px(relief_m, height), minimum=LEAST_POINTS
+    )(u[0], u[1])
     if isinstance(found, NoEstimate):
         return NoField(a=link.a, b=link.b, reason=f"no dominant plane: {found.reason}")
     everything = replace(found, inliers=np.ones(len(u[0]), bool))
@@ -95,13 +105,20 @@ def pair_field(
     if keep.sum() < LEAST_POINTS:
         return NoField(a=link.a, b=link.b, reason="its disparities do not lie along the baseline")
     return PairField(
-        a=link.a, b=link.b, px=px[1][keep], d_px=d[keep],
+        a=link.a,
+        b=link.b,
+        px=px[1][keep],
+        d_px=d[keep],
         xyz=np.c_[_placed(b, px[1][keep], z, h[keep]), h[keep]],
-        baseline_m=baseline, height_m=height, level=int((keep & flat.level).sum()),
-    )  # fmt: skip
+        baseline_m=baseline,
+        height_m=height,
+        level=int((keep & flat.level).sum()),
+    )
 
 
-def _placed(view: View, px: NDArray, z: float, h: NDArray) -> NDArray[np.float64]:
-    """(n, 2) m: where pixels of a photo lie at heights h above the level z; along a ray that is linear in h."""
+def _placed(view: View, px: NDArray[Any], z: float, h: NDArray[Any]) -> NDArray[np.float64]:
+    """(n, 2) m: where pixels of a photo lie at heights h above the level z; along a ray that is
+    linear in h.
+    """
     low, high = (on_ground(view, px, level(at))[:, :2] for at in (z, z + 1))
     return np.asarray(low + h[:, None] * (high - low))

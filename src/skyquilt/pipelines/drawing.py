@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
@@ -64,7 +64,7 @@ class BlockExtras:
     """Shot numbers from 1, 0 = none, every PROVENANCE-th pixel."""
     views: NDArray[np.uint16]
     """Photos that see each STEP-pixel cell."""
-    preview: NDArray
+    preview: NDArray[Any]
     """(h, w, bands) the block, area-averaged to every `preview_factor`-th pixel."""
     shown: NDArray[np.uint8]
     """(h, w) opacity of the preview, 0 to 255."""
@@ -89,7 +89,11 @@ class Drawn:
 
 
 def survey_ground(
-    alignment: Alignment, pictures: Pictures, methods: Methods, settings: MosaicSettings, store: Store
+    alignment: Alignment,
+    pictures: Pictures,
+    methods: Methods,
+    settings: MosaicSettings,
+    store: Store,
 ) -> Steps[Ground]:
     """Heights from the tie points (level ground where there are none), and the grid of the map.
 
@@ -114,24 +118,29 @@ def survey_ground(
     surface = store.get_or(
         "surface",
         key,
-        lambda: methods.surface(alignment.ties.xyz, area) if len(alignment.ties.xyz) > 3 else level(z),
+        lambda: (
+            methods.surface(alignment.ties.xyz, area) if len(alignment.ties.xyz) > 3 else level(z)
+        ),
     )
     views = tuple(make_views(alignment, surface))
     grid = grid_of(views, gsd, bounds)
     if methods.sweep is not None and len(alignment.ties.xyz) > 3:
         sweep, known, held = methods.sweep, surface, set(alignment.held)
         surface = store.get_or(
-            "surface", digest(key, poses_digest(alignment), grid, sweep),
+            "surface",
+            digest(key, poses_digest(alignment), grid, sweep),
             lambda: sweep(known, [v for v in views if v.photo in held], grid, pictures),
-        )  # fmt: skip
+        )
     yield 1, 1
     return Ground(surface=surface, views=views, grid=grid, native_gsd=native)
 
 
 def _check_place(
-    bounds: tuple[float, float, float, float] | None, views: Sequence[View], settings: MosaicSettings,
+    bounds: tuple[float, float, float, float] | None,
+    views: Sequence[View],
+    settings: MosaicSettings,
     alignment: Alignment,
-) -> None:  # fmt: skip
+) -> None:
     """Refuses an area that no photo shows."""
     if bounds is None or any(v.overlaps(bounds) for v in views):
         return
@@ -142,7 +151,9 @@ def _check_place(
     if settings.bounds is not None:
         asked = ",".join(f"{b:g}" for b in settings.bounds)
         raise UsageError(f"--bounds {asked} lies outside the photos, {where}")
-    raise SideFileError(f"the area of --boundary {settings.boundary} lies outside the photos, {where}")
+    raise SideFileError(
+        f"the area of --boundary {settings.boundary} lies outside the photos, {where}"
+    )
 
 
 def _check_size(grid: Grid, native: float) -> None:
@@ -151,13 +162,16 @@ def _check_size(grid: Grid, native: float) -> None:
     wide = max(grid.width, grid.height) * grid.gsd
     if grid.gsd < native / FINEST and wide < WIDEST_M:
         raise UsageError(
-            f"--gsd {grid.gsd * 100:g} asks for {size}, more than {FINEST} times finer than the photos,"
+            f"--gsd {grid.gsd * 100:g} asks for {size}, more than {FINEST} times finer than the"
+            " photos,"
             f" which show {native * 100:.2g} cm per pixel; leave --gsd out or choose one near that"
         )
     if wide > WIDEST_M or grid.width * grid.height > MOST_PIXELS:
         raise UsageError(
-            f"the map would be {wide / 1000:.0f} km wide, {size} at {grid.gsd * 100:g} cm: the positions of"
-            " some photos (or --bounds) must be wrong; correct them with --geo, or choose a larger --gsd"
+            f"the map would be {wide / 1000:.0f} km wide, {size} at {grid.gsd * 100:g} cm: the"
+            " positions of"
+            " some photos (or --bounds) must be wrong; correct them with --geo, or choose a larger"
+            " --gsd"
         )
 
 
@@ -174,13 +188,17 @@ def round_gsd(gsd: float) -> float:
     return float(round(gsd, digits))
 
 
-def _local_bounds(settings: MosaicSettings, alignment: Alignment) -> tuple[float, float, float, float] | None:
+def _local_bounds(
+    settings: MosaicSettings, alignment: Alignment
+) -> tuple[float, float, float, float] | None:
     """Bounds asked for, or those of the boundary, in the map frame."""
     frame = alignment.frame
     bounds = settings.bounds
     if settings.boundary is not None and bounds is None:
         if frame.crs is None:
-            raise UsageError("--boundary needs a georeferenced survey, and these photos have no positions")
+            raise UsageError(
+                "--boundary needs a georeferenced survey, and these photos have no positions"
+            )
         from skyquilt.raster.boundary import read_boundary
 
         bounds = read_boundary(settings.boundary, frame.crs).bounds
@@ -197,7 +215,13 @@ def balance(
     if unit_of(intake):
         frames = {v.photo: intake.looked[v.photo].thumbnail for v in ground.views}
         return drift_of(
-            ground.views, frames, ground.surface, ground.grid.bounds, unit_of(intake), methods, settings
+            ground.views,
+            frames,
+            ground.surface,
+            ground.grid.bounds,
+            unit_of(intake),
+            methods,
+            settings,
         )
     if not settings.balance or intake.photos[0].dtype != "uint8":
         return NEUTRAL
@@ -205,7 +229,7 @@ def balance(
     return methods.balance(ground.views, thumbnails, ground.surface, ground.grid.bounds)
 
 
-def _three(thumbnail: NDArray) -> NDArray:
+def _three(thumbnail: NDArray[Any]) -> NDArray[Any]:
     return thumbnail[..., None] if thumbnail.ndim == 2 else thumbnail
 
 
@@ -220,18 +244,28 @@ def composer(
     """The composer of the survey's map."""
     first = intake.photos[ground.views[0].photo]
     return Composer(
-        grid=ground.grid, views=ground.views, surface=ground.surface, blend=methods.blend, pixels=pixels,
-        bands=first.channels, dtype=np.dtype(first.dtype), exposure=exposure,
-    )  # fmt: skip
+        grid=ground.grid,
+        views=ground.views,
+        surface=ground.surface,
+        blend=methods.blend,
+        pixels=pixels,
+        bands=first.channels,
+        dtype=np.dtype(first.dtype),
+        exposure=exposure,
+    )
 
 
-def geotransform(grid: Grid, alignment: Alignment) -> tuple[float, float, float, float, float, float]:
+def geotransform(
+    grid: Grid, alignment: Alignment
+) -> tuple[float, float, float, float, float, float]:
     """The six numbers of a north-up raster in the output CRS."""
     x, y = alignment.frame.origin
     return grid.gsd, 0.0, grid.west + x, 0.0, -grid.gsd, grid.north + y
 
 
-def mosaic_spec(compose: Composer, alignment: Alignment, settings: MosaicSettings, unit: str) -> RasterSpec:
+def mosaic_spec(
+    compose: Composer, alignment: Alignment, settings: MosaicSettings, unit: str
+) -> RasterSpec:
     """How mosaic.tif is written."""
     picture = compose.dtype == np.uint8
     compress = cast(Compression, settings.compress)
@@ -239,34 +273,56 @@ def mosaic_spec(compose: Composer, alignment: Alignment, settings: MosaicSetting
         compress = "jpeg" if picture and compose.bands in (1, 3) else "zstd"
     if compress == "jpeg" and not (picture and compose.bands in (1, 3)):
         raise UsageError(
-            f"--compress jpeg is for 8-bit pictures; these photos are {compose.dtype}, {compose.bands} bands"
+            f"--compress jpeg is for 8-bit pictures; these photos are {compose.dtype},"
+            f" {compose.bands} bands"
         )
     real = compose.dtype.kind == "f"
     return RasterSpec(
-        width=compose.grid.width, height=compose.grid.height, bands=compose.bands, dtype=str(compose.dtype),
-        transform=geotransform(compose.grid, alignment), crs=alignment.frame.crs, compress=compress,
-        quality=settings.quality, mask=not real, nodata=float("nan") if real else None,
-        tags={"SOFTWARE": "Skyquilt", "METHOD": alignment.method} | value_tags(unit, compose.exposure),
+        width=compose.grid.width,
+        height=compose.grid.height,
+        bands=compose.bands,
+        dtype=str(compose.dtype),
+        transform=geotransform(compose.grid, alignment),
+        crs=alignment.frame.crs,
+        compress=compress,
+        quality=settings.quality,
+        mask=not real,
+        nodata=float("nan") if real else None,
+        tags={"SOFTWARE": "Skyquilt", "METHOD": alignment.method}
+        | value_tags(unit, compose.exposure),
         band_units=(unit,) * compose.bands if unit else (),
-    )  # fmt: skip
+    )
 
 
 def draw(
-    output: Path, compose: Composer, alignment: Alignment, settings: MosaicSettings, store: Store, key: str,
-    unit: str, jobs: int,
-) -> Steps[Drawn]:  # fmt: skip
-    """Writes mosaic.tif, provenance.tif and views.tif; a killed run goes on at the block where it stopped."""
+    output: Path,
+    compose: Composer,
+    alignment: Alignment,
+    settings: MosaicSettings,
+    store: Store,
+    key: str,
+    unit: str,
+    jobs: int,
+) -> Steps[Drawn]:
+    """Writes mosaic.tif, provenance.tif and views.tif; a killed run goes on at the block where it
+    stopped.
+    """
     whole = _Companions(compose.grid, compose.bands, compose.dtype)
     spec = mosaic_spec(compose, alignment, settings, unit)
     path, spool = output / "mosaic.tif", output / STATE / SPOOL
     keep, table = _keeper(compose, alignment, settings), _shot_numbers(compose)
 
-    def one(block: Block) -> tuple[Block, NDArray, NDArray[np.bool_], BlockExtras]:
+    def one(block: Block) -> tuple[Block, NDArray[Any], NDArray[np.bool_], BlockExtras]:
         composed = compose(_window(block))
         valid = composed.photo >= 0
         if keep is not None:
             valid &= keep(block)
-        return block, _blanked(composed.pixels, valid), valid, _extras(composed, valid, table, whole.factor)
+        return (
+            block,
+            _blanked(composed.pixels, valid),
+            valid,
+            _extras(composed, valid, table, whole.factor),
+        )
 
     if store.get("blocks", digest(key, "file")) != _stamp(path):
         with CogWriter(path, spec, spool=spool, digest=key) as writer:
@@ -281,9 +337,13 @@ def draw(
         whole.add(block.row0, block.col0, kept or one(block)[3])  # none where the store was damaged
     _write_companions(output, whole, alignment)
     return Drawn(
-        provenance=whole.provenance, provenance_grid=whole.fine, views=whole.views, views_grid=whole.coarse,
-        preview=coloured(whole.preview, whole.shown), preview_grid=whole.grid.coarser(whole.factor),
-    )  # fmt: skip
+        provenance=whole.provenance,
+        provenance_grid=whole.fine,
+        views=whole.views,
+        views_grid=whole.coarse,
+        preview=coloured(whole.preview, whole.shown),
+        preview_grid=whole.grid.coarser(whole.factor),
+    )
 
 
 def _blocks(spec: RasterSpec) -> list[Block]:
@@ -307,7 +367,9 @@ def _stamp(path: Path) -> list[int]:
 
 
 def _shot_numbers(compose: Composer) -> NDArray[np.uint32]:
-    """Number in shots.geojson of each photo; the last entry, which index -1 (no photo) finds, is 0."""
+    """Number in shots.geojson of each photo; the last entry, which index -1 (no photo) finds,
+    is 0.
+    """
     number = {v.photo: k + 1 for k, v in enumerate(sorted(compose.views, key=lambda v: v.photo))}
     table = np.zeros(max(number) + 2, np.uint32)
     table[list(number)] = list(number.values())
@@ -322,7 +384,7 @@ def _extras(
     return BlockExtras(provenance=numbers, views=composed.views, preview=preview, shown=shown)
 
 
-def _thinned(numbers: NDArray) -> NDArray:
+def _thinned(numbers: NDArray[Any]) -> NDArray[Any]:
     """Every PROVENANCE-th pixel in both directions, from the middle of its cell."""
     rows, columns = (
         np.minimum(np.arange(PROVENANCE // 2, size + PROVENANCE // 2, PROVENANCE), size - 1)
@@ -331,7 +393,7 @@ def _thinned(numbers: NDArray) -> NDArray:
     return np.asarray(numbers[rows][:, columns])
 
 
-def _blanked(pixels: NDArray, valid: NDArray[np.bool_]) -> NDArray:
+def _blanked(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[Any]:
     if pixels.dtype.kind == "f":
         pixels[~valid] = np.nan
     return pixels
@@ -357,15 +419,21 @@ def _keeper(
 
 
 def preview_factor(grid: Grid) -> int:
-    """Map pixels per preview pixel: a power of two that brings the longest side to 1600 px or less."""
+    """Map pixels per preview pixel: a power of two that brings the longest side to 1600 px or
+    less.
+    """
     factor = 1
     while max(grid.width, grid.height) / factor > 1600 and factor < 2048:
         factor *= 2
     return factor
 
 
-def _reduced(pixels: NDArray, valid: NDArray[np.bool_], factor: int) -> tuple[NDArray, NDArray[np.uint8]]:
-    """Area averages of the valid pixels (h, w, bands), and how much of each cell is valid (0 to 255)."""
+def _reduced(
+    pixels: NDArray[Any], valid: NDArray[np.bool_], factor: int
+) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """Area averages of the valid pixels (h, w, bands), and how much of each cell is valid (0 to
+    255).
+    """
     opaque = valid.view(np.uint8) * np.uint8(255)
     size = (-(-pixels.shape[1] // factor), -(-pixels.shape[0] // factor))
     share = np.asarray(averaged(opaque, size), np.uint8)
@@ -377,8 +445,10 @@ def _reduced(pixels: NDArray, valid: NDArray[np.bool_], factor: int) -> tuple[ND
     return mean, share
 
 
-def coloured(preview: NDArray, shown: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """RGBA (h, w, 4) of a preview: pictures as they are, measured values from dark to bright (inferno)."""
+def coloured(preview: NDArray[Any], shown: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """RGBA (h, w, 4) of a preview: pictures as they are, measured values from dark to bright
+    (inferno).
+    """
     if preview.dtype == np.uint8 and preview.shape[2] == 3:
         return np.dstack([preview, shown])
     value = preview[..., 0].astype(np.float32)
@@ -407,9 +477,11 @@ class _Companions:
 
     def add(self, row: int, column: int, extras: BlockExtras) -> None:
         for target, part, step in (
-            (self.provenance, extras.provenance, PROVENANCE), (self.views, extras.views, STEP),
-            (self.preview, extras.preview, self.factor), (self.shown, extras.shown, self.factor),
-        ):  # fmt: skip
+            (self.provenance, extras.provenance, PROVENANCE),
+            (self.views, extras.views, STEP),
+            (self.preview, extras.preview, self.factor),
+            (self.shown, extras.shown, self.factor),
+        ):
             r, c = row // step, column // step
             target[r : r + part.shape[0], c : c + part.shape[1]] = part
 
@@ -423,18 +495,29 @@ def _write_companions(output: Path, whole: _Companions, alignment: Alignment) ->
             whole.fine,
             "uint8" if top < 256 else "uint16" if top < 65536 else "uint32",
         ),
-        ("views.tif", whole.views, whole.coarse, "uint8" if whole.views.max(initial=0) < 256 else "uint16"),
+        (
+            "views.tif",
+            whole.views,
+            whole.coarse,
+            "uint8" if whole.views.max(initial=0) < 256 else "uint16",
+        ),
     ):
         write_array(
-            output / name, array.astype(kind),
+            output / name,
+            array.astype(kind),
             RasterSpec(
-                width=grid.width, height=grid.height, bands=1, dtype=kind,
+                width=grid.width,
+                height=grid.height,
+                bands=1,
+                dtype=kind,
                 transform=geotransform(grid, alignment),
-                crs=alignment.frame.crs, compress="deflate", nodata=0.0,
+                crs=alignment.frame.crs,
+                compress="deflate",
+                nodata=0.0,
                 overviews="mode" if name.startswith("p") else "max",
                 tags={"SOFTWARE": "Skyquilt"},
             ),
-        )  # fmt: skip
+        )
 
 
 def write_surface(output: Path, ground: Ground, alignment: Alignment) -> None:
@@ -449,10 +532,16 @@ def write_surface(output: Path, ground: Ground, alignment: Alignment) -> None:
     x, y = np.meshgrid(coarse.x(np.arange(coarse.width)), coarse.y(np.arange(coarse.height)))
     about = {"VERTICAL_DATUM": alignment.frame.vertical_datum, "SOURCE": ground.surface.source}
     spec = RasterSpec(
-        width=coarse.width, height=coarse.height, bands=1, dtype="float32",
-        transform=geotransform(coarse, alignment), crs=alignment.frame.crs, compress="zstd",
-        nodata=float("nan"), tags={"SOFTWARE": "Skyquilt"} | about,
-    )  # fmt: skip
+        width=coarse.width,
+        height=coarse.height,
+        bands=1,
+        dtype="float32",
+        transform=geotransform(coarse, alignment),
+        crs=alignment.frame.crs,
+        compress="zstd",
+        nodata=float("nan"),
+        tags={"SOFTWARE": "Skyquilt"} | about,
+    )
     write_array(output / "surface.tif", ground.surface.at(x, y).astype(np.float32), spec)
 
 
@@ -483,6 +572,8 @@ def single_kind(intake: Intake) -> Intake:
         if i not in keep
     )
     return replace(
-        intake, photos=tuple(intake.photos[i] for i in keep), looked=tuple(intake.looked[i] for i in keep),
+        intake,
+        photos=tuple(intake.photos[i] for i in keep),
+        looked=tuple(intake.looked[i] for i in keep),
         rejected=(*intake.rejected, *odd),
-    )  # fmt: skip
+    )

@@ -24,20 +24,22 @@ MOST_POINTS = 20000
 """Tie points written to reconstruction.json."""
 
 
-def rotation_vector(R: NDArray) -> list[float]:
+def rotation_vector(R: NDArray[Any]) -> list[float]:
     """Axis times angle in rad."""
     return [float(v) for v in cv2.Rodrigues(R)[0].ravel()]
 
 
-def in_crs(alignment: Alignment, xyz: NDArray) -> NDArray[np.float64]:
+def in_crs(alignment: Alignment, xyz: NDArray[Any]) -> NDArray[np.float64]:
     """Map coordinates (..., 3) in the output CRS."""
-    return np.asarray(xyz) + np.array([*alignment.frame.origin, 0.0])
+    return np.asarray(np.asarray(xyz) + np.array([*alignment.frame.origin, 0.0]))
 
 
 def write_cameras(path: Path, alignment: Alignment) -> None:
     """cameras.json: calibrations by camera."""
     used = {alignment.camera_of[i] for i in alignment.poses}
-    records = {key: camera_to_opensfm(replace(alignment.cameras[key], sigmas=None)) for key in sorted(used)}
+    records = {
+        key: camera_to_opensfm(replace(alignment.cameras[key], sigmas=None)) for key in sorted(used)
+    }
     write_text(path, json.dumps(records, indent=1))
 
 
@@ -47,22 +49,29 @@ def shot_properties(photo: Photo, alignment: Alignment, i: int) -> dict[str, Any
     yaw, pitch, roll = angles_from_cam_R_map(pose.cam_R_map)
     block = next((k for k, b in enumerate(alignment.blocks) if i in b), -1)
     return {
-        "filename": photo.name, "camera": alignment.camera_of[i],
+        "filename": photo.name,
+        "camera": alignment.camera_of[i],
         "focal": camera.focal / max(photo.width, photo.height),
-        "width": photo.width, "height": photo.height,
+        "width": photo.width,
+        "height": photo.height,
         "capture_time": photo.time.timestamp() if photo.time else None,
         "translation": [float(v) for v in in_crs(alignment, pose.map_C)],
         "rotation": rotation_vector(pose.cam_R_map),
-        "yaw": round((yaw + alignment.frame.convergence_deg) % 360, 3), "pitch": round(pitch, 3),
+        "yaw": round((yaw + alignment.frame.convergence_deg) % 360, 3),
+        "pitch": round(pitch, 3),
         "roll": round(roll, 3),
-        "block": block, "tie_points": int((alignment.ties.photo == i).sum()),
-    }  # fmt: skip
+        "block": block,
+        "tie_points": int((alignment.ties.photo == i).sum()),
+    }
 
 
-def write_shots(path: Path, photos: Sequence[Photo], alignment: Alignment, order: Sequence[int]) -> None:
+def write_shots(
+    path: Path, photos: Sequence[Photo], alignment: Alignment, order: Sequence[int]
+) -> None:
     """shots.geojson: a point per photo; the k-th feature is number k in provenance.tif."""
     features = [
-        (in_crs(alignment, alignment.poses[i].map_C), shot_properties(photos[i], alignment, i)) for i in order
+        (in_crs(alignment, alignment.poses[i].map_C), shot_properties(photos[i], alignment, i))
+        for i in order
     ]
     vector.points(path, features, crs=alignment.frame.crs)
 
@@ -72,12 +81,14 @@ def write_footprints(
 ) -> None:
     """footprints.geojson: the ground that each photo shows."""
     x, y = alignment.frame.origin
-    features = [([v.footprint + np.array([x, y])], {"filename": photos[v.photo].name}) for v in views]
+    features = [
+        ([v.footprint + np.array([x, y])], {"filename": photos[v.photo].name}) for v in views
+    ]
     vector.polygons(path, features, crs=alignment.frame.crs)
 
 
 def write_reconstruction(
-    path: Path, photos: Sequence[Photo], alignment: Alignment, colours: NDArray | None
+    path: Path, photos: Sequence[Photo], alignment: Alignment, colours: NDArray[Any] | None
 ) -> None:
     """reconstruction.json in OpenSfM's form: topocentric east-north-up about `reference_lla`."""
     enu = Topocentric(alignment)
@@ -86,13 +97,17 @@ def write_reconstruction(
         R = pose.cam_R_map @ enu.map_R_enu
         C = enu(pose.map_C[None])[0]
         shots[photos[i].name] = {
-            "camera": alignment.camera_of[i], "rotation": rotation_vector(R),
-            "translation": [float(v) for v in -R @ C], "orientation": 1, "capture_time": 0.0,
-            "gps_position": [float(v) for v in C], "gps_dop": 15.0,
-        }  # fmt: skip
-    chosen = np.linspace(0, len(alignment.ties.xyz) - 1, min(MOST_POINTS, len(alignment.ties.xyz))).astype(
-        int
-    )
+            "camera": alignment.camera_of[i],
+            "rotation": rotation_vector(R),
+            "translation": [float(v) for v in -R @ C],
+            "orientation": 1,
+            "capture_time": 0.0,
+            "gps_position": [float(v) for v in C],
+            "gps_dop": 15.0,
+        }
+    chosen = np.linspace(
+        0, len(alignment.ties.xyz) - 1, min(MOST_POINTS, len(alignment.ties.xyz))
+    ).astype(int)
     coordinates = enu(alignment.ties.xyz[chosen]) if len(chosen) else np.zeros((0, 3))
     points = {
         str(k): {
@@ -104,9 +119,13 @@ def write_reconstruction(
     used = {alignment.camera_of[i] for i in alignment.poses}
     record = {
         "cameras": {key: camera_to_opensfm(alignment.cameras[key]) for key in sorted(used)},
-        "shots": shots, "points": points, "reference_lla": enu.reference, "biases": {}, "rig_cameras": {},
+        "shots": shots,
+        "points": points,
+        "reference_lla": enu.reference,
+        "biases": {},
+        "rig_cameras": {},
         "rig_instances": {},
-    }  # fmt: skip
+    }
     write_text(path, json.dumps([record]))
 
 
@@ -115,7 +134,10 @@ class Topocentric:
 
     def __init__(self, alignment: Alignment) -> None:
         frame = alignment.frame
-        self.alignment, self.reference = alignment, {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0}
+        self.alignment, self.reference = (
+            alignment,
+            {"latitude": 0.0, "longitude": 0.0, "altitude": 0.0},
+        )
         self.map_R_enu = np.eye(3)
         self._to_ecef: Transformer | None = None
         if frame.crs is None:
@@ -134,9 +156,11 @@ class Topocentric:
         )
         self._origin = np.array(self._to_ecef.transform(lon, lat, 0.0))
         # grid north lies `convergence` clockwise of true north
-        self.map_R_enu = rotation_from_vector(np.array([0.0, 0.0, np.radians(frame.convergence_deg)]))
+        self.map_R_enu = rotation_from_vector(
+            np.array([0.0, 0.0, np.radians(frame.convergence_deg)])
+        )
 
-    def __call__(self, xyz: NDArray) -> NDArray[np.float64]:
+    def __call__(self, xyz: NDArray[Any]) -> NDArray[np.float64]:
         """East, north, up (N, 3) in m of map coordinates (N, 3)."""
         if self._to_ecef is None:
             return np.asarray(xyz)
@@ -146,22 +170,33 @@ class Topocentric:
         return np.asarray((ecef - self._origin) @ self._east_north_up.T)
 
 
-def write_run(path: Path, settings: Mapping[str, Any], photos: str, commit: str | None, method: str) -> None:
+def write_run(
+    path: Path, settings: Mapping[str, Any], photos: str, commit: str | None, method: str
+) -> None:
     """run.toml: what was asked for, by which version."""
-    about = {"version": __version__, "commit": commit or "unknown", "photos": photos, "method_used": method}
+    about = {
+        "version": __version__,
+        "commit": commit or "unknown",
+        "photos": photos,
+        "method_used": method,
+    }
     lines = [f"{key} = {_toml(value)}" for key, value in about.items()]
     lines += ["", "[settings]", *(f"{key} = {_toml(value)}" for key, value in settings.items())]
     write_text(path, "\n".join(lines) + "\n")
 
 
 def _toml(value: Any) -> str:
-    """JSON is TOML, but for characters beyond 16 bits, lone surrogates (undecodable file names) and DEL."""
+    """JSON is TOML, but for characters beyond 16 bits, lone surrogates (undecodable file names) and
+    DEL.
+    """
     text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return text.encode("utf-8", "replace").decode()
 
 
 def source_commit() -> str | None:
-    """The commit of the source this runs from, read from git's files; None for an installed package."""
+    """The commit of the source this runs from, read from git's files; None for an installed
+    package.
+    """
     for folder in Path(__file__).resolve().parents:
         head = folder / ".git" / "HEAD"
         if head.is_file():

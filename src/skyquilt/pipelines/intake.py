@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,10 +19,11 @@ from skyquilt.run.pixel_cache import PixelCache
 from skyquilt.run.store import Store, digest
 
 PICTURE = 1000
-"""Longest side in px of the grey pictures kept for sharpening sightings and the search of heights."""
+"""Longest side in px of the grey pictures kept for sharpening sightings and the search of heights.
+"""
 KEPT_BYTES = 150_000_000
 """Grey pictures held in memory at a time; the others wait in the store."""
-PhotoPixels = Callable[[int], NDArray]
+PhotoPixels = Callable[[int], NDArray[Any]]
 """Full-size pixels of a photo by its index."""
 THUMBNAIL = 256
 """Longest side in px of the thumbnails kept for exposure and the report."""
@@ -33,7 +35,7 @@ class Looked:
 
     features: Features
     """Keypoints."""
-    thumbnail: NDArray
+    thumbnail: NDArray[Any]
     """(h, w[, bands])."""
 
 
@@ -86,7 +88,7 @@ def picture_key(photo: Photo) -> str:
     return digest(photo.digest, PICTURE)
 
 
-def picture_of(pixels: NDArray) -> NDArray[np.uint8]:
+def picture_of(pixels: NDArray[Any]) -> NDArray[np.uint8]:
     """The grey picture of a photo's pixels."""
     rough = halved(pixels, PICTURE)
     if rough.dtype == np.uint8:  # one band is averaged in a third of the time of three
@@ -94,10 +96,14 @@ def picture_of(pixels: NDArray) -> NDArray[np.uint8]:
     return np.ascontiguousarray(to_grey8(shrink(rough, PICTURE)[0]))
 
 
-def thumbnail_of(pixels: NDArray) -> NDArray:
-    """The thumbnail of a photo's pixels, less a last odd row or column, which would cost more than all others."""
+def thumbnail_of(pixels: NDArray[Any]) -> NDArray[Any]:
+    """The thumbnail of a photo's pixels, less a last odd row or column, which would cost more than
+    all others.
+    """
     height, width = pixels.shape[:2]
-    return np.ascontiguousarray(shrink(pixels[: height - height % 2, : width - width % 2], THUMBNAIL)[0])
+    return np.ascontiguousarray(
+        shrink(pixels[: height - height % 2, : width - width % 2], THUMBNAIL)[0]
+    )
 
 
 def look(photo: Photo, index: int, cache: PhotoPixels, methods: Methods, store: Store) -> Looked:
@@ -111,12 +117,19 @@ def look(photo: Photo, index: int, cache: PhotoPixels, methods: Methods, store: 
     picture = picture_of(rough)
     store.put("pictures", picture_key(photo), picture)
     longest = methods.sift.longest
-    # values of a sensor are made grey at the size they are searched at: what is equalised locally depends on it
+    # values of a sensor are made grey at the size they are searched at: what is equalised locally
+    # depends on it
     source = (
-        pixels if longest > PICTURE else picture if rough.dtype == np.uint8 else shrink(rough, PICTURE)[0]
+        pixels
+        if longest > PICTURE
+        else picture
+        if rough.dtype == np.uint8
+        else shrink(rough, PICTURE)[0]
     )
     small, _ = shrink(source, longest)
-    return Looked(features=methods.sift.of_shrunken(small, pixels.shape[:2]), thumbnail=thumbnail_of(rough))
+    return Looked(
+        features=methods.sift.of_shrunken(small, pixels.shape[:2]), thumbnail=thumbnail_of(rough)
+    )
 
 
 def take_in(
@@ -144,5 +157,7 @@ def take_in(
     good = [(p, r) for p, r in zip(photos, results, strict=True) if isinstance(r, Looked)]
     bad = tuple(r for r in results if isinstance(r, RejectedPhoto))
     if not good:
-        raise NoPhotosError(f"none of {len(photos)} photos could be decoded; the first: {bad[0].reason}")
+        raise NoPhotosError(
+            f"none of {len(photos)} photos could be decoded; the first: {bad[0].reason}"
+        )
     return Intake(photos=tuple(p for p, _ in good), looked=tuple(k for _, k in good), rejected=bad)

@@ -21,7 +21,7 @@ def _round(value: float | None, digits: int = 4) -> float | None:
     return None if value is None or not np.isfinite(value) else round(float(value), digits)
 
 
-def xyz(values: Sequence[float] | NDArray | None) -> dict[str, float | None] | None:
+def xyz(values: Sequence[float] | NDArray[Any] | None) -> dict[str, float | None] | None:
     """Three figures by axis."""
     if values is None or not np.isfinite(np.asarray(values, float)).any():
         return None
@@ -43,32 +43,42 @@ def alignment_figures(alignment: Alignment, priors: Sequence[Prior]) -> dict[str
     return {
         "blocks": [len(b) for b in alignment.blocks],
         "gps_residual_rms_m": xyz(rms),
-        "gps_leave_one_out_rms_m": xyz(np.where(np.isfinite(rms), loo, np.nan) if loo is not None else None),
-        "reprojection_error_px": {"mean": _round(error.mean()),
-        "rms": _round(rms_px)} if len(error) else None,
+        "gps_leave_one_out_rms_m": xyz(
+            np.where(np.isfinite(rms), loo, np.nan) if loo is not None else None
+        ),
+        "reprojection_error_px": {"mean": _round(error.mean()), "rms": _round(rms_px)}
+        if len(error)
+        else None,
         "tie_points": len(alignment.ties.xyz),
         "sightings": len(alignment.ties.point),
         **control_figures(alignment),
-    }  # fmt: skip
+    }
 
 
 def control_figures(alignment: Alignment) -> dict[str, Any]:
     """Control and check points.
 
-    Where heights count from the take-off point (or nobody knows), and no control point ties them to the survey's, both
-    differ by a constant: the median, told apart from the errors.
+    Where heights count from the take-off point (or nobody knows), and no control point ties them to
+    the survey's, both differ by a constant: the median, told apart from the errors.
     """
     points = alignment.control
     dz = np.array([c.error_m[2] for c in points], float)
-    tied = alignment.frame.vertical_datum not in ("takeoff", "unknown") or any(not c.check for c in points)
+    tied = alignment.frame.vertical_datum not in ("takeoff", "unknown") or any(
+        not c.check for c in points
+    )
     offset = 0.0 if tied or not np.isfinite(dz).any() else float(np.nanmedian(dz))
     rows = [
         {
-            "name": c.name, "check": c.check, "dx_m": _round(c.error_m[0]), "dy_m": _round(c.error_m[1]),
-            "dz_m": _round(z - offset), "reprojection_px": _round(c.reprojection_px), "sightings": c.sightings,
+            "name": c.name,
+            "check": c.check,
+            "dx_m": _round(c.error_m[0]),
+            "dy_m": _round(c.error_m[1]),
+            "dz_m": _round(z - offset),
+            "reprojection_px": _round(c.reprojection_px),
+            "sightings": c.sightings,
         }
         for c, z in zip(points, dz, strict=True)
-    ]  # fmt: skip
+    ]
     return {"control": rows, "control_height_offset_m": _round(offset) if points else None}
 
 
@@ -94,12 +104,19 @@ def camera_figures(photos: Sequence[Photo], alignment: Alignment) -> dict[str, A
 
 
 def figures(
-    *, photos: Sequence[Photo], total: int, rejected: Sequence[RejectedPhoto], priors: Sequence[Prior],
+    *,
+    photos: Sequence[Photo],
+    total: int,
+    rejected: Sequence[RejectedPhoto],
+    priors: Sequence[Prior],
     links: Links,
-    alignment: Alignment, ground: Ground, drawn: Drawn, seams: Mapping[str, Any],
+    alignment: Alignment,
+    ground: Ground,
+    drawn: Drawn,
+    seams: Mapping[str, Any],
     conflicts: Sequence[MetadataConflict],
     notes: Sequence[str],
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """The figures of a run, without times."""
     seen = drawn.views > 0
     cell = drawn.views_grid.gsd**2
@@ -125,7 +142,7 @@ def figures(
         "metadata_conflicts": [asdict(c) for c in conflicts],
         "cameras": camera_figures(photos, alignment),
         "notes": list(notes),
-    }  # fmt: skip
+    }
 
 
 def _holes(seen: NDArray[np.bool_], cell_m2: float) -> dict[str, float]:

@@ -57,7 +57,9 @@ def link_up(
 
 
 def _closest(pairs: Sequence[Pair], count: int, each: int) -> list[Pair]:
-    """Of pairs sorted by distance, those that are among the `each` closest of one of their photos."""
+    """Of pairs sorted by distance, those that are among the `each` closest of one of their
+    photos.
+    """
     degree = np.zeros(count, int)
     kept = []
     for i, j in pairs:
@@ -68,9 +70,11 @@ def _closest(pairs: Sequence[Pair], count: int, each: int) -> list[Pair]:
 
 
 def overlap_reach_m(links: Sequence[Link], intake: Intake, xy: np.ndarray) -> float | None:
-    """Distance in m of positions beyond which photos hardly overlap, learnt from links; None if too few tell.
+    """Distance in m of positions beyond which photos hardly overlap, learnt from links; None if too
+    few tell.
 
-    A link gives the shift of the picture in px and the positions give it in m. Nothing here trusts altitudes.
+    A link gives the shift of the picture in px and the positions give it in m. Nothing here trusts
+    altitudes.
     """
     metres_per_px = []
     for link in links:
@@ -95,7 +99,9 @@ def _batches(pairs: Sequence[Pair]) -> list[Sequence[Pair]]:
 def _verified(
     pairs: Sequence[Pair], intake: Intake, methods: Methods, store: Store, jobs: int
 ) -> list[Link | RejectedLink]:
-    """Links of a batch, stored under the photos' digests and the methods; indices are those of this run."""
+    """Links of a batch, stored under the photos' digests and the methods; indices are those of this
+    run.
+    """
     photos, features = intake.photos, intake.features
 
     def one(pair: Pair) -> Link | RejectedLink:

@@ -2,8 +2,8 @@
 
     read -> features -> links -> align -> surface -> balance -> mosaic -> measure -> report
 
-Read `iter_mosaic`: it is the product. Each stage's result is looked up in the run's store before it is made,
-so a second run recomputes nothing and a killed one goes on where it stopped.
+Read `iter_mosaic`: it is the product. Each stage's result is looked up in the run's store before it
+is made, so a second run recomputes nothing and a killed one goes on where it stopped.
 """
 
 import json
@@ -29,7 +29,16 @@ from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.sequence import sequence_of
 from skyquilt.photos.survey import read_survey
-from skyquilt.pipelines import drawing, intake, judging, linking, placing, quality, radiometry, reporting
+from skyquilt.pipelines import (
+    drawing,
+    intake,
+    judging,
+    linking,
+    placing,
+    quality,
+    radiometry,
+    reporting,
+)
 from skyquilt.run.clock import Clock, Steps
 from skyquilt.run.folder import STATE, RunFolder, open_run
 from skyquilt.run.pixel_cache import PixelCache
@@ -51,24 +60,40 @@ ARTEFACTS = {
 REGISTRY = {
     c.__name__: c
     for c in (
-        intake.Looked, features.Features, features.Link, features.RejectedLink, features.Matches,
+        intake.Looked,
+        features.Features,
+        features.Link,
+        features.RejectedLink,
+        features.Matches,
         camera.Camera,
-        poses.Alignment, poses.MapFrame, poses.Pose, poses.TiePoints, poses.ControlResidual, poses.Join,
+        poses.Alignment,
+        poses.MapFrame,
+        poses.Pose,
+        poses.TiePoints,
+        poses.ControlResidual,
+        poses.Join,
         surface.Surface,
-        RejectedPhoto, drawing.BlockExtras, raster.Grid,
+        RejectedPhoto,
+        drawing.BlockExtras,
+        raster.Grid,
     )
-}  # fmt: skip
+}
 """Records that the store may hold."""
 
 
 def iter_mosaic(
-    folder: Path | str | Sequence[Path], output: Path | str, settings: MosaicSettings | None = None, *,
-    overwrite: bool = False, rerun_from: str | None = None,
-) -> Iterator[Event]:  # fmt: skip
+    folder: Path | str | Sequence[Path],
+    output: Path | str,
+    settings: MosaicSettings | None = None,
+    *,
+    overwrite: bool = False,
+    rerun_from: str | None = None,
+) -> Iterator[Event]:
     """Makes a mosaic, telling its progress; the last event is the `Result`.
 
     Raises:
-        SkyquiltError: anything a user can mend: no photos, an output that is taken, a malformed side file ...
+        SkyquiltError: anything a user can mend: no photos, an output that is taken, a malformed
+            side file ...
     """
     settings, began = settings or MosaicSettings(), Clock.now()
     folder, output = Path(folder) if isinstance(folder, str) else folder, Path(output)
@@ -89,8 +114,12 @@ def iter_mosaic(
     clock = Clock(store=store, began=began)
     clock.lap("read", began)
     yield from (Note(text=n) for n in survey.notes)
-    cache = PixelCache(read=lambda i: read_color(survey.photos[i]), budget_bytes=pixel_budget(settings))
-    taken = yield from clock.stage("features", intake.take_in(survey.photos, cache, parts, store, jobs))
+    cache = PixelCache(
+        read=lambda i: read_color(survey.photos[i]), budget_bytes=pixel_budget(settings)
+    )
+    taken = yield from clock.stage(
+        "features", intake.take_in(survey.photos, cache, parts, store, jobs)
+    )
     taken, cache = _one_kind(taken, survey, cache, settings)
     pixels = _still_there(taken.photos, cache)
     pictures = intake.Pictures(taken.photos, pixels, store)
@@ -98,9 +127,19 @@ def iter_mosaic(
     prior = priors(taken.photos, frame)
     links = yield from clock.stage("links", _links(taken, prior, parts, settings, store, jobs))
     known = placing.Known(
-        intake=taken, frame=frame, priors=prior, links=links, control=control, pictures=pictures,
-        order=[i for _, i in sorted((in_order[p.name], i) for i, p in enumerate(taken.photos) if p.name in in_order)],
-    )  # fmt: skip
+        intake=taken,
+        frame=frame,
+        priors=prior,
+        links=links,
+        control=control,
+        pictures=pictures,
+        order=[
+            i
+            for _, i in sorted(
+                (in_order[p.name], i) for i, p in enumerate(taken.photos) if p.name in in_order
+            )
+        ],
+    )
     alignment = yield from clock.stage("align", placing.place(known, parts, settings, store))
     yield from (Note(text=n, warning=True) for n in alignment.notes)
     ground = yield from clock.stage(
@@ -129,11 +168,23 @@ def iter_mosaic(
         "measure", _both(reporting.seams(compose, drawn, ground), judging_it), keeps=False
     )
     rejected = [*survey.rejected, *taken.rejected, *_unplaced(taken, alignment)]
-    figures = judging.figures(
-        photos=taken.photos, total=len(survey.photos) + len(survey.rejected), rejected=rejected, priors=prior,
-        links=links, alignment=alignment, ground=ground, drawn=drawn, seams=seams.figures,
-        conflicts=conflicts(taken.photos, prior, alignment), notes=[*survey.notes, *alignment.notes],
-    ) | {"quality": judged} | radiometry.value_figures(taken.photos, exposure, settings)  # fmt: skip
+    figures = (
+        judging.figures(
+            photos=taken.photos,
+            total=len(survey.photos) + len(survey.rejected),
+            rejected=rejected,
+            priors=prior,
+            links=links,
+            alignment=alignment,
+            ground=ground,
+            drawn=drawn,
+            seams=seams.figures,
+            conflicts=conflicts(taken.photos, prior, alignment),
+            notes=[*survey.notes, *alignment.notes],
+        )
+        | {"quality": judged}
+        | radiometry.value_figures(taken.photos, exposure, settings)
+    )
     finish = reporting.finish(
         run.path, taken, prior, alignment, ground, drawn, seams, figures, settings, clock, folder
     )
@@ -143,9 +194,12 @@ def iter_mosaic(
 
 
 def mosaic(
-    folder: Path | str | Sequence[Path], output: Path | str, settings: MosaicSettings | None = None, *,
+    folder: Path | str | Sequence[Path],
+    output: Path | str,
+    settings: MosaicSettings | None = None,
+    *,
     overwrite: bool = False,
-) -> Result:  # fmt: skip
+) -> Result:
     """Makes a mosaic of the photos in a folder and returns when it is finished.
 
     Raises:
@@ -157,7 +211,9 @@ def mosaic(
     raise RuntimeError("the story ended without a result")
 
 
-def _read(folder: Path | Sequence[Path], settings: MosaicSettings) -> tuple[Survey, tuple[ControlPoint, ...]]:
+def _read(
+    folder: Path | Sequence[Path], settings: MosaicSettings
+) -> tuple[Survey, tuple[ControlPoint, ...]]:
     """Metadata and side files; a gcp_list.txt beside the photos is used unasked."""
     survey = read_survey(
         folder, geo=settings.geo, cameras=settings.cameras, thermal_unit=settings.thermal_unit
@@ -199,7 +255,8 @@ def _apart(folder: Path | Sequence[Path], output: Path) -> None:
     """Refuses the folder of photos as output: a second run would take its own map for a photo."""
     if isinstance(folder, Path) and folder.is_dir() and folder.resolve() == output.resolve():
         raise UsageError(
-            f"{output} holds the photos; choose another folder for the results, such as {output / 'map'}"
+            f"{output} holds the photos; choose another folder for the results, such as"
+            f" {output / 'map'}"
         )
 
 
@@ -221,14 +278,18 @@ def _checked(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSe
         read_boundary(settings.boundary, frame.crs)
 
 
-def run_key(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSettings, parts: Methods) -> str:
+def run_key(
+    survey: Survey, control: Sequence[ControlPoint], settings: MosaicSettings, parts: Methods
+) -> str:
     """What a run depends on: content and metadata of its photos, side files, and the
     settings that shape results.
     """
     shaping = {k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb")}
     files = (settings.boundary, settings.distances, Path(settings.sequence))
     side = [p.read_bytes().hex() for p in files if p is not None and p.is_file()]
-    photos = [(p.name, p.digest, p.position, p.attitude, p.focal, p.calibration) for p in survey.photos]
+    photos = [
+        (p.name, p.digest, p.position, p.attitude, p.focal, p.calibration) for p in survey.photos
+    ]
     return digest(photos, list(control), shaping, side, parts, __version__)
 
 
@@ -270,15 +331,16 @@ def replace_read(cache: PixelCache, old: Sequence[int]) -> PixelCache:
     return PixelCache(read=lambda i: cache(old[i]), budget_bytes=0)
 
 
-def _still_there(photos: Sequence[Photo], cache: PixelCache) -> Callable[[int], NDArray]:
+def _still_there(photos: Sequence[Photo], cache: PixelCache) -> Callable[[int], NDArray[Any]]:
     """Pixels of photos that could be read once; an error names the one that cannot be any more."""
 
-    def pixels(photo: int) -> NDArray:
+    def pixels(photo: int) -> NDArray[Any]:
         try:
             return cache(photo)
         except UnreadablePhotoError as error:
             raise SkyquiltError(
-                f"{photos[photo].path} could be read at first, and now {error}; see to its disk and run"
+                f"{photos[photo].path} could be read at first, and now {error}; see to its disk and"
+                " run"
                 " the same command again to resume"
             ) from error
 
@@ -293,7 +355,9 @@ def _links(
     store: Store,
     jobs: int,
 ) -> Steps[linking.Links]:
-    """Links, unless the method asked for does without: to repair metadata takes links, to trust them none."""
+    """Links, unless the method asked for does without: to repair metadata takes links, to trust
+    them none.
+    """
     alone = settings.method in IN_SEQUENCE or settings.method in BY_METADATA
     repairs = settings.method in BY_METADATA and settings.repair
     if (alone and not repairs) or len(taken.photos) < 2:

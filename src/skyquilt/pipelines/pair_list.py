@@ -9,7 +9,14 @@ import numpy as np
 from skyquilt.errors import SideFileError
 from skyquilt.model.registration import Matrix
 
-COLUMNS = ("class", "source", "a", "b", "tolerance_px", *(f"h{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)))
+COLUMNS = (
+    "class",
+    "source",
+    "a",
+    "b",
+    "tolerance_px",
+    *(f"h{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)),
+)
 """Columns that must be there, in any order."""
 
 
@@ -44,7 +51,9 @@ def read_pairs(path: Path) -> tuple[Pair, ...]:
     reader = csv.DictReader(text.splitlines())
     missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
     if missing:
-        raise SideFileError(f"{path.name} lacks the columns {', '.join(missing)}; see docs/methods.md")
+        raise SideFileError(
+            f"{path.name} lacks the columns {', '.join(missing)}; see docs/methods.md"
+        )
     pairs = tuple(_pair(row, number, path) for number, row in enumerate(reader, 2))
     if not pairs:
         raise SideFileError(f"{path.name} names no pairs; one line each is expected below the head")
@@ -56,12 +65,18 @@ def _pair(row: dict[str, str], number: int, path: Path) -> Pair:
         matrix = np.array([[float(row[f"h{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)])
         tolerance = float(row["tolerance_px"])
     except (TypeError, ValueError) as error:
-        raise SideFileError(f"{path.name}, line {number}: a number is expected ({error})") from error
+        raise SideFileError(
+            f"{path.name}, line {number}: a number is expected ({error})"
+        ) from error
     if not (np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 1e-12 and tolerance > 0):
         raise SideFileError(
             f"{path.name}, line {number}: h11 to h33 are no transform, or the tolerance is not > 0"
         )
     return Pair(
-        kind=row["class"], source=row["source"], a=path.parent / row["a"], b=path.parent / row["b"],
-        tolerance_px=tolerance, b_H_a=matrix,
-    )  # fmt: skip
+        kind=row["class"],
+        source=row["source"],
+        a=path.parent / row["a"],
+        b=path.parent / row["b"],
+        tolerance_px=tolerance,
+        b_H_a=matrix,
+    )

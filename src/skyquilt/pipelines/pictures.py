@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,8 +18,10 @@ from skyquilt.raster.read_map import MapFile, open_map, read_reduced, read_windo
 from skyquilt.spectral.metadata import from_metadata
 
 LONGEST = 2048
-"""Px of the longer side at which a photo or map is registered at most; it is resampled at its full size."""
-Window = Callable[[int, int, int, int], tuple[NDArray, NDArray[np.bool_]]]
+"""Px of the longer side at which a photo or map is registered at most; it is resampled at its full
+size.
+"""
+Window = Callable[[int, int, int, int], tuple[NDArray[Any], NDArray[np.bool_]]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,30 +88,44 @@ def _of_photo(photo: Photo) -> Source:
     factor = min(1.0, LONGEST / max(values.shape[:2]))
     small = values
     if factor < 1:  # both axes alike, so that a similarity stays one
-        small = np.asarray(cv2.resize(values, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
+        small = np.asarray(
+            cv2.resize(values, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+        )
 
-    def window(row: int, column: int, height: int, width: int) -> tuple[NDArray, NDArray[np.bool_]]:
+    def window(
+        row: int, column: int, height: int, width: int
+    ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         part = (slice(row, row + height), slice(column, column + width))
         return values[part], valid[part]
 
     return Source(
-        path=photo.path, height=values.shape[0], width=values.shape[1], picture=Picture(values=small),
-        reduction=(1 / factor, 1 / factor), window=window, photo=photo,
-    )  # fmt: skip
+        path=photo.path,
+        height=values.shape[0],
+        width=values.shape[1],
+        picture=Picture(values=small),
+        reduction=(1 / factor, 1 / factor),
+        window=window,
+        photo=photo,
+    )
 
 
 def _of_map(place: MapFile) -> Source:
     values, valid = read_reduced(place, LONGEST)
     return Source(
-        path=place.path, height=place.height, width=place.width, place=place,
+        path=place.path,
+        height=place.height,
+        width=place.width,
+        place=place,
         picture=Picture(values=values, valid=valid),
         reduction=(place.width / values.shape[1], place.height / values.shape[0]),
         window=lambda row, column, height, width: read_window(place, row, column, height, width),
-    )  # fmt: skip
+    )
 
 
 def guess_of(a: Source, b: Source) -> Guess | None:
-    """What metadata or places say beforehand, in px of the pictures; None where they say nothing."""
+    """What metadata or places say beforehand, in px of the pictures; None where they say
+    nothing.
+    """
     if a.place and b.place and a.place.crs and b.place.crs:
         guess = _from_places(a, b)
     elif a.photo and b.photo:
@@ -119,9 +136,12 @@ def guess_of(a: Source, b: Source) -> Guess | None:
         return None
     small = np.linalg.inv(b.full_S_picture) @ guess.b_H_a @ a.full_S_picture
     return Guess(
-        b_H_a=small / small[2, 2], reach=guess.reach, rotation_deg=guess.rotation_deg, scale=guess.scale,
+        b_H_a=small / small[2, 2],
+        reach=guess.reach,
+        rotation_deg=guess.rotation_deg,
+        scale=guess.scale,
         source=guess.source,
-    )  # fmt: skip
+    )
 
 
 def _from_places(a: Source, b: Source) -> Guess | None:
@@ -134,16 +154,23 @@ def _from_places(a: Source, b: Source) -> Guess | None:
     x, y = Transformer.from_crs(a.place.crs, b.place.crs, always_xy=True).transform(x, y)
     p, q, c, r, s, f = b.place.affine
     there = np.linalg.solve(np.array([[p, q], [r, s]]), np.array([x - c, y - f])).T - 0.5
-    if not np.isfinite(there).all() or (there.max(0) < 0).any() or (there.min(0) > [b.width, b.height]).any():
+    if (
+        not np.isfinite(there).all()
+        or (there.max(0) < 0).any()
+        or (there.min(0) > [b.width, b.height]).any()
+    ):
         return None
     linear, *_ = np.linalg.lstsq(np.c_[px, np.ones(4)], there, rcond=None)
     return Guess(
-        b_H_a=np.vstack([linear.T, [0, 0, 1.0]]), reach=0.1, rotation_deg=4.0, scale=1.08,
+        b_H_a=np.vstack([linear.T, [0, 0, 1.0]]),
+        reach=0.1,
+        rotation_deg=4.0,
+        scale=1.08,
         source="the places of both maps",
-    )  # fmt: skip
+    )
 
 
-def _on_ground(place: MapFile, px: NDArray) -> tuple[NDArray, NDArray]:
+def _on_ground(place: MapFile, px: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     a, b, c, d, e, f = place.affine
     column, row = px[:, 0] + 0.5, px[:, 1] + 0.5
     return a * column + b * row + c, d * column + e * row + f

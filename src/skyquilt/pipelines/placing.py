@@ -1,4 +1,6 @@
-"""Where the photos are: the method asked for, or the one that fits; nobody is left behind silently."""
+"""Where the photos are: the method asked for, or the one that fits; nobody is left behind
+silently.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +28,11 @@ def choose_method(asked: str, photos: int, links: int, positions: int) -> tuple[
     if photos == 1:
         return "pose", "one photo has nothing to be adjusted against"
     if links:
-        where = "and positions place it" if positions else "but no positions: the map is not georeferenced"
+        where = (
+            "and positions place it"
+            if positions
+            else "but no positions: the map is not georeferenced"
+        )
         return "bundle", f"{links} links hold the photos together, {where}"
     if positions:
         return "pose", "no two photos could be linked, so each lies where its metadata say"
@@ -56,7 +62,9 @@ class Known:
     """Grey pictures."""
 
 
-def place(known: Known, methods: Methods, settings: MosaicSettings, store: Store) -> Steps[Alignment]:
+def place(
+    known: Known, methods: Methods, settings: MosaicSettings, store: Store
+) -> Steps[Alignment]:
     """Poses and calibration of the survey."""
     positions = sum(bool(np.isfinite(p.map_C[:2]).all()) for p in known.priors)
     photos = known.intake.photos
@@ -65,7 +73,9 @@ def place(known: Known, methods: Methods, settings: MosaicSettings, store: Store
     align, part = _way(method, methods)
     repaired = repaired_metadata(known) if method in BY_METADATA and settings.repair else None
     key = _key(known, methods, (method, part, repaired))
-    alignment = replace(store.get_or("alignment", key, lambda: align(known, methods, repaired)), why=why)
+    alignment = replace(
+        store.get_or("alignment", key, lambda: align(known, methods, repaired)), why=why
+    )
     if method == "bundle":
         alignment = with_loose_photos(alignment, known.intake, known.priors)
     if method in IN_SEQUENCE:
@@ -75,7 +85,10 @@ def place(known: Known, methods: Methods, settings: MosaicSettings, store: Store
 
 
 def _key(known: Known, methods: Methods, way: object) -> str:
-    photos = [(p.digest, p.name, p.camera_key, p.focal, p.calibration, p.editor) for p in known.intake.photos]
+    photos = [
+        (p.digest, p.name, p.camera_key, p.focal, p.calibration, p.editor)
+        for p in known.intake.photos
+    ]
     held = [(k.a, k.b, k.index_a, k.index_b) for k in known.links.links]
     return digest(
         photos,
@@ -109,14 +122,22 @@ def repaired_metadata(known: Known) -> Repaired | None:
     if not known.links.links:
         return None
     convergence = known.frame.convergence_deg
-    return repair(known.intake.photos, known.priors, known.intake.features, known.links.links, convergence)
+    return repair(
+        known.intake.photos, known.priors, known.intake.features, known.links.links, convergence
+    )
 
 
 def _bundle(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
     photos = known.intake.photos
     points = control_in_frame(known.control, photos, known.frame)
     return methods.bundle(
-        photos, known.frame, known.priors, known.intake.features, known.links.links, points, known.pictures
+        photos,
+        known.frame,
+        known.priors,
+        known.intake.features,
+        known.links.links,
+        points,
+        known.pictures,
     )
 
 
@@ -149,7 +170,9 @@ def _image(known: Known, methods: Methods, repaired: Repaired | None) -> Alignme
 
 
 def _least_height(known: Known) -> float | None:
-    """Least height above take-off in m, which stands for that above ground in (4.9); None where none is reported."""
+    """Least height above take-off in m, which stands for that above ground in (4.9); None where
+    none is reported.
+    """
     heights = np.array([p.map_C[2] for p in known.priors])
     known_heights = heights[np.isfinite(heights) & (heights > 1)]
     takeoff = known.frame.vertical_datum == "takeoff"
@@ -181,15 +204,31 @@ def with_loose_photos(alignment: Alignment, intake: Intake, priors: Sequence[Pri
     """Photos that nothing links, placed by their own metadata relative to the adjusted
     ones, and named as such.
     """
-    poses, cameras, camera_of = dict(alignment.poses), dict(alignment.cameras), dict(alignment.camera_of)
-    rejected, blocks, notes = dict(alignment.rejected), list(alignment.blocks), list(alignment.notes)
-    apart = np.array([alignment.poses[i].map_C - priors[i].map_C for i in alignment.poses]).reshape(-1, 3)
-    offset = np.array([np.median(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in apart.T])
+    poses, cameras, camera_of = (
+        dict(alignment.poses),
+        dict(alignment.cameras),
+        dict(alignment.camera_of),
+    )
+    rejected, blocks, notes = (
+        dict(alignment.rejected),
+        list(alignment.blocks),
+        list(alignment.notes),
+    )
+    apart = np.array([alignment.poses[i].map_C - priors[i].map_C for i in alignment.poses]).reshape(
+        -1, 3
+    )
+    offset = np.array(
+        [np.median(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in apart.T]
+    )
     for i, photo in enumerate(intake.photos):
         if i in poses:
             continue
         C = priors[i].map_C + offset
-        if not np.isfinite(C).all() or alignment.frame.crs is None or not np.isfinite(priors[i].yaw_deg):
+        if (
+            not np.isfinite(C).all()
+            or alignment.frame.crs is None
+            or not np.isfinite(priors[i].yaw_deg)
+        ):
             lacking = (
                 "no position"
                 if not np.isfinite(C[:2]).all()
@@ -198,7 +237,8 @@ def with_loose_photos(alignment: Alignment, intake: Intake, priors: Sequence[Pri
                 else "no heading"
             )
             rejected[i] = rejected.get(
-                i, f"it could not be linked to the other photos, and it has {lacking} to place it by"
+                i,
+                f"it could not be linked to the other photos, and it has {lacking} to place it by",
             )
             continue
         rejected.pop(i, None)
@@ -208,8 +248,15 @@ def with_loose_photos(alignment: Alignment, intake: Intake, priors: Sequence[Pri
         cameras.setdefault(key, reported_camera(photo))
         camera_of[i] = key
         blocks.append((i,))
-        notes.append(f"{photo.name} could not be linked to any other photo; it lies where its metadata say.")
+        notes.append(
+            f"{photo.name} could not be linked to any other photo; it lies where its metadata say."
+        )
     return replace(
-        alignment, poses=poses, cameras=cameras, camera_of=camera_of, rejected=rejected, blocks=tuple(blocks),
+        alignment,
+        poses=poses,
+        cameras=cameras,
+        camera_of=camera_of,
+        rejected=rejected,
+        blocks=tuple(blocks),
         notes=tuple(notes),
-    )  # fmt: skip
+    )

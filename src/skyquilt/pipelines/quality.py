@@ -1,4 +1,6 @@
-"""The quality function of the thesis, for any method: lambda, its two parts, and the graphs beside them (Y 6.1)."""
+"""The quality function of the thesis, for any method: lambda, its two parts, and the graphs beside
+them (Y 6.1).
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,7 +10,12 @@ from numpy.typing import NDArray
 
 from skyquilt.imaging.plane import view_patch
 from skyquilt.imaging.views import View, on_ground
-from skyquilt.metrics.correlation import lambda_corr, lambda_quality, lambda_spat, lambda_spat_of_table
+from skyquilt.metrics.correlation import (
+    lambda_corr,
+    lambda_quality,
+    lambda_spat,
+    lambda_spat_of_table,
+)
 from skyquilt.metrics.geolocation import geolocation_errors
 from skyquilt.metrics.replay import Replay, replay
 from skyquilt.model.photo import KnownDistance, PointObservation
@@ -22,10 +29,18 @@ ACROSS = 400
 
 
 def judge(
-    taken: Intake, alignment: Alignment, priors: Sequence[Prior], ground: Ground, pictures: Pictures,
-    known: Sequence[KnownDistance], alpha: float, order: Sequence[int],
-) -> Steps[dict[str, Any]]:  # fmt: skip
-    """Replays the placements in the order given at one ground resolution, and measures known distances."""
+    taken: Intake,
+    alignment: Alignment,
+    priors: Sequence[Prior],
+    ground: Ground,
+    pictures: Pictures,
+    known: Sequence[KnownDistance],
+    alpha: float,
+    order: Sequence[int],
+) -> Steps[dict[str, Any]]:
+    """Replays the placements in the order given at one ground resolution, and measures known
+    distances.
+    """
     yield 0, 1
     views = {v.photo: v for v in ground.views}
     order = tuple(i for i in order if i in views)
@@ -33,7 +48,9 @@ def judge(
     gsd = ground.native_gsd * wide / ACROSS
     seen = replay(view_patch(pictures(i, ACROSS), views[i], ground.surface, gsd) for i in order)
     off = np.array([np.hypot(*(alignment.poses[i].map_C - priors[i].map_C)[:2]) for i in order])
-    figures = _figures(seen, taken, views, ground, known, alpha) | _geolocation(alignment, priors, order)
+    figures = _figures(seen, taken, views, ground, known, alpha) | _geolocation(
+        alignment, priors, order
+    )
     off = off / (ground.native_gsd * wide)
     figures |= _joins(alignment) | {
         "photos": [taken.photos[i].name for i in order],
@@ -55,32 +72,47 @@ def _figures(
 ) -> dict[str, Any]:
     corr = lambda_corr(seen.with_overview)
     out: dict[str, Any] = {
-        "alpha": alpha, "lambda_corr": _short(corr), "lambda_spat": None, "lambda_spat_of_table": None, "lambda": None,
+        "alpha": alpha,
+        "lambda_corr": _short(corr),
+        "lambda_spat": None,
+        "lambda_spat_of_table": None,
+        "lambda": None,
         "correlation_with_last": _mean(seen.with_last),
-    }  # fmt: skip
+    }
     rows, actual, found = [], [], []
     index = {p.name: i for i, p in enumerate(taken.photos)}
     for distance in known:
-        ends = [_place(o, index, views, ground) for o in (distance.observations_a, distance.observations_b)]
+        ends = [
+            _place(o, index, views, ground)
+            for o in (distance.observations_a, distance.observations_b)
+        ]
         there = [e for e in ends if e is not None]
         metres = float(np.linalg.norm((there[0] - there[1])[:2])) if len(there) == 2 else None
-        rows.append({"a": distance.a, "b": distance.b, "metres": distance.metres, "on_map": _short(metres)})
+        rows.append(
+            {"a": distance.a, "b": distance.b, "metres": distance.metres, "on_map": _short(metres)}
+        )
         if metres is not None:
             actual.append(distance.metres)
             found.append(metres)
     if actual:
         spat = lambda_spat(actual, found)
         out |= {
-            "lambda_spat": _short(spat), "lambda_spat_of_table": _short(lambda_spat_of_table(actual, found)),
+            "lambda_spat": _short(spat),
+            "lambda_spat_of_table": _short(lambda_spat_of_table(actual, found)),
             "lambda": _short(lambda_quality(spat, corr, alpha=alpha)),
-        }  # fmt: skip
+        }
     return out | ({"distances": rows} if rows else {})
 
 
 def _place(
-    sightings: Sequence[PointObservation], index: dict[str, int], views: dict[int, View], ground: Ground
+    sightings: Sequence[PointObservation],
+    index: dict[str, int],
+    views: dict[int, View],
+    ground: Ground,
 ) -> NDArray[np.float64] | None:
-    """Where the map shows a point: by the sighting that looks most steeply down, whose photo wins there."""
+    """Where the map shows a point: by the sighting that looks most steeply down, whose photo wins
+    there.
+    """
     best, place = np.inf, None
     for sighting in sightings:
         view = views.get(index.get(sighting.photo, -1))
@@ -94,12 +126,15 @@ def _place(
     return place
 
 
-def _geolocation(alignment: Alignment, priors: Sequence[Prior], order: Sequence[int]) -> dict[str, Any]:
+def _geolocation(
+    alignment: Alignment, priors: Sequence[Prior], order: Sequence[int]
+) -> dict[str, Any]:
     """MAE and RMS per axis at the photos' centres against their reported positions (A Table 2)."""
     if alignment.frame.crs is None or not order:
         return {}
     errors = geolocation_errors(
-        np.array([alignment.poses[i].map_C for i in order]), np.array([priors[i].map_C for i in order])
+        np.array([alignment.poses[i].map_C for i in order]),
+        np.array([priors[i].map_C for i in order]),
     )
     axes = ("x", "y", "z")
     return {
@@ -109,13 +144,18 @@ def _geolocation(alignment: Alignment, priors: Sequence[Prior], order: Sequence[
 
 
 def _joins(alignment: Alignment) -> dict[str, Any]:
-    """STE per inlier (A 15) over the registrations of a method that has them, px^2 of the working image."""
+    """STE per inlier (A 15) over the registrations of a method that has them, px^2 of the working
+    image.
+    """
     ste = np.array([j.ste_px2 for j in alignment.joins])
     ste = ste[np.isfinite(ste)]
     if not len(ste):
         return {}
     return {
-        "ste_per_inlier_px2": {"median": _short(float(np.median(ste))), "worst": _short(float(ste.max()))}
+        "ste_per_inlier_px2": {
+            "median": _short(float(np.median(ste))),
+            "worst": _short(float(ste.max())),
+        }
     }
 
 

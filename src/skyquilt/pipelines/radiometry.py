@@ -1,4 +1,6 @@
-"""Measured values on their way into a map: whether frames' drift is balanced, and what is told about it."""
+"""Measured values on their way into a map: whether frames' drift is balanced, and what is told
+about it.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,8 +21,8 @@ TAG = "DRIFT"
 def balances_drift(settings: MosaicSettings, unit: str) -> bool:
     """Whether frames of this unit are brought to one level.
 
-    Degrees are unless somebody asks for values as recorded. Counts are only when asked: they are what a maker's
-    formula will be applied to, and it knows nothing of our offsets.
+    Degrees are unless somebody asks for values as recorded. Counts are only when asked: they are
+    what a maker's formula will be applied to, and it knows nothing of our offsets.
     """
     if not unit:
         return False
@@ -30,10 +32,17 @@ def balances_drift(settings: MosaicSettings, unit: str) -> bool:
 
 
 def drift_of(
-    views: Sequence[View], thumbnails: Mapping[int, NDArray], surface: Surface,
-    bounds: tuple[float, float, float, float], unit: str, parts: Methods, settings: MosaicSettings,
-) -> Exposure:  # fmt: skip
-    """What brings frames of measured values to one level; neutral where they are to stay as recorded."""
+    views: Sequence[View],
+    thumbnails: Mapping[int, NDArray[Any]],
+    surface: Surface,
+    bounds: tuple[float, float, float, float],
+    unit: str,
+    parts: Methods,
+    settings: MosaicSettings,
+) -> Exposure:
+    """What brings frames of measured values to one level; neutral where they are to stay as
+    recorded.
+    """
     if not balances_drift(settings, unit):
         return NEUTRAL
     return Exposure(gains={}, fields={}, offsets=parts.drift(views, thumbnails, surface, bounds))
@@ -56,7 +65,9 @@ def _drift(*, balanced: bool) -> str:
     return "balanced on overlaps" if balanced else "as recorded"
 
 
-def value_figures(photos: Sequence[Photo], exposure: Exposure, settings: MosaicSettings) -> dict[str, Any]:
+def value_figures(
+    photos: Sequence[Photo], exposure: Exposure, settings: MosaicSettings
+) -> dict[str, Any]:
     """What metrics.json says under `thermal_values`; nothing for pictures."""
     unit = photos[0].unit
     if not unit:
@@ -64,19 +75,29 @@ def value_figures(photos: Sequence[Photo], exposure: Exposure, settings: MosaicS
     offsets = np.array(list(exposure.offsets.values()) or [0.0])
     return {
         "thermal_values": {
-            "unit": unit, "balanced": bool(exposure.offsets), "why": _why(unit, exposure, settings),
+            "unit": unit,
+            "balanced": bool(exposure.offsets),
+            "why": _why(unit, exposure, settings),
             "offset_rms": round(float(np.sqrt((offsets**2).mean())), 4),
             "offset_largest": round(float(np.abs(offsets).max()), 4),
             "offsets": {photos[i].name: round(o, 4) for i, o in sorted(exposure.offsets.items())},
         }
-    }  # fmt: skip
+    }
 
 
 def _why(unit: str, exposure: Exposure, settings: MosaicSettings) -> str:
     if exposure.offsets:
-        return "one offset per frame, from overlaps, their median 0; --raw-thermal leaves values as recorded"
+        return (
+            "one offset per frame, from overlaps, their median 0; --raw-thermal leaves values as"
+            " recorded"
+        )
     if balances_drift(settings, unit):
-        return "no frames overlap enough to tell their drift; values are as recorded, resampled only"
+        return (
+            "no frames overlap enough to tell their drift; values are as recorded, resampled only"
+        )
     if settings.balance_thermal is None and unit == "counts":
-        return "counts are kept as recorded, resampled only; --balance-thermal brings frames to one level"
+        return (
+            "counts are kept as recorded, resampled only; --balance-thermal brings frames to one"
+            " level"
+        )
     return "values are as recorded, resampled only"

@@ -1,6 +1,7 @@
 """The story of two pictures: read, register, draw, tell.
 
-A is the reference; b_H_a takes its pixels to B's. A refusal is a result too: it is written down, and raised.
+A is the reference; b_H_a takes its pixels to B's. A refusal is a result too: it is written down,
+and raised.
 """
 
 import json
@@ -40,9 +41,13 @@ class _Told:
 
 
 def iter_register(
-    a: Path | str, b: Path | str, output: Path | str, settings: RegisterSettings | None = None, *,
+    a: Path | str,
+    b: Path | str,
+    output: Path | str,
+    settings: RegisterSettings | None = None,
+    *,
     overwrite: bool = False,
-) -> Iterator[Event]:  # fmt: skip
+) -> Iterator[Event]:
     """Registers picture B to picture A, telling its progress; the last event is the `Result`.
 
     Raises:
@@ -56,11 +61,18 @@ def iter_register(
     began, cpu = time.perf_counter(), cpu_seconds()
     told = _told(opened, settings)
     yield StageFinished(
-        stage="register", seconds=round(time.perf_counter() - began, 3),
-        cpu_seconds=round(cpu_seconds() - cpu, 3), reused=False,
-    )  # fmt: skip
+        stage="register",
+        seconds=round(time.perf_counter() - began, 3),
+        cpu_seconds=round(cpu_seconds() - cpu, 3),
+        reused=False,
+    )
     record = as_record(told.outcome, settings.method, told.guess)
-    record |= {"a": str(a), "b": str(b), "cpu_seconds": round(told.cpu_s, 3), "version": __version__}
+    record |= {
+        "a": str(a),
+        "b": str(b),
+        "cpu_seconds": round(told.cpu_s, 3),
+        "version": __version__,
+    }
     if isinstance(told.outcome, Registration):
         if told.outcome.note:
             yield Note(text=told.outcome.note)
@@ -72,9 +84,13 @@ def iter_register(
 
 
 def register(
-    a: Path | str, b: Path | str, output: Path | str, settings: RegisterSettings | None = None, *,
+    a: Path | str,
+    b: Path | str,
+    output: Path | str,
+    settings: RegisterSettings | None = None,
+    *,
     overwrite: bool = False,
-) -> Result:  # fmt: skip
+) -> Result:
     """Registers picture B to picture A and returns when the files are written, refused or not.
 
     Raises:
@@ -87,7 +103,9 @@ def register(
 
 
 def outcome_of(a: Source, b: Source, method: str, guess: Guess | None) -> Outcome:
-    """The registration of two opened pictures by a named method, in px of the files, with Q over A."""
+    """The registration of two opened pictures by a named method, in px of the files, with Q
+    over A.
+    """
     outcome = registration_method(method)(a.picture, b.picture, guess)
     if isinstance(outcome, RefusedRegistration):
         return outcome
@@ -95,7 +113,9 @@ def outcome_of(a: Source, b: Source, method: str, guess: Guess | None) -> Outcom
     matrix = full_b @ outcome.b_H_a @ np.linalg.inv(full_a)
     if _same(a, b):
         outcome = replace(
-            outcome, model="identity", note="A and B are the same picture: it lies on itself, unmoved."
+            outcome,
+            model="identity",
+            note="A and B are the same picture: it lies on itself, unmoved.",
         )
         matrix = np.eye(3)
     px_a, px_b = _scaled(outcome.px_a, full_a), _scaled(outcome.px_b, full_b)
@@ -105,21 +125,38 @@ def outcome_of(a: Source, b: Source, method: str, guess: Guess | None) -> Outcom
 
 def as_record(outcome: Outcome, method: str, guess: Guess | None) -> dict[str, Any]:
     """What registration.json says."""
-    shared = {"method": method, "guess": guess.source if guess else None, "evidence": dict(outcome.evidence)}
+    shared = {
+        "method": method,
+        "guess": guess.source if guess else None,
+        "evidence": dict(outcome.evidence),
+    }
     if isinstance(outcome, RefusedRegistration):
         return {
-            "accepted": False, "model": None, "b_H_a": None, "inliers": outcome.inliers, "q": 0.0,
-            "reason": outcome.reason, "residual_px": None, **shared,
-        }  # fmt: skip
+            "accepted": False,
+            "model": None,
+            "b_H_a": None,
+            "inliers": outcome.inliers,
+            "q": 0.0,
+            "reason": outcome.reason,
+            "residual_px": None,
+            **shared,
+        }
     return {
-        "accepted": True, "model": outcome.model, "b_H_a": outcome.b_H_a.tolist(),
-        "inliers": len(outcome.px_a), "q": round(outcome.q, 4), "reason": outcome.note,
-        "residual_px": residual(outcome), **shared,
-    }  # fmt: skip
+        "accepted": True,
+        "model": outcome.model,
+        "b_H_a": outcome.b_H_a.tolist(),
+        "inliers": len(outcome.px_a),
+        "q": round(outcome.q, 4),
+        "reason": outcome.note,
+        "residual_px": residual(outcome),
+        **shared,
+    }
 
 
 def residual(outcome: Registration) -> float | None:
-    """RMS distance in px of B between the inliers and where the transform puts them; None without inliers."""
+    """RMS distance in px of B between the inliers and where the transform puts them; None without
+    inliers.
+    """
     if not len(outcome.px_a):
         return None
     there = np.c_[outcome.px_a, np.ones(len(outcome.px_a))] @ outcome.b_H_a.T
@@ -127,7 +164,9 @@ def residual(outcome: Registration) -> float | None:
     return round(float(np.sqrt((off**2).sum(1).mean())), 3)
 
 
-def _told(opened: tuple[Source | RejectedPhoto, Source | RejectedPhoto], settings: RegisterSettings) -> _Told:
+def _told(
+    opened: tuple[Source | RejectedPhoto, Source | RejectedPhoto], settings: RegisterSettings
+) -> _Told:
     since = cpu_seconds()
     for name, one in zip("AB", opened, strict=True):
         if isinstance(one, RejectedPhoto):
@@ -150,7 +189,9 @@ def _scaled(px: np.ndarray, full: np.ndarray) -> np.ndarray:
 
 
 def _drawn(
-    output: Path, opened: tuple[Source | RejectedPhoto, Source | RejectedPhoto], outcome: Registration
+    output: Path,
+    opened: tuple[Source | RejectedPhoto, Source | RejectedPhoto],
+    outcome: Registration,
 ) -> Iterator[Event]:
     a, b = opened
     assert isinstance(a, Source) and isinstance(b, Source)
@@ -158,14 +199,18 @@ def _drawn(
     yield StageStarted(stage="draw", total=1)
     draw(output, a, b, outcome)
     yield StageFinished(
-        stage="draw", seconds=round(time.perf_counter() - began, 3),
-        cpu_seconds=round(cpu_seconds() - cpu, 3), reused=False,
-    )  # fmt: skip
+        stage="draw",
+        seconds=round(time.perf_counter() - began, 3),
+        cpu_seconds=round(cpu_seconds() - cpu, 3),
+        reused=False,
+    )
 
 
 def _write(
-    output: Path, record: dict[str, Any], opened: tuple[Source | RejectedPhoto, Source | RejectedPhoto],
+    output: Path,
+    record: dict[str, Any],
+    opened: tuple[Source | RejectedPhoto, Source | RejectedPhoto],
     outcome: Outcome,
-) -> None:  # fmt: skip
+) -> None:
     write_text(output / "report.html", page(record, opened, outcome))
     write_text(output / "registration.json", json.dumps(record, indent=1, allow_nan=False) + "\n")

@@ -50,14 +50,18 @@ def overlays(a: Source, b: Source, outcome: Registration) -> list[NDArray[np.uin
     seen = np.asarray(cv2.warpPerspective(np.ones_like(small_b), there, size, flags=back)) > 0
     lines = side_by_side(small_a, small_b, _apply(a_S, outcome.px_a), _apply(b_S, outcome.px_b))
     return [
-        lines, checkerboard(small_a, moved, seen), false_colour(small_a, moved, seen), alpha(small_a, moved, seen)
-    ]  # fmt: skip
+        lines,
+        checkerboard(small_a, moved, seen),
+        false_colour(small_a, moved, seen),
+        alpha(small_a, moved, seen),
+    ]
 
 
 def page(
     record: dict[str, Any],
-    opened: tuple[Source | RejectedPhoto, Source | RejectedPhoto], outcome: Registration | RefusedRegistration,
-) -> str:  # fmt: skip
+    opened: tuple[Source | RejectedPhoto, Source | RejectedPhoto],
+    outcome: Registration | RefusedRegistration,
+) -> str:
     """The report page, whole in itself."""
     a, b = opened
     pictures: list[NDArray[np.uint8]] = []
@@ -85,7 +89,7 @@ def _reduced(source: Source) -> tuple[NDArray[np.uint8], Matrix]:
     return small, shrinking @ np.linalg.inv(source.full_S_picture)
 
 
-def _apply(matrix: NDArray, px: NDArray) -> NDArray:
+def _apply(matrix: NDArray[Any], px: NDArray[Any]) -> NDArray[Any]:
     moved = np.c_[px, np.ones(len(px))] @ matrix.T
     return np.asarray(moved[:, :2] / moved[:, 2:])
 
@@ -93,16 +97,25 @@ def _apply(matrix: NDArray, px: NDArray) -> NDArray:
 def resample_onto(
     path: Path, a: Source, b: Source, b_H_a: Matrix, tags: Mapping[str, str] | None = None
 ) -> None:
-    """B's values on A's pixels, bilinear, in pieces; A's place where it has one, else A's pixels."""
+    """B's values on A's pixels, bilinear, in pieces; A's place where it has one, else A's
+    pixels.
+    """
     sample = b.picture.values
     kind = sample.dtype.name if sample.dtype.name in ("uint8", "uint16") else "float32"
     bands = 3 if sample.ndim == 3 else 1
     spec = RasterSpec(
-        width=a.width, height=a.height, bands=bands, dtype=kind,
-        transform=a.place.affine if a.place else (1, 0, 0, 0, -1, 0), crs=a.place.crs if a.place else None,
-        nodata=float("nan") if kind == "float32" else None, mask=kind != "float32", compress="deflate",
-        band_units=(b.unit,) * bands if b.unit else (), tags={"SOFTWARE": "Skyquilt"} | dict(tags or {}),
-    )  # fmt: skip
+        width=a.width,
+        height=a.height,
+        bands=bands,
+        dtype=kind,
+        transform=a.place.affine if a.place else (1, 0, 0, 0, -1, 0),
+        crs=a.place.crs if a.place else None,
+        nodata=float("nan") if kind == "float32" else None,
+        mask=kind != "float32",
+        compress="deflate",
+        band_units=(b.unit,) * bands if b.unit else (),
+        tags={"SOFTWARE": "Skyquilt"} | dict(tags or {}),
+    )
     with CogWriter(path, spec) as writer:
         for block in writer.blocks():
             writer.write_block(block, *_block(block, b, b_H_a, kind, bands))
@@ -110,7 +123,7 @@ def resample_onto(
 
 def _block(
     block: Block, b: Source, b_H_a: Matrix, kind: str, bands: int
-) -> tuple[NDArray, NDArray[np.bool_]]:
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """Values (height, width[, 3]) and validity of one block."""
     shape = (block.height, block.width, bands) if bands > 1 else (block.height, block.width)
     start = np.array([[1, 0, block.col0], [0, 1, block.row0], [0, 0, 1.0]])
@@ -134,16 +147,20 @@ def _block(
     moved = cv2.warpPerspective(
         np.where(_wide(valid, values), values, 0).astype(kind), there, size, flags=flags
     )
-    seen = np.asarray(cv2.warpPerspective(valid.astype(np.float32), there, size, flags=flags)) > 0.999
+    seen = (
+        np.asarray(cv2.warpPerspective(valid.astype(np.float32), there, size, flags=flags)) > 0.999
+    )
     return np.asarray(np.where(_wide(seen, moved), moved, np.array(0, kind))), seen
 
 
-def _wide(mask: NDArray[np.bool_], values: NDArray) -> NDArray[np.bool_]:
+def _wide(mask: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[np.bool_]:
     return mask[..., None] if values.ndim == 3 else mask
 
 
 def _part(b: Source, there: Matrix, block: Block) -> tuple[int, int, int, int] | None:
-    """Row, column, height and width of the part of B that a block shows; None where it shows none."""
+    """Row, column, height and width of the part of B that a block shows; None where it shows
+    none.
+    """
     edge = np.linspace(0, 1, 9)
     x, y = np.meshgrid(edge * (block.width - 1), edge * (block.height - 1))
     px = _apply(there, np.c_[x.ravel(), y.ravel()])
@@ -168,9 +185,16 @@ def _vrt(a: Source, b: Source, b_H_a: Matrix) -> str:
     px_b = np.c_[x.ravel(), y.ravel()]
     px_a = _apply(np.linalg.inv(b_H_a), px_b) + 0.5
     m = a.place.affine if a.place else (1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
-    ground = np.c_[m[0] * px_a[:, 0] + m[1] * px_a[:, 1] + m[2], m[3] * px_a[:, 0] + m[4] * px_a[:, 1] + m[5]]
+    ground = np.c_[
+        m[0] * px_a[:, 0] + m[1] * px_a[:, 1] + m[2], m[3] * px_a[:, 0] + m[4] * px_a[:, 1] + m[5]
+    ]
     values = b.picture.values
     return vrt(
-        b.path.resolve(), size=(b.width, b.height), bands=3 if values.ndim == 3 else 1, dtype=values.dtype.name,
-        px=px_b + 0.5, ground=ground, crs=a.place.crs if a.place else None,
-    )  # fmt: skip
+        b.path.resolve(),
+        size=(b.width, b.height),
+        bands=3 if values.ndim == 3 else 1,
+        dtype=values.dtype.name,
+        px=px_b + 0.5,
+        ground=ground,
+        crs=a.place.crs if a.place else None,
+    )

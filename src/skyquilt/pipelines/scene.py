@@ -1,9 +1,12 @@
-"""The chapters of `mosaic` up to the surface, for stories that need the placed photos themselves."""
+"""The chapters of `mosaic` up to the surface, for stories that need the placed photos
+themselves.
+"""
 
 import os
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,17 +39,22 @@ class Scene:
     """Their poses."""
     ground: drawing.Ground
     """Heights, views and the map's grid."""
-    pixels: Callable[[int], NDArray]
+    pixels: Callable[[int], NDArray[Any]]
     """Full-size pixels of a photo by its index."""
     grey: Callable[[int, int], NDArray[np.uint8]]
     """Grey picture of a photo (index), its longest side at most the px given."""
 
 
 def scene_of(
-    photos: Sequence[Photo], settings: MosaicSettings, parts: Methods, clock: Clock,
+    photos: Sequence[Photo],
+    settings: MosaicSettings,
+    parts: Methods,
+    clock: Clock,
     control: Sequence[ControlPoint] = (),
-) -> Generator[Event, None, Scene]:  # fmt: skip
-    """Places the photos as `iter_mosaic` does; what the clock's store holds of that is not made again."""
+) -> Generator[Event, None, Scene]:
+    """Places the photos as `iter_mosaic` does; what the clock's store holds of that is not made
+    again.
+    """
     jobs, store = settings.jobs or os.cpu_count() or 1, clock.store
     cache = PixelCache(read=lambda i: read_color(photos[i]), budget_bytes=pixel_budget(settings))
     taken = yield from clock.stage("features", intake.take_in(photos, cache, parts, store, jobs))
@@ -59,15 +67,22 @@ def scene_of(
     links = yield from clock.stage("links", linking.link_up(taken, prior, parts, store, jobs))
     names = [p.name for p in taken.photos]
     known = placing.Known(
-        intake=taken, frame=frame, priors=prior, links=links, control=control, pictures=pictures,
+        intake=taken,
+        frame=frame,
+        priors=prior,
+        links=links,
+        control=control,
+        pictures=pictures,
         order=sequence_of(names, settings.sequence),
-    )  # fmt: skip
+    )
     alignment = yield from clock.stage("align", placing.place(known, parts, settings, store))
     yield from (Note(text=n, warning=True) for n in alignment.notes)
     ground = yield from clock.stage(
         "surface", drawing.survey_ground(alignment, pictures, parts, settings, store)
     )
-    return Scene(taken=taken, links=links, alignment=alignment, ground=ground, pixels=cache, grey=pictures)
+    return Scene(
+        taken=taken, links=links, alignment=alignment, ground=ground, pixels=cache, grey=pictures
+    )
 
 
 def scene_of_run(photos: Path | str, run: Result, settings: MosaicSettings) -> Scene:

@@ -28,7 +28,11 @@ STAGE = "pairs"
 
 
 def iter_spectral_bench(
-    pairs: Path | str, output: Path | str, methods: Sequence[str] = DEFAULT, *, overwrite: bool = False
+    pairs: Path | str,
+    output: Path | str,
+    methods: Sequence[str] = DEFAULT,
+    *,
+    overwrite: bool = False,
 ) -> Iterator[Event]:
     """Registers every pair of a list by every method; the last event is the `Result`.
 
@@ -51,7 +55,10 @@ def iter_spectral_bench(
             yield StageProgress(stage=STAGE, done=len(rows), total=total)
     seconds, cpu = Clock.now()
     yield StageFinished(
-        stage=STAGE, seconds=round(seconds - began[0], 3), cpu_seconds=round(cpu - began[1], 3), reused=False
+        stage=STAGE,
+        seconds=round(seconds - began[0], 3),
+        cpu_seconds=round(cpu - began[1], 3),
+        reused=False,
     )
     for line in totals(rows, methods):
         yield Note(text=line)
@@ -69,14 +76,24 @@ def judged(pair: Pair, method: str) -> dict[str, Any]:
     row = {"class": pair.kind, "source": pair.source, "method": method}
     if isinstance(outcome, RefusedRegistration):
         return row | {
-            "accepted": False, "right": False, "error_px": None, "q": 0.0, "inliers": outcome.inliers,
-            "seconds": spent, "reason": outcome.reason,
-        }  # fmt: skip
+            "accepted": False,
+            "right": False,
+            "error_px": None,
+            "q": 0.0,
+            "inliers": outcome.inliers,
+            "seconds": spent,
+            "reason": outcome.reason,
+        }
     error = min(overlap_error(outcome.b_H_a, pair.b_H_a, *shapes), 1e6)
     return row | {
-        "accepted": True, "right": error < pair.tolerance_px, "error_px": round(error, 3),
-        "q": round(outcome.q, 4), "inliers": len(outcome.px_a), "seconds": spent, "reason": outcome.note,
-    }  # fmt: skip
+        "accepted": True,
+        "right": error < pair.tolerance_px,
+        "error_px": round(error, 3),
+        "q": round(outcome.q, 4),
+        "inliers": len(outcome.px_a),
+        "seconds": spent,
+        "reason": outcome.note,
+    }
 
 
 def totals(rows: Sequence[dict[str, Any]], methods: Sequence[str]) -> list[str]:
@@ -100,7 +117,9 @@ def _registered(
     a, b = opened
     for name, one in zip("AB", opened, strict=True):
         if isinstance(one, RejectedPhoto):
-            refusal = RefusedRegistration(reason=f"picture {name} ({one.name}) cannot be used: {one.reason}")
+            refusal = RefusedRegistration(
+                reason=f"picture {name} ({one.name}) cannot be used: {one.reason}"
+            )
             return refusal, ((0, 0), (0, 0))
     assert not isinstance(a, RejectedPhoto) and not isinstance(b, RejectedPhoto)
     return outcome_of(a, b, method, guess_of(a, b)), ((a.height, a.width), (b.height, b.width))

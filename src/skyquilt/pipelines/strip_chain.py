@@ -1,4 +1,6 @@
-"""One strip, mosaicked from photo to photo under one choice of lens model, features and transformation."""
+"""One strip, mosaicked from photo to photo under one choice of lens model, features and
+transformation.
+"""
 
 from dataclasses import dataclass
 
@@ -19,7 +21,9 @@ from skyquilt.twoview.ransac import Ransac
 Doubles = NDArray[np.float64]
 
 LOOSE_PX = 10.0
-"""RANSAC's threshold: things on the ground must come through, or there is nothing for levelling to do."""
+"""RANSAC's threshold: things on the ground must come through, or there is nothing for levelling to
+do.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +46,15 @@ VARIANTS = (
     Variant(name="order 4", distortion="4", levelled=True, model="homography"),
     Variant(name="order 6", distortion="6", levelled=True, model="homography"),
     Variant(name="order 6 + tangential", distortion="6t", levelled=True, model="homography"),
-    Variant(name="order 6 + tangential, not levelled", distortion="6t", levelled=False, model="homography"),
-    Variant(name="order 6 + tangential, similarity", distortion="6t", levelled=True, model="similarity"),
+    Variant(
+        name="order 6 + tangential, not levelled",
+        distortion="6t",
+        levelled=False,
+        model="homography",
+    ),
+    Variant(
+        name="order 6 + tangential, similarity", distortion="6t", levelled=True, model="similarity"
+    ),
 )
 """The seven of Y 6.2; the first five are levelled, with homographies."""
 
@@ -56,7 +67,8 @@ def calibrated(strip: Strip, settings: StripSettings) -> dict[str, tuple[Camera,
 
 
 def chained(strip: Strip, settings: StripSettings, camera: Camera, variant: Variant) -> Doubles:
-    """eta (4.7) of the board below each photo (photos,), as mapped into the first photo, against the first one.
+    """eta (4.7) of the board below each photo (photos,), as mapped into the first photo, against
+    the first one.
 
     Raises:
         RefusedError: two photos cannot be registered.
@@ -72,7 +84,8 @@ def chained(strip: Strip, settings: StripSettings, camera: Camera, variant: Vari
         step = estimate(a, b)
         if isinstance(step, NoEstimate):
             raise RefusedError(
-                f"photos {k} and {k + 1} of the strip do not match ({step.reason}); choose more overlap or less noise"
+                f"photos {k} and {k + 1} of the strip do not match ({step.reason}); choose more"
+                " overlap or less noise"
             )
         if variant.levelled:
             step = level(a, b, step).estimate

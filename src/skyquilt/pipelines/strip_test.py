@@ -22,9 +22,14 @@ FILES = ("strip.json", "report.html")
 
 
 def iter_strip_test(
-    output: Path, settings: StripSettings | None = None, *, flights: int = 5, overwrite: bool = False
+    output: Path,
+    settings: StripSettings | None = None,
+    *,
+    flights: int = 5,
+    overwrite: bool = False,
 ) -> Iterator[Event]:
-    """Fly strips of different seeds, mosaic each in seven ways, write strip.json and report.html; yields events.
+    """Fly strips of different seeds, mosaic each in seven ways, write strip.json and report.html;
+    yields events.
 
     Raises:
         UsageError: settings that do not fit.
@@ -49,7 +54,9 @@ def iter_strip_test(
             done = k * len(VARIANTS) + j + 1
             yield StageProgress(stage="strip", done=done, total=flights * len(VARIANTS))
     seconds, cpu = time.perf_counter() - begun[0], time.process_time() - begun[1]
-    yield StageFinished(stage="strip", seconds=round(seconds, 3), cpu_seconds=round(cpu, 3), reused=False)
+    yield StageFinished(
+        stage="strip", seconds=round(seconds, 3), cpu_seconds=round(cpu, 3), reused=False
+    )
     found = _figures(settings, etas, rms, cpu)
     write_text(output / "report.html", strip_page(found))
     write_text(output / "strip.json", json.dumps(found, indent=1))
@@ -63,7 +70,8 @@ def _make_room(output: Path, overwrite: bool) -> None:
         taken = [name for name in FILES if (output / name).exists()]
         if taken and not overwrite:
             raise OutputError(
-                f"{output} already holds {taken[0]}; add --overwrite to replace it, or choose another folder"
+                f"{output} already holds {taken[0]}; add --overwrite to replace it, or choose"
+                " another folder"
             )
         for name in reversed(taken):
             with suppress(FileNotFoundError):
@@ -77,7 +85,9 @@ def _make_room(output: Path, overwrite: bool) -> None:
 def _figures(
     settings: StripSettings, etas: np.ndarray, rms: list[dict[str, float]], cpu: float
 ) -> dict[str, Any]:
-    """The content of strip.json: eta (4.7) of each photo's board per variant, median over the flights, and the ends."""
+    """The content of strip.json: eta (4.7) of each photo's board per variant, median over the
+    flights, and the ends.
+    """
     variants = [
         {
             **asdict(variant),
@@ -88,6 +98,9 @@ def _figures(
         for j, variant in enumerate(VARIANTS)
     ]
     return {
-        "version": __version__, "flights": len(etas), "settings": asdict(settings), "variants": variants,
+        "version": __version__,
+        "flights": len(etas),
+        "settings": asdict(settings),
+        "variants": variants,
         "cpu_seconds": round(cpu, 2),
-    }  # fmt: skip
+    }

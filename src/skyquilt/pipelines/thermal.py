@@ -1,13 +1,15 @@
 """The story of two spectra: a visual map, and the thermal map on its grid.
 
     visual mosaic -> thermal mosaic -> registration of the two -> thermal.tif on the visual grid
-    visual mosaic -> photos taken together -> their cameras' rotation -> thermal.tif on the visual poses
+    visual mosaic -> photos taken together -> their cameras' rotation -> thermal.tif on the visual
+    poses
 
-Where one drone took both, by times or names, the cameras' rotation is found once, and the thermal photos are drawn
-where the visual ones were. Otherwise both flights become maps by themselves, each by its own adjustment. What their
-positions leave open, a few metres, the registration of the finished maps closes [Yahyanejad 2013, 5.2.3]: of the
-pictures, or of the heights under them, which look alike in every spectrum, by day and night, in summer and winter
-(5.8). Where none is to be believed, the thermal map lies where its own positions put it, and says so.
+Where one drone took both, by times or names, the cameras' rotation is found once, and the thermal
+photos are drawn where the visual ones were. Otherwise both flights become maps by themselves, each
+by its own adjustment. What their positions leave open, a few metres, the registration of the
+finished maps closes [Yahyanejad 2013, 5.2.3]: of the pictures, or of the heights under them, which
+look alike in every spectrum, by day and night, in summer and winter (5.8). Where none is to be
+believed, the thermal map lies where its own positions put it, and says so.
 """
 
 from collections.abc import Generator, Iterator, Mapping
@@ -33,7 +35,14 @@ from skyquilt.pipelines.register_files import overlays, resample_onto
 from skyquilt.pipelines.scene import Scene, scene_of_run
 from skyquilt.pipelines.thermal_files import write_figures, write_overlays, write_section
 from skyquilt.pipelines.thermal_heights import finer
-from skyquilt.pipelines.thermal_join import ROUTES, Joined, as_registration, join, opened, refuse_apart
+from skyquilt.pipelines.thermal_join import (
+    ROUTES,
+    Joined,
+    as_registration,
+    join,
+    opened,
+    refuse_apart,
+)
 from skyquilt.pipelines.thermal_pairs import by_pairs
 from skyquilt.pipelines.thermal_rig import draw_rigged, drift_of_rigged, rig_figures, rigged
 from skyquilt.run.clock import Clock
@@ -43,9 +52,15 @@ FOLDER = "thermal"
 
 
 def iter_thermal(
-    photos: Path | str, thermal: Path | str, output: Path | str, settings: MosaicSettings | None = None, *,
-    route: str = "auto", overwrite: bool = False, rerun_from: str | None = None,
-) -> Iterator[Event]:  # fmt: skip
+    photos: Path | str,
+    thermal: Path | str,
+    output: Path | str,
+    settings: MosaicSettings | None = None,
+    *,
+    route: str = "auto",
+    overwrite: bool = False,
+    rerun_from: str | None = None,
+) -> Iterator[Event]:
     """Makes the visual map and the thermal map on its grid; the last event is the `Result` of both.
 
     Raises:
@@ -63,7 +78,8 @@ def iter_thermal(
     refuse_apart(read_survey(Path(photos), geo=settings.geo).photos, heats.photos)
     if not any(p.band == "thermal" for p in heats.photos):
         yield Note(
-            text=f"no photo in {thermal} is known to be thermal; they are mapped as they are", warning=True
+            text=f"no photo in {thermal} is known to be thermal; they are mapped as they are",
+            warning=True,
         )
     visual = yield from _told(
         iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
@@ -79,14 +95,24 @@ def iter_thermal(
             return
         if route == "rig":
             raise RefusedError(
-                f"the thermal photos cannot be laid on the visual poses: {result.reason}; use --thermal-route auto"
+                f"the thermal photos cannot be laid on the visual poses: {result.reason}; use"
+                " --thermal-route auto"
             )
         refused = (("rig", result.reason),)
     own = replace(
-        heated, gcp=None, geo=None, cameras=None, bounds=None, boundary=None, gsd_cm=None,
-        crs=visual.metrics["crs"] or settings.crs, compress="auto",
-    )  # fmt: skip
-    yield Note(text="the thermal photos become a map of their own, then it is laid on the visual one")
+        heated,
+        gcp=None,
+        geo=None,
+        cameras=None,
+        bounds=None,
+        boundary=None,
+        gsd_cm=None,
+        crs=visual.metrics["crs"] or settings.crs,
+        compress="auto",
+    )
+    yield Note(
+        text="the thermal photos become a map of their own, then it is laid on the visual one"
+    )
     heat = yield from _told(
         iter_mosaic(thermal, output / FOLDER, own, overwrite=overwrite, rerun_from=rerun_from)
     )
@@ -99,16 +125,23 @@ def iter_thermal(
         return scene_of_run(photos, visual, settings), scene_of_run(thermal, heat, own)
 
     joined = join(
-        a, b, (visual.output / "surface.tif", heat.output / "surface.tif"), route,
-        pairs=lambda: by_pairs(*scenes()), finer=lambda outcome: finer(*scenes(), outcome),
-    )  # fmt: skip
+        a,
+        b,
+        (visual.output / "surface.tif", heat.output / "surface.tif"),
+        route,
+        pairs=lambda: by_pairs(*scenes()),
+        finer=lambda outcome: finer(*scenes(), outcome),
+    )
     joined = replace(joined, refused=(*refused, *joined.refused))
-    resample_onto(output / "thermal.tif", a, b, joined.thermal_H_visual, recorded_tags(heat.metrics))
+    resample_onto(
+        output / "thermal.tif", a, b, joined.thermal_H_visual, recorded_tags(heat.metrics)
+    )
     figures = {"thermal": _figures(joined, heat, b)}
     _leave(output, overlays(a, b, as_registration(joined)), visual.metrics, figures)
     yield _finished("join", began)
     yield from (
-        Note(text=f"registration by {name} was refused: {why}", warning=True) for name, why in joined.refused
+        Note(text=f"registration by {name} was refused: {why}", warning=True)
+        for name, why in joined.refused
     )
     yield Result(output=output, metrics={**visual.metrics, **figures})
 
@@ -150,7 +183,10 @@ def _by_rig(
 
 
 def _leave(
-    output: Path, pictures: list[NDArray[np.uint8]], visual: Mapping[str, Any], figures: dict[str, Any]
+    output: Path,
+    pictures: list[NDArray[np.uint8]],
+    visual: Mapping[str, Any],
+    figures: dict[str, Any],
 ) -> None:
     """Overlays, the report's section, and last the figures."""
     write_overlays(output, pictures)
@@ -173,15 +209,24 @@ def _told(events: Iterator[Event]) -> Generator[Event, None, Result]:
 
 def _figures(joined: Joined, heat: Result, b: Source) -> dict[str, Any]:
     m, outcome = heat.metrics, joined.outcome
-    exact = outcome is not None and "cells" in outcome.evidence  # by heights everywhere, not by those places
+    exact = (
+        outcome is not None and "cells" in outcome.evidence
+    )  # by heights everywhere, not by those places
     error = residual(outcome) if outcome and len(outcome.px_a) and not exact else None
     return {
-        "route": joined.route, "routes_refused": dict(joined.refused), "unit": b.unit,
+        "route": joined.route,
+        "routes_refused": dict(joined.refused),
+        "unit": b.unit,
         "thermal_H_visual": joined.thermal_H_visual.tolist(),
-        "model": outcome.model if outcome else "positions", "inliers": len(outcome.px_a) if outcome else 0,
+        "model": outcome.model if outcome else "positions",
+        "inliers": len(outcome.px_a) if outcome else 0,
         "evidence": dict(outcome.evidence) if outcome else {},
-        "residual_px": error, "residual_m": None if error is None else round(error * float(m["gsd_m"]), 4),
+        "residual_px": error,
+        "residual_m": None if error is None else round(error * float(m["gsd_m"]), 4),
         "thermal_values": m.get("thermal_values"),
-        "photos_used": m["photos_used"], "photos_total": m["photos_total"], "gsd_m": m["gsd_m"],
-        "blocks": m["blocks"], "method": m["method"],
-    }  # fmt: skip
+        "photos_used": m["photos_used"],
+        "photos_total": m["photos_total"],
+        "gsd_m": m["gsd_m"],
+        "blocks": m["blocks"],
+        "method": m["method"],
+    }

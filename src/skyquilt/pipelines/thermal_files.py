@@ -16,7 +16,8 @@ from skyquilt.report.page import write_page
 from skyquilt.report.thermal import thermal_section, with_section
 
 OVERLAYS = ("thermal_checkerboard.png", "thermal_false_colour.png", "thermal_alpha.png")
-"""Pictures of both maps on one another; the first of the registration's, side by side, is left out."""
+"""Pictures of both maps on one another; the first of the registration's, side by side, is left out.
+"""
 
 
 def write_overlays(output: Path, pictures: Sequence[NDArray[np.uint8]]) -> None:
@@ -30,13 +31,17 @@ def write_overlays(output: Path, pictures: Sequence[NDArray[np.uint8]]) -> None:
 
 def write_figures(output: Path, visual: Mapping[str, Any], figures: Mapping[str, Any]) -> None:
     """metrics.json of the visual map, and under `thermal` how the other lies on it."""
-    write_text(output / "metrics.json", json.dumps({**visual, **figures}, indent=1, allow_nan=False))
+    write_text(
+        output / "metrics.json", json.dumps({**visual, **figures}, indent=1, allow_nan=False)
+    )
 
 
 def write_section(
     output: Path, thermal: Source, pictures: Sequence[NDArray[np.uint8]], record: Mapping[str, Any]
 ) -> None:
-    """The thermal map with its overlays (`register_files.OVERLAYS`) and figures in the visual map's report."""
+    """The thermal map with its overlays (`register_files.OVERLAYS`) and figures in the visual map's
+    report.
+    """
     page = output / "report.html"
     values = thermal.picture.values
     seen = np.isfinite(values) if values.ndim == 2 else np.ones(values.shape[:2], bool)

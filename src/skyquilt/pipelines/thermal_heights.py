@@ -1,7 +1,7 @@
 """Two blocks joined by the heights under them [Yahyanejad 2013, 5.2.3, (5.8)].
 
-Pictures of both surfaces find the rough place, as pictures do everywhere; heights measured anew, as densely as the
-photos allow, find the exact one.
+Pictures of both surfaces find the rough place, as pictures do everywhere; heights measured anew, as
+densely as the photos allow, find the exact one.
 """
 
 from dataclasses import replace
@@ -24,8 +24,8 @@ def finer(
     dense: Dense | None = None,
     align: AlignHeights | None = None,
 ) -> Registration | RefusedRegistration:
-    """A registration of the maps, px of the visual to px of the thermal one, sharpened by heights; or why heights do
-    not confirm it.
+    """A registration of the maps, px of the visual to px of the thermal one, sharpened by heights;
+    or why heights do not confirm it.
     """
     fields = [_heights(scene, dense or Dense()) for scene in (visual, thermal)]
     if fields[0] is None or fields[1] is None:
@@ -44,7 +44,10 @@ def finer(
         "halves_apart_m": round(fit.apart_m, 4),
     }
     return replace(
-        outcome, model="similarity", b_H_a=matrix / matrix[2, 2], evidence={**outcome.evidence, **told}
+        outcome,
+        model="similarity",
+        b_H_a=matrix / matrix[2, 2],
+        evidence={**outcome.evidence, **told},
     )
 
 

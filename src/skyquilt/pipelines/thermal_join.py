@@ -1,4 +1,6 @@
-"""How the thermal map finds its place on the visual one: the routes, and which of them is believed."""
+"""How the thermal map finds its place on the visual one: the routes, and which of them is
+believed.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -17,8 +19,9 @@ from skyquilt.spectral.settle import Settle
 from skyquilt.spectral.sharpen import Sharpen
 
 ROUTES = ("auto", "rig", "maps", "pairs", "heights", "positions")
-"""How the thermal map finds its place: by the rig where one drone took both, by the pictures of both maps, by pairs
-of photos, by heights, or by its positions alone; auto takes the first of these that can be believed.
+"""How the thermal map finds its place: by the rig where one drone took both, by the pictures of
+both maps, by pairs of photos, by heights, or by its positions alone; auto takes the first of these
+that can be believed.
 """
 SETTLE = Settle(free=Sharpen(freedom="affine", steps=12))
 """How a believed registration of maps gets exact: with the freedom that pictures support."""
@@ -43,14 +46,19 @@ class Joined:
 
 
 def join(
-    a: Source, b: Source, surfaces: tuple[Path, Path], route: str, *, pairs: Callable[[], Outcome] = lambda: _NO_PHOTOS,
+    a: Source,
+    b: Source,
+    surfaces: tuple[Path, Path],
+    route: str,
+    *,
+    pairs: Callable[[], Outcome] = lambda: _NO_PHOTOS,
     finer: Callable[[Registration], Outcome] = lambda outcome: outcome,
-) -> Joined:  # fmt: skip
+) -> Joined:
     """The place of the thermal map b on the visual map a.
 
     `auto` takes the first of pictures, pairs and heights that can be believed.
-    `pairs` registers pairs of the photos behind both maps, px of a to px of b; `finer` sharpens a registration by
-    heights measured in those photos.
+    `pairs` registers pairs of the photos behind both maps, px of a to px of b; `finer` sharpens a
+    registration by heights measured in those photos.
 
     Raises:
         RefusedError: the one route asked for cannot be believed.
@@ -58,7 +66,8 @@ def join(
     guess = guess_of(a, b)
     if guess is None and route == "positions":
         raise RefusedError(
-            "the two maps have no common place: one of them is not georeferenced; use --thermal-route maps"
+            "the two maps have no common place: one of them is not georeferenced; use"
+            " --thermal-route maps"
         )
     ways: dict[str, Callable[[], Outcome]] = {
         "maps": lambda: _registered(a, b, a.picture, b.picture, guess),
@@ -69,15 +78,20 @@ def join(
     for name in ways if route == "auto" else (route,) if route in ways else ():
         outcome = ways[name]()
         if isinstance(outcome, Registration):
-            return Joined(route=name, thermal_H_visual=outcome.b_H_a, outcome=outcome, refused=tuple(refused))
+            return Joined(
+                route=name, thermal_H_visual=outcome.b_H_a, outcome=outcome, refused=tuple(refused)
+            )
         refused.append((name, outcome.reason))
     if guess is None or route not in ("auto", "positions"):
         told = "; ".join(f"by {name}: {why}" for name, why in refused)
         raise RefusedError(
-            f"the thermal map cannot be laid on the visual one ({told}); both maps are in the output"
+            f"the thermal map cannot be laid on the visual one ({told}); both maps are in the"
+            " output"
         )
     full = b.full_S_picture @ guess.b_H_a @ np.linalg.inv(a.full_S_picture)
-    return Joined(route="positions", thermal_H_visual=full / full[2, 2], outcome=None, refused=tuple(refused))
+    return Joined(
+        route="positions", thermal_H_visual=full / full[2, 2], outcome=None, refused=tuple(refused)
+    )
 
 
 def _by_heights(
@@ -96,8 +110,8 @@ def _by_heights(
 
 
 def heights_on(source: Source, surface: Path) -> Picture:
-    """The heights of a run on the grid of its map's picture, the general slope taken away: what stands out of the
-    ground is what both surfaces share, whatever their heights count from.
+    """The heights of a run on the grid of its map's picture, the general slope taken away: what
+    stands out of the ground is what both surfaces share, whatever their heights count from.
     """
     ground = opened(surface)
     rows, columns = source.picture.shape
@@ -112,7 +126,9 @@ def heights_on(source: Source, surface: Path) -> Picture:
 
 
 def _sampled(ground: Source, source: Source) -> NDArray[np.float32]:
-    """The heights at the pixels (h, w) of a map's picture: both rasters are north up, their grids are not the same."""
+    """The heights at the pixels (h, w) of a map's picture: both rasters are north up, their grids
+    are not the same.
+    """
     assert ground.place is not None and source.place is not None
     g, s, full = ground.place.affine, source.place.affine, source.full_S_picture
     rows, columns = source.picture.shape
@@ -122,10 +138,13 @@ def _sampled(ground: Source, source: Source) -> NDArray[np.float32]:
     values = ground.picture.values.astype(np.float32)
     return np.asarray(
         cv2.remap(
-            values, column.astype(np.float32), row.astype(np.float32), cv2.INTER_LINEAR,
+            values,
+            column.astype(np.float32),
+            row.astype(np.float32),
+            cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_REPLICATE,
         )
-    )  # fmt: skip
+    )
 
 
 def _registered(a: Source, b: Source, one: Picture, other: Picture, guess: Guess | None) -> Outcome:
@@ -149,7 +168,9 @@ def refuse_apart(visual: Sequence[Photo], thermal: Sequence[Photo]) -> None:
         RefusedError: all positions of the one lie far from all of the other.
     """
     places = [
-        np.radians([(p.position.latitude_deg, p.position.longitude_deg) for p in photos if p.position])
+        np.radians(
+            [(p.position.latitude_deg, p.position.longitude_deg) for p in photos if p.position]
+        )
         for photos in (visual, thermal)
     ]
     if not all(len(p) for p in places):
@@ -158,7 +179,8 @@ def refuse_apart(visual: Sequence[Photo], thermal: Sequence[Photo]) -> None:
     nearest = 6.371e6 * float(np.linalg.norm(a - b.transpose(1, 0, 2), axis=2).min())
     if nearest > FAR_M:
         raise RefusedError(
-            f"the thermal photos lie {nearest / 1000:.1f} km from the visual ones, by their positions; give the two"
+            f"the thermal photos lie {nearest / 1000:.1f} km from the visual ones, by their"
+            " positions; give the two"
             " flights over one place"
         )
 

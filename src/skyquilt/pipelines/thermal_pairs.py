@@ -1,9 +1,9 @@
 """Two blocks joined by their pairs [Yahyanejad 2013, 5.2.3, (5.7)].
 
-Visual and thermal photos that show the same ground are registered one by one, each laid flat by the pose and the
-surface of its own block, so that height no longer parts them, and settled by their colours, since the sun draws all
-of them aside in one direction, which no adjustment would notice. Their correspondences are then in both maps already,
-and one transform is fitted to all, in balance.
+Visual and thermal photos that show the same ground are registered one by one, each laid flat by the
+pose and the surface of its own block, so that height no longer parts them, and settled by their
+colours, since the sun draws all of them aside in one direction, which no adjustment would notice.
+Their correspondences are then in both maps already, and one transform is fitted to all, in balance.
 """
 
 from dataclasses import replace
@@ -30,9 +30,13 @@ LEAST_OVERLAP = 0.4
 _REACH_M = 6.0
 """By how much the positions of two flights may differ."""
 SETTLE = Settle()
-"""How a believed pair gets exact: as stiff as what two adjusted blocks differ by; a freer model follows shadows."""
+"""How a believed pair gets exact: as stiff as what two adjusted blocks differ by; a freer model
+follows shadows.
+"""
 _SIDE_PX = 1000
-"""Longest side of the pictures that a pair is registered in, or fewer where a thermal pixel is larger."""
+"""Longest side of the pictures that a pair is registered in, or fewer where a thermal pixel is
+larger.
+"""
 _GRID = 6
 """Points per side by which a pair's transform is carried."""
 
@@ -51,16 +55,19 @@ def by_pairs(visual: Scene, thermal: Scene) -> Registration | RefusedRegistratio
     if isinstance(outcome, RefusedRegistration):
         return outcome
     counts = {
-        "pairs_tried": float(len(asked)), "pairs_registered": float(len(found)),
+        "pairs_tried": float(len(asked)),
+        "pairs_registered": float(len(found)),
         "pairs_by_colour": float(sum(by_colour for _, by_colour in told)),
-    }  # fmt: skip
+    }
     return replace(outcome, evidence={**outcome.evidence, **counts})
 
 
 def overlapping(visual: Scene, thermal: Scene) -> list[tuple[View, View]]:
     """For thermal photos spread over the map, the visual photo that shows most of each."""
     views = [v for v in thermal.ground.views if v.photo in thermal.alignment.held]
-    spread = sorted({int(k) for k in np.linspace(0, len(views) - 1, MOST_PAIRS)} if views else set())
+    spread = sorted(
+        {int(k) for k in np.linspace(0, len(views) - 1, MOST_PAIRS)} if views else set()
+    )
     found = []
     for view in (views[k] for k in spread):
         there = view.footprint + _shift(visual, thermal)
@@ -82,27 +89,37 @@ def _share(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 def _registered(visual: Scene, thermal: Scene, a: View, b: View) -> tuple[PairPoints, bool] | None:
-    """Correspondences of one pair in px of both maps, and whether by colours; None where it cannot be registered."""
+    """Correspondences of one pair in px of both maps, and whether by colours; None where it cannot
+    be registered.
+    """
     low, high = b.footprint.min(0) - _REACH_M, b.footprint.max(0) + _REACH_M
     gsd = max(float((high - low).max()) / _SIDE_PX, thermal.ground.grid.gsd)
     width, height = (int(n) for n in np.ceil((high - low) / gsd))
     grid_b = Grid(west=float(low[0]), north=float(high[1]), gsd=gsd, width=width, height=height)
     shift = _shift(visual, thermal)
-    grid_a = replace(grid_b, west=grid_b.west + float(shift[0]), north=grid_b.north + float(shift[1]))
+    grid_a = replace(
+        grid_b, west=grid_b.west + float(shift[0]), north=grid_b.north + float(shift[1])
+    )
     flat = _flat(visual, a, grid_a), _flat(thermal, b, grid_b)
     if any(p.valid is None or p.valid.mean() < 0.1 for p in flat):
         return None
     guess = Guess(
-        b_H_a=np.eye(3), reach=_REACH_M / gsd / max(width, height), rotation_deg=3, scale=1.06,
+        b_H_a=np.eye(3),
+        reach=_REACH_M / gsd / max(width, height),
+        rotation_deg=3,
+        scale=1.06,
         source="the adjustments of both flights",
-    )  # fmt: skip
+    )
     outcome = registration_method("auto")(*flat, guess)
     if not isinstance(outcome, Registration):
         return None
     settled = SETTLE(*flat, outcome)
     px_a, px_b = _points(flat, settled)
     points = PairPoints(
-        a=a.photo, b=b.photo, px_a=_on_map(visual, grid_a, px_a), px_b=_on_map(thermal, grid_b, px_b)
+        a=a.photo,
+        b=b.photo,
+        px_a=_on_map(visual, grid_a, px_a),
+        px_b=_on_map(thermal, grid_b, px_b),
     )
     return points, settled.evidence.get("by_colour", 0.0) > 0
 
@@ -111,9 +128,14 @@ def _flat(scene: Scene, view: View, grid: Grid) -> Picture:
     """One photo on a grid, by its pose and its block's surface."""
     photo = scene.taken.photos[view.photo]
     compose = Composer(
-        grid=grid, views=[view], surface=scene.ground.surface, blend=First(), pixels=scene.pixels,
-        bands=photo.channels, dtype=np.dtype(photo.dtype),
-    )  # fmt: skip
+        grid=grid,
+        views=[view],
+        surface=scene.ground.surface,
+        blend=First(),
+        pixels=scene.pixels,
+        bands=photo.channels,
+        dtype=np.dtype(photo.dtype),
+    )
     composed = compose(Window(row=0, column=0, height=grid.height, width=grid.width))
     values = composed.pixels[..., 0] if photo.channels == 1 else composed.pixels
     return Picture(values=values, valid=composed.photo >= 0)
@@ -129,7 +151,10 @@ def _points(
     px_a = transfer(np.asarray(np.linalg.inv(outcome.b_H_a), np.float64), px_b)
     inside = ((px_a > 0) & (px_a < [a.shape[1] - 1, a.shape[0] - 1])).all(1)
     px_a, px_b = px_a[inside], px_b[inside]
-    both = a[tuple(np.round(px_a[:, ::-1]).astype(int).T)] & b[tuple(np.round(px_b[:, ::-1]).astype(int).T)]
+    both = (
+        a[tuple(np.round(px_a[:, ::-1]).astype(int).T)]
+        & b[tuple(np.round(px_b[:, ::-1]).astype(int).T)]
+    )
     return px_a[both], px_b[both]
 
 

@@ -56,14 +56,19 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
     pairs = [(i, j) for i, j in taken_together(visual, thermal) if i in scene.alignment.poses]
     if len(pairs) < FindRig.minimum:
         return RefusedRegistration(
-            reason=f"{len(pairs)} thermal photos were taken together with a visual one, by time or name"
+            reason=f"{len(pairs)} thermal photos were taken together with a visual one, by time or"
+            " name"
         )
     if any(scene.alignment.poses[i].cam_H_map is not None for i, _ in pairs):
-        return RefusedRegistration(reason="the visual photos have no poses in space; use --method bundle")
+        return RefusedRegistration(
+            reason="the visual photos have no poses in space; use --method bundle"
+        )
     first = thermal[pairs[0][1]]
     kinds = {(thermal[j].camera_key, thermal[j].channels, thermal[j].dtype) for _, j in pairs}
     if len(kinds) > 1:
-        return RefusedRegistration(reason=f"the thermal photos are of {len(kinds)} cameras or kinds")
+        return RefusedRegistration(
+            reason=f"the thermal photos are of {len(kinds)} cameras or kinds"
+        )
     asked = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, MOST_PAIRS).astype(int))]
     told = [p for i, j in asked if (p := _registered(scene, i, thermal[j])) is not None]
     rig = FindRig(free=_freedom(first))(told, reported_camera(first))
@@ -71,10 +76,15 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
         return rig
     poses = {k: _turned(scene.alignment.poses[i], rig) for k, (i, _) in enumerate(pairs)}
     alignment = Alignment(
-        method="rig", why="both cameras flew together", frame=scene.alignment.frame, poses=poses,
-        cameras={"thermal": rig.camera_b}, camera_of=dict.fromkeys(poses, "thermal"), blocks=(tuple(poses),),
+        method="rig",
+        why="both cameras flew together",
+        frame=scene.alignment.frame,
+        poses=poses,
+        cameras={"thermal": rig.camera_b},
+        camera_of=dict.fromkeys(poses, "thermal"),
+        blocks=(tuple(poses),),
         ties=no_ties(),
-    )  # fmt: skip
+    )
     return Rigged(rig=rig, photos=tuple(thermal[j] for _, j in pairs), alignment=alignment)
 
 
@@ -90,7 +100,9 @@ def _turned(pose: Pose, rig: Rig) -> Pose:
 
 
 def _registered(scene: Scene, index: int, thermal: Photo) -> RigPair | None:
-    """Correspondences over the overlap of two photos taken together; None where they cannot be registered."""
+    """Correspondences over the overlap of two photos taken together; None where they cannot be
+    registered.
+    """
     a, b = open_picture(scene.taken.photos[index].path), open_picture(thermal.path)
     if isinstance(a, RejectedPhoto) or isinstance(b, RejectedPhoto):
         return None
@@ -108,7 +120,9 @@ def _registered(scene: Scene, index: int, thermal: Photo) -> RigPair | None:
     return RigPair(px_a=px_a[inside], px_b=px_b[inside], camera_a=scene.alignment.camera(index))
 
 
-def drift_of_rigged(found: Rigged, scene: Scene, parts: Methods, settings: MosaicSettings) -> Exposure:
+def drift_of_rigged(
+    found: Rigged, scene: Scene, parts: Methods, settings: MosaicSettings
+) -> Exposure:
     """What brings the thermal frames to one level, if they are to be."""
     unit, ground = found.photos[0].unit, scene.ground
     if not balances_drift(settings, unit):
@@ -118,25 +132,42 @@ def drift_of_rigged(found: Rigged, scene: Scene, parts: Methods, settings: Mosai
     return drift_of(views, frames, ground.surface, ground.grid.bounds, unit, parts, settings)
 
 
-def draw_rigged(path: Path, found: Rigged, scene: Scene, blend: Blend, exposure: Exposure = NEUTRAL) -> None:
-    """thermal.tif on the visual map's grid and surface, values resampled only, but for their drift."""
+def draw_rigged(
+    path: Path, found: Rigged, scene: Scene, blend: Blend, exposure: Exposure = NEUTRAL
+) -> None:
+    """thermal.tif on the visual map's grid and surface, values resampled only, but for their
+    drift.
+    """
     first, grid = found.photos[0], scene.ground.grid
     kind, real = np.dtype(first.dtype), np.dtype(first.dtype).kind == "f"
     compose = Composer(
-        grid=grid, views=make_views(found.alignment, scene.ground.surface), surface=scene.ground.surface,
-        blend=blend, pixels=lambda i: read_color(found.photos[i]), bands=first.channels,
-        dtype=kind, exposure=exposure,
-    )  # fmt: skip
+        grid=grid,
+        views=make_views(found.alignment, scene.ground.surface),
+        surface=scene.ground.surface,
+        blend=blend,
+        pixels=lambda i: read_color(found.photos[i]),
+        bands=first.channels,
+        dtype=kind,
+        exposure=exposure,
+    )
     spec = RasterSpec(
-        width=grid.width, height=grid.height, bands=first.channels, dtype=kind.name,
-        transform=geotransform(grid, found.alignment), crs=found.alignment.frame.crs, compress="deflate",
-        nodata=float("nan") if real else None, mask=not real,
+        width=grid.width,
+        height=grid.height,
+        bands=first.channels,
+        dtype=kind.name,
+        transform=geotransform(grid, found.alignment),
+        crs=found.alignment.frame.crs,
+        compress="deflate",
+        nodata=float("nan") if real else None,
+        mask=not real,
         band_units=(first.unit,) * first.channels if first.unit else (),
         tags={"SOFTWARE": "Skyquilt"} | value_tags(first.unit, exposure),
-    )  # fmt: skip
+    )
     with CogWriter(path, spec) as writer:
         for block in writer.blocks():
-            window = Window(row=block.row0, column=block.col0, height=block.height, width=block.width)
+            window = Window(
+                row=block.row0, column=block.col0, height=block.height, width=block.width
+            )
             composed = compose(window)
             writer.write_block(block, composed.pixels, composed.photo >= 0)
 
@@ -145,11 +176,19 @@ def rig_figures(found: Rigged, total: int) -> dict[str, Any]:
     """What metrics.json says under `thermal`."""
     rig, first = found.rig, found.photos[0]
     return {
-        "route": "rig", "routes_refused": {}, "unit": first.unit, "thermal_H_visual": np.eye(3).tolist(),
-        "model": "rotation", "inliers": rig.agreeing,
+        "route": "rig",
+        "routes_refused": {},
+        "unit": first.unit,
+        "thermal_H_visual": np.eye(3).tolist(),
+        "model": "rotation",
+        "inliers": rig.agreeing,
         "evidence": {
-            "pairs": rig.pairs, "pairs_agreeing": rig.agreeing, "spread_deg": round(rig.spread_deg, 4),
+            "pairs": rig.pairs,
+            "pairs_agreeing": rig.agreeing,
+            "spread_deg": round(rig.spread_deg, 4),
             "focal_px": round(rig.camera_b.focal, 2),
         },
-        "thermal_R_visual": rig.b_R_a.tolist(), "photos_used": len(found.photos), "photos_total": total,
-    }  # fmt: skip
+        "thermal_R_visual": rig.b_R_a.tolist(),
+        "photos_used": len(found.photos),
+        "photos_total": total,
+    }

@@ -1,12 +1,13 @@
 """Encoded tiles to a Cloud Optimized GeoTIFF in GDAL's own order.
 
-Directories first (full size, its mask, each overview, its mask), then tiles row by row, smallest overview
-first, each mask tile behind its image tile, with the leader and trailer that GDAL's structural metadata
-promise (https://gdal.org/drivers/raster/cog.html).
+Directories first (full size, its mask, each overview, its mask), then tiles row by row, smallest
+overview first, each mask tile behind its image tile, with the leader and trailer that GDAL's
+structural metadata promise (https://gdal.org/drivers/raster/cog.html).
 """
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
@@ -16,7 +17,17 @@ from skyquilt.raster.atomic import whole_file
 from skyquilt.raster.codecs import TileEncoder, predictor
 from skyquilt.raster.geokeys import place_tags
 from skyquilt.raster.spec import RasterSpec
-from skyquilt.raster.tiff import ASCII, LONG, LONG8, RATIONAL, SHORT, UNDEFINED, Tag, directories, header
+from skyquilt.raster.tiff import (
+    ASCII,
+    LONG,
+    LONG8,
+    RATIONAL,
+    SHORT,
+    UNDEFINED,
+    Tag,
+    directories,
+    header,
+)
 
 IMAGE, MASK = 1, 2
 """Columns of an index (see `pyramid.Pyramid.indices`): bytes of image, bytes of mask."""
@@ -36,7 +47,9 @@ def assemble(
     *,
     big: bool | None = None,
 ) -> None:
-    """Write the file from one index (rows, columns, 3) per level; `read(offset, size)` fetches tiles."""
+    """Write the file from one index (rows, columns, 3) per level; `read(offset, size)` fetches
+    tiles.
+    """
     spec = encoder.spec
     total = sum(int(_spans(spec, index).sum()) for index in indices)
     head_size = len(_head(encoder, indices, 0, big=True))
@@ -81,18 +94,24 @@ def _head(encoder: TileEncoder, indices: Sequence[Index], data_start: int, *, bi
         ifds.append(_image_tags(encoder, level) + _tile_tags(offsets, images, big))
         if spec.mask:
             ifds.append(
-                _mask_tags(spec, level) + _tile_tags(offsets + images.astype(np.int64) + 8, masks, big)
+                _mask_tags(spec, level)
+                + _tile_tags(offsets + images.astype(np.int64) + 8, masks, big)
             )
     first = len(header(0, big)) + len(ghost)
     return header(first, big) + ghost + directories(ifds, first, big)
 
 
-def _tile_tags(offsets: NDArray, counts: NDArray, big: bool) -> list[Tag]:
-    return [Tag(324, LONG8 if big else LONG, np.where(counts > 0, offsets, 0)), Tag(325, LONG, counts)]
+def _tile_tags(offsets: NDArray[Any], counts: NDArray[Any], big: bool) -> list[Tag]:
+    return [
+        Tag(324, LONG8 if big else LONG, np.where(counts > 0, offsets, 0)),
+        Tag(325, LONG, counts),
+    ]
 
 
 def _ghost(mask: bool) -> bytes:
-    """GDAL's structural metadata between header and first directory; the blank leaves room for YES."""
+    """GDAL's structural metadata between header and first directory; the blank leaves room for
+    YES.
+    """
     text = (
         "LAYOUT=IFDS_BEFORE_DATA\nBLOCK_ORDER=ROW_MAJOR\nBLOCK_LEADER=SIZE_AS_UINT4\n"
         "BLOCK_TRAILER=LAST_4_BYTES_REPEATED\nKNOWN_INCOMPATIBLE_EDITION=NO\n "
@@ -123,7 +142,10 @@ def _mask_tags(spec: RasterSpec, level: int) -> list[Tag]:
 
 def _image_tags(encoder: TileEncoder, level: int) -> list[Tag]:
     spec = encoder.spec
-    ycc, rgb = spec.compress == "jpeg" and spec.bands == 3, spec.dtype == "uint8" and spec.bands == 3
+    ycc, rgb = (
+        spec.compress == "jpeg" and spec.bands == 3,
+        spec.dtype == "uint8" and spec.bands == 3,
+    )
     tags = _size_tags(spec, level, 1 if level else 0)
     tags += [
         Tag(258, SHORT, (spec.numpy_dtype.itemsize * 8,) * spec.bands),
@@ -152,7 +174,10 @@ def _image_tags(encoder: TileEncoder, level: int) -> list[Tag]:
 
 def metadata_xml(spec: RasterSpec) -> str:
     """The tag `GDAL_METADATA`."""
-    items = [f"<Item name={quoteattr(_clean(key))}>{_text(value)}</Item>" for key, value in spec.tags.items()]
+    items = [
+        f"<Item name={quoteattr(_clean(key))}>{_text(value)}</Item>"
+        for key, value in spec.tags.items()
+    ]
     for role, name, values in (
         ("description", "DESCRIPTION", spec.band_names),
         ("unittype", "UNITTYPE", spec.band_units),

@@ -14,9 +14,11 @@ CHUNK = 1 << 20
 
 @contextmanager
 def whole_file(path: Path, *, needed: int = 0) -> Iterator[BinaryIO]:
-    """A file open for writing that takes its name when the block ends well, and vanishes when it does not.
+    """A file open for writing that takes its name when the block ends well, and vanishes when it
+    does not.
 
-    `needed` is its size in bytes, if known: too little room is an `OutputError` before the first byte.
+    `needed` is its size in bytes, if known: too little room is an `OutputError` before the first
+    byte.
     """
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
@@ -42,7 +44,9 @@ def write_text(path: Path, text: str) -> None:
 
 @contextmanager
 def mended(path: Path, *, needed: int = 0) -> Iterator[None]:
-    """Turn the operating system's refusal to write `path` into an `OutputError` with the next step."""
+    """Turn the operating system's refusal to write `path` into an `OutputError` with the next
+    step.
+    """
     try:
         yield
     except OSError as error:
@@ -64,7 +68,9 @@ def _sentence(path: Path, error: OSError, needed: int) -> str:
         why = "is read-only" if error.errno == errno.EROFS else "may not be written by this user"
         return f"{path} cannot be written: {path.parent} {why}. Choose another output folder."
     if error.errno == errno.ENOENT:
-        return f"{path} cannot be written: the folder {path.parent} does not exist. Create it first."
+        return (
+            f"{path} cannot be written: the folder {path.parent} does not exist. Create it first."
+        )
     return f"{path} cannot be written: {error.strerror or error}."
 
 

@@ -1,4 +1,6 @@
-"""Super-blocks: squares of tiles, walked along a Z so that few overview tiles are open at a time."""
+"""Super-blocks: squares of tiles, walked along a Z so that few overview tiles are open at a
+time.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,7 +22,9 @@ class Block:
     """Side of a tile in px."""
 
     def tiles(self) -> Iterator[tuple[int, int, slice, slice]]:
-        """(tile_row, tile_col, rows, columns): what `write_tile` takes, slices into the block's pixels."""
+        """(tile_row, tile_col, rows, columns): what `write_tile` takes, slices into the block's
+        pixels.
+        """
         for row in range(0, self.height, self.tile):
             for col in range(0, self.width, self.tile):
                 rows, cols = slice(row, row + self.tile), slice(col, col + self.tile)

@@ -1,4 +1,6 @@
-"""The area a user wants mapped: a file of polygons into the output CRS, and onto the output's pixels."""
+"""The area a user wants mapped: a file of polygons into the output CRS, and onto the output's
+pixels.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +15,9 @@ from skyquilt.errors import SideFileError
 from skyquilt.raster.boundary_files import READERS
 
 SEGMENTS = 100
-"""Pieces that an outline's extent is cut into before it is projected: straight lines do not stay straight."""
+"""Pieces that an outline's extent is cut into before it is projected: straight lines do not stay
+straight.
+"""
 
 
 def read_boundary(path: Path, crs: str | None) -> Polygon | MultiPolygon:
@@ -25,17 +29,23 @@ def read_boundary(path: Path, crs: str | None) -> Polygon | MultiPolygon:
     path = Path(path)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
-        raise SideFileError(f"{path.name}: a boundary is one of {', '.join(READERS)}, got '{path.suffix}'")
+        raise SideFileError(
+            f"{path.name}: a boundary is one of {', '.join(READERS)}, got '{path.suffix}'"
+        )
     try:
         shapes, source = reader(path)
     except OSError as error:
         raise SideFileError(f"{path} cannot be read: {error.strerror or error}") from error
     except Exception as error:
-        raise SideFileError(f"{path.name} is not a readable {path.suffix[1:]} file: {error}") from error
+        raise SideFileError(
+            f"{path.name} is not a readable {path.suffix[1:]} file: {error}"
+        ) from error
     areas = [area for shape in shapes for area in _areas(make_valid(shape))]
     if not areas:
         kinds = sorted({shape.geom_type for shape in shapes}) or ["nothing"]
-        raise SideFileError(f"{path.name}: a boundary needs at least one polygon, found {', '.join(kinds)}")
+        raise SideFileError(
+            f"{path.name}: a boundary needs at least one polygon, found {', '.join(kinds)}"
+        )
     return _polygonal(_projected(union_all(areas), path, source, crs))
 
 
@@ -58,7 +68,9 @@ def inside(
         return np.zeros((height, width), bool)
     if prepared.contains(window):
         return np.ones((height, width), bool)
-    return geometry_mask([polygon], (height, width), Affine(a, b, x, d, e, y), invert=True)
+    return np.asarray(
+        geometry_mask([polygon], (height, width), Affine(a, b, x, d, e, y), invert=True)
+    )
 
 
 def _areas(shape: BaseGeometry) -> list[Polygon]:
@@ -73,7 +85,9 @@ def _polygonal(shape: BaseGeometry) -> Polygon | MultiPolygon:
     return areas[0] if len(areas) == 1 else MultiPolygon(areas)
 
 
-def _projected(shape: BaseGeometry, path: Path, source: str | None, crs: str | None) -> BaseGeometry:
+def _projected(
+    shape: BaseGeometry, path: Path, source: str | None, crs: str | None
+) -> BaseGeometry:
     if source is None:
         return shape
     if crs is None:
@@ -86,10 +100,14 @@ def _projected(shape: BaseGeometry, path: Path, source: str | None, crs: str | N
     try:
         transformer = pyproj.Transformer.from_crs(source, pyproj.CRS(crs).to_2d(), always_xy=True)
     except pyproj.exceptions.CRSError as error:
-        raise SideFileError(f"{path.name}: the CRS '{source[:60]}' is not known: {error}") from error
+        raise SideFileError(
+            f"{path.name}: the CRS '{source[:60]}' is not known: {error}"
+        ) from error
     west, south, east, north = shape.bounds
     fine = segmentize(shape, max(east - west, north - south) / SEGMENTS)
     placed = transform(fine, lambda xy: np.column_stack(transformer.transform(xy[:, 0], xy[:, 1])))
     if not np.isfinite(placed.bounds).all():
-        raise SideFileError(f"{path.name}: its coordinates {shape.bounds} do not fit its CRS ({source[:60]})")
+        raise SideFileError(
+            f"{path.name}: its coordinates {shape.bounds} do not fit its CRS ({source[:60]})"
+        )
     return placed

@@ -1,4 +1,6 @@
-"""Polygons in the file formats people draw them in: each reader returns shapes and the CRS they are in."""
+"""Polygons in the file formats people draw them in: each reader returns shapes and the CRS they are
+in.
+"""
 
 import json
 import sqlite3
@@ -55,8 +57,12 @@ def _kml_shapes(text: bytes) -> list[BaseGeometry]:
     root = fromstring(text)
     shapes: list[BaseGeometry] = []
     for polygon in root.iterfind(".//{*}Polygon"):
-        (outer,) = (_kml_places(ring) for ring in polygon.iterfind("{*}outerBoundaryIs//{*}coordinates"))
-        holes = [_kml_places(ring) for ring in polygon.iterfind("{*}innerBoundaryIs//{*}coordinates")]
+        (outer,) = (
+            _kml_places(ring) for ring in polygon.iterfind("{*}outerBoundaryIs//{*}coordinates")
+        )
+        holes = [
+            _kml_places(ring) for ring in polygon.iterfind("{*}innerBoundaryIs//{*}coordinates")
+        ]
         shapes.append(Polygon(outer, holes))
     for line in root.iterfind(".//{*}LineString/{*}coordinates"):
         places = _kml_places(line)
@@ -71,7 +77,9 @@ def _kml_places(element: Any) -> list[tuple[float, float]]:
 
 
 def read_wkt(path: Path) -> Shapes:
-    """One geometry as well-known text, in the output's CRS; `SRID=32615;POLYGON ...` states another."""
+    """One geometry as well-known text, in the output's CRS; `SRID=32615;POLYGON ...` states
+    another.
+    """
     text = path.read_text(encoding="utf-8-sig").strip()
     srid, _, rest = text.partition(";") if text.upper().startswith("SRID=") else ("", "", text)
     return [force_2d(from_wkt(rest))], f"EPSG:{int(srid[5:])}" if srid else None
@@ -99,7 +107,9 @@ def _gpkg_header(blob: bytes) -> int:
 
 
 def read_shapefile(path: Path) -> Shapes:
-    """Polygons (types 5, 15, 25) of a Shapefile with its `.prj` beside it (ESRI white paper, 1998)."""
+    """Polygons (types 5, 15, 25) of a Shapefile with its `.prj` beside it (ESRI white paper,
+    1998).
+    """
     data, at, shapes = path.read_bytes(), 100, []
     if data[:4] != b"\0\0\x27\x0a":
         raise ValueError("the file code is not 9994")

@@ -26,7 +26,9 @@ class TileEncoder:
         self.spec = spec
         self._pack: Callable[[Any], bytes] = PACKERS.get(spec.compress, bytes)
 
-    def __call__(self, pixels: NDArray, valid: NDArray[np.bool_] | None) -> tuple[bytes, bytes]:
+    def __call__(
+        self, pixels: NDArray[Any], valid: NDArray[np.bool_] | None
+    ) -> tuple[bytes, bytes]:
         """Image and mask bytes of pixels (h, w, bands) with validity (h, w), None = all."""
         pixels = self._filled(pixels, valid)
         image = self._jpeg(pixels) if self.spec.compress == "jpeg" else self._lossless(pixels)
@@ -49,8 +51,10 @@ class TileEncoder:
         whole[: valid.shape[0], : valid.shape[1]] = valid
         return pack_mask(whole)
 
-    def _filled(self, pixels: NDArray, valid: NDArray[np.bool_] | None) -> NDArray:
-        """The whole tile (tile, tile, bands): edges repeated outwards, something harmless where not valid."""
+    def _filled(self, pixels: NDArray[Any], valid: NDArray[np.bool_] | None) -> NDArray[Any]:
+        """The whole tile (tile, tile, bands): edges repeated outwards, something harmless where not
+        valid.
+        """
         tile = self.spec.tile
         below, right = tile - pixels.shape[0], tile - pixels.shape[1]
         if below or right:
@@ -63,17 +67,19 @@ class TileEncoder:
         nodata = self.spec.nodata if self.spec.nodata is not None else 0
         return np.where(valid[..., None], pixels, np.asarray(nodata, dtype=pixels.dtype))
 
-    def _jpeg(self, pixels: NDArray) -> bytes:
+    def _jpeg(self, pixels: NDArray[Any]) -> bytes:
         tables, rest = split_jpeg(stream := self._jpeg_stream(pixels))
         return rest if b"\xff\xd8" + tables + b"\xff\xd9" == self.jpeg_tables else stream
 
-    def _jpeg_stream(self, pixels: NDArray) -> bytes:
+    def _jpeg_stream(self, pixels: NDArray[Any]) -> bytes:
         colour, sampling = ("RGB", "420") if self.spec.bands == 3 else ("GRAY", "Gray")
         fast = self.spec.quality <= 95  # the fast transform loses more than fine quantisation keeps
         pixels = np.ascontiguousarray(pixels)
-        return simplejpeg.encode_jpeg(pixels, self.spec.quality, colour, sampling, fastdct=fast)
+        return bytes(
+            simplejpeg.encode_jpeg(pixels, self.spec.quality, colour, sampling, fastdct=fast)
+        )
 
-    def _lossless(self, pixels: NDArray) -> bytes:
+    def _lossless(self, pixels: NDArray[Any]) -> bytes:
         pixels = np.ascontiguousarray(pixels, dtype=self.spec.numpy_dtype)
         if predictor(self.spec) == 3:
             pixels = imagecodecs.floatpred_encode(pixels, axis=-2)
@@ -102,10 +108,12 @@ def split_jpeg(stream: bytes) -> tuple[bytes, bytes]:
     return b"".join(tables), b"".join([*rest, stream[at:]])
 
 
-def smooth_fill(pixels: NDArray, valid: NDArray[np.bool_]) -> NDArray:
-    """Pixels (uint8) with every invalid one set to the mean of the valid ones in or around its JPEG unit.
+def smooth_fill(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[Any]:
+    """Pixels (uint8) with every invalid one set to the mean of the valid ones in or around its JPEG
+    unit.
 
-    So the rim keeps its colour. Units without valid neighbours become black, for viewers that ignore masks.
+    So the rim keeps its colour. Units without valid neighbours become black, for viewers that
+    ignore masks.
     """
     pixels, small = pixels.copy(), (valid.shape[1] // MCU, valid.shape[0] // MCU)
     units, inside = _units(pixels), _units(valid[..., None])
@@ -122,7 +130,7 @@ def smooth_fill(pixels: NDArray, valid: NDArray[np.bool_]) -> NDArray:
     return pixels
 
 
-def _units(array: NDArray) -> NDArray:
+def _units(array: NDArray[Any]) -> NDArray[Any]:
     """A view (rows, columns, MCU, MCU, bands) of (h, w, bands)."""
     h, w, bands = array.shape
     return array.reshape(h // MCU, MCU, w // MCU, MCU, bands).swapaxes(1, 2)

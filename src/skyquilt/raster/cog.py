@@ -1,10 +1,12 @@
-"""Writing a Cloud Optimized GeoTIFF tile by tile, overviews along with it, in little memory, resumable."""
+"""Writing a Cloud Optimized GeoTIFF tile by tile, overviews along with it, in little memory,
+resumable.
+"""
 
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +23,12 @@ VERSION = 1
 
 
 class CogWriter:
-    """Writes one raster. As a context manager: leaving it well assembles the file, an error leaves none.
+    """Writes one raster. As a context manager: leaving it well assembles the file, an error leaves
+    none.
 
-    With a `digest` (of whatever the pixels depend on) the spool outlives an error or a kill, and the next
-    writer with the same digest and specification skips the blocks that were finished; without, it is removed.
+    With a `digest` (of whatever the pixels depend on) the spool outlives an error or a kill, and
+    the next writer with the same digest and specification skips the blocks that were finished;
+    without, it is removed.
     """
 
     def __init__(
@@ -51,7 +55,10 @@ class CogWriter:
         self._lock, self._closed = threading.Lock(), False
         key = spec.digest(f"{digest}|{block_level}|{VERSION}")
         self._spool = Spool(
-            spool or self.path.with_name(self.path.name + ".spool"), key, fresh=not digest, fsync=fsync
+            spool or self.path.with_name(self.path.name + ".spool"),
+            key,
+            fresh=not digest,
+            fsync=fsync,
         )
         self._pyramid = Pyramid(self._encoder, self._spool, block_level)
         for record in self._spool.records:
@@ -63,12 +70,14 @@ class CogWriter:
             if (row, col) not in self._finished:
                 yield self._block(row, col)
 
-    def write_tile(self, tile_row: int, tile_col: int, pixels: Pixels, valid: Valid | None = None) -> None:
+    def write_tile(
+        self, tile_row: int, tile_col: int, pixels: Pixels, valid: Valid | None = None
+    ) -> None:
         """Encode and spool one tile of the full size; may be called by several threads at once.
 
-        Pixels are (h, w, bands), or (h, w) for one band, cut at the raster's edge; `valid` is (h, w), None =
-        all (or, with a nodata value, what differs from it). Each tile is written once. What is not
-        valid becomes nodata, or masked, or 0.
+        Pixels are (h, w, bands), or (h, w) for one band, cut at the raster's edge; `valid` is (h,
+        w), None = all (or, with a nodata value, what differs from it). Each tile is written once.
+        What is not valid becomes nodata, or masked, or 0.
         """
         part = self._checked(tile_row, tile_col, pixels, valid)
         self._claim(tile_row, tile_col)
@@ -77,11 +86,15 @@ class CogWriter:
     def write_block(self, block: Block, pixels: Pixels, valid: Valid | None = None) -> None:
         """Write and finish a whole block: pixels (height, width, bands), valid (height, width)."""
         for row, col, rows, cols in block.tiles():
-            self.write_tile(row, col, pixels[rows, cols], None if valid is None else valid[rows, cols])
+            self.write_tile(
+                row, col, pixels[rows, cols], None if valid is None else valid[rows, cols]
+            )
         self.finish_block(block)
 
     def finish_block(self, block: Block) -> None:
-        """Make a block survive a kill. Tiles of it that were never written are empty: nothing is valid."""
+        """Make a block survive a kill. Tiles of it that were never written are empty: nothing is
+        valid.
+        """
         for row, col, _, _ in block.tiles():
             if not self._written[row, col]:
                 self._claim(row, col)
@@ -95,9 +108,12 @@ class CogWriter:
             return
         if missing := len(self._all_blocks()) - len(self._finished):
             raise ValueError(
-                f"{missing} of {len(self._all_blocks())} blocks of {self.path.name} were never finished"
+                f"{missing} of {len(self._all_blocks())} blocks of {self.path.name} were never"
+                " finished"
             )
-        assemble(self.path, self._encoder, self._pyramid.indices, self._spool.read, big=self._bigtiff)
+        assemble(
+            self.path, self._encoder, self._pyramid.indices, self._spool.read, big=self._bigtiff
+        )
         self._closed = True
         self._spool.close(remove=True)
 
@@ -111,7 +127,10 @@ class CogWriter:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         try:
             if kind is None:
@@ -124,7 +143,10 @@ class CogWriter:
 
     def _block(self, row: int, col: int) -> Block:
         row0, col0 = row * self._side, col * self._side
-        height, width = min(self._side, self.spec.height - row0), min(self._side, self.spec.width - col0)
+        height, width = (
+            min(self._side, self.spec.height - row0),
+            min(self._side, self.spec.width - col0),
+        )
         return Block(row0=row0, col0=col0, height=height, width=width, tile=self.spec.tile)
 
     def _finish(self, block: Block) -> None:
@@ -148,21 +170,31 @@ class CogWriter:
         pixels = pixels[..., None] if pixels.ndim == 2 else pixels
         if pixels.shape != shape or pixels.dtype != np.dtype(spec.dtype):
             raise ValueError(
-                f"tile ({row}, {col}) is {shape} of {spec.dtype}, got {pixels.shape} of {pixels.dtype}"
+                f"tile ({row}, {col}) is {shape} of {spec.dtype}, got {pixels.shape} of"
+                f" {pixels.dtype}"
             )
         if valid is None and spec.nodata is not None:
-            valid = ~(np.isnan(pixels) if np.isnan(spec.nodata) else pixels == spec.nodata).all(axis=2)
+            void = np.isnan(pixels) if np.isnan(spec.nodata) else pixels == spec.nodata
+            valid = np.asarray(~void.all(axis=2))
         if valid is None or valid.all():
             return pixels, None
         if valid.shape != shape[:2]:
-            raise ValueError(f"the validity of tile ({row}, {col}) is {shape[:2]}, got {valid.shape}")
+            raise ValueError(
+                f"the validity of tile ({row}, {col}) is {shape[:2]}, got {valid.shape}"
+            )
         return (pixels, valid.astype(bool)) if valid.any() else None
 
 
-def write_array(path: Path, array: NDArray, spec: RasterSpec, valid: Valid | None = None) -> None:
-    """Write a raster that fits in memory: (height, width, bands), or (height, width) for one band."""
+def write_array(
+    path: Path, array: NDArray[Any], spec: RasterSpec, valid: Valid | None = None
+) -> None:
+    """Write a raster that fits in memory: (height, width, bands), or (height, width) for one
+    band.
+    """
     with CogWriter(path, spec) as writer:
         for block in writer.blocks():
             rows = slice(block.row0, block.row0 + block.height)
             cols = slice(block.col0, block.col0 + block.width)
-            writer.write_block(block, array[rows, cols], None if valid is None else valid[rows, cols])
+            writer.write_block(
+                block, array[rows, cols], None if valid is None else valid[rows, cols]
+            )

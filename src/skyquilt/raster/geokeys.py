@@ -11,7 +11,9 @@ PIXEL_SCALE, TIE_POINT, TRANSFORMATION = 33550, 33922, 34264
 
 
 def place_tags(spec: RasterSpec) -> list[Tag]:
-    """Scale and tie point (or the full matrix if rotated), and the keys of the CRS where there is one."""
+    """Scale and tie point (or the full matrix if rotated), and the keys of the CRS where there is
+    one.
+    """
     a, b, c, d, e, f = spec.affine
     if b == 0 and d == 0 and a > 0 and e < 0:
         tags = [Tag(PIXEL_SCALE, DOUBLE, (a, -e, 0)), Tag(TIE_POINT, DOUBLE, (0, 0, 0, c, f, 0))]
@@ -24,7 +26,8 @@ def place_tags(spec: RasterSpec) -> list[Tag]:
 def crs_tags(crs: str) -> tuple[Tag, ...]:
     """GeoKeyDirectory, doubles and text of a CRS; pixels are areas.
 
-    A plain EPSG code is three keys; for anything else GDAL writes a 1 x 1 file, whose tags are taken.
+    A plain EPSG code is three keys; for anything else GDAL writes a 1 x 1 file, whose tags are
+    taken.
     """
     import pyproj
 

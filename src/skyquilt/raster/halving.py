@@ -1,20 +1,22 @@
 """Four pixels become one: the step between overview levels, aware of what is valid."""
 
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray
+Array = NDArray[Any]
 Valid = NDArray[np.bool_]
 
 
 def halve(pixels: Array, valid: Valid | None, how: str) -> tuple[Array, Valid | None]:
     """Half-size pixels (ceil(h/2), ceil(w/2), bands) and validity of (h, w, bands) ones.
 
-    A pixel of the half is valid where any of its four is; only valid ones contribute. `valid` None = all.
-    Odd edges count twice. The plain rule runs over everything, then the few mixed pixels are done again.
+    A pixel of the half is valid where any of its four is; only valid ones contribute. `valid` None
+    = all. Odd edges count twice. The plain rule runs over everything, then the few mixed pixels are
+    done again.
     """
     pixels = _even(pixels)
     plain, mixed = RULES[how]
@@ -65,7 +67,7 @@ def _nearest(pixels: Array) -> Array:
 
 
 def _nearest_mixed(values: Array, valid: Valid) -> Array:
-    return values[valid.argmax(0), np.arange(values.shape[1])]
+    return np.asarray(values[valid.argmax(0), np.arange(values.shape[1])])
 
 
 def _max(pixels: Array) -> Array:
@@ -75,7 +77,7 @@ def _max(pixels: Array) -> Array:
 
 def _max_mixed(values: Array, valid: Valid) -> Array:
     lowest = -np.inf if values.dtype.kind == "f" else np.iinfo(values.dtype).min
-    return np.where(valid[..., None], values, lowest).max(0).astype(values.dtype)
+    return np.asarray(np.where(valid[..., None], values, lowest).max(0).astype(values.dtype))
 
 
 def _mode(pixels: Array) -> Array:
@@ -88,7 +90,7 @@ def _mode(pixels: Array) -> Array:
 def _mode_mixed(values: Array, valid: Valid) -> Array:
     votes = (values[:, None] == values[None]) & valid[None, ..., None]
     score = np.where(valid[..., None], votes.sum(1), -1)
-    return np.take_along_axis(values, score.argmax(0)[None], axis=0)[0]
+    return np.asarray(np.take_along_axis(values, score.argmax(0)[None], axis=0)[0])
 
 
 RULES: dict[str, tuple[Callable[[Array], Array], Callable[[Array, Valid], Array]]] = {

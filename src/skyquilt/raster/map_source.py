@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -27,7 +27,7 @@ Bounds = tuple[float, float, float, float]
 class Part:
     """A piece of a map in its own projection."""
 
-    pixels: NDArray
+    pixels: NDArray[Any]
     """(h, w, bands)."""
     shown: NDArray[np.bool_]
     """(h, w)."""
@@ -105,7 +105,11 @@ class TileSource:
             at = (slice(r * SIDE, (r + 1) * SIDE), slice(c * SIDE, (c + 1) * SIDE))
             pixels[at], shown[at] = tile.pixels, tile.shown
         return Part(
-            pixels=pixels, shown=shown, west=c0 * size + x, north=-r0 * size + y, gsd=self.gsd * 2**level
+            pixels=pixels,
+            shown=shown,
+            west=c0 * size + x,
+            north=-r0 * size + y,
+            gsd=self.gsd * 2**level,
         )
 
 
@@ -123,9 +127,10 @@ class FileSource:
         if not self._about:
             with rasterio.open(self.path) as raster:
                 self._about.update(
-                    crs=raster.crs.to_string() if raster.crs else "", bounds=tuple(raster.bounds),
+                    crs=raster.crs.to_string() if raster.crs else "",
+                    bounds=tuple(raster.bounds),
                     bands=3 if raster.count >= 3 else 1,
-                )  # fmt: skip
+                )
         return self._about
 
     @property
@@ -145,9 +150,11 @@ class FileSource:
 
         with rasterio.open(self.path) as raster:
             west, south, east, north = (
-                max(bounds[0], raster.bounds.left), max(bounds[1], raster.bounds.bottom),
-                min(bounds[2], raster.bounds.right), min(bounds[3], raster.bounds.top),
-            )  # fmt: skip
+                max(bounds[0], raster.bounds.left),
+                max(bounds[1], raster.bounds.bottom),
+                min(bounds[2], raster.bounds.right),
+                min(bounds[3], raster.bounds.top),
+            )
             if west >= east or south >= north:
                 return None
             step = max(gsd, raster.res[0], max(east - west, north - south) / 4096)
@@ -184,7 +191,10 @@ def picture(
 
     `scale`: values (degrees Celsius, counts) shown as black and as white, for measured values.
     """
-    columns, rows = np.arange(-1, width // NODES + 2) * NODES, np.arange(-1, height // NODES + 2) * NODES
+    columns, rows = (
+        np.arange(-1, width // NODES + 2) * NODES,
+        np.arange(-1, height // NODES + 2) * NODES,
+    )
     x = bounds[0] + (columns + 0.5) / width * (bounds[2] - bounds[0])
     y = bounds[3] - (rows + 0.5) / height * (bounds[3] - bounds[1])
     gx, gy = np.meshgrid(x, y)
@@ -224,7 +234,7 @@ def _dense(nodes: NDArray[np.float32], height: int, width: int) -> NDArray[np.fl
     return np.asarray(cv2.remap(nodes, c / NODES + 1, r / NODES + 1, cv2.INTER_LINEAR), np.float32)
 
 
-def coloured(pixels: NDArray, scale: Sequence[float] | None = None) -> NDArray[np.uint8]:
+def coloured(pixels: NDArray[Any], scale: Sequence[float] | None = None) -> NDArray[np.uint8]:
     """RGB (h, w, 3) of a map's pixels; measured values from black over red and yellow to white."""
     if pixels.dtype == np.uint8:
         return pixels if pixels.shape[2] == 3 else np.repeat(pixels[..., :1], 3, 2)
@@ -237,4 +247,9 @@ def coloured(pixels: NDArray, scale: Sequence[float] | None = None) -> NDArray[n
 def mercator(z: int, x: int, y: int) -> Bounds:
     """Bounds in EPSG:3857 of a tile."""
     size = 2 * MERCATOR / 2**z
-    return x * size - MERCATOR, MERCATOR - (y + 1) * size, (x + 1) * size - MERCATOR, MERCATOR - y * size
+    return (
+        x * size - MERCATOR,
+        MERCATOR - (y + 1) * size,
+        (x + 1) * size - MERCATOR,
+        MERCATOR - y * size,
+    )

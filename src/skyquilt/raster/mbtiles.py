@@ -10,24 +10,36 @@ from skyquilt.raster.map_source import MERCATOR, Bounds
 
 TABLES = """
 create table if not exists metadata(name text primary key, value text);
-create table if not exists tiles(zoom_level integer, tile_column integer, tile_row integer, tile_data blob);
+create table if not exists tiles(zoom_level integer, tile_column integer, tile_row integer,
+  tile_data blob);
 create unique index if not exists tile_index on tiles(zoom_level, tile_column, tile_row);
 """
 
 
 def write_mbtiles(
-    path: Path, tiles: Iterable[tuple[int, int, int, bytes | None]], *, name: str, bounds: Bounds,
+    path: Path,
+    tiles: Iterable[tuple[int, int, int, bytes | None]],
+    *,
+    name: str,
+    bounds: Bounds,
     zooms: tuple[int, int],
-) -> None:  # fmt: skip
-    """Adds or replaces tiles (zoom, column, row from the north, WebP; None removes) in one transaction.
+) -> None:
+    """Adds or replaces tiles (zoom, column, row from the north, WebP; None removes) in one
+    transaction.
 
     `bounds` in degrees. Raises OutputError where the file cannot be written.
     """
+    west, south, east, north = bounds
     about = {
-        "name": name, "format": "webp", "type": "overlay", "version": "1.3", "minzoom": str(zooms[0]),
-        "maxzoom": str(zooms[1]), "bounds": ",".join(f"{v:.8f}" for v in bounds),
-        "center": f"{(bounds[0] + bounds[2]) / 2:.8f},{(bounds[1] + bounds[3]) / 2:.8f},{zooms[1] - 2}",
-    }  # fmt: skip
+        "name": name,
+        "format": "webp",
+        "type": "overlay",
+        "version": "1.3",
+        "minzoom": str(zooms[0]),
+        "maxzoom": str(zooms[1]),
+        "bounds": ",".join(f"{v:.8f}" for v in bounds),
+        "center": f"{(west + east) / 2:.8f},{(south + north) / 2:.8f},{zooms[1] - 2}",
+    }
     try:
         with closing(sqlite3.connect(path, timeout=10)) as db:
             db.executescript(TABLES)
@@ -37,12 +49,15 @@ def write_mbtiles(
                     key = (z, x, 2**z - 1 - y)  # rows count from the south there
                     if data is None:
                         db.execute(
-                            "delete from tiles where zoom_level=? and tile_column=? and tile_row=?", key
+                            "delete from tiles where zoom_level=? and tile_column=? and tile_row=?",
+                            key,
                         )
                     else:
                         db.execute("insert or replace into tiles values (?, ?, ?, ?)", (*key, data))
     except sqlite3.Error as error:
-        raise OutputError(f"{path} cannot be written ({error}); make room, it is tried again") from error
+        raise OutputError(
+            f"{path} cannot be written ({error}); make room, it is tried again"
+        ) from error
 
 
 def touched(boxes: Sequence[Bounds], z: int) -> set[tuple[int, int]]:

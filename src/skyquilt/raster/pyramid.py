@@ -1,9 +1,12 @@
-"""The levels of a raster being written: each tile is encoded once and gives its half to the one above."""
+"""The levels of a raster being written: each tile is encoded once and gives its half to the one
+above.
+"""
 
 import struct
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +15,12 @@ from skyquilt.raster.codecs import TileEncoder, pack_mask, unpack_mask
 from skyquilt.raster.halving import halve
 from skyquilt.raster.spool import Spool
 
-Pixels = NDArray
+Pixels = NDArray[Any]
 Valid = NDArray[np.bool_]
 Part = tuple[Pixels, Valid | None]
-"""Pixels (h, w, bands) and their validity (h, w), None = all. None in place of a part = nothing valid."""
+"""Pixels (h, w, bands) and their validity (h, w), None = all. None in place of a part = nothing
+valid.
+"""
 
 _RECORD = struct.Struct("<IIQQ")
 
@@ -32,14 +37,21 @@ class _Open:
 class Pyramid:
     """Encodes tiles into a spool, level upon level; open overview tiles are all it holds in memory.
 
-    The halves that tiles of `block_level` give away are spooled too: a resumed run rebuilds the levels above
-    from them (`record`, `restore`). Safe for several threads.
+    The halves that tiles of `block_level` give away are spooled too: a resumed run rebuilds the
+    levels above from them (`record`, `restore`). Safe for several threads.
     """
 
     def __init__(self, encoder: TileEncoder, spool: Spool, block_level: int) -> None:
-        self.spec, self._encoder, self._spool, self._block_level = encoder.spec, encoder, spool, block_level
+        self.spec, self._encoder, self._spool, self._block_level = (
+            encoder.spec,
+            encoder,
+            spool,
+            block_level,
+        )
         self.indices = [np.zeros((*grid, 3), np.uint64) for grid in self.spec.grids]
-        """Per level (rows, columns, 3): offset in the spool, bytes of image, bytes of mask; 0 = empty."""
+        """Per level (rows, columns, 3): offset in the spool, bytes of image, bytes of mask; 0 =
+        empty.
+        """
         self._open: dict[tuple[int, int, int], _Open] = {}
         self._halves: dict[tuple[int, int], tuple[int, int]] = {}
         self._lock = threading.Lock()
@@ -57,9 +69,13 @@ class Pyramid:
         self._pass_up(level, row, col, half)
 
     def record(self, row: int, col: int) -> bytes:
-        """What a resumed run needs to know about a finished block: where its tiles are, and its half."""
+        """What a resumed run needs to know about a finished block: where its tiles are, and its
+        half.
+        """
         half = self._halves.pop((row, col), (0, 0))
-        return _RECORD.pack(row, col, *half) + b"".join(part.tobytes() for part in self._slices(row, col))
+        return _RECORD.pack(row, col, *half) + b"".join(
+            part.tobytes() for part in self._slices(row, col)
+        )
 
     def restore(self, record: bytes) -> tuple[int, int]:
         """Take a block of an earlier run as stored; returns its row and column."""
@@ -94,7 +110,9 @@ class Pyramid:
                 return
             del self._open[above]
         valid = None if target.valid.all() else target.valid
-        self.store(*above, None if valid is not None and not valid.any() else (target.pixels, valid))
+        self.store(
+            *above, None if valid is not None and not valid.any() else (target.pixels, valid)
+        )
 
     def _opened(self, level: int, row: int, col: int) -> _Open:
         height, width = self.spec.tile_size(level, row, col)

@@ -3,6 +3,7 @@
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,16 +44,22 @@ def open_map(path: Path) -> MapFile | None:
             if not placed:
                 return None
             return MapFile(
-                path=path, width=raster.width, height=raster.height, bands=3 if raster.count >= 3 else 1,
-                dtype=raster.dtypes[0], affine=tuple(raster.transform)[:6], unit=raster.units[0] or "",
+                path=path,
+                width=raster.width,
+                height=raster.height,
+                bands=3 if raster.count >= 3 else 1,
+                dtype=raster.dtypes[0],
+                affine=tuple(raster.transform)[:6],
+                unit=raster.units[0] or "",
                 crs=raster.crs.to_wkt() if raster.crs else None,
-            )  # fmt: skip
+            )
     except rasterio.errors.RasterioError:
         return None
 
 
-def read_reduced(source: MapFile, longest: int) -> tuple[NDArray, NDArray[np.bool_]]:
-    """Pixels (h, w[, 3]) and validity (h, w), averaged so that the longer side has at most `longest` px.
+def read_reduced(source: MapFile, longest: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Pixels (h, w[, 3]) and validity (h, w), averaged so that the longer side has at most
+    `longest` px.
 
     Raises:
         OSError: the file's data are damaged.
@@ -64,7 +71,7 @@ def read_reduced(source: MapFile, longest: int) -> tuple[NDArray, NDArray[np.boo
 
 def read_window(
     source: MapFile, row: int, column: int, height: int, width: int
-) -> tuple[NDArray, NDArray[np.bool_]]:
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """Pixels (height, width[, 3]) and validity of a part that lies inside the raster.
 
     Raises:
@@ -75,16 +82,20 @@ def read_window(
     return _read(source, Window(column, row, width, height), (height, width))
 
 
-def _read(source: MapFile, window: object, shape: tuple[int, int]) -> tuple[NDArray, NDArray[np.bool_]]:
+def _read(
+    source: MapFile, window: object, shape: tuple[int, int]
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     import rasterio
     from rasterio.enums import Resampling
 
     try:
         with rasterio.open(source.path) as raster:
             values = raster.read(
-                list(range(1, source.bands + 1)), window=window, out_shape=(source.bands, *shape),
+                list(range(1, source.bands + 1)),
+                window=window,
+                out_shape=(source.bands, *shape),
                 resampling=Resampling.average,
-            )  # fmt: skip
+            )
             valid = raster.dataset_mask(window=window, out_shape=shape) > 0
     except rasterio.errors.RasterioError as error:
         raise OSError(f"its pixels cannot be decoded ({error})") from error

@@ -25,7 +25,8 @@ class RasterSpec:
     dtype: str
     """One of `DTYPES`."""
     transform: Sequence[float]
-    """(a, b, c, d, e, f), as `affine.Affine`: corner x = a col + b row + c, y = d col + e row + f."""
+    """(a, b, c, d, e, f), as `affine.Affine`: corner x = a col + b row + c, y = d col + e row + f.
+    """
     crs: str | None = None
     """As pyproj reads it (`EPSG:32615`, WKT); None = ungeoreferenced."""
     nodata: float | None = None
@@ -50,14 +51,17 @@ class RasterSpec:
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1 or self.bands < 1:
             raise ValueError(
-                f"a raster needs at least 1 x 1 x 1, asked for {self.width} x {self.height} x {self.bands}"
+                f"a raster needs at least 1 x 1 x 1, asked for {self.width} x {self.height} x"
+                f" {self.bands}"
             )
         if self.dtype not in DTYPES:
             raise ValueError(f"dtype is one of {', '.join(DTYPES)}, asked for {self.dtype}")
         if self.tile < 16 or self.tile % 16:
             raise ValueError(f"tile is a multiple of 16 px, asked for {self.tile}")
         if self.compress == "jpeg" and (self.dtype != "uint8" or self.bands not in (1, 3)):
-            raise ValueError(f"JPEG takes 1 or 3 bands of uint8, asked for {self.bands} of {self.dtype}")
+            raise ValueError(
+                f"JPEG takes 1 or 3 bands of uint8, asked for {self.bands} of {self.dtype}"
+            )
         if self.nodata is not None and self.compress == "jpeg":
             raise ValueError("JPEG does not keep a nodata value; ask for a mask instead")
         if self.nodata is not None and not _holds(np.dtype(self.dtype), self.nodata):
@@ -79,7 +83,9 @@ class RasterSpec:
 
     @property
     def levels(self) -> tuple[tuple[int, int], ...]:
-        """(height, width) of each level in px: full size, then halves until one tile holds everything."""
+        """(height, width) of each level in px: full size, then halves until one tile holds
+        everything.
+        """
         sizes = [(self.height, self.width)]
         while max(sizes[-1]) > self.tile:
             h, w = sizes[-1]

@@ -1,7 +1,8 @@
 """Encoded tiles on their way into a file: an append-only heap and a journal of what is finished.
 
-The heap grows with every tile. Each record of the journal says how far the heap reached when a piece of work
-was finished; what a killed run left behind its last whole record is cut off on reopening.
+The heap grows with every tile. Each record of the journal says how far the heap reached when a
+piece of work was finished; what a killed run left behind its last whole record is cut off on
+reopening.
 """
 
 import os
@@ -18,7 +19,8 @@ _HEAD = struct.Struct("<IIQ")
 
 
 class Spool:
-    """A folder with `tiles.bin` and `journal.bin`, valid for one key only. Safe for several threads.
+    """A folder with `tiles.bin` and `journal.bin`, valid for one key only. Safe for several
+    threads.
 
     What lies there under another key is dropped; with `fresh` everything is.
     """
@@ -92,7 +94,11 @@ def _whole_records(journal: bytes, heap_size: int) -> list[tuple[bytes, int, int
     while at + _HEAD.size <= len(journal):
         size, crc, heap_end = _HEAD.unpack_from(journal, at)
         payload = journal[at + _HEAD.size : at + _HEAD.size + size]
-        if len(payload) < size or crc != zlib.crc32(payload, heap_end & 0xFFFFFFFF) or heap_end > heap_size:
+        if (
+            len(payload) < size
+            or crc != zlib.crc32(payload, heap_end & 0xFFFFFFFF)
+            or heap_end > heap_size
+        ):
             break
         at += _HEAD.size + size
         found.append((payload, heap_end, at))

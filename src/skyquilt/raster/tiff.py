@@ -41,7 +41,9 @@ def header(first_directory: int, big: bool) -> bytes:
 
 
 def directories(ifds: Sequence[Sequence[Tag]], start: int, big: bool) -> bytes:
-    """All directories, chained, each followed by its long values; `start` is their offset in the file."""
+    """All directories, chained, each followed by its long values; `start` is their offset in the
+    file.
+    """
     out = bytearray()
     for number, tags in enumerate(ifds):
         out += _directory(tags, start + len(out), big, last=number == len(ifds) - 1)

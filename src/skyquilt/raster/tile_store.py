@@ -1,4 +1,6 @@
-"""The growing map: square tiles in the survey's own grid, with coarser levels, in one transactional file."""
+"""The growing map: square tiles in the survey's own grid, with coarser levels, in one transactional
+file.
+"""
 
 import sqlite3
 import threading
@@ -7,6 +9,7 @@ from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import simplejpeg
@@ -24,7 +27,8 @@ QUALITY = 90
 KEPT = 256
 """Decoded tiles at hand."""
 TABLES = (
-    "create table if not exists tile(layer text, level integer, row integer, col integer, version integer not null,"
+    "create table if not exists tile(layer text, level integer, row integer, col integer, version"
+    " integer not null,"
     " body blob not null, primary key(layer, level, row, col)) without rowid",
     "create table if not exists owed(layer text, level integer, row integer, col integer,"
     " primary key(layer, level, row, col)) without rowid",
@@ -39,7 +43,9 @@ SETTLED = "delete from owed where layer=? and level=? and row=? and col=?"
 
 @dataclass(frozen=True, order=True)
 class Address:
-    """Which tile: row counts southwards, column eastwards from the map frame's origin, in tiles of that level."""
+    """Which tile: row counts southwards, column eastwards from the map frame's origin, in tiles of
+    that level.
+    """
 
     layer: str
     """Name of the layer."""
@@ -67,7 +73,11 @@ class Address:
         """Its pixels; `gsd` in m is that of level 0."""
         size = gsd * 2**self.level
         return Grid(
-            west=self.col * SIDE * size, north=-self.row * SIDE * size, gsd=size, width=SIDE, height=SIDE
+            west=self.col * SIDE * size,
+            north=-self.row * SIDE * size,
+            gsd=size,
+            width=SIDE,
+            height=SIDE,
         )
 
 
@@ -75,7 +85,7 @@ class Address:
 class Tile:
     """A tile's content."""
 
-    pixels: NDArray
+    pixels: NDArray[Any]
     """(SIDE, SIDE, bands) uint8 or float32."""
     shown: NDArray[np.bool_]
     """(SIDE, SIDE) where there is anything."""
@@ -85,8 +95,10 @@ def encoded(tile: Tile) -> bytes:
     """Bytes of a tile: JPEG with a mask, or measured values without loss."""
     mask = zlib.compress(np.packbits(tile.shown).tobytes(), 1)
     if tile.pixels.dtype == np.uint8:
-        body = simplejpeg.encode_jpeg(np.ascontiguousarray(tile.pixels), quality=QUALITY, colorspace="RGB")
-        return b"J" + len(mask).to_bytes(4, "little") + mask + body
+        body = simplejpeg.encode_jpeg(
+            np.ascontiguousarray(tile.pixels), quality=QUALITY, colorspace="RGB"
+        )
+        return bytes(b"J" + len(mask).to_bytes(4, "little") + mask + body)
     values = zlib.compress(np.ascontiguousarray(tile.pixels, np.float32).tobytes(), 1)
     return b"F" + len(mask).to_bytes(4, "little") + mask + values
 
@@ -112,7 +124,9 @@ class TileStore:
             OutputError: it cannot be opened.
         """
         self.path, self._lock = Path(path), threading.RLock()
-        self._extents: dict[str, tuple[tuple[int, int], tuple[float, float, float, float] | None]] = {}
+        self._extents: dict[
+            str, tuple[tuple[int, int], tuple[float, float, float, float] | None]
+        ] = {}
         self._kept: OrderedDict[Address, tuple[int, Tile]] = OrderedDict()
         try:
             uri = f"{self.path.absolute().as_uri()}?mode={'rwc' if write else 'ro'}"
@@ -131,13 +145,16 @@ class TileStore:
             raise OutputError(f"{path} cannot be opened ({error})") from error
         if side != SIDE:
             self._db.close()
-            raise OutputError(f"{path} was written by another version of Skyquilt; use another folder")
+            raise OutputError(
+                f"{path} was written by another version of Skyquilt; use another folder"
+            )
 
     def version(self, address: Address) -> int:
         """How often the tile was written; 0 where there is none."""
         with self._lock:
             found = self._db.execute(
-                "select version from tile where layer=? and level=? and row=? and col=?", _key(address)
+                "select version from tile where layer=? and level=? and row=? and col=?",
+                _key(address),
             ).fetchone()
         return int(found[0]) if found else 0
 
@@ -145,7 +162,8 @@ class TileStore:
         """The tile, or None."""
         with self._lock:
             found = self._db.execute(
-                "select version, body from tile where layer=? and level=? and row=? and col=?", _key(address)
+                "select version, body from tile where layer=? and level=? and row=? and col=?",
+                _key(address),
             ).fetchone()
             if found is None:
                 return None
@@ -170,9 +188,11 @@ class TileStore:
         owing: Iterable[Address] = (),
         settled: Iterable[Address] = (),
     ) -> None:
-        """Writes tiles, all in one transaction; the coarser ones above them are made by `raise_levels`.
+        """Writes tiles, all in one transaction; the coarser ones above them are made by
+        `raise_levels`.
 
-        `owing`: tiles of other layers that are to follow; they are remembered until they are `settled`.
+        `owing`: tiles of other layers that are to follow; they are remembered until they are
+        `settled`.
 
         Raises:
             OutputError: the disk is full.
@@ -182,14 +202,17 @@ class TileStore:
             try:
                 self._db.execute("begin immediate")
                 self._db.executemany(PUT, rows)
-                self._db.executemany("insert or ignore into owed values (?, ?, ?, ?)", map(_key, owing))
+                self._db.executemany(
+                    "insert or ignore into owed values (?, ?, ?, ?)", map(_key, owing)
+                )
                 self._db.executemany(SETTLED, map(_key, settled))
                 self._db.execute("commit")
             except sqlite3.Error as error:
                 if self._db.in_transaction:
                     self._db.execute("rollback")
                 raise OutputError(
-                    f"the disk is full: {self.path} cannot grow ({error}). Make room; mapping goes on then"
+                    f"the disk is full: {self.path} cannot grow ({error}). Make room; mapping goes"
+                    " on then"
                 ) from error
 
     def owed(self) -> list[Address]:
@@ -199,7 +222,9 @@ class TileStore:
         return [Address(str(layer), int(z), int(r), int(c)) for layer, z, r, c in found]
 
     def raise_levels(self, changed: Iterable[Address], *, settled: Iterable[Address] = ()) -> int:
-        """Makes every coarser tile above those of level 0 that changed; returns how many. `settled`: as for `put`."""
+        """Makes every coarser tile above those of level 0 that changed; returns how many.
+        `settled`: as for `put`.
+        """
         done: dict[Address, Tile] = {}
         level = sorted(set(changed))
         while level and level[0].level + 1 < LEVELS:
@@ -221,8 +246,13 @@ class TileStore:
         shown = np.zeros((SIDE, SIDE), bool)
         for k, part in enumerate(parts):
             if part is not None:
-                at = (slice(k // 2 * half, (k // 2 + 1) * half), slice(k % 2 * half, (k % 2 + 1) * half))
-                small, valid = halve(part.pixels, None if part.shown.all() else part.shown, "average")
+                at = (
+                    slice(k // 2 * half, (k // 2 + 1) * half),
+                    slice(k % 2 * half, (k % 2 + 1) * half),
+                )
+                small, valid = halve(
+                    part.pixels, None if part.shown.all() else part.shown, "average"
+                )
                 pixels[at], shown[at] = small, True if valid is None else valid
         return Tile(pixels=pixels, shown=shown)
 
@@ -245,9 +275,14 @@ class TileStore:
             return [n for n in found if self._db.execute(TOP, (n, LEVELS - 1)).fetchone()]
 
     def extent(self, layer: str, gsd: float) -> tuple[float, float, float, float] | None:
-        """West, south, east, north in m (map frame) of what a layer shows, to a few of its pixels; None if nothing."""
+        """West, south, east, north in m (map frame) of what a layer shows, to a few of its pixels;
+        None if nothing.
+        """
         with self._lock:
-            stamp = (int(self._db.execute("pragma data_version").fetchone()[0]), self._db.total_changes)
+            stamp = (
+                int(self._db.execute("pragma data_version").fetchone()[0]),
+                self._db.total_changes,
+            )
             known = self._extents.get(layer)
         if known is not None and known[0] == stamp:
             return known[1]
@@ -267,8 +302,14 @@ class TileStore:
                 continue
             grid = address.grid(gsd)
             rows, columns = np.flatnonzero(tile.shown.any(1)), np.flatnonzero(tile.shown.any(0))
-            boxes.append((grid.west + columns[0] * grid.gsd, grid.north - (rows[-1] + 1) * grid.gsd,
-                          grid.west + (columns[-1] + 1) * grid.gsd, grid.north - rows[0] * grid.gsd))  # fmt: skip
+            boxes.append(
+                (
+                    grid.west + columns[0] * grid.gsd,
+                    grid.north - (rows[-1] + 1) * grid.gsd,
+                    grid.west + (columns[-1] + 1) * grid.gsd,
+                    grid.north - rows[0] * grid.gsd,
+                )
+            )
         if not boxes:
             return None
         low, high = np.min(boxes, axis=0), np.max(boxes, axis=0)
@@ -285,7 +326,9 @@ def _key(address: Address) -> tuple[str, int, int, int]:
 
 
 def covering(layer: str, level: int, gsd: float, bounds: Iterable[float]) -> list[Address]:
-    """Tiles of a level that bounds (west, south, east, north) in m of the map frame touch; `gsd` of level 0."""
+    """Tiles of a level that bounds (west, south, east, north) in m of the map frame touch; `gsd` of
+    level 0.
+    """
     west, south, east, north = bounds
     size = SIDE * gsd * 2**level
     rows = range(int(np.floor(-north / size)), int(np.floor(-south / size)) + 1)

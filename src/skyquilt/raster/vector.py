@@ -13,14 +13,20 @@ from skyquilt.raster.atomic import write_text
 
 DECIMALS = 9
 """Of a degree: a tenth of a millimetre."""
-UNGEOREFERENCED = "not georeferenced: the coordinates are those of the mosaic, not longitude and latitude"
+UNGEOREFERENCED = (
+    "not georeferenced: the coordinates are those of the mosaic, not longitude and latitude"
+)
 
 Properties = Mapping[str, Any]
 Project = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
-def points(path: Path, features: Iterable[tuple[ArrayLike, Properties]], *, crs: str | None) -> None:
-    """Write a collection of points, each (x, y) or (x, y, height) in `crs`, with their properties."""
+def points(
+    path: Path, features: Iterable[tuple[ArrayLike, Properties]], *, crs: str | None
+) -> None:
+    """Write a collection of points, each (x, y) or (x, y, height) in `crs`, with their
+    properties.
+    """
     _write(path, features, crs, "Point", lambda place, project: _places([place], project)[0])
 
 
@@ -32,14 +38,22 @@ def lines(path: Path, features: Iterable[tuple[ArrayLike, Properties]], *, crs: 
 def polygons(
     path: Path, features: Iterable[tuple[Sequence[ArrayLike], Properties]], *, crs: str | None
 ) -> None:
-    """Write a collection of polygons: each a list of rings (n, 2) or (n, 3) in `crs`, the outer one first."""
+    """Write a collection of polygons: each a list of rings (n, 2) or (n, 3) in `crs`, the outer one
+    first.
+    """
     _write(path, features, crs, "Polygon", _rings)
 
 
 def _write(
-    path: Path, features: Iterable[tuple[Any, Properties]], crs: str | None, kind: str, coordinates: Any
+    path: Path,
+    features: Iterable[tuple[Any, Properties]],
+    crs: str | None,
+    kind: str,
+    coordinates: Any,
 ) -> None:
-    """Heights pass through as they are. Without a CRS coordinates do too, and every feature says so."""
+    """Heights pass through as they are. Without a CRS coordinates do too, and every feature says
+    so.
+    """
     project = _projection(crs) if crs else lambda places: places
     extra = {} if crs else {"note": UNGEOREFERENCED}
     collection = {

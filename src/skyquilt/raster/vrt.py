@@ -1,6 +1,7 @@
 """A GDAL virtual raster: somebody else's pixels with ground control points of ours."""
 
 from pathlib import Path
+from typing import Any
 from xml.sax.saxutils import escape, quoteattr
 
 from numpy.typing import NDArray
@@ -10,13 +11,19 @@ _COLOURS = ("Red", "Green", "Blue")
 
 
 def vrt(
-    source: Path, *, size: tuple[int, int], bands: int, dtype: str, px: NDArray, ground: NDArray,
+    source: Path,
+    *,
+    size: tuple[int, int],
+    bands: int,
+    dtype: str,
+    px: NDArray[Any],
+    ground: NDArray[Any],
     crs: str | None,
-) -> str:  # fmt: skip
+) -> str:
     """XML of a raster of `size` (width, height) whose pixels are those of `source`.
 
-    px (n, 2) are columns and rows counted from the outer corner, ground (n, 2) x and y of `crs` (or of
-    another picture's plane, if None).
+    px (n, 2) are columns and rows counted from the outer corner, ground (n, 2) x and y of `crs` (or
+    of another picture's plane, if None).
     """
     points = "\n".join(
         f'    <GCP Id="{k}" Pixel="{p[0]:.4f}" Line="{p[1]:.4f}" X="{g[0]:.9f}" Y="{g[1]:.9f}"/>'
@@ -25,7 +32,8 @@ def vrt(
     body = "\n".join(_band(source, k, bands, _TYPES[dtype]) for k in range(1, bands + 1))
     return (
         f'<VRTDataset rasterXSize="{size[0]}" rasterYSize="{size[1]}">\n'
-        f"  <GCPList Projection={quoteattr(crs or '')}>\n{points}\n  </GCPList>\n{body}\n</VRTDataset>\n"
+        f"  <GCPList Projection={quoteattr(crs or '')}>\n{points}\n "
+        f" </GCPList>\n{body}\n</VRTDataset>\n"
     )
 
 

@@ -5,7 +5,7 @@ pixel is some photo's.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import cv2
 import numpy as np
@@ -21,10 +21,11 @@ class Layer:
 
     photo: int
     """Index of the photo."""
-    pixels: NDArray
+    pixels: NDArray[Any]
     """(h, w, bands)."""
     score: Float
-    """(h, w) squared tangent of the angle off the vertical; infinite where the photo sees nothing."""
+    """(h, w) squared tangent of the angle off the vertical; infinite where the photo sees nothing.
+    """
     centre: tuple[float, float]
     """Camera's plan position in m."""
     height: float
@@ -39,14 +40,14 @@ class Blend(Protocol):
         """Pixels beyond the window that the rule must see."""
 
     def rank(self, order: Order, score: Float) -> Float:
-        """What decides between photos: the lowest wins. `order`: position in order of capture, of one photo
-        or of each score's.
+        """What decides between photos: the lowest wins. `order`: position in order of capture, of
+        one photo or of each score's.
         """
 
     def reach(self, gsd: float) -> float:
         """How far, in rank, a photo behind the winner still matters; infinite = all photos do."""
 
-    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray, NDArray[np.int32]]:
+    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray[Any], NDArray[np.int32]]:
         """Pixels (h, w, bands) and which photo leads each (h, w), -1 = none."""
 
 
@@ -64,12 +65,14 @@ def _photos(lead: NDArray[np.int32], layers: Sequence[Layer]) -> NDArray[np.int3
     return np.asarray(np.take(table, lead))
 
 
-def _weighted(layers: Sequence[Layer], weights: Sequence[Float]) -> NDArray:
+def _weighted(layers: Sequence[Layer], weights: Sequence[Float]) -> NDArray[Any]:
     """Sum of pixels by weights that add up to one (zero where no photo sees)."""
     kind = layers[0].pixels.dtype
     total = np.zeros(layers[0].pixels.shape, np.float32)
     for layer, weight in zip(layers, weights, strict=True):
-        part = np.where(weight[..., None] > 0, layer.pixels, 0) if kind.kind == "f" else layer.pixels
+        part = (
+            np.where(weight[..., None] > 0, layer.pixels, 0) if kind.kind == "f" else layer.pixels
+        )
         total += part * weight[..., None]
     return (
         np.clip(np.rint(total), 0, np.iinfo(kind).max).astype(kind)
@@ -95,15 +98,19 @@ class Feather:
         """Half the blend's width from the seam of two cameras a height apart."""
         return self.width_px * gsd
 
-    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray, NDArray[np.int32]]:
-        """Ramps across seams, whose distance follows from the ranks: they differ linearly in the plane."""
+    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray[Any], NDArray[np.int32]]:
+        """Ramps across seams, whose distance follows from the ranks: they differ linearly in the
+        plane.
+        """
         lead = leader(layers, [layer.score for layer in layers])
         hard = _picked(layers, lead)
         if self.width_px > 0 and len(layers) > 1:
             self._soften(hard, layers, lead, gsd)
         return hard, _photos(lead, layers)
 
-    def _soften(self, hard: NDArray, layers: Sequence[Layer], lead: NDArray[np.int32], gsd: float) -> None:
+    def _soften(
+        self, hard: NDArray[Any], layers: Sequence[Layer], lead: NDArray[np.int32], gsd: float
+    ) -> None:
         """Blends, in place, the few pixels that lie within half a width of a seam."""
         slopes = _slopes(layers, gsd)
         steepest = slopes.max()
@@ -142,17 +149,21 @@ def _slopes(layers: Sequence[Layer], gsd: float) -> Float:
     centre = np.array([layer.centre for layer in layers])
     height = np.array([layer.height for layer in layers])
     apart = np.hypot(*(centre[:, None] - centre).transpose(2, 0, 1))
-    return (2 * np.maximum(apart, 0.05 * height[:, None]) * gsd / np.outer(height, height)).astype(np.float32)
+    return np.asarray(
+        (2 * np.maximum(apart, 0.05 * height[:, None]) * gsd / np.outer(height, height)).astype(
+            np.float32
+        )
+    )
 
 
-def _picked(layers: Sequence[Layer], lead: NDArray[np.int32]) -> NDArray:
+def _picked(layers: Sequence[Layer], lead: NDArray[np.int32]) -> NDArray[Any]:
     """Each pixel from its leading layer; zero or NaN where there is none."""
     kind = layers[0].pixels.dtype
     out = np.full(layers[0].pixels.shape, np.nan if kind.kind == "f" else 0, kind)
     for position, layer in enumerate(layers):
-        cv2.copyTo(layer.pixels, (lead == position).view(np.uint8), out) if kind == np.uint8 else np.copyto(
-            out, layer.pixels, where=(lead == position)[..., None]
-        )
+        cv2.copyTo(
+            layer.pixels, (lead == position).view(np.uint8), out
+        ) if kind == np.uint8 else np.copyto(out, layer.pixels, where=(lead == position)[..., None])
     return out
 
 
@@ -171,7 +182,7 @@ class First:
         """Only the winner matters."""
         return 0.0
 
-    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray, NDArray[np.int32]]:
+    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray[Any], NDArray[np.int32]]:
         """The first layer that sees the pixel; layers come in order of capture."""
         ranks = [self.rank(k, layer.score) for k, layer in enumerate(layers)]
         lead = leader(layers, ranks)
@@ -193,7 +204,7 @@ class Average:
         """All photos matter."""
         return float(np.inf)
 
-    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray, NDArray[np.int32]]:
+    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray[Any], NDArray[np.int32]]:
         """Equal weights."""
         seen = [np.isfinite(layer.score).astype(np.float32) for layer in layers]
         number = np.maximum(np.sum(seen, axis=0, dtype=np.float32), 1e-6)
@@ -217,7 +228,7 @@ class Multiband:
     @property
     def margin(self) -> int:
         """Tiles see each other's rim, so that they meet without a step."""
-        return 4 * 2**self.levels
+        return int(4 * 2**self.levels)
 
     def rank(self, order: Order, score: Float) -> Float:
         """The angle off the vertical."""
@@ -227,14 +238,14 @@ class Multiband:
         """As wide as the coarsest blend."""
         return 4.0 * self.margin * gsd
 
-    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray, NDArray[np.int32]]:
+    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray[Any], NDArray[np.int32]]:
         """Laplacian pyramids of the layers, weighted by Gaussian pyramids of their territories."""
         lead = leader(layers, [layer.score for layer in layers])
         hard = _picked(layers, lead)
         if len(layers) == 1:
             return hard, _photos(lead, layers)
-        total: list[NDArray] = []
-        mass: list[NDArray] = []
+        total: list[NDArray[Any]] = []
+        mass: list[NDArray[Any]] = []
         for position, layer in enumerate(layers):
             bands = _laplacian(_filled(layer, hard), self.levels)
             weights = _gaussian((lead == position).astype(np.float32), self.levels)
@@ -244,7 +255,9 @@ class Multiband:
                     mass.append(np.zeros_like(weight))
                 total[level] += band * weight[..., None]
                 mass[level] += weight
-        out = _collapse([t / np.maximum(m, 1e-6)[..., None] for t, m in zip(total, mass, strict=True)])
+        out = _collapse(
+            [t / np.maximum(m, 1e-6)[..., None] for t, m in zip(total, mass, strict=True)]
+        )
         kind = layers[0].pixels.dtype
         if kind.kind == "u":
             out = np.clip(np.rint(out), 0, np.iinfo(kind).max)
@@ -253,8 +266,10 @@ class Multiband:
         return blended, _photos(lead, layers)
 
 
-def _filled(layer: Layer, hard: NDArray) -> Float:
-    """The layer, continued by the hard composite where it sees nothing, so that no black bleeds in."""
+def _filled(layer: Layer, hard: NDArray[Any]) -> Float:
+    """The layer, continued by the hard composite where it sees nothing, so that no black bleeds
+    in.
+    """
     seen = np.isfinite(layer.score)[..., None]
     return np.nan_to_num(np.where(seen, layer.pixels, hard).astype(np.float32))
 

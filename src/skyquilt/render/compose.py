@@ -2,26 +2,20 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import (
-    STEP,
-    Nodes,
-    View,
-    cut,
-    densify,
-    inside_everywhere,
-)
+from skyquilt.imaging.views import STEP, Nodes, View, cut, densify, inside_everywhere
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.render.blend import Blend, Layer
 from skyquilt.render.exposure import NEUTRAL, Exposure, image_place, with_odds
 from skyquilt.render.plan import Plan, planned, stale
 
-PhotoPixels = Callable[[int], NDArray]
+PhotoPixels = Callable[[int], NDArray[Any]]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""
 PIECE = 256
 """Pixels of a piece composed at a time."""
@@ -33,7 +27,7 @@ MOST_PADDED = 12
 class Composed:
     """A window of the map."""
 
-    pixels: NDArray
+    pixels: NDArray[Any]
     """(h, w, bands)."""
     photo: NDArray[np.int32]
     """(h, w) index of the photo that leads each pixel, -1 = none."""
@@ -69,19 +63,27 @@ class Composer:
     def plan(self, window: Window, *, counted: bool = False, earlier: Plan | None = None) -> Plan:
         """Which photos can show where; costs little, and no photo is read.
 
-        `counted`: all photos that see the window are in the plan, not only those that others do not surely hide.
-        `earlier`: a plan of the same window; photos that have not changed since are not projected again, and
-        heights stay where their change does not show.
+        `counted`: all photos that see the window are in the plan, not only those that others do not
+        surely hide. `earlier`: a plan of the same window; photos that have not changed since are
+        not projected again, and heights stay where their change does not show.
         """
         return planned(
-            window, self.grid, self.views, self.surface, self.blend, counted=counted, earlier=earlier
+            window,
+            self.grid,
+            self.views,
+            self.surface,
+            self.blend,
+            counted=counted,
+            earlier=earlier,
         )
 
     def drawn(self, plan: Plan) -> Composed:
         """A window as planned, piece by piece."""
         window, margin = plan.window, plan.margin
         out = np.full(
-            (window.height, window.width, self.bands), np.nan if self.dtype.kind == "f" else 0, self.dtype
+            (window.height, window.width, self.bands),
+            np.nan if self.dtype.kind == "f" else 0,
+            self.dtype,
         )
         photo = np.full((window.height, window.width), -1, np.int32)
         for row in range(0, window.height, PIECE):
@@ -95,7 +97,8 @@ class Composer:
         return Composed(pixels=out, photo=photo, views=self._counted(plan.nodes, margin, window))
 
     def redrawn(self, plan: Plan, earlier: Plan, before: Composed) -> Composed:
-        """What `drawn(plan)` gives, from what an earlier plan gave: only cells that look different are touched.
+        """What `drawn(plan)` gives, from what an earlier plan gave: only cells that look different
+        are touched.
 
         For merge rules that look at nothing beyond a pixel (margin 0).
         """
@@ -109,7 +112,10 @@ class Composer:
             )
             h, w = rows.stop - rows.start, columns.stop - columns.start
             empty = np.nan if self.dtype.kind == "f" else 0
-            new, lead = self._piece(plan, rows.start, columns.start, h, w, changed) or (empty, np.int32(-1))
+            new, lead = self._piece(plan, rows.start, columns.start, h, w, changed) or (
+                empty,
+                np.int32(-1),
+            )
             where = changed.repeat(STEP, 0).repeat(STEP, 1)[rows, columns]
             np.copyto(out[rows, columns], new, where=where[..., None], casting="unsafe")
             np.copyto(photo[rows, columns], lead, where=where)
@@ -124,9 +130,16 @@ class Composer:
         return count
 
     def _piece(
-        self, plan: Plan, row: int, column: int, h: int, w: int, wanted: NDArray[np.bool_] | None = None
-    ) -> tuple[NDArray, NDArray[np.int32]] | None:
-        """Pixels (h, w, bands) and leading photo (h, w) from a row and column of the window of the nodes.
+        self,
+        plan: Plan,
+        row: int,
+        column: int,
+        h: int,
+        w: int,
+        wanted: NDArray[np.bool_] | None = None,
+    ) -> tuple[NDArray[Any], NDArray[np.int32]] | None:
+        """Pixels (h, w, bands) and leading photo (h, w) from a row and column of the window of the
+        nodes.
 
         `wanted`: (r, c) cells of the window that matter; None = all do.
         """
@@ -136,7 +149,9 @@ class Composer:
         )
         near = [m[cells] for m in plan.near]
         if wanted is not None:
-            some = wanted[cells[0].start - 1 : cells[0].stop - 1, cells[1].start - 1 : cells[1].stop - 1]
+            some = wanted[
+                cells[0].start - 1 : cells[0].stop - 1, cells[1].start - 1 : cells[1].stop - 1
+            ]
             near = [m & some for m in near]
         chosen = [(n, here) for n, here in zip(plan.nodes, near, strict=True) if here.any()]
         if not chosen:
@@ -146,7 +161,10 @@ class Composer:
         if alone and cuts[0].seen.all():  # nothing to merge, whatever the rule
             pixels, _ = self._warped(cuts[0], h, w, alone=True)
             return pixels, np.full((h, w), cuts[0].view.photo, np.int32)
-        layers = [self._layer(n, here, h, w, alone=alone) for n, (_, here) in zip(cuts, chosen, strict=True)]
+        layers = [
+            self._layer(n, here, h, w, alone=alone)
+            for n, (_, here) in zip(cuts, chosen, strict=True)
+        ]
         return self.blend.merge(layers, self.grid.gsd)
 
     def _layer(self, n: Nodes, near: NDArray[np.bool_], h: int, w: int, *, alone: bool) -> Layer:
@@ -158,11 +176,16 @@ class Composer:
             pixels = _embedded(pixels, 0, rows, columns, h, w)
             score = _embedded(score, np.inf, rows, columns, h, w)
         return Layer(
-            photo=n.view.photo, pixels=pixels, score=score,
-            centre=(float(n.view.pose.map_C[0]), float(n.view.pose.map_C[1])), height=n.height,
-        )  # fmt: skip
+            photo=n.view.photo,
+            pixels=pixels,
+            score=score,
+            centre=(float(n.view.pose.map_C[0]), float(n.view.pose.map_C[1])),
+            height=n.height,
+        )
 
-    def _warped(self, n: Nodes, h: int, w: int, *, alone: bool) -> tuple[NDArray, NDArray[np.float32]]:
+    def _warped(
+        self, n: Nodes, h: int, w: int, *, alone: bool
+    ) -> tuple[NDArray[Any], NDArray[np.float32]]:
         """Pixels (h, w, bands) and scores (h, w) of a photo where these nodes are."""
         image = self.pixels(n.view.photo)
         # remap works in 16 bits: a cut-out keeps its coordinates small
@@ -175,7 +198,7 @@ class Composer:
             np.copyto(score, np.float32(np.inf), where=~within)
         return self._exposed(n, warped), score
 
-    def _exposed(self, n: Nodes, warped: NDArray) -> NDArray:
+    def _exposed(self, n: Nodes, warped: NDArray[Any]) -> NDArray[Any]:
         photo = n.view.photo
         if photo in self.exposure.offsets and warped.dtype.kind == "f":
             return warped + np.float32(self.exposure.offsets[photo])
@@ -188,7 +211,7 @@ class Composer:
         return warped if table is None else np.asarray(cv2.LUT(warped, table)).reshape(warped.shape)
 
 
-def _remapped(image: NDArray, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray:
+def _remapped(image: NDArray[Any], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[Any]:
     """Pixels (h, w, bands) of an image at columns u and rows v (h, w)."""
     if image.dtype == np.uint8 and image.shape[2:] == (3,) and image.size <= MOST_PADDED * u.size:
         # OpenCV warps four bands in half the time of three, the way there and back included
@@ -211,7 +234,9 @@ def _reach(places: NDArray[np.float32], size: int) -> slice:
     return slice(start, max(min(int(np.ceil(places.max())) + 3, size), start + 1))
 
 
-def _embedded(part: NDArray, empty: float, rows: slice, columns: slice, h: int, w: int) -> NDArray:
+def _embedded(
+    part: NDArray[Any], empty: float, rows: slice, columns: slice, h: int, w: int
+) -> NDArray[Any]:
     """A part (rows, columns[, bands]) in its place of a piece (h, w[, bands])."""
     out = np.full((h, w, *part.shape[2:]), empty, part.dtype)
     out[rows, columns] = part

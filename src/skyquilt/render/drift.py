@@ -1,13 +1,13 @@
 """Drift: what a thermal camera's frames differ by though they show the same ground.
 
-An uncooled sensor warms and cools, so a frame's values are off by an amount of its own. Where frames overlap they
-show the same ground, and one number per frame makes them agree. That is a correction and no measurement: values
-as recorded are an option away.
+An uncooled sensor warms and cools, so a frame's values are off by an amount of its own. Where
+frames overlap they show the same ground, and one number per frame makes them agree. That is a
+correction and no measurement: values as recorded are an option away.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,10 +38,11 @@ class Overlaps:
 
 @dataclass(frozen=True, kw_only=True)
 class Drift:
-    """One offset per frame from the medians of all overlaps, outlying overlaps down-weighted (Cauchy).
+    """One offset per frame from the medians of all overlaps, outlying overlaps down-weighted
+    (Cauchy).
 
-    Overlaps leave a common offset open. It is fixed so that the median offset of frames that hang together is
-    zero: the map keeps the level that most of its frames have.
+    Overlaps leave a common offset open. It is fixed so that the median offset of frames that hang
+    together is zero: the map keeps the level that most of its frames have.
     """
 
     points: int = 4000
@@ -53,10 +54,15 @@ class Drift:
     version: ClassVar[int] = 1
 
     def __call__(
-        self, views: Sequence[View], thumbnails: Mapping[int, NDArray], surface: Surface,
+        self,
+        views: Sequence[View],
+        thumbnails: Mapping[int, NDArray[Any]],
+        surface: Surface,
         bounds: tuple[float, float, float, float],
-    ) -> dict[int, float]:  # fmt: skip
-        """Photo -> what is to be added to its values, from thumbnails (h, w) of the photos in their unit."""
+    ) -> dict[int, float]:
+        """Photo -> what is to be added to its values, from thumbnails (h, w) of the photos in their
+        unit.
+        """
         usable = [v for v in views if v.photo in thumbnails]
         if len(usable) < 2:
             return {}
@@ -68,9 +74,12 @@ class Drift:
         return {v.photo: float(o) for v, o in zip(usable, offsets, strict=True)}
 
     def _samples(
-        self, views: Sequence[View], thumbnails: Mapping[int, NDArray], surface: Surface,
+        self,
+        views: Sequence[View],
+        thumbnails: Mapping[int, NDArray[Any]],
+        surface: Surface,
         bounds: tuple[float, float, float, float],
-    ) -> tuple[Ints, Ints, Doubles]:  # fmt: skip
+    ) -> tuple[Ints, Ints, Doubles]:
         """Ground point, view and value (N,) of everything seen."""
         west, south, east, north = bounds
         step = np.sqrt((east - west) * (north - south) / max(self.points, 40 * len(views)))
@@ -80,14 +89,16 @@ class Drift:
         for row, view in enumerate(views):
             nodes = project_nodes(view, x, y, z)
             seen = np.flatnonzero(nodes.seen.ravel())
-            value = _nearest(thumbnails[view.photo], nodes.u.ravel()[seen], nodes.v.ravel()[seen], view)
+            value = _nearest(
+                thumbnails[view.photo], nodes.u.ravel()[seen], nodes.v.ravel()[seen], view
+            )
             good = np.isfinite(value)
             parts.append((seen[good], np.full(int(good.sum()), row), value[good]))
         point, rows, values = (np.concatenate(p) for p in zip(*parts, strict=True))
         return point.astype(np.int64), rows.astype(np.int64), values
 
 
-def _nearest(thumbnail: NDArray, u: NDArray, v: NDArray, view: View) -> Doubles:
+def _nearest(thumbnail: NDArray[Any], u: NDArray[Any], v: NDArray[Any], view: View) -> Doubles:
     """Thumbnail values (n,), themselves area means, at photo pixels."""
     height, width = thumbnail.shape[:2]
     column = np.rint((u + 0.5) * width / view.camera.width - 0.5).astype(int)
@@ -97,7 +108,9 @@ def _nearest(thumbnail: NDArray, u: NDArray, v: NDArray, view: View) -> Doubles:
 
 
 def overlaps(point: Ints, row: Ints, value: Doubles, least: int) -> Overlaps:
-    """Median differences of all pairs of frames with `least` ground points in common, from samples (N,)."""
+    """Median differences of all pairs of frames with `least` ground points in common, from samples
+    (N,).
+    """
     order = np.lexsort((row, point))
     point, row, value = point[order], row[order], value[order]
     a, b, d = [], [], []
@@ -122,15 +135,19 @@ def overlaps(point: Ints, row: Ints, value: Doubles, least: int) -> Overlaps:
     sigma = np.array(spread)
     floor = 0.3 * float(np.median(sigma)) if len(sigma) else 0.0
     return Overlaps(
-        first=first[start], second=second[start], difference=middle, sigma=np.maximum(sigma, floor + _TINY)
+        first=first[start],
+        second=second[start],
+        difference=middle,
+        sigma=np.maximum(sigma, floor + _TINY),
     )
 
 
 def solved(edges: Overlaps, count: int, rounds: int) -> Doubles:
-    """Offsets (count,) that make frames agree: second + o[second] = first + o[first], median zero per component.
+    """Offsets (count,) that make frames agree: second + o[second] = first + o[first], median zero
+    per component.
 
-    A weak pull to zero, its width what frames differ by as a rule, keeps a long line of frames from drifting off by the
-    sum of many small errors.
+    A weak pull to zero, its width what frames differ by as a rule, keeps a long line of frames from
+    drifting off by the sum of many small errors.
     """
     from scipy import sparse  # few runs are thermal, and all would wait for it
     from scipy.sparse import linalg as sparse_linalg
@@ -139,16 +156,21 @@ def solved(edges: Overlaps, count: int, rounds: int) -> Doubles:
     number = np.arange(len(edges.first))
     ones = np.ones(len(number))
     A = sparse.csr_matrix(
-        (np.r_[ones, -ones], (np.r_[number, number], np.r_[edges.second, edges.first])), (len(number), count)
+        (np.r_[ones, -ones], (np.r_[number, number], np.r_[edges.second, edges.first])),
+        (len(number), count),
     )
     usual = 1.4826 * float(np.median(np.abs(edges.difference))) + _TINY
     pull = sparse.identity(count) / usual**2
     weight, offset = 1 / edges.sigma**2, np.zeros(count)
     for k in range(rounds):
         W = sparse.diags(weight)
-        offset = sparse_linalg.spsolve((A.T @ W @ A + pull).tocsc(), -A.T @ (weight * edges.difference))
+        offset = sparse_linalg.spsolve(
+            (A.T @ W @ A + pull).tocsc(), -A.T @ (weight * edges.difference)
+        )
         lacking = edges.difference + A @ offset
         scale = max(1.4826 * float(np.median(np.abs(lacking))), 0.5 * usual * 0.5**k, _TINY)
         weight = 1 / edges.sigma**2 / (1 + (lacking / (2 * scale)) ** 2)
     _, part = connected_components(A.T @ A)
-    return np.asarray(offset - np.array([np.median(offset[part == p]) for p in range(part.max() + 1)])[part])
+    return np.asarray(
+        offset - np.array([np.median(offset[part == p]) for p in range(part.max() + 1)])[part]
+    )

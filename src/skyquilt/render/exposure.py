@@ -1,8 +1,9 @@
 """Exposure: what brings overlapping photos to one brightness, from the ground they both show.
 
-Per photo a gain for each band and a smooth field over the image (vignetting, a cloud's shadow, the sun's
-glare). Gains act on the odds x / (1 - x) of a pixel value x in (0, 1), not on the value: black stays black
-and white stays white, so nothing clips or turns purple, and two gains in a row are one gain.
+Per photo a gain for each band and a smooth field over the image (vignetting, a cloud's shadow, the
+sun's glare). Gains act on the odds x / (1 - x) of a pixel value x in (0, 1), not on the value:
+black stays black and white stays white, so nothing clips or turns purple, and two gains in a row
+are one gain.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +35,9 @@ DENSE = 1000
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Exposure:
-    """What brings photos to one brightness: log odds + gain[band] + field . (x, y, x^2, y^2, x y)."""
+    """What brings photos to one brightness: log odds + gain[band] + field . (x, y, x^2, y^2, x
+    y).
+    """
 
     gains: Mapping[int, Float]
     """Photo -> (bands,) in log odds."""
@@ -63,10 +66,12 @@ def with_odds(pixels: NDArray[np.uint8], odds: Float) -> NDArray[np.uint8]:
     brighter = cv2.multiply(pixels, odds, dtype=cv2.CV_32F).reshape(pixels.shape)
     level: Any = (255.0,) * 4  # a scalar for each band: OpenCV's stubs know arrays only
     white = cv2.add(cv2.subtract(brighter, pixels, dtype=cv2.CV_32F), level).reshape(pixels.shape)
-    return np.asarray(cv2.divide(brighter, white, scale=255, dtype=cv2.CV_8U), np.uint8).reshape(pixels.shape)
+    return np.asarray(cv2.divide(brighter, white, scale=255, dtype=cv2.CV_8U), np.uint8).reshape(
+        pixels.shape
+    )
 
 
-def _basis(x: NDArray, y: NDArray) -> NDArray:
+def _basis(x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
     """(..., 5) terms of the field."""
     return np.stack([x, y, x * x, y * y, x * y], -1)
 
@@ -95,9 +100,12 @@ class Balance:
     version: ClassVar[int] = 2
 
     def __call__(
-        self, views: Sequence[View], thumbnails: Mapping[int, NDArray[np.uint8]], surface: Surface,
+        self,
+        views: Sequence[View],
+        thumbnails: Mapping[int, NDArray[np.uint8]],
+        surface: Surface,
         bounds: tuple[float, float, float, float],
-    ) -> Exposure:  # fmt: skip
+    ) -> Exposure:
         """Estimates the exposure from thumbnails (h, w, bands) of the photos."""
         usable = [v for v in views if v.photo in thumbnails]
         if len(usable) < 2:
@@ -108,9 +116,12 @@ class Balance:
         return _solve(samples, [v.photo for v in usable], self.sigma_gain, self.sigma_field)
 
     def _samples(
-        self, views: Sequence[View], thumbnails: Mapping[int, NDArray[np.uint8]], surface: Surface,
+        self,
+        views: Sequence[View],
+        thumbnails: Mapping[int, NDArray[np.uint8]],
+        surface: Surface,
         bounds: tuple[float, float, float, float],
-    ) -> "Samples":  # fmt: skip
+    ) -> "Samples":
         west, south, east, north = bounds
         step = np.sqrt((east - west) * (north - south) / max(self.points, 60 * len(views)))
         x, y = np.meshgrid(np.arange(west, east, step), np.arange(south, north, step))
@@ -125,17 +136,24 @@ class Balance:
             point.append(seen)
             row.append(np.full(len(seen), index))
             place.append(np.stack(image_place(view, u, v), -1))
-            value.append(_sampled(thumbnails[view.photo], u, v, view.camera.width, view.camera.height))
+            value.append(
+                _sampled(thumbnails[view.photo], u, v, view.camera.width, view.camera.height)
+            )
         if not point:
             return Samples(
-                point=np.zeros(0, int), row=np.zeros(0, int), place=np.zeros((0, 2)), log=np.zeros((0, 3))
+                point=np.zeros(0, int),
+                row=np.zeros(0, int),
+                place=np.zeros((0, 2)),
+                log=np.zeros((0, 3)),
             )
         levels = np.concatenate(value)
         good = ((levels > 8) & (levels < 247)).all(1)
         return Samples(
-            point=np.concatenate(point)[good], row=np.concatenate(row)[good],
-            place=np.concatenate(place)[good], log=np.log(levels[good] / (255 - levels[good])),
-        )  # fmt: skip
+            point=np.concatenate(point)[good],
+            row=np.concatenate(row)[good],
+            place=np.concatenate(place)[good],
+            log=np.log(levels[good] / (255 - levels[good])),
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -152,21 +170,21 @@ class Samples:
     """(N, bands) log odds of the brightness."""
 
 
-def image_place(view: View, u: NDArray, v: NDArray) -> tuple[NDArray, NDArray]:
+def image_place(view: View, u: NDArray[Any], v: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """x and y from -1 to 1 over the image, of photo pixels."""
     w, h = view.camera.width - 1.0, view.camera.height - 1.0
     return np.clip(2 * u / w - 1, -1.1, 1.1), np.clip(2 * v / h - 1, -1.1, 1.1)
 
 
 def _sampled(
-    thumbnail: NDArray[np.uint8], u: NDArray, v: NDArray, width: int, height: int
+    thumbnail: NDArray[np.uint8], u: NDArray[Any], v: NDArray[Any], width: int, height: int
 ) -> NDArray[np.float64]:
     """Smoothed thumbnail values (n, bands) at photo pixels."""
     h, w = thumbnail.shape[:2]
     smooth = cv2.GaussianBlur(thumbnail.astype(np.float32), (0, 0), 1.5).reshape(h, w, -1)
     column = np.clip(np.rint((u + 0.5) * w / width - 0.5), 0, w - 1).astype(int)
     row = np.clip(np.rint((v + 0.5) * h / height - 0.5), 0, h - 1).astype(int)
-    return smooth[row, column].astype(np.float64)
+    return np.asarray(smooth[row, column].astype(np.float64))
 
 
 def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: float) -> Exposure:
@@ -180,7 +198,9 @@ def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: fl
     x = _robust_differences(terms, s.row, point, s.log.mean(1, keepdims=True), ridge, n)[..., 0]
     fields = (
         x[:, 1:]
-        * (np.abs(_basis(*np.meshgrid([-1, 0, 1], [-1, 0, 1])) @ x[:, 1:].T).max((0, 1)) > EVEN)[:, None]
+        * (np.abs(_basis(*np.meshgrid([-1, 0, 1], [-1, 0, 1])) @ x[:, 1:].T).max((0, 1)) > EVEN)[
+            :, None
+        ]
     )
     even = s.log + (terms[:, 1:] * fields[s.row]).sum(1)[:, None]
     gains = _robust_differences(terms[:, :1], s.row, point, even, ridge[:1], n)[:, 0]
@@ -192,10 +212,16 @@ def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: fl
 
 
 def _robust_differences(
-    terms: NDArray, row: NDArray, point: NDArray, y: NDArray, ridge: NDArray, count: int
+    terms: NDArray[Any],
+    row: NDArray[Any],
+    point: NDArray[Any],
+    y: NDArray[Any],
+    ridge: NDArray[Any],
+    count: int,
 ) -> NDArray[np.float64]:
-    """x (count, k, bands) that makes y + terms . x[row] equal within each point, y (N, bands) and terms (N, k),
-    reweighted against moving things and shadows, which all bands see. `ridge` (k,) pulls x to zero.
+    """x (count, k, bands) that makes y + terms . x[row] equal within each point, y (N, bands) and
+    terms (N, k), reweighted against moving things and shadows, which all bands see. `ridge` (k,)
+    pulls x to zero.
     """
     pairs = _Pairs.of(row, point)
     w = np.ones(len(y))
@@ -208,7 +234,10 @@ def _robust_differences(
         mean_y = _sums(point, w[:, None] * y, len(mass)) / mass[:, None]
         rhs = -_sums(row, weighted[:, :, None] * (y - mean_y[point])[:, None], count)
         own = _sums(row, weighted[:, :, None] * terms[:, None], count)
-        before, x = x, _solved(own, pairs, blocks, pull, rhs.reshape(len(pull), -1)).reshape(x.shape)
+        before, x = (
+            x,
+            _solved(own, pairs, blocks, pull, rhs.reshape(len(pull), -1)).reshape(x.shape),
+        )
         if np.abs(x - before).max() < SETTLED:
             break
         level = y + np.einsum("nk,nkb->nb", terms, x[row])
@@ -217,7 +246,7 @@ def _robust_differences(
     return x
 
 
-def _sums(group: NDArray, values: NDArray, count: int) -> NDArray[np.float64]:
+def _sums(group: NDArray[Any], values: NDArray[Any], count: int) -> NDArray[np.float64]:
     """(count, ...) sums of values (N, ...) by group (N,)."""
     flat = values.reshape(len(values), -1)
     total = [np.bincount(group, column, count) for column in flat.T]
@@ -240,7 +269,7 @@ class _Pairs:
     """(G,) second photo."""
 
     @classmethod
-    def of(cls, row: NDArray, point: NDArray) -> "_Pairs":
+    def of(cls, row: NDArray[Any], point: NDArray[Any]) -> "_Pairs":
         """The pairs of samples (N,), whose rows and points are given."""
         order = np.lexsort((row, point))
         a, b = [], []
@@ -253,25 +282,36 @@ class _Pairs:
         first, second = first[sort], second[sort]
         new = np.flatnonzero((np.diff(row[first]) != 0) | (np.diff(row[second]) != 0)) + 1
         cuts = np.r_[0, new, len(first)]
-        return cls(a=first, b=second, cuts=cuts, row_a=row[first[cuts[:-1]]], row_b=row[second[cuts[:-1]]])
+        return cls(
+            a=first, b=second, cuts=cuts, row_a=row[first[cuts[:-1]]], row_b=row[second[cuts[:-1]]]
+        )
 
-    def products(self, terms: NDArray) -> NDArray[np.float64]:
+    def products(self, terms: NDArray[Any]) -> NDArray[np.float64]:
         """(G, k, k) sums of the outer products of terms (N, k) over the pairs of two photos."""
         left, right = terms[self.a], terms[self.b]
         ends = zip(self.cuts[:-1].tolist(), self.cuts[1:].tolist(), strict=True)
         return np.stack([left[i:j].T @ right[i:j] for i, j in ends])
 
 
-def _solved(own: NDArray, pairs: _Pairs, blocks: NDArray, pull: NDArray, rhs: NDArray) -> NDArray:
-    """Solution (n k, bands) of the normal equations: own blocks (n, k, k) less those of pairs, and a pull to zero."""
+def _solved(
+    own: NDArray[Any], pairs: _Pairs, blocks: NDArray[Any], pull: NDArray[Any], rhs: NDArray[Any]
+) -> NDArray[Any]:
+    """Solution (n k, bands) of the normal equations: own blocks (n, k, k) less those of pairs, and
+    a pull to zero.
+    """
     n, k, _ = own.shape
-    i, j = np.r_[pairs.row_a, pairs.row_b, np.arange(n)], np.r_[pairs.row_b, pairs.row_a, np.arange(n)]
+    i, j = (
+        np.r_[pairs.row_a, pairs.row_b, np.arange(n)],
+        np.r_[pairs.row_b, pairs.row_a, np.arange(n)],
+    )
     turned = np.where((pairs.row_a != pairs.row_b)[:, None, None], blocks.transpose(0, 2, 1), 0.0)
     values = np.concatenate([-blocks, -turned, own])
     if n * k <= DENSE:
         normal = np.zeros((n, n, k, k))
         np.add.at(normal, (i, j), values)
-        return np.asarray(np.linalg.solve(normal.swapaxes(1, 2).reshape(n * k, n * k) + np.diag(pull), rhs))
+        return np.asarray(
+            np.linalg.solve(normal.swapaxes(1, 2).reshape(n * k, n * k) + np.diag(pull), rhs)
+        )
     from scipy import sparse  # where it saves more time than it takes to load
     from scipy.sparse import linalg
 

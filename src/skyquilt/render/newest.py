@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,6 @@ class Newest:
         """Only the winner matters."""
         return 0.0
 
-    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray, NDArray[np.int32]]:
+    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray[Any], NDArray[np.int32]]:
         """The last layer that sees the pixel; layers come in order of capture."""
         return First().merge(list(reversed(layers)), gsd)

@@ -1,6 +1,7 @@
 """Small orthorectified pieces of single photos."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +18,13 @@ COARSE = 8
 
 
 def grey_patches(
-    view: View, surface: Surface, pixels: PhotoPixels, xy: NDArray, gsd: float, *, side: int = SIDE
+    view: View,
+    surface: Surface,
+    pixels: PhotoPixels,
+    xy: NDArray[Any],
+    gsd: float,
+    *,
+    side: int = SIDE,
 ) -> list[NDArray[np.float32] | None]:
     """What a photo shows around map points xy (n, 2) in m: grey (side, side) each, north up;
     None where it does not see all of it.
@@ -28,10 +35,14 @@ def grey_patches(
     gy = np.broadcast_to(xy[:, 1, None, None] - nodes[:, None] * gsd, shape)
     n = project_nodes(view, gx, gy, surface.at(gx, gy))
     whole = np.asarray(inside(view.camera, n.u, n.v).all((1, 2)))
-    return [_cut_out(view, pixels, n.u[k], n.v[k], side) if whole[k] else None for k in range(len(xy))]
+    return [
+        _cut_out(view, pixels, n.u[k], n.v[k], side) if whole[k] else None for k in range(len(xy))
+    ]
 
 
-def _cut_out(view: View, pixels: PhotoPixels, nu: NDArray, nv: NDArray, side: int) -> NDArray[np.float32]:
+def _cut_out(
+    view: View, pixels: PhotoPixels, nu: NDArray[Any], nv: NDArray[Any], side: int
+) -> NDArray[np.float32]:
     """The grey patch (side, side) whose nodes lie at these photo pixels."""
     size = ((side // COARSE + 2) * COARSE,) * 2
     inner = slice(COARSE, COARSE + side)
@@ -41,19 +52,27 @@ def _cut_out(view: View, pixels: PhotoPixels, nu: NDArray, nv: NDArray, side: in
     if part.ndim == 3:
         part = cv2.cvtColor(part, cv2.COLOR_RGB2GRAY) if part.shape[2] == 3 else part[..., 0]
     return np.asarray(
-        cv2.remap(part.astype(np.float32), u - x0, v - y0, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        cv2.remap(
+            part.astype(np.float32),
+            u - x0,
+            v - y0,
+            cv2.INTER_CUBIC,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
     )
 
 
 def grey_pairs(
     first: Sequence[View],
     second: Sequence[View],
-    xy: NDArray,
+    xy: NDArray[Any],
     surface: Surface,
     pixels: PhotoPixels,
     gsd: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Patches (n, 64, 64) of two photos each around map points (n, 2), and whether both see them whole."""
+    """Patches (n, 64, 64) of two photos each around map points (n, 2), and whether both see them
+    whole.
+    """
     patches = np.zeros((2, len(xy), SIDE, SIDE), np.float32)
     seen = np.zeros((2, len(xy)), bool)
     sides: dict[int, list[tuple[int, int]]] = {}
@@ -61,7 +80,9 @@ def grey_pairs(
     for which, row in enumerate(views):
         for k, view in enumerate(row):
             sides.setdefault(view.photo, []).append((which, k))
-    for asked in sides.values():  # a photo's patches at once: it is decoded once, and projected in one go
+    for (
+        asked
+    ) in sides.values():  # a photo's patches at once: it is decoded once, and projected in one go
         which, k = asked[0]
         at = np.array([place for _, place in asked])
         found = grey_patches(views[which][k], surface, pixels, xy[at], gsd)

@@ -2,12 +2,21 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import STEP, Nodes, View, least_scores, node_places, overlapping, project_all
+from skyquilt.imaging.views import (
+    STEP,
+    Nodes,
+    View,
+    least_scores,
+    node_places,
+    overlapping,
+    project_all,
+)
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.render.blend import Blend
@@ -30,7 +39,7 @@ class Plan:
     """Where its nodes lie in each photo that sees any."""
     near: Sequence[NDArray[np.bool_]]
     """(r, c) per photo, for the cells around the nodes: whether it can show there."""
-    z: NDArray
+    z: NDArray[Any]
     """(r, c) heights in m of the nodes."""
     projected: Mapping[int, Nodes]
     """The nodes of all photos that were looked at, by photo."""
@@ -46,9 +55,15 @@ class Plan:
 
 
 def planned(
-    window: Window, grid: Grid, views: Sequence[View], surface: Surface, blend: Blend, *, counted: bool,
+    window: Window,
+    grid: Grid,
+    views: Sequence[View],
+    surface: Surface,
+    blend: Blend,
+    *,
+    counted: bool,
     earlier: Plan | None,
-) -> Plan:  # fmt: skip
+) -> Plan:
     """A plan of a window of a grid; `counted` and `earlier` as for `Composer.plan`."""
     margin = -(-blend.margin // STEP) * STEP
     x, y, z = node_places(grid, surface, window.grown(margin))
@@ -60,10 +75,13 @@ def planned(
     low = blend.rank(np.arange(len(views)), least_scores(views, x, y, z))
     height = min((float(v.pose.map_C[2]) for v in views), default=1.0) - float(np.median(z))
     slack = blend.reach(grid.gsd) / max(height, 1e-3)
-    # between nodes a rank lies between theirs: nobody wins there whose least rank exceeds another's greatest
+    # between nodes a rank lies between theirs: nobody wins there whose least rank exceeds another's
+    # greatest
     around, best = np.ones((3, 3), np.uint8), np.full(x.shape, np.float32(np.inf))
-    found: dict[int, tuple[Nodes, NDArray]] = {}
-    ready = {k: n for k, v in enumerate(views) if (n := known.get(v.photo)) is not None and n.view is v}
+    found: dict[int, tuple[Nodes, NDArray[Any]]] = {}
+    ready = {
+        k: n for k, v in enumerate(views) if (n := known.get(v.photo)) is not None and n.view is v
+    }
     order = np.argsort(low, kind="stable").tolist()
     for at, k in enumerate(order):
         if not counted and low[k] > best.max() + slack:
@@ -78,16 +96,27 @@ def planned(
             found[k] = nodes, cv2.erode(rank, around)
     kept = [found[k] for k in sorted(found)]
     return Plan(
-        window=window, margin=margin, nodes=[nodes for nodes, _ in kept],
-        near=[np.isfinite(least) & (least <= best + slack) for _, least in kept], z=z,
+        window=window,
+        margin=margin,
+        nodes=[nodes for nodes, _ in kept],
+        near=[np.isfinite(least) & (least <= best + slack) for _, least in kept],
+        z=z,
         projected={n.view.photo: n for n in ready.values()},
-    )  # fmt: skip
+    )
 
 
-def _settled(z: NDArray, earlier: Plan, gsd: float) -> tuple[NDArray, bool]:
-    """Heights (r, c): the earlier ones but where the new ones shift a photo visibly; whether that is nowhere."""
-    aside = max((float(n.score[m].max()) for n, m in zip(earlier.nodes, earlier.near, strict=True) if m.any()),
-                default=0.0)  # fmt: skip
+def _settled(z: NDArray[Any], earlier: Plan, gsd: float) -> tuple[NDArray[Any], bool]:
+    """Heights (r, c): the earlier ones but where the new ones shift a photo visibly; whether that
+    is nowhere.
+    """
+    aside = max(
+        (
+            float(n.score[m].max())
+            for n, m in zip(earlier.nodes, earlier.near, strict=True)
+            if m.any()
+        ),
+        default=0.0,
+    )
     moved = np.abs(z - earlier.z) * np.sqrt(aside) > STILL * gsd
     if not moved.any():
         return earlier.z, True
@@ -96,7 +125,9 @@ def _settled(z: NDArray, earlier: Plan, gsd: float) -> tuple[NDArray, bool]:
 
 
 def stale(plan: Plan, earlier: Plan) -> NDArray[np.bool_]:
-    """(r, c) for the cells around the nodes: whether they look different from what an earlier plan of them gave."""
+    """(r, c) for the cells around the nodes: whether they look different from what an earlier plan
+    of them gave.
+    """
     now, before = plan.showing(), earlier.showing()
     lifted = cv2.dilate((plan.z != earlier.z).view(np.uint8), np.ones((3, 3), np.uint8)) > 0
     nowhere = np.zeros(plan.z.shape, np.bool_)

@@ -22,10 +22,13 @@ def bench_page(record: Mapping[str, Any]) -> str:
     )
     pairs = len(rows) // max(len(methods), 1)
     return plain_page(
-        title="Registration between spectra", version=str(record["version"]), sections=sections,
-        summary=f"{pairs} pairs in {len(classes)} classes, {len(methods)} methods: {', '.join(methods)}.",
+        title="Registration between spectra",
+        version=str(record["version"]),
+        sections=sections,
+        summary=f"{pairs} pairs in {len(classes)} classes, {len(methods)} methods:"
+        f" {', '.join(methods)}.",
         source="The figures behind this page are in bench.json.",
-    )  # fmt: skip
+    )
 
 
 def _truth(rows: Rows, methods: tuple[str, ...], classes: tuple[str, ...]) -> Table:
@@ -34,10 +37,12 @@ def _truth(rows: Rows, methods: tuple[str, ...], classes: tuple[str, ...]) -> Ta
         return f"{right} right, {accepted - right} wrong of {len(of)}"
 
     return Table(
-        title="Registrations that are right, and accepted though wrong", head=("class", *methods),
-        rows=_by_class(rows, methods, classes, cell), numeric="t" + "n" * len(methods),
+        title="Registrations that are right, and accepted though wrong",
+        head=("class", *methods),
+        rows=_by_class(rows, methods, classes, cell),
+        numeric="t" + "n" * len(methods),
         note="Right: accepted with an RMS error over the overlap below the pair's tolerance.",
-    )  # fmt: skip
+    )
 
 
 def _thesis(rows: Rows, methods: tuple[str, ...], classes: tuple[str, ...]) -> tuple[Table, Table]:
@@ -50,20 +55,31 @@ def _thesis(rows: Rows, methods: tuple[str, ...], classes: tuple[str, ...]) -> t
     kinds = "t" + "n" * len(methods)
     return (
         Table(
-            title="Table 6.4: registrations accepted", head=("class", *methods), numeric=kinds,
-            rows=_by_class(rows, methods, classes, ratio), note="Accepted, whether right or wrong.",
+            title="Table 6.4: registrations accepted",
+            head=("class", *methods),
+            numeric=kinds,
+            rows=_by_class(rows, methods, classes, ratio),
+            note="Accepted, whether right or wrong.",
         ),
         Table(
-            title="Table 6.5: mean Q", head=("class", *methods), numeric=kinds,
-            rows=_by_class(rows, methods, classes, mean_q), note="Q of (6.3); 0 where refused.",
+            title="Table 6.5: mean Q",
+            head=("class", *methods),
+            numeric=kinds,
+            rows=_by_class(rows, methods, classes, mean_q),
+            note="Q of (6.3); 0 where refused.",
         ),
-    )  # fmt: skip
+    )
 
 
-def _by_class(rows: Rows, methods: tuple[str, ...], classes: tuple[str, ...], cell: Any) -> tuple[Any, ...]:
+def _by_class(
+    rows: Rows, methods: tuple[str, ...], classes: tuple[str, ...], cell: Any
+) -> tuple[Any, ...]:
     """A row per class and one for all."""
     table = [
-        (kind, *(cell([r for r in rows if r["class"] == kind and r["method"] == m]) for m in methods))
+        (
+            kind,
+            *(cell([r for r in rows if r["class"] == kind and r["method"] == m]) for m in methods),
+        )
         for kind in classes
     ]
     return (*table, ("all", *(cell([r for r in rows if r["method"] == m]) for m in methods)))
@@ -75,20 +91,27 @@ def _cost(rows: Rows, methods: tuple[str, ...]) -> Table:
         spent = [r["seconds"] for r in rows if r["method"] == method]
         lines.append((method, fixed(sum(spent) / len(spent), 2), fixed(max(spent), 2)))
     return Table(
-        title="CPU time per pair, reading included", head=("method", "mean, s", "longest, s"), rows=tuple(lines),
+        title="CPU time per pair, reading included",
+        head=("method", "mean, s", "longest, s"),
+        rows=tuple(lines),
         numeric="tnn",
-    )  # fmt: skip
+    )
 
 
 def _pairs(rows: Rows) -> Table:
     lines = tuple(
         (
-            r["class"], r["source"], r["method"],
+            r["class"],
+            r["source"],
+            r["method"],
             "right" if r["right"] else "wrong" if r["accepted"] else "refused",
-            fixed(r["error_px"], 2), fixed(r["q"], 2), str(r["inliers"]), fixed(r["seconds"], 2),
+            fixed(r["error_px"], 2),
+            fixed(r["q"], 2),
+            str(r["inliers"]),
+            fixed(r["seconds"], 2),
             r["reason"] or DASH,
         )
         for r in rows
-    )  # fmt: skip
+    )
     head = ("class", "pair", "method", "verdict", "error, px", "Q", "inliers", "CPU, s", "reason")
     return Table(title="Every pair by every method", head=head, rows=lines, numeric="ttttnnnnt")

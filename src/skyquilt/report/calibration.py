@@ -1,4 +1,6 @@
-"""The page of a lens calibration: tables and plots in the form of Yahyanejad 2013, Tables 6.2, 6.3, Fig. 6.8, 6.9."""
+"""The page of a lens calibration: tables and plots in the form of Yahyanejad 2013, Tables 6.2, 6.3,
+Fig. 6.8, 6.9.
+"""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -18,7 +20,8 @@ from skyquilt.report.svg import Axes, arrows, coordinate, dots, drawing, path
 
 _SIDE = 340.0
 _STYLE = (
-    ".grid{stroke:#ddd}.axis{stroke:#999}.tick,.name{font:12px sans-serif;fill:#444}.mid{text-anchor:middle}"
+    ".grid{stroke:#ddd}.axis{stroke:#999}.tick,.name{font:12px"
+    " sans-serif;fill:#444}.mid{text-anchor:middle}"
     ".end{text-anchor:end}.cloud{stroke:#1f6f8b;stroke-width:3;stroke-linecap:round;fill:none;opacity:.55}"
     ".vectors{stroke:#1f6f8b;stroke-width:1.2;fill:none}"
     ".marker{fill:none;stroke:#b8602a;stroke-width:1.5}"
@@ -49,22 +52,36 @@ class CalibrationInput:
 def calibration_page(data: CalibrationInput) -> str:
     """The whole page, in one file."""
     return plain_page(
-        title=f"Lens calibration from {data.title}", summary=_summary(data), version=data.version,
-        source="The figures behind this page are in calibration.json, the camera is in cameras.json.",
+        title=f"Lens calibration from {data.title}",
+        summary=_summary(data),
+        version=data.version,
+        source="The figures behind this page are in calibration.json, the camera is in"
+        " cameras.json.",
         tiles=_tiles(data),
         sections=(
-            Section(id="intrinsics", title="Intrinsic parameters", lead=_LEAD, blocks=_parameter_tables(data)),
+            Section(
+                id="intrinsics",
+                title="Intrinsic parameters",
+                lead=_LEAD,
+                blocks=_parameter_tables(data),
+            ),
             Section(id="errors", title="Reprojection errors", blocks=tuple(_figures(data))),
-            Section(id="registration", title="What undistortion does to registration", blocks=(_registration(data),)),
+            Section(
+                id="registration",
+                title="What undistortion does to registration",
+                blocks=(_registration(data),),
+            ),
             Section(id="boards", title="Boards as found", blocks=(_boards(data),)),
             Section(id="views", title="Views", blocks=_views(data)),
         ),
-    )  # fmt: skip
+    )
 
 
 _LEAD = (
-    "One camera, two calibrations on the same views: from the centres of the squares, corrected for perspective and"
-    " distortion, and from the corners between them. Deviations are one sigma. A coefficient smaller than three of"
+    "One camera, two calibrations on the same views: from the centres of the squares, corrected for"
+    " perspective and"
+    " distortion, and from the corners between them. Deviations are one sigma. A coefficient"
+    " smaller than three of"
     " them was dropped and the rest fitted again."
 )
 
@@ -83,7 +100,8 @@ def _summary(data: CalibrationInput) -> str:
     m = data.figures
     size = f"{data.centres.camera.width} x {data.centres.camera.height} px"
     return (
-        f"{m['camera']} ({size}): {m['views_used']} views of a board of {data.board.columns} x {data.board.rows}"
+        f"{m['camera']} ({size}): {m['views_used']} views of a board of {data.board.columns} x"
+        f" {data.board.rows}"
         f" squares in {m['frames']} frames."
     )
 
@@ -95,22 +113,40 @@ def _tiles(data: CalibrationInput) -> tuple[Tile, ...]:
     gain = m["registration"]["reduction_percent"]
     return (
         Tile(
-            label="Focal length", unit="px",
+            label="Focal length",
+            unit="px",
             value=f"{fixed(found.camera.focal, 1)} \u00b1 {fixed(found.sigma('focal'), 1)}",
             verdict="good" if share < 1 else "fair" if share < 2 else "poor",
-            says=f"Deviation {fixed(share, 2)} %; below 1 % is good, above 2 % more tilted views are needed.",
-        ),
-        Tile(label="Reprojection error", value=fixed(found.rms_px, 3), unit="px", says="RMS over all centres."),
-        Tile(
-            label="On views kept out", value=fixed(held, 3), unit="px",
-            verdict="good" if held < 1.2 * found.rms_px else "fair" if held < 1.5 * found.rms_px else "poor",
-            says="RMS of views that had no part in the camera; much above the former means too many parameters.",
+            says=f"Deviation {fixed(share, 2)} %; below 1 % is good, above 2 % more tilted views"
+            " are needed.",
         ),
         Tile(
-            label="Registration", value=fixed(-gain, 0), unit="%", verdict="good" if gain > 0 else "poor",
-            says="Change of the mean squared error when undistorted views are registered instead of raw ones.",
+            label="Reprojection error",
+            value=fixed(found.rms_px, 3),
+            unit="px",
+            says="RMS over all centres.",
         ),
-    )  # fmt: skip
+        Tile(
+            label="On views kept out",
+            value=fixed(held, 3),
+            unit="px",
+            verdict="good"
+            if held < 1.2 * found.rms_px
+            else "fair"
+            if held < 1.5 * found.rms_px
+            else "poor",
+            says="RMS of views that had no part in the camera; much above the former means too many"
+            " parameters.",
+        ),
+        Tile(
+            label="Registration",
+            value=fixed(-gain, 0),
+            unit="%",
+            verdict="good" if gain > 0 else "poor",
+            says="Change of the mean squared error when undistorted views are registered instead of"
+            " raw ones.",
+        ),
+    )
 
 
 def _parameter_tables(data: CalibrationInput) -> tuple[Table, ...]:
@@ -134,25 +170,38 @@ def _parameters(data: CalibrationInput, found: Calibration) -> Table:
         )
 
     return Table(
-        title=f"Calibration from {_WORDS[found.marks]}", head=("", "Value", "Deviation"), numeric="tnn",
+        title=f"Calibration from {_WORDS[found.marks]}",
+        head=("", "Value", "Deviation"),
+        numeric="tnn",
         rows=(
             ("Pixel error (mean absolute, x, y), px", f"({fixed(x, 4)}, {fixed(y, 4)})", ""),
             ("Reprojection error (RMS), px", fixed(found.rms_px, 4), ""),
-            (f"RMS of views kept out, judged by {_WORDS['centres']}, px", fixed(held["centres"], 4), ""),
-            (f"RMS of views kept out, judged by {_WORDS['corners']}, px", fixed(held["corners"], 4), ""),
+            (
+                f"RMS of views kept out, judged by {_WORDS['centres']}, px",
+                fixed(held["centres"], 4),
+                "",
+            ),
+            (
+                f"RMS of views kept out, judged by {_WORDS['corners']}, px",
+                fixed(held["corners"], 4),
+                "",
+            ),
             row("Focal length, px", ("focal",), 2),
             row("Principal point, px", ("cx", "cy"), 2),
             row("Radial coefficients (k1, k2, k3)", ("k1", "k2", "k3"), None),
             row("Tangential coefficients (p1, p2)", ("p1", "p2"), None),
         ),
-        note=_dropped(found), wide=False,
-    )  # fmt: skip
+        note=_dropped(found),
+        wide=False,
+    )
 
 
 def _dropped(found: Calibration) -> str:
     if not found.dropped:
         return "No coefficient was smaller than its tolerance."
-    parts = [f"{n} ({significant(v, 3)}, tolerance {significant(t, 3)})" for n, v, t in found.dropped]
+    parts = [
+        f"{n} ({significant(v, 3)}, tolerance {significant(t, 3)})" for n, v, t in found.dropped
+    ]
     return f"Dropped as smaller than its tolerance: {', '.join(parts)}."
 
 
@@ -174,21 +223,27 @@ def _pattern(data: CalibrationInput, found: Calibration) -> Figure:
     longest = max(float(np.linalg.norm(mean, axis=1).max(initial=0)), 1e-6)
     scale = 0.45 / longest
     axes = Axes(
-        x=(0.0, float(board.columns)), y=(float(board.rows), 0.0), width=_SIDE * 1.4,
+        x=(0.0, float(board.columns)),
+        y=(float(board.rows), 0.0),
+        width=_SIDE * 1.4,
         height=_SIDE * 1.4 * board.rows / board.columns + 40,
-    )  # fmt: skip
+    )
     tails, tips = axes.points(nodes), axes.points(nodes + scale * mean)
     title = f"Mean error over the pattern, from {_WORDS[found.marks]}"
     errors = path(arrows(tails, tips, longest=7.0), "vectors")
     svg = drawing(
         [axes.grid("squares", "squares"), path(dots(tails), "cloud"), errors],
-        title, axes.width, axes.height,
-    )  # fmt: skip
+        title,
+        axes.width,
+        axes.height,
+    )
     return Figure(
-        svg=svg, title=title,
-        caption=f"Measured less predicted, mean over all views; the longest arrow is {fixed(longest, 3)} px. What"
+        svg=svg,
+        title=title,
+        caption="Measured less predicted, mean over all views; the longest arrow is"
+        f" {fixed(longest, 3)} px. What"
         " repeats in all views is the board, not the lens.",
-    )  # fmt: skip
+    )
 
 
 def _chart(data: CalibrationInput, found: Calibration) -> Figure:
@@ -208,7 +263,9 @@ def _chart(data: CalibrationInput, found: Calibration) -> Figure:
     outside = int((~inside).sum())
     caption = f"{len(error)} points, the circle is the RMS of {fixed(found.rms_px, 3)} px."
     return Figure(
-        svg=svg, title=title, caption=caption + (f" {outside} further out not drawn." if outside else "")
+        svg=svg,
+        title=title,
+        caption=caption + (f" {outside} further out not drawn." if outside else ""),
     )
 
 
@@ -221,9 +278,11 @@ def _registration(data: CalibrationInput) -> Sentences:
     )
     return Sentences(
         items=(
-            f"{r['pairs']} pairs of views were registered by a homography through the board's corners, {how}: a board"
+            f"{r['pairs']} pairs of views were registered by a homography through the board's"
+            f" corners, {how}: a board"
             " is flat, so all that is left is distortion and noise.",
-            f"Mean squared error (6.2): {fixed(r['mse_raw_px2'], 3)} px\u00b2 raw, {fixed(r['mse_undistorted_px2'], 3)}"
+            f"Mean squared error (6.2): {fixed(r['mse_raw_px2'], 3)} px\u00b2 raw,"
+            f" {fixed(r['mse_undistorted_px2'], 3)}"
             f" px\u00b2 undistorted ({fixed(-r['reduction_percent'], 1, sign=True)} %).",
         )
     )
@@ -239,10 +298,16 @@ def _boards(data: CalibrationInput) -> Figure:
 def _views(data: CalibrationInput) -> tuple[Table, ...]:
     m = data.figures
     rows = tuple(
-        (v["name"], fixed(v["frames"], 0), fixed(v["squares"], 0), fixed(v["rms_px"], 3), fixed(v["tilt_deg"], 1),
-         fixed(v["distance_m"], 2))
+        (
+            v["name"],
+            fixed(v["frames"], 0),
+            fixed(v["squares"], 0),
+            fixed(v["rms_px"], 3),
+            fixed(v["tilt_deg"], 1),
+            fixed(v["distance_m"], 2),
+        )
         for v in m["views"]
-    )  # fmt: skip
+    )
     head = ("View", "Frames", "Centres", "RMS, px", "Tilt, \u00b0", "Distance, m")
     used = Table(title="Used", head=head, rows=rows, numeric="cnnnnn")
     out = tuple((name, reason) for name, reason in m["views_rejected"].items())

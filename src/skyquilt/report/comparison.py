@@ -1,4 +1,6 @@
-"""The page of a comparison: mosaics beside each other, Table 6.1 and the graphs of Fig. 6.4, A's Tables 1 and 2."""
+"""The page of a comparison: mosaics beside each other, Table 6.1 and the graphs of Fig. 6.4, A's
+Tables 1 and 2.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -16,7 +18,7 @@ ORDER = ("position", "pose", "image", "hybrid")
 """The thesis's order of lambda_corr, ascending."""
 
 
-def comparison_page(record: Mapping[str, Any], previews: Mapping[str, NDArray]) -> str:
+def comparison_page(record: Mapping[str, Any], previews: Mapping[str, NDArray[Any]]) -> str:
     """The page from what compare.json says and a picture (h, w, 4) of each mosaic."""
     every: Columns = record["methods"]
     ran = {n: c for n, c in every.items() if "refused" not in c}
@@ -29,10 +31,13 @@ def comparison_page(record: Mapping[str, Any], previews: Mapping[str, NDArray]) 
         Section(id="refused", title="Methods that refused", blocks=(_refused(every),)),
     )
     return plain_page(
-        title=f"Methods compared: {record['title']}", version=str(record["version"]), sections=sections,
+        title=f"Methods compared: {record['title']}",
+        version=str(record["version"]),
+        sections=sections,
         summary=f"{len(record['photos'])} photos, {len(every)} ways to align them.",
-        source="The figures behind this page are in compare.json; each method's own run lies in a folder of its name.",
-    )  # fmt: skip
+        source="The figures behind this page are in compare.json; each method's own run lies in a"
+        " folder of its name.",
+    )
 
 
 def _lead(record: Mapping[str, Any]) -> str:
@@ -50,15 +55,22 @@ def thesis_order(methods: Columns) -> str:
     if tuple(found) == ORDER:
         return f"The thesis's order of the correlation reappears: {told}."
     return (
-        f"The thesis found position < pose < image < hybrid in correlation; here it is {told}. Where image is ahead of"
-        " hybrid, photos fit their neighbours better than one height and the reported tilts let them: image bends them"
+        f"The thesis found position < pose < image < hybrid in correlation; here it is {told}."
+        " Where image is ahead of"
+        " hybrid, photos fit their neighbours better than one height and the reported tilts let"
+        " them: image bends them"
         " freely and pays with distances, which the geolocation below shows."
     )
 
 
-def _mosaics(ran: Columns, previews: Mapping[str, NDArray]) -> tuple[Block, ...]:
+def _mosaics(ran: Columns, previews: Mapping[str, NDArray[Any]]) -> tuple[Block, ...]:
     shown = [
-        picture(previews[n], n, f"{c['placed']} photos placed, {len(c['blocks'])} piece(s).", longest=700)
+        picture(
+            previews[n],
+            n,
+            f"{c['placed']} photos placed, {len(c['blocks'])} piece(s).",
+            longest=700,
+        )
         for n, c in ran.items()
         if n in previews
     ]
@@ -77,19 +89,26 @@ def _quality(ran: Columns) -> tuple[Block, ...]:
     errors = [_errors(c) for c in ran.values()]
     if first["distances"]:
         rows.append(("largest error, m", DASH, *(_f(max(e) if e else None, 2) for e in errors)))
-        rows.append(("median error, m", DASH, *(_f(float(np.median(e)) if e else None, 2) for e in errors)))
+        rows.append(
+            ("median error, m", DASH, *(_f(float(np.median(e)) if e else None, 2) for e in errors))
+        )
     for key, label in (
-        ("lambda_spat", "\u03bb spat (6.1)"), ("lambda_spat_of_table", "\u03bb spat as Table 6.1 prints it"),
-        ("lambda_corr", "\u03bb corr"), ("lambda", "\u03bb"),
-    ):  # fmt: skip
+        ("lambda_spat", "\u03bb spat (6.1)"),
+        ("lambda_spat_of_table", "\u03bb spat as Table 6.1 prints it"),
+        ("lambda_corr", "\u03bb corr"),
+        ("lambda", "\u03bb"),
+    ):
         rows.append((label, DASH, *(_percent(c[key]) for c in ran.values())))
     seams = [c["seam_disparity_px"] for c in ran.values()]
     rows.append(("seams, median px (measured)", DASH, *(_seam(s) for s in seams)))
     table = Table(
-        title="Table 6.1 of the thesis, on this survey", head=("", "Reference", *names), rows=tuple(rows),
+        title="Table 6.1 of the thesis, on this survey",
+        head=("", "Reference", *names),
+        rows=tuple(rows),
         numeric="t" + "n" * (len(names) + 1),
-        note="\u03bb corr replays the final placements in order of capture at one ground resolution.",
-    )  # fmt: skip
+        note="\u03bb corr replays the final placements in order of capture at one ground"
+        " resolution.",
+    )
     return (table,)
 
 
@@ -103,18 +122,34 @@ def _graphs(ran: Columns) -> tuple[Block, ...]:
     legend = tuple(LegendItem(colour=COLOURS[k % len(COLOURS)], text=n) for k, n in enumerate(ran))
     upper = lines(
         [(n, _array(c["correlation_with_last_of_photo"])) for n, c in ran.items()],
-        title="Correlation of overlapping parts of two adjacent photos", x_label="photo", y_label="CC",
-    )  # fmt: skip
+        title="Correlation of overlapping parts of two adjacent photos",
+        x_label="photo",
+        y_label="CC",
+    )
     lower = lines(
         [(n, _array(c["off_position_over_width"])) for n, c in ran.items()],
-        title="Distance from the reported position over the width of a photo", x_label="photo", y_label="widths",
-    )  # fmt: skip
+        title="Distance from the reported position over the width of a photo",
+        x_label="photo",
+        y_label="widths",
+    )
     return (
-        Figure(svg=upper, title="Correlation with the photo before", legend=legend, wide=True,
-               caption="Upper graph of Fig. 6.4: how well each photo fits the one before it where both overlap."),
-        Figure(svg=lower, title="Distance from the reported position", legend=legend, wide=True,
-               caption="Lower graph of Fig. 6.4: estimated minus reported position, over the photo's width."),
-    )  # fmt: skip
+        Figure(
+            svg=upper,
+            title="Correlation with the photo before",
+            legend=legend,
+            wide=True,
+            caption="Upper graph of Fig. 6.4: how well each photo fits the one before it where both"
+            " overlap.",
+        ),
+        Figure(
+            svg=lower,
+            title="Distance from the reported position",
+            legend=legend,
+            wide=True,
+            caption="Lower graph of Fig. 6.4: estimated minus reported position, over the photo's"
+            " width.",
+        ),
+    )
 
 
 def _geolocation(ran: Columns) -> Block:
@@ -127,23 +162,34 @@ def _geolocation(ran: Columns) -> Block:
         return Missing(why="The photos carry no positions to compare with.")
     return Table(
         title="Geolocation at the photos' centres against their reported positions (A Table 2), m",
-        head=("", "MAE x", "MAE y", "MAE z", "RMS x", "RMS y", "RMS z"), rows=tuple(rows), numeric="tnnnnnn",
-        note="Methods that take positions as they are differ by nothing from them: that is no accuracy.",
-    )  # fmt: skip
+        head=("", "MAE x", "MAE y", "MAE z", "RMS x", "RMS y", "RMS z"),
+        rows=tuple(rows),
+        numeric="tnnnnnn",
+        note="Methods that take positions as they are differ by nothing from them: that is no"
+        " accuracy.",
+    )
 
 
 def _time(ran: Columns, photos: int) -> Block:
     if not ran:
         return Missing(why="No method made a map.")
     rows = tuple(
-        (n, str(photos), _f(c["seconds"], 1), _f(c["align_seconds"], 1), _f(c["cpu_seconds"], 1),
-         _f(c["cpu_seconds"] / max(c["placed"], 1), 2))
+        (
+            n,
+            str(photos),
+            _f(c["seconds"], 1),
+            _f(c["align_seconds"], 1),
+            _f(c["cpu_seconds"], 1),
+            _f(c["cpu_seconds"] / max(c["placed"], 1), 2),
+        )
         for n, c in ran.items()
-    )  # fmt: skip
+    )
     return Table(
-        title="Time of the whole command (A Table 1)", rows=rows, numeric="tnnnnn",
+        title="Time of the whole command (A Table 1)",
+        rows=rows,
+        numeric="tnnnnn",
         head=("", "photos", "seconds", "alignment, s", "CPU s", "CPU s per photo"),
-    )  # fmt: skip
+    )
 
 
 def _refused(every: Columns) -> Block:

@@ -15,14 +15,19 @@ def time_section(data: ReportInput) -> Section:
     if not stages:
         why = "The time per stage was not recorded."
         return Section(id="time", title="Time per stage", blocks=(Missing(why=why),))
-    longest, whole = max(stages.values()) or 1.0, number(told.get("total")) or sum(stages.values()) or 1.0
+    longest, whole = (
+        max(stages.values()) or 1.0,
+        number(told.get("total")) or sum(stages.values()) or 1.0,
+    )
     parts = []
     for k, (name, value) in enumerate(stages.items()):
         y, width = k * ROW, max(0.0, value / longest * (WIDE - LEFT - 150))
         parts += [
             text(LEFT - 10, y + 18, name, "label end"),
             rect(LEFT, y + 5, max(width, 1), ROW - 10, "bar"),
-            text(LEFT + max(width, 1) + 8, y + 18, f"{seconds(value)}  ({value / whole:.0%})", "tick"),
+            text(
+                LEFT + max(width, 1) + 8, y + 18, f"{seconds(value)}  ({value / whole:.0%})", "tick"
+            ),
         ]
     title = "Time per stage"
     rest = whole - sum(stages.values())

@@ -1,6 +1,7 @@
 """Pictures and graphs of several lines for pages of sections."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -25,7 +26,9 @@ COLOURS = (
 """Of lines in one graph, in order."""
 
 
-def picture(pixels: NDArray, title: str, caption: str, *, longest: int = 1000, wide: bool = False) -> Figure:
+def picture(
+    pixels: NDArray[Any], title: str, caption: str, *, longest: int = 1000, wide: bool = False
+) -> Figure:
     """A picture (H, W, 3 or 4) uint8 as a figure; what is transparent in it is shown white."""
     small = shrunk(pixels, longest)
     if small.shape[2] == 4:
@@ -34,20 +37,30 @@ def picture(pixels: NDArray, title: str, caption: str, *, longest: int = 1000, w
     rgba = np.dstack([small, np.full(small.shape[:2], 255, np.uint8)])
     h, w = rgba.shape[:2]
     svg = Markup(
-        '<svg viewBox="0 0 {} {}" role="img" aria-label="{}"><image href="{}" width="{}" height="{}"/></svg>'
+        '<svg viewBox="0 0 {} {}" role="img" aria-label="{}"><image href="{}" width="{}"'
+        ' height="{}"/></svg>'
     )
-    return Figure(svg=svg.format(w, h, title, jpeg_uri(rgba), w, h), title=title, caption=caption, wide=wide)
+    return Figure(
+        svg=svg.format(w, h, title, jpeg_uri(rgba), w, h), title=title, caption=caption, wide=wide
+    )
 
 
 def lines(
-    series: Sequence[tuple[str, NDArray]], *, title: str, x_label: str, y_label: str, first: float = 1.0
+    series: Sequence[tuple[str, NDArray[Any]]],
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
+    first: float = 1.0,
 ) -> Markup:
     """Lines of values (n,) over their number, counted from `first`; NaN breaks a line."""
     values = np.concatenate([v[np.isfinite(v)] for _, v in series] or [np.zeros(1)])
     low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
     pad = 0.06 * (high - low) or 0.5
     longest = max((len(v) for _, v in series), default=2)
-    axes = Axes(x=(first, first + max(longest - 1, 1)), y=(low - pad, high + pad), width=900, height=360)
+    axes = Axes(
+        x=(first, first + max(longest - 1, 1)), y=(low - pad, high + pad), width=900, height=360
+    )
     parts = [axes.grid(x_label, y_label)]
     for k, (_, value) in enumerate(series):
         colour = COLOURS[k % len(COLOURS)]
@@ -57,6 +70,8 @@ def lines(
         d = "".join(polyline(points[r]) for r in runs if whole[r[0]])
         if d:
             parts.append(
-                Markup('<path d="{}" style="fill:none;stroke:{};stroke-width:2"/>').format(d, colour)
+                Markup('<path d="{}" style="fill:none;stroke:{};stroke-width:2"/>').format(
+                    d, colour
+                )
             )
     return drawing(parts, title, width=900, height=360)

@@ -1,4 +1,6 @@
-"""The ground in drawings: metres from the north-west corner, and pictures of layers that share them."""
+"""The ground in drawings: metres from the north-west corner, and pictures of layers that share
+them.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -59,7 +61,9 @@ class Ground:
 
 def ground_of(data: ReportInput) -> Ground | None:
     """The area of the map and the photos' centres; None if nothing has a place."""
-    corners = [np.reshape(b, (2, 2)) for b in (data.bounds, data.views_bounds, data.surface_bounds) if b][:1]
+    corners = [
+        np.reshape(b, (2, 2)) for b in (data.bounds, data.views_bounds, data.surface_bounds) if b
+    ][:1]
     centres = [np.reshape(s.xyz, (1, 3))[:, :2] for s in data.shots]
     marks = [np.array([[m.x, m.y]]) for m in data.seams] if not corners else []
     points = (
@@ -104,13 +108,16 @@ def scale_bar(scale: float, height: float, unit: str) -> Markup:
     y, right = height - 16, 16 + length * scale
     label = f"{fixed(length, decimals_of(length))} {unit}"
     return Markup('<g class="furniture">{}{}{}</g>').format(
-        line(16, y, right, y, "bar-casing"), line(16, y, right, y, "bar-line"), text(16, y - 8, label)
+        line(16, y, right, y, "bar-casing"),
+        line(16, y, right, y, "bar-line"),
+        text(16, y - 8, label),
     )
 
 
 def north_arrow(width: float) -> Markup:
     """An arrow to the north in the upper right corner."""
     return Markup(
-        '<g class="furniture" transform="translate({} 34)"><path class="needle" d="M0 -20L8 6L0 0L-8 6Z"/>'
+        '<g class="furniture" transform="translate({} 34)"><path class="needle" d="M0 -20L8 6L0'
+        ' 0L-8 6Z"/>'
         '<text y="22" class="mid">N</text></g>'
     ).format(coordinate(width - 30))

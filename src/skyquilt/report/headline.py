@@ -66,7 +66,8 @@ def georeference(m: Mapping[str, Any], data: ReportInput) -> Tile:
             value="not georeferenced",
             verdict="poor",
             anchor="map",
-            says="Nothing says where on Earth this is. Photos with GPS, geo.txt or control points would.",
+            says="Nothing says where on Earth this is. Photos with GPS, geo.txt or control points"
+            " would.",
         )
     return Tile(
         label="Coordinates",
@@ -80,7 +81,12 @@ def georeference(m: Mapping[str, Any], data: ReportInput) -> Tile:
 def crs_name(crs: str) -> str:
     """A sentence that names the commonest systems."""
     code = crs.upper().removeprefix("EPSG:")
-    if len(code) == 5 and code[:3] in ("326", "327") and code.isdigit() and 1 <= int(code[3:]) <= 60:
+    if (
+        len(code) == 5
+        and code[:3] in ("326", "327")
+        and code.isdigit()
+        and 1 <= int(code[3:]) <= 60
+    ):
         return f"WGS\u202f84 / UTM zone {int(code[3:])}{'N' if code[2] == '6' else 'S'}. "
     return ""
 
@@ -94,10 +100,14 @@ def blocks(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
     if len(sizes) > 1:
         listed = ", ".join(fixed(n, 0) for n in sizes[:6]) + (" \u2026" if len(sizes) > 6 else "")
         says = (
-            f"Pieces of {listed} photos, each placed by its own GPS: expect steps between them. One is good."
+            f"Pieces of {listed} photos, each placed by its own GPS: expect steps between them."
+            " One is good."
         )
     return Tile(
-        label="Blocks", value=fixed(len(sizes), 0), verdict="good" if len(sizes) == 1 else "fair", says=says
+        label="Blocks",
+        value=fixed(len(sizes), 0),
+        verdict="good" if len(sizes) == 1 else "fair",
+        says=says,
     )
 
 
@@ -107,11 +117,16 @@ def gsd(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
     if value is None:
         return None
     if not data.metric:
-        return Tile(label="Pixel size", value=significant(value), unit="units", says="The scale is unknown.")
+        return Tile(
+            label="Pixel size", value=significant(value), unit="units", says="The scale is unknown."
+        )
     says = (
-        f"Side of one map pixel on the ground; things of about {fixed(value * 300, 0)} cm can be told apart."
+        f"Side of one map pixel on the ground; things of about {fixed(value * 300, 0)} cm can be"
+        " told apart."
     )
-    return Tile(label="Ground sampling distance", value=significant(value * 100), unit="cm", says=says)
+    return Tile(
+        label="Ground sampling distance", value=significant(value * 100), unit="cm", says=says
+    )
 
 
 def area(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
@@ -123,7 +138,12 @@ def area(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
     if value is None:
         return None
     if not data.metric:
-        return Tile(label="Area", value=significant(value), unit="square units", says="The scale is unknown.")
+        return Tile(
+            label="Area",
+            value=significant(value),
+            unit="square units",
+            says="The scale is unknown.",
+        )
     large = value >= 1e4
     return Tile(
         label="Area",
@@ -149,7 +169,8 @@ def reprojection(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         unit="px",
         anchor="residuals",
         verdict=verdict(shown, 1, 2),
-        says=f"Mean distance between a point as seen and as computed{behind}{also}. Good up to 1 px, "
+        says=f"Mean distance between a point as seen and as computed{behind}{also}. Good up to 1"
+        " px, "
         "fair up to 2.",
     )
 
@@ -167,7 +188,8 @@ def gps(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         unit="m",
         anchor="positions",
         verdict=verdict(flat, 3, 10),
-        says=f"RMS horizontal distance of the photos from their GPS{height}. It judges the GPS more "
+        says=f"RMS horizontal distance of the photos from their GPS{height}. It judges the GPS more"
+        " "
         "than the map: "
         "up to 3 m is normal, up to 10 m poor but usable.",
     )
@@ -210,7 +232,12 @@ def seam(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
             "figure does not stand."
         )
     return Tile(
-        label="Seam disparity", value=fixed(median, 2), unit="px", verdict=judged, anchor="seams", says=says
+        label="Seam disparity",
+        value=fixed(median, 2),
+        unit="px",
+        verdict=judged,
+        anchor="seams",
+        says=says,
     )
 
 

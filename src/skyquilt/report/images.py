@@ -3,6 +3,7 @@
 import struct
 import zlib
 from base64 import b64encode
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ SEQUENTIAL = cv2.COLORMAP_VIRIDIS
 ACCENT = (31, 111, 139)
 
 
-def shrunk(image: NDArray, longest: int, interpolation: int = cv2.INTER_AREA) -> NDArray:
+def shrunk(image: NDArray[Any], longest: int, interpolation: int = cv2.INTER_AREA) -> NDArray[Any]:
     """The image with its longer side at most so many px."""
     factor = longest / max(image.shape[:2])
     if factor >= 1:
@@ -22,10 +23,14 @@ def shrunk(image: NDArray, longest: int, interpolation: int = cv2.INTER_AREA) ->
     return cv2.resize(image, size, interpolation=interpolation)
 
 
-def jpeg_uri(rgba: NDArray, quality: int = 80) -> str:
+def jpeg_uri(rgba: NDArray[Any], quality: int = 80) -> str:
     """A JPEG of (H, W, 4) uint8, its alpha left out."""
     data = simplejpeg.encode_jpeg(
-        np.ascontiguousarray(rgba), quality=quality, colorspace="RGBX", colorsubsampling="420", fastdct=True
+        np.ascontiguousarray(rgba),
+        quality=quality,
+        colorspace="RGBX",
+        colorsubsampling="420",
+        fastdct=True,
     )
     return "data:image/jpeg;base64," + b64encode(data).decode()
 
@@ -49,20 +54,20 @@ def png_uri(index: NDArray[np.uint8], colours: NDArray[np.uint8]) -> str:
     return "data:image/png;base64," + b64encode(data).decode()
 
 
-def thinned(values: NDArray, most: int) -> NDArray:
+def thinned(values: NDArray[Any], most: int) -> NDArray[Any]:
     """Every n-th row and column, so that neither side has more than about so many."""
     step = max(1, -(-max(values.shape[:2]) // most))
     return values[::step, ::step]
 
 
-def scale(values: NDArray) -> NDArray[np.uint8]:
+def scale(values: NDArray[Any]) -> NDArray[np.uint8]:
     """Colours (..., 3) RGB of values in [0, 1] on the sequential scale."""
     index = np.clip(np.nan_to_num(values) * 255, 0, 255).astype(np.uint8)
     bgr = cv2.applyColorMap(np.atleast_2d(index), SEQUENTIAL)
     return np.ascontiguousarray(bgr[..., ::-1], np.uint8).reshape(*index.shape, 3)
 
 
-def css(rgb: NDArray) -> str:
+def css(rgb: NDArray[Any]) -> str:
     """`#rrggbb`."""
     return "#" + "".join(f"{int(c):02x}" for c in rgb)
 
@@ -70,7 +75,8 @@ def css(rgb: NDArray) -> str:
 def outline(
     alpha: NDArray[np.uint8], *, tolerance: float = 0.7, limit: int = 200
 ) -> list[NDArray[np.float64]]:
-    """Rings (k, 2) in px (the image spans 0 to its size) around what is not transparent, and around holes.
+    """Rings (k, 2) in px (the image spans 0 to its size) around what is not transparent, and around
+    holes.
 
     At most `limit` rings, the largest ones.
     """
@@ -80,7 +86,7 @@ def outline(
     return [np.float64(1) * cv2.approxPolyDP(r, tolerance, True)[:, 0, :] - 0.5 for r in rings]
 
 
-def shaded(z: NDArray, cell: float) -> NDArray[np.uint8]:
+def shaded(z: NDArray[Any], cell: float) -> NDArray[np.uint8]:
     """RGBA (h, w, 4) of heights in m, lit from the north-west; transparent where not finite."""
     valid = np.isfinite(z)
     low, high = height_range(z)
@@ -92,7 +98,7 @@ def shaded(z: NDArray, cell: float) -> NDArray[np.uint8]:
     return np.dstack([rgb, np.where(valid, 255, 0).astype(np.uint8)])
 
 
-def height_range(z: NDArray) -> tuple[float, float]:
+def height_range(z: NDArray[Any]) -> tuple[float, float]:
     """Both ends of the colour scale for heights of which some are finite."""
     low, high = (float(v) for v in np.percentile(z[np.isfinite(z)], [1, 99]))
     return (low, high) if high - low > 1e-6 else (low - 0.5, high + 0.5)

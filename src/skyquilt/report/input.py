@@ -1,4 +1,6 @@
-"""What a finished run hands to its report: plain arrays and numbers, nothing that needs another stage."""
+"""What a finished run hands to its report: plain arrays and numbers, nothing that needs another
+stage.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,15 +18,15 @@ class Shot:
 
     name: str
     """Photo.name."""
-    xyz: NDArray
+    xyz: NDArray[Any]
     """(3,) solved camera centre in m (map frame)."""
-    reported_xyz: NDArray
+    reported_xyz: NDArray[Any]
     """(3,) position its metadata report in m (map frame); NaN where they say nothing."""
     block: int = 0
     """Number of its block, the largest is 0."""
     method: str = ""
     """How it was placed."""
-    footprint: NDArray
+    footprint: NDArray[Any]
     """(k, 2) outline on the ground in m (map frame); empty if unknown."""
 
 
@@ -38,9 +40,9 @@ class CameraResiduals:
     """Image width in px."""
     height: int
     """Image height in px."""
-    px: NDArray
+    px: NDArray[Any]
     """(N, 2) where the points were seen."""
-    residual_px: NDArray
+    residual_px: NDArray[Any]
     """(N, 2) projected minus seen."""
 
 
@@ -62,7 +64,7 @@ class DepthPicture:
 
     name: str
     """The photo registered."""
-    pixels: NDArray
+    pixels: NDArray[Any]
     """(h, w, 3) uint8."""
     features: int
     """Inliers it was made from."""
@@ -75,8 +77,10 @@ class ReportInput:
     """Everything the page shows. What is absent is left out, with a sentence why."""
 
     metrics: Mapping[str, Any]
-    """The content of metrics.json, with `control`, `cameras`, `notes`, `warnings` where there are any."""
-    preview: NDArray | None = None
+    """The content of metrics.json, with `control`, `cameras`, `notes`, `warnings` where there are
+    any.
+    """
+    preview: NDArray[Any] | None = None
     """(H, W, 4) uint8 RGBA, north up: the mosaic, reduced."""
     bounds: Bounds | None = None
     """Of the preview."""
@@ -86,16 +90,18 @@ class ReportInput:
     """As pyproj reads it; None when nothing says where on Earth the survey is."""
     metric: bool = True
     """False when even the scale is unknown: then 1 m is an arbitrary unit."""
-    views: NDArray | None = None
+    views: NDArray[Any] | None = None
     """(h, w) integers: number of photos that see each cell, row 0 is the northernmost."""
     views_bounds: Bounds | None = None
     """Of the views."""
-    surface: NDArray | None = None
+    surface: NDArray[Any] | None = None
     """(h, w) float heights in m, NaN where unknown, row 0 is the northernmost."""
     surface_bounds: Bounds | None = None
     """Of the surface."""
     vertical_datum: str = "unknown"
-    """What heights count from: `takeoff`, `sea_level`, `ellipsoid`, `control`, `unknown`, or any phrase."""
+    """What heights count from: `takeoff`, `sea_level`, `ellipsoid`, `control`, `unknown`, or any
+    phrase.
+    """
     shots: Sequence[Shot] = ()
     """Placed photos in order of capture."""
     residuals: Sequence[CameraResiduals] = ()

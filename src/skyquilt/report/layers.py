@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,7 +22,14 @@ MANY = 300
 """From here on marks are drawn finer."""
 SEAM_EDGES = (0.5, 1.0, 2.0, 5.0)
 SEAM_COLOURS = ("#2166ac", "#67a9cf", "#f6e27f", "#ef8a62", "#c2183b", "#8b8f96")
-SEAM_LABELS = ("up to 0.5 px", "0.5 to 1 px", "1 to 2 px", "2 to 5 px", "more than 5 px", "not measured")
+SEAM_LABELS = (
+    "up to 0.5 px",
+    "0.5 to 1 px",
+    "1 to 2 px",
+    "2 to 5 px",
+    "more than 5 px",
+    "not measured",
+)
 MOST_VIEWS = 9
 BLOCK_COLOURS = ("#ffd54a", "#4fc3f7", "#f48fb1", "#aed581", "#ffab66", "#c5b3f5")
 
@@ -64,10 +72,14 @@ def mosaic(data: ReportInput, ground: Ground) -> Layer | None:
     if data.preview is None or data.bounds is None or not data.preview.size:
         return None
     small = images.shrunk(data.preview, PREVIEW_PX)
-    return Layer(id="mosaic", label="Mosaic", shape=clipped("mosaic", small, data.bounds, ground), on=True)
+    return Layer(
+        id="mosaic", label="Mosaic", shape=clipped("mosaic", small, data.bounds, ground), on=True
+    )
 
 
-def clipped(name: str, rgba: NDArray, bounds: Bounds, ground: Ground, *, within: str = "") -> Markup:
+def clipped(
+    name: str, rgba: NDArray[Any], bounds: Bounds, ground: Ground, *, within: str = ""
+) -> Markup:
     """A raster as JPEG, cut along the outline of its alpha and along another clip path."""
     height, width = rgba.shape[:2]
     west, south, east, north = bounds
@@ -93,13 +105,16 @@ def overlap(data: ReportInput, ground: Ground) -> Layer | None:
     colours = view_colours()
     table = np.zeros((MOST_VIEWS + 1, 4), np.uint8)
     table[1:, :3], table[1:, 3] = colours, 255
-    index = np.clip(images.thinned(np.asarray(data.views), VIEWS_PX), 0, MOST_VIEWS).astype(np.uint8)
+    index = np.clip(images.thinned(np.asarray(data.views), VIEWS_PX), 0, MOST_VIEWS).astype(
+        np.uint8
+    )
     shape = Markup('<image id="layer-overlap" {} href="{}"/>').format(
         ground.box(data.views_bounds), Markup(images.png_uri(index, table))
     )
     legend = tuple(
         LegendItem(
-            colour=images.css(colours[k]), text=f"{k + 1}" if k + 1 < MOST_VIEWS else f"{MOST_VIEWS} or more"
+            colour=images.css(colours[k]),
+            text=f"{k + 1}" if k + 1 < MOST_VIEWS else f"{MOST_VIEWS} or more",
         )
         for k in range(MOST_VIEWS)
     )
@@ -108,7 +123,7 @@ def overlap(data: ReportInput, ground: Ground) -> Layer | None:
 
 def view_colours() -> NDArray[np.uint8]:
     """Colours (MOST_VIEWS, 3) of 1, 2, ... photos."""
-    return images.scale(np.linspace(0.02, 0.98, MOST_VIEWS)[None])[0]
+    return np.asarray(images.scale(np.linspace(0.02, 0.98, MOST_VIEWS)[None])[0])
 
 
 def surface(data: ReportInput, ground: Ground) -> Layer | None:
@@ -118,7 +133,9 @@ def surface(data: ReportInput, ground: Ground) -> Layer | None:
         return None
     small = images.shrunk(np.asarray(z, np.float32), SURFACE_PX, cv2.INTER_NEAREST)
     rgba = images.shaded(small, (bounds[2] - bounds[0]) / small.shape[1])
-    shape = clipped("heights", rgba, bounds, ground, within="" if data.preview is None else "mosaic-rim")
+    shape = clipped(
+        "heights", rgba, bounds, ground, within="" if data.preview is None else "mosaic-rim"
+    )
     return Layer(id="heights", label="Heights", shape=shape)
 
 
@@ -131,11 +148,13 @@ def footprints(shots: Sequence[Shot], ground: Ground) -> Layer | None:
     return Layer(id="footprints", label="Footprints", shape=shape, styles=("footprints",))
 
 
-def _outline(footprint: NDArray, ground: Ground) -> str:
+def _outline(footprint: NDArray[Any], ground: Ground) -> str:
     if len(footprint) < 3 or not np.isfinite(footprint).all():
         return ""
     ring = ground.xy(footprint).astype(np.float32)[:, None]
-    return polyline(cv2.approxPolyDP(ring, ground.diagonal / 1500, True)[:, 0], ground.decimals, close=True)
+    return polyline(
+        cv2.approxPolyDP(ring, ground.diagonal / 1500, True)[:, 0], ground.decimals, close=True
+    )
 
 
 def placed(shots: Sequence[Shot]) -> NDArray[np.float64]:
@@ -154,8 +173,12 @@ def flight(shots: Sequence[Shot], ground: Ground) -> Layer | None:
     xyz = xyz[np.isfinite(xyz).all(1)]
     if len(xyz) < 2:
         return None
-    shape = Markup('<path id="layer-flight" d="{}"/>').format(polyline(ground.xy(xyz), ground.decimals))
-    return Layer(id="flight", label="Flight path", shape=shape, styles=("casing", "flight"), on=True)
+    shape = Markup('<path id="layer-flight" d="{}"/>').format(
+        polyline(ground.xy(xyz), ground.decimals)
+    )
+    return Layer(
+        id="flight", label="Flight path", shape=shape, styles=("casing", "flight"), on=True
+    )
 
 
 def centres(shots: Sequence[Shot], ground: Ground) -> Layer | None:
@@ -171,27 +194,35 @@ def centres(shots: Sequence[Shot], ground: Ground) -> Layer | None:
         member = known & ((blocks == block) if k < last else np.isin(blocks, kinds[last:]))
         shapes.append(path(dots(ground.xy(xyz[member]), ground.decimals), f"b{k}"))
         legend.append(
-            LegendItem(colour=BLOCK_COLOURS[k], text=f"block {block + 1}" if k < last else "other blocks")
+            LegendItem(
+                colour=BLOCK_COLOURS[k], text=f"block {block + 1}" if k < last else "other blocks"
+            )
         )
     shape = Markup('<g id="layer-centres">{}</g>').format(Markup().join(shapes))
     return Layer(
         id="centres",
         label="Photo centres",
         shape=shape,
-        styles=("dot-casing", "dots") if known.sum() <= MANY else ("small dot-casing", "small dots"),
+        styles=("dot-casing", "dots")
+        if known.sum() <= MANY
+        else ("small dot-casing", "small dots"),
         on=True,
         legend=tuple(legend) if len(kinds) > 1 else (),
     )
 
 
 def exaggeration(shots: Sequence[Shot], ground: Ground) -> float:
-    """Round factor at which the arrows from reported to solved positions can be seen; at least 1."""
+    """Round factor at which the arrows from reported to solved positions can be seen; at least
+    1.
+    """
     off = placed(shots)[:, :2] - reported(shots)[:, :2]
     length = np.linalg.norm(off, axis=1)
     length = length[np.isfinite(length) & (length > 0)]
     if not len(length):
         return 1.0
-    room = min(0.05 * ground.diagonal, 0.8 * float(np.sqrt(ground.width * ground.height / len(length))))
+    room = min(
+        0.05 * ground.diagonal, 0.8 * float(np.sqrt(ground.width * ground.height / len(length)))
+    )
     wanted = room / float(np.percentile(length, 75))
     return max(1.0, nice(wanted / 2, 1)) if wanted > 1 else 1.0
 
@@ -206,7 +237,10 @@ def gps(shots: Sequence[Shot], ground: Ground) -> Layer | None:
     tails, off = tails[near][:MOST_SHOTS], off[near][:MOST_SHOTS]
     shape = Markup('<path id="layer-gps" d="{}"/>').format(
         arrows(
-            ground.xy(tails), ground.xy(tails + factor * off), ground.decimals, longest=ground.diagonal / 90
+            ground.xy(tails),
+            ground.xy(tails + factor * off),
+            ground.decimals,
+            longest=ground.diagonal / 90,
         )
     )
     return Layer(
@@ -225,17 +259,27 @@ def seams(marks: Sequence[SeamMark], ground: Ground) -> Layer | None:
     xy = ground.xy([[m.x, m.y] for m in marks[::stride]])
     kind = seam_kinds(marks[::stride])
     order = (5, 0, 1, 2, 3, 4)  # the worst on top
-    shapes = [path(dots(xy[kind == k], ground.decimals), f"s{k}") for k in order if (kind == k).any()]
+    shapes = [
+        path(dots(xy[kind == k], ground.decimals), f"s{k}") for k in order if (kind == k).any()
+    ]
     shape = Markup('<g id="layer-seams">{}</g>').format(Markup().join(shapes))
-    legend = tuple(LegendItem(colour=c, text=t) for c, t in zip(SEAM_COLOURS, SEAM_LABELS, strict=True))
+    legend = tuple(
+        LegendItem(colour=c, text=t) for c, t in zip(SEAM_COLOURS, SEAM_LABELS, strict=True)
+    )
     return Layer(
-        id="seams", label="Seam samples", shape=shape, styles=("fine dot-casing", "fine dots"), legend=legend
+        id="seams",
+        label="Seam samples",
+        shape=shape,
+        styles=("fine dot-casing", "fine dots"),
+        legend=legend,
     )
 
 
 def disparities(marks: Sequence[SeamMark]) -> NDArray[np.float64]:
     """(n,) in px, NaN where not measured."""
-    return np.array([np.nan if m.disparity_px is None else m.disparity_px for m in marks], np.float64)
+    return np.array(
+        [np.nan if m.disparity_px is None else m.disparity_px for m in marks], np.float64
+    )
 
 
 def seam_kinds(marks: Sequence[SeamMark]) -> NDArray[np.int64]:

@@ -52,7 +52,8 @@ def map_view(data: ReportInput, ground: Ground, layers: Sequence[Layer]) -> MapV
         layers=tuple(layers),
         world=Markup().join(world),
         transform=transform,
-        furniture=scale_bar(scale, height, ground.unit) + (north_arrow(MAP_WIDTH) if data.crs else Markup()),
+        furniture=scale_bar(scale, height, ground.unit)
+        + (north_arrow(MAP_WIDTH) if data.crs else Markup()),
         width=MAP_WIDTH,
         height=height,
         facts=facts(data, ground),
@@ -101,7 +102,10 @@ def extent(data: ReportInput, ground: Ground) -> str:
     east_0, north_0 = data.origin
     if not data.crs:
         size = f"{fixed(east - west, 1)} by {fixed(north - south, 1)} {ground.unit}"
-        return f"The map measures {size}; its coordinates count from an arbitrary point and north is unknown."
+        return (
+            f"The map measures {size}; its coordinates count from an arbitrary point and north"
+            " is unknown."
+        )
     return (
         f"{data.crs}: easting {fixed(west + east_0, 1)} to {fixed(east + east_0, 1)} m, "
         f"northing {fixed(south + north_0, 1)} to {fixed(north + north_0, 1)} m."

@@ -102,7 +102,9 @@ def count(n: float, noun: str, plural: str = "") -> str:
 
 
 def nice(span: float, parts: float) -> float:
-    """A round step (1, 2, 5 times a power of ten) that divides the span into about so many parts."""
+    """A round step (1, 2, 5 times a power of ten) that divides the span into about so many
+    parts.
+    """
     raw = span / max(parts, 1e-9)
     if not math.isfinite(raw) or raw <= 0:
         return 1.0

@@ -32,10 +32,16 @@ def overlap_section(data: ReportInput, ground: Ground | None, layers: dict[str, 
             )
             svg = picture(
                 ground,
-                [use("mosaic", "faded") if "mosaic" in layers else use("overlap"), use("overlap", "haze")],
+                [
+                    use("mosaic", "faded") if "mosaic" in layers else use("overlap"),
+                    use("overlap", "haze"),
+                ],
                 title,
             )
-            blocks = (Figure(svg=svg, title=title, caption=caption, legend=layers["overlap"].legend), *blocks)
+            blocks = (
+                Figure(svg=svg, title=title, caption=caption, legend=layers["overlap"].legend),
+                *blocks,
+            )
     return Section(id="overlap", title="Overlap", blocks=blocks)
 
 
@@ -55,7 +61,8 @@ def _heights(z: np.ndarray, low: float, high: float, unit: str) -> Figure:
         marks=((median, f"median {fixed(median, 1)}"),),
     )
     caption = (
-        "A few cells far from all others would be outliers that passed; they tear the map where they lie."
+        "A few cells far from all others would be outliers that passed; they tear the map"
+        " where they lie."
     )
     return Figure(svg=svg, title=title, caption=caption)
 
@@ -88,7 +95,12 @@ def surface_section(data: ReportInput, ground: Ground | None, layers: dict[str, 
     blocks: tuple[Block, ...] = (
         Missing(why="The photos were placed on a plane: there is no height surface to show."),
     )
-    if ground and "heights" in layers and data.surface is not None and data.surface_bounds is not None:
+    if (
+        ground
+        and "heights" in layers
+        and data.surface is not None
+        and data.surface_bounds is not None
+    ):
         z = np.asarray(data.surface)[np.isfinite(data.surface)]
         low, high = images.height_range(z)
         datum = DATUMS.get(data.vertical_datum, data.vertical_datum)
@@ -105,7 +117,8 @@ def surface_section(data: ReportInput, ground: Ground | None, layers: dict[str, 
         if z.max() - z.min() < 1e-3:
             blocks = (
                 Missing(
-                    why=f"The surface is level at {fixed(low, 1)} {unit} {datum}: there is no relief to show."
+                    why=f"The surface is level at {fixed(low, 1)} {unit} {datum}: there is no"
+                    " relief to show."
                 ),
             )
     return Section(id="surface", title="Height surface", blocks=blocks)

@@ -69,7 +69,9 @@ def build_report(data: ReportInput) -> str:
 
 
 def write_report(path: Path, data: ReportInput) -> None:
-    """Build the page and put it at `path`, whole or not at all; `OutputError` if it cannot be written."""
+    """Build the page and put it at `path`, whole or not at all; `OutputError` if it cannot be
+    written.
+    """
     write_page(path, build_report(data))
 
 
@@ -111,14 +113,24 @@ def tied(words: str) -> str:
 
 
 def plain_page(
-    *, title: str, summary: str, version: str, source: str, sections: tuple[Section, ...],
+    *,
+    title: str,
+    summary: str,
+    version: str,
+    source: str,
+    sections: tuple[Section, ...],
     tiles: tuple[Tile, ...] = (),
-) -> str:  # fmt: skip
+) -> str:
     """A page of sections without a map; `source` says where the figures lie. Whole in itself."""
     return _template("plain.html.j2").render(
-        title=title, summary=summary, version=version, source=source, sections=sections, tiles=tiles,
+        title=title,
+        summary=summary,
+        version=version,
+        source=source,
+        sections=sections,
+        tiles=tiles,
         style=_asset("style.css"),
-    )  # fmt: skip
+    )
 
 
 def section_html(section: Section) -> str:

@@ -1,4 +1,6 @@
-"""What a page consists of; `page.html.j2` draws each kind and escapes every string that is not `Markup`."""
+"""What a page consists of; `page.html.j2` draws each kind and escapes every string that is not
+`Markup`.
+"""
 
 from dataclasses import dataclass
 from typing import Literal

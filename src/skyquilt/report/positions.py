@@ -1,6 +1,7 @@
 """Section: reported positions against solved ones."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -17,7 +18,9 @@ WORST = 10
 SERIES = (("east", "x0"), ("north", "x1"), ("up", "x2"))
 
 
-def positions_section(data: ReportInput, ground: Ground | None, layers: dict[str, Layer]) -> Section:
+def positions_section(
+    data: ReportInput, ground: Ground | None, layers: dict[str, Layer]
+) -> Section:
     """GPS residuals on the map, along the flight and as a table."""
     shots = data.shots
     off = placed(shots) - reported(shots)
@@ -37,7 +40,9 @@ def positions_section(data: ReportInput, ground: Ground | None, layers: dict[str
     )
 
 
-def _arrows(ground: Ground, layers: dict[str, Layer], shots: Sequence[Shot], off: NDArray) -> Figure:
+def _arrows(
+    ground: Ground, layers: dict[str, Layer], shots: Sequence[Shot], off: NDArray[Any]
+) -> Figure:
     factor, length = exaggeration(shots, ground), np.linalg.norm(off[:, :2], axis=1)
     far = int((length >= ground.diagonal).sum())
     title = "From the reported to the solved position"
@@ -46,17 +51,21 @@ def _arrows(ground: Ground, layers: dict[str, Layer], shots: Sequence[Shot], off
         "as the residual."
     )
     if factor == 1:
-        caption = "Arrows lead from where the photo says it was taken to where it was found, at true length."
+        caption = (
+            "Arrows lead from where the photo says it was taken to where it was found, at"
+            " true length."
+        )
     if far:
         caption += (
-            f" {count(far, 'photo')} reported further away than the map is wide: not drawn, see the table."
+            f" {count(far, 'photo')} reported further away than the map is wide: not drawn,"
+            " see the table."
         )
     under = [use("mosaic", "faded")] if "mosaic" in layers else []
     svg = picture(ground, [*under, *(use("gps", c) for c in layers["gps"].styles)], title)
     return Figure(svg=svg, title=title, caption=caption)
 
 
-def _series(off: NDArray, unit: str) -> Figure:
+def _series(off: NDArray[Any], unit: str) -> Figure:
     """East, north and up in order of capture, in three strips."""
     title = "Residuals in order of capture"
     stride = -(-len(off) // 1500)
@@ -81,16 +90,19 @@ def _series(off: NDArray, unit: str) -> Figure:
         )
         grid = axes.grid("photo" if k == 2 else "", f"{name}, {unit}", x_ticks=k == 2, y_parts=5)
         parts.append(
-            Markup('<g transform="translate(0 {})">{}</g>').format(coordinate(k * strip), grid + lines)
+            Markup('<g transform="translate(0 {})">{}</g>').format(
+                coordinate(k * strip), grid + lines
+            )
         )
     svg = drawing(parts, title, WIDTH, strip * 3 + 32)
     caption = (
-        "A step or a slope that lasts for many photos is a fault of the receiver or the barometer, not noise."
+        "A step or a slope that lasts for many photos is a fault of the receiver or the"
+        " barometer, not noise."
     )
     return Figure(svg=svg, title=title, caption=caption)
 
 
-def _worst(shots: Sequence[Shot], off: NDArray, known: NDArray) -> Table:
+def _worst(shots: Sequence[Shot], off: NDArray[Any], known: NDArray[Any]) -> Table:
     flat = np.where(known, np.linalg.norm(off[:, :2], axis=1), -1.0)
     rows = tuple(
         (shots[k].name, *(fixed(v, 2, sign=True) for v in off[k]), fixed(flat[k], 2))

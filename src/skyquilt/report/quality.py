@@ -1,4 +1,6 @@
-"""Section: the quality function of the thesis, its graphs, and depth maps of pairs (Y 4.8, 6.1, Fig. 6.4)."""
+"""Section: the quality function of the thesis, its graphs, and depth maps of pairs (Y 4.8, 6.1,
+Fig. 6.4).
+"""
 
 from collections.abc import Mapping
 from typing import Any
@@ -17,22 +19,48 @@ def quality_section(data: ReportInput) -> Section:
     """How photos agree where they are placed, and known distances on the map."""
     quality = mapping(data.metrics.get("quality"))
     if not quality:
-        return Section(id="quality", title="Quality", blocks=(Missing(why="Not measured in this run."),))
-    blocks: list[Block] = [_lambda(quality), *_distances(quality), *_graphs(quality), *_depths(data)]
+        return Section(
+            id="quality", title="Quality", blocks=(Missing(why="Not measured in this run."),)
+        )
+    blocks: list[Block] = [
+        _lambda(quality),
+        *_distances(quality),
+        *_graphs(quality),
+        *_depths(data),
+    ]
     return Section(
-        id="quality", title="Quality", blocks=tuple(blocks),
-        lead="The placements are replayed in order of capture, reduced to one ground resolution: how well does each"
+        id="quality",
+        title="Quality",
+        blocks=tuple(blocks),
+        lead="The placements are replayed in order of capture, reduced to one ground resolution:"
+        " how well does each"
         " photo fit what lies there already?",
-    )  # fmt: skip
+    )
 
 
 def _lambda(quality: Mapping[str, Any]) -> Table:
     rows = [
-        ("\u03bb corr", _percent(quality.get("lambda_corr")), "fit to the map so far, mean of (1 + CC) / 2"),
-        ("\u03bb spat", _percent(quality.get("lambda_spat")), "known distances kept, mean of 1 / (1 + relative error)"),
-        ("\u03bb spat, as printed", _percent(quality.get("lambda_spat_of_table")), "1 less the sum of relative errors"),
-        ("\u03bb", _percent(quality.get("lambda")), f"distances weigh {_plain(quality.get('alpha'), 2)}"),
-    ]  # fmt: skip
+        (
+            "\u03bb corr",
+            _percent(quality.get("lambda_corr")),
+            "fit to the map so far, mean of (1 + CC) / 2",
+        ),
+        (
+            "\u03bb spat",
+            _percent(quality.get("lambda_spat")),
+            "known distances kept, mean of 1 / (1 + relative error)",
+        ),
+        (
+            "\u03bb spat, as printed",
+            _percent(quality.get("lambda_spat_of_table")),
+            "1 less the sum of relative errors",
+        ),
+        (
+            "\u03bb",
+            _percent(quality.get("lambda")),
+            f"distances weigh {_plain(quality.get('alpha'), 2)}",
+        ),
+    ]
     ste = mapping(quality.get("ste_per_inlier_px2"))
     if ste:
         told = f"{_plain(ste.get('median'), 2)} (worst {_plain(ste.get('worst'), 2)})"
@@ -43,12 +71,17 @@ def _lambda(quality: Mapping[str, Any]) -> Table:
                 "symmetric transfer error of the registrations, at 1500 px width",
             )
         )
-    for key, label in (("geolocation_mae_m", "MAE x, y, z, m"), ("geolocation_rms_m", "RMS x, y, z, m")):
+    for key, label in (
+        ("geolocation_mae_m", "MAE x, y, z, m"),
+        ("geolocation_rms_m", "RMS x, y, z, m"),
+    ):
         axes = mapping(quality.get(key))
         if axes:
             told = ", ".join(_plain(axes.get(a), 2) for a in "xyz")
             rows.append((label, told, "photos' centres against their reported positions"))
-    return Table(title="Quality function", head=("", "value", "meaning"), rows=tuple(rows), numeric="tnt")
+    return Table(
+        title="Quality function", head=("", "value", "meaning"), rows=tuple(rows), numeric="tnt"
+    )
 
 
 def _distances(quality: Mapping[str, Any]) -> list[Block]:
@@ -59,7 +92,9 @@ def _distances(quality: Mapping[str, Any]) -> list[Block]:
     for d in known[:MOST_DISTANCES]:
         metres, found = number(d.get("metres")), number(d.get("on_map"))
         off = None if metres is None or found is None else found - metres
-        rows.append((f"{d.get('a')} to {d.get('b')}", _plain(metres, 3), _plain(found, 3), _plain(off, 3)))
+        rows.append(
+            (f"{d.get('a')} to {d.get('b')}", _plain(metres, 3), _plain(found, 3), _plain(off, 3))
+        )
     note = (
         f"{count(len(known) - MOST_DISTANCES, 'distance')} more in metrics.json."
         if len(known) > MOST_DISTANCES
@@ -79,32 +114,48 @@ def _graphs(quality: Mapping[str, Any]) -> list[Block]:
     legend = tuple(LegendItem(colour=COLOURS[k], text=name) for k, (name, _) in enumerate(both))
     upper = lines(both, title="Correlation of overlapping parts", x_label="photo", y_label="CC")
     figures: list[Block] = [
-        Figure(svg=upper, title="Correlation", legend=legend, wide=True,
-               caption="A dip is a photo that does not fit what lies there: moving things, relief, or a wrong place.")
-    ]  # fmt: skip
+        Figure(
+            svg=upper,
+            title="Correlation",
+            legend=legend,
+            wide=True,
+            caption="A dip is a photo that does not fit what lies there: moving things, relief, or"
+            " a wrong place.",
+        )
+    ]
     off = _array(quality.get("off_position_over_width"))
     if np.isfinite(off).sum() > 1:
         lower = lines(
-            [("", off)], title="Distance from the reported position", x_label="photo", y_label="photo widths"
+            [("", off)],
+            title="Distance from the reported position",
+            x_label="photo",
+            y_label="photo widths",
         )
         figures.append(
-            Figure(svg=lower, title="Distance from the reported position", wide=True,
-                   caption="Over the width of a photo on the ground.")
-        )  # fmt: skip
+            Figure(
+                svg=lower,
+                title="Distance from the reported position",
+                wide=True,
+                caption="Over the width of a photo on the ground.",
+            )
+        )
     return figures
 
 
 def _depths(data: ReportInput) -> list[Block]:
     return [
         picture(
-            d.pixels, f"Depth map of {d.name}",
-            f"Disparity vectors of {count(d.features, 'inlier')} after the transformation: red their x, green their"
-            f" length, blue their y, each stretched to its range; {count(d.removed, 'feature')} off the dominant"
+            d.pixels,
+            f"Depth map of {d.name}",
+            f"Disparity vectors of {count(d.features, 'inlier')} after the transformation: red"
+            " their x, green their"
+            f" length, blue their y, each stretched to its range; {count(d.removed, 'feature')} off"
+            " the dominant"
             " plane left out.",
             longest=420,
         )
         for d in data.depths
-    ]  # fmt: skip
+    ]
 
 
 def _array(values: object) -> np.ndarray:

@@ -13,7 +13,10 @@ from skyquilt.report.page import plain_page
 from skyquilt.report.parts import Figure, Section, Sentences, Table, Tile
 
 _CAPTIONS = (
-    ("Side by side", "Both pictures as they are; lines join places that were found in both by themselves."),
+    (
+        "Side by side",
+        "Both pictures as they are; lines join places that were found in both by themselves.",
+    ),
     ("Checkerboard", "A and B by turns: what runs on across the squares' edges is registered."),
     ("False colour", "A in green, B in magenta: fringes show where edges part."),
     ("B over A", "B in warm colours, half transparent."),
@@ -28,17 +31,24 @@ _EVIDENCE = {
 
 
 def registration_page(record: Mapping[str, Any], pictures: Sequence[NDArray[np.uint8]]) -> str:
-    """The page from what registration.json says and RGB pictures: four of an accepted one, one of a refused."""
+    """The page from what registration.json says and RGB pictures: four of an accepted one, one of a
+    refused.
+    """
     sections = (
-        [Section(id="pictures", title="Pictures", blocks=tuple(_figures(pictures)))] if pictures else []
+        [Section(id="pictures", title="Pictures", blocks=tuple(_figures(pictures)))]
+        if pictures
+        else []
     )
     sections.append(Section(id="transform", title="Transform", blocks=_transform(record)))
     sections.append(Section(id="evidence", title="Evidence", blocks=(_evidence(record),)))
     return plain_page(
-        title=f"{_name(record['b'])} on {_name(record['a'])}", summary=_summary(record),
-        version=str(record["version"]), source="The figures behind this page are in registration.json.",
-        sections=tuple(sections), tiles=_tiles(record),
-    )  # fmt: skip
+        title=f"{_name(record['b'])} on {_name(record['a'])}",
+        summary=_summary(record),
+        version=str(record["version"]),
+        source="The figures behind this page are in registration.json.",
+        sections=tuple(sections),
+        tiles=_tiles(record),
+    )
 
 
 def picture(rgb: NDArray[np.uint8], title: str, caption: str) -> Figure:
@@ -51,7 +61,11 @@ def picture(rgb: NDArray[np.uint8], title: str, caption: str) -> Figure:
 def _figures(pictures: Sequence[NDArray[np.uint8]]) -> list[Figure]:
     if len(pictures) == 1:
         return [
-            picture(pictures[0], "Side by side", "Both pictures as they are; nothing was laid on anything.")
+            picture(
+                pictures[0],
+                "Side by side",
+                "Both pictures as they are; nothing was laid on anything.",
+            )
         ]
     return [picture(p, *words) for p, words in zip(pictures, _CAPTIONS, strict=True)]
 
@@ -67,17 +81,29 @@ def _tiles(record: Mapping[str, Any]) -> tuple[Tile, ...]:
     accepted = bool(record["accepted"])
     return (
         Tile(
-            label="Verdict", value="accepted" if accepted else "refused", verdict="good" if accepted else "poor",
+            label="Verdict",
+            value="accepted" if accepted else "refused",
+            verdict="good" if accepted else "poor",
             says="Whether the registration is believed; the evidence below says why.",
         ),
-        Tile(label="Inliers", value=plain(record["inliers"]), says="Features or patches that agree."),
-        Tile(label="Q", value=fixed(record["q"], 2), says="Spread of the inliers over A: 1 is everywhere."),
         Tile(
-            label="Residual", value=fixed(record["residual_px"], 2), unit="px",
+            label="Inliers", value=plain(record["inliers"]), says="Features or patches that agree."
+        ),
+        Tile(
+            label="Q",
+            value=fixed(record["q"], 2),
+            says="Spread of the inliers over A: 1 is everywhere.",
+        ),
+        Tile(
+            label="Residual",
+            value=fixed(record["residual_px"], 2),
+            unit="px",
             says="RMS distance in B between inliers and the transform.",
         ),
-        Tile(label="Time", value=seconds(record["cpu_seconds"]), says="CPU time of the registration."),
-    )  # fmt: skip
+        Tile(
+            label="Time", value=seconds(record["cpu_seconds"]), says="CPU time of the registration."
+        ),
+    )
 
 
 def _transform(record: Mapping[str, Any]) -> tuple[Table | Sentences, ...]:
@@ -88,9 +114,12 @@ def _transform(record: Mapping[str, Any]) -> tuple[Table | Sentences, ...]:
     scale = float(np.sqrt(abs(np.linalg.det(m[:2, :2]))))
     turn = float(np.degrees(np.arctan2(m[1, 0] - m[0, 1], m[0, 0] + m[1, 1])))
     said = (
-        f"Takes pixels of A (x right, y down, centres at integers) to pixels of B; a {record['model']}.",
+        "Takes pixels of A (x right, y down, centres at integers) to pixels of B; a"
+        f" {record['model']}.",
         f"Scale {fixed(scale, 4)}, rotation {fixed(turn, 2)} degrees clockwise.",
-        f"Known beforehand from {record['guess']}." if record["guess"] else "Nothing was known beforehand.",
+        f"Known beforehand from {record['guess']}."
+        if record["guess"]
+        else "Nothing was known beforehand.",
     )
     return Sentences(items=said), Table(
         title="b_H_a", head=("", "", ""), rows=rows, numeric="nnn", wide=False

@@ -1,5 +1,7 @@
 """Section: what the geometry leaves unexplained in the photos."""
 
+from typing import Any
+
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
@@ -41,7 +43,11 @@ def residuals_section(data: ReportInput) -> Section:
         why = "This method uses no tie points, so there are no residuals to show."
         return Section(id="residuals", title="Reprojection residuals", blocks=(Missing(why=why),))
     every = np.concatenate([r.residual_px for r in cameras])
-    blocks: list[Block] = [_density(every), _lengths(every), *(_field(r) for r in cameras[:MOST_CAMERAS])]
+    blocks: list[Block] = [
+        _density(every),
+        _lengths(every),
+        *(_field(r) for r in cameras[:MOST_CAMERAS]),
+    ]
     if (more := len(cameras) - MOST_CAMERAS) > 0:
         blocks.append(Missing(why=f"{count(more, 'camera')} with fewer sightings not drawn."))
     return Section(
@@ -60,13 +66,15 @@ def _finite(r: CameraResiduals) -> CameraResiduals:
     )
 
 
-def _density(residual: NDArray) -> Figure:
+def _density(residual: NDArray[Any]) -> Figure:
     """Where residual vectors end, darker where there are more."""
     title = "Residual vectors"
     rms = float(np.sqrt((residual**2).sum(1).mean()))
     reach = max(nice(3 * float(np.percentile(np.abs(residual), 95)) / 2, 1), 1e-3)
     size = 320.0
-    axes = Axes(x=(-reach, reach), y=(reach, -reach), width=size + LEFT + RIGHT, height=size + TOP + BOTTOM)
+    axes = Axes(
+        x=(-reach, reach), y=(reach, -reach), width=size + LEFT + RIGHT, height=size + TOP + BOTTOM
+    )
     inside = (np.abs(residual) < reach).all(1)
     body = (
         _points(residual[inside], axes)
@@ -96,21 +104,27 @@ def _density(residual: NDArray) -> Figure:
     return Figure(svg=svg, title=title, caption=caption)
 
 
-def _points(residual: NDArray, axes: Axes) -> Markup:
+def _points(residual: NDArray[Any], axes: Axes) -> Markup:
     return path(dots(axes.points(residual)), "cloud")
 
 
-def _cells(residual: NDArray, reach: float, axes: Axes, size: float) -> Markup:
+def _cells(residual: NDArray[Any], reach: float, axes: Axes, size: float) -> Markup:
     index = np.clip(((residual + reach) / (2 * reach) * CELLS).astype(np.int64), 0, CELLS - 1)
-    counts = np.bincount(index[:, 1] * CELLS + index[:, 0], minlength=CELLS * CELLS).reshape(CELLS, CELLS)
+    counts = np.bincount(index[:, 1] * CELLS + index[:, 0], minlength=CELLS * CELLS).reshape(
+        CELLS, CELLS
+    )
     index = (255 * np.log1p(counts) / np.log1p(counts.max())).astype(np.uint8)
     colours = np.array([(*images.ACCENT, alpha) for alpha in range(256)], np.uint8)
     return Markup('<image class="cells" x="{}" y="{}" width="{}" height="{}" href="{}"/>').format(
-        coordinate(axes.left), TOP, coordinate(size), coordinate(size), Markup(images.png_uri(index, colours))
+        coordinate(axes.left),
+        TOP,
+        coordinate(size),
+        coordinate(size),
+        Markup(images.png_uri(index, colours)),
     )
 
 
-def _lengths(residual: NDArray) -> Figure:
+def _lengths(residual: NDArray[Any]) -> Figure:
     title = "Lengths of the residuals"
     length = np.linalg.norm(residual, axis=1)
     top = max(float(np.percentile(length, 99)), 1e-6)
@@ -129,7 +143,9 @@ def _lengths(residual: NDArray) -> Figure:
     beyond = int((length > edges[-1]).sum())
     caption = "Many short ones and a thin tail are good; a hump far out would be wrong matches."
     return Figure(
-        svg=svg, title=title, caption=caption + (f" {count(beyond, 'sighting')} beyond." if beyond else "")
+        svg=svg,
+        title=title,
+        caption=caption + (f" {count(beyond, 'sighting')} beyond." if beyond else ""),
     )
 
 
@@ -141,7 +157,9 @@ def _field(r: CameraResiduals) -> Figure:
     scale = body / width
     height = r.height * scale
     frame = [rect(1, 1, body, height, "frame")]
-    frame += [path(f"M{1 + k * body / COLUMNS:.1f} 1v{height:.1f}", "grid") for k in range(1, COLUMNS)]
+    frame += [
+        path(f"M{1 + k * body / COLUMNS:.1f} 1v{height:.1f}", "grid") for k in range(1, COLUMNS)
+    ]
     frame += [path(f"M1 {1 + k * height / ROWS:.1f}h{body:.1f}", "grid") for k in range(1, ROWS)]
     if not len(at):
         why = f"No part of the image has {FEWEST} sightings; too few for a mean."
@@ -168,17 +186,21 @@ def _field(r: CameraResiduals) -> Figure:
 def _key(step: float, length: float, height: float) -> Markup:
     y = height + 22
     arrow = arrows(np.array([[2.0, y]]), np.array([[2.0 + length, y]]), longest=12)
-    return path(arrow, "vectors") + text(length + 12, y + 4, f"{fixed(step, decimals_of(step))} px", "tick")
+    return path(arrow, "vectors") + text(
+        length + 12, y + 4, f"{fixed(step, decimals_of(step))} px", "tick"
+    )
 
 
-def systematic(r: CameraResiduals, mean: NDArray, n: NDArray) -> float:
+def systematic(r: CameraResiduals, mean: NDArray[Any], n: NDArray[Any]) -> float:
     """RMS in px of the cells' means (k, 2) beyond what residuals of this spread give by chance."""
     chance = (r.residual_px**2).sum(1).mean() / n
     return float(np.sqrt(max(0.0, np.average((mean**2).sum(1) - chance, weights=n))))
 
 
-def mean_field(r: CameraResiduals) -> tuple[NDArray, NDArray, NDArray]:
-    """Centres (k, 2) in px, mean residuals (k, 2) in px and counts (k,) of cells with enough sightings."""
+def mean_field(r: CameraResiduals) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """Centres (k, 2) in px, mean residuals (k, 2) in px and counts (k,) of cells with enough
+    sightings.
+    """
     column = np.clip((r.px[:, 0] + 0.5) / r.width * COLUMNS, 0, COLUMNS - 1).astype(np.int64)
     row = np.clip((r.px[:, 1] + 0.5) / r.height * ROWS, 0, ROWS - 1).astype(np.int64)
     cell, size = row * COLUMNS + column, COLUMNS * ROWS
@@ -186,6 +208,7 @@ def mean_field(r: CameraResiduals) -> tuple[NDArray, NDArray, NDArray]:
     total = np.stack([np.bincount(cell, r.residual_px[:, k], minlength=size) for k in (0, 1)], 1)
     enough = np.flatnonzero(n >= FEWEST)
     centre = np.stack(
-        [(enough % COLUMNS + 0.5) * r.width / COLUMNS, (enough // COLUMNS + 0.5) * r.height / ROWS], 1
+        [(enough % COLUMNS + 0.5) * r.width / COLUMNS, (enough // COLUMNS + 0.5) * r.height / ROWS],
+        1,
     )
     return centre, total[enough] / n[enough, None], n[enough]

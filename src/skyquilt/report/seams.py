@@ -1,5 +1,7 @@
 """Section: how well neighbouring photos fit along the seams of the mosaic."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +22,9 @@ def seams_section(data: ReportInput, ground: Ground | None, layers: dict[str, La
     value = disparities(data.seams)
     measured = value[np.isfinite(value)]
     blocks: list[Block] = [_picture(ground, layers, len(value), len(measured))]
-    blocks.append(_histogram(measured) if len(measured) else Missing(why="No sample could be measured."))
+    blocks.append(
+        _histogram(measured) if len(measured) else Missing(why="No sample could be measured.")
+    )
     return Section(
         id="seams",
         title="Seams",
@@ -34,10 +38,14 @@ def seams_section(data: ReportInput, ground: Ground | None, layers: dict[str, La
 def _picture(ground: Ground, layers: dict[str, Layer], attempted: int, measured: int) -> Figure:
     title = "Displacement along the seams"
     under = [use("mosaic", "faded")] if "mosaic" in layers else []
-    svg = picture(ground, [*under, *(use("seams", f"small {c}") for c in ("dot-casing", "dots"))], title)
+    svg = picture(
+        ground, [*under, *(use("seams", f"small {c}") for c in ("dot-casing", "dots"))], title
+    )
     share = measured / attempted
     stands = (
-        "enough for the figures to stand" if share >= SEAMS_MEASURED else "too few for the figures to stand"
+        "enough for the figures to stand"
+        if share >= SEAMS_MEASURED
+        else "too few for the figures to stand"
     )
     caption = (
         f"{fixed(measured, 0)} of {count(attempted, 'sample')} measured ({share:.0%}): {stands} "
@@ -46,7 +54,7 @@ def _picture(ground: Ground, layers: dict[str, Layer], attempted: int, measured:
     return Figure(svg=svg, title=title, caption=caption, legend=layers["seams"].legend)
 
 
-def _histogram(measured: NDArray) -> Figure:
+def _histogram(measured: NDArray[Any]) -> Figure:
     title = "Displacements"
     top = max(float(np.percentile(measured, 98)), 1e-3)
     step = nice(top, 24)
@@ -61,7 +69,11 @@ def _histogram(measured: NDArray) -> Figure:
         marks=((median, f"median {fixed(median, 2)}"), (p95, f"95\u202f% below {fixed(p95, 2)}")),
     )
     beyond = int((measured > edges[-1]).sum())
-    caption = "In px of the map. Up to 2 px is not noticed in print; more than 5 px is a broken line."
+    caption = (
+        "In px of the map. Up to 2 px is not noticed in print; more than 5 px is a broken line."
+    )
     return Figure(
-        svg=svg, title=title, caption=caption + (f" {count(beyond, 'sample')} beyond." if beyond else "")
+        svg=svg,
+        title=title,
+        caption=caption + (f" {count(beyond, 'sample')} beyond." if beyond else ""),
     )

@@ -1,7 +1,10 @@
-"""Small drawings: axes with round ticks, bars, lines, arrows. Colours come from the style sheet's classes."""
+"""Small drawings: axes with round ticks, bars, lines, arrows. Colours come from the style sheet's
+classes.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -22,19 +25,27 @@ def coordinate(value: float, decimals: int = 1) -> str:
 
 def polyline(points: ArrayLike, decimals: int = 1, *, close: bool = False) -> str:
     """Path data through points (k, 2)."""
-    pairs = [f"{x:.{decimals}f} {y:.{decimals}f}" for x, y in np.asarray(points, np.float64).tolist()]
+    pairs = [
+        f"{x:.{decimals}f} {y:.{decimals}f}" for x, y in np.asarray(points, np.float64).tolist()
+    ]
     return f"M{'L'.join(pairs)}{'Z' if close else ''}" if len(pairs) > 1 else ""
 
 
 def dots(points: ArrayLike, decimals: int = 1) -> str:
-    """Path data of one point each; round line caps make them discs of a constant size on the screen."""
+    """Path data of one point each; round line caps make them discs of a constant size on the
+    screen.
+    """
     return "".join(
         f"M{x:.{decimals}f} {y:.{decimals}f}h0" for x, y in np.asarray(points, np.float64).tolist()
     )
 
 
 def arrows(
-    tails: NDArray, tips: NDArray, decimals: int = 1, head: float = 0.28, longest: float = np.inf
+    tails: NDArray[Any],
+    tips: NDArray[Any],
+    decimals: int = 1,
+    head: float = 0.28,
+    longest: float = np.inf,
 ) -> str:
     """Path data of arrows (k, 2) -> (k, 2); heads grow with the arrow up to `longest`."""
     along = tips - tails
@@ -57,7 +68,9 @@ def path(d: str, cls: str) -> Markup:
 def text(x: float, y: float, words: str, cls: str = "", *, turn: int = 0) -> Markup:
     """Words at a place; classes `mid` and `end` align them."""
     turned = (
-        Markup(' transform="rotate({} {} {})"').format(turn, coordinate(x), coordinate(y)) if turn else ""
+        Markup(' transform="rotate({} {} {})"').format(turn, coordinate(x), coordinate(y))
+        if turn
+        else ""
     )
     return Markup('<text x="{}" y="{}" class="{}"{}>{}</text>').format(
         coordinate(x), coordinate(y), cls, turned, words
@@ -80,7 +93,11 @@ def rect(x: float, y: float, width: float, height: float, cls: str, fill: str = 
 
 
 def drawing(
-    content: Iterable[Markup | str], title: str, width: float = WIDTH, height: float = HEIGHT, left: float = 0
+    content: Iterable[Markup | str],
+    title: str,
+    width: float = WIDTH,
+    height: float = HEIGHT,
+    left: float = 0,
 ) -> Markup:
     """An SVG element of its own; `left` px of it lie left of x = 0."""
     inner = Markup().join(content)
@@ -114,7 +131,9 @@ class Axes:
     def py(self, y: ArrayLike) -> NDArray[np.float64]:
         """Vertical places in the drawing."""
         floor = self.height - self.bottom
-        return floor - (np.asarray(y, np.float64) - self.y[0]) / (self.y[1] - self.y[0]) * (floor - TOP)
+        return floor - (np.asarray(y, np.float64) - self.y[0]) / (self.y[1] - self.y[0]) * (
+            floor - TOP
+        )
 
     def points(self, xy: ArrayLike) -> NDArray[np.float64]:
         """Places (k, 2) in the drawing."""
@@ -142,7 +161,10 @@ class Axes:
         if x_ticks:
             for value, label in ticks(*self.x, (right - self.left) / 62):
                 x = float(self.px(value))
-                parts += [line(x, floor, x, floor + 4, "axis"), text(x, floor + 18, label, "tick mid")]
+                parts += [
+                    line(x, floor, x, floor + 4, "axis"),
+                    text(x, floor + 18, label, "tick mid"),
+                ]
         parts.append(line(self.left, floor, right, floor, "axis"))
         if x_label:
             parts.append(text((self.left + right) / 2, self.height - 6, x_label, "name mid"))
@@ -167,11 +189,14 @@ def ticks(low: float, high: float, parts: float) -> list[tuple[float, str]]:
     low, high = min(low, high), max(low, high)
     step = nice(high - low, max(2.0, parts))
     first, last = int(np.ceil(low / step - 1e-6)), int(np.floor(high / step + 1e-6))
-    return [(k * step, fixed(k * step, decimals_of(step))) for k in range(first, min(last, first + 40) + 1)]
+    return [
+        (k * step, fixed(k * step, decimals_of(step)))
+        for k in range(first, min(last, first + 40) + 1)
+    ]
 
 
 def bars(
-    edges: Sequence[float] | NDArray,
+    edges: Sequence[float] | NDArray[Any],
     counts: ArrayLike,
     *,
     title: str,
@@ -182,13 +207,17 @@ def bars(
 ) -> Markup:
     """A histogram: counts (n,) between edges (n + 1,)."""
     counts = np.asarray(counts, np.float64)
-    axes = Axes(x=(float(edges[0]), float(edges[-1])), y=(0.0, float(counts.max(initial=0)) * 1.12 or 1.0))
+    axes = Axes(
+        x=(float(edges[0]), float(edges[-1])), y=(0.0, float(counts.max(initial=0)) * 1.12 or 1.0)
+    )
     x, y, floor = axes.px(edges), axes.py(counts), axes.height - axes.bottom
     boxes = [
         rect(x[k] + 0.5, y[k], max(x[k + 1] - x[k] - 1, 0.5), floor - y[k], "bar")
         for k in np.flatnonzero(counts)
     ]
-    lines = [axes.marker(value, label, k) for k, (value, label) in enumerate(marks) if value <= edges[-1]]
+    lines = [
+        axes.marker(value, label, k) for k, (value, label) in enumerate(marks) if value <= edges[-1]
+    ]
     return drawing([axes.grid(x_label, y_label, unit=unit), *boxes, *lines], title)
 
 
@@ -203,7 +232,9 @@ def columns(
 ) -> Markup:
     """One column per label, its share in percent written above."""
     shares = np.asarray(shares, np.float64)
-    axes = Axes(x=(0.0, float(len(labels))), y=(0.0, max(float(shares.max(initial=0)) * 1.18, 1e-9)))
+    axes = Axes(
+        x=(0.0, float(len(labels))), y=(0.0, max(float(shares.max(initial=0)) * 1.18, 1e-9))
+    )
     parts = [axes.grid(x_label, y_label, x_ticks=False, unit="\u202f%")]
     floor, step = axes.height - axes.bottom, float(axes.px(1) - axes.px(0))
     for k, (label, share, colour) in enumerate(zip(labels, shares.tolist(), colours, strict=True)):
@@ -211,7 +242,9 @@ def columns(
         parts.append(rect(x + step * 0.08, y, step * 0.84, floor - y, "column", colour))
         parts.append(text(x + step / 2, floor + 18, label, "tick mid"))
         if share > 0:
-            parts.append(text(x + step / 2, y - 5, f"{share:.0f}" if share >= 1 else "<1", "value mid"))
+            parts.append(
+                text(x + step / 2, y - 5, f"{share:.0f}" if share >= 1 else "<1", "value mid")
+            )
     return drawing(parts, title)
 
 
@@ -222,7 +255,9 @@ def colour_bar(stops: Sequence[str], low: str, high: str, name: str) -> Markup:
         f'<rect x="{k * 240 / n:.1f}" width="{240 / n + 0.5:.1f}" height="12" fill="{c}"/>'
         for k, c in enumerate(stops)
     )
-    words = text(0, 28, low, "tick") + text(240, 28, high, "tick end") + text(120, 28, name, "name mid")
+    words = (
+        text(0, 28, low, "tick") + text(240, 28, high, "tick end") + text(120, 28, name, "name mid")
+    )
     return (
         Markup('<svg class="scale" viewBox="0 0 240 34" role="img" aria-label="{}">').format(
             f"{name}: {low} to {high}"

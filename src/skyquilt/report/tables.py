@@ -1,4 +1,6 @@
-"""Sections made of tables: calibration, control points, contradictions, rejected photos, settings."""
+"""Sections made of tables: calibration, control points, contradictions, rejected photos,
+settings.
+"""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -6,7 +8,17 @@ from typing import Any
 import numpy as np
 
 from skyquilt.report.input import ReportInput
-from skyquilt.report.numbers import DASH, axes, count, fixed, items, mapping, number, plain, significant
+from skyquilt.report.numbers import (
+    DASH,
+    axes,
+    count,
+    fixed,
+    items,
+    mapping,
+    number,
+    plain,
+    significant,
+)
 from skyquilt.report.parts import Block, Missing, Section, Sentences, Table
 
 MOST_ROWS = 200
@@ -28,11 +40,14 @@ CONFLICTS = {
         "the compass is off."
     ),
     "altitude": (
-        "The reported height does not fit the image scale: a drifting barometer or another zero of heights."
+        "The reported height does not fit the image scale: a drifting barometer or another zero of"
+        " heights."
     ),
-    "position": "The GPS position lies far from where the pixels put the photo; it was given little weight.",
+    "position": "The GPS position lies far from where the pixels put the photo; it was given little"
+    " weight.",
     "focal": (
-        "The focal length found differs from the reported one: check the camera, a zoom or a resized file."
+        "The focal length found differs from the reported one: check the camera, a zoom or a"
+        " resized file."
     ),
 }
 UNITS = {"yaw": "\u00b0", "altitude": " m", "position": " m", "focal": " px"}
@@ -62,10 +77,14 @@ def _camera(name: str, parameters: Mapping[str, Any]) -> Table:
             number(entry.get(k)) for k in ("value", "sigma", "prior", "prior_sigma")
         )
         pixels = key in ("focal", "cx", "cy")
-        shown = [fixed(v, 1) if pixels else significant(v) for v in (value, sigma, prior, prior_sigma)]
+        shown = [
+            fixed(v, 1) if pixels else significant(v) for v in (value, sigma, prior, prior_sigma)
+        ]
         held = sigma == 0 or (sigma is None and value == 0)
         moved = (
-            (value - prior) / prior_sigma if value is not None and prior is not None and prior_sigma else None
+            (value - prior) / prior_sigma
+            if value is not None and prior is not None and prior_sigma
+            else None
         )
         if moved is not None and abs(moved) > FAR:
             far.append(key)
@@ -99,7 +118,9 @@ def control_section(data: ReportInput) -> Section:
     """Control and check points."""
     points = [mapping(v) for v in items(data.metrics.get("control"))]
     if not any(points):
-        why = "No surveyed points were given: absolute accuracy rests on the photos\u2019 GPS alone."
+        why = (
+            "No surveyed points were given: absolute accuracy rests on the photos\u2019 GPS alone."
+        )
         return Section(id="control", title="Control and check points", blocks=(Missing(why=why),))
     rows = tuple(
         (
@@ -115,7 +136,8 @@ def control_section(data: ReportInput) -> Section:
     offset = number(data.metrics.get("control_height_offset_m"))
     if offset:
         sums.append(
-            f"Heights differ by {fixed(offset, 2, sign=True)} m between the two datums; that is taken out."
+            f"Heights differ by {fixed(offset, 2, sign=True)} m between the two datums; that is"
+            " taken out."
         )
     return Section(
         id="control",
@@ -125,7 +147,15 @@ def control_section(data: ReportInput) -> Section:
         blocks=(
             Table(
                 title="Residuals",
-                head=("Point", "Role", "East, m", "North, m", "Up, m", "Reprojection, px", "Photos"),
+                head=(
+                    "Point",
+                    "Role",
+                    "East, m",
+                    "North, m",
+                    "Up, m",
+                    "Reprojection, px",
+                    "Photos",
+                ),
                 rows=rows,
                 numeric="ctnnnnn",
                 note=" ".join(s for s in sums if s),
@@ -168,12 +198,17 @@ def conflicts_section(data: ReportInput) -> Section:
     told = ", ".join(f"{sum(str(c.get('field')) == k for c in found)} \u00d7 {k}" for k in kinds)
     head = ("Photo", "Field", "Reported", "Estimated", "What it means")
     table = Table(
-        title=f"Contradictions: {told}", head=head, rows=rows, numeric="ctnnt", note=_cut(len(found))
+        title=f"Contradictions: {told}",
+        head=head,
+        rows=rows,
+        numeric="ctnnt",
+        note=_cut(len(found)),
     )
     return Section(
         id="conflicts",
         title="Metadata conflicts",
-        lead="Metadata are measurements, not facts. These were contradicted by the photos themselves "
+        lead="Metadata are measurements, not facts. These were contradicted by the photos"
+        " themselves "
         "and not relied on.",
         blocks=(table,),
     )
@@ -194,7 +229,9 @@ def rejected_section(data: ReportInput) -> Section:
     rejected = mapping(data.metrics.get("photos_rejected"))
     if not rejected:
         why = (
-            "No photo was rejected." if "photos_rejected" in data.metrics else "Rejections were not recorded."
+            "No photo was rejected."
+            if "photos_rejected" in data.metrics
+            else "Rejections were not recorded."
         )
         return Section(id="rejected", title="Rejected photos", blocks=(Missing(why=why),))
     rows = tuple((str(k), plain(v)) for k, v in list(rejected.items())[:MOST_ROWS])
@@ -227,7 +264,9 @@ def settings_section(data: ReportInput) -> Section:
     if not rows:
         none = Missing(why="The settings were not recorded with this run.")
         return Section(id="settings", title="Settings", blocks=(none,))
-    table = Table(title="As resolved for this run", head=("Name", "Value"), rows=rows[:500], numeric="ct")
+    table = Table(
+        title="As resolved for this run", head=("Name", "Value"), rows=rows[:500], numeric="ct"
+    )
     return Section(id="settings", title="Settings", blocks=(table,), folded=True)
 
 

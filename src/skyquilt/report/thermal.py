@@ -1,4 +1,6 @@
-"""Section: how a thermal map lies on the visual one, put into the finished report of the visual map."""
+"""Section: how a thermal map lies on the visual one, put into the finished report of the visual
+map.
+"""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -17,14 +19,18 @@ from skyquilt.report.values import UNITS
 LONGEST = 1000
 """Px of the longer side of pictures in the page."""
 _ROUTES = {
-    "rig": "One drone took both: the thermal photos lie on the poses and the surface of the visual ones, turned by what"
+    "rig": "One drone took both: the thermal photos lie on the poses and the surface of the visual"
+    " ones, turned by what"
     " both cameras differ by.",
     "maps": "Both flights are maps by themselves; the pictures of both maps were registered.",
-    "pairs": "Both flights are maps by themselves; pairs of their photos were registered and their places carried into"
+    "pairs": "Both flights are maps by themselves; pairs of their photos were registered and their"
+    " places carried into"
     " both maps.",
-    "heights": "Both flights are maps by themselves; the heights under them were registered, which look alike at any"
+    "heights": "Both flights are maps by themselves; the heights under them were registered, which"
+    " look alike at any"
     " hour.",
-    "positions": "Both flights are maps by themselves and lie where their own positions put them: no registration could"
+    "positions": "Both flights are maps by themselves and lie where their own positions put them:"
+    " no registration could"
     " be believed.",
 }
 _EVIDENCE = {
@@ -34,7 +40,8 @@ _EVIDENCE = {
     "correlation": "correlation of edge orientations over the overlap",
     "likeness": "correlation of edge orientations once sharpened",
     "by_colour": "sharpened by the visual picture's colours (1) or by its brightness (0)",
-    "colour_surprise": "agreement of independent patches on the colours alone, -log10 of what chance would give",
+    "colour_surprise": "agreement of independent patches on the colours alone, -log10 of what"
+    " chance would give",
     "correspondences": "correspondences carried into both maps",
     "pairs": "pairs of photos used",
     "pairs_agreeing": "of them, those that agree",
@@ -45,7 +52,8 @@ _EVIDENCE = {
     "focal_px": "thermal focal length, px",
     "cells": "cells of heights compared",
     "residual_m": "robust deviation of the heights' differences, m",
-    "halves_apart_m": "distance between the places that two halves of the ground find by themselves, m",
+    "halves_apart_m": "distance between the places that two halves of the ground find by"
+    " themselves, m",
 }
 _CAPTIONS = (
     ("Thermal map", "On the visual map's grid, {low} (dark) to {high} (bright)."),
@@ -62,8 +70,8 @@ _BEGIN, _END = "<!-- other spectrum -->", "<!-- /other spectrum -->"
 def thermal_section(
     record: Mapping[str, Any], pictures: Sequence[NDArray[np.uint8]], ends: tuple[float, float]
 ) -> Section:
-    """From what metrics.json says under `thermal`, RGB pictures in the order of the captions, and the values of the
-    darkest and the brightest colour.
+    """From what metrics.json says under `thermal`, RGB pictures in the order of the captions, and
+    the values of the darkest and the brightest colour.
     """
     unit = UNITS.get(str(record.get("unit")), "")
     low, high = (f"{fixed(v, 1)} {unit}".strip() for v in ends)
@@ -80,7 +88,10 @@ def thermal_section(
 def _error(record: Mapping[str, Any]) -> Table:
     rows = [
         ("route", plain(record["route"])),
-        ("thermal photos used", f"{plain(record['photos_used'])} of {plain(record['photos_total'])}"),
+        (
+            "thermal photos used",
+            f"{plain(record['photos_used'])} of {plain(record['photos_total'])}",
+        ),
         ("places or pairs that agree", plain(record["inliers"])),
     ]
     if number(record.get("residual_m")) is not None:
@@ -100,7 +111,9 @@ def _error(record: Mapping[str, Any]) -> Table:
 
 def _refused(record: Mapping[str, Any]) -> list[Block]:
     refused = mapping(record.get("routes_refused"))
-    return [Sentences(items=tuple(f"Not by {k}: {v}." for k, v in refused.items()))] if refused else []
+    return (
+        [Sentences(items=tuple(f"Not by {k}: {v}." for k, v in refused.items()))] if refused else []
+    )
 
 
 def with_section(page: str, section: Section) -> str:

@@ -9,7 +9,9 @@ UNITS = {"celsius": "\u00b0C", "counts": "counts"}
 
 
 def values_section(data: ReportInput) -> tuple[Section, ...]:
-    """What measured values mean and whether frames were brought to one level; nothing for pictures."""
+    """What measured values mean and whether frames were brought to one level; nothing for
+    pictures.
+    """
     told = mapping(data.metrics.get("thermal_values"))
     if not told:
         return ()

@@ -11,14 +11,16 @@ def claim(path: Path, names: Sequence[str], *, overwrite: bool) -> None:
     """Makes the folder, or clears the files `names` of a former run from it; other files stay.
 
     Raises:
-        OutputError: it holds files already and `overwrite` is not given, is a file, or cannot be written.
+        OutputError: it holds files already and `overwrite` is not given, is a file, or cannot be
+            written.
     """
     if path.exists() and not path.is_dir():
         raise OutputError(f"{path} is a file; the output is a folder")
     try:
         if path.is_dir() and any(path.iterdir()) and not overwrite:
             raise OutputError(
-                f"{path} already holds files; add --overwrite to replace its results, or choose another folder"
+                f"{path} already holds files; add --overwrite to replace its results, or choose"
+                " another folder"
             )
         path.mkdir(parents=True, exist_ok=True)
         for name in names:

@@ -42,7 +42,8 @@ class Clock:
     cpu: dict[str, float] = field(default_factory=dict)
     """CPU time per stage in s."""
     peak_mb: dict[str, float] = field(default_factory=dict)
-    """Largest resident memory up to the end of each stage in MB; empty on systems that do not tell."""
+    """Largest resident memory up to the end of each stage in MB; empty on systems that do not tell.
+    """
 
     @staticmethod
     def now() -> tuple[float, float]:
@@ -57,7 +58,9 @@ class Clock:
             self.peak_mb[stage] = round(peak, 1)
 
     def stage(self, name: str, work: Steps[T], *, keeps: bool = True) -> Generator[Event, None, T]:
-        """Runs a stage's steps as events and returns its result; `keeps` is False for one that stores none."""
+        """Runs a stage's steps as events and returns its result; `keeps` is False for one that
+        stores none.
+        """
         begun, hits, misses = self.now(), self.store.hits, self.store.misses
         yield StageStarted(stage=name, total=0)
         try:
@@ -74,9 +77,11 @@ class Clock:
             work.close()
         self.lap(name, begun)
         yield StageFinished(
-            stage=name, seconds=self.seconds[name], cpu_seconds=round(cpu_seconds() - begun[1], 3),
+            stage=name,
+            seconds=self.seconds[name],
+            cpu_seconds=round(cpu_seconds() - begun[1], 3),
             reused=keeps and self.store.misses == misses and self.store.hits > hits,
-        )  # fmt: skip
+        )
         return result
 
     def total(self) -> float:

@@ -1,4 +1,6 @@
-"""Files that were closed after writing, or moved into a folder, as Linux tells it (inotify); elsewhere nobody tells."""
+"""Files that were closed after writing, or moved into a folder, as Linux tells it (inotify);
+elsewhere nobody tells.
+"""
 
 import ctypes
 import os
@@ -38,16 +40,20 @@ class ClosedFiles:
             return False
         self._folders[number] = folder
         try:
-            below = [e.path for e in os.scandir(folder) if e.is_dir() and not e.name.startswith(".")]
+            below = [
+                e.path for e in os.scandir(folder) if e.is_dir() and not e.name.startswith(".")
+            ]
         except OSError:
             return True
         watched = [self._watch(path) for path in below]
         return all(watched)
 
     def look(self) -> tuple[set[str], bool]:
-        """Paths closed since the last look, and whether the whole folder should be looked at besides.
+        """Paths closed since the last look, and whether the whole folder should be looked at
+        besides.
 
-        That is so where a folder has come, whose files may have come before it was watched, and after a flood.
+        That is so where a folder has come, whose files may have come before it was watched, and
+        after a flood.
         """
         closed: set[str] = set()
         everything = False

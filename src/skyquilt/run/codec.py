@@ -1,4 +1,6 @@
-"""Records to files and back, without executing anything on the way: JSON for structure, npz for arrays."""
+"""Records to files and back, without executing anything on the way: JSON for structure, npz for
+arrays.
+"""
 
 import dataclasses
 import io
@@ -31,7 +33,9 @@ def decode(data: bytes, registry: Registry) -> Any:
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             tree = json.loads(bytes(arrays["__tree__"]).decode())
             return _up(tree, arrays, registry)
-    except Exception as error:  # damaged zip, npy and JSON raise many kinds; all mean that there is no record
+    except (
+        Exception
+    ) as error:  # damaged zip, npy and JSON raise many kinds; all mean that there is no record
         raise ValueError(f"not a stored record: {error}") from error
 
 

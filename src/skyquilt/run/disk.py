@@ -12,6 +12,9 @@ def refusal(path: Path, error: OSError) -> OutputError:
     """The error with the next step: make room and resume, or another folder."""
     if error.errno in FULL:
         return OutputError(
-            f"the disk is full: cannot write to {path}. Make room and run the same command again to resume"
+            f"the disk is full: cannot write to {path}. Make room and run the same command again to"
+            " resume"
         )
-    return OutputError(f"cannot write to {path}: {error.strerror or error}; choose another output folder")
+    return OutputError(
+        f"cannot write to {path}: {error.strerror or error}; choose another output folder"
+    )

@@ -12,8 +12,8 @@ B = TypeVar("B")
 def in_order(work: Callable[[A], B], items: Iterable[A], *, jobs: int) -> Iterator[B]:
     """work(item) for each item, in order, in `jobs` threads, never more than a few results ahead.
 
-    The heavy parts (OpenCV, BLAS, the JPEG codec) release the interpreter lock. An interrupt cancels what has
-    not begun and waits only for the pieces under way.
+    The heavy parts (OpenCV, BLAS, the JPEG codec) release the interpreter lock. An interrupt
+    cancels what has not begun and waits only for the pieces under way.
     """
     if jobs <= 1:
         for item in items:

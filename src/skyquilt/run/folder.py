@@ -8,9 +8,18 @@ from skyquilt.errors import OutputError
 from skyquilt.run.disk import refusal
 
 CONTRACT = (
-    "mosaic.tif", "provenance.tif", "views.tif", "surface.tif", "cameras.json", "shots.geojson",
-    "reconstruction.json", "footprints.geojson", "metrics.json", "report.html", "run.toml",
-)  # fmt: skip
+    "mosaic.tif",
+    "provenance.tif",
+    "views.tif",
+    "surface.tif",
+    "cameras.json",
+    "shots.geojson",
+    "reconstruction.json",
+    "footprints.geojson",
+    "metrics.json",
+    "report.html",
+    "run.toml",
+)
 """Files of a finished run."""
 STATE = ".skyquilt"
 
@@ -68,7 +77,9 @@ def open_run(path: Path, key: str, *, overwrite: bool, again: bool = False) -> R
         raise OutputError(f"{path} is a file; the output is a folder")
     known, state = _state(path)
     try:
-        taken = path.is_dir() and any(p.name != STATE or known for p in path.iterdir()) and known != key
+        taken = (
+            path.is_dir() and any(p.name != STATE or known for p in path.iterdir()) and known != key
+        )
         if taken and not overwrite and not (again and known):
             what = "another run (other photos or other settings)" if known else "other files"
             raise OutputError(

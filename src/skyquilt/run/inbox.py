@@ -1,4 +1,5 @@
-"""Photos accepted for good: a file lies durably in the survey's folder before a row says that it was received.
+"""Photos accepted for good: a file lies durably in the survey's folder before a row says that it
+was received.
 
 Contents name the files; names that senders give are only ever text.
 """
@@ -51,7 +52,9 @@ class Inbox:
     def __init__(
         self, ledger: Ledger, folder: Path, *, most_bytes: int = 500_000_000, tidy: bool = True
     ) -> None:
-        """Photos go to `folder`; one file may have at most `most_bytes`. `tidy`: removes what a crash left of some."""
+        """Photos go to `folder`; one file may have at most `most_bytes`. `tidy`: removes what a
+        crash left of some.
+        """
         self.ledger, self.folder, self.most_bytes = ledger, folder, most_bytes
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -61,7 +64,8 @@ class Inbox:
             raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
 
     def bring(self, blocks: Iterable[bytes]) -> Arrived | None:
-        """Writes a file's bytes durably under the name of their content; None where they are no photo.
+        """Writes a file's bytes durably under the name of their content; None where they are no
+        photo.
 
         Raises:
             OutputError: the disk is full, or the file is larger than allowed.
@@ -78,7 +82,9 @@ class Inbox:
                 for block in chain((first,), rest):
                     size += len(block)
                     if size > self.most_bytes:
-                        raise OutputError(f"a photo may have {self.most_bytes} bytes, this one has more")
+                        raise OutputError(
+                            f"a photo may have {self.most_bytes} bytes, this one has more"
+                        )
                     digest.update(block)
                     file.write(block)
                 file.flush()

@@ -1,7 +1,9 @@
-"""What a live survey knows, in one transactional file: photos, links, cameras, heights, events, layers.
+"""What a live survey knows, in one transactional file: photos, links, cameras, heights, events,
+layers.
 
-SQLite in WAL mode with `synchronous=FULL`: what is committed survives a kill and a power cut, what is not is not
-there at all. One writer (the mapping) and any number of readers, in this process or in others.
+SQLite in WAL mode with `synchronous=FULL`: what is committed survives a kill and a power cut, what
+is not is not there at all. One writer (the mapping) and any number of readers, in this process or
+in others.
 """
 
 import json
@@ -23,17 +25,22 @@ TABLES = """
 create table if not exists meta(key text primary key, value text not null);
 create table if not exists photo(
   id integer primary key, digest text not null unique, name text not null, source text not null,
-  file text not null, bytes integer not null, received real not null, shot text not null, width integer not null,
-  state text not null, reason text not null default '', pose text, camera text, footprint text, about text);
+  file text not null, bytes integer not null, received real not null,
+  shot text not null, width integer not null, state text not null,
+  reason text not null default '', pose text, camera text, footprint text, about text);
 create table if not exists refused(
-  id integer primary key, name text not null, source text not null, reason text not null, at real not null);
-create table if not exists link(a integer not null, b integer not null, body blob, primary key(a, b));
+  id integer primary key, name text not null, source text not null, reason text not null,
+  at real not null);
+create table if not exists link(a integer not null, b integer not null, body blob,
+  primary key(a, b));
 create table if not exists camera(key text primary key, body text not null);
-create table if not exists height(col integer, row integer, z real not null, primary key(col, row)) without rowid;
-create table if not exists event(seq integer primary key autoincrement, at real not null, kind text not null,
-  body text not null);
+create table if not exists height(col integer, row integer, z real not null,
+  primary key(col, row)) without rowid;
+create table if not exists event(seq integer primary key autoincrement, at real not null,
+  kind text not null, body text not null);
 create table if not exists layer(name text primary key, body text not null, at real not null);
-create table if not exists seen(path text primary key, size integer not null, mtime integer not null);
+create table if not exists seen(path text primary key, size integer not null,
+  mtime integer not null);
 create index if not exists photo_state on photo(state);
 create index if not exists photo_shot on photo(shot);
 create index if not exists link_b on link(b);
@@ -49,13 +56,17 @@ def connected(path: Path, *, write: bool) -> sqlite3.Connection:
     try:
         mode = "rwc" if write else "ro"
         uri = f"{path.absolute().as_uri()}?mode={mode}"
-        db = sqlite3.connect(uri, uri=True, timeout=30, check_same_thread=False, isolation_level=None)
+        db = sqlite3.connect(
+            uri, uri=True, timeout=30, check_same_thread=False, isolation_level=None
+        )
         if write:
             db.execute("pragma journal_mode=wal")
             db.execute("pragma synchronous=full")
         db.execute("select count(*) from sqlite_master").fetchone()
     except sqlite3.Error as error:
-        raise OutputError(f"{path} cannot be opened ({error}); choose another output folder") from error
+        raise OutputError(
+            f"{path} cannot be opened ({error}); choose another output folder"
+        ) from error
     return db
 
 
@@ -74,7 +85,8 @@ def transaction(db: sqlite3.Connection, path: Path) -> Iterator[None]:
         _rolled_back(db)
         if "full" in str(error) or "disk I/O" in str(error):
             raise OutputError(
-                f"the disk is full: {path} cannot grow. Make room; what was accepted is safe and mapping goes on"
+                f"the disk is full: {path} cannot grow. Make room; what was accepted is safe and"
+                " mapping goes on"
             ) from error
         raise OutputError(f"{path} cannot be written: {error}") from error
     except BaseException:
@@ -104,7 +116,8 @@ class Ledger:
         found = self.meta("format", FORMAT if write else None)
         if found != FORMAT:
             raise OutputError(
-                f"{self.path} has format {found}, this version reads {FORMAT}; choose another folder"
+                f"{self.path} has format {found}, this version reads {FORMAT}; choose another"
+                " folder"
             )
         if write and self.meta("began") is None:
             with self.change():
@@ -123,7 +136,9 @@ class Ledger:
 
     @contextmanager
     def lightly(self) -> Iterator[None]:
-        """Changes that a power cut, though no kill, may undo: nothing is promised, so nobody waits for them."""
+        """Changes that a power cut, though no kill, may undo: nothing is promised, so nobody waits
+        for them.
+        """
         with self.lock:
             light = not self.db.in_transaction
             if light:
@@ -159,7 +174,8 @@ class Ledger:
         """Appends to what viewers follow."""
         with self.change() as db:
             db.execute(
-                "insert into event(at, kind, body) values (?, ?, ?)", (time.time(), kind, json.dumps(body))
+                "insert into event(at, kind, body) values (?, ?, ?)",
+                (time.time(), kind, json.dumps(body)),
             )
 
     def told(self, after: int, limit: int = 500) -> list[tuple[int, str, str]]:
@@ -170,7 +186,9 @@ class Ledger:
         return [(int(n), str(k), str(b)) for n, k, b in found]
 
     def stamp(self) -> int:
-        """A number that changes when another connection has written: far cheaper to ask for than news."""
+        """A number that changes when another connection has written: far cheaper to ask for than
+        news.
+        """
         with self.lock:
             return int(self.db.execute("pragma data_version").fetchone()[0])
 
@@ -197,7 +215,9 @@ class Ledger:
 
     def counts(self) -> dict[str, int]:
         """Number of photos by state, `refused` among them."""
-        found = {str(s): int(n) for s, n in self.rows("select state, count(*) from photo group by state")}
+        found = {
+            str(s): int(n) for s, n in self.rows("select state, count(*) from photo group by state")
+        }
         refused = self.row("select count(*) from refused")
         return {**found, "refused": int(refused[0]) if refused else 0}
 

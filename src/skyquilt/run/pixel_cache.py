@@ -4,25 +4,28 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 from numpy.typing import NDArray
 
 
 @dataclass(kw_only=True)
 class PixelCache:
-    """Least recently used photos make room when the budget is exceeded; safe to share between threads."""
+    """Least recently used photos make room when the budget is exceeded; safe to share between
+    threads.
+    """
 
-    read: Callable[[int], NDArray]
+    read: Callable[[int], NDArray[Any]]
     """Decodes a photo by its index."""
     budget_bytes: int
     """Most bytes kept; one photo larger than that is still handed out, but not kept."""
     decoded: int = 0
     """How many times a photo was decoded."""
-    _kept: OrderedDict[int, NDArray] = field(default_factory=OrderedDict)
+    _kept: OrderedDict[int, NDArray[Any]] = field(default_factory=OrderedDict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _busy: dict[int, threading.Lock] = field(default_factory=dict)
 
-    def __call__(self, photo: int) -> NDArray:
+    def __call__(self, photo: int) -> NDArray[Any]:
         """Pixels of a photo, read-only."""
         with self._lock:
             own = self._busy.setdefault(photo, threading.Lock())
@@ -36,7 +39,7 @@ class PixelCache:
             self.put(photo, pixels)
             return pixels
 
-    def put(self, photo: int, pixels: NDArray) -> None:
+    def put(self, photo: int, pixels: NDArray[Any]) -> None:
         """Keeps pixels decoded by a call, if they fit."""
         with self._lock:
             self.decoded += 1
@@ -47,7 +50,7 @@ class PixelCache:
             while sum(p.nbytes for p in self._kept.values()) > self.budget_bytes:
                 self._kept.popitem(last=False)
 
-    def peek(self, photo: int) -> NDArray | None:
+    def peek(self, photo: int) -> NDArray[Any] | None:
         """Pixels of a photo if they are at hand; nothing is decoded."""
         with self._lock:
             return self._kept.get(photo)

@@ -1,4 +1,6 @@
-"""Artefacts on disk, keyed by what they were made from and by which method: resuming is looking them up."""
+"""Artefacts on disk, keyed by what they were made from and by which method: resuming is looking
+them up.
+"""
 
 import dataclasses
 import hashlib
@@ -19,8 +21,12 @@ T = TypeVar("T")
 
 
 def digest(*parts: Any) -> str:
-    """Hash (hex) of anything made of strings, numbers, paths, tuples, dicts and dataclasses, by value."""
-    return hashlib.blake2b(json.dumps(_plain(parts), sort_keys=True).encode(), digest_size=16).hexdigest()
+    """Hash (hex) of anything made of strings, numbers, paths, tuples, dicts and dataclasses, by
+    value.
+    """
+    return hashlib.blake2b(
+        json.dumps(_plain(parts), sort_keys=True).encode(), digest_size=16
+    ).hexdigest()
 
 
 def _plain(value: Any) -> Any:
@@ -34,7 +40,11 @@ def _plain(value: Any) -> Any:
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.ndarray):
-        return [value.dtype.str, value.shape, hashlib.blake2b(value.tobytes(), digest_size=16).hexdigest()]
+        return [
+            value.dtype.str,
+            value.shape,
+            hashlib.blake2b(value.tobytes(), digest_size=16).hexdigest(),
+        ]
     if isinstance(value, np.generic):
         return _plain(value.item())
     return str(value)

@@ -1,11 +1,21 @@
-"""Names for the moments at which something has just become durable: what crash tests are aimed at."""
+"""Names for the moments at which something has just become durable: what crash tests are aimed
+at.
+"""
 
 from collections.abc import Callable
 
 POINTS = (
-    "photo file synced", "photo file named", "photo row committed", "photo placed", "tiles written", "drawing told",
-    "photo refined", "block closed", "folder seen", "published",
-)  # fmt: skip
+    "photo file synced",
+    "photo file named",
+    "photo row committed",
+    "photo placed",
+    "tiles written",
+    "drawing told",
+    "photo refined",
+    "block closed",
+    "folder seen",
+    "published",
+)
 """All of them, in the order that a photo passes them."""
 
 

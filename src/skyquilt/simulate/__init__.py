@@ -10,6 +10,14 @@ from skyquilt.simulate.settings import FlightSettings
 from skyquilt.simulate.strip import Strip, StripSettings, fly_strip
 
 __all__ = [
-    "PRESETS", "FlightSettings", "Progress", "Strip", "StripSettings", "Waypoint", "fly_strip", "prepare", "preset",
+    "PRESETS",
+    "FlightSettings",
+    "Progress",
+    "Strip",
+    "StripSettings",
+    "Waypoint",
+    "fly_strip",
+    "prepare",
+    "preset",
     "simulate",
-]  # fmt: skip
+]

@@ -1,4 +1,6 @@
-"""Frames of a chess-board of known truth: single views, and a sweep of a lamp that heats it part by part."""
+"""Frames of a chess-board of known truth: single views, and a sweep of a lamp that heats it part by
+part.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -72,8 +74,12 @@ class Lamp:
     """Share of the gain that is lost from frame to frame."""
 
 
-def tilted(angle_x: float, angle_y: float, spin: float, shift: tuple[float, float, float]) -> BoardPose:
-    """A pose by three turns in degrees, about x, y and the line of sight, and the place of the middle in m."""
+def tilted(
+    angle_x: float, angle_y: float, spin: float, shift: tuple[float, float, float]
+) -> BoardPose:
+    """A pose by three turns in degrees, about x, y and the line of sight, and the place of the
+    middle in m.
+    """
     a, b, c = np.radians([angle_x, angle_y, spin])
     rx = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
     ry = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
@@ -100,7 +106,12 @@ def five_poses(lens: Lens, board: Chessboard, rng: np.random.Generator) -> list[
 
 
 def sweep(
-    lens: Lens, board: Chessboard, pose: BoardPose, lamp: Lamp, sensor: Sensor, rng: np.random.Generator
+    lens: Lens,
+    board: Chessboard,
+    pose: BoardPose,
+    lamp: Lamp,
+    sensor: Sensor,
+    rng: np.random.Generator,
 ) -> Iterator[Floats]:
     """Frames (height, width) in K, the camera and the board standing still."""
     black, where = _ink(board), _rays_on_board(lens, board, pose)
@@ -120,11 +131,16 @@ def sweep(
 
 
 def still(
-    lens: Lens, board: Chessboard, pose: BoardPose, sensor: Sensor, rng: np.random.Generator, *,
+    lens: Lens,
+    board: Chessboard,
+    pose: BoardPose,
+    sensor: Sensor,
+    rng: np.random.Generator,
+    *,
     clutter: float = 0.0,
-) -> Floats:  # fmt: skip
-    """One frame (height, width) of an evenly warmed board, black 6 K above white, before a background whose
-    texture has a standard deviation of `clutter` K.
+) -> Floats:
+    """One frame (height, width) of an evenly warmed board, black 6 K above white, before a
+    background whose texture has a standard deviation of `clutter` K.
     """
     where = _rays_on_board(lens, board, pose)
     ground = rng.standard_normal((lens.height, lens.width)).astype(np.float32)
@@ -138,7 +154,9 @@ def _cell(board: Chessboard) -> float:
 
 
 def _ink(board: Chessboard) -> Floats:
-    """1 for black, 0 for white, on a raster over the board and its rim; shares where an edge crosses a cell."""
+    """1 for black, 0 for white, on a raster over the board and its rim; shares where an edge
+    crosses a cell.
+    """
     cell, fine = _cell(board), 8
     x, y = (
         (np.arange(round((n * board.square + 2 * board.margin) / cell) * fine) + 0.5) * cell / fine
@@ -148,12 +166,14 @@ def _ink(board: Chessboard) -> Floats:
     i, j = np.floor(x / board.square).astype(int), np.floor(y / board.square).astype(int)
     on = ((i >= 0) & (i < board.columns))[None, :] & ((j >= 0) & (j < board.rows))[:, None]
     black = (on & ((i[None, :] + j[:, None]) % 2 == 1)).astype(np.float32)
-    return np.asarray(black.reshape(len(y) // fine, fine, len(x) // fine, fine).mean((1, 3)), np.float32)
+    return np.asarray(
+        black.reshape(len(y) // fine, fine, len(x) // fine, fine).mean((1, 3)), np.float32
+    )
 
 
 def _rays_on_board(lens: Lens, board: Chessboard, pose: BoardPose) -> Floats:
-    """Column and row (height, width, 2, finer by `_OVER`) of the board's raster that every ray meets; far outside
-    where it misses.
+    """Column and row (height, width, 2, finer by `_OVER`) of the board's raster that every ray
+    meets; far outside where it misses.
     """
     fine = (
         (np.arange(lens.width * _OVER) + 0.5) / _OVER - 0.5,
@@ -170,7 +190,9 @@ def _rays_on_board(lens: Lens, board: Chessboard, pose: BoardPose) -> Floats:
 
 
 def _lamp_at(share: float, lamp: Lamp, size: Doubles) -> tuple[float, float]:
-    """Where the lamp points, m from the raster's corner, after a share of the sweep; there and back."""
+    """Where the lamp points, m from the raster's corner, after a share of the sweep; there and
+    back.
+    """
     line = min(int(share * lamp.lines), lamp.lines - 1)
     along = share * lamp.lines - line
     along = along if line % 2 == 0 else 1 - along
@@ -182,7 +204,9 @@ def _frame(
 ) -> Floats:
     """What the sensor makes of a board's temperatures and of those behind it."""
     height, width = where.shape[0] // _OVER, where.shape[1] // _OVER
-    seen = cv2.remap(board, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    seen = cv2.remap(
+        board, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     outer = np.array([board.shape[1], board.shape[0]]) - 0.5
     mask = np.all((where > -0.5) & (where < outer), -1).astype(np.float32)
     size = (width, height)

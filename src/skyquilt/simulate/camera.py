@@ -81,7 +81,9 @@ class Lens:
 
     def turned(self) -> "Lens":
         """The lens that describes files whose pixels were turned by 180 degrees."""
-        return replace(self, offset_x=-self.offset_x, offset_y=-self.offset_y, p1=-self.p1, p2=-self.p2)
+        return replace(
+            self, offset_x=-self.offset_x, offset_y=-self.offset_y, p1=-self.p1, p2=-self.p2
+        )
 
     def scaled(self, width: int, height: int) -> "Lens":
         """The same field of view on another number of pixels."""

@@ -24,7 +24,9 @@ class Canvas:
     grid: Grid
     """Where the block lies."""
     look: Floats
-    """(h, w, 4) red, green, blue in 0-255 and temperature in degrees Celsius, all before light and shadow."""
+    """(h, w, 4) red, green, blue in 0-255 and temperature in degrees Celsius, all before light and
+    shadow.
+    """
     height: Floats
     """(h, w) surface above the base, m."""
     ground: Floats
@@ -37,7 +39,9 @@ class Canvas:
     @cached_property
     def grain(self) -> Floats:
         """White noise per cell, a little softened."""
-        return np.asarray(cv2.GaussianBlur(self.noise.grain(self.grid, 5), (0, 0), 0.6)) * np.float32(1.9)
+        return np.asarray(
+            cv2.GaussianBlur(self.noise.grain(self.grid, 5), (0, 0), 0.6)
+        ) * np.float32(1.9)
 
     @cached_property
     def fine(self) -> Floats:
@@ -93,7 +97,9 @@ class Canvas:
         return part
 
     def local(self, x: float, y: float, angle_deg: float) -> tuple[Floats, Floats]:
-        """Coordinates (h, w) in m along and across a direction (degrees from map x) about a map point."""
+        """Coordinates (h, w) in m along and across a direction (degrees from map x) about a map
+        point.
+        """
         c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
         dx = (self.grid.xs - x).astype(np.float32)[None, :]
         dy = (self.grid.ys - y).astype(np.float32)[:, None]
@@ -102,7 +108,9 @@ class Canvas:
     def lay(
         self, material: Material, cover: Floats | NDArray[np.bool_], texture: Floats | float = 0.0
     ) -> None:
-        """Paint a material where `cover` (h, w, 0-1) is; `texture` is a relative change of brightness."""
+        """Paint a material where `cover` (h, w, 0-1) is; `texture` is a relative change of
+        brightness.
+        """
         where = cover > 0
         change = texture[where] if isinstance(texture, np.ndarray) else np.float32(texture)
         share = cover[where].astype(np.float32)
@@ -115,4 +123,4 @@ class Canvas:
 
     def _fixed(self, points: Doubles) -> NDArray[np.int32]:
         pixels = np.clip(self.grid.pixels(points), -30000, 30000)
-        return np.round(pixels * 2**_SHIFT).astype(np.int32)
+        return np.asarray(np.round(pixels * 2**_SHIFT).astype(np.int32))

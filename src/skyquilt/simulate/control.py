@@ -151,16 +151,23 @@ def sightings(
         pixels = lens.project(points, shot.rotation, shot.place)
         for target, point, pixel in zip(country.targets, points, pixels, strict=True):
             if _inside(lens, pixel) and _in_sight(scene, shot.place, point):
-                x, y = pixel if not report.turned else (lens.width - 1 - pixel[0], lens.height - 1 - pixel[1])
+                x, y = (
+                    pixel
+                    if not report.turned
+                    else (lens.width - 1 - pixel[0], lens.height - 1 - pixel[1])
+                )
                 dx, dy = rng.normal(0, settings.pixel_noise, 2)
-                found.append(Sighting(point=target.name, photo=shot.name, x=float(x + dx), y=float(y + dy)))
+                found.append(
+                    Sighting(point=target.name, photo=shot.name, x=float(x + dx), y=float(y + dy))
+                )
     return found
 
 
 def _inside(lens: Lens, pixel: Doubles) -> bool:
     x, y = pixel
     return bool(
-        _MARGIN_PX < x < lens.width - 1 - _MARGIN_PX and _MARGIN_PX < y < lens.height - 1 - _MARGIN_PX
+        _MARGIN_PX < x < lens.width - 1 - _MARGIN_PX
+        and _MARGIN_PX < y < lens.height - 1 - _MARGIN_PX
     )
 
 
@@ -175,7 +182,9 @@ def _in_sight(scene: Scene, eye: Doubles, point: Doubles) -> bool:
     return bool((scene.height[rows, cols] < line[:, 2] + 0.05).all())
 
 
-def write_gcp_list(path: Path, crs: str, points: Sequence[Surveyed], seen: Sequence[Sighting]) -> None:
+def write_gcp_list(
+    path: Path, crs: str, points: Sequence[Surveyed], seen: Sequence[Sighting]
+) -> None:
     """OpenDroneMap's `gcp_list.txt`; a check point says so in the eighth column."""
     by_name = {point.target.name: point for point in points}
     lines = [crs]

@@ -29,11 +29,15 @@ class Body:
     """Clock time at which the flight starts."""
 
 
-def write_jpeg(path: Path, pixels: NDArray[np.uint8], report: Report, body: Body, quality: int) -> None:
+def write_jpeg(
+    path: Path, pixels: NDArray[np.uint8], report: Report, body: Body, quality: int
+) -> None:
     """A photo (h, w, 3) with its metadata."""
     exif = _exif(report, body, pixels.shape[1])
     buffer = BytesIO()
-    Image.fromarray(pixels).save(buffer, "JPEG", quality=quality, subsampling=2, exif=exif.tobytes())
+    Image.fromarray(pixels).save(
+        buffer, "JPEG", quality=quality, subsampling=2, exif=exif.tobytes()
+    )
     data = buffer.getvalue()
     xmp = _xmp(report)
     if xmp is not None:
@@ -83,7 +87,9 @@ def _exif(report: Report, body: Body, width: int) -> Image.Exif:
     return exif
 
 
-def _gps(gps: dict[int, object], latitude: float, longitude: float, sea_level: float | None) -> None:
+def _gps(
+    gps: dict[int, object], latitude: float, longitude: float, sea_level: float | None
+) -> None:
     gps[0] = b"\x02\x03\x00\x00"
     gps[1], gps[2] = "N" if latitude >= 0 else "S", _degrees(abs(latitude))
     gps[3], gps[4] = "E" if longitude >= 0 else "W", _degrees(abs(longitude))

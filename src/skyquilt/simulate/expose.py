@@ -22,8 +22,10 @@ _TEXTURE_PX = 1024
 def _leaves() -> Floats:
     """A periodic texture of clumps, about -1 to 1."""
     white = np.random.default_rng(7).standard_normal((_TEXTURE_PX, _TEXTURE_PX), dtype=np.float32)
-    layers = [gaussian_filter(white, sigma, mode="wrap") * (3.5 * sigma) for sigma in (0.8, 2.0, 5.0)]
-    return np.clip(0.4 * sum(layers), -1.2, 1.2).astype(np.float32)
+    layers = [
+        gaussian_filter(white, sigma, mode="wrap") * (3.5 * sigma) for sigma in (0.8, 2.0, 5.0)
+    ]
+    return np.asarray(np.clip(0.4 * sum(layers), -1.2, 1.2).astype(np.float32))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,7 +42,8 @@ class Exposer:
     def pixels(self, shot: Shot) -> tuple[Floats, Floats, Grid]:
         """Where each pixel's ray first meets the surface.
 
-        Pixels (h, w, 2) of a window of the scene's grid, heights (h, w) above the base, and that window.
+        Pixels (h, w, 2) of a window of the scene's grid, heights (h, w) above the base, and that
+        window.
         """
         window = self.window(shot)
         corner = np.array([window.xs[0], window.ys[0]])
@@ -57,11 +60,15 @@ class Exposer:
         slope_x = cv2.Sobel(surface, cv2.CV_32F, 1, 0, scale=1 / (8 * window.res))
         slope_y = cv2.Sobel(surface, cv2.CV_32F, 0, 1, scale=1 / (8 * window.res))
         slope = np.hypot(slope_x, slope_y)
-        rough = np.clip(0.6 * (slope - 1.2), 0, 1) * np.clip(1.6 - slope / 25, 0.35, 1)  # walls are smoother
+        rough = np.clip(0.6 * (slope - 1.2), 0, 1) * np.clip(
+            1.6 - slope / 25, 0.35, 1
+        )  # walls are smoother
         steep = sample(rough, hits)
         offset = np.array([window.col, window.row], dtype=np.float32) % _TEXTURE_PX
         where = (
-            hits + offset + (heights / np.float32(window.res))[..., None] * np.array([0.83, 0.71], np.float32)
+            hits
+            + offset
+            + (heights / np.float32(window.res))[..., None] * np.array([0.83, 0.71], np.float32)
         )
         x, y = cv2.split(where)
         leaves = cv2.remap(_leaves(), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
@@ -91,17 +98,21 @@ class Exposer:
         seen *= (np.float32(gain) * falloff(self.lens, settings.vignetting))[..., None]
         if settings.noise > 0:
             seen += rng.standard_normal(seen.shape, dtype=np.float32) * np.float32(settings.noise)
-        return np.clip(seen + 0.5, 0, 255).astype(np.uint8)
+        return np.asarray(np.clip(seen + 0.5, 0, 255).astype(np.uint8))
 
-    def heat(self, shot: Shot, noise: float, offset: float, rng: np.random.Generator) -> NDArray[np.uint16]:
+    def heat(
+        self, shot: Shot, noise: float, offset: float, rng: np.random.Generator
+    ) -> NDArray[np.uint16]:
         """(h, w) hundredths of a kelvin."""
         if self.scene.thermal is None:
             raise ValueError("the scene was drawn without temperatures")
         hits, _, window = self.pixels(shot)
-        kelvin = sample(np.ascontiguousarray(self.scene.thermal[window.slices]).astype(np.float32), hits)
+        kelvin = sample(
+            np.ascontiguousarray(self.scene.thermal[window.slices]).astype(np.float32), hits
+        )
         kelvin = cv2.GaussianBlur(kelvin, (0, 0), 0.7) + np.float32(100 * offset)
         kelvin += rng.standard_normal(kelvin.shape, dtype=np.float32) * np.float32(100 * noise)
-        return np.clip(kelvin + 0.5, 0, 65535).astype(np.uint16)
+        return np.asarray(np.clip(kelvin + 0.5, 0, 65535).astype(np.uint16))
 
 
 def exposer(scene: Scene, lens: Lens) -> Exposer:
@@ -113,8 +124,12 @@ def footprint(lens: Lens, shot: Shot, level: float) -> Doubles:
     """Map places (n, 2) where the image border meets a level height above the base."""
     w, h = lens.width - 0.5, lens.height - 0.5
     side = np.linspace(0, 1, 9)[:-1]
-    x = np.concatenate([-0.5 + side * (w + 0.5), np.full(8, w), w - side * (w + 0.5), np.full(8, -0.5)])
-    y = np.concatenate([np.full(8, -0.5), -0.5 + side * (h + 0.5), np.full(8, h), h - side * (h + 0.5)])
+    x = np.concatenate(
+        [-0.5 + side * (w + 0.5), np.full(8, w), w - side * (w + 0.5), np.full(8, -0.5)]
+    )
+    y = np.concatenate(
+        [np.full(8, -0.5), -0.5 + side * (h + 0.5), np.full(8, h), h - side * (h + 0.5)]
+    )
     ix, iy = lens.undistort((x - lens.cx) / lens.focal, (y - lens.cy) / lens.focal)
     rays = np.stack([ix, iy, np.ones_like(ix)], axis=1) @ shot.rotation
     return shot.place[:2] + rays[:, :2] * ((level - shot.centre[2]) / rays[:, 2])[:, None]

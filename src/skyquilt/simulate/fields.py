@@ -36,12 +36,18 @@ class Cover:
 COVERS = {
     "meadow": Cover(material=m.MEADOW, grain=0.05, fine=0.10, patchy=0.09),
     "yard": Cover(material=m.LAWN, grain=0.045, fine=0.06, patchy=0.07),
-    "crop": Cover(material=m.CROP, grain=0.06, fine=0.08, patchy=0.06, spacing=0.75, rows=0.20, height=0.25),
+    "crop": Cover(
+        material=m.CROP, grain=0.06, fine=0.08, patchy=0.06, spacing=0.75, rows=0.20, height=0.25
+    ),
     "wood": Cover(material=m.WOOD_FLOOR, grain=0.09, fine=0.16, patchy=0.12),
-    "wheat": Cover(material=m.WHEAT, grain=0.05, fine=0.05, patchy=0.06, spacing=2.4, rows=0.05, height=0.7),
+    "wheat": Cover(
+        material=m.WHEAT, grain=0.05, fine=0.05, patchy=0.06, spacing=2.4, rows=0.05, height=0.7
+    ),
     "bare": Cover(material=m.BARE, grain=0.025, fine=0.03, patchy=0.035),
     "orchard": Cover(material=m.MEADOW, grain=0.05, fine=0.09, patchy=0.10, spacing=6.0, rows=0.07),
-    "maize": Cover(material=m.MAIZE, grain=0.10, fine=0.10, patchy=0.06, spacing=0.8, rows=0.26, height=1.6),
+    "maize": Cover(
+        material=m.MAIZE, grain=0.10, fine=0.10, patchy=0.06, spacing=0.8, rows=0.26, height=1.6
+    ),
     "pond": Cover(material=m.MEADOW, grain=0.05, fine=0.11, patchy=0.12),
     "stubble": Cover(
         material=m.STUBBLE, grain=0.06, fine=0.07, patchy=0.06, spacing=1.6, rows=0.10, height=0.12
@@ -69,7 +75,9 @@ def paint_parcels(canvas: Canvas, layout: Layout) -> None:
 
 
 def _colour(cover: Cover, parcel: Parcel, canvas: Canvas) -> Floats:
-    return cover.material.look(canvas.weather) * np.array([parcel.shade] * 3 + [1.0], dtype=np.float32)
+    return cover.material.look(canvas.weather) * np.array(
+        [parcel.shade] * 3 + [1.0], dtype=np.float32
+    )
 
 
 def _per_cell(values: list[float], index: NDArray[np.int32]) -> Floats:
@@ -98,18 +106,22 @@ def _rows(
     track = ((np.abs(offset - np.float32(0.9)) < 0.22) & (tall > 0)).astype(np.float32)
     gaps = np.clip(canvas.patchy - np.float32(1.9), 0, 1) * (contrast > 0.15)
     height = tall * (1 - track) * (0.75 + 0.25 * wave) + 0.12 * tall * canvas.fine
-    return contrast * wave * (1 - track) + track * np.float32(0.16) + gaps * np.float32(0.35), np.maximum(
-        height, 0
-    )
+    return contrast * wave * (1 - track) + track * np.float32(0.16) + gaps * np.float32(
+        0.35
+    ), np.maximum(height, 0)
 
 
 def paint_borders(canvas: Canvas, layout: Layout) -> None:
     """Ragged strips of grass between parcels."""
     for parcel in layout.parcels:
         if parcel.kind != "yard" and canvas.touches(parcel.outline, 2.0):
-            strip = cv2.GaussianBlur(canvas.line(parcel.outline, 1.5), (0, 0), 0.25 / canvas.grid.res)
+            strip = cv2.GaussianBlur(
+                canvas.line(parcel.outline, 1.5), (0, 0), 0.25 / canvas.grid.res
+            )
             cover = np.clip((strip - 0.5 + 0.16 * canvas.patchy) * 6 + 0.5, 0, 1) * (strip > 0.02)
-            canvas.lay(m.MEADOW, cover, 0.08 * canvas.fine + 0.05 * canvas.grain + 0.08 * canvas.patchy)
+            canvas.lay(
+                m.MEADOW, cover, 0.08 * canvas.fine + 0.05 * canvas.grain + 0.08 * canvas.patchy
+            )
             canvas.height[...] += cover * (canvas.ground - canvas.height)
 
 
@@ -136,7 +148,9 @@ def _shoulder(canvas: Canvas, road: Road) -> None:
 
 
 def _lanes(canvas: Canvas, road: Road) -> None:
-    texture = 0.018 * canvas.grain + 0.02 * canvas.fine + 0.035 * canvas.patchy + 0.03 * canvas.broad
+    texture = (
+        0.018 * canvas.grain + 0.02 * canvas.fine + 0.035 * canvas.patchy + 0.03 * canvas.broad
+    )
     canvas.lay(m.ASPHALT, canvas.line(road.line, road.width), texture)
 
 

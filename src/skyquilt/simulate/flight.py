@@ -60,7 +60,9 @@ class Shot:
 
 
 def plan(route: Route, lens: Lens) -> list[Waypoint]:
-    """Waypoints in the order in which they are flown, centred on the map origin; times per drone."""
+    """Waypoints in the order in which they are flown, centred on the map origin; times per
+    drone.
+    """
     forward = (1 - route.overlap) * route.height * lens.height / lens.focal
     sideways = (1 - route.sidelap) * route.height * lens.width / lens.focal
     if route.pattern == "roundtrip":
@@ -88,7 +90,9 @@ def _counts(route: Route, forward: float, sideways: float) -> list[int]:
     """Photos on each line, for a site or for a number of photos on a nearly square one."""
     if route.site is not None:
         along, across = route.site
-        return [int(np.ceil(along / forward - 1e-9)) + 1] * (int(np.ceil(across / sideways - 1e-9)) + 1)
+        return [int(np.ceil(along / forward - 1e-9)) + 1] * (
+            int(np.ceil(across / sideways - 1e-9)) + 1
+        )
     lines = min(max(1, round(np.sqrt(route.photos * forward / sideways))), route.photos)
     share, rest = divmod(route.photos, lines)
     return [share + (i < rest) for i in range(lines)]
@@ -108,7 +112,9 @@ def _lines(counts: list[int], forward: float, sideways: float, heading: float) -
 
 
 def _around(photos: int, forward: float, heading: float) -> list[Waypoint]:
-    """Once around a rectangle of sides about 3 : 2, nose ahead; the last photo is beside the first."""
+    """Once around a rectangle of sides about 3 : 2, nose ahead; the last photo is beside the
+    first.
+    """
     length = photos * forward
     long_ = round(0.3 * length / forward) * forward
     sides = [long_, length / 2 - long_, long_, length / 2 - long_]
@@ -142,14 +148,18 @@ def _timed(points: list[Waypoint], interval: float) -> list[Waypoint]:
     for p in points:
         last = clock.get(p.drone)
         start = 0.37 * interval * p.drone
-        time = start if last is None else last[0] + interval + (_TURN_S if last[1] != p.line else 0.0)
+        time = (
+            start if last is None else last[0] + interval + (_TURN_S if last[1] != p.line else 0.0)
+        )
         clock[p.drone] = (time, p.line)
         timed.append(replace(p, time=time))
     return sorted(timed, key=lambda p: (p.time, p.drone))
 
 
 def fly(points: list[Waypoint], route: Route, takeoff: float, seed: int, prefix: str) -> list[Shot]:
-    """The true shots, lost ones left out; `takeoff` is the height of the take-off point above the base."""
+    """The true shots, lost ones left out; `takeoff` is the height of the take-off point above the
+    base.
+    """
     rng = np.random.default_rng([seed, 21, len(prefix)])
     lost = _losses(len(points), route.lost, rng)
     shots = []
@@ -171,11 +181,15 @@ def fly(points: list[Waypoint], route: Route, takeoff: float, seed: int, prefix:
 
 
 def _losses(count: int, lost: int, rng: np.random.Generator) -> set[int]:
-    """Numbers of lost photos: spread out, never neighbours, never the first or last where that can be."""
+    """Numbers of lost photos: spread out, never neighbours, never the first or last where that can
+    be.
+    """
     if lost == 0:
         return set()
     edges = np.linspace(1, count - 1, lost + 1)
     chosen: set[int] = set()
     for low, high in pairwise(edges):
-        chosen.add(int(rng.integers(int(np.ceil(low)), max(int(np.ceil(high)) - 1, int(np.ceil(low)) + 1))))
+        chosen.add(
+            int(rng.integers(int(np.ceil(low)), max(int(np.ceil(high)) - 1, int(np.ceil(low)) + 1)))
+        )
     return chosen

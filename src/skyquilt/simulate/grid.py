@@ -31,7 +31,9 @@ class Grid:
     """First row of this window in the endless raster."""
 
     def window(self, row: int, col: int, height: int, width: int) -> "Grid":
-        """A part of this grid, clipped to it; rows and columns count from this grid's own corner."""
+        """A part of this grid, clipped to it; rows and columns count from this grid's own
+        corner.
+        """
         r0, c0 = max(row, 0), max(col, 0)
         r1, c1 = min(row + height, self.height), min(col + width, self.width)
         return Grid(
@@ -51,7 +53,9 @@ class Grid:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Where this window lies in an array of the endless raster that starts at row 0, column 0."""
+        """Where this window lies in an array of the endless raster that starts at row 0, column
+        0.
+        """
         return slice(self.row, self.row + self.height), slice(self.col, self.col + self.width)
 
     @property
@@ -67,7 +71,9 @@ class Grid:
         return np.asarray(self.top - rows * self.res)
 
     def pixels(self, xy: Doubles) -> Doubles:
-        """Pixel coordinates (..., 2) as (column, row), centres at integers, of map points (..., 2)."""
+        """Pixel coordinates (..., 2) as (column, row), centres at integers, of map points (...,
+        2).
+        """
         xy = np.asarray(xy, dtype=np.float64)
         u = (xy[..., 0] - self.left) / self.res - 0.5 - self.col
         v = (self.top - xy[..., 1]) / self.res - 0.5 - self.row

@@ -31,12 +31,18 @@ class Basin:
     def weight(self, grid: Grid) -> Floats | None:
         """The pull on a window; None where the pond is far."""
         corner = self.grid.pixels(np.array([[grid.xs[0], grid.ys[0]], [grid.xs[-1], grid.ys[-1]]]))
-        if (corner[1] < 0).any() or corner[0, 0] > self.grid.width or corner[0, 1] > self.grid.height:
+        if (
+            (corner[1] < 0).any()
+            or corner[0, 0] > self.grid.width
+            or corner[0, 1] > self.grid.height
+        ):
             return None
         u = self.grid.pixels(np.stack([grid.xs, np.full(grid.width, grid.ys[0])], axis=1))[:, 0]
         v = self.grid.pixels(np.stack([np.full(grid.height, grid.xs[0]), grid.ys], axis=1))[:, 1]
         uu, vv = np.meshgrid(u.astype(np.float32), v.astype(np.float32))
-        return np.asarray(cv2.remap(self.pull, uu, vv, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+        return np.asarray(
+            cv2.remap(self.pull, uu, vv, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,7 +58,9 @@ class Ground:
 
     def hills(self, grid: Grid) -> Floats:
         """Without ponds; (height, width), m."""
-        coarse = max(1, int(1.0 / grid.res))  # nothing below 10 m here: compute it per metre and enlarge
+        coarse = max(
+            1, int(1.0 / grid.res)
+        )  # nothing below 10 m here: compute it per metre and enlarge
         if coarse < 3 or min(grid.width, grid.height) < 8:
             return self.noise.fractal(grid, 170.0, 10.0, 0.42, 1) * np.float32(self.relief / 3.6)
         return _enlarged(self.hills, grid, coarse)
@@ -103,7 +111,13 @@ def _enlarged(field: Callable[[Grid], Floats], grid: Grid, factor: int) -> Float
     c0, r0 = grid.col // factor - 1, grid.row // factor - 1
     c1, r1 = (grid.col + grid.width) // factor + 2, (grid.row + grid.height) // factor + 2
     large = Grid(
-        left=grid.left, top=grid.top, res=grid.res * factor, col=c0, row=r0, width=c1 - c0, height=r1 - r0
+        left=grid.left,
+        top=grid.top,
+        res=grid.res * factor,
+        col=c0,
+        row=r0,
+        width=c1 - c0,
+        height=r1 - r0,
     )
     u = ((grid.col + np.arange(grid.width) + 0.5) / factor - 0.5 - c0).astype(np.float32)
     v = ((grid.row + np.arange(grid.height) + 0.5) / factor - 0.5 - r0).astype(np.float32)

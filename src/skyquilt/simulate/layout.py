@@ -8,9 +8,23 @@ import numpy as np
 from skyquilt.simulate.grid import Doubles
 
 KINDS = (
-    "meadow", "yard", "crop", "wood", "wheat", "yard", "bare", "orchard",
-    "maize", "pond", "stubble", "yard", "crop", "meadow", "wood", "wheat",
-)  # fmt: skip
+    "meadow",
+    "yard",
+    "crop",
+    "wood",
+    "wheat",
+    "yard",
+    "bare",
+    "orchard",
+    "maize",
+    "pond",
+    "stubble",
+    "yard",
+    "crop",
+    "meadow",
+    "wood",
+    "wheat",
+)
 """What parcels are used for, in the order in which shuffled parcels get their use."""
 
 _SMALL_M2 = 2600.0
@@ -155,9 +169,13 @@ class Lot:
 
 
 def divide(
-    box: tuple[float, float, float, float], rng: np.random.Generator, cuts: list[tuple[Doubles, float]]
+    box: tuple[float, float, float, float],
+    rng: np.random.Generator,
+    cuts: list[tuple[Doubles, float]],
 ) -> list[Lot]:
-    """Halve a box until its parts are fields; the cuts go to `cuts` with the length of the side they cut."""
+    """Halve a box until its parts are fields; the cuts go to `cuts` with the length of the side
+    they cut.
+    """
     a0, b0, a1, b1 = box
     long_, short = max(a1 - a0, b1 - b0), min(a1 - a0, b1 - b0)
     if long_ * short < _SMALL_M2 * rng.uniform(0.8, 1.8):

@@ -31,7 +31,9 @@ def lit(height: Floats, res: float, weather: Weather) -> Floats:
 
 
 def _shadow(height: Floats, res: float, sun: Floats) -> Floats:
-    """1 in shadow: the surface's running maximum towards the sun, less the rise of the ray, by doubling."""
+    """1 in shadow: the surface's running maximum towards the sun, less the rise of the ray, by
+    doubling.
+    """
     flat = float(np.hypot(sun[0], sun[1]))
     rise = float(sun[2]) / flat * res
     reach = int(np.ceil(_TALLEST_M / rise))
@@ -46,7 +48,9 @@ def _shadow(height: Floats, res: float, sun: Floats) -> Floats:
         offset += done
         if offset > reach:
             break
-        further = _shifted(highest, sun[0] / flat * done, -sun[1] / flat * done) - np.float32(rise * done)
+        further = _shifted(highest, sun[0] / flat * done, -sun[1] / flat * done) - np.float32(
+            rise * done
+        )
         highest, done = np.maximum(highest, further), 2 * done
     dark = np.clip((best - height) / 0.12, 0, 1)
     return np.asarray(cv2.GaussianBlur(dark, (0, 0), 0.8))
@@ -61,7 +65,9 @@ def _shifted(raster: Floats, dx: float, dy: float) -> Floats:
 
 
 def shine(look: Floats, direct: Floats, weather: Weather) -> Floats:
-    """(h, w, 4) colours and temperatures under light: visible shading, and warmth where the sun lies."""
+    """(h, w, 4) colours and temperatures under light: visible shading, and warmth where the sun
+    lies.
+    """
     strength = np.float32(0.25 + 0.75 * weather.strength)
     sun, sky = (1 - _AMBIENT) * direct[..., None] * _SUN_TINT, _AMBIENT * _SKY_TINT
     out = look.copy()

@@ -31,7 +31,9 @@ def _spline(positions: Doubles) -> tuple[sparse.csr_matrix, NDArray[np.int64]]:
     columns = base[:, None] - 1 - first + np.arange(4)
     rows = np.arange(len(t) + 1) * 4
     shape = (len(t), int(base.max()) + 2 - first + 1)
-    matrix = sparse.csr_matrix(((weights / 6).astype(np.float32).ravel(), columns.ravel(), rows), shape=shape)
+    matrix = sparse.csr_matrix(
+        ((weights / 6).astype(np.float32).ravel(), columns.ravel(), rows), shape=shape
+    )
     return matrix, np.arange(first, first + shape[1], dtype=np.int64)
 
 
@@ -43,7 +45,9 @@ class Noise:
     """Equal seeds give equal fields."""
 
     def smooth(self, grid: Grid, wavelength: float, key: int) -> Floats:
-        """A field (height, width), zero mean, unit deviation, no features below the wavelength (m)."""
+        """A field (height, width), zero mean, unit deviation, no features below the wavelength
+        (m).
+        """
         down, rows = _spline(grid.ys / wavelength)
         across, cols = _spline(grid.xs / wavelength)
         lattice = _lattice(self.seed, key, _LATTICE)[np.ix_(rows % _LATTICE, cols % _LATTICE)]
@@ -51,7 +55,9 @@ class Noise:
         return np.ascontiguousarray(field.T) * np.float32(1 / _SPREAD)
 
     def fractal(self, grid: Grid, longest: float, shortest: float, gain: float, key: int) -> Floats:
-        """Octaves from the longest wavelength down to the shortest (m), each `gain` times the last."""
+        """Octaves from the longest wavelength down to the shortest (m), each `gain` times the
+        last.
+        """
         total = np.zeros((grid.height, grid.width), dtype=np.float32)
         weight, wavelength, power, octave = 1.0, longest, 0.0, 0
         while wavelength >= shortest:

@@ -16,7 +16,9 @@ def _demo() -> FlightSettings:
 
 
 def _strip() -> FlightSettings:
-    return FlightSettings(route=Route(pattern="strip", photos=20), control=Control(points=0, checks=5))
+    return FlightSettings(
+        route=Route(pattern="strip", photos=20), control=Control(points=0, checks=5)
+    )
 
 
 def _roundtrip() -> FlightSettings:
@@ -43,8 +45,9 @@ PRESETS: dict[str, Callable[[], FlightSettings]] = {
     "thermal": _thermal,
     "drones": _drones,
 }
-"""Name -> settings: 40 photos in four lines; a small quick one; one line; once around with losses; with a
-thermal flight; three drones at once with clocks apart."""
+"""Name -> settings: 40 photos in four lines; a small quick one; one line; once around with losses;
+with a thermal flight; three drones at once with clocks apart.
+"""
 
 
 def preset(name: str) -> FlightSettings:

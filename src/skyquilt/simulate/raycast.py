@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from skyquilt.simulate.grid import Doubles, Floats
 
-_CELL = 16  # px: side of the cells in which hits are first bracketed, in the photo and in the raster alike
+# px: side of the cells in which hits are first bracketed, in the photo and in the raster alike
+_CELL = 16
 _LEVEL_M = 0.35  # height between two levels of the bracketing march
 _STEP_PX = 2.0  # raster px between two samples of the exact march
 _MAX_STEPS = 128
@@ -42,7 +43,9 @@ class Rays:
         return Rays(start=self.start[at], slope=self.slope[at])
 
 
-def rays_of(directions: Floats, rotation: Doubles, centre: Doubles, origin: Doubles, res: float) -> Rays:
+def rays_of(
+    directions: Floats, rotation: Doubles, centre: Doubles, origin: Doubles, res: float
+) -> Rays:
     """Rays of ideal image coordinates (h, w, 2) from a camera.
 
     `origin` is the map place of raster pixel (0, 0).
@@ -53,13 +56,19 @@ def rays_of(directions: Floats, rotation: Doubles, centre: Doubles, origin: Doub
     x, y = directions[..., 0], directions[..., 1]
     dx, dy, dz = (to_map[i, 0] * x + to_map[i, 1] * y + to_map[i, 2] for i in range(3))
     if dz.max() > -0.05:
-        raise ValueError("a ray of the photo does not meet the ground: tilt or field of view too large")
+        raise ValueError(
+            "a ray of the photo does not meet the ground: tilt or field of view too large"
+        )
     slope = np.stack([dx, -dy], axis=-1) / (-dz * np.float32(res))[..., None]
-    place = np.array([(centre[0] - origin[0]) / res, (origin[1] - centre[1]) / res], dtype=np.float32)
+    place = np.array(
+        [(centre[0] - origin[0]) / res, (origin[1] - centre[1]) / res], dtype=np.float32
+    )
     return Rays(start=place + np.float32(centre[2]) * slope, slope=slope)
 
 
-def sample(raster: NDArray[Any], pixels: Floats, interpolation: int = cv2.INTER_LINEAR) -> NDArray[Any]:
+def sample(
+    raster: NDArray[Any], pixels: Floats, interpolation: int = cv2.INTER_LINEAR
+) -> NDArray[Any]:
     """Values of a raster at pixels (h, w, 2) or (n, 2), edges repeated."""
     if pixels.ndim == 3:
         return _remap(raster, pixels, interpolation)
@@ -93,7 +102,9 @@ def _bracket(raster: Floats, rays: Rays) -> tuple[Floats, Floats]:
     above = np.full(rays.start.shape[:2], np.nan, dtype=np.float32)
     below = np.full(rays.start.shape[:2], np.nan, dtype=np.float32)
     for upper, lower in pairwise(levels):
-        cell = rays.at(np.full_like(above, lower)) / np.float32(_CELL) - np.float32(0.5 - 0.5 / _CELL)
+        cell = rays.at(np.full_like(above, lower)) / np.float32(_CELL) - np.float32(
+            0.5 - 0.5 / _CELL
+        )
         highest = sample(high, cell, cv2.INTER_NEAREST)
         lowest = sample(low, cell, cv2.INTER_NEAREST)
         above = np.where(np.isnan(above) & (highest >= lower), upper, above)
@@ -102,7 +113,9 @@ def _bracket(raster: Floats, rays: Rays) -> tuple[Floats, Floats]:
 
 
 def _march(raster: Floats, rays: Rays, above: Floats, below: Floats, steps: int) -> Floats:
-    """Heights (n,) of first hits between two heights (n,) per ray: even steps, then false position."""
+    """Heights (n,) of first hits between two heights (n,) per ray: even steps, then false
+    position.
+    """
     z_over, z_under = above.copy(), below.copy()
     f_over = np.full_like(above, -1e-3)
     f_under = np.full_like(above, 1e-3)
@@ -125,7 +138,11 @@ def _polish(
 ) -> Floats:
     """Close in on the crossing between heights over and under the surface."""
     for k in range(5):
-        share = np.float32(0.5) if k in (0, 2) else np.clip(f_over / (f_over - f_under - 1e-9), 0.02, 0.98)
+        share = (
+            np.float32(0.5)
+            if k in (0, 2)
+            else np.clip(f_over / (f_over - f_under - 1e-9), 0.02, 0.98)
+        )
         z = z_over + (z_under - z_over) * share
         f = sample(raster, rays.at(z)) - z
         hit = f >= 0
@@ -136,7 +153,9 @@ def _polish(
 
 
 def first_hits(raster: Floats, rays: Rays) -> tuple[Floats, Floats]:
-    """Raster pixels (h, w, 2) and heights (h, w) where the rays of a photo first meet the height raster."""
+    """Raster pixels (h, w, 2) and heights (h, w) where the rays of a photo first meet the height
+    raster.
+    """
     h, w = rays.start.shape[:2]
     coarse = rays.coarse()
     above, below = _bracket(raster, coarse)

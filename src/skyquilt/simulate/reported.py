@@ -111,9 +111,11 @@ def report_all(
 def _position_errors(shots: list[Shot], settings: Reporting, rng: np.random.Generator) -> Doubles:
     """(n, 3) errors in m; alike over `gps_correlation` seconds per drone (Gauss-Markov)."""
     vertical = 1.5 * settings.gps_noise if settings.gps_noise_z is None else settings.gps_noise_z
-    white = rng.normal(0, 1, (len(shots), 3)) * np.array([settings.gps_noise, settings.gps_noise, vertical])
+    white = rng.normal(0, 1, (len(shots), 3)) * np.array(
+        [settings.gps_noise, settings.gps_noise, vertical]
+    )
     if settings.gps_correlation <= 0:
-        return white
+        return np.asarray(white)
     last: dict[int, int] = {}
     for i, shot in enumerate(shots):
         before = last.get(shot.waypoint.drone)
@@ -122,7 +124,7 @@ def _position_errors(shots: list[Shot], settings: Reporting, rng: np.random.Gene
             gap = shot.waypoint.time - shots[before].waypoint.time
             keep = float(np.exp(-gap / settings.gps_correlation))
             white[i] = keep * white[before] + np.sqrt(1 - keep**2) * white[i]
-    return white
+    return np.asarray(white)
 
 
 def _liars(shots: list[Shot]) -> set[int]:
@@ -163,8 +165,12 @@ def _report(
         longitude=None if silent else round(longitude, 9),
         sea_level=None if silent else round(start.base + z + error[2] + drift, 3),
         takeoff=round(z - start.takeoff + barometer + drift, 3) if with_angles else None,
-        gimbal=(round(gimbal[0], 2), round(gimbal[1], 2), round(gimbal[2], 2)) if with_angles else None,
-        flight_yaw=round(wrap(shot.waypoint.heading + north + lie + nose), 2) if with_angles else None,
+        gimbal=(round(gimbal[0], 2), round(gimbal[1], 2), round(gimbal[2], 2))
+        if with_angles
+        else None,
+        flight_yaw=round(wrap(shot.waypoint.heading + north + lie + nose), 2)
+        if with_angles
+        else None,
         clock=round(shot.waypoint.time + offsets[shot.waypoint.drone % len(offsets)], 3),
         focal=None if settings.focal_missing else focal * (1 + settings.focal_error),
         turned=lying and settings.yaw_lie == "turned",

@@ -1,6 +1,7 @@
 """Rotations of the simulator's own; nothing is shared with the stages it will judge.
 
-Map: x east, y north, z up. Camera: x right, y down, z along the view. Body: x nose, y right wing, z down.
+Map: x east, y north, z up. Camera: x right, y down, z along the view. Body: x nose, y right wing, z
+down.
 """
 
 import numpy as np
@@ -29,11 +30,15 @@ def camera_rotation(yaw: float, pitch: float, roll: float) -> Doubles:
 
 
 def gimbal_angles(yaw: float, pitch: float, roll: float) -> tuple[float, float, float]:
-    """Yaw, pitch, roll of a gimbal (nose camera, pitch -90 at nadir) that looks as the belly camera does."""
+    """Yaw, pitch, roll of a gimbal (nose camera, pitch -90 at nadir) that looks as the belly camera
+    does.
+    """
     belly = _turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll)
     nose = belly @ _NOSE_CAMERA_OF_BELLY.T
     lift = np.degrees(np.arcsin(np.clip(-nose[2, 0], -1, 1)))
-    if np.hypot(nose[0, 0], nose[1, 0]) < 1e-9:  # nadir: yaw and roll turn about one axis, so roll rests
+    if (
+        np.hypot(nose[0, 0], nose[1, 0]) < 1e-9
+    ):  # nadir: yaw and roll turn about one axis, so roll rests
         return wrap(np.degrees(np.arctan2(-nose[0, 1], nose[1, 1]))), float(lift), 0.0
     turn = np.degrees(np.arctan2(nose[1, 0], nose[0, 0]))
     bank = np.degrees(np.arctan2(nose[2, 1], nose[2, 2]))

@@ -78,13 +78,24 @@ def prepare(settings: FlightSettings, waypoints: list[Waypoint] | None = None) -
     hills = Ground(noise=Noise(seed=settings.seed), relief=settings.scene.relief)
     start = Start(base=settings.scene.base, takeoff=hills.at(points[0].x, points[0].y))
     shots = fly(points, settings.route, start.takeoff, settings.seed, "SIM")
-    reports = report_all(shots, settings.reporting, place, start, settings.lens.focal, settings.seed)
+    reports = report_all(
+        shots, settings.reporting, place, start, settings.lens.focal, settings.seed
+    )
     visible = Flight(lens=settings.lens, shots=shots, reports=reports)
-    thermal = _thermal_flight(settings, settings.thermal, points, place, start) if settings.thermal else None
+    thermal = (
+        _thermal_flight(settings, settings.thermal, points, place, start)
+        if settings.thermal
+        else None
+    )
     country = Country(
         settings=settings.scene, bounds=_bounds(settings, [visible, thermal]), seed=settings.seed
     )
-    reach = 0.3 * min(settings.lens.width, settings.lens.height) * settings.route.height / settings.lens.focal
+    reach = (
+        0.3
+        * min(settings.lens.width, settings.lens.height)
+        * settings.route.height
+        / settings.lens.focal
+    )
     targets = lay_out(settings.control, country, settings.lens, shots, reach, settings.resolution)
     return World(
         settings=settings,
@@ -114,11 +125,15 @@ def _thermal_flight(
         forward = (1 - route.overlap) * route.height * thermal.lens.height / thermal.lens.focal
         route = replace(route, photos=int(np.ceil((route.site or (0, 0))[0] / forward)) + 1)
     shots = fly(plan(route, thermal.lens), route, start.takeoff, settings.seed, "THM_T")
-    reports = report_all(shots, settings.reporting, place, start, thermal.lens.focal, settings.seed + 1)
+    reports = report_all(
+        shots, settings.reporting, place, start, thermal.lens.focal, settings.seed + 1
+    )
     return Flight(lens=thermal.lens, shots=shots, reports=reports)
 
 
-def _bounds(settings: FlightSettings, flights: list[Flight | None]) -> tuple[float, float, float, float]:
+def _bounds(
+    settings: FlightSettings, flights: list[Flight | None]
+) -> tuple[float, float, float, float]:
     """What all photos can see of the lowest ground, with a margin."""
     lowest = -0.9 * settings.scene.relief - 1.0
     parts = [footprint(f.lens, shot, lowest) for f in flights if f is not None for shot in f.shots]
@@ -136,7 +151,8 @@ def simulate(
 ) -> Iterator[Progress]:
     """Fly a survey of known truth and write it; yields progress.
 
-    Raises UsageError for settings that do not fit, OutputError where the folder is not free or not writable.
+    Raises UsageError for settings that do not fit, OutputError where the folder is not free or not
+    writable.
     """
     world = prepare(settings, waypoints)
     try:
@@ -170,7 +186,9 @@ def _write(world: World, output: Path) -> Iterator[Progress]:
     taken = yield from _photograph(world, scene, output)
     points = survey(settings.control, country, world.place)
     visible = world.visible
-    found = sightings(settings.control, country, scene, visible.lens, visible.shots, visible.reports)
+    found = sightings(
+        settings.control, country, scene, visible.lens, visible.shots, visible.reports
+    )
     seen = [replace(s, photo=s.photo + ".jpg") for s in found]
     if points:
         write_gcp_list(output / "gcp_list.txt", world.place.crs, points, seen)
@@ -179,7 +197,9 @@ def _write(world: World, output: Path) -> Iterator[Progress]:
     del scene
     if world.thermal is not None and settings.thermal is not None:
         taken += yield from _film(world, world.thermal, settings.thermal, output)
-    write_truth(output / "truth" / "truth.json", settings, world.place, world.start, taken, points, seen)
+    write_truth(
+        output / "truth" / "truth.json", settings, world.place, world.start, taken, points, seen
+    )
     yield Progress(stage="truth", done=1, total=1)
 
 
@@ -215,7 +235,9 @@ def _photograph(world: World, scene: Scene, output: Path) -> Generator[Progress,
             start=world.settings.weather.moment,
         )
         write_jpeg(folder / name, pixels, report, body, pictures.quality)
-        taken.append(Taken(shot=shot, report=report, band="visible", file=f"photos/{name}", exposure=gain))
+        taken.append(
+            Taken(shot=shot, report=report, band="visible", file=f"photos/{name}", exposure=gain)
+        )
         yield Progress(stage="photos", done=number + 1, total=len(flight.shots), name=name)
     return taken
 
@@ -239,7 +261,11 @@ def _film(
             counts = np.ascontiguousarray(counts[::-1, ::-1])
         name = f"{shot.name}.tif"
         write_tiff(folder / name, counts, report, body)
-        taken.append(Taken(shot=shot, report=report, band="thermal", file=f"thermal/{name}", exposure=offset))
+        taken.append(
+            Taken(shot=shot, report=report, band="thermal", file=f"thermal/{name}", exposure=offset)
+        )
         yield Progress(stage="thermal", done=number + 1, total=len(flight.shots), name=name)
-    write_thermal(output / "truth", scene, covered(scene.grid, flight.lens, flight.shots, 0.0), world.place)
+    write_thermal(
+        output / "truth", scene, covered(scene.grid, flight.lens, flight.shots, 0.0), world.place
+    )
     return taken

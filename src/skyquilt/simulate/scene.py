@@ -98,12 +98,19 @@ class Country:
         ground = self.ground.heights(grid)
         look = np.zeros((grid.height, grid.width, 4), dtype=np.float32)
         canvas = Canvas(
-            grid=grid, look=look, height=ground.copy(), ground=ground, noise=self.noise, weather=weather
+            grid=grid,
+            look=look,
+            height=ground.copy(),
+            ground=ground,
+            noise=self.noise,
+            weather=weather,
         )
         if self.settings.kind == "chessboard":
             _paint_squares(canvas, self.settings.square)
         else:
-            canvas.height[...] += np.float32(0.035) * canvas.patchy + np.float32(0.012) * canvas.fine
+            canvas.height[...] += (
+                np.float32(0.035) * canvas.patchy + np.float32(0.012) * canvas.fine
+            )
             paint_parcels(canvas, self.layout)
             paint_borders(canvas, self.layout)
             paint_roads(canvas, self.layout)
@@ -113,7 +120,9 @@ class Country:
         return canvas
 
     def draw(self, scene: Scene, weather: Weather, *, scratch: Path) -> Iterator[tuple[int, int]]:
-        """Fill a scene, first its surfaces, then their light, block by block; yields (done, total)."""
+        """Fill a scene, first its surfaces, then their light, block by block; yields (done,
+        total).
+        """
         looks = _room(scene.grid, (4,), np.float16, scratch / "look")
         blocks = scene.grid.blocks(_BLOCK)
         for number, block in enumerate(blocks):
@@ -135,7 +144,9 @@ def empty_scene(grid: Grid, *, thermal: bool, scratch: Path) -> Scene:
     )
 
 
-def _light(scene: Scene, looks: NDArray[np.float16], block: Grid, weather: Weather, *, flat: bool) -> None:
+def _light(
+    scene: Scene, looks: NDArray[np.float16], block: Grid, weather: Weather, *, flat: bool
+) -> None:
     """Light one block, seeing its neighbours' shadows."""
     margin = int(np.ceil(shadow_reach(weather) / scene.grid.res)) + 4
     wide = scene.grid.window(
@@ -157,9 +168,9 @@ def _paint_squares(canvas: Canvas, square: float) -> None:
     """A chess-board with a little grain."""
     x, y = canvas.grid.xs, canvas.grid.ys
     odd = (np.floor(x / square)[None, :] + np.floor(y / square)[:, None]) % 2
-    canvas.look[..., :3] = (70 + 120 * odd[..., None]) * (1 + 0.03 * canvas.fine + 0.02 * canvas.grain)[
-        ..., None
-    ]
+    canvas.look[..., :3] = (70 + 120 * odd[..., None]) * (
+        1 + 0.03 * canvas.fine + 0.02 * canvas.grain
+    )[..., None]
     canvas.look[..., 3] = 20 + 6 * odd
 
 

@@ -21,7 +21,9 @@ class Route:
     photos: int = 40
     """Photos planned, before losses."""
     site: tuple[float, float] | None = None
-    """Extent along and across the lines in m that the camera centres cover; replaces `photos` for a block."""
+    """Extent along and across the lines in m that the camera centres cover; replaces `photos` for a
+    block.
+    """
     overlap: float = 0.75
     """Forward overlap, share of the footprint."""
     sidelap: float = 0.60
@@ -69,7 +71,8 @@ class Reporting:
     gps_noise: float = 2.0
     """Standard deviation of the position, each horizontal axis, m."""
     gps_noise_z: float | None = None
-    """Standard deviation of the height above sea level, m; 1.5 times the horizontal one where None."""
+    """Standard deviation of the height above sea level, m; 1.5 times the horizontal one where None.
+    """
     gps_correlation: float = 0.0
     """Time in s over which position errors stay alike; 0 is independent errors."""
     barometer_noise: float = 0.3
@@ -79,7 +82,8 @@ class Reporting:
     angle_noise: float = 0.5
     """Standard deviation of each reported angle, degrees."""
     yaw_lie: YawLie = "none"
-    """One whole line: files turned by 180 degrees in a viewer, or only the yaw tag 180 degrees off."""
+    """One whole line: files turned by 180 degrees in a viewer, or only the yaw tag 180 degrees off.
+    """
     focal_error: float = 0.01
     """Relative error of the focal length in the EXIF."""
     focal_missing: bool = False
@@ -161,7 +165,8 @@ class FlightSettings:
     thermal: Thermal | None = None
     """A thermal flight as well."""
     gsd: float | None = None
-    """Cell size of the country's raster, m; the nominal ground resolution of the photos where None."""
+    """Cell size of the country's raster, m; the nominal ground resolution of the photos where None.
+    """
 
     @property
     def resolution(self) -> float:
@@ -188,11 +193,17 @@ def _route_rules(settings: FlightSettings) -> _Rules:
         (route.photos >= 1, f"photos must be at least 1, not {route.photos}"),
         (0 <= route.overlap < 0.98, f"overlap must be 0 to 97 %, not {100 * route.overlap:.0f} %"),
         (0 <= route.sidelap < 0.98, f"sidelap must be 0 to 97 %, not {100 * route.sidelap:.0f} %"),
-        (route.height >= 25, f"height must be at least 25 m (trees, houses), not {route.height:g} m"),
+        (
+            route.height >= 25,
+            f"height must be at least 25 m (trees, houses), not {route.height:g} m",
+        ),
         (route.height > 2 * relief, low),
         (route.drones >= 1, f"drones must be at least 1, not {route.drones}"),
         (0 <= 2 * route.lost < route.photos, lost),
-        (0 <= route.tilt_noise <= 8, f"tilt noise must be 0 to 8 degrees, not {route.tilt_noise:g}"),
+        (
+            0 <= route.tilt_noise <= 8,
+            f"tilt noise must be 0 to 8 degrees, not {route.tilt_noise:g}",
+        ),
     ]
 
 
@@ -202,12 +213,18 @@ def _other_rules(settings: FlightSettings) -> _Rules:
     return [
         (relief >= 0, f"relief must not be negative, not {relief:g} m"),
         (0 <= hour < 24, f"hour must be 0 to 24, not {hour:g}"),
-        (min(settings.lens.width, settings.lens.height) >= 64, "photos must be at least 64 px wide and high"),
+        (
+            min(settings.lens.width, settings.lens.height) >= 64,
+            "photos must be at least 64 px wide and high",
+        ),
         (
             control.points >= 0 and control.checks >= 0,
             "numbers of control and check points must not be negative",
         ),
-        (reporting.gps_noise >= 0, f"GPS noise must not be negative, not {reporting.gps_noise:g} m"),
+        (
+            reporting.gps_noise >= 0,
+            f"GPS noise must not be negative, not {reporting.gps_noise:g} m",
+        ),
         (reporting.gps_missing >= 0, "the number of photos without position must not be negative"),
         (reporting.focal_error > -0.9, "the error of the focal length must be above -90 %"),
         (pictures.exposure_noise >= 0, "exposure noise must not be negative"),

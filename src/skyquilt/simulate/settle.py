@@ -19,7 +19,8 @@ from skyquilt.simulate.layout import (
 )
 
 _ESTATE_M = 400.0
-"""Large countries are cut into estates of this size first, so that every one has all kinds of land."""
+"""Large countries are cut into estates of this size first, so that every one has all kinds of land.
+"""
 
 
 def settle(bounds: tuple[float, float, float, float], seed: int) -> Layout:
@@ -33,9 +34,16 @@ def settle(bounds: tuple[float, float, float, float], seed: int) -> Layout:
     houses, trees, cars = _furnish(lots, kinds, frame, rng)
     roads = _roads(cuts, frame)
     trees += _avenue(roads, rng)
-    ponds = tuple(_shore(lot, frame, rng) for lot, kind in zip(lots, kinds, strict=True) if kind == "pond")
+    ponds = tuple(
+        _shore(lot, frame, rng) for lot, kind in zip(lots, kinds, strict=True) if kind == "pond"
+    )
     return Layout(
-        parcels=parcels, roads=roads, houses=tuple(houses), trees=tuple(trees), cars=tuple(cars), ponds=ponds
+        parcels=parcels,
+        roads=roads,
+        houses=tuple(houses),
+        trees=tuple(trees),
+        cars=tuple(cars),
+        ponds=ponds,
     )
 
 
@@ -56,7 +64,11 @@ def _shuffled(lots: list[Lot], rng: np.random.Generator) -> list[Lot]:
     """Lots in random order, but middle ones first, so that small sites see every kind."""
     middle = np.mean([lot.box for lot in lots], axis=0)
     far = [
-        float(np.hypot(*(np.mean([lot.box[:2], lot.box[2:]], axis=0) - middle[:2] / 2 - middle[2:] / 2)))
+        float(
+            np.hypot(
+                *(np.mean([lot.box[:2], lot.box[2:]], axis=0) - middle[:2] / 2 - middle[2:] / 2)
+            )
+        )
         for lot in lots
     ]
     order = np.argsort(np.array(far) + rng.uniform(0, 30, len(lots)))
@@ -80,7 +92,9 @@ def _roads(cuts: list[tuple[Doubles, float]], frame: Frame) -> tuple[Road, ...]:
     for line, side in cuts:
         if side > 95:
             paved = side > 190
-            roads.append(Road(line=frame.place(dense(line)), width=5.6 if paved else 3.0, paved=paved))
+            roads.append(
+                Road(line=frame.place(dense(line)), width=5.6 if paved else 3.0, paved=paved)
+            )
     return tuple(sorted(roads, key=lambda road: road.paved))
 
 
@@ -95,15 +109,21 @@ def _furnish(
             built, planted, parked = _yard(lot, frame, rng)
             houses, trees, cars = houses + built, trees + planted, cars + parked
         elif kind == "wood":
-            trees += _grove(lot, frame, rng, spacing=4.2, jitter=1.6, radius=(1.8, 3.6), height=(7, 13))
+            trees += _grove(
+                lot, frame, rng, spacing=4.2, jitter=1.6, radius=(1.8, 3.6), height=(7, 13)
+            )
         elif kind == "orchard":
-            trees += _grove(lot, frame, rng, spacing=6.0, jitter=0.25, radius=(1.5, 2.1), height=(3, 4.5))
+            trees += _grove(
+                lot, frame, rng, spacing=6.0, jitter=0.25, radius=(1.5, 2.1), height=(3, 4.5)
+            )
         elif kind in ("meadow", "pond"):
             trees += _scatter(lot, frame, rng, count=5)
     return houses, trees, cars
 
 
-def _yard(lot: Lot, frame: Frame, rng: np.random.Generator) -> tuple[list[House], list[Tree], list[Car]]:
+def _yard(
+    lot: Lot, frame: Frame, rng: np.random.Generator
+) -> tuple[list[House], list[Tree], list[Car]]:
     """Houses in a loose row, each with a car and garden trees."""
     a0, b0, a1, b1 = lot.box
     houses, trees, cars = [], [], []
@@ -115,7 +135,9 @@ def _yard(lot: Lot, frame: Frame, rng: np.random.Generator) -> tuple[list[House]
             side = np.radians(angle + 90)
             away = houses[-1].depth / 2 + 2.6
             cx, cy = x + away * np.cos(side), y + away * np.sin(side)
-            cars.append(Car(x=cx, y=cy, angle_deg=angle + rng.normal(0, 4), paint=int(rng.integers(5))))
+            cars.append(
+                Car(x=cx, y=cy, angle_deg=angle + rng.normal(0, 4), paint=int(rng.integers(5)))
+            )
             for _ in range(rng.integers(1, 4)):
                 tx, ty = _spot(frame, a + 10.5 * rng.choice([-1, 1]), b + rng.uniform(-9, 9))
                 trees.append(_tree(tx, ty, rng, radius=(0.9, 2.4), height=(2, 6)))
@@ -184,7 +206,12 @@ def _avenue(roads: tuple[Road, ...], rng: np.random.Generator) -> list[Tree]:
 
 
 def _tree(
-    x: float, y: float, rng: np.random.Generator, *, radius: tuple[float, float], height: tuple[float, float]
+    x: float,
+    y: float,
+    rng: np.random.Generator,
+    *,
+    radius: tuple[float, float],
+    height: tuple[float, float],
 ) -> Tree:
     size = rng.random()
     return Tree(

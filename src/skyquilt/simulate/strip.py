@@ -1,4 +1,6 @@
-"""A strip over chess-boards as a camera sights it: corners, things on the boards, views to calibrate with."""
+"""A strip over chess-boards as a camera sights it: corners, things on the boards, views to
+calibrate with.
+"""
 
 from dataclasses import dataclass, field
 
@@ -15,9 +17,17 @@ from skyquilt.simulate.settings import Route
 def _wide() -> Lens:
     """28 mm on a full-size sensor, photos reduced to 1500 px."""
     return Lens(
-        width=1500, height=1000, focal=1170.0, offset_x=9.0, offset_y=-6.0,
-        k1=-0.16, k2=0.10, k3=-0.05, p1=0.0012, p2=-0.0009,
-    )  # fmt: skip
+        width=1500,
+        height=1000,
+        focal=1170.0,
+        offset_x=9.0,
+        offset_y=-6.0,
+        k1=-0.16,
+        k2=0.10,
+        k3=-0.05,
+        p1=0.0012,
+        p2=-0.0009,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,7 +43,9 @@ class StripSettings:
     relief: float = 1.2
     """Height of the highest thing on the boards, m."""
     things: float = 0.25
-    """Share of the sighted points that lie on things, at heights of 0 to `relief`, smaller ones more often."""
+    """Share of the sighted points that lie on things, at heights of 0 to `relief`, smaller ones
+    more often.
+    """
     square: float = 1.0
     """Side of a board's square, m."""
     noise: float = 0.3
@@ -51,7 +63,10 @@ class StripSettings:
         """Itself; raises UsageError where values do not fit together."""
         rules = [
             (2 <= self.photos <= 500, f"photos must be 2 to 500, not {self.photos}"),
-            (0.3 <= self.overlap <= 0.95, f"overlap must be 30 to 95 %, not {100 * self.overlap:.0f} %"),
+            (
+                0.3 <= self.overlap <= 0.95,
+                f"overlap must be 30 to 95 %, not {100 * self.overlap:.0f} %",
+            ),
             (self.height >= 1, f"height must be at least 1 m, not {self.height:g} m"),
             (
                 0 <= 3 * self.relief <= self.height,
@@ -75,7 +90,9 @@ class Strip:
     px: tuple[Doubles, ...]
     """Per photo (N, 2), sightings with noise."""
     targets: tuple[Doubles, ...]
-    """Per photo (4, 2) px without noise: corners, in order around it, of the board square of four by four below it."""
+    """Per photo (4, 2) px without noise: corners, in order around it, of the board square of four
+    by four below it.
+    """
     views: tuple[Doubles, ...]
     """Of the calibration: (88, 2) px per view, with noise."""
     board: Doubles
@@ -89,9 +106,15 @@ def fly_strip(settings: StripSettings) -> Strip:
     settings = settings.checked()
     rng, lens = np.random.default_rng([settings.seed, 77]), settings.lens
     route = Route(
-        pattern="strip", photos=settings.photos, overlap=settings.overlap, height=settings.height, heading=90.0,
-        jitter=0.01 * settings.height, yaw_noise=2.0, tilt_noise=settings.tilt,
-    )  # fmt: skip
+        pattern="strip",
+        photos=settings.photos,
+        overlap=settings.overlap,
+        height=settings.height,
+        heading=90.0,
+        jitter=0.01 * settings.height,
+        yaw_noise=2.0,
+        tilt_noise=settings.tilt,
+    )
     shots = fly(plan(route, lens), route, 0.0, settings.seed, "STRIP")
     points = _points(settings, np.array([s.centre[:2] for s in shots]), rng)
     ids, px, targets = [], [], []
@@ -102,16 +125,28 @@ def fly_strip(settings: StripSettings) -> Strip:
         px.append(seen[inside] + rng.normal(0, settings.noise, (int(inside.sum()), 2)))
         middle = np.rint(shot.place[:2] / settings.square)
         square = (middle + np.array([[-2, 2], [2, 2], [2, -2], [-2, -2]])) * settings.square
-        targets.append(lens.project(np.column_stack([square, np.zeros(4)]), shot.rotation, shot.place))
+        targets.append(
+            lens.project(np.column_stack([square, np.zeros(4)]), shot.rotation, shot.place)
+        )
     board, views = _board_views(settings, rng)
     return Strip(
-        ids=tuple(ids), px=tuple(px), targets=tuple(targets), views=views, board=board, raised=points[:, 2]
+        ids=tuple(ids),
+        px=tuple(px),
+        targets=tuple(targets),
+        views=views,
+        board=board,
+        raised=points[:, 2],
     )
 
 
 def _points(settings: StripSettings, centres: Doubles, rng: np.random.Generator) -> Doubles:
     """(n, 3) corners of all squares, and points on things among them."""
-    reach = settings.height * np.hypot(settings.lens.width, settings.lens.height) / settings.lens.focal / 1.8
+    reach = (
+        settings.height
+        * np.hypot(settings.lens.width, settings.lens.height)
+        / settings.lens.focal
+        / 1.8
+    )
     (left, low), (right, high) = centres.min(0) - reach, centres.max(0) + reach
     s = settings.square
     x, y = np.arange(np.floor(left / s), right / s), np.arange(np.floor(low / s), high / s)
@@ -119,10 +154,14 @@ def _points(settings: StripSettings, centres: Doubles, rng: np.random.Generator)
     count = round(settings.things / (1 - settings.things) * len(corners))
     places = rng.uniform((left, low), (right, high), (count, 2))
     heights = settings.relief * rng.uniform(0, 1, count) ** 2
-    return np.vstack([np.column_stack([corners, np.zeros(len(corners))]), np.column_stack([places, heights])])
+    return np.vstack(
+        [np.column_stack([corners, np.zeros(len(corners))]), np.column_stack([places, heights])]
+    )
 
 
-def _board_views(settings: StripSettings, rng: np.random.Generator) -> tuple[Doubles, tuple[Doubles, ...]]:
+def _board_views(
+    settings: StripSettings, rng: np.random.Generator
+) -> tuple[Doubles, tuple[Doubles, ...]]:
     """A board of 11 x 8 corners seen from all sides and in every part of the image."""
     x, y = np.meshgrid(np.arange(11.0), np.arange(8.0))
     board = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * 0.05
@@ -131,11 +170,14 @@ def _board_views(settings: StripSettings, rng: np.random.Generator) -> tuple[Dou
         angles = rng.uniform(-180, 180), *rng.uniform(-35, 35, 2)
         R = camera_rotation(*(float(v) for v in angles))
         far = rng.uniform(0.35, 0.7)
-        middle = rng.uniform(-0.5, 0.5, 2) * far * np.array([settings.lens.width, settings.lens.height])
+        middle = (
+            rng.uniform(-0.5, 0.5, 2) * far * np.array([settings.lens.width, settings.lens.height])
+        )
         target = np.array([*middle / settings.lens.focal, far])
         px = settings.lens.project(board, R, board.mean(0) - R.T @ target)
         inside = (
-            np.isfinite(px).all() and ((px > 0) & (px < (settings.lens.width, settings.lens.height))).all()
+            np.isfinite(px).all()
+            and ((px > 0) & (px < (settings.lens.width, settings.lens.height))).all()
         )
         if inside:
             views.append(px + rng.normal(0, 0.15, px.shape))

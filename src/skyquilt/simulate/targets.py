@@ -44,4 +44,4 @@ def paint_targets(canvas: Canvas, targets: Sequence[Target]) -> None:
 
 
 def _step(cells: Floats) -> Floats:
-    return np.clip(cells + 0.5, 0, 1)
+    return np.asarray(np.clip(cells + 0.5, 0, 1))

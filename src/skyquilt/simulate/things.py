@@ -58,7 +58,10 @@ def _house(canvas: Canvas, house: House, ground: Ground) -> None:
     roof = outside < 0
     tiles = 0.045 * np.sign(np.cos(b * (2 * np.pi / 0.36))) + 0.02 * np.cos(a * (2 * np.pi / 0.24))
     texture = (
-        (tiles if house.rise else 0.0) + 0.035 * canvas.fine + 0.03 * canvas.grain + 0.05 * canvas.patchy
+        (tiles if house.rise else 0.0)
+        + 0.035 * canvas.fine
+        + 0.03 * canvas.grain
+        + 0.05 * canvas.patchy
     )
     canvas.lay(m.ROOFS[house.roof], roof, texture)
     canvas.lay(m.GUTTER, roof & (outside > -0.12))
@@ -76,7 +79,9 @@ def _details(canvas: Canvas, house: House, a: Floats, b: Floats, top: Floats) ->
     canvas.lay(m.ROOFS[1], chimney, 0.08 * canvas.grain)
     _raise(canvas, chimney, top + 1.0)
     if int(house.length * 100) % 3 == 0:
-        panel = (np.abs(a + 0.2 * half_a) < 0.6 * half_a) & (np.abs(b + 0.5 * half_b) < 0.33 * half_b)
+        panel = (np.abs(a + 0.2 * half_a) < 0.6 * half_a) & (
+            np.abs(b + 0.5 * half_b) < 0.33 * half_b
+        )
         seam = (np.mod(a, 1.0) < 0.06) | (np.mod(b, 1.65) < 0.06)
         canvas.lay(m.ROOFS[3], panel, np.where(seam, 0.7, -0.45).astype(np.float32))
     else:
@@ -98,7 +103,11 @@ def _tree(canvas: Canvas, tree: Tree, ground: Ground) -> None:
     level = ground.at(tree.x, tree.y)
     height = level + tree.height * (base + (1 - base) * form) + clumps
     bare = canvas.weather.season == "winter" and not tree.conifer
-    crown = (d < 1) & (height > canvas.height) & ((canvas.fine + canvas.grain > 0.5) if bare else True)
+    crown = (
+        (d < 1) & (height > canvas.height) & ((canvas.fine + canvas.grain > 0.5) if bare else True)
+    )
     texture = tree.tint * (0.62 + 0.42 * form) * (1 + 0.20 * canvas.fine + 0.10 * canvas.grain) - 1
-    canvas.lay(m.CONIFER if tree.conifer else (m.TREE if tree.height > 3 else m.BUSH), crown, texture)
+    canvas.lay(
+        m.CONIFER if tree.conifer else (m.TREE if tree.height > 3 else m.BUSH), crown, texture
+    )
     _raise(canvas, crown, height)

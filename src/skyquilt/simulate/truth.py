@@ -65,7 +65,8 @@ def write_truth(
         },
         "meridian_convergence_deg": place.convergence,
         "gsd_m": settings.resolution,
-        "conventions": "pixel centres at integers; OpenCV distortion; x_cam = cam_R_map (x_map - position)",
+        "conventions": "pixel centres at integers; OpenCV distortion; x_cam = cam_R_map (x_map -"
+        " position)",
         "start": settings.weather.moment.isoformat(),
         "seed": settings.seed,
         "settings": asdict(settings),

@@ -1,15 +1,16 @@
 """Whether a registration is to be believed: do patches that know nothing of it find the same place?
 
-The overlap is cut into patches. Each is correlated alone with the other picture over small shifts; the rank
-of the registered place among all of them is a p-value that needs no model of noise: for pictures that have
-nothing in common, the place is as good as any other, and ranks are uniform. Fisher's method makes one
-number of all ranks. It is not a probability any more once the place was chosen as the best of
-thousands; what chance reaches then is measured on pictures that show different things (docs/methods.md).
+The overlap is cut into patches. Each is correlated alone with the other picture over small shifts;
+the rank of the registered place among all of them is a p-value that needs no model of noise: for
+pictures that have nothing in common, the place is as good as any other, and ranks are uniform.
+Fisher's method makes one number of all ranks. It is not a probability any more once the place was
+chosen as the best of thousands; what chance reaches then is measured on pictures that show
+different things (docs/methods.md).
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -66,13 +67,15 @@ class Agree:
         )
 
     def _patches(
-        self, fields: Fields, target: Fields, both: NDArray, across: int
+        self, fields: Fields, target: Fields, both: NDArray[Any], across: int
     ) -> Iterator[tuple[float, float, float, float, float]]:
         """Rank, middle and shift of each patch."""
         height, width = both.shape
         side = int(np.sqrt(height * width) / across)
         reach = self.reach
-        padded = cv2.copyMakeBorder(fields, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=(0,) * 4)
+        padded = cv2.copyMakeBorder(
+            fields, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=(0,) * 4
+        )
         for top in range(0, height - side + 1, side):
             for left in range(0, width - side + 1, side):
                 part = (slice(top, top + side), slice(left, left + side))
@@ -82,11 +85,14 @@ class Agree:
                 score = _scores(around, target[part] * both[part][..., None])
                 x, y = _summit(score)
                 yield (
-                    self._rank(score), left + (side - 1) / 2, top + (side - 1) / 2,
-                    reach - x, reach - y,
-                )  # fmt: skip
+                    self._rank(score),
+                    left + (side - 1) / 2,
+                    top + (side - 1) / 2,
+                    reach - x,
+                    reach - y,
+                )
 
-    def _rank(self, score: NDArray) -> float:
+    def _rank(self, score: NDArray[Any]) -> float:
         """Share of places at least as good as the registered one, each with its neighbourhood."""
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * self.near + 1, 2 * self.near + 1))
         best = np.asarray(cv2.dilate(score, disc))
@@ -99,16 +105,22 @@ def _scores(around: Fields, patch: Fields) -> NDArray[np.float32]:
     """Normalised correlation of a patch (s, s, 4) at every place of its surroundings."""
     side = patch.shape[0]
     energy = cv2.boxFilter(
-        np.einsum("ijk,ijk->ij", around, around), -1, (side, side), anchor=(0, 0), normalize=False,
+        np.einsum("ijk,ijk->ij", around, around),
+        -1,
+        (side, side),
+        anchor=(0, 0),
+        normalize=False,
         borderType=cv2.BORDER_CONSTANT,
-    )  # fmt: skip
+    )
     rows, columns = (size - side + 1 for size in around.shape[:2])
     product = np.zeros((rows, columns), np.float32)
     for k in range(around.shape[2]):
         one = np.ascontiguousarray(around[..., k])
         product += cv2.matchTemplate(one, np.ascontiguousarray(patch[..., k]), cv2.TM_CCORR)
     own = float((patch * patch).sum())
-    return np.asarray(product / np.sqrt(np.asarray(energy)[:rows, :columns] * own + 1e-6), np.float32)
+    return np.asarray(
+        product / np.sqrt(np.asarray(energy)[:rows, :columns] * own + 1e-6), np.float32
+    )
 
 
 def _summit(score: NDArray[np.float32]) -> tuple[float, float]:
@@ -131,9 +143,14 @@ def _between(three: NDArray[np.float32]) -> float:
 def _fisher(ranks: NDArray[np.float64]) -> float:
     """-log10 of the p-value of independent uniform ranks being this small together; 0 without any.
 
-    -2 sum of logs is chi-squared with 2 n degrees of freedom, whose tail is a sum of n terms of Poisson's.
+    -2 sum of logs is chi-squared with 2 n degrees of freedom, whose tail is a sum of n terms of
+    Poisson's.
     """
     if not len(ranks):
         return 0.0
     half, k = -float(np.log(ranks).sum()), np.arange(len(ranks))
-    return float((half - logsumexp(k * np.log(half) - gammaln(k + 1))) / np.log(10)) if half > 0 else 0.0
+    return (
+        float((half - logsumexp(k * np.log(half) - gammaln(k + 1))) / np.log(10))
+        if half > 0
+        else 0.0
+    )

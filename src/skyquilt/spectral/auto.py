@@ -22,8 +22,9 @@ _SEARCH, _NEARBY, _SELECT, _DECIDE = range(4)
 
 @dataclass(frozen=True, kw_only=True)
 class Auto:
-    """The default. Structure matches are quick and bear distortion; where patches do not confirm them beyond doubt,
-    every rotation and a range of scales are searched, and the neighbourhood of a guess.
+    """The default. Structure matches are quick and bear distortion; where patches do not confirm
+    them beyond doubt, every rotation and a range of scales are searched, and the neighbourhood of a
+    guess.
     """
 
     propose: StructureMatches
@@ -35,7 +36,9 @@ class Auto:
     decide: Decide = field(default_factory=Decide)
     """The verdict."""
     sides: tuple[float, float, float, float] = (80.0, 128.0, 160.0, 256.0)
-    """Px of the squares whose areas the pictures are shrunken to: search, search nearby, selection, verdict."""
+    """Px of the squares whose areas the pictures are shrunken to: search, search nearby, selection,
+    verdict.
+    """
     sure: float = 6.0
     """Agreement beyond which nothing else is tried."""
     version: ClassVar[int] = 1
@@ -45,7 +48,8 @@ class Auto:
     ) -> Registration | RefusedRegistration:
         """The registration of b to a, or why there is none.
 
-        A guess is tried first; where it is not confirmed the search goes on everywhere: metadata may lie.
+        A guess is tried first; where it is not confirmed the search goes on everywhere: metadata
+        may lie.
         """
         if guess is not None and (found := self._guided(a, b, guess)):
             return found
@@ -96,6 +100,8 @@ class Auto:
         return [f for f in fits if any(f.b_H_a is c.b_H_a for c in kept)]
 
 
-def _sharpened(a: Orientation, b: Orientation, places: Sequence[Matrix], steps: int) -> list[Candidate]:
+def _sharpened(
+    a: Orientation, b: Orientation, places: Sequence[Matrix], steps: int
+) -> list[Candidate]:
     fits = [Sharpen(steps=steps)(a, b, place) for place in places]
     return [Candidate(b_H_a=fit.b_H_a, score=fit.score) for fit in fits]

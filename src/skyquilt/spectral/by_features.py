@@ -1,12 +1,13 @@
-"""The thesis's registration: features, matches, outliers removed, nine inliers believed [Y 5.2.1, 6.4.1].
+"""The thesis's registration: features, matches, outliers removed, nine inliers believed [Y 5.2.1,
+6.4.1].
 
-Nine inliers are no proof: random matches at a loose ratio reach them easily. These methods are here to be
-compared with; `Auto` is the one to work with.
+Nine inliers are no proof: random matches at a loose ratio reach them easily. These methods are here
+to be compared with; `Auto` is the one to work with.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 from numpy.typing import NDArray
 
@@ -17,9 +18,9 @@ from skyquilt.spectral.edges import THRESHOLDS, binary_edges, gradient_magnitude
 from skyquilt.spectral.usable import both_usable
 
 Outcome = Registration | RefusedRegistration
-Detector = Callable[[NDArray], Features]
+Detector = Callable[[NDArray[Any]], Features]
 Matcher = Callable[[Features, Features], Matches]
-Estimator = Callable[[NDArray, NDArray], Estimate | NoEstimate]
+Estimator = Callable[[NDArray[Any], NDArray[Any]], Estimate | NoEstimate]
 DELTA = 0.1
 """Radius about an inlier that it covers, as a share of a's width [Y 6.4.1]."""
 
@@ -27,7 +28,7 @@ DELTA = 0.1
 class Quality(Protocol):
     """Q of (6.3)."""
 
-    def __call__(self, inliers: NDArray, width: int, height: int, *, delta: float) -> float:
+    def __call__(self, inliers: NDArray[Any], width: int, height: int, *, delta: float) -> float:
         """Spread of inliers (n, 2) over a picture, in [0, 1]."""
         ...
 
@@ -51,7 +52,11 @@ class Outliers:
         return best(outcomes)
 
     def _outcome(
-        self, estimate: Estimate | NoEstimate, pa: NDArray, pb: NDArray, shape: tuple[int, int]
+        self,
+        estimate: Estimate | NoEstimate,
+        pa: NDArray[Any],
+        pb: NDArray[Any],
+        shape: tuple[int, int],
     ) -> Outcome:
         evidence = {"matches": float(len(pa))}
         if isinstance(estimate, NoEstimate):
@@ -59,9 +64,13 @@ class Outliers:
         inliers = pa[estimate.inliers]
         q = self.quality(inliers, shape[1], shape[0], delta=DELTA * shape[1])
         return Registration(
-            model="similarity", b_H_a=estimate.b_H_a, px_a=inliers, px_b=pb[estimate.inliers], q=q,
+            model="similarity",
+            b_H_a=estimate.b_H_a,
+            px_a=inliers,
+            px_b=pb[estimate.inliers],
+            q=q,
             evidence=evidence,
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,8 +92,8 @@ class ByFeatures:
 
 @dataclass(frozen=True, kw_only=True)
 class Rfae:
-    """Robust features along the edge [Y 5.2.2]: features of binary edge images, each picture's threshold
-    chosen by the highest Q of all pairs of thresholds.
+    """Robust features along the edge [Y 5.2.2]: features of binary edge images, each picture's
+    threshold chosen by the highest Q of all pairs of thresholds.
     """
 
     detect: Detector

@@ -46,7 +46,9 @@ def distinct(
 def corners(b_H_a: Matrix, shape: tuple[int, int]) -> np.ndarray:
     """Where a transform carries the corners of a picture of `shape`: (4, 2) in px of b."""
     height, width = shape
-    ends = np.array([[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1.0]])
+    ends = np.array(
+        [[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1.0]]
+    )
     moved = ends @ b_H_a.T
     return np.asarray(moved[:, :2] / moved[:, 2:])
 

@@ -1,10 +1,14 @@
-"""Edges of colour instead of brightness: what remains of a picture when the light on it is taken away.
+"""Edges of colour instead of brightness: what remains of a picture when the light on it is taken
+away.
 
-Sun, shade and slope scale all bands of a surface's colour nearly alike, so ratios of bands tell one material from
-another and know little of shadows and shading (Gevers and Smeulders 1999; the same idea as Finlayson's invariants).
-Thermal pictures have shadows and sunny slopes of their own hour. Where the other picture has some too, both are alike a
-little aside of the true place, along both suns' directions; edges of materials are alike in the true place alone.
+Sun, shade and slope scale all bands of a surface's colour nearly alike, so ratios of bands tell one
+material from another and know little of shadows and shading (Gevers and Smeulders 1999; the same
+idea as Finlayson's invariants). Thermal pictures have shadows and sunny slopes of their own hour.
+Where the other picture has some too, both are alike a little aside of the true place, along both
+suns' directions; edges of materials are alike in the true place alone.
 """
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +20,10 @@ DARK = 1 / 64
 """Share of the largest value that is added to all: the ratios of black are noise."""
 
 
-def chromaticity(rgb: NDArray) -> NDArray[np.float32]:
-    """Logarithms (h, w, 3) of an RGB picture's values, less their mean over the bands: the same for any brightness."""
+def chromaticity(rgb: NDArray[Any]) -> NDArray[np.float32]:
+    """Logarithms (h, w, 3) of an RGB picture's values, less their mean over the bands: the same for
+    any brightness.
+    """
     largest = float(np.iinfo(rgb.dtype).max) if rgb.dtype.kind == "u" else float(np.nanmax(rgb))
     logarithm = np.log(
         np.maximum(rgb.astype(np.float32), 0) / np.float32(max(largest, 1e-9)) + np.float32(DARK)
@@ -26,7 +32,9 @@ def chromaticity(rgb: NDArray) -> NDArray[np.float32]:
 
 
 def chromatic(picture: Picture, valid: NDArray[np.bool_], side: float) -> Orientation | None:
-    """Fields of a picture's colours, shrunken as `orientation` does; None where it has no colours."""
+    """Fields of a picture's colours, shrunken as `orientation` does; None where it has no
+    colours.
+    """
     values = picture.values
     if values.ndim != 3 or values.shape[2] != 3:
         return None

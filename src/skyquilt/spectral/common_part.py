@@ -1,10 +1,12 @@
 """The parts of two pictures that a guess says they share.
 
-A thermal camera that sees the middle of a visible photo, or two maps of different extent, would otherwise be compared
-at different ground resolutions, as resolutions are chosen by the pictures' areas.
+A thermal camera that sees the middle of a visible photo, or two maps of different extent, would
+otherwise be compared at different ground resolutions, as resolutions are chosen by the pictures'
+areas.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,15 +34,19 @@ class CommonPart:
     shift_b: NDArray[np.float64]
     """(2,) the same in b."""
 
-    def whole(self, outcome: Registration | RefusedRegistration) -> Registration | RefusedRegistration:
+    def whole(
+        self, outcome: Registration | RefusedRegistration
+    ) -> Registration | RefusedRegistration:
         """A registration of the parts as one of the pictures."""
         if isinstance(outcome, RefusedRegistration):
             return outcome
         matrix = _moved(self.shift_b) @ outcome.b_H_a @ _moved(-self.shift_a)
         return replace(
-            outcome, b_H_a=matrix / matrix[2, 2], px_a=outcome.px_a + self.shift_a,
+            outcome,
+            b_H_a=matrix / matrix[2, 2],
+            px_a=outcome.px_a + self.shift_a,
             px_b=outcome.px_b + self.shift_b,
-        )  # fmt: skip
+        )
 
 
 def common_part(a: Picture, b: Picture, guess: Guess) -> CommonPart:
@@ -53,15 +59,20 @@ def common_part(a: Picture, b: Picture, guess: Guess) -> CommonPart:
     matrix = _moved(-shift_b) @ guess.b_H_a @ _moved(shift_a)
     part_b = _part(b, in_b)
     return CommonPart(
-        a=_part(a, in_a), b=part_b, shift_a=shift_a, shift_b=shift_b,
+        a=_part(a, in_a),
+        b=part_b,
+        shift_a=shift_a,
+        shift_b=shift_b,
         guess=replace(guess, b_H_a=matrix / matrix[2, 2], reach=margin / max(part_b.shape)),
-    )  # fmt: skip
+    )
 
 
 def _window(
-    to_H_from: NDArray, source: tuple[int, int], margin: float, target: tuple[int, int]
+    to_H_from: NDArray[Any], source: tuple[int, int], margin: float, target: tuple[int, int]
 ) -> tuple[slice, slice]:
-    """Rows and columns of `target` that the picture `source` covers, widened by a margin; all where that is most."""
+    """Rows and columns of `target` that the picture `source` covers, widened by a margin; all where
+    that is most.
+    """
     height, width = source
     ends = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1.0]]) @ to_H_from.T
     everything = (slice(0, target[0]), slice(0, target[1]))

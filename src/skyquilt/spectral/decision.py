@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,9 @@ Outcome = Registration | RefusedRegistration
 
 @dataclass(frozen=True, kw_only=True)
 class Decide:
-    """Believes the place that independent patches confirm, and frees the model as far as pictures support it."""
+    """Believes the place that independent patches confirm, and frees the model as far as pictures
+    support it.
+    """
 
     agree: Agree = field(default_factory=Agree)
     """The test."""
@@ -34,13 +36,16 @@ class Decide:
         """The verdict on places in px of the finest level."""
         judged = [(self.agree(*pyramid.at(pyramid.last), fit.b_H_a), fit) for fit in fits]
         if not judged:
-            return RefusedRegistration(reason="no place was found where enough of both pictures overlaps")
+            return RefusedRegistration(
+                reason="no place was found where enough of both pictures overlaps"
+            )
         agreement, fit = max(judged, key=lambda j: j[0].surprise)
         if agreement.surprise < self.least_surprise:
             return RefusedRegistration(
-                reason=_doubt(agreement, self.least_surprise), inliers=len(agreement.px),
+                reason=_doubt(agreement, self.least_surprise),
+                inliers=len(agreement.px),
                 evidence=_evidence(agreement, fit),
-            )  # fmt: skip
+            )
         return self._finished(pyramid, fit, agreement)
 
     def _finished(self, pyramid: Pyramid, fit: Fit, agreement: Agreement) -> Registration:
@@ -55,13 +60,17 @@ class Decide:
         full = self._finest(pyramid, pyramid.full(fit.b_H_a, pyramid.last), model)
         to_full = np.linalg.inv(b.small_S_full)
         return Registration(
-            model=model, b_H_a=full, evidence=_evidence(agreement, fit),
+            model=model,
+            b_H_a=full,
+            evidence=_evidence(agreement, fit),
             px_a=_apply(np.linalg.inv(full) @ to_full, agreement.px),
             px_b=_apply(to_full, agreement.px + agreement.shift),
-        )  # fmt: skip
+        )
 
     def _finest(self, pyramid: Pyramid, full: Matrix, model: Freedom) -> Matrix:
-        """The transform sharpened once more where pictures are so large that a pixel of the verdict is many."""
+        """The transform sharpened once more where pictures are so large that a pixel of the verdict
+        is many.
+        """
         larger = pyramid.finest(self.finest)
         if larger is None:
             return full
@@ -69,7 +78,7 @@ class Decide:
         return full_size(*larger, fit.b_H_a)
 
 
-def _apply(matrix: NDArray, px: NDArray) -> NDArray:
+def _apply(matrix: NDArray[Any], px: NDArray[Any]) -> NDArray[Any]:
     moved = np.c_[px, np.ones(len(px))] @ matrix.T
     return np.asarray(moved[:, :2] / moved[:, 2:])
 
@@ -85,6 +94,7 @@ def _evidence(agreement: Agreement, fit: Fit) -> dict[str, float]:
 
 def _doubt(agreement: Agreement, least: float) -> str:
     return (
-        f"the best place found is not confirmed: {len(agreement.px)} of {agreement.patches} patches find it by"
+        f"the best place found is not confirmed: {len(agreement.px)} of {agreement.patches} patches"
+        " find it by"
         f" themselves, which is worth 10^-{agreement.surprise:.1f} where 10^-{least:g} is asked for"
     )

@@ -17,7 +17,8 @@ _LEAST = 0.3
 def distinctness(a: Orientation, b: Orientation, b_H_a: Matrix) -> float:
     """The peak at a registration over the RMS of all far shifts.
 
-    Unlike the correlation it can be compared between pictures: smooth ones correlate by chance, too.
+    Unlike the correlation it can be compared between pictures: smooth ones correlate by chance,
+    too.
     """
     fields, valid = warped(a, b_H_a, b.shape)
     shape = (scipy.fft.next_fast_len(2 * b.shape[0]), scipy.fft.next_fast_len(2 * b.shape[1]))

@@ -1,5 +1,7 @@
 """Binary edge images [Y 5.2.2, (5.5), (5.6)]."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +12,10 @@ THRESHOLDS = (0.2, 0.4, 0.6)
 """Shares of the largest gradient above which a pixel is an edge [Y 5.2.2]."""
 
 
-def gradient_magnitude(values: NDArray) -> NDArray[np.float32]:
-    """(H, W) in [0, 1]: length of Sobel's gradient (5.5) over its largest value; 0 where nothing changes."""
+def gradient_magnitude(values: NDArray[Any]) -> NDArray[np.float32]:
+    """(H, W) in [0, 1]: length of Sobel's gradient (5.5) over its largest value; 0 where nothing
+    changes.
+    """
     grey = to_grey8(values).astype(np.float32)
     x = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.25)
     y = cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.25)

@@ -20,9 +20,9 @@ _COARSE = 4
 class Everywhere:
     """Correlation of orientation fields by FFT over a grid of rotations and scales.
 
-    The score is the correlation's sum over the root of the overlap: what chance reaches is then the same for
-    large overlaps and small ones. Scales are relative to equal areas, so pictures of one field of view
-    have 1, whatever their sizes.
+    The score is the correlation's sum over the root of the overlap: what chance reaches is then the
+    same for large overlaps and small ones. Scales are relative to equal areas, so pictures of one
+    field of view have 1, whatever their sizes.
     """
 
     step_deg: float = 4.0
@@ -82,17 +82,19 @@ class _Plane:
         coarse = side // _COARSE
         valid = np.conj(scipy.fft.fft2(b.valid[::_COARSE, ::_COARSE], s=(coarse, coarse)))
         return cls(
-            side=side, b=(fields, _reversed(fields)), b_valid=(valid, _reversed(valid)),
+            side=side,
+            b=(fields, _reversed(fields)),
+            b_valid=(valid, _reversed(valid)),
             b_middle=middle(b.shape),
-        )  # fmt: skip
+        )
 
     def correlations(
         self, a: Orientation, scale: float, angle: float
     ) -> Iterator[tuple[float, NDArray[np.float32], NDArray[np.float32]]]:
         """Angle, correlation and overlap (side, side) for `angle` and for `angle` + 180 degrees.
 
-        Turning by 180 degrees leaves orientations as they are and mirrors positions, so both share their
-        transforms: the second one is the first against a b that is turned instead.
+        Turning by 180 degrees leaves orientations as they are and mirrors positions, so both share
+        their transforms: the second one is the first against a b that is turned instead.
         """
         half = np.array([self.side / 2, self.side / 2])
         turn = similarity(scale, angle, middle(a.shape), half)[:2]

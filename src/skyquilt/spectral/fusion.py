@@ -3,6 +3,8 @@
 All take a and b on the same grid, grey (H, W) uint8, and `seen` (H, W), where b has a picture.
 """
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -15,19 +17,29 @@ _GAP = 8
 _LINE = (64, 200, 255)
 
 
-def shown(values: NDArray, valid: Mask) -> Grey:
-    """Grey levels of any picture: stretched between its 1st and 99th percentile; 0 where invalid."""
-    band = values if values.ndim == 2 else cv2.cvtColor(values.astype(np.float32), cv2.COLOR_RGB2GRAY)
+def shown(values: NDArray[Any], valid: Mask) -> Grey:
+    """Grey levels of any picture: stretched between its 1st and 99th percentile; 0 where
+    invalid.
+    """
+    band = (
+        values if values.ndim == 2 else cv2.cvtColor(values.astype(np.float32), cv2.COLOR_RGB2GRAY)
+    )
     band = np.where(valid, band, np.nan).astype(np.float32)
     inside = band[np.isfinite(band)]
     if not inside.size:
         return np.zeros(band.shape, np.uint8)
     low, high = np.percentile(inside, [1, 99])
-    return np.clip(np.nan_to_num((band - low) / max(float(high - low), 1e-6) * 255), 0, 255).astype(np.uint8)
+    return np.asarray(
+        np.clip(np.nan_to_num((band - low) / max(float(high - low), 1e-6) * 255), 0, 255).astype(
+            np.uint8
+        )
+    )
 
 
 def false_colour(a: Grey, b: Grey, seen: Mask) -> Rgb:
-    """a in green, b in red and blue: grey where both are alike, coloured fringes where edges part."""
+    """a in green, b in red and blue: grey where both are alike, coloured fringes where edges
+    part.
+    """
     other = np.where(seen, b, 0).astype(np.uint8)
     return np.dstack([other, a, other])
 
@@ -37,20 +49,24 @@ def alpha(a: Grey, b: Grey, seen: Mask, weight: float = 0.5) -> Rgb:
     colours = cv2.cvtColor(cv2.applyColorMap(b, _COLOURS), cv2.COLOR_BGR2RGB).astype(np.float32)
     base = np.repeat(a[..., None], 3, 2).astype(np.float32)
     share = np.where(seen, weight, 0)[..., None]
-    return np.rint(base * (1 - share) + colours * share).astype(np.uint8)
+    return np.asarray(np.rint(base * (1 - share) + colours * share).astype(np.uint8))
 
 
 def checkerboard(a: Grey, b: Grey, seen: Mask, squares: int = 8) -> Rgb:
-    """a and b by turns in squares, so many along the longer side; what runs on across them is registered."""
+    """a and b by turns in squares, so many along the longer side; what runs on across them is
+    registered.
+    """
     side = max(1, -(-max(a.shape) // squares))
     rows, columns = np.indices(a.shape)
     turn = ((rows // side + columns // side) % 2 == 1) & seen
     return np.repeat(np.where(turn, b, a)[..., None], 3, 2)
 
 
-def side_by_side(a: Grey, b: Grey, px_a: NDArray, px_b: NDArray, most: int = 60) -> Rgb:
+def side_by_side(a: Grey, b: Grey, px_a: NDArray[Any], px_b: NDArray[Any], most: int = 60) -> Rgb:
     """Both pictures as they are, inliers (n, 2) joined by lines; at most `most`, evenly chosen."""
-    canvas = np.full((max(a.shape[0], b.shape[0]), a.shape[1] + _GAP + b.shape[1], 3), 255, np.uint8)
+    canvas = np.full(
+        (max(a.shape[0], b.shape[0]), a.shape[1] + _GAP + b.shape[1], 3), 255, np.uint8
+    )
     canvas[: a.shape[0], : a.shape[1]] = a[..., None]
     canvas[: b.shape[0], a.shape[1] + _GAP :] = b[..., None]
     chosen = np.unique(np.linspace(0, max(len(px_a) - 1, 0), min(most, len(px_a))).astype(int))

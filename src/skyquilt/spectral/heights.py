@@ -1,13 +1,14 @@
 """Two fields of heights laid on one another to a fraction of a cell.
 
-Heights look alike in every spectrum, at any hour and in every season, but for leaves: no shadow and no shading draws
-the fit aside, as it does with pictures. Two adjusted blocks differ by a similarity, heights included; slopes tell
-how far the one must move for its heights to equal the other's (least squares matching; for elevation models Rosenholm
-and Torlegard 1988). Walls do not count, nor does what only one field has.
+Heights look alike in every spectrum, at any hour and in every season, but for leaves: no shadow and
+no shading draws the fit aside, as it does with pictures. Two adjusted blocks differ by a
+similarity, heights included; slopes tell how far the one must move for its heights to equal the
+other's (least squares matching; for elevation models Rosenholm and Torlegard 1988). Walls do not
+count, nor does what only one field has.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -21,7 +22,9 @@ _TILES = 4
 """Per side of the chess-board that parts the ground into halves."""
 _LEAST = 400
 """Cells that both fields must know."""
-_TOO_LITTLE = RefusedRegistration(reason="too little ground has heights in both maps to compare them")
+_TOO_LITTLE = RefusedRegistration(
+    reason="too little ground has heights in both maps to compare them"
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,12 +38,15 @@ class HeightFit:
     residual_m: float
     """Robust deviation of the heights' differences."""
     apart_m: float
-    """RMS distance over the ground between the places that the two halves of it find by themselves."""
+    """RMS distance over the ground between the places that the two halves of it find by themselves.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
 class AlignHeights:
-    """Gauss-Newton, coarse to fine: a similarity of the plane, and of the heights a factor and a bent plane."""
+    """Gauss-Newton, coarse to fine: a similarity of the plane, and of the heights a factor and a
+    bent plane.
+    """
 
     sigmas: tuple[float, ...] = (5.0, 2.5, 1.25, 0.75)
     """Standard deviations of the smoothing, in cells."""
@@ -53,12 +59,14 @@ class AlignHeights:
     furthest_apart: float = 2.0
     """Cells by which the places that two halves of the ground find may differ."""
     likeness: float = 1.25
-    """Factor, either way, by which what stands out of the ground may be higher in one map than in the other: noise and
-    other ground come out at nearly none.
+    """Factor, either way, by which what stands out of the ground may be higher in one map than in
+    the other: noise and other ground come out at nearly none.
     """
     version: ClassVar[int] = 1
 
-    def __call__(self, a: HeightField, b: HeightField, start: Matrix) -> HeightFit | RefusedRegistration:
+    def __call__(
+        self, a: HeightField, b: HeightField, start: Matrix
+    ) -> HeightFit | RefusedRegistration:
         """b on a near a start (3, 3), ground coordinates in m, or why heights do not tell it."""
         cell = 2 * max(a.cell, b.cell)
         a, b = a.coarser(cell), b.coarser(cell)
@@ -68,7 +76,8 @@ class AlignHeights:
             return _TOO_LITTLE
         if abs(np.log(max(fit.factor, 1e-3))) > np.log(self.likeness):
             return RefusedRegistration(
-                reason=f"heights of the one map stand {fit.factor:.2f} times as high in the other: no likeness"
+                reason=f"heights of the one map stand {fit.factor:.2f} times as high in the other:"
+                " no likeness"
             )
         parts = [self._fitted(a, b, fit, half, self.sigmas[-2:]) for half in _halves(a.z.shape)]
         if parts[0] is None or parts[1] is None:
@@ -76,12 +85,18 @@ class AlignHeights:
         apart = float(np.sqrt((((parts[0].p - parts[1].p) @ fit.spread) ** 2).sum()))
         if apart > self.furthest_apart * cell:
             return RefusedRegistration(
-                reason=f"two halves of the ground find places {apart:.1f} m apart: its relief does not tell the place"
+                reason=f"two halves of the ground find places {apart:.1f} m apart: its relief does"
+                " not tell the place"
             )
         return HeightFit(b_H_a=fit.matrix, cells=fit.cells, residual_m=fit.residual, apart_m=apart)
 
     def _fitted(
-        self, a: HeightField, b: HeightField, fit: "_Fit", part: NDArray[np.bool_], sigmas: tuple[float, ...]
+        self,
+        a: HeightField,
+        b: HeightField,
+        fit: "_Fit",
+        part: NDArray[np.bool_],
+        sigmas: tuple[float, ...],
     ) -> "_Fit | None":
         """The best place by the cells of a in `part`; None where too few can be compared."""
         for sigma in sigmas:
@@ -97,7 +112,12 @@ class AlignHeights:
         return fit
 
     def _step(
-        self, one: NDArray[np.float32], known: NDArray[np.bool_], other: "_Slopes", fit: "_Fit", cell: float
+        self,
+        one: NDArray[np.float32],
+        known: NDArray[np.bool_],
+        other: "_Slopes",
+        fit: "_Fit",
+        cell: float,
     ) -> "tuple[_Fit, float] | None":
         """A step, and by how many m it moves the ground's border."""
         z, gx, gy, both = other.at(*fit.there(one - np.median(one[known])))
@@ -112,15 +132,21 @@ class AlignHeights:
         change *= min(1.0, 5 * cell / max(float(np.abs(change).max()), 1e-9))
         residual = 1.4826 * float(np.median(np.abs(lacking)))
         told = replace(
-            fit, p=fit.p + change, tilt=found[2:4] / fit.unit, factor=float(found[0]), cells=int(both.sum()),
+            fit,
+            p=fit.p + change,
+            tilt=found[2:4] / fit.unit,
+            factor=float(found[0]),
+            cells=int(both.sum()),
             residual=residual,
-        )  # fmt: skip
+        )
         return told, float(np.abs(change).max())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Fit:
-    """A similarity by its movement in m of the ground's middle and border: x = x0 + p0 + p2 u - p3 v and so on."""
+    """A similarity by its movement in m of the ground's middle and border: x = x0 + p0 + p2 u - p3
+    v and so on.
+    """
 
     u: Doubles
     v: Doubles
@@ -148,16 +174,22 @@ class _Fit:
         )
         there = start @ np.array([[middle[0], middle[0] + unit], [middle[1], middle[1]], [1, 1]])
         there = there[:2] / there[2]
-        return cls(u=u, v=v, middle=middle, unit=unit, p=np.r_[there[:, 0], there[:, 1] - there[:, 0]])
+        return cls(
+            u=u, v=v, middle=middle, unit=unit, p=np.r_[there[:, 0], there[:, 1] - there[:, 0]]
+        )
 
-    def there(self, lift: NDArray) -> tuple[Doubles, Doubles]:
-        """(rows, cols) where the cells of a lie in b, `lift` m above the level that the similarity is true for.
+    def there(self, lift: NDArray[Any]) -> tuple[Doubles, Doubles]:
+        """(rows, cols) where the cells of a lie in b, `lift` m above the level that the similarity
+        is true for.
 
         A block that leans by a slope has roofs and crowns aside by the slope times their height.
         """
         x, y, c, s = self.p
         along, across = self.tilt
-        return x + c * self.u - s * self.v + along * lift, y + s * self.u + c * self.v + across * lift
+        return (
+            x + c * self.u - s * self.v + along * lift,
+            y + s * self.u + c * self.v + across * lift,
+        )
 
     @property
     def matrix(self) -> Matrix:
@@ -191,8 +223,13 @@ class _Slopes:
     def at(self, x: Doubles, y: Doubles) -> tuple[Doubles, Doubles, Doubles, NDArray[np.bool_]]:
         """Height, slopes and whether they are known, each in the shape of x and y."""
         b = self.field
-        column, row = ((x - b.x0) / b.cell).astype(np.float32), ((y - b.y0) / b.cell).astype(np.float32)
-        found = cv2.remap(self.layers, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        column, row = (
+            ((x - b.x0) / b.cell).astype(np.float32),
+            ((y - b.y0) / b.cell).astype(np.float32),
+        )
+        found = cv2.remap(
+            self.layers, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+        )
         z, gx, gy, known = np.moveaxis(np.asarray(found, np.float64), -1, 0)
         return z, gx, gy, known > 0.99
 
@@ -204,7 +241,7 @@ def _smooth(one: HeightField, sigma: float) -> NDArray[np.float32]:
     return np.asarray(total / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3), np.float32)
 
 
-def _robust(A: Doubles, wanted: NDArray, scale: float) -> tuple[Doubles, Doubles]:
+def _robust(A: Doubles, wanted: NDArray[Any], scale: float) -> tuple[Doubles, Doubles]:
     """Least squares reweighted (Geman and McClure), and what it leaves."""
     weight = np.ones(len(A))
     for _ in range(6):

@@ -1,12 +1,15 @@
-"""Keypoints of phase congruency, described by histograms of the maximum index map, in RIFT2's manner.
+"""Keypoints of phase congruency, described by histograms of the maximum index map, in RIFT2's
+manner.
 
-RIFT (Li, Hu and Ai 2020) makes its descriptor independent of rotation by a ring of filter sequences, RIFT2 (2023) by
-the patch's dominant index; here the dominant direction is found to a fraction of an index, the patch is sampled
-along it and its indices are counted from it. A direction is one of 180 degrees: the other half is tried
-when descriptors are compared, where it is the same descriptor with its cells in reverse.
+RIFT (Li, Hu and Ai 2020) makes its descriptor independent of rotation by a ring of filter
+sequences, RIFT2 (2023) by the patch's dominant index; here the dominant direction is found to a
+fraction of an index, the patch is sampled along it and its indices are counted from it. A direction
+is one of 180 degrees: the other half is tried when descriptors are compared, where it is the same
+descriptor with its cells in reverse.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -35,7 +38,7 @@ class IndexFeatures:
         return len(self.px)
 
 
-def index_features(phase: Phase, valid: NDArray, *, count: int, patch: int) -> IndexFeatures:
+def index_features(phase: Phase, valid: NDArray[Any], *, count: int, patch: int) -> IndexFeatures:
     """The strongest keypoints, spread out, with descriptors of patches of `patch` px."""
     px = _keypoints(phase, valid, count)
     share = [
@@ -53,10 +56,10 @@ def similarities(a: IndexFeatures, b: IndexFeatures) -> NDArray[np.float32]:
     """(len(a), len(b)) dot products, the better of both halves of the turn."""
     fa, fb = a.vectors.reshape(len(a), -1), b.vectors.reshape(len(b), -1)
     turned = b.vectors[:, ::-1].reshape(len(b), -1)
-    return np.maximum(fa @ fb.T, fa @ turned.T)
+    return np.asarray(np.maximum(fa @ fb.T, fa @ turned.T))
 
 
-def mutual(a: IndexFeatures, b: IndexFeatures) -> tuple[NDArray, NDArray]:
+def mutual(a: IndexFeatures, b: IndexFeatures) -> tuple[NDArray[Any], NDArray[Any]]:
     """Indices into a and b of each other's nearest."""
     if not len(a) or not len(b):
         return np.zeros(0, int), np.zeros(0, int)
@@ -66,7 +69,7 @@ def mutual(a: IndexFeatures, b: IndexFeatures) -> tuple[NDArray, NDArray]:
     return rows, there[rows]
 
 
-def _keypoints(phase: Phase, valid: NDArray, count: int) -> NDArray[np.float64]:
+def _keypoints(phase: Phase, valid: NDArray[Any], count: int) -> NDArray[np.float64]:
     """FAST on both moments, strongest first within each cell of a coarse grid."""
     inner = cv2.erode(valid.astype(np.uint8), np.ones((2 * _BORDER + 1,) * 2), borderValue=0)
     points = []
@@ -84,7 +87,9 @@ def _spread(
 ) -> NDArray[np.float64]:
     cell = (table[:, 1] * cells // shape[0]) * cells + table[:, 0] * cells // shape[1]
     order = np.lexsort((-table[:, 2], cell))
-    starts = np.flatnonzero(np.r_[True, np.diff(cell[order]) != 0]) if len(order) else np.zeros(0, int)
+    starts = (
+        np.flatnonzero(np.r_[True, np.diff(cell[order]) != 0]) if len(order) else np.zeros(0, int)
+    )
     rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
     return table[order[np.argsort(rank, kind="stable")][:count], :2]
 
@@ -95,10 +100,14 @@ def _dominant(histograms: NDArray[np.float32]) -> NDArray[np.float64]:
     top = histograms.argmax(1)
     left, right = histograms[n, top - 1], histograms[n, (top + 1) % ORIENTATIONS]
     bend = left - 2 * histograms[n, top] + right
-    return np.asarray(top + np.where(bend < -1e-9, (left - right) / (2 * np.minimum(bend, -1e-9)), 0))
+    return np.asarray(
+        top + np.where(bend < -1e-9, (left - right) / (2 * np.minimum(bend, -1e-9)), 0)
+    )
 
 
-def _vectors(maps: NDArray, px: NDArray, direction: NDArray, patch: int) -> NDArray[np.float32]:
+def _vectors(
+    maps: NDArray[Any], px: NDArray[Any], direction: NDArray[Any], patch: int
+) -> NDArray[np.float32]:
     """Cells sampled along each keypoint's direction, indices counted from it."""
     step = patch / CELLS
     y, x = np.mgrid[:CELLS, :CELLS].reshape(2, -1) * step - (CELLS - 1) / 2 * step
@@ -107,7 +116,10 @@ def _vectors(maps: NDArray, px: NDArray, direction: NDArray, patch: int) -> NDAr
     u = (px[:, :1] + c * x - s * y).astype(np.float32)
     v = (px[:, 1:] + s * x + c * y).astype(np.float32)
     cells = np.stack(
-        [cv2.remap(np.ascontiguousarray(maps[..., k]), u, v, cv2.INTER_LINEAR) for k in range(ORIENTATIONS)],
+        [
+            cv2.remap(np.ascontiguousarray(maps[..., k]), u, v, cv2.INTER_LINEAR)
+            for k in range(ORIENTATIONS)
+        ],
         -1,
     )
     whole = np.floor(direction).astype(int)

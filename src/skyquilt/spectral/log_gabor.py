@@ -1,10 +1,12 @@
 """Log-Gabor responses, phase congruency and the maximum index map.
 
-Kovesi (1999), "Image features from phase congruency", and (2003) for the moments; Li, Hu and Ai (2020), RIFT, for
-the map of the orientation that responds most, which hardly depends on how bright either side of an edge is.
+Kovesi (1999), "Image features from phase congruency", and (2003) for the moments; Li, Hu and Ai
+(2020), RIFT, for the map of the orientation that responds most, which hardly depends on how bright
+either side of an edge is.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -49,14 +51,14 @@ def phase(grey: NDArray[np.float32]) -> Phase:
     return Phase(index=np.argmax(strengths, 0).astype(np.uint8), edges=edges, corners=corners)
 
 
-def _polar(shape: tuple[int, ...]) -> tuple[NDArray, NDArray]:
+def _polar(shape: tuple[int, ...]) -> tuple[NDArray[Any], NDArray[Any]]:
     y, x = np.fft.fftfreq(shape[0])[:, None], np.fft.fftfreq(shape[1])[None]
     radius = np.hypot(x, y)
     radius[0, 0] = 1.0
     return radius, np.arctan2(y, x) + 0 * radius
 
 
-def _bands(radius: NDArray) -> list[NDArray[np.float32]]:
+def _bands(radius: NDArray[Any]) -> list[NDArray[np.float32]]:
     low = 1 / (1 + (radius / _CUTOFF) ** (2 * _SHARP))
     bands = []
     for s in range(SCALES):
@@ -68,13 +70,13 @@ def _bands(radius: NDArray) -> list[NDArray[np.float32]]:
 
 
 def _oriented(
-    spectrum: NDArray, bands: list[NDArray[np.float32]], angle: NDArray, direction: float
+    spectrum: NDArray[Any], bands: list[NDArray[np.float32]], angle: NDArray[Any], direction: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Summed amplitude over scales, and energy above the noise, both (h, w), of one direction."""
     off = np.abs(np.angle(np.exp(1j * (angle - direction))))
     spread = (np.cos(np.minimum(off * ORIENTATIONS / 2, np.pi)) + 1) / 2
     spread = spread.astype(np.float32)
-    total: NDArray = np.zeros(spectrum.shape, np.complex64)
+    total: NDArray[Any] = np.zeros(spectrum.shape, np.complex64)
     amplitude, noise = np.zeros(spectrum.shape, np.float32), 0.0
     for s, band in enumerate(bands):
         response = scipy.fft.ifft2(spectrum * (band * spread))
@@ -88,7 +90,7 @@ def _oriented(
     return amplitude, np.maximum(np.abs(total) - noise, 0).astype(np.float32)
 
 
-def _moments(congruent: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _moments(congruent: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Maximum and minimum moment of phase congruency (orientations, h, w)."""
     angles = np.arange(len(congruent)) * np.pi / len(congruent)
     x, y = congruent * np.cos(angles)[:, None, None], congruent * np.sin(angles)[:, None, None]

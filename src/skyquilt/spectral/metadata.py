@@ -20,8 +20,8 @@ _SCALE = 1.3
 def from_metadata(a: Photo, b: Photo) -> Guess | None:
     """The guess for two photos that look straight down, or None where they do not say enough.
 
-    Scale from focal lengths and heights above take-off, rotation from yaws, shift from positions; what both
-    do not state is taken as equal. Focal lengths that are guesses say nothing.
+    Scale from focal lengths and heights above take-off, rotation from yaws, shift from positions;
+    what both do not state is taken as equal. Focal lengths that are guesses say nothing.
     """
     if "guess" in (a.focal.source, b.focal.source):
         return None
@@ -44,9 +44,12 @@ def from_metadata(a: Photo, b: Photo) -> Guess | None:
         return None
     transform = similarity(scale, radians(yaw_a - yaw_b), middle((a.height, a.width)), to_px)
     return Guess(
-        b_H_a=transform, reach=_REACH, rotation_deg=_TURN_DEG, scale=_SCALE,
+        b_H_a=transform,
+        reach=_REACH,
+        rotation_deg=_TURN_DEG,
+        scale=_SCALE,
         source=f"the photos' metadata ({', '.join(said)})",
-    )  # fmt: skip
+    )
 
 
 def _heights(a: Photo, b: Photo) -> tuple[float, float] | None:

@@ -13,7 +13,9 @@ from skyquilt.spectral.orientation import Orientation, between, spectra, turned
 
 
 def same_view(a: tuple[int, int], b: tuple[int, int]) -> Guess:
-    """The guess for two cameras side by side: equal fields of view, of pictures of shapes (H, W)."""
+    """The guess for two cameras side by side: equal fields of view, of pictures of shapes (H,
+    W).
+    """
     scale = float(np.sqrt(b[0] * b[1] / (a[0] * a[1])))
     return Guess(b_H_a=similarity(scale, 0.0, middle(a), middle(b)), source="equal fields of view")
 
@@ -47,7 +49,9 @@ class Nearby:
         turns = int(guess.rotation_deg / self.step_deg)
         factors = int(np.log(guess.scale) / np.log(self.step_scale))
         return [
-            similarity(self.step_scale**k, np.radians(t * self.step_deg), middle(shape), middle(shape))
+            similarity(
+                self.step_scale**k, np.radians(t * self.step_deg), middle(shape), middle(shape)
+            )
             for k in range(-factors, factors + 1)
             for t in range(-turns, turns + 1)
         ]
@@ -63,10 +67,13 @@ class Nearby:
         fields = turned(cv2.warpPerspective(a.fields, moved, (width, height)), angle)
         field = scipy.fft.ifft2((spectra(fields, (height, width)) * conjugate).sum(0)).real
         valid = cv2.warpPerspective(a.valid, start, (b.shape[1], b.shape[0]))
-        z = field[: 2 * reach + 1, : 2 * reach + 1] / np.sqrt(max(float((valid * b.valid).sum()), 1.0))
+        z = field[: 2 * reach + 1, : 2 * reach + 1] / np.sqrt(
+            max(float((valid * b.valid).sum()), 1.0)
+        )
         return [
             Candidate(
-                b_H_a=np.array([[1, 0, reach - x], [0, 1, reach - y], [0, 0, 1.0]]) @ start, score=score
+                b_H_a=np.array([[1, 0, reach - x], [0, 1, reach - y], [0, 0, 1.0]]) @ start,
+                score=score,
             )
             for score, x, y in peaks(z.copy(), self.per_turn)
         ]

@@ -1,12 +1,13 @@
 """What spectra have in common: where edges run, whichever side of them is brighter.
 
-A picture becomes fields of unit-contrast orientation. With g = |g| exp(i t) the gradient, the fields are
-w exp(2 i t) and w exp(4 i t): both are the same for t and t + pi, so a reversed contrast changes nothing; the
-second tells orientations apart more sharply than the first alone. w is the gradient's length over its
-surroundings' RMS, so that faint and strong structure weigh alike.
+A picture becomes fields of unit-contrast orientation. With g = |g| exp(i t) the gradient, the
+fields are w exp(2 i t) and w exp(4 i t): both are the same for t and t + pi, so a reversed contrast
+changes nothing; the second tells orientations apart more sharply than the first alone. w is the
+gradient's length over its surroundings' RMS, so that faint and strong structure weigh alike.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,12 +16,13 @@ from numpy.typing import NDArray
 
 from skyquilt.model.registration import Matrix
 
-Fields = NDArray
+Fields = NDArray[Any]
 """(h, w, 4) of 32-bit numbers, see above."""
 BLUR = 1.0
 """Standard deviation in px of the smoothing before gradients are taken."""
 SURROUNDINGS = 1 / 16
-"""Standard deviation of the surroundings that contrast is measured against, as a share of the side."""
+"""Standard deviation of the surroundings that contrast is measured against, as a share of the side.
+"""
 FLOOR = 0.3
 """Share of the median contrast that is added to every contrast: flat areas stay weak."""
 STRONGEST = 2.0
@@ -35,7 +37,7 @@ class Orientation:
 
     fields: Fields
     """(h, w, 4): real and imaginary parts of w exp(2 i t), then of w exp(4 i t)."""
-    valid: NDArray
+    valid: NDArray[Any]
     """(h, w) 1 where a gradient could be taken, else 0."""
     small_S_full: Matrix
     """(3, 3) takes full-size pixels to pixels of this resolution."""
@@ -52,20 +54,24 @@ def orientation(grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float
     return of_bands(small, whole, small_S_full)
 
 
-def of_bands(small: NDArray, whole: NDArray[np.bool_], small_S_full: Matrix) -> Orientation:
-    """Fields of a picture (h, w) or (h, w, bands) at its own resolution; `whole` (h, w) where it is known.
+def of_bands(small: NDArray[Any], whole: NDArray[np.bool_], small_S_full: Matrix) -> Orientation:
+    """Fields of a picture (h, w) or (h, w, bands) at its own resolution; `whole` (h, w) where it is
+    known.
 
-    Gradients g of several bands add up as g^2: the direction along which all of them together change most (Di Zenzo
-    1986), whichever way each of them changes.
+    Gradients g of several bands add up as g^2: the direction along which all of them together
+    change most (Di Zenzo 1986), whichever way each of them changes.
     """
     inner = cv2.erode(
-        whole.astype(np.float32), np.ones((MARGIN, MARGIN)), borderType=cv2.BORDER_CONSTANT, borderValue=0
+        whole.astype(np.float32),
+        np.ones((MARGIN, MARGIN)),
+        borderType=cv2.BORDER_CONSTANT,
+        borderValue=0,
     )
     smooth = np.asarray(cv2.GaussianBlur(small, (0, 0), BLUR))
     return Orientation(fields=_fields(smooth, inner), valid=inner, small_S_full=small_S_full)
 
 
-def _fields(small: NDArray, valid: NDArray) -> Fields:
+def _fields(small: NDArray[Any], valid: NDArray[Any]) -> Fields:
     bands = small[..., None] if small.ndim == 2 else small
     square = np.zeros(small.shape[:2], np.complex64)
     for band in np.moveaxis(bands, -1, 0):
@@ -80,20 +86,23 @@ def _fields(small: NDArray, valid: NDArray) -> Fields:
     return np.stack([first.real, first.imag, second.real, second.imag], -1).astype(np.float32)
 
 
-def _surroundings(length: NDArray, valid: NDArray) -> NDArray[np.float32]:
+def _surroundings(length: NDArray[Any], valid: NDArray[Any]) -> NDArray[np.float32]:
     """RMS gradient about each pixel, over valid ones, and the floor."""
     sigma = np.sqrt(length.size) * SURROUNDINGS
     share = cv2.GaussianBlur(valid, (0, 0), sigma) + 1e-3
     rms = np.sqrt(cv2.GaussianBlur(length * length * valid, (0, 0), sigma) / share)
     inside = rms[valid > 0]
-    return np.asarray(rms + FLOOR * (np.median(inside) if inside.size else 0) + 1e-3 * (rms.max() or 1.0))
+    return np.asarray(
+        rms + FLOOR * (np.median(inside) if inside.size else 0) + 1e-3 * (rms.max() or 1.0)
+    )
 
 
 def shrunken(
     grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float
-) -> tuple[NDArray, NDArray[np.bool_], Matrix]:
-    """A picture (H, W) or (H, W, bands) and its validity (H, W) averaged down to the area of a square of `side` px
-    (never enlarged), and the (3, 3) that takes its pixels there. Both axes shrink alike, so a similarity stays one.
+) -> tuple[NDArray[Any], NDArray[np.bool_], Matrix]:
+    """A picture (H, W) or (H, W, bands) and its validity (H, W) averaged down to the area of a
+    square of `side` px (never enlarged), and the (3, 3) that takes its pixels there. Both axes
+    shrink alike, so a similarity stays one.
     """
     factor = min(1.0, side / float(np.sqrt(valid.size)))
     small, share = (
@@ -116,8 +125,10 @@ def full_size(a: Orientation, b: Orientation, small: Matrix) -> Matrix:
     return np.asarray(m / m[2, 2])
 
 
-def warped(a: Orientation, b_H_a: Matrix, shape: tuple[int, int]) -> tuple[Fields, NDArray]:
-    """a's fields and validity as they would be in b's frame, (h, w, 4) and (h, w); orientations turn along."""
+def warped(a: Orientation, b_H_a: Matrix, shape: tuple[int, int]) -> tuple[Fields, NDArray[Any]]:
+    """a's fields and validity as they would be in b's frame, (h, w, 4) and (h, w); orientations
+    turn along.
+    """
     size = (shape[1], shape[0])
     fields = cv2.warpPerspective(a.fields, b_H_a, size)
     valid = cv2.warpPerspective(a.valid, b_H_a, size)

@@ -1,8 +1,8 @@
 """Registration of two blocks by the pairs that could be registered [Yahyanejad 2013, 5.2.3, (5.7)].
 
-Photos of one spectrum are tied to one another by homographies, which hold even with little overlap. So
-correspondences of one pair between spectra are correspondences of every other pair, and of both mosaics: one pair
-that registers is enough, and all of them together are better.
+Photos of one spectrum are tied to one another by homographies, which hold even with little overlap.
+So correspondences of one pair between spectra are correspondences of every other pair, and of both
+mosaics: one pair that registers is enough, and all of them together are better.
 """
 
 from collections.abc import Mapping, Sequence
@@ -48,9 +48,14 @@ def carried(
 ) -> Carried:
     """(5.7): R(x_V2, x_T2) = R(H_V1V2 x_V1, H_T1T2 x_T1), for all pairs whose photos are placed.
 
-    The homographies take pixels of each photo of a spectrum to one frame: another photo of it, or its mosaic.
+    The homographies take pixels of each photo of a spectrum to one frame: another photo of it, or
+    its mosaic.
     """
-    known = [(k, p) for k, p in enumerate(pairs) if p.a in common_H_a and p.b in common_H_b and len(p.px_a)]
+    known = [
+        (k, p)
+        for k, p in enumerate(pairs)
+        if p.a in common_H_a and p.b in common_H_b and len(p.px_a)
+    ]
     if not known:
         return Carried(px_a=np.zeros((0, 2)), px_b=np.zeros((0, 2)), pair=np.zeros(0, np.int64))
     return Carried(
@@ -63,8 +68,8 @@ def carried(
 def balanced_weights(px: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
     """(n,) one over the number of points within `radius` px, itself included.
 
-    A place that many pairs see, or that one pair sees many times, then weighs about as much as any other: the thesis
-    names the double counting as the flaw of fitting all points alike.
+    A place that many pairs see, or that one pair sees many times, then weighs about as much as any
+    other: the thesis names the double counting as the flaw of fitting all points alike.
     """
     if not len(px):
         return np.zeros(0)
@@ -91,34 +96,47 @@ class Propagate:
     version: ClassVar[int] = 1
 
     def __call__(
-        self, pairs: Sequence[PairPoints], common_H_a: Mapping[int, Matrix],
+        self,
+        pairs: Sequence[PairPoints],
+        common_H_a: Mapping[int, Matrix],
         common_H_b: Mapping[int, Matrix],
-    ) -> Registration | RefusedRegistration:  # fmt: skip
+    ) -> Registration | RefusedRegistration:
         """b's frame on a's, or why there is no such transform."""
         points = carried(pairs, common_H_a, common_H_b)
         if len(points.px_a) < self.minimum:
-            reason = f"{len(points.px_a)} correspondences were carried, and {self.minimum} are needed"
+            reason = (
+                f"{len(points.px_a)} correspondences were carried, and {self.minimum} are needed"
+            )
             return RefusedRegistration(reason=reason)
         extent = float(np.linalg.norm(np.ptp(points.px_a, axis=0)))
         balance = balanced_weights(points.px_a, self.radius * extent)
         matrix = self._fitted(points, balance)
         error = (
-            None if matrix is None else np.linalg.norm(transfer(matrix, points.px_a) - points.px_b, axis=1)
+            None
+            if matrix is None
+            else np.linalg.norm(transfer(matrix, points.px_a) - points.px_b, axis=1)
         )
         if matrix is None or error is None or (error < self.inlier_px).sum() < self.minimum:
-            return RefusedRegistration(reason="the pairs' correspondences agree on no common transform")
+            return RefusedRegistration(
+                reason="the pairs' correspondences agree on no common transform"
+            )
         inside = error < self.inlier_px
         return Registration(
-            model="similarity" if self.model == "translation" else self.model, b_H_a=matrix,
-            px_a=points.px_a[inside], px_b=points.px_b[inside],
+            model="similarity" if self.model == "translation" else self.model,
+            b_H_a=matrix,
+            px_a=points.px_a[inside],
+            px_b=points.px_b[inside],
             evidence={
-                "correspondences": float(len(inside)), "pairs": float(len(np.unique(points.pair))),
+                "correspondences": float(len(inside)),
+                "pairs": float(len(np.unique(points.pair))),
                 "pairs_agreeing": float(len(np.unique(points.pair[inside]))),
             },
-        )  # fmt: skip
+        )
 
     def _fitted(self, points: Carried, balance: NDArray[np.float64]) -> Matrix | None:
-        """Least squares reweighted by Cauchy's function, its scale narrowing from the median error."""
+        """Least squares reweighted by Cauchy's function, its scale narrowing from the median
+        error.
+        """
         matrix = fit(self.model, points.px_a, points.px_b, balance)
         for k in range(self.steps):
             if matrix is None:

@@ -1,7 +1,8 @@
 """Two cameras on one drone: how one is turned against the other, from pairs taken together.
 
-Both look from almost the same place, so that a pair's pixels correspond by a rotation alone, whatever the ground
-looks like. Each pair gives one; the rig has one, and pairs that disagree with it are wrong.
+Both look from almost the same place, so that a pair's pixels correspond by a rotation alone,
+whatever the ground looks like. Each pair gives one; the rig has one, and pairs that disagree with
+it are wrong.
 """
 
 from collections.abc import Sequence
@@ -64,7 +65,8 @@ class FindRig:
         """The rig, or why there is none."""
         if len(pairs) < self.minimum:
             return RefusedRegistration(
-                reason=f"{len(pairs)} pairs taken together could be registered, and {self.minimum} are needed"
+                reason=f"{len(pairs)} pairs taken together could be registered, and {self.minimum}"
+                " are needed"
             )
         if self.free > 0:
             camera_b = self._focal(pairs, camera_b)
@@ -74,23 +76,31 @@ class FindRig:
         agreeing = [p for p, o in zip(pairs, off, strict=True) if o < self.agree_deg]
         if len(agreeing) < max(self.minimum, 0.5 * len(pairs)):
             return RefusedRegistration(
-                reason=f"{len(agreeing)} of {len(pairs)} pairs taken together agree on one rotation of the cameras"
+                reason=f"{len(agreeing)} of {len(pairs)} pairs taken together agree on one rotation"
+                " of the cameras"
             )
         R = _rotation(agreeing, camera_b)
         return Rig(
-            b_R_a=R, camera_b=camera_b, agreeing=len(agreeing), pairs=len(pairs),
+            b_R_a=R,
+            camera_b=camera_b,
+            agreeing=len(agreeing),
+            pairs=len(pairs),
             spread_deg=float(np.median(off[off < self.agree_deg])),
-        )  # fmt: skip
+        )
 
     def _focal(self, pairs: Sequence[RigPair], camera_b: Camera) -> Camera:
-        """The camera whose focal length makes the pairs' directions congruent, in the median over pairs."""
+        """The camera whose focal length makes the pairs' directions congruent, in the median over
+        pairs.
+        """
 
         def misfit(log: float) -> float:
             camera = replace(camera_b, focal=camera_b.focal * float(np.exp(log)))
             return float(np.median([_misfit(p, camera) for p in pairs]))
 
         reach = float(np.log1p(self.free))
-        found = minimize_scalar(misfit, bounds=(-reach, reach), method="bounded", options={"xatol": 1e-4})
+        found = minimize_scalar(
+            misfit, bounds=(-reach, reach), method="bounded", options={"xatol": 1e-4}
+        )
         return replace(camera_b, focal=camera_b.focal * float(np.exp(found.x)))
 
 

@@ -1,9 +1,11 @@
-"""A believed registration brought to its exact place: by colours where they tell it, else by brightness.
+"""A believed registration brought to its exact place: by colours where they tell it, else by
+brightness.
 
-The place is known by then to a few pixels. What is left is the pull of the light, see `chromatic`. Brightness may be
-the better likeness of the two and yet the worse guide, since rough ground is shaded in both pictures, by two suns. So
-colours are not compared with it: they decide wherever patches confirm their place by the test that registrations are
-believed by, asked of the colours alone. Pictures without colours (a grey lens, snow, asphalt, haze) go by brightness.
+The place is known by then to a few pixels. What is left is the pull of the light, see `chromatic`.
+Brightness may be the better likeness of the two and yet the worse guide, since rough ground is
+shaded in both pictures, by two suns. So colours are not compared with it: they decide wherever
+patches confirm their place by the test that registrations are believed by, asked of the colours
+alone. Pictures without colours (a grey lens, snow, asphalt, haze) go by brightness.
 """
 
 from dataclasses import dataclass, field, replace
@@ -40,11 +42,15 @@ class Settle:
     least_surprise: float = 5.0
     """Agreement below which colours tell nothing."""
     reach: float = 0.02
-    """Share of the longer side by which the place may move (RMS): what was believed is right to half of that."""
+    """Share of the longer side by which the place may move (RMS): what was believed is right to
+    half of that.
+    """
     version: ClassVar[int] = 1
 
     def __call__(self, a: Picture, b: Picture, outcome: Registration) -> Registration:
-        """The registration at its exact place; as it was where the pictures show nothing near it."""
+        """The registration at its exact place; as it was where the pictures show nothing near
+        it.
+        """
         pair = both_usable(a, b)
         if isinstance(pair, RefusedRegistration):
             return outcome
@@ -66,18 +72,26 @@ class Settle:
     def _confirmed(
         self, colours: Orientation | None, other: Usable, start: Matrix
     ) -> tuple[Matrix, float] | None:
-        """Where colours alone put the picture at the resolution of the verdict, and how clearly patches agree on it."""
+        """Where colours alone put the picture at the resolution of the verdict, and how clearly
+        patches agree on it.
+        """
         if colours is None:
             return None
         target = orientation(other.grey, other.valid, _JUDGED)
         found = self.rigid(colours, target, between(colours, target, start)).b_H_a
         surprise = self.agree(colours, target, found).surprise
-        return (full_size(colours, target, found), surprise) if surprise >= self.least_surprise else None
+        return (
+            (full_size(colours, target, found), surprise)
+            if surprise >= self.least_surprise
+            else None
+        )
 
     def _fitted(
         self, fields: Orientation, target: Orientation, begin: Matrix, start: Matrix
     ) -> tuple[Fit, Sharpen] | None:
-        """The place found from `begin`, in px of the target, and the way; None where it lies far from the start."""
+        """The place found from `begin`, in px of the target, and the way; None where it lies far
+        from the start.
+        """
         begun = between(fields, target, start)
         found, way = self.rigid(fields, target, between(fields, target, begin)), self.rigid
         if self.free is not None:
@@ -91,14 +105,19 @@ class Settle:
 
 
 def _placed(
-    outcome: Registration, fields: Orientation, target: Orientation, found: tuple[Fit, Sharpen],
+    outcome: Registration,
+    fields: Orientation,
+    target: Orientation,
+    found: tuple[Fit, Sharpen],
     told: dict[str, float],
-) -> Registration:  # fmt: skip
+) -> Registration:
     fit, way = found
     return replace(
-        outcome, model=way.freedom, b_H_a=full_size(fields, target, fit.b_H_a),
+        outcome,
+        model=way.freedom,
+        b_H_a=full_size(fields, target, fit.b_H_a),
         evidence={**outcome.evidence, "likeness": round(fit.correlation, 4), **told},
-    )  # fmt: skip
+    )
 
 
 def stiff(b_H_a: Matrix, shape: tuple[int, int]) -> Matrix:

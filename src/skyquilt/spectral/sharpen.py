@@ -1,8 +1,9 @@
-"""From a rough place to the exact one: the correlation coefficient of orientation fields, maximised.
+"""From a rough place to the exact one: the correlation coefficient of orientation fields,
+maximised.
 
-Evangelidis and Psarakis (2008), ECC, forward compositional: the coefficient's own Gauss-Newton step, which
-stays right where the pictures correlate by a tenth only. Fields turn along with the picture, so a
-rotation's derivative has a term of its own.
+Evangelidis and Psarakis (2008), ECC, forward compositional: the coefficient's own Gauss-Newton
+step, which stays right where the pictures correlate by a tenth only. Fields turn along with the
+picture, so a rotation's derivative has a term of its own.
 """
 
 from dataclasses import dataclass
@@ -73,7 +74,9 @@ class Sharpen:
         return best
 
 
-def _tried(a: Orientation, b: Orientation, b_H_a: Matrix) -> tuple[Fit, Fields, NDArray[np.float32]]:
+def _tried(
+    a: Orientation, b: Orientation, b_H_a: Matrix
+) -> tuple[Fit, Fields, NDArray[np.float32]]:
     b_H_a = b_H_a / b_H_a[2, 2]
     fields, valid = warped(a, b_H_a, b.shape)
     both = valid * b.valid
@@ -81,12 +84,18 @@ def _tried(a: Orientation, b: Orientation, b_H_a: Matrix) -> tuple[Fit, Fields, 
     energy_a = float(np.einsum("ijk,ijk,ij->", fields, fields, b.valid))
     energy_b = float(np.einsum("ijk,ijk,ij->", b.fields, b.fields, valid))
     correlation = product / np.sqrt(energy_a * energy_b + _TINY)
-    return Fit(b_H_a=b_H_a, correlation=float(correlation), overlap=float(both.sum())), fields, valid
+    return (
+        Fit(b_H_a=b_H_a, correlation=float(correlation), overlap=float(both.sum())),
+        fields,
+        valid,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Frame:
-    """b's pixels counted from its middle in units of half its longer side: parameters of like size."""
+    """b's pixels counted from its middle in units of half its longer side: parameters of like
+    size.
+    """
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
@@ -99,13 +108,16 @@ class _Frame:
         unit = max(shape) / 2
         y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
         return cls(
-            x=(x - np.float32(cx)) / np.float32(unit), y=(y - np.float32(cy)) / np.float32(unit),
+            x=(x - np.float32(cx)) / np.float32(unit),
+            y=(y - np.float32(cy)) / np.float32(unit),
             unit=unit,
             centre=np.array([[1, 0, cx], [0, 1, cy], [0, 0, 1.0]]),
-        )  # fmt: skip
+        )
 
     def applied(self, p: NDArray[np.float64], freedom: Freedom) -> Matrix:
-        """A small transform of b's frame from its parameters: px of movement, at the middle or at the unit."""
+        """A small transform of b's frame from its parameters: px of movement, at the middle or at
+        the unit.
+        """
         q = np.zeros(6)
         if freedom == "similarity":
             q[:4] = np.array([p[2], -p[3], p[3], p[2]]) / self.unit
@@ -131,7 +143,9 @@ def _change(
     Jw, Jb = (J @ w).astype(np.float64), (J @ target).astype(np.float64)
     projected = np.linalg.solve(H, Jw)
     own, cross = float(w @ w) - Jw @ projected, float(target @ w) - Jb @ projected
-    if cross <= 0:  # the shift alone explains all: Evangelidis and Psarakis's second case, simplified
+    if (
+        cross <= 0
+    ):  # the shift alone explains all: Evangelidis and Psarakis's second case, simplified
         cross = float(target @ w)
     if cross <= 0:
         return None
@@ -147,7 +161,8 @@ def _derivatives(
     np.subtract(fields[2:], fields[:-2], out=gy[1:-1])
     gx, gy, w = gx[inside] / 2, gy[inside] / 2, fields[inside]
     x, y = frame.x[inside][:, None], frame.y[inside][:, None]
-    # by what an orientation's own turning changes the fields, per px of movement at the unit's distance
+    # by what an orientation's own turning changes the fields, per px of movement at the unit's
+    # distance
     turn = np.stack([-w[:, 1], w[:, 0], -2 * w[:, 3], 2 * w[:, 2]], -1) / np.float32(frame.unit)
     J = np.empty((_PARAMETERS[freedom], *w.shape), np.float32)
     np.negative(gx, out=J[0])

@@ -58,7 +58,9 @@ class StructureMatches:
         grey, valid, small_S_full = shrunken(picture.grey, picture.valid, self.side)
         # what is no picture gets the mean, whose edge is weaker than that of black or white
         filled = np.where(valid, grey, grey[valid].mean() if valid.any() else 0).astype(np.float32)
-        return index_features(phase(filled), valid, count=self.count, patch=self.patch), small_S_full
+        return index_features(
+            phase(filled), valid, count=self.count, patch=self.patch
+        ), small_S_full
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,12 +84,16 @@ class Structure:
             return pictures
         proposal = self.propose(*pictures)
         if proposal.b_H_a is None:
-            return RefusedRegistration(reason=proposal.reason, evidence={"matches": float(proposal.matches)})
+            return RefusedRegistration(
+                reason=proposal.reason, evidence={"matches": float(proposal.matches)}
+            )
         pyramid = Pyramid(a=pictures[0], b=pictures[1], sides=self.sides)
         return self.decide(pyramid, [sharpened(pyramid, proposal.b_H_a, pyramid.last - 1)])
 
 
 def sharpened(pyramid: Pyramid, b_H_a: Matrix, level: int) -> Fit:
-    """A transform of the pictures' pixels sharpened at a level, then at the last one, in whose px it is."""
+    """A transform of the pictures' pixels sharpened at a level, then at the last one, in whose px
+    it is.
+    """
     rough = Sharpen()(*pyramid.at(level), pyramid.small(b_H_a, level))
     return Sharpen()(*pyramid.at(pyramid.last), pyramid.moved(rough.b_H_a, level, pyramid.last))

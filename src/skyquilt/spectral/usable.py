@@ -1,6 +1,7 @@
 """What of a picture can be registered, and whether that is enough."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,11 +14,14 @@ SHORTEST = 48
 NEAR_END = 4
 """8-bit levels from black or white within which JPEG leaves a frame's colour."""
 LEAST_FRAME = 0.002
-"""Share of the picture that a frame takes at least; smaller dark spots at the border are picture."""
+"""Share of the picture that a frame takes at least; smaller dark spots at the border are picture.
+"""
 LEAST_VALID = 0.1
 """Share of the picture that must be left."""
 LEAST_RANGE = 3.0
-"""Levels between the 1st and 99th percentile (8 bits; counts of 16) below which there is no contrast."""
+"""Levels between the 1st and 99th percentile (8 bits; counts of 16) below which there is no
+contrast.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,8 +40,8 @@ class Usable:
 
 
 def usable(picture: Picture) -> Usable:
-    """Brightness and valid part of a picture. A black or white frame, as rotated pictures have, is no
-    picture: its edges would be taken for structure and its shape would betray the rotation.
+    """Brightness and valid part of a picture. A black or white frame, as rotated pictures have, is
+    no picture: its edges would be taken for structure and its shape would betray the rotation.
     """
     band = _one_band(picture.values)
     finite = np.isfinite(band)
@@ -47,12 +51,12 @@ def usable(picture: Picture) -> Usable:
     return Usable(grey=grey, valid=valid, reason=_reason(grey, valid))
 
 
-def _one_band(values: NDArray) -> NDArray[np.float32]:
+def _one_band(values: NDArray[Any]) -> NDArray[np.float32]:
     if values.ndim == 2:
         return values.astype(np.float32)
     if values.shape[2] == 3:
         return np.asarray(cv2.cvtColor(values.astype(np.float32), cv2.COLOR_RGB2GRAY))
-    return values.mean(2, dtype=np.float32)
+    return np.asarray(values.mean(2, dtype=np.float32))
 
 
 def _frame(grey: NDArray[np.float32], given: NDArray[np.bool_], slack: float) -> NDArray[np.bool_]:
@@ -62,7 +66,9 @@ def _frame(grey: NDArray[np.float32], given: NDArray[np.bool_], slack: float) ->
         return frame
     low, high = float(grey[given].min()), float(grey[given].max())
     for end in ((grey <= low + slack) & given, (grey >= high - slack) & given):
-        _count, label, stats, _ = cv2.connectedComponentsWithStats(end.astype(np.uint8), connectivity=4)
+        _count, label, stats, _ = cv2.connectedComponentsWithStats(
+            end.astype(np.uint8), connectivity=4
+        )
         for region in np.unique(np.r_[label[0], label[-1], label[:, 0], label[:, -1]]):
             if region and stats[region, cv2.CC_STAT_AREA] > LEAST_FRAME * grey.size:
                 frame |= label == region

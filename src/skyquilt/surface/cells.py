@@ -1,4 +1,6 @@
-"""Heights of a map that grows: a grid of cells that points of the ground fill, and the surface of any part of it."""
+"""Heights of a map that grows: a grid of cells that points of the ground fill, and the surface of
+any part of it.
+"""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -15,7 +17,8 @@ WEIGHT = 0.4
 
 
 BLOCK = 32
-"""Cells along a side of the blocks that they are kept in: parts of the map are then read as arrays."""
+"""Cells along a side of the blocks that they are kept in: parts of the map are then read as arrays.
+"""
 
 
 @dataclass(kw_only=True)
@@ -78,23 +81,31 @@ class HeightCells:
                         min(c1, C * BLOCK + BLOCK - 1) + 1,
                     )
                     z[row - r0 : end_row - r0, column - c0 : end_column - c0] = held[
-                        row - R * BLOCK : end_row - R * BLOCK, column - C * BLOCK : end_column - C * BLOCK
+                        row - R * BLOCK : end_row - R * BLOCK,
+                        column - C * BLOCK : end_column - C * BLOCK,
                     ]
         return z
 
     def surface(self, bounds: Iterable[float], otherwise: float) -> Surface:
-        """Heights over bounds (west, south, east, north) in m: gaps filled from around, smoothed a little."""
+        """Heights over bounds (west, south, east, north) in m: gaps filled from around, smoothed a
+        little.
+        """
         c0, r0, c1, r1 = self._reach(bounds)
         c0, r0, c1, r1 = c0 - 3, r0 - 3, c1 + 3, r1 + 3
         z = self._part(c0, r0, c1, r1).astype(np.float32)
         return Surface(
-            z=_filled(z, otherwise), x0=(c0 + 0.5) * self.cell, y0=(r0 + 0.5) * self.cell, cell=self.cell,
+            z=_filled(z, otherwise),
+            x0=(c0 + 0.5) * self.cell,
+            y0=(r0 + 0.5) * self.cell,
+            cell=self.cell,
             source="tie points",
-        )  # fmt: skip
+        )
 
 
 def _by_block(cells: Cells) -> Iterator[tuple[tuple[int, int], NDArray[np.bool_], Cells]]:
-    """Each block that some of the cells (k, 2) lie in: which block, which of them, and their columns and rows in it."""
+    """Each block that some of the cells (k, 2) lie in: which block, which of them, and their
+    columns and rows in it.
+    """
     block, inner = np.divmod(cells, BLOCK)
     for column, row in np.unique(block, axis=0).tolist():
         mine = (block == (column, row)).all(1)
@@ -119,7 +130,9 @@ def _filled(z: NDArray[np.float32], otherwise: float) -> NDArray[np.float32]:
     out, settled = np.full(z.shape, np.float32(np.median(z[known]))), np.zeros(z.shape, bool)
     for sigma in (1.0, 2.5, 6.0):
         w = cv2.GaussianBlur(weight, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
-        v = cv2.GaussianBlur(value, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT) / np.maximum(w, 1e-6)
+        v = cv2.GaussianBlur(value, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT) / np.maximum(
+            w, 1e-6
+        )
         now = (w > 0.08) & ~settled
         out[now], settled = v[now], settled | now
     return np.asarray(cv2.medianBlur(out, 3), np.float32)

@@ -1,7 +1,9 @@
-"""Heights above the dominant planes of many pairs, brought to one: the mosaic of disparities [Yahyanejad 2013, 5.2.3].
+"""Heights above the dominant planes of many pairs, brought to one: the mosaic of disparities
+[Yahyanejad 2013, 5.2.3].
 
-Each pair counts from its own dominant plane, and its homography has swallowed the slope of the ground. Where pairs
-show the same ground their heights must agree, so each gets a plane of its own that makes them agree best.
+Each pair counts from its own dominant plane, and its homography has swallowed the slope of the
+ground. Where pairs show the same ground their heights must agree, so each gets a plane of its own
+that makes them agree best.
 """
 
 from collections.abc import Sequence
@@ -18,7 +20,9 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class OnePlane:
-    """Least squares for the height of each cell of the ground and a plane for each pair, outliers down-weighted."""
+    """Least squares for the height of each cell of the ground and a plane for each pair, outliers
+    down-weighted.
+    """
 
     cells: int = 60
     """Cells along the longer side."""
@@ -29,20 +33,26 @@ class OnePlane:
     version: ClassVar[int] = 1
 
     def __call__(self, fields: Sequence[Array]) -> Array:
-        """All points (n, 3), x, y, height in m, of the pairs' own (n_k, 3), without a general slope."""
+        """All points (n, 3), x, y, height in m, of the pairs' own (n_k, 3), without a general
+        slope.
+        """
         xyz = np.concatenate(fields)
         owner = np.repeat(np.arange(len(fields)), [len(f) for f in fields])
         middle, extent = xyz[:, :2].mean(0), max(float(np.ptp(xyz[:, :2], axis=0).max()), 1e-9)
         terms = np.c_[np.ones(len(xyz)), (xyz[:, :2] - middle) / extent]
         z = xyz[:, 2].copy()
         if len(fields) > 1:
-            place = np.floor((xyz[:, :2] - xyz[:, :2].min(0)) / extent * self.cells).astype(np.int64)
+            place = np.floor((xyz[:, :2] - xyz[:, :2].min(0)) / extent * self.cells).astype(
+                np.int64
+            )
             _, cell = np.unique(place @ [self.cells + 1, 1], return_inverse=True)
             z += self._planes(z, terms, owner, cell)
         z -= terms @ np.linalg.lstsq(terms, z, rcond=None)[0]
-        return np.c_[xyz[:, :2], z]
+        return np.asarray(np.c_[xyz[:, :2], z])
 
-    def _planes(self, z: Array, terms: Array, owner: NDArray[np.int64], cell: NDArray[np.int64]) -> Array:
+    def _planes(
+        self, z: Array, terms: Array, owner: NDArray[np.int64], cell: NDArray[np.int64]
+    ) -> Array:
         """Each pair's plane at its points (n,)."""
         row = np.arange(len(z))
         column = 3 * owner[:, None] + np.arange(3)

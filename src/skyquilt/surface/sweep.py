@@ -1,14 +1,15 @@
-"""Heights where tie points are few: a plane sweep over the ground, from the two best views of every place.
+"""Heights where tie points are few: a plane sweep over the ground, from the two best views of every
+place.
 
-The ground is shown twice, by its most vertical view and by the next one that sees it from elsewhere, at many
-heights about the surface known so far; the height at which the two pictures agree is kept. Coarse pictures
-find canopies and roofs, finer ones polish. In the manner of Collins (1996), on a map grid instead of an
-image.
+The ground is shown twice, by its most vertical view and by the next one that sees it from
+elsewhere, at many heights about the surface known so far; the height at which the two pictures
+agree is kept. Coarse pictures find canopies and roofs, finer ones polish. In the manner of Collins
+(1996), on a map grid instead of an image.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -45,7 +46,9 @@ class Sweep:
     """Standard deviation of the final Gaussian in cells."""
     version: ClassVar[int] = 3
 
-    def __call__(self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture) -> Surface:
+    def __call__(
+        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture
+    ) -> Surface:
         """The surface with the heights found; where pictures do not agree it stays as it was."""
         height = float(np.median([v.pose.map_C[2] for v in views]) - np.median(surface.z))
         if len(views) < 2 or height <= 0:
@@ -53,7 +56,12 @@ class Sweep:
         for number, side in enumerate(self.sides):
             gsd = (
                 float(
-                    np.median([height / v.camera.focal * max(v.camera.width, v.camera.height) for v in views])
+                    np.median(
+                        [
+                            height / v.camera.focal * max(v.camera.width, v.camera.height)
+                            for v in views
+                        ]
+                    )
                 )
                 / side
             )
@@ -64,37 +72,70 @@ class Sweep:
         return surface
 
     def _pass(
-        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, side: int, gsd: float,
-        height: float, span: tuple[float, float], *, relative: bool,
-    ) -> Surface:  # fmt: skip
+        self,
+        surface: Surface,
+        views: Sequence[View],
+        grid: Grid,
+        grey: GreyPicture,
+        side: int,
+        gsd: float,
+        height: float,
+        span: tuple[float, float],
+        *,
+        relative: bool,
+    ) -> Surface:
         """One pass; `span` in m, or in steps of about one pixel of disparity when `relative`."""
-        work, z, trust = self.searched(surface, views, grid, grey, side, gsd, height, span, relative=relative)
+        work, z, trust = self.searched(
+            surface, views, grid, grey, side, gsd, height, span, relative=relative
+        )
         return self._fused(surface, work, z, trust)
 
     def searched(
-        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, side: int, gsd: float,
-        height: float, span: tuple[float, float], *, relative: bool,
-    ) -> tuple[Grid, Float, Float]:  # fmt: skip
-        """A grid of cells of gsd m, the heights on it (h, w) in m, and how far two pictures agree there (h, w), 0 where
-        they do not. Pictures are `side` px long, cameras `height` m above ground; `span` as in a pass.
+        self,
+        surface: Surface,
+        views: Sequence[View],
+        grid: Grid,
+        grey: GreyPicture,
+        side: int,
+        gsd: float,
+        height: float,
+        span: tuple[float, float],
+        *,
+        relative: bool,
+    ) -> tuple[Grid, Float, Float]:
+        """A grid of cells of gsd m, the heights on it (h, w) in m, and how far two pictures agree
+        there (h, w), 0 where they do not. Pictures are `side` px long, cameras `height` m above
+        ground; `span` as in a pass.
         """
         w, s, e, n = grid.bounds
-        work = Grid(west=w, north=n, gsd=gsd, width=int((e - w) / gsd) + 1, height=int((n - s) / gsd) + 1)
+        work = Grid(
+            west=w, north=n, gsd=gsd, width=int((e - w) / gsd) + 1, height=int((n - s) / gsd) + 1
+        )
         z = np.zeros((work.height, work.width), np.float32)
         trust = np.zeros_like(z)
         for row in range(0, work.height, TILE):
             for column in range(0, work.width, TILE):
-                piece = self._piece(surface, views, work, grey, side, height, span, relative, row, column)
+                piece = self._piece(
+                    surface, views, work, grey, side, height, span, relative, row, column
+                )
                 h, c = min(TILE, work.height - row), min(TILE, work.width - column)
                 inner = (slice(row, row + h), slice(column, column + c))
                 z[inner], trust[inner] = piece[0][:h, :c], piece[1][:h, :c]
         return work, z, trust
 
     def _piece(
-        self, surface: Surface, views: Sequence[View], work: Grid, grey: GreyPicture, side: int,
+        self,
+        surface: Surface,
+        views: Sequence[View],
+        work: Grid,
+        grey: GreyPicture,
+        side: int,
         height: float,
-        span: tuple[float, float], relative: bool, row: int, column: int,
-    ) -> tuple[Float, Float]:  # fmt: skip
+        span: tuple[float, float],
+        relative: bool,
+        row: int,
+        column: int,
+    ) -> tuple[Float, Float]:
         """Heights and trust (TILE, TILE) of a piece."""
         full = TILE + 2 * MARGIN
         cells = np.arange(-1, full // STEP + 1) + 0.5
@@ -120,7 +161,9 @@ class Sweep:
         return start[inner, inner] + best, np.where(trust > self.agree, trust, 0).astype(np.float32)
 
     def _fused(self, surface: Surface, work: Grid, z: Float, trust: Float) -> Surface:
-        """Medians of believed heights in cells of four pixels; gaps keep the surface known so far."""
+        """Medians of believed heights in cells of four pixels; gaps keep the surface known so
+        far.
+        """
         cell = 4
         rows, columns = -(-work.height // cell), -(-work.width // cell)
         coarse = work.coarser(cell)
@@ -128,7 +171,10 @@ class Sweep:
         known = surface.at(gx, gy)
         pad = ((0, rows * cell - work.height), (0, columns * cell - work.width))
         blocks = [
-            np.pad(a, pad).reshape(rows, cell, columns, cell).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
+            np.pad(a, pad)
+            .reshape(rows, cell, columns, cell)
+            .transpose(0, 2, 1, 3)
+            .reshape(rows, columns, -1)
             for a in (z, trust)
         ]
         believed = np.where(blocks[1] > 0, blocks[0], np.nan)
@@ -143,7 +189,11 @@ class Sweep:
         smooth = cv2.GaussianBlur(value * weight, (0, 0), spread) / total
         x0, y0 = float(coarse.x(np.array(0))), float(coarse.y(np.array(rows - 1)))
         return Surface(
-            z=np.ascontiguousarray(smooth[::-1]), x0=x0, y0=y0, cell=coarse.gsd, source="tie points and sweep"
+            z=np.ascontiguousarray(smooth[::-1]),
+            x0=x0,
+            y0=y0,
+            cell=coarse.gsd,
+            source="tie points and sweep",
         )
 
 
@@ -158,8 +208,8 @@ def _nanmedian(values: Float) -> Float:
 def pair_labels(
     nodes: Sequence[Nodes], gsd: float
 ) -> tuple[NDArray[np.int32] | None, NDArray[np.int32] | None, float]:
-    """Per node the most vertical photo and the most vertical one seen from elsewhere (-1 = none), and the
-    step in m of height that moves one picture against the other by about one pixel of gsd.
+    """Per node the most vertical photo and the most vertical one seen from elsewhere (-1 = none),
+    and the step in m of height that moves one picture against the other by about one pixel of gsd.
     """
     if len(nodes) < 2:
         return None, None, 0.0
@@ -180,11 +230,16 @@ def pair_labels(
 
 
 def _shown(
-    labels: NDArray[np.int32], views: Sequence[View], x: NDArray, y: NDArray, z: NDArray, grey: GreyPicture,
+    labels: NDArray[np.int32],
+    views: Sequence[View],
+    x: NDArray[Any],
+    y: NDArray[Any],
+    z: NDArray[Any],
+    grey: GreyPicture,
     side: int,
-) -> Float:  # fmt: skip
-    """The ground at each of k heights z (k, r + 2, c + 2) as the labelled photos show it, (k, r, c) in pixels
-    instead of nodes; NaN where none does.
+) -> Float:
+    """The ground at each of k heights z (k, r + 2, c + 2) as the labelled photos show it, (k, r, c)
+    in pixels instead of nodes; NaN where none does.
     """
     inner = labels[1:-1, 1:-1]
     out = np.full((len(z), inner.shape[0] * STEP, inner.shape[1] * STEP), np.nan, np.float32)
@@ -202,7 +257,11 @@ def _shown(
             zip((n.u + 0.5) * scale - 0.5, (n.v + 0.5) * scale - 0.5, n.seen, strict=True)
         ):
             warped = cv2.remap(
-                picture, densify(u, h, w), densify(v, h, w), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+                picture,
+                densify(u, h, w),
+                densify(v, h, w),
+                cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_REPLICATE,
             )
             cells = mine & seen[1:-1, 1:-1]
             dense = np.repeat(np.repeat(cells, STEP, 0), STEP, 1)
@@ -212,7 +271,9 @@ def _shown(
 
 
 def _agreement(a: Float, b: Float, window: int) -> Float:
-    """Normalised cross-correlation of two pictures in a sliding window; -1 where either is missing."""
+    """Normalised cross-correlation of two pictures in a sliding window; -1 where either is
+    missing.
+    """
     missing = np.isnan(a) | np.isnan(b)
     whole = not missing.any()
     if not whole:
@@ -237,7 +298,11 @@ def _summit(scores: Float, offsets: Float) -> tuple[Float, Float]:
     inner = np.clip(best, 1, len(offsets) - 2)
     left, mid, right = (np.take_along_axis(scores, (inner + k)[None], 0)[0] for k in (-1, 0, 1))
     curve = left - 2 * mid + right
-    shift = np.where(curve < -1e-4, np.clip(0.5 * (left - right) / np.minimum(curve, -1e-4), -0.5, 0.5), 0)
+    shift = np.where(
+        curve < -1e-4, np.clip(0.5 * (left - right) / np.minimum(curve, -1e-4), -0.5, 0.5), 0
+    )
     step = offsets[1] - offsets[0] if len(offsets) > 1 else np.float32(0)
     at_end = (best == 0) | (best == len(offsets) - 1)
-    return (offsets[best] + shift * step).astype(np.float32), np.where(at_end, 0, top).astype(np.float32)
+    return (offsets[best] + shift * step).astype(np.float32), np.where(at_end, 0, top).astype(
+        np.float32
+    )

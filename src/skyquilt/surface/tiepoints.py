@@ -16,18 +16,24 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class FromTiePoints:
-    """Nearest points, their outliers removed, weighted by inverse distance, then smoothed a little."""
+    """Nearest points, their outliers removed, weighted by inverse distance, then smoothed a
+    little.
+    """
 
     neighbours: int = 8
     """Points behind each cell."""
     smoothing_cells: float = 1.2
     """Standard deviation of the final Gaussian in cells."""
     outlier: float = 4.0
-    """Points further than this many robust deviations from their neighbours' median height are dropped."""
+    """Points further than this many robust deviations from their neighbours' median height are
+    dropped.
+    """
     version: ClassVar[int] = 1
 
     def __call__(self, xyz: Array, bounds: tuple[float, float, float, float]) -> Surface:
-        """The surface over bounds (west, south, east, north) in m from points (P, 3) in the map frame."""
+        """The surface over bounds (west, south, east, north) in m from points (P, 3) in the map
+        frame.
+        """
         if len(xyz) < 4:
             return level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
         points = without_outliers(xyz, self.outlier)
@@ -39,13 +45,16 @@ class FromTiePoints:
         z = self._interpolate(points, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2), cell).reshape(
             rows, columns
         )
-        smooth = np.asarray(cv2.GaussianBlur(z.astype(np.float32), (0, 0), self.smoothing_cells), np.float32)
+        smooth = np.asarray(
+            cv2.GaussianBlur(z.astype(np.float32), (0, 0), self.smoothing_cells), np.float32
+        )
         return Surface(z=smooth, x0=bounds[0], y0=bounds[1], cell=cell, source="tie points")
 
     def _interpolate(self, points: Array, at: Array, cell: float) -> Array:
         k = min(self.neighbours, len(points))
         distance, index = nearest(points[:, :2], at, k)
-        # beyond the points, the reach grows with the distance to them: the rim continues the average, not one
+        # beyond the points, the reach grows with the distance to them: the rim continues the
+        # average, not one
         # point
         weight = 1.0 / (distance + 0.5 * cell + 0.5 * distance[:, :1]) ** 2
         return np.asarray((weight * points[index, 2]).sum(1) / weight.sum(1))
@@ -61,7 +70,7 @@ def without_outliers(xyz: Array, limit: float) -> Array:
     median = np.median(around, axis=1)
     spread = 1.48 * np.median(np.abs(around - median[:, None]), axis=1)
     floor = 1.48 * np.median(np.abs(xyz[:, 2] - median)) + 1e-6
-    return xyz[np.abs(xyz[:, 2] - median) < limit * np.maximum(spread, floor)]
+    return np.asarray(xyz[np.abs(xyz[:, 2] - median) < limit * np.maximum(spread, floor)])
 
 
 def grid_spacing(points: Array, bounds: tuple[float, float, float, float]) -> float:

@@ -1,7 +1,9 @@
-"""Direct registration of two pictures by normalised cross-correlation over an image pyramid; no features."""
+"""Direct registration of two pictures by normalised cross-correlation over an image pyramid; no
+features.
+"""
 
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,35 +20,51 @@ _COARSE = 128
 
 
 class Direct(Protocol):
-    """What registers pixels: `Ncc`, `PhaseCorrelation`, `Ecc`, `MutualInformation`. `start` (3, 3) b_H_a or None."""
+    """What registers pixels: `Ncc`, `PhaseCorrelation`, `Ecc`, `MutualInformation`. `start` (3, 3)
+    b_H_a or None.
+    """
 
-    def __call__(self, a: NDArray, b: NDArray, start: Doubles | None = None) -> Registration | NoEstimate:
+    def __call__(
+        self, a: NDArray[Any], b: NDArray[Any], start: Doubles | None = None
+    ) -> Registration | NoEstimate:
         """b_H_a with its score, or why there is none."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ncc:
-    """All shifts (and the turns and scales asked for) in small pictures, then the best refined in larger ones."""
+    """All shifts (and the turns and scales asked for) in small pictures, then the best refined in
+    larger ones.
+    """
 
     turn: float = 0.0
-    """Largest rotation tried, degrees either way from the start; 0 looks for a translation, unless `zoom` is given."""
+    """Largest rotation tried, degrees either way from the start; 0 looks for a translation, unless
+    `zoom` is given.
+    """
     zoom: float = 1.0
     """Largest factor between the scales tried, either way."""
     minimum: float = 0.3
     """Least correlation that is trusted."""
     clear: float = 0.95
-    """Largest share of the best place's correlation that another place may have (at the coarsest level)."""
+    """Largest share of the best place's correlation that another place may have (at the coarsest
+    level).
+    """
     overlap: float = 0.2
     """Least share of a's pixels that lie on b."""
     version: ClassVar[int] = 1
 
-    def __call__(self, a: NDArray, b: NDArray, start: Doubles | None = None) -> Registration | NoEstimate:
-        """b_H_a of two pictures (H, W[, C]), shifts from `start` of any size; or why there is none."""
+    def __call__(
+        self, a: NDArray[Any], b: NDArray[Any], start: Doubles | None = None
+    ) -> Registration | NoEstimate:
+        """b_H_a of two pictures (H, W[, C]), shifts from `start` of any size; or why there is
+        none.
+        """
         a, b = to_grey8(a), to_grey8(b)
         first = np.eye(3) if start is None else start
         factors = levels((*a.shape, *b.shape), coarsest=_COARSE)
-        found = self._everything(reduced(a, factors[0]), reduced(b, factors[0]), at_level(first, factors[0]))
+        found = self._everything(
+            reduced(a, factors[0]), reduced(b, factors[0]), at_level(first, factors[0])
+        )
         if isinstance(found, NoEstimate):
             return found
         similarity = self.turn > 0 or self.zoom > 1
@@ -64,7 +82,7 @@ class Ncc:
         model = "similarity" if similarity else "translation"
         return Registration(model=model, b_H_a=H, score=score, overlap=share, method="NCC")
 
-    def _everything(self, a: NDArray, b: NDArray, start: Doubles) -> Doubles | NoEstimate:
+    def _everything(self, a: NDArray[Any], b: NDArray[Any], start: Doubles) -> Doubles | NoEstimate:
         """The best of all shifts, turns and scales of small pictures, close enough for climbing."""
         best: tuple[float, float, Doubles] = (-1.0, -1.0, start)
         size = (int(2 * max(b.shape)),) * 2
@@ -85,7 +103,9 @@ class Ncc:
         if best[0] < self.minimum:
             return NoEstimate(reason=f"weak peak ({best[0]:.2f} of {self.minimum:g})")
         if best[1] > self.clear * best[0]:
-            return NoEstimate(reason=f"ambiguous (correlations of {best[0]:.2f} and {best[1]:.2f} apart)")
+            return NoEstimate(
+                reason=f"ambiguous (correlations of {best[0]:.2f} and {best[1]:.2f} apart)"
+            )
         return best[2]
 
     def _tried(self, longest: int) -> list[tuple[float, float]]:

@@ -1,4 +1,6 @@
-"""What all estimators share: checked points, and the record of a transformation with its inliers."""
+"""What all estimators share: checked points, and the record of a transformation with its
+inliers.
+"""
 
 from typing import Protocol
 
@@ -13,7 +15,9 @@ Doubles = NDArray[np.float64]
 
 
 class Estimator(Protocol):
-    """What finds a transformation from matches a, b (N, 2) px: `Ransac`, `Lmeds`, `Magsac`, `RansacSte`."""
+    """What finds a transformation from matches a, b (N, 2) px: `Ransac`, `Lmeds`, `Magsac`,
+    `RansacSte`.
+    """
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> Estimate | NoEstimate:
         """b_H_a with its inliers, or why there is none."""
@@ -31,7 +35,9 @@ def matched(a: ArrayLike, b: ArrayLike) -> tuple[Doubles, Doubles]:
 
 
 def too_few(model: str, count: int, minimum: int) -> NoEstimate | None:
-    """Why `count` matches are not enough; None when they are. One more than a model needs can agree at the least."""
+    """Why `count` matches are not enough; None when they are. One more than a model needs can agree
+    at the least.
+    """
     least = max(minimum, MINIMAL[model] + 1)
     return NoEstimate(reason=f"too few matches ({count} of {least})") if count < least else None
 
@@ -46,7 +52,9 @@ def weak(model: str, count: int, total: int, minimum: int) -> NoEstimate | None:
 def polished(
     model: str, H: Doubles, a: Doubles, b: Doubles, limit: float, *, rounds: int = 5
 ) -> tuple[Doubles, NDArray[np.bool_]]:
-    """The model fitted to those with a symmetric transfer error below `limit` px^2, again until they stay; and they."""
+    """The model fitted to those with a symmetric transfer error below `limit` px^2, again until
+    they stay; and they.
+    """
     inliers = symmetric_transfer_errors(H, a, b) < limit
     for _ in range(rounds):
         if inliers.sum() < MINIMAL[model]:

@@ -1,23 +1,40 @@
-"""What estimators that search, then polish, have in common: checks, the search, refusals, the record."""
+"""What estimators that search, then polish, have in common: checks, the search, refusals, the
+record.
+"""
 
 from collections.abc import Callable
+from typing import Any
 
 from numpy.typing import ArrayLike, NDArray
 
 from skyquilt.geometry.transforms import symmetric_transfer_errors
-from skyquilt.twoview.estimate import Doubles, Estimate, NoEstimate, matched, polished, too_few, weak
+from skyquilt.twoview.estimate import (
+    Doubles,
+    Estimate,
+    NoEstimate,
+    matched,
+    polished,
+    too_few,
+    weak,
+)
 from skyquilt.twoview.search import Found
 
 Search = Callable[[Doubles, Doubles], Found | None]
-"""The best model through random samples of matches a, b (N, 2) px; None when no sample determines one."""
-Settle = Callable[[NDArray, Doubles, Doubles], tuple[Doubles, float] | NoEstimate]
-"""b_H_a of a search -> the one to polish, and the largest symmetric transfer error of an inlier in px^2."""
+"""The best model through random samples of matches a, b (N, 2) px; None when no sample determines
+one.
+"""
+Settle = Callable[[NDArray[Any], Doubles, Doubles], tuple[Doubles, float] | NoEstimate]
+"""b_H_a of a search -> the one to polish, and the largest symmetric transfer error of an inlier in
+px^2.
+"""
 
 
 def estimated(
     name: str, model: str, a: ArrayLike, b: ArrayLike, *, minimum: int, find: Search, settle: Settle
 ) -> Estimate | NoEstimate:
-    """b_H_a from matches a, b (N, 2) px by a loss that `find` and `settle` know, or why there is none."""
+    """b_H_a from matches a, b (N, 2) px by a loss that `find` and `settle` know, or why there is
+    none.
+    """
     a, b = matched(a, b)
     if (few := too_few(model, len(a), minimum)) is not None:
         return few
@@ -31,6 +48,11 @@ def estimated(
     if (feeble := weak(model, int(inliers.sum()), len(a), minimum)) is not None:
         return feeble
     return Estimate(
-        model=model, b_H_a=H, inliers=inliers, iterations=found.iterations, capped=found.capped,
-        ste_per_inlier=float(symmetric_transfer_errors(H, a[inliers], b[inliers]).mean()), method=name,
-    )  # fmt: skip
+        model=model,
+        b_H_a=H,
+        inliers=inliers,
+        iterations=found.iterations,
+        capped=found.capped,
+        ste_per_inlier=float(symmetric_transfer_errors(H, a[inliers], b[inliers]).mean()),
+        method=name,
+    )

@@ -23,7 +23,9 @@ _NODES = 200
 
 
 def threshold_px(relief_m: float | None, height_m: float | None) -> int:
-    """(4.9): eps_d in px at a working width of 1500, from the largest height variation and the least altitude."""
+    """(4.9): eps_d in px at a working width of 1500, from the largest height variation and the
+    least altitude.
+    """
     share = SHARE if relief_m is None or height_m is None else relief_m / height_m
     # 50 * 0.1 is a little more than 5 in binary: it is not to become 6
     return max(1, math.ceil(round(50 * share, 9)))
@@ -47,9 +49,9 @@ class LevelledFeatures:
 class Level:
     """Removes inliers whose disparity after the transformation exceeds eps_d, and fits anew.
 
-    A fit to all inliers lies between the ground and what stands on it, so that much of the ground would be removed.
-    Disparities are therefore counted from the dominant plane, as the thesis means them: from a fit whose weights fall
-    with the disparity, the faster the closer it gets.
+    A fit to all inliers lies between the ground and what stands on it, so that much of the ground
+    would be removed. Disparities are therefore counted from the dominant plane, as the thesis means
+    them: from a fit whose weights fall with the disparity, the faster the closer it gets.
     """
 
     relief_m: float | None = None
@@ -57,11 +59,15 @@ class Level:
     height_m: float | None = None
     """Least flight altitude above it, m; where either is None, their quotient is taken as 0.1."""
     width: int = WORKING_WIDTH
-    """Width in px of the images that points are given in; eps_d is for 1500 and shrinks with smaller ones."""
+    """Width in px of the images that points are given in; eps_d is for 1500 and shrinks with
+    smaller ones.
+    """
     version: ClassVar[int] = 1
 
     def __call__(self, a: Doubles, b: Doubles, estimate: Estimate) -> LevelledFeatures:
-        """From the matches a, b (N, 2) px and the estimate from them, whose inliers are looked at."""
+        """From the matches a, b (N, 2) px and the estimate from them, whose inliers are looked
+        at.
+        """
         a, b = a[estimate.inliers], b[estimate.inliers]
         eps = max(1.0, threshold_px(self.relief_m, self.height_m) * self.width / WORKING_WIDTH)
         d = disparities(_dominant(estimate, a, b, eps), a, b)
@@ -69,7 +75,9 @@ class Level:
         model = estimate.model
         fitted = fit(model, a[level], b[level]) if level.sum() > MINIMAL[model] else None
         if fitted is None:
-            return LevelledFeatures(estimate=estimate, d_px=d, level=np.ones(len(d), bool), eps_px=eps)
+            return LevelledFeatures(
+                estimate=estimate, d_px=d, level=np.ones(len(d), bool), eps_px=eps
+            )
         H = refine(model, fitted, a[level], b[level])
         inliers = estimate.inliers.copy()
         inliers[inliers] = level
@@ -79,7 +87,9 @@ class Level:
 
 
 def _dominant(estimate: Estimate, a: Doubles, b: Doubles, eps: float) -> Doubles:
-    """b_H_a of the plane that most points lie on: graduated reweighting (Geman and McClure's) down to half of eps."""
+    """b_H_a of the plane that most points lie on: graduated reweighting (Geman and McClure's) down
+    to half of eps.
+    """
     H = estimate.b_H_a
     d2 = (disparities(H, a, b) ** 2).sum(1)
     scale = max(eps, 2 * math.sqrt(float(d2.max(initial=0.0))))
@@ -94,15 +104,18 @@ def _dominant(estimate: Estimate, a: Doubles, b: Doubles, eps: float) -> Doubles
 
 
 def disparities(b_H_a: Doubles, a: Doubles, b: Doubles) -> Doubles:
-    """(N, 2) px: from where the transformation expects each point of a to where b has it [(4.8)]."""
+    """(N, 2) px: from where the transformation expects each point of a to where b has it
+    [(4.8)].
+    """
     return np.asarray(b - transfer(b_H_a, a))
 
 
 def depth_map(px: Doubles, d_px: Doubles, shape: tuple[int, int]) -> NDArray[np.float32]:
-    """DM (H, W, 3) in [0, 1] of disparities d_px (M, 2) at px (M, 2): red d_x, green |d|, blue d_y [(4.8)].
+    """DM (H, W, 3) in [0, 1] of disparities d_px (M, 2) at px (M, 2): red d_x, green |d|, blue d_y
+    [(4.8)].
 
-    Each is scaled from its least to its largest value, 0.5 where all are alike; between points linearly, outside of
-    them as the nearest. All 0.5 where there is no point.
+    Each is scaled from its least to its largest value, 0.5 where all are alike; between points
+    linearly, outside of them as the nearest. All 0.5 where there is no point.
     """
     from scipy.interpolate import (  # a tenth of a second that few need
         LinearNDInterpolator,
@@ -122,5 +135,7 @@ def depth_map(px: Doubles, d_px: Doubles, shape: tuple[int, int]) -> NDArray[np.
     if len(px) > 3 and np.linalg.matrix_rank(px - px.mean(0), tol=1e-6) == 2:
         inside = LinearNDInterpolator(px, scaled)(*nodes)
         field = np.where(np.isfinite(inside), inside, field)
-    large = cv2.resize(field.astype(np.float32), (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
+    large = cv2.resize(
+        field.astype(np.float32), (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR
+    )
     return np.asarray(np.clip(large, 0, 1), np.float32)

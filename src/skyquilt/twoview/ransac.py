@@ -1,4 +1,6 @@
-"""RANSAC with a fixed threshold (Fischler and Bolles 1981), scored as MSAC (Torr and Zisserman 2000)."""
+"""RANSAC with a fixed threshold (Fischler and Bolles 1981), scored as MSAC (Torr and Zisserman
+2000).
+"""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -34,9 +36,20 @@ class Ransac:
         """b_H_a from matches a, b (N, 2) px, or why there is none."""
         limit = 2 * self.threshold_px**2
         return estimated(
-            "RANSAC", self.model, a, b, minimum=self.minimum, settle=lambda H, a, b: (H, limit),
+            "RANSAC",
+            self.model,
+            a,
+            b,
+            minimum=self.minimum,
+            settle=lambda H, a, b: (H, limit),
             find=lambda a, b: search(
-                self.model, a, b, confidence=self.confidence, cap=self.max_iterations, seed=self.seed,
-                cost=lambda e: np.minimum(e, limit).sum(1), support=lambda e: int((e < limit).sum()),
+                self.model,
+                a,
+                b,
+                confidence=self.confidence,
+                cap=self.max_iterations,
+                seed=self.seed,
+                cost=lambda e: np.minimum(e, limit).sum(1),
+                support=lambda e: int((e < limit).sum()),
             ),
-        )  # fmt: skip
+        )

@@ -1,4 +1,6 @@
-"""Direct registration from a start: phase correlation, ECC, mutual information. One call form with `direct.Ncc`."""
+"""Direct registration from a start: phase correlation, ECC, mutual information. One call form with
+`direct.Ncc`.
+"""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
@@ -20,7 +22,9 @@ Doubles = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class PhaseCorrelation:
-    """Shift, and if asked for rotation and scale, without any start: from the phases of the spectra."""
+    """Shift, and if asked for rotation and scale, without any start: from the phases of the
+    spectra.
+    """
 
     similarity: bool = False
     """Rotation and scale too, from log-polar spectra; else a translation."""
@@ -30,8 +34,12 @@ class PhaseCorrelation:
     """Least share of a's pixels that lie on b."""
     version: ClassVar[int] = 1
 
-    def __call__(self, a: NDArray, b: NDArray, start: Doubles | None = None) -> Registration | NoEstimate:
-        """b_H_a of two pictures (H, W[, C]); `start` is undone first, the rest may be half of the picture."""
+    def __call__(
+        self, a: NDArray[Any], b: NDArray[Any], start: Doubles | None = None
+    ) -> Registration | NoEstimate:
+        """b_H_a of two pictures (H, W[, C]); `start` is undone first, the rest may be half of the
+        picture.
+        """
         a, b = to_grey8(a), to_grey8(b)
         first = np.eye(3) if start is None else start
         turns: list[tuple[float, float]] = [(0.0, 1.0)]
@@ -48,8 +56,12 @@ class PhaseCorrelation:
         model = "similarity" if self.similarity else "translation"
         return Registration(model=model, b_H_a=H, score=response, overlap=share, method="phase")
 
-    def _shifted(self, a: NDArray, b: NDArray, H: Doubles) -> tuple[Doubles, float, float, float]:
-        """(b_H_a, response, correlation, overlap) after two rounds: the second sees what the first brought in."""
+    def _shifted(
+        self, a: NDArray[Any], b: NDArray[Any], H: Doubles
+    ) -> tuple[Doubles, float, float, float]:
+        """(b_H_a, response, correlation, overlap) after two rounds: the second sees what the first
+        brought in.
+        """
         response = 0.0
         for _ in range(2):
             dx, dy, response = phase_shift(a, warped(b, H, a.shape)[0])
@@ -61,7 +73,9 @@ class PhaseCorrelation:
 
 @dataclass(frozen=True, kw_only=True)
 class Ecc:
-    """The enhanced correlation coefficient (Evangelidis and Psarakis 2008), OpenCV's, over a pyramid, from a start."""
+    """The enhanced correlation coefficient (Evangelidis and Psarakis 2008), OpenCV's, over a
+    pyramid, from a start.
+    """
 
     model: Literal["translation", "euclidean", "affine", "homography"] = "homography"
     """What is estimated; a similarity OpenCV has not."""
@@ -70,12 +84,16 @@ class Ecc:
     coarsest: int = 256
     """Longer side in px at which it begins; the start must be right to a few px there."""
     reach: float = 0.2
-    """Farthest that a corner may move from the start, share of the diagonal: beyond it the search has run away."""
+    """Farthest that a corner may move from the start, share of the diagonal: beyond it the search
+    has run away.
+    """
     iterations: int = 60
     """Most per level."""
     version: ClassVar[int] = 1
 
-    def __call__(self, a: NDArray, b: NDArray, start: Doubles | None = None) -> Registration | NoEstimate:
+    def __call__(
+        self, a: NDArray[Any], b: NDArray[Any], start: Doubles | None = None
+    ) -> Registration | NoEstimate:
         """b_H_a of two pictures (H, W[, C]) near `start`, or why there is none."""
         a, b = to_grey8(a), to_grey8(b)
         first = np.eye(3) if start is None else np.asarray(start, np.float64)
@@ -83,7 +101,9 @@ class Ecc:
         for factor in levels((*a.shape, *b.shape), coarsest=self.coarsest):
             small = at_level(H, factor)
             try:
-                score, small = self._level(reduced(a, factor), reduced(b, factor), small / small[2, 2])
+                score, small = self._level(
+                    reduced(a, factor), reduced(b, factor), small / small[2, 2]
+                )
             except cv2.error:  # not one pixel in common, or no convergence
                 return NoEstimate(reason="the pictures do not converge on each other")
             H = at_level(small, 1 / factor)
@@ -91,7 +111,9 @@ class Ecc:
         if not score >= self.minimum:
             return NoEstimate(reason=f"weak peak ({score:.2f} of {self.minimum:g})")
         if not self._near(H, first, a.shape):
-            return NoEstimate(reason=f"moved by more than {self.reach:g} of the diagonal from the start")
+            return NoEstimate(
+                reason=f"moved by more than {self.reach:g} of the diagonal from the start"
+            )
         share = float(warped(b, H, a.shape)[1].mean())
         return Registration(model=self.model, b_H_a=H, score=score, overlap=share, method="ECC")
 
@@ -101,7 +123,7 @@ class Ecc:
         diagonal = np.linalg.norm(np.diff(transfer(start, corners[[0, 3]]), axis=0))
         return bool(moved.max() <= self.reach * diagonal)
 
-    def _level(self, a: NDArray, b: NDArray, H: Doubles) -> tuple[float, Doubles]:
+    def _level(self, a: NDArray[Any], b: NDArray[Any], H: Doubles) -> tuple[float, Doubles]:
         kind = getattr(cv2, f"MOTION_{self.model.upper()}")
         rows = 3 if self.model == "homography" else 2
         stop: Any = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, self.iterations, 1e-6)
@@ -112,7 +134,9 @@ class Ecc:
 
 @dataclass(frozen=True, kw_only=True)
 class MutualInformation:
-    """Refinement where grey values of one picture say nothing about those of the other but where: two spectra, say."""
+    """Refinement where grey values of one picture say nothing about those of the other but where:
+    two spectra, say.
+    """
 
     similarity: bool = True
     """Rotation and scale too; else a translation."""
@@ -128,15 +152,22 @@ class MutualInformation:
     """Reduction at which it ends."""
     version: ClassVar[int] = 1
 
-    def __call__(self, a: NDArray, b: NDArray, start: Doubles | None = None) -> Registration | NoEstimate:
+    def __call__(
+        self, a: NDArray[Any], b: NDArray[Any], start: Doubles | None = None
+    ) -> Registration | NoEstimate:
         """b_H_a of two pictures (H, W[, C]) near `start`, or why there is none."""
         a, b = to_grey8(a), to_grey8(b)
         first = np.eye(3) if start is None else start
         factors = levels((*a.shape, *b.shape), coarsest=self.coarsest, finest=self.finest)
         H, score, share = climb(
-            lambda x, y, m: mutual_information(x, y, m, bins=self.bins), a, b, first,
-            similarity=self.similarity, overlap=self.overlap, factors=factors,
-        )  # fmt: skip
+            lambda x, y, m: mutual_information(x, y, m, bins=self.bins),
+            a,
+            b,
+            first,
+            similarity=self.similarity,
+            overlap=self.overlap,
+            factors=factors,
+        )
         if score < self.minimum:
             return NoEstimate(reason=f"weak peak ({score:.3f} of {self.minimum:g})")
         model = "similarity" if self.similarity else "translation"

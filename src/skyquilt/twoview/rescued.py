@@ -10,10 +10,12 @@ from skyquilt.twoview.estimate import Estimate, Estimator, NoEstimate
 
 @dataclass(frozen=True, kw_only=True)
 class Rescued:
-    """The first estimate where it is one; where its error per inlier is beyond any registration's, the second.
+    """The first estimate where it is one; where its error per inlier is beyond any registration's,
+    the second.
 
-    A's threshold grows with the outliers (A 9). Where more than a few of the matches are wrong, in forest say, nearly
-    all become inliers of a model that fits none, at 10^5 px^2 an inlier. That much is no accuracy worth keeping.
+    A's threshold grows with the outliers (A 9). Where more than a few of the matches are wrong, in
+    forest say, nearly all become inliers of a model that fits none, at 10^5 px^2 an inlier. That
+    much is no accuracy worth keeping.
     """
 
     first: Estimator
@@ -30,4 +32,10 @@ class Rescued:
         if isinstance(found, Estimate) and found.ste_per_inlier <= self.hopeless_px2:
             return found
         other = self.second(a, b)
-        return other if isinstance(other, Estimate) else found if isinstance(found, NoEstimate) else other
+        return (
+            other
+            if isinstance(other, Estimate)
+            else found
+            if isinstance(found, NoEstimate)
+            else other
+        )

@@ -38,8 +38,8 @@ def samples(rng: np.random.Generator, total: int, size: int, count: int) -> NDAr
 
 
 def needed(confidence: float, share: float, size: int, cap: int) -> int:
-    """Samples until one is free of outliers with that confidence, at most cap + 1 [A (10), its exponent S read as
-    (1 - eps)^s].
+    """Samples until one is free of outliers with that confidence, at most cap + 1 [A (10), its
+    exponent S read as (1 - eps)^s].
     """
     clean = share**size
     if clean >= 1:
@@ -50,13 +50,21 @@ def needed(confidence: float, share: float, size: int, cap: int) -> int:
 
 
 def search(
-    model: str, a: Doubles, b: Doubles, *, cost: Callable[[Doubles], Doubles], support: Callable[[Doubles], int],
-    confidence: float, cap: int, seed: int,
-) -> Found | None:  # fmt: skip
-    """The model through a random minimal sample with the least cost; None when no sample determines one.
+    model: str,
+    a: Doubles,
+    b: Doubles,
+    *,
+    cost: Callable[[Doubles], Doubles],
+    support: Callable[[Doubles], int],
+    confidence: float,
+    cap: int,
+    seed: int,
+) -> Found | None:
+    """The model through a random minimal sample with the least cost; None when no sample determines
+    one.
 
-    `cost` takes symmetric transfer errors (M, N) px^2 to (M,); `support` those of one model (N,) to its number
-    of inliers, which says how many samples are enough. Equal seeds give equal results.
+    `cost` takes symmetric transfer errors (M, N) px^2 to (M,); `support` those of one model (N,) to
+    its number of inliers, which says how many samples are enough. Equal seeds give equal results.
     """
     rng, size = np.random.default_rng(seed), MINIMAL[model]
     best, least, done, wanted, batch = None, np.inf, 0, cap + 1, _FIRST

@@ -1,10 +1,11 @@
-"""RANSAC by the symmetric transfer error per inlier, Arteaga et al. (2019), section 2.5 and figure 8.
+"""RANSAC by the symmetric transfer error per inlier, Arteaga et al. (2019), section 2.5 and figure
+8.
 
-As printed, with five readings: (10) has (1 - eps)^s with s = 4 in the place of its exponent S; the errors are sums
-of squares, so 0.2, 0.5 and t are px^2; the four distant points are those of the two longest of random pairs; a model
-whose error exceeds ten times that of the best so far is skipped (taken literally the reference ratchets upwards);
-RANSAC-2-OPT runs once and four times more. Photos are to be reduced to at most 1500 x 1000 px first: the thresholds
-are those of such.
+As printed, with five readings: (10) has (1 - eps)^s with s = 4 in the place of its exponent S; the
+errors are sums of squares, so 0.2, 0.5 and t are px^2; the four distant points are those of the two
+longest of random pairs; a model whose error exceeds ten times that of the best so far is skipped
+(taken literally the reference ratchets upwards); RANSAC-2-OPT runs once and four times more. Photos
+are to be reduced to at most 1500 x 1000 px first: the thresholds are those of such.
 """
 
 from dataclasses import dataclass, replace
@@ -48,13 +49,16 @@ class RansacSte:
     model: Model = "homography"
     """A's is the homography; the others are tried in the same way."""
     threshold_px2: float | None = None
-    """Largest symmetric transfer error of an inlier in px^2. None is (9), t = sqrt(5.99) sigma over all matches, which
-    grows with the outliers themselves; a number is an extension of ours that keeps it from that.
+    """Largest symmetric transfer error of an inlier in px^2. None is (9), t = sqrt(5.99) sigma over
+    all matches, which grows with the outliers themselves; a number is an extension of ours that
+    keeps it from that.
     """
     confidence: float = 0.99
     """p_o, that one sample was free of outliers."""
     max_iterations: int = 1000
-    """Cap of the samples of one RANSAC-2; those of RANSAC-1, each refined over all matches, are capped at a tenth."""
+    """Cap of the samples of one RANSAC-2; those of RANSAC-1, each refined over all matches, are
+    capped at a tenth.
+    """
     minimum: int = 8
     """Fewest inliers of an estimate."""
     seed: int = 0
@@ -78,7 +82,9 @@ class RansacSte:
                 break
             spent, capped = spent + found.iterations, capped or found.capped
             if found.ste < self.accept_ste and found.count > self.accept_share * len(a):
-                return self._told(replace(found, iterations=spent, capped=capped), a, "RANSAC-1-OPT")
+                return self._told(
+                    replace(found, iterations=spent, capped=capped), a, "RANSAC-1-OPT"
+                )
             if found.ste >= self.retry_ste:
                 break
         return self._second(rng, a, b, spent, capped)
@@ -86,7 +92,9 @@ class RansacSte:
     def _second(
         self, rng: np.random.Generator, a: Doubles, b: Doubles, spent: int, capped: bool
     ) -> Estimate | NoEstimate:
-        """Steps 3 and 4: RANSAC-2-OPT once and four times more, the least error per inlier of all."""
+        """Steps 3 and 4: RANSAC-2-OPT once and four times more, the least error per inlier of
+        all.
+        """
         best: _Reference | None = None
         for _ in range(self.tries):
             found = self._optimised(self._ransac_2(rng, a, b), a, b)
@@ -98,19 +106,28 @@ class RansacSte:
             ):
                 best = found
         if best is None:
-            return NoEstimate(reason=f"weak inliers (fewer than {self.minimum} of {len(a)} matches)")
+            return NoEstimate(
+                reason=f"weak inliers (fewer than {self.minimum} of {len(a)} matches)"
+            )
         return self._told(replace(best, iterations=spent, capped=capped), a, "RANSAC-2-OPT")
 
     def _told(self, found: _Reference, a: Doubles, method: str) -> Estimate | NoEstimate:
         if (feeble := weak(self.model, found.count, len(a), self.minimum)) is not None:
             return feeble
         return Estimate(
-            model=self.model, b_H_a=found.H, inliers=found.inliers, ste_per_inlier=found.ste,
-            iterations=found.iterations, capped=found.capped, method=method,
-        )  # fmt: skip
+            model=self.model,
+            b_H_a=found.H,
+            inliers=found.inliers,
+            ste_per_inlier=found.ste,
+            iterations=found.iterations,
+            capped=found.capped,
+            method=method,
+        )
 
     def _optimised(self, found: _Reference | None, a: Doubles, b: Doubles) -> _Reference | None:
-        """OPT (12), (13): the model refined over its inliers, which stay; `ste` becomes (15), per inlier."""
+        """OPT (12), (13): the model refined over its inliers, which stay; `ste` becomes (15), per
+        inlier.
+        """
         if found is None or found.count < MINIMAL[self.model]:
             return None
         a, b = a[found.inliers], b[found.inliers]
@@ -130,7 +147,9 @@ class RansacSte:
             if new is not None and new.ste <= 10 * least:
                 least = min(least, new.ste)
                 best = new if best is None or new.beats(best) else best
-            wanted = cap + 1 if best is None else needed(self.confidence, best.count / len(a), size, cap)
+            wanted = (
+                cap + 1 if best is None else needed(self.confidence, best.count / len(a), size, cap)
+            )
         return None if best is None else replace(best, iterations=done, capped=done < wanted)
 
     def _ransac_2(self, rng: np.random.Generator, a: Doubles, b: Doubles) -> _Reference | None:
@@ -145,13 +164,19 @@ class RansacSte:
                 done += 1
                 new = self._judged(H, a, b) if np.isfinite(H).all() else None
                 best = new if new is not None and (best is None or new.beats(best)) else best
-                wanted = cap + 1 if best is None else needed(self.confidence, best.count / len(a), size, cap)
+                wanted = (
+                    cap + 1
+                    if best is None
+                    else needed(self.confidence, best.count / len(a), size, cap)
+                )
                 if done >= wanted:
                     break
         return None if best is None else replace(best, iterations=done, capped=done < wanted)
 
     def _judged(self, H: Doubles, a: Doubles, b: Doubles) -> _Reference | None:
-        """Steps iii and iv: errors, the threshold (9), the inliers with the sum and the scatter of their errors."""
+        """Steps iii and iv: errors, the threshold (9), the inliers with the sum and the scatter of
+        their errors.
+        """
         errors = symmetric_transfer_errors(H, a, b)
         if not np.isfinite(errors).all():
             return None
@@ -160,7 +185,10 @@ class RansacSte:
         if not inliers.any():
             return None
         return _Reference(
-            H=H, inliers=inliers, ste=float(errors[inliers].sum()), sigma=float(errors[inliers].std())
+            H=H,
+            inliers=inliers,
+            ste=float(errors[inliers].sum()),
+            sigma=float(errors[inliers].std()),
         )
 
 

@@ -26,11 +26,21 @@ class Verify:
     version: ClassVar[int] = 1
 
     def __call__(
-        self, a: int, b: int, features_a: Features, features_b: Features, matches: Matches, width: int
+        self,
+        a: int,
+        b: int,
+        features_a: Features,
+        features_b: Features,
+        matches: Matches,
+        width: int,
     ) -> Link | RejectedLink:
-        """The link of photos a and b (indices), or why there is none. `width`: image width in px."""
+        """The link of photos a and b (indices), or why there is none. `width`: image width in
+        px.
+        """
         if len(matches) < self.minimum:
-            return RejectedLink(a=a, b=b, reason=f"too few matches ({len(matches)} of {self.minimum})")
+            return RejectedLink(
+                a=a, b=b, reason=f"too few matches ({len(matches)} of {self.minimum})"
+            )
         pa = features_a.px[matches.index_a]
         pb = features_b.px[matches.index_b]
         tolerance = self.similarity_share * width
@@ -42,7 +52,9 @@ class Verify:
         keep = np.flatnonzero(inliers.ravel())
         scale = float(np.hypot(model[0, 0], model[1, 0]))
         if len(keep) < self.minimum:
-            return RejectedLink(a=a, b=b, reason=f"weak inliers ({len(keep)} of {len(matches)} matches)")
+            return RejectedLink(
+                a=a, b=b, reason=f"weak inliers ({len(keep)} of {len(matches)} matches)"
+            )
         if not 1 / self.scale < scale < self.scale:
             return RejectedLink(a=a, b=b, reason=f"implausible scale ({scale:.2f})")
         keep = self._epipolar(pa, pb, keep, max(features_a.scale, features_b.scale))
@@ -50,11 +62,16 @@ class Verify:
             return RejectedLink(a=a, b=b, reason=f"weak inliers after epipolar check ({len(keep)})")
         # image y runs down: conjugate to get the y-up similarity
         return Link(
-            a=a, b=b, index_a=matches.index_a[keep], index_b=matches.index_b[keep],
+            a=a,
+            b=b,
+            index_a=matches.index_a[keep],
+            index_b=matches.index_b[keep],
             b_S_a=complex(model[0, 0], -model[1, 0]),
-        )  # fmt: skip
+        )
 
-    def _epipolar(self, pa: np.ndarray, pb: np.ndarray, keep: np.ndarray, scale: float) -> np.ndarray:
+    def _epipolar(
+        self, pa: np.ndarray, pb: np.ndarray, keep: np.ndarray, scale: float
+    ) -> np.ndarray:
         """Indices of those in `keep` that agree with one epipolar geometry."""
         try:
             _, inliers = cv2.findFundamentalMat(

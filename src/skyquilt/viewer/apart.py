@@ -1,4 +1,6 @@
-"""The viewer in a process of its own: however many look on, they take no turn from the one that places photos."""
+"""The viewer in a process of its own: however many look on, they take no turn from the one that
+places photos.
+"""
 
 import multiprocessing
 import os
@@ -88,7 +90,10 @@ class ServingApart:
         context = multiprocessing.get_context("spawn")
         wire, theirs = context.Pipe()
         process = context.Process(
-            target=_serve, args=(self._parts["socket"], self.asked, theirs, wire), daemon=True, name="viewer"
+            target=_serve,
+            args=(self._parts["socket"], self.asked, theirs, wire),
+            daemon=True,
+            name="viewer",
         )
         process.start()
         theirs.close()
@@ -105,7 +110,10 @@ class ServingApart:
                 return
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._ending.set()
         self._parts["wire"].close()
@@ -131,7 +139,13 @@ def _serve(listening: socket.socket, asked: Asked, wire: Connection, other: Conn
         survey = LiveSurvey(asked.folder, base=asked.base)
         door = Door(asked.folder, asked.settings)
         with (
-            Serving(survey=survey, guard=asked.guard, folder=asked.folder, writer=door, listening=listening),
+            Serving(
+                survey=survey,
+                guard=asked.guard,
+                folder=asked.folder,
+                writer=door,
+                listening=listening,
+            ),
             Publishing(LiveSurvey(asked.folder), asked.folder),
         ):
             wire.send("")

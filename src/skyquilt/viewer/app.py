@@ -1,5 +1,5 @@
-"""The server's addresses. It reads what the mapping has written and hands in what clients send; poses are not its
-business.
+"""The server's addresses. It reads what the mapping has written and hands in what clients send;
+poses are not its business.
 """
 
 from pathlib import Path
@@ -25,8 +25,13 @@ from skyquilt.viewer.wms_service import WmsService
 
 def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) -> FastAPI:
     """The application."""
-    app = FastAPI(title="Skyquilt", version=__version__, docs_url=None, redoc_url=None,
-                  description="A map that grows while drones fly: tiles, WMS, photos, layers, news.")  # fmt: skip
+    app = FastAPI(
+        title="Skyquilt",
+        version=__version__,
+        docs_url=None,
+        redoc_url=None,
+        description="A map that grows while drones fly: tiles, WMS, photos, layers, news.",
+    )
     gate, images = Gate(survey, guard, writer, folder), Images(survey)
     maps, wms, listed = Maps(gate, images), WmsService(gate, images), PhotoList(gate)
     received, layers, news = Receiving(gate), Overlays(gate), Listening(gate)
@@ -34,21 +39,26 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
 
     get, post = {"methods": ["GET"]}, {"methods": ["POST"]}
     for path, work, options in (
-        ("/", maps.page, {**get, "include_in_schema": False}), ("/info", maps.info, get),
+        ("/", maps.page, {**get, "include_in_schema": False}),
+        ("/info", maps.info, get),
         ("/tiles/{z}/{x}/{y}", maps.tile, {**get, "response_class": Response}),
-        ("/tiles.json", maps.tilejson, get), ("/wms", wms.wms, {**get, "response_class": Response}),
+        ("/tiles.json", maps.tilejson, get),
+        ("/wms", wms.wms, {**get, "response_class": Response}),
         ("/export", maps.export, {**get, "response_class": FileResponse}),
-        ("/photos", listed.photos, get), ("/photos", received.upload, post),
+        ("/photos", listed.photos, get),
+        ("/photos", received.upload, post),
         ("/photos/uploads", received.upload_begin, post),
         ("/photos/uploads/{number}", received.upload_state, {"methods": ["HEAD"]}),
         ("/photos/uploads/{number}", received.upload_part, {"methods": ["PATCH"]}),
         ("/photos/{number}", listed.photo, get),
         ("/photos/{number}/file", listed.photo_file, {**get, "response_class": FileResponse}),
-        ("/layers", layers.layer_list, get), ("/layers", layers.layer_post, post),
+        ("/layers", layers.layer_list, get),
+        ("/layers", layers.layer_post, post),
         ("/layers/{name}", layers.layer_get, {**get, "response_class": Response}),
         ("/layers/{name}", layers.layer_delete, {"methods": ["DELETE"]}),
-        ("/events", news.events, {**get, "response_class": StreamingResponse}), ("/finish", layers.finish, post),
-    ):  # fmt: skip
+        ("/events", news.events, {**get, "response_class": StreamingResponse}),
+        ("/finish", layers.finish, post),
+    ):
         app.add_api_route(path, work, **options)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     app.add_middleware(Guarded, guard=guard)

@@ -13,7 +13,8 @@ MOST_PIXELS = 60_000_000
 
 
 def write_cog(source: MapSource, bounds: Bounds, path: Path, gsd: float) -> Part | None:
-    """Writes bounds (map projection), at `gsd` m or coarser where that would be too large; None where nothing is.
+    """Writes bounds (map projection), at `gsd` m or coarser where that would be too large; None
+    where nothing is.
 
     The file appears whole or not at all.
     """
@@ -27,10 +28,27 @@ def write_cog(source: MapSource, bounds: Bounds, path: Path, gsd: float) -> Part
     pixels, shown = part.pixels[r0:r1, c0:c1], part.shown[r0:r1, c0:c1]
     measured = pixels.dtype != np.uint8
     spec = RasterSpec(
-        width=pixels.shape[1], height=pixels.shape[0], bands=pixels.shape[2], dtype=pixels.dtype.name,
-        transform=(part.gsd, 0, part.west + c0 * part.gsd, 0, -part.gsd, part.north - r0 * part.gsd), crs=source.crs,
-        nodata=float("nan") if measured else None, compress="deflate" if measured else "jpeg", mask=not measured,
-    )  # fmt: skip
-    write_array(path, np.ascontiguousarray(np.where(shown[..., None], pixels, np.nan) if measured else pixels),
-                spec, None if measured else np.ascontiguousarray(shown))  # fmt: skip
+        width=pixels.shape[1],
+        height=pixels.shape[0],
+        bands=pixels.shape[2],
+        dtype=pixels.dtype.name,
+        transform=(
+            part.gsd,
+            0,
+            part.west + c0 * part.gsd,
+            0,
+            -part.gsd,
+            part.north - r0 * part.gsd,
+        ),
+        crs=source.crs,
+        nodata=float("nan") if measured else None,
+        compress="deflate" if measured else "jpeg",
+        mask=not measured,
+    )
+    write_array(
+        path,
+        np.ascontiguousarray(np.where(shown[..., None], pixels, np.nan) if measured else pixels),
+        spec,
+        None if measured else np.ascontiguousarray(shown),
+    )
     return part

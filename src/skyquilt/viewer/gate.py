@@ -24,7 +24,9 @@ class Gate:
 
     def __init__(self, survey: Survey, guard: Guard, writer: Writer | None, folder: Path) -> None:
         self.survey, self.guard, self.writer = survey, guard, writer
-        self.uploads = Uploads(folder / "uploads", most=guard.most_uploads) if writer is not None else None
+        self.uploads = (
+            Uploads(folder / "uploads", most=guard.most_uploads) if writer is not None else None
+        )
 
     def layer(self, name: str | None) -> str:
         """The layer of a name, or the first one."""
@@ -33,14 +35,17 @@ class Gate:
             return next(iter(known))
         if name not in known:
             raise HTTPException(
-                404, f"there is no layer {str(name)[:60]!r}; there are {', '.join(known) or 'none yet'}"
+                404,
+                f"there is no layer {str(name)[:60]!r}; there are {', '.join(known) or 'none yet'}",
             )
         return str(name)
 
     def writing(self, request: Request) -> tuple[Writer, Uploads]:
         """Whether a request may write."""
         if self.writer is None or self.uploads is None:
-            raise HTTPException(405, "this survey is only looked at; 'skyquilt live' takes photos and layers")
+            raise HTTPException(
+                405, "this survey is only looked at; 'skyquilt live' takes photos and layers"
+            )
         given = request.headers.get("authorization") or request.headers.get("x-token")
         if not self.guard.admits(given):
             raise HTTPException(

@@ -15,7 +15,9 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-"""Sent with every answer. Scripts come from this server only; a base map's pictures may come from elsewhere."""
+"""Sent with every answer. Scripts come from this server only; a base map's pictures may come from
+elsewhere.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,24 +38,31 @@ class Guard:
     def __post_init__(self) -> None:
         if self.token is None and not local(self.host):
             raise UsageError(
-                f"--host {self.host} can be reached from other machines, and nothing protects the map against"
+                f"--host {self.host} can be reached from other machines, and nothing protects the"
+                " map against"
                 " writing; add --token with a secret, or listen on 127.0.0.1"
             )
         if self.token is not None and len(self.token) < 8:
             raise UsageError(f"--token has {len(self.token)} characters; take at least 8")
 
     def admits(self, given: str | None) -> bool:
-        """Whether a request may write: its `Authorization: Bearer ...` or `X-Token` holds the token."""
+        """Whether a request may write: its `Authorization: Bearer ...` or `X-Token` holds the
+        token.
+        """
         if self.token is None:
             return True
         said = (given or "").removeprefix("Bearer ").strip()
         return hmac.compare_digest(said.encode(), self.token.encode())
 
     def knows(self, host_header: str) -> bool:
-        """Whether a request was meant for this server: names that others let point here are refused (DNS rebinding)."""
+        """Whether a request was meant for this server: names that others let point here are refused
+        (DNS rebinding).
+        """
         if self.token is not None or not local(self.host):
             return True
-        return local(host_header.rsplit(":", 1)[0] if not host_header.endswith("]") else host_header)
+        return local(
+            host_header.rsplit(":", 1)[0] if not host_header.endswith("]") else host_header
+        )
 
 
 def local(host: str) -> bool:

@@ -68,7 +68,9 @@ class Images:
         self._scales: dict[str, tuple[int, tuple[float, float]]] = {}
 
     def kept(self, layer: str, z: int, x: int, y: int) -> WebTile | None:
-        """A web tile that is at hand and shows the map as it is; None where it would have to be drawn."""
+        """A web tile that is at hand and shows the map as it is; None where it would have to be
+        drawn.
+        """
         self._forget_changed()
         key = (layer, z, x, y)
         with self._lock:
@@ -82,7 +84,9 @@ class Images:
             return found
         before = self._known
         source = self.survey.layers()[layer]
-        rgba = picture(source, "EPSG:3857", mercator(z, x, y), TILE, TILE, self.scale(layer, source))
+        rgba = picture(
+            source, "EPSG:3857", mercator(z, x, y), TILE, TILE, self.scale(layer, source)
+        )
         made = WebTile(data=None if rgba is None else image_bytes(rgba, "image/webp"))
         with self._lock:
             if self._known == before:  # else it may have changed while it was drawn
@@ -92,7 +96,9 @@ class Images:
         return made
 
     def scale(self, layer: str, source: MapSource) -> tuple[float, float] | None:
-        """Values shown as black and as white: the 2nd and 98th percentile of a measured layer, renewed as it grows."""
+        """Values shown as black and as white: the 2nd and 98th percentile of a measured layer,
+        renewed as it grows.
+        """
         if not layer.startswith("thermal") and layer not in ("mosaic", "finished"):
             return None
         version = self.survey.version()

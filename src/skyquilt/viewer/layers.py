@@ -1,4 +1,6 @@
-"""GeoJSON layers over the map: detections, tracks, restricted areas, planned routes [methods D7]."""
+"""GeoJSON layers over the map: detections, tracks, restricted areas, planned routes [methods
+D7].
+"""
 
 import json
 import time
@@ -21,7 +23,9 @@ def checked(data: bytes) -> dict[str, Any]:
         LayerError: it is none.
     """
     try:
-        found = json.loads(data, parse_constant=lambda name: _no(f"it holds {name}, which is no number"))
+        found = json.loads(
+            data, parse_constant=lambda name: _no(f"it holds {name}, which is no number")
+        )
     except LayerError:
         raise
     except (ValueError, RecursionError) as error:
@@ -36,9 +40,13 @@ def checked(data: bytes) -> dict[str, Any]:
     features = found.get("features")
     if found.get("type") != "FeatureCollection" or not isinstance(features, list):
         raise LayerError(
-            f"it is of type {str(kind)[:40]!r}; a FeatureCollection, a Feature or a geometry is needed"
+            f"it is of type {str(kind)[:40]!r}; a FeatureCollection, a Feature or a geometry is"
+            " needed"
         )
-    return {"type": "FeatureCollection", "features": [_feature(f, k) for k, f in enumerate(features)]}
+    return {
+        "type": "FeatureCollection",
+        "features": [_feature(f, k) for k, f in enumerate(features)],
+    }
 
 
 def _no(text: str) -> None:
@@ -52,9 +60,10 @@ def _feature(feature: Any, k: int) -> dict[str, Any]:
     _places(geometry.get("coordinates"), k, 0)
     properties = feature.get("properties")
     return {
-        "type": "Feature", "properties": properties if isinstance(properties, dict) else {},
+        "type": "Feature",
+        "properties": properties if isinstance(properties, dict) else {},
         "geometry": {"type": geometry["type"], "coordinates": geometry["coordinates"]},
-    }  # fmt: skip
+    }
 
 
 def _places(value: Any, k: int, depth: int) -> None:
@@ -76,7 +85,9 @@ def put_layer(ledger: Ledger, name: str, layer: dict[str, Any], most: int) -> bo
         count = ledger.row("select count(*) from layer where name != ?", name)
         if count is not None and count[0] >= most:
             return False
-        db.execute("insert or replace into layer values (?, ?, ?)", (name, json.dumps(layer), time.time()))
+        db.execute(
+            "insert or replace into layer values (?, ?, ?)", (name, json.dumps(layer), time.time())
+        )
         ledger.tell("layer", {"name": name, "features": len(layer["features"])})
     return True
 

@@ -27,19 +27,32 @@ class Listening:
         self.ending = threading.Event()
 
     async def events(self, request: Request, after: int | None = None) -> StreamingResponse:
-        """Server-sent events: photo, tiles, layer, note, refused, finish; `Last-Event-ID` or `after` take them up."""
+        """Server-sent events: photo, tiles, layer, note, refused, finish; `Last-Event-ID` or
+        `after` take them up.
+        """
         said = request.headers.get("last-event-id", "")
-        start = int(said) if said.isdigit() else after if after is not None else self.gate.survey.version()
+        start = (
+            int(said)
+            if said.isdigit()
+            else after
+            if after is not None
+            else self.gate.survey.version()
+        )
         return StreamingResponse(
-            self._news(request, start), media_type="text/event-stream",
+            self._news(request, start),
+            media_type="text/event-stream",
             headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
-        )  # fmt: skip
+        )
 
     async def _news(self, request: Request, last: int) -> AsyncIterator[str]:
         yield f": skyquilt {__version__}\nretry: 1000\n\n"
         quiet = 0.0
         while not self.ending.is_set() and not await request.is_disconnected():
-            told = self.gate.survey.ledger.told(last) if isinstance(self.gate.survey, LiveSurvey) else []
+            told = (
+                self.gate.survey.ledger.told(last)
+                if isinstance(self.gate.survey, LiveSurvey)
+                else []
+            )
             for number, kind, body in told:
                 yield f"id: {number}\nevent: {kind}\ndata: {body}\n\n"
                 last = number

@@ -38,16 +38,36 @@ class Maps:
         found = []
         for name, source in self.gate.survey.layers().items():
             bounds = source.bounds()
-            box = None if bounds is None else between(source.crs, "EPSG:4326").transform_bounds(*bounds)
+            box = (
+                None
+                if bounds is None
+                else between(source.crs, "EPSG:4326").transform_bounds(*bounds)
+            )
             found.append({"name": name, "crs": source.crs, "bounds": box})
-        counts = self.gate.survey.ledger.counts() if isinstance(self.gate.survey, LiveSurvey) else {}
-        finish = self.gate.survey.ledger.meta("finish") if isinstance(self.gate.survey, LiveSurvey) else None
-        return {"layers": found, "growing": self.gate.survey.growing and self.gate.writer is not None, "counts": counts,
-                "event": self.gate.survey.version(), "version": __version__, "token": self.gate.guard.token is not None,
-                "finish": finish}  # fmt: skip
+        counts = (
+            self.gate.survey.ledger.counts() if isinstance(self.gate.survey, LiveSurvey) else {}
+        )
+        finish = (
+            self.gate.survey.ledger.meta("finish")
+            if isinstance(self.gate.survey, LiveSurvey)
+            else None
+        )
+        return {
+            "layers": found,
+            "growing": self.gate.survey.growing and self.gate.writer is not None,
+            "counts": counts,
+            "event": self.gate.survey.version(),
+            "version": __version__,
+            "token": self.gate.guard.token is not None,
+            "finish": finish,
+        }
 
-    async def tile(self, request: Request, z: int, x: int, y: int, layer: str | None = None) -> Response:
-        """A web tile (EPSG:3857, 256 px, WebP); 204 where the map has nothing, 304 where the client has it."""
+    async def tile(
+        self, request: Request, z: int, x: int, y: int, layer: str | None = None
+    ) -> Response:
+        """A web tile (EPSG:3857, 256 px, WebP); 204 where the map has nothing, 304 where the client
+        has it.
+        """
         name = self.gate.layer(layer)
         if not (0 <= z <= 26 and 0 <= x < 2**z and 0 <= y < 2**z):
             raise HTTPException(404, f"there is no tile {z}/{x}/{y}")
@@ -66,13 +86,25 @@ class Maps:
         name = self.gate.layer(layer)
         source = self.gate.survey.layers()[name]
         bounds = source.bounds()
-        box = None if bounds is None else list(between(source.crs, "EPSG:4326").transform_bounds(*bounds))
-        return {"tilejson": "3.0.0", "name": name, "scheme": "xyz", "minzoom": 0, "maxzoom": 24,
-                "tiles": [f"{request.base_url}tiles/{{z}}/{{x}}/{{y}}?layer={name}"],
-                **({"bounds": box} if box else {})}  # fmt: skip
+        box = (
+            None
+            if bounds is None
+            else list(between(source.crs, "EPSG:4326").transform_bounds(*bounds))
+        )
+        return {
+            "tilejson": "3.0.0",
+            "name": name,
+            "scheme": "xyz",
+            "minzoom": 0,
+            "maxzoom": 24,
+            "tiles": [f"{request.base_url}tiles/{{z}}/{{x}}/{{y}}?layer={name}"],
+            **({"bounds": box} if box else {}),
+        }
 
     def export(self, bbox: str, layer: str | None = None) -> FileResponse:
-        """A part of a layer as Cloud Optimized GeoTIFF; `bbox`: west,south,east,north in degrees."""
+        """A part of a layer as Cloud Optimized GeoTIFF; `bbox`: west,south,east,north in
+        degrees.
+        """
         name = self.gate.layer(layer)
         source = self.gate.survey.layers()[name]
         try:
@@ -102,4 +134,6 @@ class Maps:
         if done is None:
             Path(path).unlink(missing_ok=True)
             raise HTTPException(404, "the map has nothing there")
-        return FileResponse(path, media_type="image/tiff", filename="skyquilt-export.tif", background=gone)
+        return FileResponse(
+            path, media_type="image/tiff", filename="skyquilt-export.tif", background=gone
+        )

@@ -42,7 +42,9 @@ class Overlays:
         async for block in request.stream():
             data += block
             if len(data) > self.gate.guard.most_layer_bytes:
-                raise HTTPException(413, f"a layer may have {self.gate.guard.most_layer_bytes} bytes")
+                raise HTTPException(
+                    413, f"a layer may have {self.gate.guard.most_layer_bytes} bytes"
+                )
         try:
             layer = await run_in_threadpool(checked, data)
             stored = await run_in_threadpool(
@@ -53,7 +55,9 @@ class Overlays:
         except OutputError as error:
             raise HTTPException(507, str(error)) from error
         if not stored:
-            raise HTTPException(429, f"there are {self.gate.guard.most_layers} layers already; remove one")
+            raise HTTPException(
+                429, f"there are {self.gate.guard.most_layers} layers already; remove one"
+            )
         return JSONResponse({"name": shown_name(name), "features": len(layer["features"])}, 201)
 
     def layer_delete(self, request: Request, name: str) -> dict[str, str]:
@@ -64,7 +68,9 @@ class Overlays:
         return {"name": name}
 
     def finish(self, request: Request) -> dict[str, str]:
-        """Asks for the final map: all photos adjusted together, drawn at full resolution, kept beside the live one."""
+        """Asks for the final map: all photos adjusted together, drawn at full resolution, kept
+        beside the live one.
+        """
         writer, _ = self.gate.writing(request)
         writer.ledger.put_meta("finish", "asked")
         writer.ledger.tell("finish", {"state": "asked"})

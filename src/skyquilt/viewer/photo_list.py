@@ -20,7 +20,9 @@ class PhotoList:
     def photos(
         self, lon: Degrees | None = None, lat: Annotated[float | None, Query(ge=-90, le=90)] = None
     ) -> dict[str, Any]:
-        """All photos; with `lon` and `lat` in degrees those that cover the point, the most vertical first."""
+        """All photos; with `lon` and `lat` in degrees those that cover the point, the most vertical
+        first.
+        """
         everything = self.gate.survey.photos()
         if lon is not None and lat is not None:
             return {"photos": [p.record for p in covering(everything, lon, lat)]}

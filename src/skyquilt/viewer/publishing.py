@@ -1,4 +1,6 @@
-"""Files of the growing map for programs that open files: `map.mbtiles` and a snapshot, `map.tif`."""
+"""Files of the growing map for programs that open files: `map.mbtiles` and a snapshot,
+`map.tif`.
+"""
 
 import json
 import math
@@ -48,10 +50,13 @@ class Publishing:
             try:
                 self.step()
             except OutputError:
-                continue  # the disk is full: tried again when there is room; the mapping says so to the user
+                # the disk is full: tried again when there is room; the mapping says so to the user
+                continue
 
     def step(self, *, now: bool = False) -> None:
-        """Brings both files up to date; the snapshot not more often than every `SNAPSHOT_S`, unless `now`."""
+        """Brings both files up to date; the snapshot not more often than every `SNAPSHOT_S`, unless
+        `now`.
+        """
         layer = next(iter(self.survey.layers()), None)
         if layer is None or layer in ("finished", "base"):
             return
@@ -106,4 +111,6 @@ class Publishing:
         self, made: list[tuple[int, int, int, bytes | None]], layer: str, bounds: Bounds, top: int
     ) -> None:
         zooms = (max(0, top - ZOOMS + 1), top)
-        write_mbtiles(self.folder / "map.mbtiles", made, name=f"Skyquilt {layer}", bounds=bounds, zooms=zooms)
+        write_mbtiles(
+            self.folder / "map.mbtiles", made, name=f"Skyquilt {layer}", bounds=bounds, zooms=zooms
+        )

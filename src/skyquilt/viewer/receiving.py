@@ -18,14 +18,22 @@ class Receiving:
     def __init__(self, gate: Gate) -> None:
         self.gate = gate
 
-    async def upload(self, request: Request, name: str = "photo", source: str = "upload") -> JSONResponse:
-        """Takes a photo (the body). It answers when the photo is safe: 201, 200 for a duplicate, 422 refused."""
+    async def upload(
+        self, request: Request, name: str = "photo", source: str = "upload"
+    ) -> JSONResponse:
+        """Takes a photo (the body). It answers when the photo is safe: 201, 200 for a duplicate,
+        422 refused.
+        """
         writer, uploads = self.gate.writing(request)
         held = self._begun(uploads, name, source, self._length(request))
         try:
             size = await self._received(request, held.id, writer.intake.inbox.most_bytes)
-            if "content-length" in request.headers and size != int(request.headers["content-length"]):
-                raise HTTPException(400, "the connection was lost before the photo was whole; send it again")
+            if "content-length" in request.headers and size != int(
+                request.headers["content-length"]
+            ):
+                raise HTTPException(
+                    400, "the connection was lost before the photo was whole; send it again"
+                )
             return await run_in_threadpool(self._handed_in, writer.intake, held.id, name, source)
         finally:
             uploads.drop(held.id)
@@ -60,7 +68,9 @@ class Receiving:
                 async for block in request.stream():
                     size += len(block)
                     if size > most:
-                        raise HTTPException(413, f"a photo may have {most} bytes, this one has more")
+                        raise HTTPException(
+                            413, f"a photo may have {most} bytes, this one has more"
+                        )
                     file.write(block)
         except OSError as error:
             raise HTTPException(
@@ -77,7 +87,11 @@ class Receiving:
             raise HTTPException(507, str(error)) from error
         if not isinstance(done, Accepted):
             return JSONResponse({"name": done.name, "state": "refused", "reason": done.reason}, 422)
-        said = {"id": done.id, "name": done.name, "state": "duplicate" if done.duplicate else "received"}
+        said = {
+            "id": done.id,
+            "name": done.name,
+            "state": "duplicate" if done.duplicate else "received",
+        }
         return JSONResponse(said, 200 if done.duplicate else 201)
 
     def upload_begin(
@@ -90,7 +104,9 @@ class Receiving:
                 413, f"a photo may have {writer.intake.inbox.most_bytes} bytes, this one has {size}"
             )
         held = self._begun(uploads, name, source, size)
-        return JSONResponse({"id": held.id, "offset": 0}, 201, {"Location": f"/photos/uploads/{held.id}"})
+        return JSONResponse(
+            {"id": held.id, "offset": 0}, 201, {"Location": f"/photos/uploads/{held.id}"}
+        )
 
     def upload_state(self, request: Request, number: str) -> Response:
         """How far a resumable upload is: header `Upload-Offset`."""
@@ -98,7 +114,9 @@ class Receiving:
         held = uploads.get(number)
         if held is None:
             raise HTTPException(404, "there is no such upload")
-        return Response(headers={"Upload-Offset": str(held.offset), "Upload-Length": str(held.size)})
+        return Response(
+            headers={"Upload-Offset": str(held.offset), "Upload-Length": str(held.size)}
+        )
 
     async def upload_part(self, request: Request, number: str) -> JSONResponse:
         """Appends a part at header `Upload-Offset`; the last one makes it a photo."""
@@ -121,7 +139,11 @@ class Receiving:
                 507, f"the server's disk is full ({error.strerror}); send the rest later"
             ) from error
         if offset < held.size:
-            return JSONResponse({"id": number, "offset": offset}, 200, {"Upload-Offset": str(offset)})
-        answer = await run_in_threadpool(self._handed_in, writer.intake, number, held.name, held.source)
+            return JSONResponse(
+                {"id": number, "offset": offset}, 200, {"Upload-Offset": str(offset)}
+            )
+        answer = await run_in_threadpool(
+            self._handed_in, writer.intake, number, held.name, held.source
+        )
         uploads.drop(number)
         return answer

@@ -69,18 +69,30 @@ class Serving:
         self.port = int(listening.getsockname()[1])
         app = make_app(self.survey, self.guard, self.writer, self.folder)
         config = uvicorn.Config(
-            app, log_level="error", timeout_graceful_shutdown=1, limit_concurrency=1000, server_header=False
+            app,
+            log_level="error",
+            timeout_graceful_shutdown=1,
+            limit_concurrency=1000,
+            server_header=False,
         )
         server = uvicorn.Server(config)
         thread = threading.Thread(
             target=server.run, kwargs={"sockets": [listening]}, daemon=True, name="viewer"
         )
         thread.start()
-        self._parts = {"server": server, "thread": thread, "socket": listening, "ending": app.state.ending}
+        self._parts = {
+            "server": server,
+            "thread": thread,
+            "socket": listening,
+            "ending": app.state.ending,
+        }
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._parts["ending"].set()
         self._parts["server"].should_exit = True

@@ -68,7 +68,8 @@ def open_survey(folder: Path, base: Path | None = None) -> "LiveSurvey | Finishe
     if (folder / "mosaic.tif").is_file():
         return FinishedSurvey(folder, base=base)
     raise UsageError(
-        f"{folder} holds neither a live survey ({NAME}) nor a finished run (mosaic.tif); name the folder given to -o"
+        f"{folder} holds neither a live survey ({NAME}) nor a finished run (mosaic.tif); name the"
+        " folder given to -o"
     )
 
 
@@ -106,7 +107,9 @@ class LiveSurvey:
         found: dict[str, MapSource] = {}
         if frame and gsd:
             x, y = frame["origin"]
-            for layer in sorted(self.tiles.layers(), key=lambda n: (not n.startswith("visible"), n)):
+            for layer in sorted(
+                self.tiles.layers(), key=lambda n: (not n.startswith("visible"), n)
+            ):
                 found[layer] = TileSource(
                     tiles=self.tiles, layer=layer, crs=frame["crs"], origin=(x, y), gsd=gsd
                 )
@@ -117,12 +120,18 @@ class LiveSurvey:
 
     def photos(self) -> list[Shown]:
         """All accepted photos."""
-        query = "select id, name, source, state, reason, footprint, file, received from photo order by id"
+        query = (
+            "select id, name, source, state, reason, footprint, file, received from photo order"
+            " by id"
+        )
         return [self._shown(row) for row in self.ledger.rows(query)]
 
     def photo(self, number: int) -> Shown | None:
         """One accepted photo."""
-        query = "select id, name, source, state, reason, footprint, file, received from photo where id = ?"
+        query = (
+            "select id, name, source, state, reason, footprint, file, received from photo where"
+            " id = ?"
+        )
         row = self.ledger.row(query, number)
         return None if row is None else self._shown(row)
 
@@ -130,15 +139,28 @@ class LiveSurvey:
         number, name, source, state, reason, place, file, received = row
         held = json.loads(place) if place else {}
         ring = tuple((float(a), float(b)) for a, b in held.get("ring", ()))
-        record = {"id": number, "name": name, "source": source, "state": state, "reason": reason,
-                  "at": held.get("at"), "ring": [list(p) for p in ring], "received": received}  # fmt: skip
+        record = {
+            "id": number,
+            "name": name,
+            "source": source,
+            "state": state,
+            "reason": reason,
+            "at": held.get("at"),
+            "ring": [list(p) for p in ring],
+            "received": received,
+        }
         path = self.folder / PHOTOS / file
         return Shown(id=int(number), name=name, state=state, record=record, ring=ring, path=path)
 
     def refused(self) -> list[dict[str, Any]]:
         """Files that were refused, the latest first."""
-        rows = self.ledger.rows("select name, source, reason, at from refused order by id desc limit 200")
-        return [{"name": n, "source": s, "reason": r, "at": a, "state": "refused"} for n, s, r, a in rows]
+        rows = self.ledger.rows(
+            "select name, source, reason, at from refused order by id desc limit 200"
+        )
+        return [
+            {"name": n, "source": s, "reason": r, "at": a, "state": "refused"}
+            for n, s, r, a in rows
+        ]
 
     def version(self) -> int:
         """Number of the newest event."""
@@ -164,28 +186,46 @@ class FinishedSurvey:
         self._photos: list[Shown] = []
         self._source = FileSource(path=folder / "mosaic.tif")
         if not self._source.crs:
-            raise UsageError(f"{folder / 'mosaic.tif'} is not georeferenced; open report.html instead")
+            raise UsageError(
+                f"{folder / 'mosaic.tif'} is not georeferenced; open report.html instead"
+            )
         home = _photo_folder(folder)
         shots = json.loads((folder / "shots.geojson").read_text(encoding="utf-8"))["features"]
         prints = json.loads((folder / "footprints.geojson").read_text(encoding="utf-8"))
-        rings = {f["properties"]["filename"]: f["geometry"]["coordinates"][0] for f in prints["features"]}
+        rings = {
+            f["properties"]["filename"]: f["geometry"]["coordinates"][0] for f in prints["features"]
+        }
         for k, shot in enumerate(shots, 1):
             name = shot["properties"]["filename"]
             self._photos.append(self._shown(k, name, shot, rings.get(name, []), home))
 
-    def _shown(self, k: int, name: str, shot: dict[str, Any], ring: list[Any], home: Path | None) -> Shown:
+    def _shown(
+        self, k: int, name: str, shot: dict[str, Any], ring: list[Any], home: Path | None
+    ) -> Shown:
         x, y = shot["properties"]["translation"][:2]
         lon, lat = between(self._source.crs, "EPSG:4326").transform(x, y)
         corners = np.array(_flat(ring))
         path = home / name if home is not None else None
-        inside = path is not None and home is not None and path.resolve().is_relative_to(home.resolve())
+        inside = (
+            path is not None and home is not None and path.resolve().is_relative_to(home.resolve())
+        )
         ring_ll = tuple((float(a), float(b)) for a, b in corners.reshape(-1, 2))
         return Shown(
-            id=k, name=name, state="refined",
-            record={"id": k, "name": name, "source": shot["properties"]["camera"], "state": "refined", "reason": "",
-                    "at": [lon, lat], "ring": [list(p) for p in ring_ll]},
-            ring=ring_ll, path=path if inside and path is not None and path.is_file() else None,
-        )  # fmt: skip
+            id=k,
+            name=name,
+            state="refined",
+            record={
+                "id": k,
+                "name": name,
+                "source": shot["properties"]["camera"],
+                "state": "refined",
+                "reason": "",
+                "at": [lon, lat],
+                "ring": [list(p) for p in ring_ll],
+            },
+            ring=ring_ll,
+            path=path if inside and path is not None and path.is_file() else None,
+        )
 
     def layers(self) -> dict[str, MapSource]:
         """The mosaic."""
@@ -226,7 +266,9 @@ def _flat(ring: list[Any]) -> list[Any]:
 
 
 def _photo_folder(folder: Path) -> Path | None:
-    """Where the photos of a run lie, as its run.toml says; those of a live survey's final map lie beside it."""
+    """Where the photos of a run lie, as its run.toml says; those of a live survey's final map lie
+    beside it.
+    """
     import tomllib
 
     try:
@@ -239,15 +281,23 @@ def _photo_folder(folder: Path) -> Path | None:
 
 
 def covering(photos: list[Shown], lon: float, lat: float) -> list[Shown]:
-    """Photos whose footprint holds a point, the one that looks down most steeply (nearest centre) first."""
+    """Photos whose footprint holds a point, the one that looks down most steeply (nearest centre)
+    first.
+    """
     found = []
     for photo in photos:
         if photo.state == "superseded" or len(photo.ring) < 3 or photo.record.get("at") is None:
             continue
         ring = np.array(photo.ring)
-        if (ring.min(0) <= (lon, lat)).all() and (ring.max(0) >= (lon, lat)).all() and _holds(ring, lon, lat):
+        if (
+            (ring.min(0) <= (lon, lat)).all()
+            and (ring.max(0) >= (lon, lat)).all()
+            and _holds(ring, lon, lat)
+        ):
             x, y = photo.record["at"]
-            found.append((((x - lon) * np.cos(np.radians(lat))) ** 2 + (y - lat) ** 2, photo.id, photo))
+            found.append(
+                (((x - lon) * np.cos(np.radians(lat))) ** 2 + (y - lat) ** 2, photo.id, photo)
+            )
     return [p for _, _, p in sorted(found, key=lambda f: f[:2])]
 
 

@@ -1,4 +1,6 @@
-"""Uploads that survive a lost connection: parts are appended at the offset that the server knows."""
+"""Uploads that survive a lost connection: parts are appended at the offset that the server
+knows.
+"""
 
 import json
 import os
@@ -61,7 +63,11 @@ class Uploads:
         except (OSError, ValueError):
             return None
         return Upload(
-            id=number, name=record["name"], source=record["source"], size=record["size"], offset=offset
+            id=number,
+            name=record["name"],
+            source=record["source"],
+            size=record["size"],
+            offset=offset,
         )
 
     def path(self, number: str) -> Path:
@@ -69,7 +75,9 @@ class Uploads:
         return self.folder / f"{number}.part"
 
     def append(self, upload: Upload, data: bytes) -> int:
-        """Adds bytes; returns the new offset. OSError where the disk is full: then nothing of them counts."""
+        """Adds bytes; returns the new offset. OSError where the disk is full: then nothing of them
+        counts.
+        """
         path = self.path(upload.id)
         before = path.stat().st_size
         try:

@@ -1,4 +1,6 @@
-"""WMS 1.1.1 and 1.3.0 (OGC 06-042): GetCapabilities, GetMap, GetFeatureInfo; QGIS and Mission Planner are clients."""
+"""WMS 1.1.1 and 1.3.0 (OGC 06-042): GetCapabilities, GetMap, GetFeatureInfo; QGIS and Mission
+Planner are clients.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -55,14 +57,17 @@ def map_request(query: Mapping[str, str], known: Mapping[str, MapSource]) -> Map
     Raises:
         WmsError: they do not fit.
     """
-    version = "1.1.1" if query.get("VERSION", query.get("WMTVER", "1.3.0")).startswith("1.1") else "1.3.0"
+    version = (
+        "1.1.1" if query.get("VERSION", query.get("WMTVER", "1.3.0")).startswith("1.1") else "1.3.0"
+    )
     layers = tuple(n for n in query.get("LAYERS", "").split(",") if n)
     if not layers:
         raise WmsError("LAYERS is missing", "LayerNotDefined")
     for name in layers:
         if name not in known:
             raise WmsError(
-                f"there is no layer {name!r}; there are {', '.join(known) or 'none yet'}", "LayerNotDefined"
+                f"there is no layer {name!r}; there are {', '.join(known) or 'none yet'}",
+                "LayerNotDefined",
             )
     crs = query.get("CRS") or query.get("SRS") or ""
     if crs not in supported(known):
@@ -75,10 +80,15 @@ def map_request(query: Mapping[str, str], known: Mapping[str, MapSource]) -> Map
     if form not in FORMATS:
         raise WmsError(f"FORMAT {form!r} is none of {', '.join(FORMATS)}", "InvalidFormat")
     return MapRequest(
-        version=version, layers=layers, crs="EPSG:4326" if crs == "CRS:84" else crs,
-        bounds=_bounds(query.get("BBOX", ""), crs, version), width=width, height=height, format=form,
+        version=version,
+        layers=layers,
+        crs="EPSG:4326" if crs == "CRS:84" else crs,
+        bounds=_bounds(query.get("BBOX", ""), crs, version),
+        width=width,
+        height=height,
+        format=form,
         transparent=query.get("TRANSPARENT", "FALSE").upper() == "TRUE",
-    )  # fmt: skip
+    )
 
 
 def _whole(query: Mapping[str, str], name: str) -> int:
@@ -119,26 +129,37 @@ def capabilities(known: Mapping[str, MapSource], url: str, version: str) -> str:
     old = version.startswith("1.1")
     crs_tag = "SRS" if old else "CRS"
     layers = "".join(_layer(n, s, known, old=old) for n, s in known.items())
-    crs = "".join(f"<{crs_tag}>{c}</{crs_tag}>" for c in supported(known) if not (old and c == "CRS:84"))
+    crs = "".join(
+        f"<{crs_tag}>{c}</{crs_tag}>" for c in supported(known) if not (old and c == "CRS:84")
+    )
     href = escape(url, {chr(34): "&quot;"})
-    online = f'<OnlineResource xmlns:xlink="http://www.w3.org/1999/xlink" xlink:type="simple" xlink:href="{href}"/>'
+    online = (
+        '<OnlineResource xmlns:xlink="http://www.w3.org/1999/xlink" xlink:type="simple"'
+        f' xlink:href="{href}"/>'
+    )
     get = f"<DCPType><HTTP><Get>{online}</Get></HTTP></DCPType>"
     kind = "application/vnd.ogc.wms_xml" if old else "text/xml"
     formats = "".join(f"<Format>{f}</Format>" for f in FORMATS)
     root, end = (
         ('<WMT_MS_Capabilities version="1.1.1">', "</WMT_MS_Capabilities>")
         if old
-        else ('<WMS_Capabilities version="1.3.0" xmlns="http://www.opengis.net/wms">', "</WMS_Capabilities>")
+        else (
+            '<WMS_Capabilities version="1.3.0" xmlns="http://www.opengis.net/wms">',
+            "</WMS_Capabilities>",
+        )
     )
+    service, problem = ("OGC:WMS", "application/vnd.ogc.se_xml") if old else ("WMS", "XML")
     return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n' + root
-        + f"<Service><Name>{'OGC:WMS' if old else 'WMS'}</Name><Title>Skyquilt</Title>{online}</Service>"
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
+        + root
+        + f"<Service><Name>{service}</Name><Title>Skyquilt</Title>{online}</Service>"
         + f"<Capability><Request><GetCapabilities><Format>{kind}</Format>{get}</GetCapabilities>"
         + f"<GetMap>{formats}{get}</GetMap>"
         + f"<GetFeatureInfo><Format>application/json</Format>{get}</GetFeatureInfo></Request>"
-        + f"<Exception><Format>{'application/vnd.ogc.se_xml' if old else 'XML'}</Format></Exception>"
-        + f"<Layer><Title>Skyquilt</Title>{crs}{layers}</Layer></Capability>" + end
-    )  # fmt: skip
+        + f"<Exception><Format>{problem}</Format></Exception>"
+        + f"<Layer><Title>Skyquilt</Title>{crs}{layers}</Layer></Capability>"
+        + end
+    )
 
 
 def _layer(name: str, source: MapSource, known: Mapping[str, MapSource], *, old: bool) -> str:
@@ -147,7 +168,9 @@ def _layer(name: str, source: MapSource, known: Mapping[str, MapSource], *, old:
     if bounds is not None:
         west, south, east, north = between(source.crs, "EPSG:4326").transform_bounds(*bounds)
         if old:
-            boxes = f'<LatLonBoundingBox minx="{west}" miny="{south}" maxx="{east}" maxy="{north}"/>'
+            boxes = (
+                f'<LatLonBoundingBox minx="{west}" miny="{south}" maxx="{east}" maxy="{north}"/>'
+            )
         else:
             boxes = (
                 f"<EX_GeographicBoundingBox><westBoundLongitude>{west}</westBoundLongitude><eastBoundLongitude>{east}"
@@ -157,12 +180,22 @@ def _layer(name: str, source: MapSource, known: Mapping[str, MapSource], *, old:
         for crs in supported(known):
             if old and crs == "CRS:84":
                 continue
-            box = list(between(source.crs, "EPSG:4326" if crs == "CRS:84" else crs).transform_bounds(*bounds))
+            box = list(
+                between(source.crs, "EPSG:4326" if crs == "CRS:84" else crs).transform_bounds(
+                    *bounds
+                )
+            )
             if not old and crs != "CRS:84" and northing_first(crs):
                 box = [box[1], box[0], box[3], box[2]]
             tag = "SRS" if old else "CRS"
-            boxes += f'<BoundingBox {tag}="{crs}" minx="{box[0]}" miny="{box[1]}" maxx="{box[2]}" maxy="{box[3]}"/>'
-    return f'<Layer queryable="1"><Name>{escape(name)}</Name><Title>{escape(name)}</Title>{boxes}</Layer>'
+            boxes += (
+                f'<BoundingBox {tag}="{crs}" minx="{box[0]}" miny="{box[1]}" maxx="{box[2]}"'
+                f' maxy="{box[3]}"/>'
+            )
+    return (
+        "<Layer"
+        f' queryable="1"><Name>{escape(name)}</Name><Title>{escape(name)}</Title>{boxes}</Layer>'
+    )
 
 
 def refusal(error: WmsError, version: str) -> str:
@@ -174,6 +207,7 @@ def refusal(error: WmsError, version: str) -> str:
         else '<ServiceExceptionReport version="1.3.0" xmlns="http://www.opengis.net/ogc">'
     )
     return (
-        f'<?xml version="1.0" encoding="UTF-8"?>\n{head}<ServiceException code="{error.code}">{escape(str(error))}'
+        f'<?xml version="1.0" encoding="UTF-8"?>\n{head}<ServiceException'
+        f' code="{error.code}">{escape(str(error))}'
         "</ServiceException></ServiceExceptionReport>"
     )

@@ -26,7 +26,9 @@ class WmsService:
             what = query.get("REQUEST", "").lower()
             if what in ("getcapabilities", "capabilities"):
                 kind = "application/vnd.ogc.wms_xml" if version.startswith("1.1") else "text/xml"
-                return Response(capabilities(known, f"{request.base_url}wms?", version), media_type=kind)
+                return Response(
+                    capabilities(known, f"{request.base_url}wms?", version), media_type=kind
+                )
             if what in ("getmap", "map"):
                 return self._map(query, version)
             if what == "getfeatureinfo":
@@ -51,7 +53,9 @@ class WmsService:
             out = rgba if rgba is not None else out
         if out is None:
             out = np.zeros((want.height, want.width, 4), np.uint8)
-        return Response(image_bytes(out, want.format, transparent=want.transparent), media_type=want.format)
+        return Response(
+            image_bytes(out, want.format, transparent=want.transparent), media_type=want.format
+        )
 
     def _feature_info(self, query: dict[str, str]) -> Response:
         want = map_request(query, self.gate.survey.layers())
@@ -64,6 +68,8 @@ class WmsService:
             west + (i + 0.5) / want.width * (east - west),
             north - (j + 0.5) / want.height * (north - south),
         )
-        lon, lat = between(want.crs, "EPSG:4326").transform(x, y) if want.crs != "EPSG:4326" else (x, y)
+        lon, lat = (
+            between(want.crs, "EPSG:4326").transform(x, y) if want.crs != "EPSG:4326" else (x, y)
+        )
         found = [p.record for p in covering(self.gate.survey.photos(), lon, lat)]
         return JSONResponse({"lon": lon, "lat": lat, "photos": found})

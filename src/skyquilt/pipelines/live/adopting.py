@@ -13,18 +13,26 @@ from skyquilt.run.write_points import reached
 
 
 class Adopting:
-    """New poses of a block; what was placed meanwhile follows its neighbours and is settled again."""
+    """New poses of a block; what was placed meanwhile follows its neighbours and is settled
+    again.
+    """
 
     def __init__(self, refining: Refining) -> None:
         self.refining, self.members, self.ledger = refining, refining.members, refining.ledger
-        self.schedule, self.showing, self.queues = refining.schedule, refining.showing, refining.queues
+        self.schedule, self.showing, self.queues = (
+            refining.schedule,
+            refining.showing,
+            refining.queues,
+        )
 
     def adopt(self, done: Closed) -> Update:
         """Takes it over, in one transaction."""
         if not done.poses:
             return self._failed(done.problem)
         before = {i: self.members.by_id[i].pose for i in done.poses}
-        steps = {i: p.map_C - old.map_C for i, p in done.poses.items() if (old := before[i]) is not None}
+        steps = {
+            i: p.map_C - old.map_C for i, p in done.poses.items() if (old := before[i]) is not None
+        }
         since = self._since(done)
         text = f"{len(done.poses)} photos were adjusted together"
         self.schedule.ended()

@@ -1,6 +1,8 @@
-"""Loops closed behind the scenes: a whole block bundled, or a large part of it settled, in a process of its own.
+"""Loops closed behind the scenes: a whole block bundled, or a large part of it settled, in a
+process of its own.
 
-The foreground goes on meanwhile; what it has placed since follows its neighbours when the outcome is taken over.
+The foreground goes on meanwhile; what it has placed since follows its neighbours when the outcome
+is taken over.
 """
 
 import multiprocessing
@@ -40,7 +42,8 @@ class Job:
     ids: tuple[int, ...]
     """Photos, ascending."""
     held: frozenset[int]
-    """Of these, the ones that stay; empty = the block is bundled as a whole, calibration included."""
+    """Of these, the ones that stay; empty = the block is bundled as a whole, calibration included.
+    """
     photos: tuple[Photo, ...]
     """Their files."""
     priors: tuple[Prior, ...]
@@ -91,7 +94,9 @@ def close(job: Job) -> Closed:
             links = _links(job, ledger)
         finally:
             ledger.close()
-        store = Store(folder=job.store, registry={c.__name__: c for c in (Looked, Features, Surface)})
+        store = Store(
+            folder=job.store, registry={c.__name__: c for c in (Looked, Features, Surface)}
+        )
         features = [_features(p, store, job.methods) for p in job.photos]
         return _part(job, links, features) if job.held else _whole(job, links, features, store)
     except (AlignmentError, SkyquiltError, np.linalg.LinAlgError, ValueError) as error:
@@ -99,7 +104,9 @@ def close(job: Job) -> Closed:
 
 
 def _nothing(ids: tuple[int, ...], problem: str) -> Closed:
-    return Closed(ids=ids, poses={}, cameras={}, camera_of={}, xyz=np.zeros((0, 3)), problem=problem)
+    return Closed(
+        ids=ids, poses={}, cameras={}, camera_of={}, xyz=np.zeros((0, 3)), problem=problem
+    )
 
 
 def _features(photo: Photo, store: Store, methods: Methods) -> Features:
@@ -127,9 +134,12 @@ def _whole(job: Job, links: Sequence[Link], features: Sequence[Features], store:
     done = Bundle()(job.photos, job.frame, job.priors, features, links, (), pictures)
     xyz = _swept(done, pictures, job, store) if job.sweep else done.ties.xyz
     return Closed(
-        ids=job.ids, poses={job.ids[k]: p for k, p in done.poses.items()}, cameras=dict(done.cameras),
-        camera_of={job.ids[k]: done.camera_of[k] for k in done.poses}, xyz=xyz,
-    )  # fmt: skip
+        ids=job.ids,
+        poses={job.ids[k]: p for k, p in done.poses.items()},
+        cameras=dict(done.cameras),
+        camera_of={job.ids[k]: done.camera_of[k] for k in done.poses},
+        xyz=xyz,
+    )
 
 
 def _swept(done: Alignment, pictures: Pictures, job: Job, store: Store) -> NDArray[np.float64]:
@@ -161,17 +171,28 @@ def _part(job: Job, links: Sequence[Link], features: Sequence[Features]) -> Clos
     where = {i: k for k, i in enumerate(job.ids)}
     free = next(i for i in job.ids if i not in job.held)
     window = Window(
-        photos=job.photos, priors=job.priors, features=features, links=links,
-        poses={where[i]: p for i, p in job.poses.items()}, cameras=job.cameras,
-        camera_of={where[i]: c for i, c in job.camera_of.items()}, new=where[free],
-        held=frozenset(where[i] for i in job.held), ground=job.ground, sigma_xy=0.0,
-    )  # fmt: skip
+        photos=job.photos,
+        priors=job.priors,
+        features=features,
+        links=links,
+        poses={where[i]: p for i, p in job.poses.items()},
+        cameras=job.cameras,
+        camera_of={where[i]: c for i, c in job.camera_of.items()},
+        new=where[free],
+        held=frozenset(where[i] for i in job.held),
+        ground=job.ground,
+        sigma_xy=0.0,
+    )
     done = Incremental(per_photo=60)(window)
     if not isinstance(done, Settled):
         raise AlignmentError(done.reason)
     moved = {job.ids[k]: p for k, p in done.poses.items()}
     return Closed(
-        ids=job.ids, poses=moved, cameras={}, camera_of={i: job.camera_of[i] for i in moved}, xyz=done.xyz
+        ids=job.ids,
+        poses=moved,
+        cameras={},
+        camera_of={i: job.camera_of[i] for i in moved},
+        xyz=done.xyz,
     )
 
 

@@ -1,4 +1,6 @@
-"""The growing map drawn: a tile is a function of the photos that see it, drawn anew where those look different."""
+"""The growing map drawn: a tile is a function of the photos that see it, drawn anew where those
+look different.
+"""
 
 import os
 from collections import OrderedDict, defaultdict
@@ -33,7 +35,8 @@ MOST_VIEWS = 24
 LEAST_MOVE = 0.6
 """Map pixels by which a photo must have moved to be drawn again."""
 DRAWINGS = 96
-"""Tiles at hand with what they were composed from: where photos change, only their parts are drawn."""
+"""Tiles at hand with what they were composed from: where photos change, only their parts are drawn.
+"""
 THREADS = min(2, os.cpu_count() or 1)
 """Tiles drawn side by side."""
 WHOLE = Window(row=0, column=0, height=SIDE, width=SIDE)
@@ -114,13 +117,21 @@ class Canvas:
         )
         scale = w / camera.width
         small = replace(
-            camera, width=w, height=h, focal=camera.focal * scale, cx=(camera.cx + 0.5) * scale - 0.5,
+            camera,
+            width=w,
+            height=h,
+            focal=camera.focal * scale,
+            cx=(camera.cx + 0.5) * scale - 0.5,
             cy=(camera.cy + 0.5) * scale - 0.5,
-        )  # fmt: skip
+        )
         x, y, z = pose.map_C.tolist()
         reach = 1.5 * abs(z - self.ground)
         outline = footprint(small, pose, self.surface((x - reach, y - reach, x + reach, y + reach)))
-        return View(photo=member.id, camera=small, pose=pose, footprint=outline) if len(outline) else None
+        return (
+            View(photo=member.id, camera=small, pose=pose, footprint=outline)
+            if len(outline)
+            else None
+        )
 
     def surface(self, bounds: Iterable[float]) -> Surface:
         """Heights over bounds in m."""
@@ -159,14 +170,18 @@ class Canvas:
     def draw(self, dirty: Mapping[Address, Collection[int]], rule: str = "") -> list[Address]:
         """Draws tiles of level 0 (addresses of the plain layer) on which these photos have changed.
 
-        A tile stays as it is where none of them shows, before or now. Returns those written; `finish` does the
-        coarser ones.
+        A tile stays as it is where none of them shows, before or now. Returns those written;
+        `finish` does the coarser ones.
         """
         drawn = list(in_order(lambda a: self._drawn(a, dirty[a], rule), list(dirty), jobs=THREADS))
         for at, drawing, _ in drawn:
             self._keep(at, drawing)
         written = [(at, tile) for at, _, tile in drawn if tile is not None]
-        newest = [at for at, _, _ in drawn] if rule else [replace(a, layer=a.layer + NEWEST) for a in dirty]
+        newest = (
+            [at for at, _, _ in drawn]
+            if rule
+            else [replace(a, layer=a.layer + NEWEST) for a in dirty]
+        )
         self.tiles.put(written, owing=() if rule else newest)
         reached("tiles written")
         self._met.update(newest if rule else ())
@@ -176,7 +191,9 @@ class Canvas:
     def _drawn(
         self, address: Address, changed: Collection[int], rule: str
     ) -> tuple[Address, "Drawing | None", Tile | None]:
-        """The tile's address in its own layer, what it was made from, and how it looks; None = as before."""
+        """The tile's address in its own layer, what it was made from, and how it looks; None = as
+        before.
+        """
         at = replace(address, layer=address.layer + rule)
         compose, kept = self._composer(address, RULES[rule]), self._kept.get(at)
         plan = compose.plan(WHOLE, earlier=kept.plan if kept else None) if compose else None
@@ -209,13 +226,19 @@ class Canvas:
         return raised
 
     def owed(self) -> list[Address]:
-        """Tiles (addresses of the plain layer) whose newest-on-top fellows show less than they do."""
+        """Tiles (addresses of the plain layer) whose newest-on-top fellows show less than they
+        do.
+        """
         return [replace(a, layer=a.layer.removesuffix(NEWEST)) for a in self.tiles.owed()]
 
     def _composer(self, address: Address, blend: Blend) -> Composer | None:
         """What a tile is drawn with; None where no photo sees it."""
         grid = address.grid(self.gsd)
-        inside = [v for i in sorted(self._by_tile.get(address, ())) if (v := self._views.get(i)) is not None]
+        inside = [
+            v
+            for i in sorted(self._by_tile.get(address, ()))
+            if (v := self._views.get(i)) is not None
+        ]
         if len(inside) > MOST_VIEWS:
             middle = np.array([grid.west + SIDE * self.gsd / 2, grid.north - SIDE * self.gsd / 2])
             inside.sort(key=lambda v: float(np.hypot(*(v.pose.map_C[:2] - middle))))
@@ -226,10 +249,14 @@ class Canvas:
         rim = 8 * self.heights.cell
         values = measured(self.members[inside[0].photo])
         return Composer(
-            grid=grid, views=inside, surface=self.surface((west - rim, south - rim, east + rim, north + rim)),
-            blend=blend, pixels=self._pictures, bands=1 if values else 3,
+            grid=grid,
+            views=inside,
+            surface=self.surface((west - rim, south - rim, east + rim, north + rim)),
+            blend=blend,
+            pixels=self._pictures,
+            bands=1 if values else 3,
             dtype=np.dtype(np.float32 if values else np.uint8),
-        )  # fmt: skip
+        )
 
     @staticmethod
     def _tile(done: Composed) -> Tile | None:
@@ -240,5 +267,9 @@ class Canvas:
 
     def _empty(self, layer: str) -> Tile:
         thermal = layer.startswith("thermal")
-        pixels = np.zeros((SIDE, SIDE, 1), np.float32) if thermal else np.zeros((SIDE, SIDE, 3), np.uint8)
+        pixels = (
+            np.zeros((SIDE, SIDE, 1), np.float32)
+            if thermal
+            else np.zeros((SIDE, SIDE, 3), np.uint8)
+        )
         return Tile(pixels=pixels, shown=np.zeros((SIDE, SIDE), bool))

@@ -1,4 +1,6 @@
-"""The end of a flight: the batch story on the photos that were accepted, from features that are there already."""
+"""The end of a flight: the batch story on the photos that were accepted, from features that are
+there already.
+"""
 
 import os
 import re
@@ -27,20 +29,26 @@ def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
     ledger = Ledger(folder, write=False)
     try:
         rows = ledger.rows(
-            "select id, name, file from photo where state not in ('superseded', 'refused') order by id"
+            "select id, name, file from photo where state not in ('superseded', 'refused') order by"
+            " id"
         )
     finally:
         ledger.close()
     if not rows:
         raise NoPhotosError(f"{folder} holds no accepted photo; there is nothing to finish")
     paths = named(folder, [(int(i), str(n), str(f)) for i, n, f in rows])
-    wanted = MosaicSettings(features=settings.features, crs=settings.crs, thermal_unit=settings.thermal_unit)
-    # asked for again after more photos have come, the final map is made anew; what was computed before is found
+    wanted = MosaicSettings(
+        features=settings.features, crs=settings.crs, thermal_unit=settings.thermal_unit
+    )
+    # asked for again after more photos have come, the final map is made anew; what was computed
+    # before is found
     yield from iter_mosaic(paths, folder / FINISHED, wanted, overwrite=True)
 
 
 def named(folder: Path, photos: list[tuple[int, str, str]]) -> list[Path]:
-    """Links to accepted photos (number, name, file) whose names are harmless and tell what was sent."""
+    """Links to accepted photos (number, name, file) whose names are harmless and tell what was
+    sent.
+    """
     home = folder / NAMED
     shutil.rmtree(home, ignore_errors=True)
     home.mkdir()

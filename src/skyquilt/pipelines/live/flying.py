@@ -1,4 +1,6 @@
-"""A flight replayed: photos of a simulated or real flight arrive as they would from drones in the air."""
+"""A flight replayed: photos of a simulated or real flight arrive as they would from drones in the
+air.
+"""
 
 import time
 import urllib.error
@@ -45,9 +47,12 @@ class FlySettings:
 
     def __post_init__(self) -> None:
         for name, value, low, high in (
-            ("--rate", self.rate, 0.01, 1000), ("--drones", self.drones, 1, 100), ("--loss", self.loss, 0, 0.95),
-            ("--reorder", self.reorder, 0, 1), ("--burst", self.burst, 0.01, 1000),
-        ):  # fmt: skip
+            ("--rate", self.rate, 0.01, 1000),
+            ("--drones", self.drones, 1, 100),
+            ("--loss", self.loss, 0, 0.95),
+            ("--reorder", self.reorder, 0, 1),
+            ("--burst", self.burst, 0.01, 1000),
+        ):
             if value is not None and not low <= value <= high:
                 raise UsageError(f"{name} {value} lies outside {low} to {high}")
 
@@ -94,7 +99,8 @@ def fly(folder: Path, to: str, settings: FlySettings, token: str | None = None) 
     """Sends the photos of a folder (or of a simulated flight's `photos` below it) in real time.
 
     Raises:
-        NoPhotosError: there are none. UsageError, OutputError: the receiver is not there, or refuses to write.
+        NoPhotosError: there are none. UsageError, OutputError: the receiver is not there, or
+            refuses to write.
     """
     below = folder / "photos"
     survey = read_survey(below if below.is_dir() else folder)
@@ -115,8 +121,12 @@ def fly(folder: Path, to: str, settings: FlySettings, token: str | None = None) 
         data = preview_of(photo.path) if small else photo.path.read_bytes()
         name = Path(photo.name).name
         name = f"{Path(name).stem}-preview.jpg" if small else name
-        answer = _posted(to, name, drone, data, token) if web else _copied(Path(to), name, drone, data)
-        yield Sent(name=name, drone=drone, preview=small, at_s=time.monotonic() - began, answer=answer)
+        answer = (
+            _posted(to, name, drone, data, token) if web else _copied(Path(to), name, drone, data)
+        )
+        yield Sent(
+            name=name, drone=drone, preview=small, at_s=time.monotonic() - began, answer=answer
+        )
         bursting = settings.burst is not None and 0 <= due - middle < BURST_S
         due += 1 / (settings.burst if bursting and settings.burst else settings.rate)
 
@@ -131,9 +141,11 @@ def preview_of(path: Path) -> bytes:
     small, _ = shrink(decode_jpeg(data), PREVIEW)
     plain = simplejpeg.encode_jpeg(np.ascontiguousarray(small), quality=80, colorspace="RGB")
     parts = b"".join(
-        bytes([0xFF, m]) + (len(p) + 2).to_bytes(2, "big") + p for m, p in head.segments if m == APP1
+        bytes([0xFF, m]) + (len(p) + 2).to_bytes(2, "big") + p
+        for m, p in head.segments
+        if m == APP1
     )
-    return plain[:2] + parts + plain[2:]
+    return bytes(plain[:2] + parts + plain[2:])
 
 
 def _copied(folder: Path, name: str, drone: int, data: bytes) -> str:
@@ -152,7 +164,9 @@ def _copied(folder: Path, name: str, drone: int, data: bytes) -> str:
 def _posted(url: str, name: str, drone: int, data: bytes, token: str | None) -> str:
     query = urllib.parse.urlencode({"name": name, "source": f"drone-{drone}"})
     headers = {"Content-Type": "application/octet-stream"} | ({"X-Token": token} if token else {})
-    request = urllib.request.Request(f"{url.rstrip('/')}/photos?{query}", data=data, headers=headers)
+    request = urllib.request.Request(
+        f"{url.rstrip('/')}/photos?{query}", data=data, headers=headers
+    )
     try:
         with urllib.request.urlopen(request, timeout=60) as answer:
             return f"{answer.status}"

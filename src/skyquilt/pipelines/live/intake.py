@@ -49,7 +49,9 @@ class Refused:
 
 
 def shown_name(name: str) -> str:
-    """A name as text to show: last part of any path, no control characters, bounded; never used as a path."""
+    """A name as text to show: last part of any path, no control characters, bounded; never used as
+    a path.
+    """
     last = re.split(r"[\\/]", name)[-1] or "photo"
     text = "".join(c if unicodedata.category(c)[0] != "C" else "?" for c in last)
     return text[:NAME] or "photo"
@@ -69,7 +71,9 @@ class Intake:
         """
         name, source = shown_name(name), shown_name(source)
         if self._full():
-            return self.refuse(name, source, f"this map takes {self.settings.most_photos} photos at most")
+            return self.refuse(
+                name, source, f"this map takes {self.settings.most_photos} photos at most"
+            )
         arrived = self.inbox.bring(blocks)
         if arrived is None:
             return self.refuse(
@@ -113,19 +117,34 @@ class Intake:
             if known is not None:
                 return Accepted(id=int(known[0]), name=str(known[1]), duplicate=True)
             same = self.ledger.rows(
-                "select id, name, width from photo where shot = ? and width != ? and state != 'superseded'"
-                " and state != 'refused'", shot, photo.width,
-            )  # fmt: skip
+                "select id, name, width from photo where shot = ? and width != ? and state !="
+                " 'superseded'"
+                " and state != 'refused'",
+                shot,
+                photo.width,
+            )
             larger = next((n for _, n, w in same if w > photo.width), None)
             if larger is not None:
                 _gone(arrived.path)
-                return self.refuse(name, source, f"it is a smaller copy of {larger}, which is there already")
+                return self.refuse(
+                    name, source, f"it is a smaller copy of {larger}, which is there already"
+                )
             cursor = db.execute(
-                "insert into photo(digest, name, source, file, bytes, received, shot, width, state, about)"
+                "insert into photo(digest, name, source, file, bytes, received, shot, width, state,"
+                " about)"
                 " values (?, ?, ?, ?, ?, ?, ?, ?, 'received', ?)",
-                (arrived.digest, name, source, arrived.path.name, arrived.size, time.time(), shot, photo.width,
-                 json.dumps({"preview": [int(i) for i, _, _ in same]})),
-            )  # fmt: skip
+                (
+                    arrived.digest,
+                    name,
+                    source,
+                    arrived.path.name,
+                    arrived.size,
+                    time.time(),
+                    shot,
+                    photo.width,
+                    json.dumps({"preview": [int(i) for i, _, _ in same]}),
+                ),
+            )
             number = int(cursor.lastrowid or 0)
             said = {"id": number, "name": name, "source": source, "state": "received"}
             self.ledger.tell("photo", said)
@@ -134,7 +153,9 @@ class Intake:
 
 
 def shot_of(photo: Photo) -> str:
-    """What a preview and the full picture of one shot have in common; of photos without a time, nothing."""
+    """What a preview and the full picture of one shot have in common; of photos without a time,
+    nothing.
+    """
     if photo.time is None or photo.position is None:
         return photo.digest
     size = f"{photo.width}x{photo.height}"
@@ -147,7 +168,10 @@ def shot_of(photo: Photo) -> str:
 def _too_large(photo: Photo) -> str:
     if photo.width * photo.height <= MOST_PIXELS:
         return ""
-    return f"it claims {photo.width} x {photo.height} px, and {MOST_PIXELS // 10**6} megapixels are the most"
+    return (
+        f"it claims {photo.width} x {photo.height} px, and {MOST_PIXELS // 10**6} megapixels are"
+        " the most"
+    )
 
 
 def _gone(path: Path) -> None:

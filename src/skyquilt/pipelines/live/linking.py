@@ -25,7 +25,9 @@ LINKS_KEPT = 1500
 class Linking:
     """Compares photos."""
 
-    def __init__(self, members: Members, methods: Methods, store: Store, pixels: PixelCache) -> None:
+    def __init__(
+        self, members: Members, methods: Methods, store: Store, pixels: PixelCache
+    ) -> None:
         self.members, self.methods, self.store, self.pixels = members, methods, store, pixels
         self._features: OrderedDict[int, Features] = OrderedDict()
 
@@ -49,7 +51,9 @@ class Linking:
         return looked.features
 
     def compared(self, member: Member, others: Sequence[int]) -> dict[tuple[int, int], Link | None]:
-        """Links to others, one after the other until enough hold; None where a pair does not match."""
+        """Links to others, one after the other until enough hold; None where a pair does not
+        match.
+        """
         own = self.features(member.id)
         found: dict[tuple[int, int], Link | None] = {}
         for i in others:
@@ -57,15 +61,21 @@ class Linking:
                 break
             theirs = self.features(i)
             matches = self.methods.mutual(theirs, own)
-            link = self.methods.verify(i, member.id, theirs, own, matches, self.members.by_id[i].photo.width)
+            link = self.methods.verify(
+                i, member.id, theirs, own, matches, self.members.by_id[i].photo.width
+            )
             found[i, member.id] = link if isinstance(link, Link) else None
         return found
 
-    def links_among(self, ids: Iterable[int], touching: Collection[int] | None = None) -> list[Link]:
+    def links_among(
+        self, ids: Iterable[int], touching: Collection[int] | None = None
+    ) -> list[Link]:
         """Known links between these photos, or only those that hold one of `touching`."""
         inside = set(ids)
         ends = inside if touching is None else touching
-        pairs = sorted({(min(i, j), max(i, j)) for i in ends for j in self.members.by_id[i].links & inside})
+        pairs = sorted(
+            {(min(i, j), max(i, j)) for i in ends for j in self.members.by_id[i].links & inside}
+        )
         return [k for a, b in pairs if (k := self.link(a, b)) is not None]
 
     def link(self, a: int, b: int) -> Link | None:
@@ -80,9 +90,14 @@ class Linking:
 def link_bytes(link: Link) -> bytes:
     """A link for the ledger."""
     return encode(
-        {"a": link.a, "b": link.b, "ia": link.index_a.astype(np.int32), "ib": link.index_b.astype(np.int32),
-         "s": complex(link.b_S_a)}
-    )  # fmt: skip
+        {
+            "a": link.a,
+            "b": link.b,
+            "ia": link.index_a.astype(np.int32),
+            "ib": link.index_b.astype(np.int32),
+            "s": complex(link.b_S_a),
+        }
+    )
 
 
 @lru_cache(maxsize=LINKS_KEPT)
@@ -90,5 +105,9 @@ def link_from(body: bytes) -> Link:
     """The link of such bytes; every photo asks for the same links of its surroundings."""
     d = decode(body, {})
     return Link(
-        a=d["a"], b=d["b"], index_a=d["ia"].astype(np.int64), index_b=d["ib"].astype(np.int64), b_S_a=d["s"]
+        a=d["a"],
+        b=d["b"],
+        index_a=d["ia"].astype(np.int64),
+        index_b=d["ib"].astype(np.int64),
+        b_S_a=d["s"],
     )

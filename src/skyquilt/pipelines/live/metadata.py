@@ -1,12 +1,17 @@
 """Where a photo is by its metadata, corrected by what earlier photos of its source have shown."""
 
 from collections import defaultdict, deque
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.priors import choose_frame
-from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map, cam_R_map_from_angles
+from skyquilt.geometry.frames import (
+    angle_difference_deg,
+    angles_from_cam_R_map,
+    cam_R_map_from_angles,
+)
 from skyquilt.model.poses import Pose
 from skyquilt.pipelines.live.settings import LiveSettings
 from skyquilt.pipelines.live.state import Member, Members
@@ -24,7 +29,9 @@ class Metadata:
     def __init__(self, members: Members, heights: HeightCells, settings: LiveSettings) -> None:
         """What was learned before a restart is learned again, in the same order."""
         self.members, self.heights, self.settings = members, heights, settings
-        self._recent: dict[str, deque[tuple[float, float]]] = defaultdict(lambda: deque(maxlen=RECENT))
+        self._recent: dict[str, deque[tuple[float, float]]] = defaultdict(
+            lambda: deque(maxlen=RECENT)
+        )
         self._misfit: deque[float] = deque(maxlen=60)
         for member in sorted(members.by_id.values(), key=lambda m: m.tried):
             self._remember(member)
@@ -36,7 +43,9 @@ class Metadata:
         return self.members.frame is not None
 
     def first(self, member: Member) -> Pose | None:
-        """A pose from metadata, corrected by what earlier photos of the same source have shown; None without place."""
+        """A pose from metadata, corrected by what earlier photos of the same source have shown;
+        None without place.
+        """
         prior = member.prior
         if prior is None or not np.isfinite(prior.map_C[:2]).all():
             return None
@@ -49,7 +58,9 @@ class Metadata:
         elif not np.isfinite(z) or (datum == "takeoff" and z < 3):
             z = self.ground_at(prior.map_C) + NOMINAL_M
         R = cam_R_map_from_angles(
-            yaw, 0.0 if abs(turn) > 90 else prior.pitch_deg, 0.0 if abs(turn) > 90 else prior.roll_deg
+            yaw,
+            0.0 if abs(turn) > 90 else prior.pitch_deg,
+            0.0 if abs(turn) > 90 else prior.roll_deg,
         )
         return Pose(cam_R_map=R, map_C=np.array([prior.map_C[0], prior.map_C[1], z]))
 
@@ -68,13 +79,17 @@ class Metadata:
         return (turn if abs(turn) > 10 else 0.0), lift
 
     def learn(self, member: Member) -> None:
-        """Compares what a photo that has just settled reported with where it is; `member.learned` keeps it."""
+        """Compares what a photo that has just settled reported with where it is; `member.learned`
+        keeps it.
+        """
         assert member.pose is not None
         assert member.prior is not None
         yaw, _, _ = angles_from_cam_R_map(member.pose.cam_R_map)
         off = member.pose.map_C - member.prior.map_C
         turn = (
-            angle_difference_deg(member.prior.yaw_deg, yaw) if np.isfinite(member.prior.yaw_deg) else np.nan
+            angle_difference_deg(member.prior.yaw_deg, yaw)
+            if np.isfinite(member.prior.yaw_deg)
+            else np.nan
         )
         lift = float(off[2]) if np.isfinite(off[2]) else float(member.pose.map_C[2])
         member.learned = float(turn), lift, float(np.hypot(off[0], off[1]))
@@ -88,12 +103,14 @@ class Metadata:
         if np.isfinite(misfit):
             self._misfit.append(misfit)
 
-    def ground_at(self, xyz: NDArray) -> float:
+    def ground_at(self, xyz: NDArray[Any]) -> float:
         """Height of the ground near a place in m."""
         reach = 60.0
         x, y = float(xyz[0]), float(xyz[1])
         near = (
-            self.heights.median((x - reach, y - reach, x + reach, y + reach)) if np.isfinite(x + y) else None
+            self.heights.median((x - reach, y - reach, x + reach, y + reach))
+            if np.isfinite(x + y)
+            else None
         )
         return near if near is not None else float(self.members.ledger.meta("ground", 0.0))
 

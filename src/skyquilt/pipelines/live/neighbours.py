@@ -1,6 +1,7 @@
 """Which photos a new one is compared with: an index of where they were taken from."""
 
 from collections import defaultdict
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,30 +45,44 @@ class Neighbours:
         return np.asarray(pose.map_C[:2] + ray[:2] * drop)
 
     def of(self, member: Member, pose: Pose | None, most: int = NEIGHBOURS) -> list[int]:
-        """Photos of the same spectrum, compared before, nearest first; the latest where nothing tells the place."""
+        """Photos of the same spectrum, compared before, nearest first; the latest where nothing
+        tells the place.
+        """
         if pose is None:
             return self._latest(member, most)
         photo = member.photo
         ground = self.metadata.ground_at(pose.map_C)
         at = self.aim(pose, ground)
         above = max(float(pose.map_C[2]) - ground, 2.0)
-        reach = above * max(photo.width, photo.height) / photo.focal.px + 2 * self.metadata.scatter()
+        reach = (
+            above * max(photo.width, photo.height) / photo.focal.px + 2 * self.metadata.scatter()
+        )
         found = []
         for i in self._near(at, reach + above):
             other = self.members.by_id[i]
             if i == member.id or other.photo.band != photo.band or other.state == "superseded":
                 continue
-            apart = np.inf if other.pose is None else float(np.hypot(*(self.aim(other.pose, ground) - at)))
+            apart = (
+                np.inf
+                if other.pose is None
+                else float(np.hypot(*(self.aim(other.pose, ground) - at)))
+            )
             if apart <= reach:
                 found.append((apart, i))
         return [i for _, i in sorted(found)[:most]]
 
-    def _near(self, at: NDArray, reach: float) -> list[int]:
-        """Photos taken from above a square around a place; cameras that look aslant stand beside what they see."""
+    def _near(self, at: NDArray[Any], reach: float) -> list[int]:
+        """Photos taken from above a square around a place; cameras that look aslant stand beside
+        what they see.
+        """
         rings = int(np.ceil(reach / CELL_M))
         c, r = np.floor(at / CELL_M).astype(int).tolist()
-        return [i for dc in range(-rings, rings + 1) for dr in range(-rings, rings + 1)
-                for i in self._grid.get((c + dc, r + dr), ())]  # fmt: skip
+        return [
+            i
+            for dc in range(-rings, rings + 1)
+            for dr in range(-rings, rings + 1)
+            for i in self._grid.get((c + dc, r + dr), ())
+        ]
 
     def _latest(self, member: Member, most: int) -> list[int]:
         found = []

@@ -1,4 +1,6 @@
-"""What those who look on are told: each sentence is a row of the ledger, in the transaction of what it tells."""
+"""What those who look on are told: each sentence is a row of the ledger, in the transaction of what
+it tells.
+"""
 
 from collections.abc import Iterable
 from typing import Any
@@ -22,13 +24,20 @@ class News:
     def photo(self, member: Member, **more: Any) -> None:
         """The state of a photo, and `more` of it."""
         photo = member.photo
-        said = {"id": member.id, "name": photo.name, "source": member.source, "state": member.state,
-                "time": photo.time.isoformat() if photo.time else None}  # fmt: skip
+        said = {
+            "id": member.id,
+            "name": photo.name,
+            "source": member.source,
+            "state": member.state,
+            "time": photo.time.isoformat() if photo.time else None,
+        }
         self.ledger.tell("photo", {**said, **more})
 
     def superseded(self, member: Member) -> None:
         """A preview that has given way."""
-        self.ledger.tell("photo", {"id": member.id, "name": member.photo.name, "state": "superseded"})
+        self.ledger.tell(
+            "photo", {"id": member.id, "name": member.photo.name, "state": "superseded"}
+        )
 
     def place(self, member: Member) -> tuple[list[list[float]], list[float]]:
         """Footprint and centre of a photo on the map, in degrees."""
@@ -38,7 +47,9 @@ class News:
         return ring, self.members.lonlat(member.pose.map_C[None, :2])[0]
 
     def tiles(self, addresses: Iterable[Address]) -> None:
-        """Where the map has changed, by layer: as a whole, and by parts, so that the rest need not be fetched again."""
+        """Where the map has changed, by layer: as a whole, and by parts, so that the rest need not
+        be fetched again.
+        """
         by_layer: dict[str, set[Address]] = {}
         for a in addresses:
             by_layer.setdefault(a.layer, set()).add(a)

@@ -1,5 +1,7 @@
 """Photos as small as the growing map needs them."""
 
+from typing import Any
+
 import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
@@ -28,8 +30,8 @@ def measured(member: Member) -> bool:
 class SmallPictures:
     """Pixels by photo, one band or three; they are made once.
 
-    Pictures go through the store: on a large map each is needed again and again, and a small file is read in a
-    quarter of the time of the photo.
+    Pictures go through the store: on a large map each is needed again and again, and a small file
+    is read in a quarter of the time of the photo.
     """
 
     def __init__(self, full: PixelCache, members: dict[int, Member], store: Store) -> None:
@@ -37,7 +39,7 @@ class SmallPictures:
         self._longest: dict[int, int] = {}
         self._at_hand = PixelCache(read=self._read, budget_bytes=PICTURES_BYTES)
 
-    def __call__(self, number: int) -> NDArray:
+    def __call__(self, number: int) -> NDArray[Any]:
         """Pixels (h, w, bands) of a photo whose size was asked for before, read-only."""
         return self._at_hand(number)
 
@@ -47,7 +49,9 @@ class SmallPictures:
         return self._at_hand.decoded
 
     def longest(self, member: Member, gsd: float, ground: float) -> int:
-        """Longest side in px of a photo on a map of that pixel size in m over the ground; the same ever after."""
+        """Longest side in px of a photo on a map of that pixel size in m over the ground; the same
+        ever after.
+        """
         if member.id not in self._longest:
             photo, pose = member.photo, member.pose
             above = float(pose.map_C[2]) - ground if pose is not None else 50.0
@@ -55,7 +59,7 @@ class SmallPictures:
             self._longest[member.id] = max(64, round(max(photo.width, photo.height) / factor))
         return self._longest[member.id]
 
-    def _read(self, number: int) -> NDArray:
+    def _read(self, number: int) -> NDArray[Any]:
         member = self.members[number]
         if measured(member):
             small = self._shrunken(member)
@@ -64,7 +68,7 @@ class SmallPictures:
         body = self.store.get_or(STAGE, key, lambda: _encoded(self._shrunken(member)))
         return np.asarray(simplejpeg.decode_jpeg(body.tobytes()))
 
-    def _shrunken(self, member: Member) -> NDArray:
+    def _shrunken(self, member: Member) -> NDArray[Any]:
         photo, longest = member.photo, self._longest[member.id]
         factor = max(photo.width, photo.height) / longest
         ready = self.full.peek(member.id)
@@ -74,7 +78,7 @@ class SmallPictures:
         return np.ascontiguousarray(shrink(ready, longest)[0])
 
 
-def _encoded(small: NDArray) -> NDArray[np.uint8]:
+def _encoded(small: NDArray[Any]) -> NDArray[np.uint8]:
     if small.dtype != np.uint8 or small.ndim == 2 or small.shape[2] < 3:
         small = np.repeat(to_grey8(small)[..., None], 3, 2)
     rgb = np.ascontiguousarray(small[..., :3])

@@ -46,8 +46,13 @@ class Placing:
     """Settles single photos; nothing is written."""
 
     def __init__(
-        self, members: Members, metadata: Metadata, neighbours: Neighbours, linking: Linking, settings: LiveSettings
-    ) -> None:  # fmt: skip
+        self,
+        members: Members,
+        metadata: Metadata,
+        neighbours: Neighbours,
+        linking: Linking,
+        settings: LiveSettings,
+    ) -> None:
         self.members, self.settings = members, settings
         self.metadata, self.neighbours, self.linking = metadata, neighbours, linking
         self.settle = Incremental()
@@ -58,12 +63,21 @@ class Placing:
         links = self.linking.compared(member, self.neighbours.of(member, member.pose))
         good = {key: k for key, k in links.items() if k is not None}
         if not good:
-            why = "no neighbour shows the same ground recognisably" if links else "nothing is near it yet"
-            return Change(moved={}, cameras={}, camera_of={}, links=links, xyz=np.zeros((0, 3)), reason=why)
+            why = (
+                "no neighbour shows the same ground recognisably"
+                if links
+                else "nothing is near it yet"
+            )
+            return Change(
+                moved={}, cameras={}, camera_of={}, links=links, xyz=np.zeros((0, 3)), reason=why
+            )
         return self._joined(member, links, good)
 
     def _joined(
-        self, member: Member, links: dict[tuple[int, int], Link | None], good: dict[tuple[int, int], Link]
+        self,
+        member: Member,
+        links: dict[tuple[int, int], Link | None],
+        good: dict[tuple[int, int], Link],
     ) -> Change:
         whole = {member.id}
         for a, _ in good:
@@ -73,10 +87,13 @@ class Placing:
             if isinstance(done, Alignment):
                 ids = sorted(whole)
                 return Change(
-                    moved={ids[k]: p for k, p in done.poses.items()}, cameras=dict(done.cameras),
-                    camera_of={ids[k]: done.camera_of[k] for k in done.poses}, links=links, xyz=done.ties.xyz,
+                    moved={ids[k]: p for k, p in done.poses.items()},
+                    cameras=dict(done.cameras),
+                    camera_of={ids[k]: done.camera_of[k] for k in done.poses},
+                    links=links,
+                    xyz=done.ties.xyz,
                     reason=done.rejected.get(ids.index(member.id), ""),
-                )  # fmt: skip
+                )
         return self._settled(member, links, good)
 
     def _bundled(self, ids: Sequence[int], good: dict[tuple[int, int], Link]) -> Alignment | None:
@@ -98,14 +115,20 @@ class Placing:
             return None
 
     def _settled(
-        self, member: Member, links: dict[tuple[int, int], Link | None], good: dict[tuple[int, int], Link]
+        self,
+        member: Member,
+        links: dict[tuple[int, int], Link | None],
+        good: dict[tuple[int, int], Link],
     ) -> Change:
         """A photo that joins a larger block: its window adjusted, everything around it held."""
         direct = sorted({a for a, _ in good if self.members.by_id[a].pose is not None})
         by_strength = sorted(direct, key=lambda a: (-len(good[a, member.id]), a))
         moving = set(by_strength[:MOVING]) if self.settings.reposition else set()
         ring = {
-            j for i in moving for j in self.members.by_id[i].links if self.members.by_id[j].pose is not None
+            j
+            for i in moving
+            for j in self.members.by_id[i].links
+            if self.members.by_id[j].pose is not None
         }
         ring -= {member.id, *direct}
         kept = sorted(ring, key=lambda j: (-len(self.members.by_id[j].links & moving), j))[:RING]
@@ -114,7 +137,12 @@ class Placing:
         done = self.settle(self.window(member, ids, held, list(good.values())))
         if not isinstance(done, Settled):
             return Change(
-                moved={}, cameras={}, camera_of={}, links=links, xyz=np.zeros((0, 3)), reason=done.reason
+                moved={},
+                cameras={},
+                camera_of={},
+                links=links,
+                xyz=np.zeros((0, 3)),
+                reason=done.reason,
             )
         for key in done.dropped:
             links[ids[key[0]], ids[key[1]]] = None
@@ -130,13 +158,16 @@ class Placing:
         members = [self.members.by_id[i] for i in ids]
         known = {(k.a, k.b) for k in more}
         free = set(ids) - held  # what links held photos to each other moves nothing
-        links = [*(k for k in self.linking.links_among(ids, free) if (k.a, k.b) not in known), *more]
+        links = [
+            *(k for k in self.linking.links_among(ids, free) if (k.a, k.b) not in known),
+            *more,
+        ]
         placed = {where[m.id]: m.pose for m in members if m.pose is not None and m.id != member.id}
         cameras: dict[str, Camera] = {}
         for m in members:
-            cameras[m.photo.camera_key] = self.members.cameras.get(m.photo.camera_key) or self.members.camera(
-                m
-            )
+            cameras[m.photo.camera_key] = self.members.cameras.get(
+                m.photo.camera_key
+            ) or self.members.camera(m)
             if m.camera:
                 cameras[m.camera] = self.members.camera(m)
         at = (
@@ -147,15 +178,25 @@ class Placing:
             else np.zeros(3)
         )
         return Window(
-            photos=[m.photo for m in members], priors=[m.prior for m in members if m.prior is not None],
-            features=[self.linking.features(i) for i in ids], links=[_renumbered(k, where) for k in links],
-            poses=placed, cameras=cameras, camera_of={where[m.id]: m.camera for m in members}, new=where[member.id],
-            held=frozenset(where[i] for i in held), ground=self.metadata.ground_at(at),
+            photos=[m.photo for m in members],
+            priors=[m.prior for m in members if m.prior is not None],
+            features=[self.linking.features(i) for i in ids],
+            links=[_renumbered(k, where) for k in links],
+            poses=placed,
+            cameras=cameras,
+            camera_of={where[m.id]: m.camera for m in members},
+            new=where[member.id],
+            held=frozenset(where[i] for i in held),
+            ground=self.metadata.ground_at(at),
             sigma_xy=self.metadata.scatter(),
-        )  # fmt: skip
+        )
 
 
 def _renumbered(link: Link, where: dict[int, int]) -> Link:
     return Link(
-        a=where[link.a], b=where[link.b], index_a=link.index_a, index_b=link.index_b, b_S_a=link.b_S_a
+        a=where[link.a],
+        b=where[link.b],
+        index_a=link.index_a,
+        index_b=link.index_b,
+        b_S_a=link.b_S_a,
     )

@@ -22,7 +22,9 @@ LOST = 2
 
 
 class Refining:
-    """All that one photo changes becomes true at once: links, poses, heights, what was learned, what is due next."""
+    """All that one photo changes becomes true at once: links, poses, heights, what was learned,
+    what is due next.
+    """
 
     def __init__(
         self, placing: Placing, showing: Showing, news: News, queues: Queues, schedule: Schedule
@@ -43,9 +45,11 @@ class Refining:
         self.queues.untried.popleft()
         self._requeue(member, found)
         return Update(
-            what="refined" if member.state == "refined" else "loose", photo=member.id, moved=tuple(change.moved),
+            what="refined" if member.state == "refined" else "loose",
+            photo=member.id,
+            moved=tuple(change.moved),
             text=change.reason,
-        )  # fmt: skip
+        )
 
     def _commit(self, member: Member, change: Change, found: list[Member]) -> None:
         far = self._distance(member, change) > LOOP
@@ -53,7 +57,9 @@ class Refining:
             self.members.joined(a, b)
         self._tried += 1
         with self.ledger.change():
-            links = [(a, b, None if k is None else link_bytes(k)) for (a, b), k in change.links.items()]
+            links = [
+                (a, b, None if k is None else link_bytes(k)) for (a, b), k in change.links.items()
+            ]
             self.ledger.put_links(links)
             self.members.save_cameras(change.cameras)
             member.tried = self._tried
@@ -62,7 +68,9 @@ class Refining:
             if member.state == "refined":
                 self.placing.metadata.learn(member)
                 self.schedule.refined(member.id, loop=far)
-            self.members.save(member, about=about_record(member, change.reason), reason=change.reason)
+            self.members.save(
+                member, about=about_record(member, change.reason), reason=change.reason
+            )
             for lost in found:
                 lost.tried, lost.again = 0, self._tried
                 self.members.save(lost, about=about_record(lost, ""))
@@ -84,11 +92,15 @@ class Refining:
                 self.showing.moved(member)
 
     def heights(self, xyz: NDArray[np.float64], *, known: bool, anew: bool = False) -> None:
-        """Takes in ground points (P, 3) (inside a transaction); `known`: they come from calibrated cameras."""
+        """Takes in ground points (P, 3) (inside a transaction); `known`: they come from calibrated
+        cameras.
+        """
         cells = self.placing.metadata.heights
         touched, z = cells.add(xyz, anew=anew)
         with self.ledger.change() as db:
-            values = [(c, r, height) for (c, r), height in zip(touched.tolist(), z.tolist(), strict=True)]
+            values = [
+                (c, r, height) for (c, r), height in zip(touched.tolist(), z.tolist(), strict=True)
+            ]
             db.executemany("insert or replace into height values (?, ?, ?)", values)
             if known and len(xyz):
                 ground = float(np.median(xyz[:, 2]))
@@ -96,8 +108,12 @@ class Refining:
                 self.showing.canvas.ground = ground
 
     def _distance(self, member: Member, change: Change) -> int:
-        """Steps along known links between the photos that this one links; more than LOOP = it closes a loop."""
-        ends = [i for key, k in change.links.items() if k is not None for i in key if i != member.id]
+        """Steps along known links between the photos that this one links; more than LOOP = it
+        closes a loop.
+        """
+        ends = [
+            i for key, k in change.links.items() if k is not None for i in key if i != member.id
+        ]
         if len(ends) < 2:
             return 0
         known, rim = {ends[0]}, {ends[0]}

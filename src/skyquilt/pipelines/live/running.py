@@ -1,4 +1,6 @@
-"""The live story as events: folders watched, photos mapped, the final map made when it is asked for."""
+"""The live story as events: folders watched, photos mapped, the final map made when it is asked
+for.
+"""
 
 import threading
 import time
@@ -23,11 +25,16 @@ STEADY_S = 5.0
 
 
 def iter_live(
-    folders: Sequence[Path], live: LiveMap, *, finish: bool = False, stop: threading.Event | None = None
+    folders: Sequence[Path],
+    live: LiveMap,
+    *,
+    finish: bool = False,
+    stop: threading.Event | None = None,
 ) -> Iterator[Event | Update]:
     """Maps photos as they come into folders or by other ways into `live`, until `stop`.
 
-    `finish`: ends when no photo has come for some seconds, with the final map. Every pause and refusal is told.
+    `finish`: ends when no photo has come for some seconds, with the final map. Every pause and
+    refusal is told.
 
     Raises:
         UsageError: a folder is missing.
@@ -73,7 +80,8 @@ def _finished(live: LiveMap, settings: LiveSettings) -> Iterator[Event]:
             if isinstance(happened, Result):
                 live.ledger.put_meta("finish", "done")
                 live.ledger.tell(
-                    "finish", {"state": "done", "text": "the final map is there, beside the live one"}
+                    "finish",
+                    {"state": "done", "text": "the final map is there, beside the live one"},
                 )
     except SkyquiltError as error:
         live.ledger.put_meta("finish", "failed")

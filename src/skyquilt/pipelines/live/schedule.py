@@ -20,7 +20,9 @@ KEY = "schedule"
 
 @dataclass(kw_only=True)
 class Schedule:
-    """What it is decided by: written down with whatever changes it, so that a restart decides the same."""
+    """What it is decided by: written down with whatever changes it, so that a restart decides the
+    same.
+    """
 
     closed_at: dict[int, int] = field(default_factory=dict)
     """Photos that a block had when it was last adjusted as a whole, by its name."""
@@ -29,9 +31,12 @@ class Schedule:
     loop: int | None = None
     """A photo that closed a loop which nothing has adjusted yet."""
     checked: bool = True
-    """Whether it has been decided on since the last photo was refined; where work is deterministic."""
+    """Whether it has been decided on since the last photo was refined; where work is deterministic.
+    """
     under_way: dict[str, Any] | None = None
-    """What this was when the job in the background began: it counts as not done until its outcome is taken over."""
+    """What this was when the job in the background began: it counts as not done until its outcome
+    is taken over.
+    """
 
     @classmethod
     def read(cls, ledger: Ledger) -> "Schedule":
@@ -39,9 +44,11 @@ class Schedule:
         found = ledger.meta(KEY) or {}
         closed = {int(k): int(v) for k, v in found.get("closed_at", {}).items()}
         return cls(
-            closed_at=closed, since=int(found.get("since", 0)), loop=found.get("loop"),
+            closed_at=closed,
+            since=int(found.get("since", 0)),
+            loop=found.get("loop"),
             checked=bool(found.get("checked", True)),
-        )  # fmt: skip
+        )
 
     def write(self, ledger: Ledger) -> None:
         """Writes it down (inside a transaction)."""
@@ -73,14 +80,22 @@ class Blocks:
     """Chooses the next job."""
 
     def __init__(
-        self, members: Members, schedule: Schedule, settings: LiveSettings, folder: Path, store: Path, parts: Methods
-    ) -> None:  # fmt: skip
+        self,
+        members: Members,
+        schedule: Schedule,
+        settings: LiveSettings,
+        folder: Path,
+        store: Path,
+        parts: Methods,
+    ) -> None:
         self.members, self.schedule, self.settings = members, schedule, settings
         self.folder, self.store, self.methods = folder, store, parts
         self.last_arrival = time.monotonic()
 
     def due(self, ground: float, *, idle: bool) -> Job | None:
-        """The block, or part of one, that should be adjusted as a whole now; `ground`: its height in m."""
+        """The block, or part of one, that should be adjusted as a whole now; `ground`: its height
+        in m.
+        """
         if not self.settings.reposition or self.schedule.since == 0:
             return None
         root = self._root()
@@ -101,14 +116,17 @@ class Blocks:
         return job
 
     def _root(self) -> int:
-        """A photo of the block: the one that closed a loop, else the newest of the block that has grown most."""
+        """A photo of the block: the one that closed a loop, else the newest of the block that has
+        grown most.
+        """
         if self.schedule.loop is not None:
             return self.schedule.loop
         closed = self.schedule.closed_at
         grown = max(
-            self.members.blocks.items(), key=lambda b: (len(b[1]) / closed.get(b[0], 2), len(b[1]), -b[0]),
+            self.members.blocks.items(),
+            key=lambda b: (len(b[1]) / closed.get(b[0], 2), len(b[1]), -b[0]),
             default=(0, {0}),
-        )  # fmt: skip
+        )
         return max(grown[1])
 
     def _around(self, root: int) -> tuple[list[int], frozenset[int]]:
@@ -123,7 +141,9 @@ class Blocks:
         ids = list(reached)
         return sorted(ids), frozenset(ids[PART:])
 
-    def _job(self, ids: list[int], held: frozenset[int], ground: float, *, sweep: bool) -> Job | None:
+    def _job(
+        self, ids: list[int], held: frozenset[int], ground: float, *, sweep: bool
+    ) -> Job | None:
         members = [self.members.by_id[i] for i in ids]
         frame = self.members.frame
         if frame is None or any(m.prior is None for m in members):
@@ -132,9 +152,17 @@ class Blocks:
         for m in members:
             cameras[m.camera or m.photo.camera_key] = self.members.camera(m)
         return Job(
-            ids=tuple(ids), held=held, photos=tuple(m.photo for m in members),
-            priors=tuple(m.prior for m in members if m.prior is not None), frame=frame,
-            poses={m.id: m.pose for m in members if m.pose is not None}, cameras=cameras,
-            camera_of={m.id: m.camera or m.photo.camera_key for m in members}, ground=ground, folder=self.folder,
-            store=self.store, methods=self.methods, sweep=sweep,
-        )  # fmt: skip
+            ids=tuple(ids),
+            held=held,
+            photos=tuple(m.photo for m in members),
+            priors=tuple(m.prior for m in members if m.prior is not None),
+            frame=frame,
+            poses={m.id: m.pose for m in members if m.pose is not None},
+            cameras=cameras,
+            camera_of={m.id: m.camera or m.photo.camera_key for m in members},
+            ground=ground,
+            folder=self.folder,
+            store=self.store,
+            methods=self.methods,
+            sweep=sweep,
+        )

@@ -84,7 +84,9 @@ class Showing:
         return Update(what="noted")
 
     def _looks_as_drawn(self, number: int) -> bool:
-        """Whether a photo's rim, where poses, lenses and heights show most, lies where it was drawn."""
+        """Whether a photo's rim, where poses, lenses and heights show most, lies where it was
+        drawn.
+        """
         rim, drawn = self.canvas.outline(number), self._rims.get(number)
         if rim is None or drawn is None or rim.shape != drawn.shape:
             return False
@@ -100,7 +102,9 @@ class Showing:
         return self._drawn_some(queue, some, rule)
 
     def draw_moved(self) -> Update:
-        """The same for photos that moved, and soon after, their pictures still at hand, for the other layers."""
+        """The same for photos that moved, and soon after, their pictures still at hand, for the
+        other layers.
+        """
         ready = self._newest()
         if len(ready) >= DRAWN_AT_ONCE:
             return self._drawn_some(self.later, ready[:DRAWN_AT_ONCE], NEWEST)
@@ -150,7 +154,9 @@ class Showing:
             self.ledger.set_photo(member.id, footprint="")
             return
         ring, at = self.news.place(member)
-        self.ledger.set_photo(member.id, footprint={"ring": ring, "at": at, "pose": pose_record(member.pose)})
+        self.ledger.set_photo(
+            member.id, footprint={"ring": ring, "at": at, "pose": pose_record(member.pose)}
+        )
         self._drawn[member.id] = member.pose
         if (rim := self.canvas.outline(member.id)) is not None:
             self._rims[member.id] = rim

@@ -42,9 +42,13 @@ class Member:
     tried: int = 0
     """Which one it was to be compared with its neighbours, counted from 1; 0 = it has yet to be."""
     again: int = 0
-    """Counts from 1 when a photo without place has met one that it links to and is to be tried again."""
+    """Counts from 1 when a photo without place has met one that it links to and is to be tried
+    again.
+    """
     learned: tuple[float, float, float] | None = None
-    """By how much its metadata were found wrong: heading in degrees, height in m, place in m; NaN = not known."""
+    """By how much its metadata were found wrong: heading in degrees, height in m, place in m; NaN =
+    not known.
+    """
     links: set[int] = field(default_factory=set)
     """Photos it is linked to."""
 
@@ -66,7 +70,9 @@ class Queues:
 
 
 class Members:
-    """All accepted photos, blocks of linked ones, the frame and the cameras; what changes is written by `save`."""
+    """All accepted photos, blocks of linked ones, the frame and the cameras; what changes is
+    written by `save`.
+    """
 
     def __init__(self, ledger: Ledger, inbox: Inbox, thermal_unit: str | None = None) -> None:
         """Reads what the ledger holds; `thermal_unit` as photos were accepted with."""
@@ -98,20 +104,27 @@ class Members:
     def take_up(self) -> list[Member]:
         """Photos that were accepted since the last look, in order."""
         query = (
-            "select id, name, source, file, state, pose, camera, about from photo where id > ? order by id"
+            "select id, name, source, file, state, pose, camera, about from photo where id > ?"
+            " order by id"
         )
         new = []
-        for number, name, source, file, state, pose, camera, about in self.ledger.rows(query, self._last):
+        for number, name, source, file, state, pose, camera, about in self.ledger.rows(
+            query, self._last
+        ):
             self._last = int(number)
             photo = read_photo(self.inbox.folder / file, name=name, thermal_unit=self.thermal_unit)
             if isinstance(photo, RejectedPhoto):
                 self.ledger.set_photo(number, state="refused", reason=photo.reason)
                 continue
             member = Member(
-                id=int(number), photo=photo, source=source, state=state, camera=camera or "",
+                id=int(number),
+                photo=photo,
+                source=source,
+                state=state,
+                camera=camera or "",
                 pose=pose_from(json.loads(pose)) if pose else None,
                 **_about(json.loads(about) if about else {}),
-            )  # fmt: skip
+            )
             if self.frame is not None:
                 member.prior = photo_prior(photo, self.frame, self._to_map)
             self.by_id[member.id] = member
@@ -121,7 +134,9 @@ class Members:
         return new
 
     def joined(self, a: int, b: int) -> None:
-        """Notes a link; a block is named by its first photo, in whatever order its links were found."""
+        """Notes a link; a block is named by its first photo, in whatever order its links were
+        found.
+        """
         if a not in self.by_id or b not in self.by_id:
             return
         self.by_id[a].links.add(b)
@@ -143,7 +158,9 @@ class Members:
         photo = member.photo
         if known is not None:
             return known
-        return photo.calibration or Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
+        return photo.calibration or Camera.ideal(
+            width=photo.width, height=photo.height, focal=photo.focal.px
+        )
 
     def on_map(self) -> Iterator[Member]:
         """Photos that are drawn, in order."""
@@ -152,9 +169,12 @@ class Members:
     def save(self, member: Member, **more: Any) -> None:
         """Writes down where a photo is (inside a transaction of the ledger)."""
         self.ledger.set_photo(
-            member.id, state=member.state, camera=member.camera,
-            pose=json.dumps(pose_record(member.pose)) if member.pose is not None else None, **more,
-        )  # fmt: skip
+            member.id,
+            state=member.state,
+            camera=member.camera,
+            pose=json.dumps(pose_record(member.pose)) if member.pose is not None else None,
+            **more,
+        )
 
     def save_cameras(self, cameras: dict[str, Camera]) -> None:
         """Keeps calibrations (inside a transaction of the ledger)."""
@@ -178,9 +198,12 @@ def _about(said: dict[str, Any]) -> dict[str, Any]:
     """The fields of a member that its row holds as JSON."""
     learned = said.get("learned")
     return {
-        "tried": int(said.get("tried", 0)), "again": int(said.get("again", 0)),
-        "learned": None if learned is None else tuple(np.nan if v is None else float(v) for v in learned),
-    }  # fmt: skip
+        "tried": int(said.get("tried", 0)),
+        "again": int(said.get("again", 0)),
+        "learned": None
+        if learned is None
+        else tuple(np.nan if v is None else float(v) for v in learned),
+    }
 
 
 def about_record(member: Member, why: str) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """The live map: photos in any order become a map that is always there, photo by photo.
 
-Read `LiveMap.work`: one unit of work at a time, the most urgent first. Everything that must survive is in the
-ledger, the tile store and the folder of photos before the next unit begins; a restart reads them and goes on.
+Read `LiveMap.work`: one unit of work at a time, the most urgent first. Everything that must survive
+is in the ledger, the tile store and the folder of photos before the next unit begins; a restart
+reads them and goes on.
 """
 
 import time
@@ -86,11 +87,14 @@ class LiveMap:
             self.ledger.put_meta("settings", asked)
         elif differing := ", ".join(k for k in asked if known.get(k) != asked[k]):
             raise UsageError(
-                f"{self.folder} was begun with other settings ({differing}); use the same, or another folder"
+                f"{self.folder} was begun with other settings ({differing}); use the same, or"
+                " another folder"
             )
 
     def _load(self) -> None:
-        """Everything in memory, from what is durable: after a start, and after a write that failed."""
+        """Everything in memory, from what is durable: after a start, and after a write that
+        failed.
+        """
         self.members = Members(self.ledger, self.inbox, self.settings.thermal_unit)
         self.queues = Queues(self.members.by_id.values())
         self.schedule = Schedule.read(self.ledger)
@@ -111,19 +115,23 @@ class LiveMap:
         self.refining = Refining(placing, self.showing, news, self.queues, self.schedule)
         self.adopting = Adopting(self.refining)
         store = self.folder / STORE
-        self.blocks = Blocks(self.members, self.schedule, self.settings, self.folder, store, self.methods)
+        self.blocks = Blocks(
+            self.members, self.schedule, self.settings, self.folder, store, self.methods
+        )
 
     def _pixels(self, number: int) -> Any:
         return read_color(self.members.by_id[number].photo)
 
-    # -- adding -----------------------------------------------------------------------------------------------
+    # -- adding
 
     def add(self, path: Path, source: str = "") -> Update:
         """Accepts one photo and brings the map up to date with it."""
         done = self.intake.take_file(path, source or path.parent.name)
         if isinstance(done, Refused):
             return Update(what="refused", text=f"{done.name}: {done.reason}")
-        last = Update(what="noted", photo=done.id, text="it was there already" if done.duplicate else "")
+        last = Update(
+            what="noted", photo=done.id, text="it was there already" if done.duplicate else ""
+        )
         for update in self.drain():
             if update.photo == done.id and update.what != "drawn":
                 last = update
@@ -142,13 +150,14 @@ class LiveMap:
                 return
             time.sleep(0.02)
 
-    # -- working ----------------------------------------------------------------------------------------------
+    # -- working
 
     def work(self) -> Update | None:
         """The most urgent unit of work; None when there is none.
 
         Raises:
-            OutputError: the disk is full; nothing accepted is lost, and the same unit is done when there is room.
+            OutputError: the disk is full; nothing accepted is lost, and the same unit is done when
+                there is room.
         """
         began = time.perf_counter()
         try:
@@ -207,7 +216,9 @@ class LiveMap:
         return self.refining.refine(member)
 
     def _drawn_first(self) -> Update | None:
-        """Who came first is seen first: photos that come while others are drawn are placed after them."""
+        """Who came first is seen first: photos that come while others are drawn are placed after
+        them.
+        """
         update = self.showing.draw(self.showing.urgent) if self.showing.urgent else None
         self._room = 0 if self.showing.urgent else TOGETHER
         return update
@@ -231,7 +242,9 @@ class LiveMap:
         if job is None:
             return None
         self.closing.start(job)
-        return Update(what="noted", text=f"{len(job.ids)} photos are adjusted together in the background")
+        return Update(
+            what="noted", text=f"{len(job.ids)} photos are adjusted together in the background"
+        )
 
     def close(self) -> None:
         """Ends; what is written stays."""

@@ -21,11 +21,14 @@ QUIET_S = 0.04
 SCAN_S = 0.05
 """Between looks at the whole folder where the system does not tell of files that are complete."""
 SCAN_TOLD_S = 1.0
-"""The same where it does: it does not tell of files that other machines write into a shared folder."""
+"""The same where it does: it does not tell of files that other machines write into a shared folder.
+"""
 SHARE = 0.02
 """Of the time that looking may take, however many files there are."""
 PATIENCE_S = 4.0
-"""A file that is cut off is refused when it has not grown for so long; it is looked at again when it changes."""
+"""A file that is cut off is refused when it has not grown for so long; it is looked at again when
+it changes.
+"""
 Stamp = tuple[int, int]
 """Size and time of change of a file."""
 
@@ -69,7 +72,9 @@ class Watch:
         Raises:
             OutputError: the disk is full; the file stays and is taken later.
         """
-        now = time.monotonic()  # one moment for all, so that files that came together are taken in order
+        now = (
+            time.monotonic()
+        )  # one moment for all, so that files that came together are taken in order
         self._note(now)
         for key in sorted(self.growing, key=Path):
             known = self.growing[key]
