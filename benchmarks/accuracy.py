@@ -20,9 +20,9 @@ import numpy as np
 import rasterio
 
 from skyquilt import simulate as sim
-from skyquilt.config import MosaicSettings
-from skyquilt.metrics.map_error import map_error
-from skyquilt.pipelines.mosaic import mosaic
+from skyquilt.quality.map_error import map_error
+from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.workflows.mosaic import mosaic
 
 WINDOWS = {
     "default": {

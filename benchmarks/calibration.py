@@ -18,9 +18,9 @@ from skyquilt.calibration.assemble import Assemble
 from skyquilt.calibration.calibrate import Calibrate
 from skyquilt.calibration.disagreement import widened
 from skyquilt.calibration.find_board import FindBoard
+from skyquilt.calibration.workflow import CalibrateSettings, calibrate
 from skyquilt.cli.calibrate import parse_board
 from skyquilt.model.board import Board
-from skyquilt.pipelines.calibrate import CalibrateSettings, calibrate
 from skyquilt.simulate.board import Chessboard, Lamp, Sensor, five_poses, sweep
 from skyquilt.simulate.camera import Lens
 

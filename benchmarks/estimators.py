@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 
 from skyquilt.geometry.transforms import transfer
-from skyquilt.twoview.lmeds import Lmeds
-from skyquilt.twoview.magsac import Magsac
-from skyquilt.twoview.ransac import Ransac
-from skyquilt.twoview.ste import RansacSte
+from skyquilt.matching.ransac import Ransac
+from skyquilt.papers.lmeds import Lmeds
+from skyquilt.papers.magsac import Magsac
+from skyquilt.papers.ste import RansacSte
 
 GRID = np.stack(np.meshgrid(np.linspace(0, 1499, 13), np.linspace(0, 999, 9)), -1).reshape(-1, 2)
 SUCCESS_PX = 3.0

@@ -111,8 +111,8 @@ def browser(survey: Path, rate: float, gsd: float) -> None:
 
 
 def cost(survey: Path, gsd: float) -> None:
-    from skyquilt.pipelines.live.settings import LiveSettings
-    from skyquilt.pipelines.live.story import LiveMap
+    from skyquilt.live.live_map import LiveMap
+    from skyquilt.live.settings import LiveSettings
 
     home = Path(tempfile.mkdtemp())
     live = LiveMap(home / "out", LiveSettings(gsd_cm=gsd))
@@ -165,17 +165,19 @@ def watch(url: str, visible: dict[str, float]) -> None:
 
 
 def seams(survey: Path, gsd: float) -> None:
-    from skyquilt.config import MosaicSettings, methods
+    from skyquilt.engine.pixel_cache import PixelCache
+    from skyquilt.engine.store import Store
     from skyquilt.imaging.views import grid_of, make_views, native_gsd
+    from skyquilt.live.live_map import LiveMap
+    from skyquilt.live.settings import LiveSettings
     from skyquilt.model.poses import Alignment, no_ties
+    from skyquilt.ortho import orthomosaic as drawing
+    from skyquilt.ortho.exposure import NEUTRAL
     from skyquilt.photos.pixels import read_color
-    from skyquilt.pipelines import drawing, intake, reporting
-    from skyquilt.pipelines.live.settings import LiveSettings
-    from skyquilt.pipelines.live.story import LiveMap
-    from skyquilt.pipelines.mosaic import REGISTRY, mosaic
-    from skyquilt.render.exposure import NEUTRAL
-    from skyquilt.run.pixel_cache import PixelCache
-    from skyquilt.run.store import Store
+    from skyquilt.workflows import photo_features as intake
+    from skyquilt.workflows import run_report as reporting
+    from skyquilt.workflows.methods import MosaicSettings, methods
+    from skyquilt.workflows.mosaic import REGISTRY, mosaic
 
     home = Path(tempfile.mkdtemp())
     live = LiveMap(home / "live", LiveSettings(gsd_cm=gsd))

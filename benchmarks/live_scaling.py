@@ -20,9 +20,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from skyquilt.live.live_map import LiveMap
+from skyquilt.live.settings import LiveSettings
 from skyquilt.photos.survey import capture_order, read_survey
-from skyquilt.pipelines.live.settings import LiveSettings
-from skyquilt.pipelines.live.story import LiveMap
 
 BURST, THIRD_S = 90, 1 / 3
 

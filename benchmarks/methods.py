@@ -24,12 +24,12 @@ import cv2
 import numpy as np
 
 from skyquilt import simulate as sim
-from skyquilt.config import MosaicSettings
 from skyquilt.errors import SkyquiltError
-from skyquilt.metrics.geolocation import geolocation_errors
-from skyquilt.pipelines.mosaic import mosaic
+from skyquilt.quality.geolocation import geolocation_errors
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
+from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.workflows.mosaic import mosaic
 
 LINES = 6
 METHODS = {
@@ -154,8 +154,8 @@ def closing_step(output: Path, names: list[str]) -> float | None:
     """
     from skyquilt.imaging.plane import view_patch
     from skyquilt.imaging.views import make_views, native_gsd
-    from skyquilt.pipelines.compare import alignment_of
-    from skyquilt.surface.plane import level
+    from skyquilt.ortho.tie_surface import level
+    from skyquilt.papers.compare import alignment_of
 
     alignment = alignment_of(output)
     z = float(np.median(alignment.ties.xyz[:, 2])) if len(alignment.ties.xyz) else 0.0

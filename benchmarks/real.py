@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from skyquilt.config import MosaicSettings
-from skyquilt.pipelines.mosaic import mosaic
+from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.workflows.mosaic import mosaic
 
 ASKED = {
     "brighton": {
@@ -133,13 +133,15 @@ def strip_all(source: Path, target: Path) -> Path:
 def control_from_full_run(source: Path, work: Path) -> Path:
     """A gcp_list.txt of three far-apart tie points of the full run; 40 others are check points."""
     from skyquilt.alignment.priors import choose_frame, priors
-    from skyquilt.config import methods
+    from skyquilt.engine.pixel_cache import PixelCache
+    from skyquilt.engine.store import Store
     from skyquilt.photos.pixels import read_color
     from skyquilt.photos.survey import read_survey
-    from skyquilt.pipelines import intake, linking, placing
-    from skyquilt.pipelines.mosaic import REGISTRY
-    from skyquilt.run.pixel_cache import PixelCache
-    from skyquilt.run.store import Store
+    from skyquilt.workflows import align as placing
+    from skyquilt.workflows import links as linking
+    from skyquilt.workflows import photo_features as intake
+    from skyquilt.workflows.methods import methods
+    from skyquilt.workflows.mosaic import REGISTRY
 
     settings = MosaicSettings()
     parts, store = methods(settings), Store(folder=work / "full-store", registry=REGISTRY)

@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.config_register import registration_method
-from skyquilt.metrics.overlap_error import overlap_error
+from skyquilt.coregistration.methods import registration_method
+from skyquilt.coregistration.pictures import open_picture
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.model.registration import Picture
-from skyquilt.pipelines.pair_list import Pair, read_pairs
-from skyquilt.pipelines.pictures import open_picture
+from skyquilt.papers.overlap_error import overlap_error
+from skyquilt.papers.pair_list import Pair, read_pairs
 
 METHOD = registration_method("auto")
 

@@ -15,15 +15,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from skyquilt.features.akaze import Akaze
-from skyquilt.features.harris import Harris
-from skyquilt.features.orb import Orb
-from skyquilt.features.sift import Sift
-from skyquilt.features.surf import Surf
 from skyquilt.geometry.transforms import transfer
 from skyquilt.imaging.grey import shrink, to_grey8
-from skyquilt.matching.mutual import Mutual
+from skyquilt.matching.binary_features import Akaze, Orb
+from skyquilt.matching.matchers import Mutual
+from skyquilt.matching.sift import Sift
 from skyquilt.model.features import Features
+from skyquilt.papers.harris import Harris
+from skyquilt.papers.surf import Surf
 
 try:
     from mahotas.features import surf as mahotas_surf

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skyquilt.metrics.map_error import map_error
+from skyquilt.quality.map_error import map_error
 
 
 def displacements(raster: Path, truth: Path) -> tuple[np.ndarray, np.ndarray, float]:

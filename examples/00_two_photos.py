@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from skyquilt.features.sift import Sift
-from skyquilt.matching.mutual import Mutual
+from skyquilt.matching.matchers import Mutual
+from skyquilt.matching.sift import Sift
+from skyquilt.matching.verify import Verify
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import read_photo
-from skyquilt.twoview.verify import Verify
 
 
 def place(photo: Photo) -> str:

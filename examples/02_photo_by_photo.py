@@ -12,11 +12,11 @@ import numpy as np
 
 import skyquilt
 from skyquilt.alignment.priors import choose_frame, priors
-from skyquilt.features.sift import Sift
-from skyquilt.matching.mutual import Mutual
+from skyquilt.matching.matchers import Mutual
+from skyquilt.matching.sift import Sift
+from skyquilt.matching.verify import Verify
 from skyquilt.model.features import Features, Link
 from skyquilt.photos.pixels import read_color
-from skyquilt.twoview.verify import Verify
 
 NEIGHBOURS = 4
 

@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 import skyquilt
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.priors import choose_frame, priors
-from skyquilt.features.sift import Sift
 from skyquilt.imaging.grey import full_px, shrink, to_grey8
-from skyquilt.matching.mutual import Mutual
+from skyquilt.matching.candidates import Nearest
+from skyquilt.matching.matchers import Mutual
+from skyquilt.matching.sift import Sift
+from skyquilt.matching.verify import Verify
 from skyquilt.model.features import Features
-from skyquilt.pairs.nearest import Nearest
 from skyquilt.photos.pixels import read_color
-from skyquilt.twoview.verify import Verify
 
 
 @dataclass(frozen=True, kw_only=True)

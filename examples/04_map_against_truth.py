@@ -7,7 +7,7 @@ python examples/04_map_against_truth.py MOSAIC.tif TRUTH.tif
 import sys
 from pathlib import Path
 
-from skyquilt.metrics.map_error import map_error
+from skyquilt.quality.map_error import map_error
 
 
 def main(mosaic: Path, truth: Path) -> None:

@@ -89,7 +89,7 @@ def test_the_readme_names_every_file_of_a_run_and_every_option():
     from typer.main import get_command
 
     from skyquilt.cli.app import app
-    from skyquilt.run.folder import CONTRACT
+    from skyquilt.engine.folder import CONTRACT
 
     readme = (ROOT / "README.md").read_text()
     assert [name for name in CONTRACT if f"`{name}`" not in readme] == []

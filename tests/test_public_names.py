@@ -38,7 +38,7 @@ def test_the_story_of_a_small_survey_waits_for_nothing_it_does_not_need():
     wait for it.
     """
     code = (
-        "import sys, skyquilt.pipelines.mosaic as m; from skyquilt.config import *;"
+        "import sys, skyquilt.workflows.mosaic as m; from skyquilt.workflows.methods import *;"
         " methods(MosaicSettings());"
         "print(*(m for m in ('scipy', 'rasterio', 'shapely', 'tifffile') if m in sys.modules))"
     )

@@ -8,30 +8,30 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from skyquilt import simulate
-    from skyquilt.config import MosaicSettings
+    from skyquilt.coregistration.workflow import register
     from skyquilt.errors import SkyquiltError
     from skyquilt.model.camera import Camera
     from skyquilt.model.event import Result
     from skyquilt.model.photo import Photo, Survey
     from skyquilt.model.poses import Alignment
     from skyquilt.photos.survey import read_survey
-    from skyquilt.pipelines.mosaic import iter_mosaic, mosaic
-    from skyquilt.pipelines.register import register
+    from skyquilt.workflows.methods import MosaicSettings
+    from skyquilt.workflows.mosaic import iter_mosaic, mosaic
 
 __version__ = "0.1.0"
 
 _HOME = {
     "Alignment": "skyquilt.model.poses",
     "Camera": "skyquilt.model.camera",
-    "MosaicSettings": "skyquilt.config",
+    "MosaicSettings": "skyquilt.workflows.methods",
     "Photo": "skyquilt.model.photo",
     "Result": "skyquilt.model.event",
     "SkyquiltError": "skyquilt.errors",
     "Survey": "skyquilt.model.photo",
-    "iter_mosaic": "skyquilt.pipelines.mosaic",
-    "mosaic": "skyquilt.pipelines.mosaic",
+    "iter_mosaic": "skyquilt.workflows.mosaic",
+    "mosaic": "skyquilt.workflows.mosaic",
     "read_survey": "skyquilt.photos.survey",
-    "register": "skyquilt.pipelines.register",
+    "register": "skyquilt.coregistration.workflow",
 }
 """Public name -> module that defines it."""
 

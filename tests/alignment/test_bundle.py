@@ -13,11 +13,11 @@ from skyquilt.alignment.setup import HALF_TURN, mirrored
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import angles_from_cam_R_map, rotation_from_vector
+from skyquilt.matching.verify import Verify
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link, Matches
 from skyquilt.model.photo import ControlPoint, PointObservation
 from skyquilt.model.poses import MapFrame
-from skyquilt.twoview.verify import Verify
 from tests.alignment.blocks import HEIGHT, LENS, WIDTH, make_block, seen_by
 from tests.alignment.surveys import photo, prior
 

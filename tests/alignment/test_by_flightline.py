@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment.by_flightline import ByFlightline
 from skyquilt.errors import AlignmentError
-from skyquilt.matching.best import Best
-from skyquilt.twoview.ste import RansacSte
+from skyquilt.papers.best_matches import Best
+from skyquilt.papers.flightline import ByFlightline
+from skyquilt.papers.ste import RansacSte
 from tests.alignment.flights import FRAME, fly, lawn, line
 from tests.alignment.test_chain import ground_error
 

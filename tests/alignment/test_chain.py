@@ -5,15 +5,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment.chain import Chain
-from skyquilt.alignment.joining import implausible
-from skyquilt.alignment.overview import ByOverview
-from skyquilt.features.sift import Sift
 from skyquilt.imaging.views import make_views, on_ground
-from skyquilt.matching.mutual import Mutual
-from skyquilt.surface.plane import level
-from skyquilt.twoview.levelled import Level
-from skyquilt.twoview.ransac import Ransac
+from skyquilt.matching.levelled import Level
+from skyquilt.matching.matchers import Mutual
+from skyquilt.matching.ransac import Ransac
+from skyquilt.matching.sift import Sift
+from skyquilt.ortho.tie_surface import level
+from skyquilt.papers.chain import Chain
+from skyquilt.papers.overview import ByOverview
+from skyquilt.papers.plane_registration import implausible
 from tests.alignment.flights import CORNERS, FRAME, fly, line
 
 

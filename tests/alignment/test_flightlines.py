@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
-from skyquilt.alignment.flightlines import (
+from skyquilt.papers.flightline_geometry import (
     by_distance,
     by_heading,
     middle_out,

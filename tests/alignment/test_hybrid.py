@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment.hybrid import Hybrid, turned
-from skyquilt.alignment.objective import Distances, Level, Objective, pyramid
-from skyquilt.alignment.optimise import Anneal, Surfaces, masked_correlation
 from skyquilt.alignment.pose import ByPose
 from skyquilt.geometry.frames import angles_from_cam_R_map
 from skyquilt.imaging.plane import Overview, Patch
+from skyquilt.papers.hybrid import Hybrid, turned
+from skyquilt.papers.hybrid_objective import Distances, Level, Objective, pyramid
+from skyquilt.papers.hybrid_search import Anneal, Surfaces, masked_correlation
 from tests.alignment.flights import FRAME, fly, lawn, line
 from tests.alignment.test_chain import ground_error
 from tests.texture import texture

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from skyquilt.alignment.lens import of_order, to_working, working_K
 from skyquilt.geometry.camera import undistort
 from skyquilt.model.camera import Camera
+from skyquilt.papers.lens_order import of_order, to_working, working_K
 
 TRUE = Camera(
     width=4000,

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyquilt.alignment.planar import map_H_cam_of, planar_pose
 from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
 from skyquilt.imaging.views import make_views, on_ground, project_nodes
 from skyquilt.model.poses import Pose
-from skyquilt.surface.plane import level
+from skyquilt.ortho.tie_surface import level
+from skyquilt.papers.planar import map_H_cam_of, planar_pose
 from tests.alignment.flights import CAMERA, CORNERS
 from tests.alignment.surveys import alignment
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment.repair import repair
-from skyquilt.matching.mutual import Mutual
-from skyquilt.pairs.nearest import sequence
-from skyquilt.twoview.verify import Verify
+from skyquilt.matching.candidates import sequence
+from skyquilt.matching.matchers import Mutual
+from skyquilt.matching.verify import Verify
 from tests.alignment.flights import fly, lawn
 from tests.alignment.surveys import WIDTH
 

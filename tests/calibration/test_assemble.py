@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from skyquilt.calibration.assemble import Assemble, cell_of
-from skyquilt.calibration.bimodality import bimodality, separation
+from skyquilt.calibration.assemble import Assemble, bimodality, cell_of, separation
 from skyquilt.calibration.calibrate import Calibrate
 from skyquilt.calibration.disagreement import widened
 from skyquilt.calibration.find_board import FindBoard

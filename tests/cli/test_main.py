@@ -8,10 +8,11 @@ import pytest
 from typer.testing import CliRunner
 
 import skyquilt
-from skyquilt import config, errors
+from skyquilt import errors
 from skyquilt.cli import app as commands
 from skyquilt.cli import main
-from skyquilt.pipelines.mosaic import STAGES
+from skyquilt.workflows import methods as config
+from skyquilt.workflows.mosaic import STAGES
 
 CHOICES = {
     "--method": config.METHODS,

@@ -5,12 +5,11 @@ are.
 import numpy as np
 import pytest
 
-from skyquilt.features.akaze import Akaze
-from skyquilt.features.harris import Harris
-from skyquilt.features.orb import Orb
-from skyquilt.matching.mutual import Mutual
+from skyquilt.engine.codec import decode, encode
+from skyquilt.matching.binary_features import Akaze, Orb
+from skyquilt.matching.matchers import Mutual
 from skyquilt.model.features import Features
-from skyquilt.run.codec import decode, encode
+from skyquilt.papers.harris import Harris
 from tests.features.test_sift import warped
 from tests.texture import texture
 

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from skyquilt.features.sift import Sift
-from skyquilt.features.spread import spread
 from skyquilt.imaging.grey import full_px, halved, shrink, to_grey8
-from skyquilt.matching.mutual import Mutual
+from skyquilt.matching.keypoints import spread
+from skyquilt.matching.matchers import Mutual
+from skyquilt.matching.sift import Sift
 from skyquilt.model.features import DESCRIPTOR_UNIT
 from tests.texture import texture
 

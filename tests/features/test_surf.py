@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from skyquilt.features.haar import Means, orientations
-from skyquilt.features.hessian import blobs, determinants, octave_lobes, summits
-from skyquilt.features.sift import Sift
-from skyquilt.features.surf import Surf
-from skyquilt.matching.mutual import Mutual
+from skyquilt.engine.codec import decode, encode
+from skyquilt.matching.matchers import Mutual
+from skyquilt.matching.sift import Sift
 from skyquilt.model.features import Features
-from skyquilt.run.codec import decode, encode
+from skyquilt.papers.surf import Surf
+from skyquilt.papers.surf_blobs import blobs, determinants, octave_lobes, summits
+from skyquilt.papers.surf_descriptors import Means, orientations
 from tests.features.test_sift import warped
 from tests.texture import texture
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from skyquilt.depth.parallax import heights_above_plane
 from skyquilt.geometry.frames import cam_R_map_from_angles
-from skyquilt.geometry.parallax import heights_above_plane
 
 
 def seen(R, C, xyz):

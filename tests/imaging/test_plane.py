@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from skyquilt.alignment.planar import map_H_cam_of
 from skyquilt.imaging.plane import Overview, Patch, to_grid, view_patch
 from skyquilt.imaging.views import make_views
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Pose
-from skyquilt.surface.plane import level
+from skyquilt.ortho.tie_surface import level
+from skyquilt.papers.planar import map_H_cam_of
 from tests.alignment.flights import CAMERA, CELL, fly, line
 from tests.alignment.surveys import alignment
 

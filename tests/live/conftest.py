@@ -12,15 +12,15 @@ import httpx
 import numpy as np
 import pytest
 
-from skyquilt.pipelines.live.running import iter_live
-from skyquilt.pipelines.live.settings import LiveSettings
-from skyquilt.pipelines.live.story import LiveMap
+from skyquilt.live.live_map import LiveMap
+from skyquilt.live.settings import LiveSettings
+from skyquilt.live.workflow import iter_live
+from skyquilt.server.guard import Guard
+from skyquilt.server.server_thread import Serving
+from skyquilt.server.survey import LiveSurvey
 from skyquilt.simulate import FlightSettings, simulate
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Reporting, Route, Thermal
-from skyquilt.viewer.guard import Guard
-from skyquilt.viewer.serving import Serving
-from skyquilt.viewer.survey import LiveSurvey
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,12 +9,13 @@ import sys
 import time
 from pathlib import Path
 
-from skyquilt.pipelines.live.settings import LiveSettings
-from skyquilt.pipelines.live.story import LiveMap
-from skyquilt.pipelines.live.watch import Watch
-from skyquilt.run import inbox, write_points
-from skyquilt.viewer.publishing import Publishing
-from skyquilt.viewer.survey import LiveSurvey
+from skyquilt.live import crash_points as write_points
+from skyquilt.live import inbox
+from skyquilt.live.folder_watch import Watch
+from skyquilt.live.live_map import LiveMap
+from skyquilt.live.settings import LiveSettings
+from skyquilt.server.published_files import Publishing
+from skyquilt.server.survey import LiveSurvey
 
 
 def die(*_: object) -> None:

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from playwright.sync_api import sync_playwright
 
-from skyquilt.pipelines.live.settings import LiveSettings
+from skyquilt.live.settings import LiveSettings
 from tests.live.conftest import served
 
 pytestmark = pytest.mark.slow

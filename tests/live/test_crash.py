@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skyquilt.run.write_points import POINTS
+from skyquilt.live.crash_points import POINTS
 from tests.stories.conftest import relabel
 
 KILLS = int(os.environ.get("SKYQUILT_KILLS", "5"))
@@ -109,8 +109,8 @@ def test_a_full_disk_refuses_and_loses_nothing(flight, tmp_path, monkeypatch):
     import errno
 
     from skyquilt.errors import OutputError
-    from skyquilt.pipelines.live.settings import LiveSettings
-    from skyquilt.pipelines.live.story import LiveMap
+    from skyquilt.live.live_map import LiveMap
+    from skyquilt.live.settings import LiveSettings
 
     live = LiveMap(tmp_path / "out", LiveSettings(features=600))
     live.add(flight.photos[0])
@@ -132,8 +132,8 @@ def test_a_full_disk_refuses_and_loses_nothing(flight, tmp_path, monkeypatch):
 def test_a_database_that_cannot_grow_refuses_and_loses_nothing(flight, tmp_path):
     """SQLite itself is told that the disk is full: its page limit is what a small disk is."""
     from skyquilt.errors import OutputError
-    from skyquilt.pipelines.live.settings import LiveSettings
-    from skyquilt.pipelines.live.story import LiveMap
+    from skyquilt.live.live_map import LiveMap
+    from skyquilt.live.settings import LiveSettings
 
     live = LiveMap(tmp_path / "out", LiveSettings(features=600))
     live.add(flight.photos[0])
@@ -170,8 +170,8 @@ def small_disk(tmp_path):
 @pytest.mark.slow
 def test_a_real_full_disk_refuses_and_loses_nothing(flight, small_disk):
     from skyquilt.errors import OutputError
-    from skyquilt.pipelines.live.settings import LiveSettings
-    from skyquilt.pipelines.live.story import LiveMap
+    from skyquilt.live.live_map import LiveMap
+    from skyquilt.live.settings import LiveSettings
 
     settings = LiveSettings(features=300, deterministic=True)
     live = LiveMap(small_disk / "out", settings)

@@ -19,11 +19,11 @@ from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 
 from skyquilt.errors import UsageError
-from skyquilt.pipelines.live.settings import LiveSettings
+from skyquilt.live.settings import LiveSettings
 from skyquilt.raster.map_source import mercator
-from skyquilt.viewer.guard import Guard
-from skyquilt.viewer.serving import Serving
-from skyquilt.viewer.survey import open_survey
+from skyquilt.server.guard import Guard
+from skyquilt.server.server_thread import Serving
+from skyquilt.server.survey import open_survey
 from tests.interrupts import hears_interrupts
 from tests.live.conftest import served
 from tests.live.test_http import middle, tile_of

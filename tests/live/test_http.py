@@ -20,10 +20,10 @@ import rasterio
 from PIL import Image
 
 from skyquilt.errors import UsageError
-from skyquilt.pipelines.live.settings import LiveSettings
-from skyquilt.viewer.guard import Guard
-from skyquilt.viewer.publishing import Publishing
-from skyquilt.viewer.survey import LiveSurvey
+from skyquilt.live.settings import LiveSettings
+from skyquilt.server.guard import Guard
+from skyquilt.server.published_files import Publishing
+from skyquilt.server.survey import LiveSurvey
 from tests.live.conftest import served
 
 QUICK = LiveSettings(features=600, most_bytes=3_000_000)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from skyquilt.raster.map_source import MERCATOR, mercator
-from skyquilt.viewer.images import _meet
+from skyquilt.server.images import _meet
 
 
 def test_tiles_that_touch_a_box_are_found_as_rectangles_say():

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from skyquilt.imaging.grey import shrink
+from skyquilt.live import reduced_pictures as pictures
+from skyquilt.live.live_map import LiveMap
+from skyquilt.live.reduced_pictures import STAGE, SmallPictures
 from skyquilt.photos.pixels import read_color
-from skyquilt.pipelines.live import pictures
-from skyquilt.pipelines.live.pictures import STAGE, SmallPictures
-from skyquilt.pipelines.live.story import LiveMap
 
 
 @pytest.fixture

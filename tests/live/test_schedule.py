@@ -5,9 +5,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from skyquilt.config import MosaicSettings, methods
-from skyquilt.pipelines.live.schedule import Blocks, Schedule
-from skyquilt.pipelines.live.settings import CLOSING, GROWTH, PART, LiveSettings
+from skyquilt.live.adjustment_schedule import Blocks, Schedule
+from skyquilt.live.settings import CLOSING, GROWTH, PART, LiveSettings
+from skyquilt.workflows.methods import MosaicSettings, methods
 
 
 def blocks_of(*sizes, closed=(), since=1, loop=None):

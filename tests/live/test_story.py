@@ -10,15 +10,15 @@ import rasterio
 
 from skyquilt.errors import OutputError, UsageError
 from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
-from skyquilt.metrics.correlation import correlation
+from skyquilt.live.live_map import LiveMap
+from skyquilt.live.replay_flight import FlySettings, fly, order_of, preview_of
+from skyquilt.live.settings import LiveSettings
+from skyquilt.live.tile_drawing import WHOLE
+from skyquilt.ortho.blend import Feather
 from skyquilt.photos.survey import read_survey
-from skyquilt.pipelines.live.drawing import WHOLE
-from skyquilt.pipelines.live.flying import FlySettings, fly, order_of, preview_of
-from skyquilt.pipelines.live.settings import LiveSettings
-from skyquilt.pipelines.live.story import LiveMap
+from skyquilt.quality.replay import correlation
 from skyquilt.raster.map_source import TileSource
 from skyquilt.raster.tile_store import SIDE
-from skyquilt.render.blend import Feather
 from tests.live.conftest import offsets
 from tests.stories.conftest import relabel
 
@@ -174,7 +174,7 @@ def test_a_preview_gives_way_to_the_full_picture(flight, tmp_path):
     live = LiveMap(tmp_path / "out", LiveSettings())
     small = tmp_path / "a-preview.jpg"
     data = flight.photos[0].read_bytes()
-    import skyquilt.pipelines.live.flying as flying
+    import skyquilt.live.replay_flight as flying
 
     longest, flying.PREVIEW = flying.PREVIEW, 240
     try:

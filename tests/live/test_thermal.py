@@ -7,7 +7,7 @@ import pytest
 import rasterio
 from PIL import Image
 
-from skyquilt.pipelines.live.settings import LiveSettings
+from skyquilt.live.settings import LiveSettings
 from skyquilt.raster.map_source import TileSource
 from tests.live.conftest import served
 from tests.live.test_http import middle, tile_of

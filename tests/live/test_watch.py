@@ -5,12 +5,12 @@ import time
 
 import pytest
 
-from skyquilt.pipelines.live import watch as watching
-from skyquilt.pipelines.live.intake import Accepted, Intake, Refused
-from skyquilt.pipelines.live.settings import LiveSettings
-from skyquilt.pipelines.live.watch import Watch
-from skyquilt.run.inbox import Inbox
-from skyquilt.run.ledger import Ledger
+from skyquilt.live import folder_watch as watching
+from skyquilt.live.folder_watch import Watch
+from skyquilt.live.inbox import Inbox
+from skyquilt.live.ledger import Ledger
+from skyquilt.live.photo_intake import Accepted, Intake, Refused
+from skyquilt.live.settings import LiveSettings
 
 
 class Watched:

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from skyquilt.matching.best import Best
-from skyquilt.matching.guided import Guided
-from skyquilt.matching.mutual import Mutual
+from skyquilt.matching.matchers import Guided, Mutual
 from skyquilt.model.features import Features
+from skyquilt.papers.best_matches import Best
 
 
 def features(descriptors, px=None, binary=False):

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyquilt.matching.mutual import Mutual
+from skyquilt.matching.matchers import Mutual
 from skyquilt.model.features import Features
 
 

@@ -6,7 +6,7 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from skyquilt.metrics.map_error import map_error
+from skyquilt.quality.map_error import map_error
 from tests.texture import texture
 
 GSD = 0.05

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skyquilt.metrics.overlap_error import overlap_error
+from skyquilt.papers.overlap_error import overlap_error
 
 
 def shifted(x, y=0.0):

@@ -3,21 +3,21 @@
 import numpy as np
 import pytest
 
-from skyquilt.metrics.correlation import (
+from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior, no_ties
+from skyquilt.quality.geolocation import geolocation_errors, gps_residuals
+from skyquilt.quality.registration_quality import (
+    eta,
+    four_lengths,
+    mean_squared_error,
+    spread_quality,
+)
+from skyquilt.quality.replay import (
     correlation,
     lambda_corr,
     lambda_quality,
     lambda_spat,
     lambda_spat_of_table,
 )
-from skyquilt.metrics.geolocation import geolocation_errors, gps_residuals
-from skyquilt.metrics.registration_quality import (
-    eta,
-    four_lengths,
-    mean_squared_error,
-    spread_quality,
-)
-from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior, no_ties
 
 REFERENCE = (31, 37.9, 51.75)
 TABLE = {

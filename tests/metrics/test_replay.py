@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from skyquilt.imaging.plane import Patch
-from skyquilt.metrics.correlation import lambda_corr
-from skyquilt.metrics.replay import replay
+from skyquilt.quality.replay import lambda_corr, replay
 from tests.texture import texture
 
 GROUND = texture(120, 300, seed=2)

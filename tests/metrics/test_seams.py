@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyquilt.metrics.seam_points import SeamPoint, seam_points
-from skyquilt.metrics.seams import PatchPairs, seam_disparity
+from skyquilt.quality.seam_points import SeamPoint, seam_points
+from skyquilt.quality.seams import PatchPairs, seam_disparity
 from tests.texture import seen, texture
 
 

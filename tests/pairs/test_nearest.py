@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyquilt.features.sift import Sift
+from skyquilt.matching.candidates import Nearest, Retrieval, sequence
+from skyquilt.matching.sift import Sift
 from skyquilt.model.features import Features
-from skyquilt.pairs.nearest import Nearest, sequence
-from skyquilt.pairs.retrieval import Retrieval
 from tests.texture import texture
 
 

@@ -3,8 +3,8 @@ import math
 import piexif
 import pytest
 
+from skyquilt.photos.lens import _table, find_sensor
 from skyquilt.photos.read import read_photo
-from skyquilt.photos.sensors import _table, find_sensor
 
 from .conftest import dji_exif, dji_xmp, pixels
 

@@ -11,15 +11,12 @@ from PIL import Image
 
 from skyquilt.errors import SkyquiltError, UnreadablePhotoError
 from skyquilt.model.photo import Photo, RejectedPhoto
-from skyquilt.photos.exif import parse_exif
 from skyquilt.photos.gcp import read_gcp_list
-from skyquilt.photos.geo_txt import read_geo_txt
-from skyquilt.photos.mrk import read_mrk
 from skyquilt.photos.pixels import read_color
-from skyquilt.photos.positions_csv import read_positions_csv
 from skyquilt.photos.read import read_photo
+from skyquilt.photos.side_files import read_geo_txt, read_mrk, read_positions_csv
 from skyquilt.photos.srt import read_srt
-from skyquilt.photos.xmp import parse_xmp
+from skyquilt.photos.tags import parse_exif, parse_xmp
 
 from .conftest import dji_exif, dji_xmp, jpeg_bytes, pixels
 from .test_thermal import flir_jpeg, planck_counts, scene

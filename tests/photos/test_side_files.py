@@ -11,11 +11,8 @@ from skyquilt.geometry.camera_formats import camera_to_opensfm
 from skyquilt.model.camera import Camera
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
 from skyquilt.photos.gcp import read_gcp_list
-from skyquilt.photos.geo_txt import read_geo_txt
-from skyquilt.photos.mrk import read_mrk
-from skyquilt.photos.positions_csv import read_positions_csv
 from skyquilt.photos.read import read_photo
-from skyquilt.photos.side_files import apply_positions
+from skyquilt.photos.side_files import apply_positions, read_geo_txt, read_mrk, read_positions_csv
 from skyquilt.photos.side_rows import PhotoNames, SideRow, apply_rows
 from skyquilt.photos.srt import read_srt
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 
-from skyquilt.config import MosaicSettings
 from skyquilt.model.event import Event, Result
-from skyquilt.pipelines.mosaic import iter_mosaic
 from skyquilt.simulate import FlightSettings, simulate
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
+from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.workflows.mosaic import iter_mosaic
 
 
 @dataclass(frozen=True, kw_only=True)

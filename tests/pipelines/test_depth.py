@@ -8,9 +8,9 @@ import pytest
 import rasterio
 from rasterio.warp import Resampling, reproject
 
-from skyquilt.config import MosaicSettings
+from skyquilt.depth.workflow import depth, iter_depth
 from skyquilt.errors import OutputError, RefusedError, UsageError
-from skyquilt.pipelines.depth import depth, iter_depth
+from skyquilt.workflows.methods import MosaicSettings
 
 SETTINGS = MosaicSettings(gsd_cm=25, features=3000, jobs=2)
 

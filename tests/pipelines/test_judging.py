@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from skyquilt.model.poses import ControlResidual
-from skyquilt.pipelines.judging import _holes, control_figures
+from skyquilt.quality.run_metrics import _holes, control_figures
 
 
 @pytest.mark.parametrize(

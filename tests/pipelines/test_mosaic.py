@@ -11,10 +11,10 @@ import pytest
 import rasterio
 from pyproj import Transformer
 
-from skyquilt.config import MosaicSettings
-from skyquilt.metrics.map_error import map_error
 from skyquilt.model.event import Result, StageFinished, StageStarted
-from skyquilt.pipelines.mosaic import iter_mosaic
+from skyquilt.quality.map_error import map_error
+from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.workflows.mosaic import iter_mosaic
 
 
 @pytest.fixture(scope="module")

@@ -5,9 +5,9 @@ asked, pictures never.
 import numpy as np
 import pytest
 
-from skyquilt.config import MosaicSettings
-from skyquilt.pipelines.radiometry import balances_drift, recorded_tags, value_tags
-from skyquilt.render.exposure import NEUTRAL, Exposure
+from skyquilt.ortho.exposure import NEUTRAL, Exposure
+from skyquilt.ortho.radiometry import balances_drift, recorded_tags, value_tags
+from skyquilt.workflows.methods import MosaicSettings
 
 
 @pytest.mark.parametrize(

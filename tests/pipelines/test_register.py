@@ -11,9 +11,9 @@ import rasterio
 from rasterio.transform import Affine, from_origin
 
 from skyquilt.cli.main import run
+from skyquilt.coregistration.files import CONTRACT, OVERLAYS
+from skyquilt.coregistration.workflow import iter_register, register
 from skyquilt.errors import OutputError, RefusedError, UsageError
-from skyquilt.pipelines.register import iter_register, register
-from skyquilt.pipelines.register_files import CONTRACT, OVERLAYS
 from tests.photos.conftest import with_segment
 from tests.spectral.scenes import error, layout, pair, spectrum, turned
 
@@ -296,7 +296,7 @@ def test_help_names_every_method():
     from typer.testing import CliRunner
 
     from skyquilt.cli.app import app
-    from skyquilt.config_register import REGISTRATIONS
+    from skyquilt.coregistration.methods import REGISTRATIONS
 
     told = (
         CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(app, ["register", "--help"]).output

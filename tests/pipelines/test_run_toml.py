@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyquilt import __version__
-from skyquilt.config import MosaicSettings
-from skyquilt.pipelines.files import source_commit, write_run
+from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.workflows.run_files import source_commit, write_run
 
 
 def written(folder, settings, photos="photos"):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from skyquilt.errors import OutputError, SideFileError, UsageError
-from skyquilt.pipelines.pair_list import COLUMNS, read_pairs
-from skyquilt.pipelines.spectral_bench import iter_spectral_bench
+from skyquilt.papers.pair_list import COLUMNS, read_pairs
+from skyquilt.papers.spectral_bench import iter_spectral_bench
 from tests.spectral.scenes import pair, turned
 
 SHAPE = (400, 480)
@@ -143,7 +143,7 @@ def test_auto_on_the_real_pairs(tmp_path):
 @pytest.mark.slow
 def test_mirrored_real_pairs_are_refused():
     """The same pictures and places, but no transform of the family exists."""
-    from skyquilt.config_register import registration_method
+    from skyquilt.coregistration.methods import registration_method
     from skyquilt.model.registration import Picture
 
     if not REAL.is_file():

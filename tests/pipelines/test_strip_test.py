@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from skyquilt.errors import OutputError, RefusedError, UsageError
-from skyquilt.geometry.board_camera import board_camera
-from skyquilt.model.distortion import ORDERS
+from skyquilt.model.camera import ORDERS
 from skyquilt.model.event import Result, StageProgress
-from skyquilt.pipelines.strip_test import iter_strip_test
+from skyquilt.papers.board_camera import board_camera
+from skyquilt.papers.strip_test import iter_strip_test
 from skyquilt.simulate import StripSettings, fly_strip
 
 

@@ -6,10 +6,10 @@ import rasterio
 from rasterio.transform import from_origin
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from skyquilt.coregistration.files import resample_onto
 from skyquilt.errors import RefusedError, UsageError
-from skyquilt.pipelines.register_files import resample_onto
-from skyquilt.pipelines.thermal import iter_thermal
-from skyquilt.pipelines.thermal_join import heights_on, join, opened
+from skyquilt.thermal.routes import heights_on, join, opened
+from skyquilt.thermal.workflow import iter_thermal
 
 GSD_A, GSD_B = 0.1, 0.2
 TRUE_SHIFT = (1.4, -0.8)

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.config import MosaicSettings
 from skyquilt.model.event import Result
-from skyquilt.pipelines.mosaic import mosaic
-from skyquilt.pipelines.scene import scene_of_run
-from skyquilt.pipelines.thermal_pairs import by_pairs, overlapping
+from skyquilt.thermal.by_pairs import by_pairs, overlapping
+from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.workflows.mosaic import mosaic
+from skyquilt.workflows.scene import scene_of_run
 
 SETTINGS = MosaicSettings(gsd_cm=15, jobs=2)
 OFF = (2.1, -1.2)

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 import rasterio
 
-from skyquilt.config import MosaicSettings
 from skyquilt.errors import RefusedError
 from skyquilt.geometry.camera import project, rays
-from skyquilt.geometry.frames import cam_R_map_from_angles
-from skyquilt.geometry.rotations import angle_deg
+from skyquilt.geometry.frames import angle_deg, cam_R_map_from_angles
 from skyquilt.model.camera import Camera
 from skyquilt.model.event import Result
-from skyquilt.pipelines.thermal import iter_thermal
+from skyquilt.thermal.workflow import iter_thermal
+from skyquilt.workflows.methods import MosaicSettings
 
 HEAT = Camera.ideal(width=320, height=256, focal=400.0)
 TURN = cam_R_map_from_angles(2.0, 1.0, -1.5) @ cam_R_map_from_angles(0, 0, 0).T

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 import tifffile
 
-from skyquilt.config import MosaicSettings
+from skyquilt.depth.workflow import iter_depth
 from skyquilt.errors import UsageError
+from skyquilt.live.live_map import LiveMap
+from skyquilt.live.photo_intake import Accepted
+from skyquilt.live.settings import LiveSettings
 from skyquilt.model.event import Note
-from skyquilt.pipelines import compare
-from skyquilt.pipelines.compare import CompareSettings, iter_compare
-from skyquilt.pipelines.depth import iter_depth
-from skyquilt.pipelines.live.intake import Accepted
-from skyquilt.pipelines.live.settings import LiveSettings
-from skyquilt.pipelines.live.story import LiveMap
-from skyquilt.pipelines.mosaic import iter_mosaic
+from skyquilt.papers import compare
+from skyquilt.papers.compare import CompareSettings, iter_compare
+from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.workflows.mosaic import iter_mosaic
 
 
 @pytest.fixture

@@ -14,9 +14,9 @@ from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Pose
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
-from skyquilt.render.blend import Feather
-from skyquilt.render.compose import Composer
-from skyquilt.render.exposure import NEUTRAL
+from skyquilt.ortho.blend import Feather
+from skyquilt.ortho.compose import Composer
+from skyquilt.ortho.exposure import NEUTRAL
 from tests.texture import texture
 
 FLAT = Surface(z=np.zeros((2, 2), np.float32), x0=0.0, y0=0.0, cell=1.0, source="plane")

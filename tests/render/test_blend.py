@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skyquilt.render.blend import Average, Feather, First, Layer, Multiband
+from skyquilt.ortho.blend import Average, Feather, First, Layer, Multiband
 
 H, W, GSD, FLYING = 64, 96, 0.1, 50.0
 

@@ -11,12 +11,12 @@ import pytest
 from skyquilt.geometry.camera import project
 from skyquilt.imaging.registration import shifts_between
 from skyquilt.imaging.views import STEP, inside
+from skyquilt.live.newest_blend import Newest
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
-from skyquilt.render.blend import Average, Feather, First, Multiband
-from skyquilt.render.compose import _remapped
-from skyquilt.render.newest import Newest
-from skyquilt.render.plan import STILL
+from skyquilt.ortho.blend import Average, Feather, First, Multiband
+from skyquilt.ortho.compose import _remapped
+from skyquilt.ortho.plan import STILL
 from tests.render.scenes import CAMERA, FLAT, GRID, block, composer, photograph, truth, view
 
 WHOLE = Window(row=0, column=0, height=GRID.height, width=GRID.width)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from skyquilt.model.raster import Window
-from skyquilt.render.drift import Drift, Overlaps, overlaps, solved
-from skyquilt.render.exposure import NEUTRAL, Exposure
+from skyquilt.ortho.drift import Drift, Overlaps, overlaps, solved
+from skyquilt.ortho.exposure import NEUTRAL, Exposure
 from tests.render.scenes import FLAT, GRID, block, composer, photograph, view
 
 

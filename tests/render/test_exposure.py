@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyquilt.model.raster import Window
-from skyquilt.render import exposure
-from skyquilt.render.exposure import NEUTRAL, Balance, Exposure, odds_table, with_odds
+from skyquilt.ortho import exposure
+from skyquilt.ortho.exposure import NEUTRAL, Balance, Exposure, odds_table, with_odds
 from tests.render.scenes import FLAT, GRID, block, composer, photograph
 
 gains = st.floats(-1.5, 1.5)

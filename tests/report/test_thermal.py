@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from skyquilt.report.thermal import thermal_section, with_section
+from skyquilt.thermal.page import thermal_section, with_section
 
 RECORD = {
     "route": "heights",

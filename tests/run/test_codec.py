@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from skyquilt.run.codec import decode, encode
+from skyquilt.engine.codec import decode, encode
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -3,7 +3,7 @@ import time
 
 import pytest
 
-from skyquilt.run.executor import in_order
+from skyquilt.engine.executor import in_order
 
 
 @pytest.mark.parametrize("jobs", [0, 1, 2, 7])

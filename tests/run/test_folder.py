@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from skyquilt.engine.folder import CONTRACT, STATE, open_run
 from skyquilt.errors import OutputError
-from skyquilt.run.folder import CONTRACT, STATE, open_run
 
 
 def finish(path, key="k"):

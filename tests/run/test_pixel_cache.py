@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from skyquilt.run.pixel_cache import PixelCache
+from skyquilt.engine.pixel_cache import PixelCache
 
 
 def cache(budget, read=None):

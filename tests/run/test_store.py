@@ -4,9 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skyquilt.config import MosaicSettings, methods
+from skyquilt.engine.store import Store, digest
 from skyquilt.errors import OutputError
-from skyquilt.run.store import Store, digest
+from skyquilt.workflows.methods import MosaicSettings, methods
 
 
 @pytest.fixture

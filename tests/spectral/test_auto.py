@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from skyquilt.config_register import registration_method
+from skyquilt.coregistration.methods import registration_method
+from skyquilt.coregistration.structure import StructureMatches
 from skyquilt.model.estimate import NoEstimate
 from skyquilt.model.registration import Guess, Picture, RefusedRegistration
-from skyquilt.spectral.structure import StructureMatches
 from tests.spectral.scenes import error, layout, pair, spectrum, turned
 
 SHAPE = (400, 480)

@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from skyquilt.config_register import registration_method
-from skyquilt.metrics.registration_quality import spread_quality
+from skyquilt.coregistration.methods import registration_method
 from skyquilt.model.estimate import NoEstimate
 from skyquilt.model.features import DESCRIPTOR_UNIT, Features
 from skyquilt.model.registration import Picture, RefusedRegistration, Registration
-from skyquilt.spectral.by_features import BetterByQ, Outliers, best
-from skyquilt.spectral.edges import binary_edges, gradient_magnitude
+from skyquilt.papers.rfae import BetterByQ, Outliers, best, binary_edges, gradient_magnitude
+from skyquilt.quality.registration_quality import spread_quality
 from tests.spectral.scenes import error, layout, spectrum, turned
 
 SHAPE = (400, 480)
@@ -89,7 +88,7 @@ def test_the_highest_q_wins_and_refusals_lose():
 
 
 def test_outliers_keep_the_estimator_with_the_higher_q():
-    from skyquilt.matching.one_way import OneWay
+    from skyquilt.matching.matchers import OneWay
     from skyquilt.model.estimate import Estimate
 
     def features(seed):
@@ -131,7 +130,7 @@ def test_outliers_keep_the_estimator_with_the_higher_q():
 
 
 def test_one_way_matching_against_a_loop():
-    from skyquilt.matching.one_way import OneWay
+    from skyquilt.matching.matchers import OneWay
 
     rng = np.random.default_rng(4)
 

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from skyquilt.config_register import registration_method
+from skyquilt.coregistration.common_part import common_part
+from skyquilt.coregistration.methods import registration_method
 from skyquilt.model.registration import Guess, Picture
-from skyquilt.spectral.common_part import common_part
 from tests.spectral.scenes import layout, spectrum, turned
 
 WIDE, NARROW = (900, 1200), (256, 320)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from skyquilt.spectral.fusion import alpha, checkerboard, false_colour, shown, side_by_side
+from skyquilt.coregistration.fusion import alpha, checkerboard, false_colour, shown, side_by_side
 
 A = np.arange(64, dtype=np.uint8).reshape(8, 8)
 B = (255 - A).astype(np.uint8)

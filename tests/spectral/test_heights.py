@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from skyquilt.coregistration.heights import AlignHeights
 from skyquilt.model.registration import RefusedRegistration
 from skyquilt.model.surface import HeightField
-from skyquilt.spectral.heights import AlignHeights
 
 CELL, SIZE = 0.1, 400
 TRUTH = np.array([[1.006, -0.009, 1.3], [0.009, 1.006, -0.7], [0, 0, 1.0]])

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from skyquilt.coregistration.metadata import from_metadata
 from skyquilt.model.photo import Attitude, Focal, GeoPosition, Photo
-from skyquilt.spectral.metadata import from_metadata
 
 LATITUDE, LONGITUDE = 46.5, -92.0
 METRES = np.pi / 180 * 6378137

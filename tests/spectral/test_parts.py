@@ -5,15 +5,29 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from skyquilt.coregistration.agreement import Agree, _fisher
+from skyquilt.coregistration.candidates import (
+    Candidate,
+    Nearby,
+    corners,
+    distinct,
+    peaks,
+    same_view,
+    similarity,
+)
+from skyquilt.coregistration.decision import distinctness
+from skyquilt.coregistration.everywhere import Everywhere, _Plane
+from skyquilt.coregistration.orientation import (
+    between,
+    full_size,
+    orientation,
+    spectra,
+    turned,
+    warped,
+)
+from skyquilt.coregistration.subpixel import Sharpen
+from skyquilt.coregistration.usable import usable
 from skyquilt.model.registration import Picture
-from skyquilt.spectral.agreement import Agree, _fisher
-from skyquilt.spectral.candidates import Candidate, corners, distinct, peaks, similarity
-from skyquilt.spectral.distinctness import distinctness
-from skyquilt.spectral.everywhere import Everywhere, _Plane
-from skyquilt.spectral.nearby import Nearby, same_view
-from skyquilt.spectral.orientation import between, full_size, orientation, spectra, turned, warped
-from skyquilt.spectral.sharpen import Sharpen
-from skyquilt.spectral.usable import usable
 from tests.spectral.scenes import error, layout, pair, spectrum
 from tests.spectral.scenes import turned as turned_by
 
@@ -212,7 +226,7 @@ def test_colour_is_brightness(scene):
 def test_fishers_tail_is_scipys():
     from scipy.stats import chi2
 
-    from skyquilt.spectral.agreement import _fisher
+    from skyquilt.coregistration.agreement import _fisher
 
     rng = np.random.default_rng(0)
     for n in (1, 2, 9, 40):

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from skyquilt.coregistration.propagation import PairPoints, Propagate, balanced_weights, carried
 from skyquilt.geometry.transforms import transfer
-from skyquilt.spectral.propagation import PairPoints, Propagate, balanced_weights, carried
 
 rng = np.random.default_rng
 

@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from skyquilt.coregistration.rig import FindRig, RigPair
 from skyquilt.geometry.camera import project, rays
-from skyquilt.geometry.frames import cam_R_map_from_angles
-from skyquilt.geometry.rotations import angle_deg, median_rotation
+from skyquilt.geometry.frames import angle_deg, cam_R_map_from_angles, median_rotation
 from skyquilt.model.camera import Camera
-from skyquilt.spectral.rig import FindRig, RigPair
 
 A = Camera(width=4000, height=3000, focal=3000.0, cx=2010.0, cy=1490.0, k1=-0.05)
 B = Camera(width=640, height=512, focal=760.0, cx=321.0, cy=257.0, k1=-0.2, k2=0.05)

@@ -6,11 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
+from skyquilt.coregistration.orientation import orientation
+from skyquilt.coregistration.refine_registration import Settle, chromatic, chromaticity, stiff
+from skyquilt.coregistration.subpixel import Sharpen
 from skyquilt.model.registration import Picture, Registration
-from skyquilt.spectral.chromatic import chromatic, chromaticity
-from skyquilt.spectral.orientation import orientation
-from skyquilt.spectral.settle import Settle, stiff
-from skyquilt.spectral.sharpen import Sharpen
 from tests.spectral.lit import rough_ground
 from tests.spectral.scenes import error, turned
 

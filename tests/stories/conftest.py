@@ -20,7 +20,7 @@ import pytest
 from PIL import Image
 
 from skyquilt.cli.main import run
-from skyquilt.run.folder import CONTRACT
+from skyquilt.engine.folder import CONTRACT
 from skyquilt.simulate import FlightSettings, simulate
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route

@@ -130,7 +130,7 @@ def test_all_kinds_of_bad_at_once(mosaic, photos):
 @pytest.mark.slow
 def test_a_photo_that_cannot_be_read_any_more_when_the_map_is_drawn(mosaic, photos, monkeypatch):
     """A disk goes away in the middle: the file is named, and the same command resumes."""
-    from skyquilt.pipelines import mosaic as story
+    from skyquilt.workflows import mosaic as story
 
     read, seen = story.read_color, set()
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import tifffile
 
+from skyquilt.calibration.files import CONTRACT
+from skyquilt.calibration.workflow import CalibrateSettings, calibrate
 from skyquilt.errors import NoPhotosError, OutputError, RefusedError, UsageError
 from skyquilt.photos.cameras_json import read_cameras_json
-from skyquilt.pipelines.calibrate import CalibrateSettings, calibrate
-from skyquilt.pipelines.calibrate_files import CONTRACT
 from skyquilt.simulate.board import tilted
 from tests.calibration.boards import LENS, frame, frontal, poses
 

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import rasterio
 
-from skyquilt.pipelines.mosaic import STAGES
-from skyquilt.run.folder import CONTRACT
+from skyquilt.engine.folder import CONTRACT
+from skyquilt.workflows.mosaic import STAGES
 from tests.interrupts import hears_interrupts
 from tests.stories.conftest import leftovers, named
 
@@ -299,7 +299,7 @@ def test_an_output_inside_the_folder_of_photos_is_no_input(mosaic, photos):
 def test_an_unfinished_output_inside_the_folder_of_photos_is_no_input_either(
     mosaic, photos, monkeypatch
 ):
-    from skyquilt.pipelines import mosaic as story
+    from skyquilt.workflows import mosaic as story
 
     def interrupted(*args, **words):
         raise KeyboardInterrupt

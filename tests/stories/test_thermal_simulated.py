@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import rasterio
 
-from skyquilt.config import MosaicSettings
 from skyquilt.errors import NoPhotosError, RefusedError
-from skyquilt.metrics.map_error import map_error
 from skyquilt.model.event import Note, Result
-from skyquilt.pipelines.thermal import iter_thermal
+from skyquilt.quality.map_error import map_error
 from skyquilt.simulate import FlightSettings, simulate
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route, Thermal
 from skyquilt.simulate.weather import Weather
+from skyquilt.thermal.workflow import iter_thermal
+from skyquilt.workflows.methods import MosaicSettings
 from tests.stories.conftest import relabel
 
 SETTINGS = MosaicSettings(jobs=2)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyquilt.surface.cells import WEIGHT, HeightCells
+from skyquilt.ortho.height_cells import WEIGHT, HeightCells
 
 
 def test_cells_hold_the_medians_of_their_points():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skyquilt.surface.disparities import OnePlane
+from skyquilt.depth.one_plane import OnePlane
 
 
 def ground(x, y):

@@ -13,9 +13,8 @@ from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Pose
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
-from skyquilt.surface.plane import level
-from skyquilt.surface.sweep import Sweep
-from skyquilt.surface.tiepoints import FromTiePoints, grid_spacing, without_outliers
+from skyquilt.ortho.sweep import Sweep
+from skyquilt.ortho.tie_surface import FromTiePoints, grid_spacing, level, without_outliers
 from tests.texture import texture
 
 BOUNDS = (-50.0, -40.0, 50.0, 40.0)

@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 
 from skyquilt.geometry.transforms import transfer
-from skyquilt.imaging.mutual_information import mutual_information
-from skyquilt.imaging.ncc import ncc, ncc_of_shifts, summit
-from skyquilt.imaging.phase import phase_shift, rotation_and_scale
-from skyquilt.twoview.climb import levels, motion
-from skyquilt.twoview.direct import Ncc
-from skyquilt.twoview.refinements import Ecc, MutualInformation, PhaseCorrelation
+from skyquilt.papers.climb import levels, motion
+from skyquilt.papers.direct import Ncc
+from skyquilt.papers.direct_refinement import Ecc, MutualInformation, PhaseCorrelation
+from skyquilt.papers.phase import phase_shift, rotation_and_scale
+from skyquilt.papers.picture_similarity import mutual_information, ncc, ncc_of_shifts, summit
 from tests.texture import texture
 
 SIZE = (300, 400)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from skyquilt.geometry.transforms import MODELS, symmetric_transfer_errors, transfer
-from skyquilt.twoview.lmeds import Lmeds
-from skyquilt.twoview.magsac import Magsac, _area, _loss, _weight
-from skyquilt.twoview.ransac import Ransac
-from skyquilt.twoview.search import needed, samples
-from skyquilt.twoview.ste import RansacSte, _distant
+from skyquilt.matching.ransac import Ransac
+from skyquilt.matching.search import needed, samples
+from skyquilt.papers.lmeds import Lmeds
+from skyquilt.papers.magsac import Magsac, _area, _loss, _weight
+from skyquilt.papers.ste import RansacSte, _distant
 from tests.geometry.test_transforms import FRAME, drawn
 
 NOISE = 0.3

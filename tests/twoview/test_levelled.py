@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from skyquilt.geometry.transforms import transfer
-from skyquilt.twoview.levelled import Level, depth_map, disparities, threshold_px
-from skyquilt.twoview.ransac import Ransac
+from skyquilt.matching.levelled import Level, depth_map, disparities, threshold_px
+from skyquilt.matching.ransac import Ransac
 
 F, HEIGHT, BASE = 1170.0, 40.0, 12.0
 GRID = np.stack(np.meshgrid(np.linspace(0, 1500, 7), np.linspace(0, 1000, 5)), -1).reshape(-1, 2)

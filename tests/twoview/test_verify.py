@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.matching.verify import Verify
 from skyquilt.model.features import Features, Link, Matches, RejectedLink
-from skyquilt.twoview.verify import Verify
 from tests.alignment.blocks import FLYING, HEIGHT, LENS, WIDTH, ground, seen_by
 
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import adjust, covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
+from skyquilt.alignment.least_squares_matching import GreyPicture, Sharpen
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
-from skyquilt.alignment.sharpen import GreyPicture, Sharpen
 from skyquilt.alignment.start import Start, find_start
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import polish, triangulated

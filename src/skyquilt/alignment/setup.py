@@ -11,8 +11,7 @@ from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.start import Start
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.geometry.frames import angle_difference_deg, cam_R_map_from_angles
-from skyquilt.model.camera import Camera
-from skyquilt.model.distortion import order_named
+from skyquilt.model.camera import Camera, order_named
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Pose, Prior
 

@@ -1,5 +1,6 @@
-"""A series of frames of one pose, heated part by part -> one picture of the greatest contrast [Y
-5.1.2].
+"""Frames of one board pose, heated part by part, to one picture of the greatest contrast.
+
+Bimodality and weights: Yahyanejad 2013, 5.1.2, (5.1) to (5.3).
 """
 
 from collections.abc import Iterable
@@ -10,7 +11,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.calibration.bimodality import separation
 from skyquilt.calibration.find_board import grey_float
 from skyquilt.model.board import Board
 
@@ -62,3 +62,38 @@ def cell_of(shape: tuple[int, ...], board: Board) -> int:
     """
     short, long = sorted((board.columns, board.rows))
     return max(4, int(2 * min(min(shape[:2]) / short, max(shape[:2]) / long)))
+
+
+def bimodality(cell: NDArray[Any]) -> float:
+    """phi of (5.1): spread of the pixels below the mean plus spread of those above it, over the
+    squared distance of the two means. Low is well separated; infinite for a cell without contrast.
+    Unit: 1 / unit of the cell.
+    """
+    values = np.asarray(cell, np.float64).ravel()
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return float("inf")
+    middle = values.mean()
+    below, above = values[values < middle], values[values > middle]
+    if not below.size or not above.size:
+        return float("inf")
+    return float((below.std() + above.std()) / (below.mean() - above.mean()) ** 2)
+
+
+def separation(image: NDArray[np.float32], cell_px: int) -> NDArray[np.float64]:
+    """1 / phi (m, n) on overlapping cells of an image (H, W), `cell_px` wide at steps of half of
+    it.
+
+    phi is low where black and white part well, so its inverse is what a weight must grow with.
+    """
+    step = max(1, cell_px // 2)
+    rows, columns = (max(1, 1 + (size - cell_px + step - 1) // step) for size in image.shape)
+    out = np.zeros((rows, columns))
+    for i, j in np.ndindex(rows, columns):
+        top, left = (
+            min(i * step, max(image.shape[0] - cell_px, 0)),
+            min(j * step, max(image.shape[1] - cell_px, 0)),
+        )
+        phi = bimodality(image[top : top + cell_px, left : left + cell_px])
+        out[i, j] = 1 / phi if phi > 0 else 0.0
+    return out

@@ -8,11 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.calibration.blobs import Blobs, blobs
+from skyquilt.calibration.blobs import Blobs, Wellner, blobs
+from skyquilt.calibration.board_pose import Misplaced, Placed, place
 from skyquilt.calibration.lattice import lattices
 from skyquilt.calibration.measure import Measure, corners
-from skyquilt.calibration.placing import Misplaced, Placed, place
-from skyquilt.calibration.threshold import Wellner
 from skyquilt.imaging.grey import shrink
 from skyquilt.model.board import Board, BoardView, RejectedView
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.calibration.placing import Placed, cell_levels, through
+from skyquilt.calibration.board_pose import Placed, cell_levels, through
 from skyquilt.model.board import Board
 
 Array = NDArray[np.float64]

@@ -39,8 +39,8 @@ def command(
     it.
     """
     with ends_at_once():
+        from skyquilt.calibration.workflow import CalibrateSettings, iter_calibrate
         from skyquilt.cli.progress import show
-        from skyquilt.pipelines.calibrate import CalibrateSettings, iter_calibrate
 
     mode = mode_of(quiet=quiet, json=json)
     columns, rows = parse_board(board)

@@ -75,8 +75,8 @@ def command(
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
-        from skyquilt.config import MosaicSettings
-        from skyquilt.pipelines.compare import VARIANTS, CompareSettings, iter_compare
+        from skyquilt.papers.compare import VARIANTS, CompareSettings, iter_compare
+        from skyquilt.workflows.methods import MosaicSettings
 
     mode = mode_of(quiet=quiet, json=json)
     shared = MosaicSettings(

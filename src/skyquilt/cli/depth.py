@@ -59,8 +59,8 @@ def command(
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
-        from skyquilt.config import MosaicSettings
-        from skyquilt.pipelines.depth import iter_depth
+        from skyquilt.depth.workflow import iter_depth
+        from skyquilt.workflows.methods import MosaicSettings
 
     mode = mode_of(quiet=quiet, json=json)
     settings = MosaicSettings(

@@ -39,7 +39,7 @@ def command(
     previews first.
     """
     with ends_at_once():
-        from skyquilt.pipelines.live.flying import FlySettings, fly
+        from skyquilt.live.replay_flight import FlySettings, fly
     settings = FlySettings(
         rate=rate,
         drones=drones,

@@ -72,11 +72,11 @@ def command(
     """
     with ends_at_once():
         from skyquilt.cli.live_progress import show_live
-        from skyquilt.pipelines.live.running import iter_live
-        from skyquilt.pipelines.live.settings import LiveSettings
-        from skyquilt.pipelines.live.story import LiveMap
-        from skyquilt.viewer.apart import Asked, ServingApart
-        from skyquilt.viewer.guard import Guard
+        from skyquilt.live.live_map import LiveMap
+        from skyquilt.live.settings import LiveSettings
+        from skyquilt.live.workflow import iter_live
+        from skyquilt.server.guard import Guard
+        from skyquilt.server.server_process import Asked, ServingApart
     settings = LiveSettings(
         gsd_cm=gsd,
         crs=crs,

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from dataclasses import asdict
 
 from skyquilt.cli.progress import as_record, mosaic_summary
+from skyquilt.live.update import Update
 from skyquilt.model.event import Event, Note, Result, StageStarted
-from skyquilt.pipelines.live.update import Update
 
 
 def show_live(events: Iterable[Event | Update], url: str, *, mode: str) -> None:

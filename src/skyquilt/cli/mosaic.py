@@ -207,8 +207,8 @@ def command(
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
-        from skyquilt.config import MosaicSettings
-        from skyquilt.pipelines.mosaic import STAGES, iter_mosaic
+        from skyquilt.workflows.methods import MosaicSettings
+        from skyquilt.workflows.mosaic import STAGES, iter_mosaic
 
     if rerun_from is not None and rerun_from not in STAGES[1:]:
         raise UsageError(f"--rerun-from {rerun_from!r} is not one of {', '.join(STAGES[1:])}")
@@ -251,7 +251,7 @@ def command(
     if thermal is None:
         events = iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
     else:
-        from skyquilt.pipelines.thermal import iter_thermal
+        from skyquilt.thermal.workflow import iter_thermal
 
         events = iter_thermal(
             photos,

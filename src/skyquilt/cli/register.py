@@ -41,8 +41,8 @@ def command(
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
-        from skyquilt.config_register import RegisterSettings
-        from skyquilt.pipelines.register import iter_register
+        from skyquilt.coregistration.methods import RegisterSettings
+        from skyquilt.coregistration.workflow import iter_register
 
     mode = mode_of(quiet=quiet, json=json)
     settings = RegisterSettings(method=method, use_metadata=metadata)

@@ -35,7 +35,7 @@ def command(
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
-        from skyquilt.pipelines.spectral_bench import iter_spectral_bench
+        from skyquilt.papers.spectral_bench import iter_spectral_bench
 
     mode = mode_of(quiet=quiet, json=json)
     asked = tuple(dict.fromkeys(word.strip() for word in method.split(",") if word.strip()))

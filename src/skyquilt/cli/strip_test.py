@@ -39,7 +39,7 @@ def command(
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
-        from skyquilt.pipelines.strip_test import iter_strip_test
+        from skyquilt.papers.strip_test import iter_strip_test
         from skyquilt.simulate import StripSettings
 
     mode = mode_of(quiet=quiet, json=json)

@@ -24,9 +24,9 @@ def command(
 ) -> None:
     """Show a map in a browser, with all photos that cover any point. Nothing is changed."""
     with ends_at_once():
-        from skyquilt.viewer.guard import Guard
-        from skyquilt.viewer.serving import Serving
-        from skyquilt.viewer.survey import open_survey
+        from skyquilt.server.guard import Guard
+        from skyquilt.server.server_thread import Serving
+        from skyquilt.server.survey import open_survey
     survey = open_survey(folder, base=base)
     guard = Guard(host=host, token="looking-only")  # nothing can be written: there is no writer
     with Serving(survey=survey, guard=guard, folder=folder, port=port) as serving:

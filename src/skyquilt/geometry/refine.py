@@ -5,8 +5,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skyquilt.geometry.dlt import normalisation
-from skyquilt.geometry.transforms import inverse, symmetric_transfer_errors
+from skyquilt.geometry.transforms import inverse, normalisation, symmetric_transfer_errors
 
 Doubles = NDArray[np.float64]
 

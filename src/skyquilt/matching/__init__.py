@@ -1,1 +1,1 @@
-"""Stage: Features x 2 -> Matches."""
+"""What photos have in common: features, candidate pairs, matches, verified links."""

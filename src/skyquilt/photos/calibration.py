@@ -3,10 +3,9 @@
 from dataclasses import replace
 
 from skyquilt.model.camera import Camera
-from skyquilt.photos import exif as tag
-from skyquilt.photos.exif import Exif
-from skyquilt.photos.sensors import Sensor
-from skyquilt.photos.xmp import Xmp
+from skyquilt.photos import tags as tag
+from skyquilt.photos.lens import Sensor
+from skyquilt.photos.tags import Exif, Xmp
 
 _SIGMA_SHARE = {"focal": 0.01, "centre": 0.003}
 _SIGMA_RADIAL, _SIGMA_TANGENTIAL = 0.01, 0.001

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from skyquilt.errors import SideFileError
 from skyquilt.model.photo import ControlPoint, KnownDistance, PointObservation
-from skyquilt.photos.side_rows import PhotoNames, sentence_of
-from skyquilt.photos.side_text import finite, number, read_lines
+from skyquilt.photos.side_rows import PhotoNames, finite, number, read_lines, sentence_of
 
 _ENDS = ("a", "b")
 _NEEDED = ("point_a", "point_b", "metres")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from skyquilt.photos.jpeg import APP1, JpegHeader
+from skyquilt.photos.headers import APP1, JpegHeader
 
 _PREFIX = b"FLIR\x00"
 _RAW_IMAGE, _CAMERA = 1, 0x20

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from skyquilt.errors import SideFileError
 from skyquilt.model.photo import ControlPoint, PointObservation
-from skyquilt.photos.side_rows import PhotoNames, sentence_of
-from skyquilt.photos.side_text import finite, number, read_crs, read_lines
+from skyquilt.photos.side_rows import PhotoNames, finite, number, read_crs, read_lines, sentence_of
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,8 +18,8 @@ from PIL import Image
 
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.photo import Photo
-from skyquilt.photos.exif import MAKE
-from skyquilt.photos.header import read_header
+from skyquilt.photos.headers import read_header
+from skyquilt.photos.tags import MAKE
 from skyquilt.photos.thermal import thermal_frame_of_jpeg, thermal_frame_of_values
 
 Pixels = NDArray[Any]

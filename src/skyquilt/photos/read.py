@@ -10,16 +10,19 @@ import numpy as np
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Stored
-from skyquilt.photos import exif as tag
-from skyquilt.photos.attitude import read_attitude, read_flight_yaw
+from skyquilt.photos import tags as tag
 from skyquilt.photos.calibration import read_calibration
-from skyquilt.photos.clock import modified_time, read_time
-from skyquilt.photos.editor import find_editor
-from skyquilt.photos.focal import find_focal, focal_notes, native_scale
-from skyquilt.photos.header import Header, content_digest, read_header
+from skyquilt.photos.headers import Header, content_digest, read_header
+from skyquilt.photos.lens import Sensor, find_focal, find_sensor, focal_notes, native_scale
+from skyquilt.photos.metadata import (
+    find_editor,
+    modified_time,
+    read_attitude,
+    read_flight_yaw,
+    read_position,
+    read_time,
+)
 from skyquilt.photos.pixels import read_tiff
-from skyquilt.photos.position import read_position
-from skyquilt.photos.sensors import Sensor, find_sensor
 from skyquilt.photos.thermal import (
     ThermalFrame,
     stated_unit,

@@ -5,8 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from skyquilt.errors import SideFileError
-from skyquilt.photos.side_rows import PhotoNames, sentence_of
-from skyquilt.photos.side_text import read_lines
+from skyquilt.photos.side_rows import PhotoNames, read_lines, sentence_of
 
 
 def sequence_of(names: Sequence[str], how: str) -> list[int]:

@@ -1,13 +1,15 @@
-"""Which side file is which."""
+"""Positions from side files: CSV, OpenDroneMap's geo.txt, DJI's MRK; SRT has its own module."""
 
+import csv
+import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from skyquilt.model.photo import Photo
-from skyquilt.photos.geo_txt import read_geo_txt
-from skyquilt.photos.mrk import read_mrk
-from skyquilt.photos.positions_csv import read_positions_csv
-from skyquilt.photos.side_rows import apply_rows
+from skyquilt.errors import SideFileError
+from skyquilt.model.photo import Datum, Photo
+from skyquilt.photos.side_rows import SideRow, apply_rows, finite, number, read_crs, read_lines
 from skyquilt.photos.srt import read_srt
 
 
@@ -26,3 +28,203 @@ def apply_positions(
     if ending == ".srt":
         return apply_rows(photos, read_srt(file, photos), file=file, source="srt")
     return apply_rows(photos, read_geo_txt(file), file=file, source="geo.txt")
+
+
+_COLUMNS = {
+    "name": ("name", "filename", "file", "image", "imagename", "photo", "label"),
+    "latitude": ("latitude", "lat", "latitudedeg", "gpslatitude"),
+    "longitude": ("longitude", "lon", "lng", "long", "longitudedeg", "gpslongitude"),
+    "sea_level": ("altitude", "alt", "z", "elevation", "height", "altitudem", "gpsaltitude"),
+    "takeoff": ("relativealtitude", "relalt", "takeoff", "takeoffm", "heightabovetakeoff"),
+    "ellipsoid": ("ellipsoid", "ellipsoidm", "ellipsoidalheight", "ellh", "heightellipsoid"),
+    "yaw": ("yaw", "heading", "yawdeg", "gimbalyaw", "gimbalyawdegree"),
+    "pitch": ("pitch", "pitchdeg", "gimbalpitch", "gimbalpitchdegree"),
+    "roll": ("roll", "rolldeg", "gimbalroll", "gimbalrolldegree"),
+    "sigma_xy": (
+        "accuracy",
+        "horizontalaccuracy",
+        "hacc",
+        "accuracyhorz",
+        "sigmaxym",
+        "xyaccuracy",
+    ),
+    "sigma_z": ("verticalaccuracy", "vacc", "accuracyvert", "sigmazm", "zaccuracy"),
+}
+_DATUMS: tuple[Datum, ...] = ("ellipsoid", "takeoff", "sea_level")
+
+
+def read_positions_csv(path: Path) -> tuple[SideRow, ...]:
+    """One row per photo; raises `SideFileError` where the header or a number is wrong.
+
+    Columns (case, blanks and underscores do not matter): name or filename; lat, lon in degrees; alt
+    (above sea level), rel_alt (above take-off) or ellipsoid in m; yaw, pitch, roll in degrees
+    (pitch 0 = nadir; below -45 it is read as a gimbal's); accuracy, vertical_accuracy in m. Only
+    the name is obligatory.
+    """
+    lines = [line for _, line in read_lines(path)]
+    if not lines:
+        raise SideFileError(f"{path.name} is empty; expected a header and one line per photo.")
+    delimiter = max(",;\t", key=lines[0].count)
+    table = list(csv.reader(lines, delimiter=delimiter))
+    columns = _columns(table[0], path)
+    return tuple(
+        _csv_row(cells, columns, f"{path.name}, row {i}") for i, cells in enumerate(table[1:], 1)
+    )
+
+
+def _columns(header: list[str], path: Path) -> dict[str, int]:
+    plain = [re.sub(r"[^a-z]", "", re.sub(r"[\[(].*", "", cell.lower())) for cell in header]
+    found = {
+        field: next(plain.index(alias) for alias in aliases if alias in plain)
+        for field, aliases in _COLUMNS.items()
+        if set(aliases) & set(plain)
+    }
+    if "name" not in found or ("latitude" in found) != ("longitude" in found) or len(found) < 2:
+        raise SideFileError(
+            f"{path.name}: its header is '{', '.join(header)}'; expected at least 'name' with 'lat'"
+            " and "
+            "'lon', or 'name' with 'yaw'. Add a header line."
+        )
+    return found
+
+
+def _csv_row(cells: list[str], columns: dict[str, int], place: str) -> SideRow:
+    values = {f: _cell(cells, c, f, place) for f, c in columns.items() if f != "name"}
+    datum: Datum = next((d for d in _DATUMS if values.get(d) is not None), "sea_level")
+    yaw = values.get("yaw")
+    return SideRow(
+        name=cells[columns["name"]].strip() if len(cells) > columns["name"] else "",
+        latitude_deg=values.get("latitude"),
+        longitude_deg=values.get("longitude"),
+        altitude_m=values.get(datum),
+        datum=datum,
+        angles_deg=None
+        if yaw is None
+        else (yaw, values.get("pitch") or 0.0, values.get("roll") or 0.0),
+        sigma_xy_m=values.get("sigma_xy"),
+        sigma_z_m=values.get("sigma_z") or values.get("sigma_xy"),
+    )
+
+
+def _cell(cells: list[str], column: int, field: str, place: str) -> float | None:
+    text = cells[column].strip() if column < len(cells) else ""
+    value = number(text)
+    if text and value is None:
+        raise SideFileError(
+            f"{place}: expected a number for {field}, found '{text}'. Correct that cell."
+        )
+    return finite(value)
+
+
+if TYPE_CHECKING:
+    from pyproj import CRS, Transformer
+
+
+def read_geo_txt(path: Path) -> tuple[SideRow, ...]:
+    """All rows, in degrees; raises `SideFileError` with the line that is wrong."""
+    lines = read_lines(path)
+    if len(lines) < 2:
+        raise SideFileError(
+            f"{path.name} has {len(lines)} lines; expected a coordinate system and one line per"
+            " photo."
+        )
+    crs = read_crs(lines[0][1], file=path.name)
+    to_degrees = _to_degrees(crs)
+    datum: Datum = "ellipsoid" if crs.is_geographic and len(crs.axis_info) == 3 else "sea_level"
+    return tuple(
+        _geo_txt_row(text, f"{path.name}, line {i}", to_degrees, datum) for i, text in lines[1:]
+    )
+
+
+def _to_degrees(crs: "CRS") -> "Transformer":
+    from pyproj import Transformer
+
+    return Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+
+
+def _geo_txt_row(line: str, place: str, to_degrees: "Transformer", datum: Datum) -> SideRow:
+    name, numbers = _split(line)
+    if not name or len(numbers) not in (2, 3, 6, 7, 8):
+        raise SideFileError(
+            f"{place}: expected 'name x y [z] [yaw pitch roll [hacc vacc]]', found '{line}'. "
+            "Correct that line."
+        )
+    longitude, latitude = to_degrees.transform(numbers[0], numbers[1])
+    values = [finite(v) for v in numbers[2:]] + [None] * 6
+    angles = values[1:4]
+    return SideRow(
+        name=name,
+        latitude_deg=finite(latitude),
+        longitude_deg=finite(longitude),
+        altitude_m=values[0],
+        datum=datum,
+        angles_deg=(angles[0], angles[1], angles[2])
+        if angles[0] is not None and angles[1] is not None and angles[2] is not None
+        else None,
+        sigma_xy_m=values[4],
+        sigma_z_m=values[5] or values[4],
+    )
+
+
+def _split(line: str) -> tuple[str, list[float]]:
+    """The name (it may hold spaces) and the numbers behind it."""
+    words = line.replace(",", " ").split()
+    numbers: list[float] = []
+    while words and (value := number(words[-1])) is not None:
+        numbers.insert(0, value)
+        words.pop()
+    return " ".join(words), numbers
+
+
+_NUMBER = r"\s*([-+]?\d+(?:\.\d+)?)\s*"
+_LINE = re.compile(
+    rf"^(\d+)\s+\S+\s+\[\d+\]{_NUMBER},\s*N{_NUMBER},\s*E{_NUMBER},\s*V"
+    rf"{_NUMBER},\s*Lat{_NUMBER},\s*Lon{_NUMBER},\s*Ellh(?:{_NUMBER},{_NUMBER},{_NUMBER})?"
+)
+_SHOT = re.compile(r"_(\d{4,})(?:_[A-Za-z]+)?$")
+_METRES_PER_DEGREE = 111_320.0
+
+
+def read_mrk(path: Path, photo_names: Sequence[str]) -> tuple[SideRow, ...]:
+    """Camera positions for the photos whose index the file has; raises `SideFileError`."""
+    shots = {}
+    for i, line in read_lines(path):
+        found = _LINE.match(line)
+        if not found:
+            raise SideFileError(
+                f"{path.name}, line {i}: expected a DJI shot record (index, time, [week], N, E, V,"
+                " Lat, Lon, "
+                f"Ellh ...), found '{line[:60]}'. Give the file as the drone wrote it."
+            )
+        shots[int(found[1])] = [float(v) if v else None for v in found.groups()[1:]]
+    pairs = ((name, shots.get(_index(name))) for name in photo_names)
+    rows = tuple(_mrk_row(name, shot) for name, shot in pairs if shot)
+    if not rows:
+        raise SideFileError(
+            f"{path.name} has shots {min(shots, default=0)} to {max(shots, default=0)}; no photo's"
+            " name ends "
+            "in one of these numbers. Photos must keep the drone's names, such as"
+            " 100_0001_0023.JPG."
+        )
+    return rows
+
+
+def _index(name: str) -> int:
+    found = _SHOT.search(Path(name).stem)
+    return int(found[1]) if found else -1
+
+
+def _mrk_row(name: str, shot: list[float | None]) -> SideRow:
+    north, east, down, lat, lon, height, *sigmas = shot
+    latitude, longitude = lat or 0.0, lon or 0.0
+    shrink = math.cos(math.radians(latitude))
+    plane = [s for s in sigmas[:2] if s]
+    return SideRow(
+        name=name,
+        latitude_deg=latitude + (north or 0.0) / 1000 / _METRES_PER_DEGREE,
+        longitude_deg=longitude + (east or 0.0) / 1000 / (_METRES_PER_DEGREE * max(shrink, 1e-6)),
+        altitude_m=(height or 0.0) - (down or 0.0) / 1000,
+        datum="ellipsoid",
+        sigma_xy_m=max(plane) if plane else None,
+        sigma_z_m=sigmas[2],
+    )

@@ -13,9 +13,8 @@ from pathlib import Path
 
 from skyquilt.errors import SideFileError
 from skyquilt.model.photo import Photo
-from skyquilt.photos.clock import parse_moment
-from skyquilt.photos.side_rows import SideRow
-from skyquilt.photos.side_text import read_lines
+from skyquilt.photos.metadata import parse_moment
+from skyquilt.photos.side_rows import SideRow, read_lines
 
 _NUMBER = r"([-+]?\d+(?:\.\d+)?)"
 _OLD = re.compile(rf"(?<!\w)GPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}", re.IGNORECASE)

@@ -1,18 +1,104 @@
 """A folder of files to a `Survey`: what a run begins with."""
 
-from collections.abc import Iterable, Sequence
+import os
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 
-from skyquilt.errors import NoPhotosError
+from skyquilt.errors import NoPhotosError, UsageError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
-from skyquilt.photos.files import FoundFiles, find_files
+from skyquilt.photos.implausible_positions import (
+    without_ground_heights,
+    without_outliers,
+    without_stuck,
+)
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
-from skyquilt.photos.survey_notes import survey_notes
-from skyquilt.photos.voids import without_ground_heights, without_outliers, without_stuck
+
+_PHOTO_ENDINGS = frozenset({".jpg", ".jpeg", ".tif", ".tiff", ".png"})
+_RUN_MARK = "run.toml"
+_RUN_STATE = ".skyquilt"
+_SIDE_NAMES = frozenset({"geo.txt", "gcp_list.txt"})
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoundFiles:
+    """What lies in the input."""
+
+    photos: tuple[tuple[str, Path], ...]
+    """Name in the survey and file, sorted by name."""
+    ignored: tuple[str, ...]
+    """Names of all other files."""
+    geo: Path | None
+    """A `geo.txt` that lies at the top."""
+    runs: tuple[str, ...]
+    """Folders of earlier runs, left alone."""
+
+
+def find_files(source: Path | Sequence[Path]) -> FoundFiles:
+    """Photos by their endings below a folder, or among files given one by one.
+
+    Hidden files and folders are passed over, and so are folders of earlier runs (they hold
+    `run.toml`, or `.skyquilt` while they are under way). Raises `UsageError` where something named
+    does not exist.
+    """
+    if isinstance(source, (str, Path)) and Path(source).is_dir():
+        return _in_folder(Path(source))
+    paths = [Path(source)] if isinstance(source, (str, Path)) else [Path(p) for p in source]
+    for path in paths:
+        if not path.exists():
+            raise UsageError(f"{path} does not exist; give a folder of photos.")
+    return _listed(paths)
+
+
+def _in_folder(folder: Path) -> FoundFiles:
+    runs: list[str] = []
+    files = [(_text(p.relative_to(folder).as_posix()), p) for p in _walk(folder, runs, folder)]
+    geo = next((p for name, p in files if name.lower() == "geo.txt"), None)
+    return _sorted(files, geo, tuple(sorted(runs)))
+
+
+def _walk(folder: Path, runs: list[str], top: Path) -> Iterator[Path]:
+    for where, folders, files in os.walk(folder):
+        here = Path(where)
+        if here != top and (_RUN_MARK in files or _RUN_STATE in folders):
+            runs.append(_text(here.relative_to(top).as_posix()))
+            folders.clear()
+            continue
+        folders[:] = sorted(f for f in folders if not f.startswith("."))
+        yield from (here / f for f in files if not f.startswith("."))
+
+
+def _listed(paths: Sequence[Path]) -> FoundFiles:
+    """Files keep their bare names where these differ, else their path below the common folder."""
+    files: list[Path] = []
+    for path in paths:
+        files += [p for _, p in _in_folder(path).photos] if path.is_dir() else [path]
+    unique = list(dict.fromkeys(p.absolute() for p in files))
+    top = Path(os.path.commonpath([p.parent for p in unique])) if unique else Path()
+    bare = len({p.name for p in unique}) == len(unique)
+    return _sorted(
+        [(_text(p.name if bare else p.relative_to(top).as_posix()), p) for p in unique], None, ()
+    )
+
+
+def _text(name: str) -> str:
+    """A name that can be written to any file: Linux allows bytes in names that are no text."""
+    return name.encode("utf-8", "backslashreplace").decode()
+
+
+def _sorted(
+    files: Sequence[tuple[str, Path]], geo: Path | None, runs: tuple[str, ...]
+) -> FoundFiles:
+    photos = sorted((n, p) for n, p in files if p.suffix.lower() in _PHOTO_ENDINGS)
+    known = {n for n, _ in photos}
+    ignored = sorted(n for n, p in files if n not in known and p.name.lower() not in _SIDE_NAMES)
+    return FoundFiles(photos=tuple(photos), ignored=tuple(ignored), geo=geo, runs=runs)
 
 
 def read_survey(
@@ -99,3 +185,83 @@ def _nothing_sentence(
     return (
         f"There is no photo in {where}: it holds {held}. Give a folder of JPEG, TIFF or PNG photos."
     )
+
+
+_LONG_GAP_H = 12.0
+
+
+def survey_notes(photos: Sequence[Photo], copies: int = 0) -> tuple[str, ...]:
+    """Plain sentences: several cameras or bands, rolling shutters, clocks, what most photos
+    lack.
+    """
+    return (
+        *_cameras(photos),
+        *_thermal_units(photos),
+        *_gaps(photos),
+        *_clocks(photos),
+        *_copies(copies),
+    )
+
+
+def _cameras(photos: Sequence[Photo]) -> Iterator[str]:
+    keys = Counter(p.camera_key for p in photos)
+    if len(keys) > 1:
+        listed = sentence_of([f"{key} ({n})" for key, n in keys.items()])
+        yield f"There are {len(keys)} cameras: {listed}; each is calibrated by itself."
+    bands = Counter(p.band for p in photos)
+    if len(bands) > 1:
+        counts = " and ".join(f"{n} {band}" for band, n in sorted(bands.items()))
+        yield f"The spectra are mixed: {counts} photos."
+    rolling = sorted({p.camera_key for p in photos if p.rolling_shutter})
+    if rolling:
+        yield f"Rolling (electronic) shutter, not modelled: {sentence_of(rolling)}."
+
+
+def _thermal_units(photos: Sequence[Photo]) -> Iterator[str]:
+    units = Counter(p.stored for p in photos if p.stored)
+    listed = " and ".join(f"{n} as {unit}" for unit, n in units.most_common())
+    if len(units) > 1:
+        yield (
+            f"Thermal TIFFs are read in different units, {listed}; --thermal-unit says which is"
+            " right for all."
+        )
+    elif units:
+        yield f"Thermal TIFFs are read as {listed.split(' as ')[1]} ({sum(units.values())})."
+
+
+def _gaps(photos: Sequence[Photo]) -> Iterator[str]:
+    void = [p.name for p in photos if p.position is None]
+    if void:
+        which = (
+            "No photo carries"
+            if len(void) == len(photos)
+            else f"{len(void)} of {len(photos)} photos lack"
+        )
+        yield f"{which} a usable GPS position" + (
+            f": {sentence_of(void)}." if len(void) < len(photos) else "."
+        )
+    if all(p.attitude is None for p in photos):
+        yield "No photo carries camera angles."
+    guessed = sorted({p.camera_key for p in photos if p.focal.source == "guess"})
+    if guessed:
+        yield f"The focal length is guessed for {sentence_of(guessed)}."
+    edited = [p.name for p in photos if p.editor]
+    if edited:
+        yield f"{len(edited)} photos were rewritten by another program: {sentence_of(edited)}."
+
+
+def _clocks(photos: Sequence[Photo]) -> Iterator[str]:
+    timeless = [p.name for p in photos if p.time is None]
+    if timeless and len(timeless) < len(photos):
+        yield f"Without a capture time, put last: {sentence_of(timeless)}."
+    times = sorted(p.time.replace(tzinfo=None) for p in photos if p.time)
+    gap = max(((b - a).total_seconds() / 3600 for a, b in pairwise(times)), default=0.0)
+    if gap > _LONG_GAP_H:
+        yield (
+            f"The capture times have a gap of {gap:.0f} h: several flights, or clocks that"
+            " disagree."
+        )
+
+
+def _copies(copies: int) -> tuple[str, ...]:
+    return (f"{copies} files are copies of others and were left out.",) if copies else ()

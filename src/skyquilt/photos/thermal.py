@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from skyquilt.model.photo import Stored
 from skyquilt.photos.flir import read_flir
-from skyquilt.photos.jpeg import APP3, JpegHeader
+from skyquilt.photos.headers import APP3, JpegHeader
 
 _DJI_SIZES = ((640, 512), (1280, 1024), (640, 480), (336, 256), (320, 256), (256, 192), (160, 120))
 _CENTIKELVIN = (22_000, 42_000)

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from skyquilt.raster.atomic import whole_file
 from skyquilt.raster.codecs import TileEncoder, predictor
-from skyquilt.raster.geokeys import place_tags
 from skyquilt.raster.spec import RasterSpec
 from skyquilt.raster.tiff import (
     ASCII,
@@ -27,6 +26,7 @@ from skyquilt.raster.tiff import (
     Tag,
     directories,
     header,
+    place_tags,
 )
 
 IMAGE, MASK = 1, 2

@@ -17,7 +17,7 @@ from skyquilt.report.layers import layers_of
 from skyquilt.report.mapview import map_view
 from skyquilt.report.numbers import count, items, mapping, plain
 from skyquilt.report.overlap import overlap_section, surface_section
-from skyquilt.report.parts import Section, Tile
+from skyquilt.report.parts import Section, Tile, values_section
 from skyquilt.report.positions import positions_section
 from skyquilt.report.quality import quality_section
 from skyquilt.report.residuals import residuals_section
@@ -30,7 +30,6 @@ from skyquilt.report.tables import (
     rejected_section,
     settings_section,
 )
-from skyquilt.report.values import values_section
 
 HERE = Path(__file__).parent
 

@@ -14,10 +14,10 @@ from skyquilt.simulate.canvas import Canvas
 from skyquilt.simulate.fields import paint_borders, paint_parcels, paint_ponds, paint_roads
 from skyquilt.simulate.grid import Floats, Grid
 from skyquilt.simulate.ground import Ground
+from skyquilt.simulate.landscape import settle
 from skyquilt.simulate.layout import Layout
 from skyquilt.simulate.light import lit, shadow_reach, shine
 from skyquilt.simulate.noise import Noise
-from skyquilt.simulate.settle import settle
 from skyquilt.simulate.targets import Target, paint_targets
 from skyquilt.simulate.things import paint_things
 from skyquilt.simulate.weather import Weather

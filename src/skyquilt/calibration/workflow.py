@@ -1,0 +1,192 @@
+"""The story of a lens: frames of a chess-board become a calibrated camera.
+
+read -> boards -> calibrate -> judge -> report
+"""
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from skyquilt.calibration import figures as calibrate_judging
+from skyquilt.calibration import files as calibrate_files
+from skyquilt.calibration.board_views import SERIES, Seen, look, one_camera
+from skyquilt.calibration.calibrate import Calibrate, strangers
+from skyquilt.calibration.disagreement import widened
+from skyquilt.calibration.find_board import FindBoard
+from skyquilt.engine.clock import Clock, Steps
+from skyquilt.engine.folder import claim
+from skyquilt.engine.store import Store
+from skyquilt.errors import RefusedError, UsageError
+from skyquilt.model.board import Board, RejectedView
+from skyquilt.model.calibration import Calibration
+from skyquilt.model.event import Event, Note, Result
+from skyquilt.photos.survey import read_survey
+
+FEWEST_VIEWS = 3
+_UNKNOWN = 0.1
+"""Share of the focal length at which its deviation says that nothing was determined."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateSettings:
+    """Everything a calibration can be asked for."""
+
+    columns: int
+    """Squares in a row of the board."""
+    rows: int
+    """Squares in a column."""
+    square_m: float
+    """Side of a square in m."""
+    series: str = "auto"
+    """One of `SERIES`."""
+    jobs: int = 0
+    """Threads; 0 = all processors."""
+
+    def __post_init__(self) -> None:
+        if self.series not in SERIES:
+            raise UsageError(f"--series {self.series!r} is not one of {', '.join(SERIES)}")
+        if not (min(self.columns, self.rows) >= 3 and max(self.columns, self.rows) <= 100):
+            raise UsageError(
+                f"--board {self.columns}x{self.rows}: 3 to 100 squares a side are expected"
+            )
+        if not 1e-4 <= self.square_m <= 100:
+            raise UsageError(
+                f"--square {self.square_m:g}: the side of a square in m, 0.0001 to 100, is expected"
+            )
+
+    @property
+    def board(self) -> Board:
+        """The board."""
+        return Board(columns=self.columns, rows=self.rows, square_m=self.square_m)
+
+
+def iter_calibrate(
+    frames: Path | str, output: Path | str, settings: CalibrateSettings, *, overwrite: bool = False
+) -> Iterator[Event]:
+    """Calibrates the camera that took the frames, telling its progress; the last event is the
+    `Result`.
+
+    Raises:
+        RefusedError: mixed cameras, too few boards, or boards that do not determine the lens.
+        SkyquiltError: anything else a user can mend.
+    """
+    frames, output, began = Path(frames), Path(output), Clock.now()
+    if frames.is_dir() and frames.resolve() == output.resolve():
+        raise UsageError(
+            f"{output} holds the frames; choose another folder, such as {output / 'calibration'}"
+        )
+    survey = read_survey(frames)
+    one_camera(survey.photos)
+    claim(output, calibrate_files.CONTRACT, overwrite=overwrite)
+    clock = Clock(store=Store(folder=output, registry={}), began=began)
+    board, jobs = settings.board, settings.jobs or os.cpu_count() or 1
+    seen = yield from clock.stage(
+        "boards", look(survey.photos, board, FindBoard(), settings.series, jobs)
+    )
+    unread = (RejectedView(name=r.name, reason=r.reason) for r in survey.rejected)
+    seen = replace(seen, rejected=(*unread, *seen.rejected))
+    _enough(seen)
+    yield Note(
+        text=f"the board was found in {len(seen.views)} of {len(seen.views) + len(seen.rejected)}"
+        " views"
+    )
+    centres, corners = Calibrate(), Calibrate(marks="corners")
+    seen, by_centres, by_corners = yield from clock.stage(
+        "calibrate", _calibrated(seen, board, centres, corners)
+    )
+    yield from (Note(text=f"{r.name} was left out: {r.reason}") for r in seen.rejected)
+    _determined(by_centres)
+    judged = yield from clock.stage(
+        "judge",
+        calibrate_judging.judge(seen.views, board, (centres, corners), (by_centres, by_corners)),
+    )
+    key = survey.photos[0].camera_key
+    work = calibrate_files.finish(
+        output, seen, board, key, by_centres, by_corners, judged, clock, frames
+    )
+    figures = yield from clock.stage("report", work)
+    yield Result(output=output, metrics=figures)
+
+
+def calibrate(
+    frames: Path | str, output: Path | str, settings: CalibrateSettings, *, overwrite: bool = False
+) -> Result:
+    """Calibrates the camera that took the frames and returns when all is written.
+
+    Raises:
+        SkyquiltError: anything a user can mend.
+    """
+    for happened in iter_calibrate(frames, output, settings, overwrite=overwrite):
+        if isinstance(happened, Result):
+            return happened
+    raise RuntimeError("the story ended without a result")
+
+
+def _calibrated(
+    seen: Seen, board: Board, centres: Calibrate, corners: Calibrate
+) -> Steps[tuple[Seen, Calibration, Calibration]]:
+    """From centres and, on the same views, from corners; views that do not belong are left out
+    first.
+    """
+    yield 0, 2
+    by_centres = centres(seen.views, board)
+    odd = strangers(by_centres)
+    if odd:
+        reasons = [
+            RejectedView(
+                name=n,
+                reason=f"its squares lie {e:.1f} px (RMS) off, far more than those of the other"
+                " views",
+            )
+            for n, e in odd.items()
+        ]
+        seen = replace(
+            seen,
+            views=tuple(v for v in seen.views if v.name not in odd),
+            rejected=(*seen.rejected, *reasons),
+        )
+        _enough(seen)
+        by_centres = centres(seen.views, board)
+    yield 1, 2
+    by_corners = corners(seen.views, board)
+    yield 2, 2
+    return seen, widened(by_centres, by_corners), widened(by_corners, by_centres)
+
+
+def _enough(seen: Seen) -> None:
+    """Refuses what is too little for a calibration.
+
+    Raises:
+        RefusedError: it is.
+    """
+    if len(seen.views) >= FEWEST_VIEWS:
+        return
+    raise RefusedError(
+        f"the board was found in {len(seen.views)} of {len(seen.views) + len(seen.rejected)} views,"
+        " and"
+        f" {FEWEST_VIEWS} or more are needed{_reasons(seen.rejected)}; take more, tilted by 20 to"
+        " 40 degrees in"
+        " different directions, the whole board in the frame"
+    )
+
+
+def _reasons(rejected: Sequence[RejectedView]) -> str:
+    return "".join(f"; {r.name}: {r.reason}" for r in rejected[:5]) + (
+        "; ..." if len(rejected) > 5 else ""
+    )
+
+
+def _determined(found: Calibration) -> None:
+    """Refuses a focal length that nothing determined.
+
+    Raises:
+        RefusedError: all boards were seen at the same tilt.
+    """
+    focal, sigma = found.camera.focal, found.sigma("focal")
+    if not sigma < _UNKNOWN * focal:
+        raise RefusedError(
+            f"the focal length remains unknown ({focal:.0f} px with a deviation of {sigma:.0f}):"
+            " all boards are seen"
+            " at much the same angle; tilt the board by 20 to 40 degrees in different directions"
+        )

@@ -1,0 +1,1 @@
+"""Pictures of different spectra laid on one another."""

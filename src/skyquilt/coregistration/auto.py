@@ -1,0 +1,104 @@
+"""Registration by structure, coarse to fine, believed only where independent patches agree."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+from skyquilt.coregistration.candidates import Candidate, Nearby, distinct, same_view
+from skyquilt.coregistration.common_part import common_part
+from skyquilt.coregistration.decision import Decide, distinctness
+from skyquilt.coregistration.everywhere import Everywhere
+from skyquilt.coregistration.orientation import Orientation, Pyramid
+from skyquilt.coregistration.structure import StructureMatches, sharpened
+from skyquilt.coregistration.subpixel import Fit, Sharpen
+from skyquilt.coregistration.usable import both_usable
+from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistration, Registration
+
+_SEARCH, _NEARBY, _SELECT, _DECIDE = range(4)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Auto:
+    """The default. Structure matches are quick and bear distortion; where patches do not confirm
+    them beyond doubt, every rotation and a range of scales are searched, and the neighbourhood of a
+    guess.
+    """
+
+    propose: StructureMatches
+    """Structure matches."""
+    everywhere: Everywhere = field(default_factory=Everywhere)
+    """Search without knowledge."""
+    nearby: Nearby = field(default_factory=Nearby)
+    """Search about the guess (without one: two cameras side by side with equal fields of view)."""
+    decide: Decide = field(default_factory=Decide)
+    """The verdict."""
+    sides: tuple[float, float, float, float] = (80.0, 128.0, 160.0, 256.0)
+    """Px of the squares whose areas the pictures are shrunken to: search, search nearby, selection,
+    verdict.
+    """
+    sure: float = 6.0
+    """Agreement beyond which nothing else is tried."""
+    version: ClassVar[int] = 1
+
+    def __call__(
+        self, a: Picture, b: Picture, guess: Guess | None = None
+    ) -> Registration | RefusedRegistration:
+        """The registration of b to a, or why there is none.
+
+        A guess is tried first; where it is not confirmed the search goes on everywhere: metadata
+        may lie.
+        """
+        if guess is not None and (found := self._guided(a, b, guess)):
+            return found
+        pictures = both_usable(a, b)
+        if isinstance(pictures, RefusedRegistration):
+            return pictures
+        pyramid = Pyramid(a=pictures[0], b=pictures[1], sides=self.sides)
+        matched = self.propose(*pictures).b_H_a
+        first = [] if matched is None else [sharpened(pyramid, matched, _SELECT)]
+        found = self.decide(pyramid, first)
+        if found.evidence.get("surprise", 0.0) >= self.sure:
+            return found
+        places = self._near(pyramid, same_view(a.shape, b.shape)) + self._anywhere(pyramid)
+        return self.decide(pyramid, first + self._best(pyramid, places))
+
+    def _guided(self, a: Picture, b: Picture, guess: Guess) -> Registration | RefusedRegistration:
+        """The verdict on the neighbourhood of a guess, within what both pictures then share."""
+        part = common_part(a, b, guess)
+        pictures = both_usable(part.a, part.b)
+        if isinstance(pictures, RefusedRegistration):
+            return pictures
+        pyramid = Pyramid(a=pictures[0], b=pictures[1], sides=self.sides)
+        fits = self._best(pyramid, self._near(pyramid, part.guess))
+        return part.whole(self.decide(pyramid, fits))
+
+    def _near(self, pyramid: Pyramid, guess: Guess) -> list[Matrix]:
+        """Places near a guess, in px of the level that selects."""
+        a, b = pyramid.at(_NEARBY)
+        found = distinct(self.nearby(a, b, guess), a.shape, 3, 8)
+        return [pyramid.moved(c.b_H_a, _NEARBY, _SELECT) for c in found]
+
+    def _anywhere(self, pyramid: Pyramid) -> list[Matrix]:
+        """Places of all rotations and scales, in px of the level that selects."""
+        a, b = pyramid.at(_SEARCH)
+        rough = distinct(self.everywhere(a, b), a.shape, 3, 40)
+        better = distinct(_sharpened(a, b, [c.b_H_a for c in rough], 2), a.shape, 1.5, 16)
+        found = distinct(_sharpened(a, b, [c.b_H_a for c in better], 3), a.shape, 1.5, 8)
+        return [pyramid.moved(c.b_H_a, _SEARCH, _SELECT) for c in found]
+
+    def _best(self, pyramid: Pyramid, places: Sequence[Matrix]) -> list[Fit]:
+        """The few that stand out most, sharpened at the level of the verdict."""
+        a, b = pyramid.at(_SELECT)
+        found = distinct(_sharpened(a, b, places, 5), a.shape, 2, 8)
+        found.sort(key=lambda c: -distinctness(a, b, c.b_H_a))
+        a, b = pyramid.at(_DECIDE)
+        fits = [Sharpen()(a, b, pyramid.moved(c.b_H_a, _SELECT, _DECIDE)) for c in found[:3]]
+        kept = distinct([Candidate(b_H_a=f.b_H_a, score=f.score) for f in fits], a.shape, 2, 3)
+        return [f for f in fits if any(f.b_H_a is c.b_H_a for c in kept)]
+
+
+def _sharpened(
+    a: Orientation, b: Orientation, places: Sequence[Matrix], steps: int
+) -> list[Candidate]:
+    fits = [Sharpen(steps=steps)(a, b, place) for place in places]
+    return [Candidate(b_H_a=fit.b_H_a, score=fit.score) for fit in fits]

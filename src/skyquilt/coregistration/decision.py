@@ -1,0 +1,136 @@
+"""Which of several places is believed, with which model, or why none is; ambiguity counts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from skyquilt.coregistration.agreement import Agree, Agreement
+from skyquilt.coregistration.orientation import (
+    Orientation,
+    Pyramid,
+    between,
+    full_size,
+    spectra,
+    warped,
+)
+from skyquilt.coregistration.subpixel import Fit, Freedom, Sharpen
+from skyquilt.model.registration import Matrix, RefusedRegistration, Registration
+
+Outcome = Registration | RefusedRegistration
+
+
+@dataclass(frozen=True, kw_only=True)
+class Decide:
+    """Believes the place that independent patches confirm, and frees the model as far as pictures
+    support it.
+    """
+
+    agree: Agree = field(default_factory=Agree)
+    """The test."""
+    least_surprise: float = 5.0
+    """Agreement below which a registration is refused; docs/methods.md says what chance reaches."""
+    gain: float = 0.02
+    """Relative gain in correlation that a freer model must bring to be preferred."""
+    finest: float = 640.0
+    """Px of the square whose area larger pictures are sharpened at in the end."""
+    version: ClassVar[int] = 1
+
+    def __call__(self, pyramid: Pyramid, fits: Sequence[Fit]) -> Outcome:
+        """The verdict on places in px of the finest level."""
+        judged = [(self.agree(*pyramid.at(pyramid.last), fit.b_H_a), fit) for fit in fits]
+        if not judged:
+            return RefusedRegistration(
+                reason="no place was found where enough of both pictures overlaps"
+            )
+        agreement, fit = max(judged, key=lambda j: j[0].surprise)
+        if agreement.surprise < self.least_surprise:
+            return RefusedRegistration(
+                reason=_doubt(agreement, self.least_surprise),
+                inliers=len(agreement.px),
+                evidence=_evidence(agreement, fit),
+            )
+        return self._finished(pyramid, fit, agreement)
+
+    def _finished(self, pyramid: Pyramid, fit: Fit, agreement: Agreement) -> Registration:
+        """The model that the pictures support, in px of the pictures."""
+        a, b = pyramid.at(pyramid.last)
+        freedoms: tuple[Freedom, ...] = ("affine", "homography")
+        model: Freedom = "similarity"
+        for freer in freedoms:
+            other = Sharpen(freedom=freer)(a, b, fit.b_H_a)
+            if other.correlation > (1 + self.gain) * fit.correlation:
+                model, fit, agreement = freer, other, self.agree(a, b, other.b_H_a)
+        full = self._finest(pyramid, pyramid.full(fit.b_H_a, pyramid.last), model)
+        to_full = np.linalg.inv(b.small_S_full)
+        return Registration(
+            model=model,
+            b_H_a=full,
+            evidence=_evidence(agreement, fit),
+            px_a=_apply(np.linalg.inv(full) @ to_full, agreement.px),
+            px_b=_apply(to_full, agreement.px + agreement.shift),
+        )
+
+    def _finest(self, pyramid: Pyramid, full: Matrix, model: Freedom) -> Matrix:
+        """The transform sharpened once more where pictures are so large that a pixel of the verdict
+        is many.
+        """
+        larger = pyramid.finest(self.finest)
+        if larger is None:
+            return full
+        fit = Sharpen(freedom=model, steps=3)(*larger, between(*larger, full))
+        return full_size(*larger, fit.b_H_a)
+
+
+def _apply(matrix: NDArray[Any], px: NDArray[Any]) -> NDArray[Any]:
+    moved = np.c_[px, np.ones(len(px))] @ matrix.T
+    return np.asarray(moved[:, :2] / moved[:, 2:])
+
+
+def _evidence(agreement: Agreement, fit: Fit) -> dict[str, float]:
+    return {
+        "surprise": round(agreement.surprise, 3),
+        "patches": float(agreement.patches),
+        "patches_agreeing": float(len(agreement.px)),
+        "correlation": round(fit.correlation, 4),
+    }
+
+
+def _doubt(agreement: Agreement, least: float) -> str:
+    return (
+        f"the best place found is not confirmed: {len(agreement.px)} of {agreement.patches} patches"
+        " find it by"
+        f" themselves, which is worth 10^-{agreement.surprise:.1f} where 10^-{least:g} is asked for"
+    )
+
+
+_NEAR = 2
+"""Px about the registered place in which its peak is looked for."""
+_OWN = 0.03
+"""Share of the picture about the registered place that belongs to its peak."""
+_LEAST = 0.3
+"""Share of the overlap below which a shift does not count."""
+
+
+def distinctness(a: Orientation, b: Orientation, b_H_a: Matrix) -> float:
+    """The peak at a registration over the RMS of all far shifts.
+
+    Unlike the correlation it can be compared between pictures: smooth ones correlate by chance,
+    too.
+    """
+    fields, valid = warped(a, b_H_a, b.shape)
+    shape = (scipy.fft.next_fast_len(2 * b.shape[0]), scipy.fft.next_fast_len(2 * b.shape[1]))
+    cross = (spectra(fields, shape) * np.conj(spectra(b.fields, shape))).sum(0)
+    masks = scipy.fft.fft2(valid, s=shape) * np.conj(scipy.fft.fft2(b.valid, s=shape))
+    overlap = scipy.fft.ifft2(masks).real
+    field = scipy.fft.ifft2(cross).real
+    z = np.where(overlap > _LEAST * overlap[0, 0], field / np.sqrt(np.maximum(overlap, 1)), 0)
+    far = overlap > _LEAST * overlap[0, 0]
+    own = np.arange(-max(4, int(_OWN * b.shape[0])), max(4, int(_OWN * b.shape[0])) + 1)
+    far[np.ix_(own, own)] = False
+    near = np.arange(-_NEAR, _NEAR + 1)
+    noise = float(np.sqrt((z[far] ** 2).mean())) if far.any() else 0.0
+    return float(z[np.ix_(near, near)].max()) / max(noise, 1e-9)

@@ -1,0 +1,200 @@
+"""What a registration leaves behind: B on A's grid, pictures for people, a page."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.coregistration.fusion import alpha, checkerboard, false_colour, shown, side_by_side
+from skyquilt.coregistration.page import registration_page
+from skyquilt.coregistration.pictures import Source
+from skyquilt.model.photo import RejectedPhoto
+from skyquilt.model.registration import Matrix, RefusedRegistration, Registration
+from skyquilt.raster.atomic import whole_file, write_text
+from skyquilt.raster.blocks import Block
+from skyquilt.raster.cog import CogWriter
+from skyquilt.raster.spec import RasterSpec
+from skyquilt.raster.vrt import vrt
+
+OVERLAYS = ("side_by_side.png", "checkerboard.png", "false_colour.png", "alpha.png")
+CONTRACT = ("registration.json", "report.html", "b_on_a.tif", "b.vrt", *OVERLAYS)
+"""Files of an accepted registration; a refused one leaves the first two."""
+LONGEST_SHOWN = 1600
+"""Px of the longer side of the pictures for people."""
+_MARGIN = 2
+
+
+def draw(output: Path, a: Source, b: Source, outcome: Registration) -> None:
+    """Writes B on A's grid at full size, B's own pixels with their place, and the pictures."""
+    resample_onto(output / "b_on_a.tif", a, b, outcome.b_H_a)
+    if not (b.photo and b.photo.unit):  # a virtual raster would show a radiometric photo's palette
+        write_text(output / "b.vrt", _vrt(a, b, outcome.b_H_a))
+    for name, picture in zip(OVERLAYS, overlays(a, b, outcome), strict=True):
+        done, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
+        assert done
+        with whole_file(output / name, needed=len(data)) as file:
+            file.write(data.tobytes())
+
+
+def overlays(a: Source, b: Source, outcome: Registration) -> list[NDArray[np.uint8]]:
+    """RGB pictures in the order of `OVERLAYS`, reduced to `LONGEST_SHOWN`."""
+    small_a, a_S = _reduced(a)
+    small_b, b_S = _reduced(b)
+    there = b_S @ outcome.b_H_a @ np.linalg.inv(a_S)
+    size = (small_a.shape[1], small_a.shape[0])
+    back = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
+    moved = np.asarray(cv2.warpPerspective(small_b, there, size, flags=back), np.uint8)
+    seen = np.asarray(cv2.warpPerspective(np.ones_like(small_b), there, size, flags=back)) > 0
+    lines = side_by_side(small_a, small_b, _apply(a_S, outcome.px_a), _apply(b_S, outcome.px_b))
+    return [
+        lines,
+        checkerboard(small_a, moved, seen),
+        false_colour(small_a, moved, seen),
+        alpha(small_a, moved, seen),
+    ]
+
+
+def page(
+    record: dict[str, Any],
+    opened: tuple[Source | RejectedPhoto, Source | RejectedPhoto],
+    outcome: Registration | RefusedRegistration,
+) -> str:
+    """The report page, whole in itself."""
+    a, b = opened
+    pictures: list[NDArray[np.uint8]] = []
+    if isinstance(a, Source) and isinstance(b, Source):
+        if isinstance(outcome, Registration):
+            pictures = overlays(a, b, outcome)
+        else:
+            none = np.zeros((0, 2))
+            pictures = [side_by_side(_reduced(a)[0], _reduced(b)[0], none, none)]
+    return registration_page(record, pictures)
+
+
+def _reduced(source: Source) -> tuple[NDArray[np.uint8], Matrix]:
+    """Grey levels for people, and what takes the file's pixels to theirs."""
+    values = source.picture.values
+    valid = source.picture.valid
+    if valid is None:
+        valid = np.isfinite(values if values.ndim == 2 else values.sum(2, dtype=np.float32))
+    grey = shown(values, valid)
+    factor = min(1.0, LONGEST_SHOWN / max(grey.shape))
+    size = (round(grey.shape[1] * factor), round(grey.shape[0] * factor))
+    small = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
+    x, y = size[0] / grey.shape[1], size[1] / grey.shape[0]
+    shrinking = np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
+    return small, shrinking @ np.linalg.inv(source.full_S_picture)
+
+
+def _apply(matrix: NDArray[Any], px: NDArray[Any]) -> NDArray[Any]:
+    moved = np.c_[px, np.ones(len(px))] @ matrix.T
+    return np.asarray(moved[:, :2] / moved[:, 2:])
+
+
+def resample_onto(
+    path: Path, a: Source, b: Source, b_H_a: Matrix, tags: Mapping[str, str] | None = None
+) -> None:
+    """B's values on A's pixels, bilinear, in pieces; A's place where it has one, else A's
+    pixels.
+    """
+    sample = b.picture.values
+    kind = sample.dtype.name if sample.dtype.name in ("uint8", "uint16") else "float32"
+    bands = 3 if sample.ndim == 3 else 1
+    spec = RasterSpec(
+        width=a.width,
+        height=a.height,
+        bands=bands,
+        dtype=kind,
+        transform=a.place.affine if a.place else (1, 0, 0, 0, -1, 0),
+        crs=a.place.crs if a.place else None,
+        nodata=float("nan") if kind == "float32" else None,
+        mask=kind != "float32",
+        compress="deflate",
+        band_units=(b.unit,) * bands if b.unit else (),
+        tags={"SOFTWARE": "Skyquilt"} | dict(tags or {}),
+    )
+    with CogWriter(path, spec) as writer:
+        for block in writer.blocks():
+            writer.write_block(block, *_block(block, b, b_H_a, kind, bands))
+
+
+def _block(
+    block: Block, b: Source, b_H_a: Matrix, kind: str, bands: int
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Values (height, width[, 3]) and validity of one block."""
+    shape = (block.height, block.width, bands) if bands > 1 else (block.height, block.width)
+    start = np.array([[1, 0, block.col0], [0, 1, block.row0], [0, 0, 1.0]])
+    part = _part(b, b_H_a @ start, block)
+    if part is None:
+        return np.zeros(shape, kind), np.zeros(shape[:2], bool)
+    row, column, height, width = part
+    values, valid = b.window(row, column, height, width)
+    there = np.array([[1, 0, -column], [0, 1, -row], [0, 0, 1.0]]) @ b_H_a @ start
+    factor = _shrinking(there, block)
+    if factor > 1 and min(height, width) >= factor:
+        size = (width // factor, height // factor)
+        x, y = size[0] / width, size[1] / height
+        values = cv2.resize(values.astype(np.float32), size, interpolation=cv2.INTER_AREA).astype(
+            values.dtype
+        )
+        valid = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+        there = np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]]) @ there
+    flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
+    size = (block.width, block.height)
+    moved = cv2.warpPerspective(
+        np.where(_wide(valid, values), values, 0).astype(kind), there, size, flags=flags
+    )
+    seen = (
+        np.asarray(cv2.warpPerspective(valid.astype(np.float32), there, size, flags=flags)) > 0.999
+    )
+    return np.asarray(np.where(_wide(seen, moved), moved, np.array(0, kind))), seen
+
+
+def _wide(mask: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[np.bool_]:
+    return mask[..., None] if values.ndim == 3 else mask
+
+
+def _part(b: Source, there: Matrix, block: Block) -> tuple[int, int, int, int] | None:
+    """Row, column, height and width of the part of B that a block shows; None where it shows
+    none.
+    """
+    edge = np.linspace(0, 1, 9)
+    x, y = np.meshgrid(edge * (block.width - 1), edge * (block.height - 1))
+    px = _apply(there, np.c_[x.ravel(), y.ravel()])
+    low = np.maximum(np.floor(px.min(0)).astype(int) - _MARGIN, 0)
+    high = np.minimum(np.ceil(px.max(0)).astype(int) + _MARGIN + 1, [b.width, b.height])
+    if (high - low < 1).any():
+        return None
+    return int(low[1]), int(low[0]), int(high[1] - low[1]), int(high[0] - low[0])
+
+
+def _shrinking(there: Matrix, block: Block) -> int:
+    """How many of B's pixels one of A's covers, per axis: they are averaged, not skipped."""
+    middle = np.array([block.width / 2, block.height / 2])
+    ends = _apply(there, middle + np.array([[0, 0], [1, 0], [0, 1]]))
+    return max(1, int(min(np.linalg.norm(ends[1:] - ends[0], axis=1))))
+
+
+def _vrt(a: Source, b: Source, b_H_a: Matrix) -> str:
+    """B's own file, placed by a grid of ground points on A."""
+    ends = np.linspace(0, 1, 6)
+    x, y = np.meshgrid(ends * (b.width - 1), ends * (b.height - 1))
+    px_b = np.c_[x.ravel(), y.ravel()]
+    px_a = _apply(np.linalg.inv(b_H_a), px_b) + 0.5
+    m = a.place.affine if a.place else (1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
+    ground = np.c_[
+        m[0] * px_a[:, 0] + m[1] * px_a[:, 1] + m[2], m[3] * px_a[:, 0] + m[4] * px_a[:, 1] + m[5]
+    ]
+    values = b.picture.values
+    return vrt(
+        b.path.resolve(),
+        size=(b.width, b.height),
+        bands=3 if values.ndim == 3 else 1,
+        dtype=values.dtype.name,
+        px=px_b + 0.5,
+        ground=ground,
+        crs=a.place.crs if a.place else None,
+    )

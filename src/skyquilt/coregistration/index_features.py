@@ -1,0 +1,132 @@
+"""Keypoints of phase congruency, described by histograms of the maximum index map, in RIFT2's
+manner.
+
+RIFT (Li, Hu and Ai 2020) makes its descriptor independent of rotation by a ring of filter
+sequences, RIFT2 (2023) by the patch's dominant index; here the dominant direction is found to a
+fraction of an index, the patch is sampled along it and its indices are counted from it. A direction
+is one of 180 degrees: the other half is tried when descriptors are compared, where it is the same
+descriptor with its cells in reverse.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.coregistration.log_gabor import ORIENTATIONS, Phase
+
+CELLS = 6
+"""Cells along each side of a patch."""
+_FAST = 4
+"""Levels of 255 by which a FAST corner's ring differs."""
+_BORDER = 6
+"""Px at the border of what is valid where no keypoint is taken."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class IndexFeatures:
+    """Keypoints and descriptors."""
+
+    px: NDArray[np.float64]
+    """(n, 2) px of the resolution they were found in."""
+    vectors: NDArray[np.float32]
+    """(n, CELLS**2, ORIENTATIONS) of unit length."""
+
+    def __len__(self) -> int:
+        return len(self.px)
+
+
+def index_features(phase: Phase, valid: NDArray[Any], *, count: int, patch: int) -> IndexFeatures:
+    """The strongest keypoints, spread out, with descriptors of patches of `patch` px."""
+    px = _keypoints(phase, valid, count)
+    share = [
+        cv2.blur(((phase.index == k) * valid).astype(np.float32), (patch // CELLS,) * 2)
+        for k in range(ORIENTATIONS)
+    ]
+    maps = np.stack(share, -1).astype(np.float32)
+    whole = cv2.blur(maps, (patch, patch))
+    middle = np.rint(px).astype(int)
+    direction = _dominant(whole[middle[:, 1], middle[:, 0]])
+    return IndexFeatures(px=px, vectors=_vectors(maps, px, direction, patch))
+
+
+def similarities(a: IndexFeatures, b: IndexFeatures) -> NDArray[np.float32]:
+    """(len(a), len(b)) dot products, the better of both halves of the turn."""
+    fa, fb = a.vectors.reshape(len(a), -1), b.vectors.reshape(len(b), -1)
+    turned = b.vectors[:, ::-1].reshape(len(b), -1)
+    return np.asarray(np.maximum(fa @ fb.T, fa @ turned.T))
+
+
+def mutual(a: IndexFeatures, b: IndexFeatures) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Indices into a and b of each other's nearest."""
+    if not len(a) or not len(b):
+        return np.zeros(0, int), np.zeros(0, int)
+    likeness = similarities(a, b)
+    there, back = likeness.argmax(1), likeness.argmax(0)
+    rows = np.flatnonzero(back[there] == np.arange(len(a)))
+    return rows, there[rows]
+
+
+def _keypoints(phase: Phase, valid: NDArray[Any], count: int) -> NDArray[np.float64]:
+    """FAST on both moments, strongest first within each cell of a coarse grid."""
+    inner = cv2.erode(valid.astype(np.uint8), np.ones((2 * _BORDER + 1,) * 2), borderValue=0)
+    points = []
+    for field in (phase.corners, phase.edges):
+        top = float(np.percentile(field, 99.5)) or 1.0
+        picture = np.clip(field / top * 255, 0, 255).astype(np.uint8)
+        found = cv2.FastFeatureDetector.create(_FAST).detect(picture, inner)
+        points += [(p.pt[0], p.pt[1], p.response) for p in found]
+    table = np.array(points, np.float64).reshape(-1, 3)
+    return _spread(table, valid.shape, count)
+
+
+def _spread(
+    table: NDArray[np.float64], shape: tuple[int, ...], count: int, cells: int = 12
+) -> NDArray[np.float64]:
+    cell = (table[:, 1] * cells // shape[0]) * cells + table[:, 0] * cells // shape[1]
+    order = np.lexsort((-table[:, 2], cell))
+    starts = (
+        np.flatnonzero(np.r_[True, np.diff(cell[order]) != 0]) if len(order) else np.zeros(0, int)
+    )
+    rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
+    return table[order[np.argsort(rank, kind="stable")][:count], :2]
+
+
+def _dominant(histograms: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(n,) direction in indices, by a parabola through the highest bin and its neighbours."""
+    n = np.arange(len(histograms))
+    top = histograms.argmax(1)
+    left, right = histograms[n, top - 1], histograms[n, (top + 1) % ORIENTATIONS]
+    bend = left - 2 * histograms[n, top] + right
+    return np.asarray(
+        top + np.where(bend < -1e-9, (left - right) / (2 * np.minimum(bend, -1e-9)), 0)
+    )
+
+
+def _vectors(
+    maps: NDArray[Any], px: NDArray[Any], direction: NDArray[Any], patch: int
+) -> NDArray[np.float32]:
+    """Cells sampled along each keypoint's direction, indices counted from it."""
+    step = patch / CELLS
+    y, x = np.mgrid[:CELLS, :CELLS].reshape(2, -1) * step - (CELLS - 1) / 2 * step
+    angle = direction * np.pi / ORIENTATIONS
+    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+    u = (px[:, :1] + c * x - s * y).astype(np.float32)
+    v = (px[:, 1:] + s * x + c * y).astype(np.float32)
+    cells = np.stack(
+        [
+            cv2.remap(np.ascontiguousarray(maps[..., k]), u, v, cv2.INTER_LINEAR)
+            for k in range(ORIENTATIONS)
+        ],
+        -1,
+    )
+    whole = np.floor(direction).astype(int)
+    part = (direction - whole)[:, None, None].astype(np.float32)
+    order = (np.arange(ORIENTATIONS)[None] + whole[:, None]) % ORIENTATIONS
+    low = np.take_along_axis(cells, order[:, None, :], 2)
+    high = np.take_along_axis(cells, (order[:, None, :] + 1) % ORIENTATIONS, 2)
+    vectors = np.sqrt((1 - part) * low + part * high)
+    length = np.linalg.norm(vectors.reshape(len(px), -1), axis=1)[:, None, None]
+    return np.asarray(vectors / np.maximum(length, 1e-6), np.float32)

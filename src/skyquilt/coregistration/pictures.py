@@ -1,0 +1,176 @@
+"""A file to register, whatever it is: a photo, a radiometric frame or a map with its place."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.coregistration.metadata import from_metadata
+from skyquilt.errors import UnreadablePhotoError, UsageError
+from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.model.registration import Guess, Matrix, Picture
+from skyquilt.photos.pixels import read_color
+from skyquilt.photos.read import read_photo
+from skyquilt.raster.read_map import MapFile, open_map, read_reduced, read_window
+
+LONGEST = 2048
+"""Px of the longer side at which a photo or map is registered at most; it is resampled at its full
+size.
+"""
+Window = Callable[[int, int, int, int], tuple[NDArray[Any], NDArray[np.bool_]]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Source:
+    """An opened file."""
+
+    path: Path
+    """The file."""
+    height: int
+    """Rows at full size."""
+    width: int
+    """Columns at full size."""
+    picture: Picture
+    """What is registered; smaller than the file where that is large."""
+    reduction: tuple[float, float]
+    """Px of the file per px of the picture, along x and y."""
+    window: Window
+    """(row, column, height, width) -> pixels and validity at full size."""
+    photo: Photo | None = None
+    """Its metadata, if it is a photo."""
+    place: MapFile | None = None
+    """Its place, if it has one."""
+
+    @property
+    def full_S_picture(self) -> Matrix:
+        """(3, 3) takes the picture's pixels to those of the file."""
+        x, y = self.reduction
+        return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
+
+    @property
+    def unit(self) -> str:
+        """Unit of the values; empty for pictures."""
+        return self.photo.unit if self.photo else self.place.unit if self.place else ""
+
+
+def open_picture(path: Path) -> Source | RejectedPhoto:
+    """Opens a file and reads the picture, or says why it cannot be used.
+
+    Raises:
+        UsageError: there is no such file.
+    """
+    if not path.is_file():
+        raise UsageError(f"{path} is no file; two photos or two GeoTIFFs are registered")
+    if path.suffix.lower() in (".tif", ".tiff", ".vrt") and (place := open_map(path)) is not None:
+        try:
+            return _of_map(place)
+        except OSError as error:
+            return RejectedPhoto(name=path.name, reason=str(error))
+    photo = read_photo(path)
+    if isinstance(photo, RejectedPhoto):
+        return photo
+    try:
+        return _of_photo(photo)
+    except (UnreadablePhotoError, OSError) as error:
+        return RejectedPhoto(name=path.name, reason=str(error))
+
+
+def _of_photo(photo: Photo) -> Source:
+    values = read_color(photo)
+    if values.ndim == 3 and values.shape[2] not in (1, 3):
+        values = values[..., :3] if values.shape[2] > 3 else values[..., 0]
+    values = values[..., 0] if values.ndim == 3 and values.shape[2] == 1 else values
+    valid = np.isfinite(values if values.ndim == 2 else values.sum(2, dtype=np.float32))
+    factor = min(1.0, LONGEST / max(values.shape[:2]))
+    small = values
+    if factor < 1:  # both axes alike, so that a similarity stays one
+        small = np.asarray(
+            cv2.resize(values, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+        )
+
+    def window(
+        row: int, column: int, height: int, width: int
+    ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        part = (slice(row, row + height), slice(column, column + width))
+        return values[part], valid[part]
+
+    return Source(
+        path=photo.path,
+        height=values.shape[0],
+        width=values.shape[1],
+        picture=Picture(values=small),
+        reduction=(1 / factor, 1 / factor),
+        window=window,
+        photo=photo,
+    )
+
+
+def _of_map(place: MapFile) -> Source:
+    values, valid = read_reduced(place, LONGEST)
+    return Source(
+        path=place.path,
+        height=place.height,
+        width=place.width,
+        place=place,
+        picture=Picture(values=values, valid=valid),
+        reduction=(place.width / values.shape[1], place.height / values.shape[0]),
+        window=lambda row, column, height, width: read_window(place, row, column, height, width),
+    )
+
+
+def guess_of(a: Source, b: Source) -> Guess | None:
+    """What metadata or places say beforehand, in px of the pictures; None where they say
+    nothing.
+    """
+    if a.place and b.place and a.place.crs and b.place.crs:
+        guess = _from_places(a, b)
+    elif a.photo and b.photo:
+        guess = from_metadata(a.photo, b.photo)
+    else:
+        return None
+    if guess is None:
+        return None
+    small = np.linalg.inv(b.full_S_picture) @ guess.b_H_a @ a.full_S_picture
+    return Guess(
+        b_H_a=small / small[2, 2],
+        reach=guess.reach,
+        rotation_deg=guess.rotation_deg,
+        scale=guess.scale,
+        source=guess.source,
+    )
+
+
+def _from_places(a: Source, b: Source) -> Guess | None:
+    """The transform that two georeferences imply, an affine one through the overlap's corners."""
+    from pyproj import Transformer
+
+    assert a.place is not None and b.place is not None
+    px = np.array([[0, 0], [a.width, 0], [0, a.height], [a.width, a.height]], np.float64) - 0.5
+    x, y = _on_ground(a.place, px)
+    x, y = Transformer.from_crs(a.place.crs, b.place.crs, always_xy=True).transform(x, y)
+    p, q, c, r, s, f = b.place.affine
+    there = np.linalg.solve(np.array([[p, q], [r, s]]), np.array([x - c, y - f])).T - 0.5
+    if (
+        not np.isfinite(there).all()
+        or (there.max(0) < 0).any()
+        or (there.min(0) > [b.width, b.height]).any()
+    ):
+        return None
+    linear, *_ = np.linalg.lstsq(np.c_[px, np.ones(4)], there, rcond=None)
+    return Guess(
+        b_H_a=np.vstack([linear.T, [0, 0, 1.0]]),
+        reach=0.1,
+        rotation_deg=4.0,
+        scale=1.08,
+        source="the places of both maps",
+    )
+
+
+def _on_ground(place: MapFile, px: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    a, b, c, d, e, f = place.affine
+    column, row = px[:, 0] + 0.5, px[:, 1] + 0.5
+    return a * column + b * row + c, d * column + e * row + f

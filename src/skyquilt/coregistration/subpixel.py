@@ -1,0 +1,178 @@
+"""From a rough place to the exact one: the correlation coefficient of orientation fields,
+maximised.
+
+Evangelidis and Psarakis (2008), ECC, forward compositional: the coefficient's own Gauss-Newton
+step, which stays right where the pictures correlate by a tenth only. Fields turn along with the
+picture, so a rotation's derivative has a term of its own.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.coregistration.orientation import Fields, Orientation, warped
+from skyquilt.model.registration import Matrix
+
+Freedom = Literal["similarity", "affine", "homography"]
+_TINY = 1e-9
+_LARGEST_GAIN = 20.0
+"""Of the step's own scaling, which is unbounded where there is no correlation."""
+_STILL = 0.02
+"""Px below which a step ends the search."""
+_PARAMETERS = {"similarity": 4, "affine": 6, "homography": 8}
+_LEAST = 50
+"""Px of overlap below which there is nothing to fit."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Fit:
+    """A transform and how well it fits."""
+
+    b_H_a: Matrix
+    """(3, 3) in px of the resolution."""
+    correlation: float
+    """Coefficient over the overlap, in [-1, 1]."""
+    overlap: float
+    """Px of b."""
+
+    @property
+    def score(self) -> float:
+        """Correlation times the root of the overlap: comparable between overlaps."""
+        return self.correlation * float(np.sqrt(self.overlap))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sharpen:
+    """Gauss-Newton steps, each accepted only where it raises the correlation."""
+
+    freedom: Freedom = "similarity"
+    """What may change."""
+    steps: int = 6
+    """Most steps."""
+    version: ClassVar[int] = 1
+
+    def __call__(self, a: Orientation, b: Orientation, b_H_a: Matrix) -> Fit:
+        """The best transform near a given one; at worst the given one itself."""
+        frame = _Frame.of(b.shape)
+        best, fields, valid = _tried(a, b, b_H_a)
+        for _ in range(self.steps):
+            change = _change(fields, valid, b, frame, self.freedom)
+            if change is None:
+                break
+            for share in (1.0, 0.5, 0.25):
+                step = frame.applied(change * share, self.freedom)
+                fit, moved, covered = _tried(a, b, step @ best.b_H_a)
+                if fit.correlation > best.correlation + 1e-5:
+                    best, fields, valid = fit, moved, covered
+                    break
+            else:
+                break
+            if np.abs(change).max() < _STILL:
+                break
+        return best
+
+
+def _tried(
+    a: Orientation, b: Orientation, b_H_a: Matrix
+) -> tuple[Fit, Fields, NDArray[np.float32]]:
+    b_H_a = b_H_a / b_H_a[2, 2]
+    fields, valid = warped(a, b_H_a, b.shape)
+    both = valid * b.valid
+    product = float(np.vdot(fields, b.fields))
+    energy_a = float(np.einsum("ijk,ijk,ij->", fields, fields, b.valid))
+    energy_b = float(np.einsum("ijk,ijk,ij->", b.fields, b.fields, valid))
+    correlation = product / np.sqrt(energy_a * energy_b + _TINY)
+    return (
+        Fit(b_H_a=b_H_a, correlation=float(correlation), overlap=float(both.sum())),
+        fields,
+        valid,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Frame:
+    """b's pixels counted from its middle in units of half its longer side: parameters of like
+    size.
+    """
+
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    unit: float
+    centre: Matrix
+
+    @classmethod
+    def of(cls, shape: tuple[int, int]) -> "_Frame":
+        cx, cy = (shape[1] - 1) / 2, (shape[0] - 1) / 2
+        unit = max(shape) / 2
+        y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
+        return cls(
+            x=(x - np.float32(cx)) / np.float32(unit),
+            y=(y - np.float32(cy)) / np.float32(unit),
+            unit=unit,
+            centre=np.array([[1, 0, cx], [0, 1, cy], [0, 0, 1.0]]),
+        )
+
+    def applied(self, p: NDArray[np.float64], freedom: Freedom) -> Matrix:
+        """A small transform of b's frame from its parameters: px of movement, at the middle or at
+        the unit.
+        """
+        q = np.zeros(6)
+        if freedom == "similarity":
+            q[:4] = np.array([p[2], -p[3], p[3], p[2]]) / self.unit
+        else:
+            q[:4] = p[2:6] / self.unit
+        if freedom == "homography":
+            q[4:] = -p[6:8] / self.unit**2
+        small = np.array([[1 + q[0], q[1], p[0]], [q[2], 1 + q[3], p[1]], [q[4], q[5], 1.0]])
+        return np.asarray(self.centre @ small @ np.linalg.inv(self.centre))
+
+
+def _change(
+    fields: Fields, valid: NDArray[np.float32], b: Orientation, frame: _Frame, freedom: Freedom
+) -> NDArray[np.float64] | None:
+    """The step's parameters; None where the overlap is lost or nothing correlates."""
+    inside = (valid * b.valid) > 0.5
+    if inside.sum() < _LEAST:
+        return None
+    J = _derivatives(fields, inside, frame, freedom)
+    w, target = fields[inside].ravel(), b.fields[inside].ravel()
+    H = (J @ J.T).astype(np.float64)
+    H += 1e-4 * np.trace(H) / len(H) * np.eye(len(H))
+    Jw, Jb = (J @ w).astype(np.float64), (J @ target).astype(np.float64)
+    projected = np.linalg.solve(H, Jw)
+    own, cross = float(w @ w) - Jw @ projected, float(target @ w) - Jb @ projected
+    if (
+        cross <= 0
+    ):  # the shift alone explains all: Evangelidis and Psarakis's second case, simplified
+        cross = float(target @ w)
+    if cross <= 0:
+        return None
+    return np.asarray(np.linalg.solve(H, min(own / cross, _LARGEST_GAIN) * Jb - Jw))
+
+
+def _derivatives(
+    fields: Fields, inside: NDArray[np.bool_], frame: _Frame, freedom: Freedom
+) -> NDArray[np.float32]:
+    """Derivatives (parameters, 4 n) of the warped fields at n pixels."""
+    gx, gy = np.zeros_like(fields), np.zeros_like(fields)
+    np.subtract(fields[:, 2:], fields[:, :-2], out=gx[:, 1:-1])
+    np.subtract(fields[2:], fields[:-2], out=gy[1:-1])
+    gx, gy, w = gx[inside] / 2, gy[inside] / 2, fields[inside]
+    x, y = frame.x[inside][:, None], frame.y[inside][:, None]
+    # by what an orientation's own turning changes the fields, per px of movement at the unit's
+    # distance
+    turn = np.stack([-w[:, 1], w[:, 0], -2 * w[:, 3], 2 * w[:, 2]], -1) / np.float32(frame.unit)
+    J = np.empty((_PARAMETERS[freedom], *w.shape), np.float32)
+    np.negative(gx, out=J[0])
+    np.negative(gy, out=J[1])
+    if freedom == "similarity":
+        J[2] = J[0] * x + J[1] * y
+        J[3] = J[1] * x - J[0] * y + 2 * turn
+        return J.reshape(4, -1)
+    J[2], J[3], J[4], J[5] = J[0] * x, J[0] * y - turn, J[1] * x + turn, J[1] * y
+    if freedom == "homography":
+        along = J[0] * x + J[1] * y
+        J[6], J[7] = along * x, along * y
+    return J.reshape(len(J), -1)

@@ -1,0 +1,216 @@
+"""The story of two pictures: read, register, draw, tell.
+
+A is the reference; b_H_a takes its pixels to B's. A refusal is a result too: it is written down,
+and raised.
+"""
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skyquilt import __version__
+from skyquilt.coregistration.files import CONTRACT, draw, page
+from skyquilt.coregistration.methods import RegisterSettings, registration_method
+from skyquilt.coregistration.pictures import Source, guess_of, open_picture
+from skyquilt.engine.clock import cpu_seconds
+from skyquilt.engine.folder import claim
+from skyquilt.errors import RefusedError
+from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarted
+from skyquilt.model.photo import RejectedPhoto
+from skyquilt.model.registration import Guess, RefusedRegistration, Registration
+from skyquilt.quality.registration_quality import spread_quality
+from skyquilt.raster.atomic import write_text
+
+Outcome = Registration | RefusedRegistration
+STAGES = ("read", "register", "draw")
+"""Stages in order; a refusal has nothing to draw."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Told:
+    """A registration in px of the files, with what it was made from."""
+
+    outcome: Outcome
+    guess: Guess | None
+    cpu_s: float
+
+
+def iter_register(
+    a: Path | str,
+    b: Path | str,
+    output: Path | str,
+    settings: RegisterSettings | None = None,
+    *,
+    overwrite: bool = False,
+) -> Iterator[Event]:
+    """Registers picture B to picture A, telling its progress; the last event is the `Result`.
+
+    Raises:
+        RefusedError: there is no registration to be trusted; raised after the `Result`.
+        SkyquiltError: anything else a user can mend.
+    """
+    settings, output = settings or RegisterSettings(), Path(output)
+    opened = open_picture(Path(a)), open_picture(Path(b))
+    claim(output, CONTRACT, overwrite=overwrite)
+    yield StageStarted(stage="register", total=1)
+    began, cpu = time.perf_counter(), cpu_seconds()
+    told = _told(opened, settings)
+    yield StageFinished(
+        stage="register",
+        seconds=round(time.perf_counter() - began, 3),
+        cpu_seconds=round(cpu_seconds() - cpu, 3),
+        reused=False,
+    )
+    record = as_record(told.outcome, settings.method, told.guess)
+    record |= {
+        "a": str(a),
+        "b": str(b),
+        "cpu_seconds": round(told.cpu_s, 3),
+        "version": __version__,
+    }
+    if isinstance(told.outcome, Registration):
+        if told.outcome.note:
+            yield Note(text=told.outcome.note)
+        yield from _drawn(output, opened, told.outcome)
+    _write(output, record, opened, told.outcome)
+    yield Result(output=output, metrics=record)
+    if isinstance(told.outcome, RefusedRegistration):
+        raise RefusedError(f"refused: {told.outcome.reason}")
+
+
+def register(
+    a: Path | str,
+    b: Path | str,
+    output: Path | str,
+    settings: RegisterSettings | None = None,
+    *,
+    overwrite: bool = False,
+) -> Result:
+    """Registers picture B to picture A and returns when the files are written, refused or not.
+
+    Raises:
+        SkyquiltError: anything a user can mend, but for a refusal, which the result tells.
+    """
+    for happened in iter_register(a, b, output, settings, overwrite=overwrite):
+        if isinstance(happened, Result):
+            return happened
+    raise RuntimeError("the story ended without a result")
+
+
+def outcome_of(a: Source, b: Source, method: str, guess: Guess | None) -> Outcome:
+    """The registration of two opened pictures by a named method, in px of the files, with Q
+    over A.
+    """
+    outcome = registration_method(method)(a.picture, b.picture, guess)
+    if isinstance(outcome, RefusedRegistration):
+        return outcome
+    full_a, full_b = a.full_S_picture, b.full_S_picture
+    matrix = full_b @ outcome.b_H_a @ np.linalg.inv(full_a)
+    if _same(a, b):
+        outcome = replace(
+            outcome,
+            model="identity",
+            note="A and B are the same picture: it lies on itself, unmoved.",
+        )
+        matrix = np.eye(3)
+    px_a, px_b = _scaled(outcome.px_a, full_a), _scaled(outcome.px_b, full_b)
+    q = spread_quality(px_a, a.width, a.height, delta=0.1 * a.width)
+    return replace(outcome, b_H_a=matrix / matrix[2, 2], px_a=px_a, px_b=px_b, q=q)
+
+
+def as_record(outcome: Outcome, method: str, guess: Guess | None) -> dict[str, Any]:
+    """What registration.json says."""
+    shared = {
+        "method": method,
+        "guess": guess.source if guess else None,
+        "evidence": dict(outcome.evidence),
+    }
+    if isinstance(outcome, RefusedRegistration):
+        return {
+            "accepted": False,
+            "model": None,
+            "b_H_a": None,
+            "inliers": outcome.inliers,
+            "q": 0.0,
+            "reason": outcome.reason,
+            "residual_px": None,
+            **shared,
+        }
+    return {
+        "accepted": True,
+        "model": outcome.model,
+        "b_H_a": outcome.b_H_a.tolist(),
+        "inliers": len(outcome.px_a),
+        "q": round(outcome.q, 4),
+        "reason": outcome.note,
+        "residual_px": residual(outcome),
+        **shared,
+    }
+
+
+def residual(outcome: Registration) -> float | None:
+    """RMS distance in px of B between the inliers and where the transform puts them; None without
+    inliers.
+    """
+    if not len(outcome.px_a):
+        return None
+    there = np.c_[outcome.px_a, np.ones(len(outcome.px_a))] @ outcome.b_H_a.T
+    off = there[:, :2] / there[:, 2:] - outcome.px_b
+    return round(float(np.sqrt((off**2).sum(1).mean())), 3)
+
+
+def _told(
+    opened: tuple[Source | RejectedPhoto, Source | RejectedPhoto], settings: RegisterSettings
+) -> _Told:
+    since = cpu_seconds()
+    for name, one in zip("AB", opened, strict=True):
+        if isinstance(one, RejectedPhoto):
+            reason = f"picture {name} ({one.name}) cannot be used: {one.reason}"
+            return _Told(outcome=RefusedRegistration(reason=reason), guess=None, cpu_s=0.0)
+    a, b = opened
+    assert isinstance(a, Source) and isinstance(b, Source)
+    guess = guess_of(a, b) if settings.use_metadata else None
+    outcome = outcome_of(a, b, settings.method, guess)
+    return _Told(outcome=outcome, guess=guess, cpu_s=cpu_seconds() - since)
+
+
+def _same(a: Source, b: Source) -> bool:
+    va, vb = a.picture.values, b.picture.values
+    return va.shape == vb.shape and np.array_equal(va, vb, equal_nan=va.dtype.kind == "f")
+
+
+def _scaled(px: np.ndarray, full: np.ndarray) -> np.ndarray:
+    return np.asarray(px @ full[:2, :2].T + full[:2, 2])
+
+
+def _drawn(
+    output: Path,
+    opened: tuple[Source | RejectedPhoto, Source | RejectedPhoto],
+    outcome: Registration,
+) -> Iterator[Event]:
+    a, b = opened
+    assert isinstance(a, Source) and isinstance(b, Source)
+    began, cpu = time.perf_counter(), cpu_seconds()
+    yield StageStarted(stage="draw", total=1)
+    draw(output, a, b, outcome)
+    yield StageFinished(
+        stage="draw",
+        seconds=round(time.perf_counter() - began, 3),
+        cpu_seconds=round(cpu_seconds() - cpu, 3),
+        reused=False,
+    )
+
+
+def _write(
+    output: Path,
+    record: dict[str, Any],
+    opened: tuple[Source | RejectedPhoto, Source | RejectedPhoto],
+    outcome: Outcome,
+) -> None:
+    write_text(output / "report.html", page(record, opened, outcome))
+    write_text(output / "registration.json", json.dumps(record, indent=1, allow_nan=False) + "\n")

@@ -1,0 +1,1 @@
+"""Heights on the map grid by the thesis's three routes."""

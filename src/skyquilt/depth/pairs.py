@@ -1,0 +1,124 @@
+"""Disparities of linked photos after their homography, signed along the baseline: heights above the
+dominant plane.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.depth.parallax import heights_above_plane
+from skyquilt.geometry.camera import rays
+from skyquilt.geometry.transforms import transfer
+from skyquilt.imaging.views import View, on_ground
+from skyquilt.matching.levelled import WORKING_WIDTH, Level, disparities, threshold_px
+from skyquilt.matching.ransac import Ransac
+from skyquilt.model.estimate import NoEstimate
+from skyquilt.model.features import Features, Link
+from skyquilt.ortho.tie_surface import level
+
+LEAST_BASE = 0.05
+"""Baseline over height below which disparities tell nothing."""
+ACROSS_PX = 2.0
+"""Disparity across the baseline, px at the working width, from which a match is taken for a wrong
+one.
+"""
+LEAST_POINTS = 12
+"""Fewest points of a pair that counts."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PairField:
+    """What two photos say about height."""
+
+    a: int
+    """Index of the first photo."""
+    b: int
+    """Index of the second."""
+    px: NDArray[np.float64]
+    """(n, 2) px of b."""
+    d_px: NDArray[np.float64]
+    """(n, 2) disparity vectors (Y 4.8) in px of an image WORKING_WIDTH wide."""
+    xyz: NDArray[np.float64]
+    """(n, 3) map coordinates x, y and height above the pair's dominant plane, m."""
+    baseline_m: float
+    """Distance of both centres, m."""
+    height_m: float
+    """Height of a above the plane, m."""
+    level: int
+    """Points of the dominant plane."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoField:
+    """A pair that says nothing about height: false in `if`."""
+
+    a: int
+    """Index of the first photo."""
+    b: int
+    """Index of the second."""
+    reason: str
+    """A plain sentence."""
+
+    def __bool__(self) -> bool:
+        return False
+
+
+def pair_field(
+    link: Link,
+    features: tuple[Features, Features],
+    views: tuple[View, View],
+    z: float,
+    relief_m: float | None,
+) -> PairField | NoField:
+    """Heights from the disparities of one linked pair; `z`: level in m of the ground in the map
+    frame.
+
+    All matches of the link are asked, which obey one epipolar geometry, not only those on the
+    plane.
+    """
+    a, b = views
+    px = features[0].px[link.index_a], features[1].px[link.index_b]
+    baseline = float(np.linalg.norm(a.pose.map_C - b.pose.map_C))
+    height = float(a.pose.map_C[2] - z)
+    if baseline < LEAST_BASE * height:
+        return NoField(a=link.a, b=link.b, reason=f"its baseline of {baseline:.2f} m is too short")
+    unit = b.camera.focal * WORKING_WIDTH / b.camera.width
+    u = [
+        r[:, :2] / r[:, 2:] * unit
+        for r in (rays(v.camera, p) for v, p in zip(views, px, strict=True))
+    ]
+    found = Ransac(
+        model="homography", threshold_px=threshold_px(relief_m, height), minimum=LEAST_POINTS
+    )(u[0], u[1])
+    if isinstance(found, NoEstimate):
+        return NoField(a=link.a, b=link.b, reason=f"no dominant plane: {found.reason}")
+    everything = replace(found, inliers=np.ones(len(u[0]), bool))
+    flat = Level(relief_m=relief_m, height_m=height)(u[0], u[1], everything)
+    H = flat.estimate.b_H_a
+    d, w = disparities(H, u[0], u[1]), transfer(H, u[0]) / unit
+    depth = (z - b.pose.map_C[2]) / (np.c_[w, np.ones(len(w))] @ b.pose.cam_R_map)[:, 2]
+    b_T = b.pose.cam_R_map @ (a.pose.map_C - b.pose.map_C)
+    h, _, across = heights_above_plane(d / unit, w, b_T, depth, height)
+    keep = np.isfinite(h) & (np.abs(across) * unit < ACROSS_PX) & (np.abs(h) < 0.5 * height)
+    if keep.sum() < LEAST_POINTS:
+        return NoField(a=link.a, b=link.b, reason="its disparities do not lie along the baseline")
+    return PairField(
+        a=link.a,
+        b=link.b,
+        px=px[1][keep],
+        d_px=d[keep],
+        xyz=np.c_[_placed(b, px[1][keep], z, h[keep]), h[keep]],
+        baseline_m=baseline,
+        height_m=height,
+        level=int((keep & flat.level).sum()),
+    )
+
+
+def _placed(view: View, px: NDArray[Any], z: float, h: NDArray[Any]) -> NDArray[np.float64]:
+    """(n, 2) m: where pixels of a photo lie at heights h above the level z; along a ray that is
+    linear in h.
+    """
+    low, high = (on_ground(view, px, level(at))[:, :2] for at in (z, z + 1))
+    return np.asarray(low + h[:, None] * (high - low))

@@ -1,0 +1,254 @@
+"""The story of `depth`: heights on the map grid, by one of the thesis's three ways [Yahyanejad
+2013, 5.2.3].
+
+    pair             two photos: disparities after the homography, signed along the baseline
+    disparities      the same of all linked pairs, normalised by their baselines, merged on the map
+    reconstruction   the heights of the whole adjustment, projected on the plane (5.8)
+
+The photos are placed as `mosaic` places them, so depth.tif has the place of its map.
+"""
+
+import json
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt import __version__
+from skyquilt.depth.files import (
+    FILES,
+    PAIRS,
+    false_colour,
+    field_name,
+    field_picture,
+    former_fields,
+    write_depth,
+    write_png,
+)
+from skyquilt.depth.one_plane import OnePlane
+from skyquilt.depth.page import depth_page
+from skyquilt.depth.pairs import NoField, PairField, pair_field
+from skyquilt.engine.clock import Clock, Steps
+from skyquilt.engine.folder import STATE, claim
+from skyquilt.engine.store import Store
+from skyquilt.errors import RefusedError, UsageError
+from skyquilt.model.event import Event, Note, Result
+from skyquilt.model.photo import Survey
+from skyquilt.model.surface import Surface
+from skyquilt.photos.survey import read_survey
+from skyquilt.raster.atomic import write_text
+from skyquilt.workflows.methods import Methods, MosaicSettings, methods
+from skyquilt.workflows.mosaic import REGISTRY
+from skyquilt.workflows.scene import Scene, scene_of
+
+FEATURE_PX = 640
+"""Longest side in px of the pictures searched for features: their disparities are the map, so they
+lie dense.
+"""
+ROUTES = ("auto", "pair", "disparities", "reconstruction")
+"""auto: pair for two photos, reconstruction for more."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Depth:
+    """What a route found."""
+
+    surface: Surface
+    """Heights."""
+    fields: tuple[PairField, ...] = ()
+    """Pairs it rests on; none for the reconstruction."""
+    without: tuple[NoField, ...] = ()
+    """Linked pairs that say nothing."""
+
+
+def iter_depth(
+    photos: Path | str | Sequence[Path],
+    output: Path | str,
+    settings: MosaicSettings | None = None,
+    *,
+    route: str = "auto",
+    relief_m: float | None = None,
+    overwrite: bool = False,
+) -> Iterator[Event]:
+    """Makes depth.tif, its pictures and figures; the last event is the `Result`.
+
+    `relief_m`: largest height variation on the ground, which tells what counts as the dominant
+    plane (Y 4.9).
+
+    Raises:
+        RefusedError: no two photos tell a height.
+        SkyquiltError: anything else a user can mend.
+    """
+    settings, output, began = settings or MosaicSettings(), Path(output), Clock.now()
+    if route not in ROUTES:
+        raise UsageError(f"--route {route!r} is not one of {', '.join(ROUTES)}")
+    survey = read_survey(
+        Path(photos) if isinstance(photos, str) else photos,
+        geo=settings.geo,
+        cameras=settings.cameras,
+        thermal_unit=settings.thermal_unit,
+    )
+    if len(survey.photos) < 2:
+        raise UsageError("depth takes two photos at least, and here is one; give its neighbour too")
+    if route == "auto":
+        route = "pair" if len(survey.photos) == 2 else "reconstruction"
+    former = former_fields(output)
+    claim(output, FILES, overwrite=overwrite)
+    for path in former:
+        path.unlink(missing_ok=True)
+    clock = Clock(store=Store(folder=output / STATE / "store", registry=REGISTRY), began=began)
+    yield from (Note(text=n) for n in survey.notes)
+    scene, depth = yield from _by_route(route, survey, settings, relief_m, clock)
+    record = yield from clock.stage("draw", _drawn(output, route, scene, depth))
+    record |= {"cpu_seconds": round(clock.cpu_total(), 2), "photos_total": len(survey.photos)}
+    write_text(output / "depth.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
+    yield Result(output=output, metrics=record)
+
+
+def depth(
+    photos: Path | str | Sequence[Path],
+    output: Path | str,
+    settings: MosaicSettings | None = None,
+    *,
+    route: str = "auto",
+    relief_m: float | None = None,
+    overwrite: bool = False,
+) -> Result:
+    """Makes a depth map and returns when it is finished.
+
+    Raises:
+        SkyquiltError: anything a user can mend.
+    """
+    for happened in iter_depth(
+        photos, output, settings, route=route, relief_m=relief_m, overwrite=overwrite
+    ):
+        if isinstance(happened, Result):
+            return happened
+    raise RuntimeError("the story ended without a result")
+
+
+def _by_route(
+    route: str, survey: Survey, settings: MosaicSettings, relief_m: float | None, clock: Clock
+) -> Generator[Event, None, tuple[Scene, Depth]]:
+    parts = methods(settings)
+    parts = replace(parts, sift=replace(parts.sift, longest=FEATURE_PX))
+    if route == "reconstruction":
+        scene = yield from scene_of(survey.photos, settings, parts, clock)
+        if not len(scene.alignment.ties.xyz):
+            raise RefusedError(
+                "no tie points: the photos do not overlap recognisably, so nothing tells heights"
+            )
+        return scene, Depth(surface=scene.ground.surface)
+    parts = replace(parts, sweep=None)
+    if route == "disparities":
+        scene = yield from scene_of(survey.photos, settings, parts, clock)
+        return scene, (
+            yield from clock.stage("disparities", _disparities(scene, parts, relief_m), keeps=False)
+        )
+    why = ""
+    for k in range(len(survey.photos) - 1):
+        scene = yield from scene_of(survey.photos[k : k + 2], settings, parts, clock)
+        found = yield from clock.stage(
+            "disparities", _disparities(scene, parts, relief_m, refuse=False), keeps=False
+        )
+        if found.fields:
+            return scene, found
+        why = why or (found.without[0].reason if found.without else "they do not match")
+    raise RefusedError(f"no two photos in sequence tell a height; of the first two: {why}")
+
+
+def _disparities(
+    scene: Scene, parts: Methods, relief_m: float | None, *, refuse: bool = True
+) -> Steps[Depth]:
+    """Heights from the disparities of all linked pairs.
+
+    Raises:
+        RefusedError: no pair tells a height, and `refuse` is set.
+    """
+    views = {v.photo: v for v in scene.ground.views}
+    features, z = scene.taken.features, float(np.median(scene.ground.surface.z))
+    fields: list[PairField] = []
+    without: list[NoField] = []
+    for done, link in enumerate(scene.links.links):
+        yield done, len(scene.links.links)
+        if link.a not in views or link.b not in views:
+            continue
+        pair = features[link.a], features[link.b]
+        found = pair_field(link, pair, (views[link.a], views[link.b]), z, relief_m)
+        (fields if found else without).append(found)  # type: ignore[arg-type]
+    if not fields:
+        if refuse:
+            raise RefusedError(
+                "no pair of photos tells a height: none is linked over a sufficient baseline"
+            )
+        return Depth(surface=scene.ground.surface, without=tuple(without))
+    xyz = OnePlane()([f.xyz for f in fields])
+    surface = parts.surface(xyz, scene.ground.grid.bounds)
+    return Depth(
+        surface=replace(surface, source="disparities"), fields=tuple(fields), without=tuple(without)
+    )
+
+
+def _drawn(output: Path, route: str, scene: Scene, depth: Depth) -> Steps[dict[str, Any]]:
+    """Writes all files but depth.json; returns what that says."""
+    yield 0, 1
+    alignment, ground, photos = scene.alignment, scene.ground, scene.taken.photos
+    counted = alignment.frame.vertical_datum if route == "reconstruction" else "the dominant plane"
+    unit = "m" if alignment.frame.metric else "arbitrary"
+    tags = {"UNIT": unit, "ROUTE": route, "VERTICAL_DATUM": counted}
+    z, known = write_depth(
+        output / "depth.tif", depth.surface, ground.views, ground.grid, alignment, tags
+    )
+    if not known.any():
+        raise RefusedError("no place is seen by two placed photos, so nothing tells heights there")
+    picture = false_colour(z, known)
+    write_png(output / "depth.png", picture)
+    shown: list[tuple[str, NDArray[np.uint8]]] = []
+    for field in depth.fields:
+        name = field_name(photos[field.a], photos[field.b])
+        shown.append((name, field_picture(field, photos[field.b])))
+        write_png(output / PAIRS / name, shown[-1][1])
+    record = _record(route, scene, depth, z[known], unit, counted)
+    write_text(output / "report.html", depth_page(record, picture, shown))
+    yield 1, 1
+    return record
+
+
+def _record(
+    route: str, scene: Scene, depth: Depth, z: NDArray[np.float32], unit: str, counted: str
+) -> dict[str, Any]:
+    photos, grid, alignment = scene.taken.photos, scene.ground.grid, scene.alignment
+    pairs = [
+        {
+            "a": photos[f.a].name,
+            "b": photos[f.b].name,
+            "points": len(f.px),
+            "level": f.level,
+            "field": field_name(photos[f.a], photos[f.b]),
+            "baseline_m": round(f.baseline_m, 3),
+            "height_m": round(f.height_m, 3),
+            "largest_disparity_px": round(float(np.linalg.norm(f.d_px, axis=1).max()), 2),
+        }
+        for f in depth.fields
+    ]
+    return {
+        "version": __version__,
+        "route": route,
+        "unit": unit,
+        "counted_from": counted,
+        "crs": alignment.frame.crs,
+        "gsd_m": grid.gsd,
+        "size_px": [grid.width, grid.height],
+        "photos_used": len(scene.ground.views),
+        "method": alignment.method,
+        "cell_m": round(depth.surface.cell, 4),
+        "percentiles": {str(p): round(float(np.percentile(z, p)), 3) for p in (1, 50, 99)},
+        "pairs": pairs,
+        "pairs_without": [
+            {"a": photos[f.a].name, "b": photos[f.b].name, "reason": f.reason}
+            for f in depth.without
+        ],
+    }

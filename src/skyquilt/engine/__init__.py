@@ -1,0 +1,1 @@
+"""How work runs: artefacts on disk, progress, threads, caches, the run's folder."""

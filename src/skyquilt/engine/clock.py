@@ -1,0 +1,93 @@
+"""Time per stage, told as events."""
+
+import sys
+import time
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from skyquilt.engine.store import Store
+from skyquilt.model.event import Event, StageFinished, StageProgress, StageStarted
+
+T = TypeVar("T")
+Steps = Generator[tuple[int, int] | Event, None, T]
+"""A stage's work: yields (done, total) or events, returns its result."""
+
+
+def cpu_seconds() -> float:
+    """CPU time of this process in s."""
+    return time.process_time()
+
+
+def peak_memory_mb() -> float | None:
+    """Largest resident memory of this process in MB; None on systems that do not tell (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    unit = 1e6 if sys.platform == "darwin" else 1e6 / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+@dataclass(kw_only=True)
+class Clock:
+    """Stage times of a run."""
+
+    store: Store
+    """Watched to tell reused stages."""
+    began: tuple[float, float]
+    """When the run began: wall clock and CPU time in s, as `now` gives them."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Wall-clock time per stage in s."""
+    cpu: dict[str, float] = field(default_factory=dict)
+    """CPU time per stage in s."""
+    peak_mb: dict[str, float] = field(default_factory=dict)
+    """Largest resident memory up to the end of each stage in MB; empty on systems that do not tell.
+    """
+
+    @staticmethod
+    def now() -> tuple[float, float]:
+        """Wall clock and CPU time in s."""
+        return time.perf_counter(), cpu_seconds()
+
+    def lap(self, stage: str, since: tuple[float, float]) -> None:
+        """Notes a stage's time from an earlier `now`."""
+        self.seconds[stage] = round(time.perf_counter() - since[0], 3)
+        self.cpu[stage] = round(cpu_seconds() - since[1], 3)
+        if (peak := peak_memory_mb()) is not None:
+            self.peak_mb[stage] = round(peak, 1)
+
+    def stage(self, name: str, work: Steps[T], *, keeps: bool = True) -> Generator[Event, None, T]:
+        """Runs a stage's steps as events and returns its result; `keeps` is False for one that
+        stores none.
+        """
+        begun, hits, misses = self.now(), self.store.hits, self.store.misses
+        yield StageStarted(stage=name, total=0)
+        try:
+            while True:
+                step = next(work)
+                yield (
+                    StageProgress(stage=name, done=step[0], total=step[1])
+                    if isinstance(step, tuple)
+                    else step
+                )
+        except StopIteration as stop:
+            result: T = stop.value
+        finally:
+            work.close()
+        self.lap(name, begun)
+        yield StageFinished(
+            stage=name,
+            seconds=self.seconds[name],
+            cpu_seconds=round(cpu_seconds() - begun[1], 3),
+            reused=keeps and self.store.misses == misses and self.store.hits > hits,
+        )
+        return result
+
+    def total(self) -> float:
+        """Wall-clock time so far in s."""
+        return time.perf_counter() - self.began[0]
+
+    def cpu_total(self) -> float:
+        """CPU time so far in s, of this process."""
+        return cpu_seconds() - self.began[1]

@@ -1,0 +1,142 @@
+"""The run's folder: who may write there, what may be resumed, what a full disk is told as."""
+
+import errno
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from skyquilt.errors import OutputError
+
+CONTRACT = (
+    "mosaic.tif",
+    "provenance.tif",
+    "views.tif",
+    "surface.tif",
+    "cameras.json",
+    "shots.geojson",
+    "reconstruction.json",
+    "footprints.geojson",
+    "metrics.json",
+    "report.html",
+    "run.toml",
+)
+"""Files of a finished run."""
+STATE = ".skyquilt"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFolder:
+    """An opened output folder."""
+
+    path: Path
+    """The folder."""
+    key: str
+    """What the run is made from: inputs and settings."""
+
+    @property
+    def store(self) -> Path:
+        """Where intermediate results lie."""
+        return self.path / STATE / "store"
+
+    def mark(self, state: str) -> None:
+        """Writes down how far the run is: `running` or `done`."""
+        target = self.path / STATE / "run.json"
+        partial = target.with_suffix(".partial")
+        try:
+            partial.write_text(json.dumps({"key": self.key, "state": state}))
+            partial.replace(target)
+        except OSError as error:
+            partial.unlink(missing_ok=True)
+            raise refusal(self.path, error) from error
+
+    @property
+    def done(self) -> bool:
+        """Whether this very run was finished before."""
+        return _state(self.path) == (self.key, "done") and all(
+            (self.path / name).is_file() for name in CONTRACT
+        )
+
+
+def _state(path: Path) -> tuple[str, str]:
+    try:
+        found = json.loads((path / STATE / "run.json").read_text())
+        return str(found["key"]), str(found["state"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "", ""
+
+
+def open_run(path: Path, key: str, *, overwrite: bool, again: bool = False) -> RunFolder:
+    """Opens a folder for a run: new, empty, the same run again (resumed), or overwritten.
+
+    `again` allows to replace another run's results, but not to write among other files.
+
+    Raises:
+        OutputError: it holds something else, or cannot be written.
+    """
+    if path.exists() and not path.is_dir():
+        raise OutputError(f"{path} is a file; the output is a folder")
+    known, state = _state(path)
+    try:
+        taken = (
+            path.is_dir() and any(p.name != STATE or known for p in path.iterdir()) and known != key
+        )
+        if taken and not overwrite and not (again and known):
+            what = "another run (other photos or other settings)" if known else "other files"
+            raise OutputError(
+                f"{path} already holds {what}; add --overwrite to replace its results,"
+                " or choose another folder"
+            )
+        if taken:
+            for name in CONTRACT:
+                (path / name).unlink(missing_ok=True)
+        (path / STATE).mkdir(parents=True, exist_ok=True)
+        probe = path / STATE / "probe"
+        probe.write_bytes(b"x")
+        probe.unlink()
+    except OSError as error:
+        raise refusal(path, error) from error
+    folder = RunFolder(path=path, key=key)
+    if state != "done" or known != key:
+        folder.mark("running")
+    return folder
+
+
+def claim(path: Path, names: Sequence[str], *, overwrite: bool) -> None:
+    """Makes the folder, or clears the files `names` of a former run from it; other files stay.
+
+    Raises:
+        OutputError: it holds files already and `overwrite` is not given, is a file, or cannot be
+            written.
+    """
+    if path.exists() and not path.is_dir():
+        raise OutputError(f"{path} is a file; the output is a folder")
+    try:
+        if path.is_dir() and any(path.iterdir()) and not overwrite:
+            raise OutputError(
+                f"{path} already holds files; add --overwrite to replace its results, or choose"
+                " another folder"
+            )
+        path.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            (path / name).unlink(missing_ok=True)
+        probe = path / ".probe"
+        probe.write_bytes(b"x")
+        probe.unlink()
+    except OSError as error:
+        raise refusal(path, error) from error
+
+
+FULL = (errno.ENOSPC, errno.EDQUOT)
+
+
+def refusal(path: Path, error: OSError) -> OutputError:
+    """The error with the next step: make room and resume, or another folder."""
+    if error.errno in FULL:
+        return OutputError(
+            f"the disk is full: cannot write to {path}. Make room and run the same command again to"
+            " resume"
+        )
+    return OutputError(
+        f"cannot write to {path}: {error.strerror or error}; choose another output folder"
+    )

@@ -1,0 +1,80 @@
+"""The outcome of work on a whole block becomes the map's."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.live.background_adjustment import Closed
+from skyquilt.live.crash_points import reached
+from skyquilt.live.members import Member, about_record
+from skyquilt.live.refinement import Refining
+from skyquilt.live.settings import CLOSING
+from skyquilt.live.update import Update
+from skyquilt.model.poses import Pose
+
+
+class Adopting:
+    """New poses of a block; what was placed meanwhile follows its neighbours and is settled
+    again.
+    """
+
+    def __init__(self, refining: Refining) -> None:
+        self.refining, self.members, self.ledger = refining, refining.members, refining.ledger
+        self.schedule, self.showing, self.queues = (
+            refining.schedule,
+            refining.showing,
+            refining.queues,
+        )
+
+    def adopt(self, done: Closed) -> Update:
+        """Takes it over, in one transaction."""
+        if not done.poses:
+            return self._failed(done.problem)
+        before = {i: self.members.by_id[i].pose for i in done.poses}
+        steps = {
+            i: p.map_C - old.map_C for i, p in done.poses.items() if (old := before[i]) is not None
+        }
+        since = self._since(done)
+        text = f"{len(done.poses)} photos were adjusted together"
+        self.schedule.ended()
+        with self.ledger.change():
+            self.members.save_cameras(done.cameras)
+            self.refining.heights(done.xyz, known=bool(done.cameras), anew=True)
+            self.refining.move(done.poses, done.camera_of)
+            for member in since:
+                self._follow(member, steps)
+            self.schedule.write(self.ledger)
+            self.ledger.tell("note", {"text": text})
+        reached("block closed")
+        if done.cameras:  # heights and calibrations changed: all of the block looks different
+            self._show(done)
+        return Update(what="closed", moved=tuple(done.poses), text=text)
+
+    def _failed(self, problem: str) -> Update:
+        self.schedule.ended()
+        with self.ledger.change():
+            self.schedule.write(self.ledger)
+        return Update(what="noted", text=f"a block could not be adjusted as a whole: {problem}")
+
+    def _since(self, done: Closed) -> list[Member]:
+        """Photos that have joined the block since the job began; of large blocks, none."""
+        block = self.members.block(next(iter(done.poses)))
+        if len(block) > CLOSING:
+            return []
+        return [self.members.by_id[i] for i in sorted(block - set(done.ids))]
+
+    def _show(self, done: Closed) -> None:
+        for i in done.poses:
+            if self.members.by_id[i].state == "refined":
+                self.showing.changed(self.members.by_id[i])
+
+    def _follow(self, member: Member, steps: dict[int, NDArray[np.float64]]) -> None:
+        near = [steps[j] for j in sorted(member.links) if j in steps]
+        if member.pose is None or not near:
+            return
+        step = np.median(np.array(near), axis=0)
+        pose = Pose(cam_R_map=member.pose.cam_R_map, map_C=member.pose.map_C + step)
+        self.refining.move({member.id: pose}, {member.id: member.camera})
+        if member not in self.queues.untried:
+            member.tried = 0
+            self.members.save(member, about=about_record(member, ""))
+            self.queues.untried.append(member)

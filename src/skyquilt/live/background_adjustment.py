@@ -1,0 +1,256 @@
+"""Loops closed behind the scenes: a whole block bundled, or a large part of it settled, in a
+process of its own.
+
+The foreground goes on meanwhile; what it has placed since follows its neighbours when the outcome
+is taken over.
+"""
+
+import multiprocessing
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.bundle import Bundle
+from skyquilt.alignment.local_adjustment import Incremental, Settled, Window
+from skyquilt.engine.store import Store, digest
+from skyquilt.errors import AlignmentError, SkyquiltError
+from skyquilt.live.ledger import Ledger
+from skyquilt.live.links import link_from
+from skyquilt.model.camera import Camera
+from skyquilt.model.features import Features, Link
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior
+from skyquilt.model.surface import Surface
+from skyquilt.ortho.orthomosaic import Ground, survey_ground
+from skyquilt.photos.pixels import read_color
+from skyquilt.workflows.methods import Methods, MosaicSettings
+from skyquilt.workflows.photo_features import THUMBNAIL, Looked, Pictures
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Job:
+    """What to bundle."""
+
+    ids: tuple[int, ...]
+    """Photos, ascending."""
+    held: frozenset[int]
+    """Of these, the ones that stay; empty = the block is bundled as a whole, calibration included.
+    """
+    photos: tuple[Photo, ...]
+    """Their files."""
+    priors: tuple[Prior, ...]
+    """Their metadata."""
+    frame: MapFrame
+    """The map's frame."""
+    poses: dict[int, Pose]
+    """Where they are."""
+    cameras: dict[str, Camera]
+    """Calibrations."""
+    camera_of: dict[int, str]
+    """Names of them."""
+    ground: float
+    """Height of the ground in m."""
+    folder: Path
+    """The survey's folder: links and features are read from there."""
+    store: Path
+    """The store's folder."""
+    methods: Methods
+    """How features were found."""
+    sweep: bool
+    """Whether heights are swept from the pictures too, as the batch story does it."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Closed:
+    """The outcome."""
+
+    ids: tuple[int, ...]
+    """The photos of the job."""
+    poses: dict[int, Pose]
+    """New poses."""
+    cameras: dict[str, Camera]
+    """New calibrations; none of a part."""
+    camera_of: dict[int, str]
+    """Names of the calibrations of the photos moved."""
+    xyz: NDArray[np.float64]
+    """(P, 3) ground points in m."""
+    problem: str = ""
+    """Why there is no outcome, where there is none."""
+
+
+def close(job: Job) -> Closed:
+    """Does the work."""
+    try:
+        ledger = Ledger(job.folder, write=False)
+        try:
+            links = _links(job, ledger)
+        finally:
+            ledger.close()
+        store = Store(
+            folder=job.store, registry={c.__name__: c for c in (Looked, Features, Surface)}
+        )
+        features = [_features(p, store, job.methods) for p in job.photos]
+        return _part(job, links, features) if job.held else _whole(job, links, features, store)
+    except (AlignmentError, SkyquiltError, np.linalg.LinAlgError, ValueError) as error:
+        return _nothing(job.ids, str(error))
+
+
+def _nothing(ids: tuple[int, ...], problem: str) -> Closed:
+    return Closed(
+        ids=ids, poses={}, cameras={}, camera_of={}, xyz=np.zeros((0, 3)), problem=problem
+    )
+
+
+def _features(photo: Photo, store: Store, methods: Methods) -> Features:
+    looked = store.get("features", digest(photo.digest, methods.sift, THUMBNAIL))
+    if looked is None:
+        raise AlignmentError(f"the features of {photo.name} are gone from the store")
+    found: Features = looked.features
+    return found
+
+
+def _links(job: Job, ledger: Ledger) -> list[Link]:
+    where = {i: k for k, i in enumerate(job.ids)}
+    links = []
+    for i in job.ids:
+        for a, b, body in ledger.rows(
+            "select a, b, body from link where a = ? and body is not null order by b", i
+        ):
+            if b in where:
+                links.append(replace(link_from(body), a=where[a], b=where[b]))
+    return links
+
+
+def _whole(job: Job, links: Sequence[Link], features: Sequence[Features], store: Store) -> Closed:
+    pictures = Pictures(job.photos, lambda i: read_color(job.photos[i]), store)
+    done = Bundle()(job.photos, job.frame, job.priors, features, links, (), pictures)
+    xyz = _swept(done, pictures, job, store) if job.sweep else done.ties.xyz
+    return Closed(
+        ids=job.ids,
+        poses={job.ids[k]: p for k, p in done.poses.items()},
+        cameras=dict(done.cameras),
+        camera_of={job.ids[k]: done.camera_of[k] for k in done.poses},
+        xyz=xyz,
+    )
+
+
+def _swept(done: Alignment, pictures: Pictures, job: Job, store: Store) -> NDArray[np.float64]:
+    """(P, 3) the ground as the batch story finds it, at the nodes of its grid below the photos."""
+    steps = survey_ground(done, pictures, job.methods, MosaicSettings(), store)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            ground: Ground = end.value
+            break
+    surface = ground.surface
+    rows, columns = np.mgrid[: surface.z.shape[0], : surface.z.shape[1]]
+    xyz = np.column_stack(
+        [
+            surface.x0 + columns.ravel() * surface.cell,
+            surface.y0 + rows.ravel() * surface.cell,
+            surface.z.ravel(),
+        ]
+    )
+    seen = np.zeros(surface.z.shape, np.uint8)
+    for view in ground.views:
+        corners = (view.footprint - (surface.x0, surface.y0)) / surface.cell
+        cv2.fillPoly(seen, [np.rint(corners).astype(np.int32)], 1)
+    return np.asarray(xyz[seen.ravel() > 0], np.float64)
+
+
+def _part(job: Job, links: Sequence[Link], features: Sequence[Features]) -> Closed:
+    where = {i: k for k, i in enumerate(job.ids)}
+    free = next(i for i in job.ids if i not in job.held)
+    window = Window(
+        photos=job.photos,
+        priors=job.priors,
+        features=features,
+        links=links,
+        poses={where[i]: p for i, p in job.poses.items()},
+        cameras=job.cameras,
+        camera_of={where[i]: c for i, c in job.camera_of.items()},
+        new=where[free],
+        held=frozenset(where[i] for i in job.held),
+        ground=job.ground,
+        sigma_xy=0.0,
+    )
+    done = Incremental(per_photo=60)(window)
+    if not isinstance(done, Settled):
+        raise AlignmentError(done.reason)
+    moved = {job.ids[k]: p for k, p in done.poses.items()}
+    return Closed(
+        ids=job.ids,
+        poses=moved,
+        cameras={},
+        camera_of={i: job.camera_of[i] for i in moved},
+        xyz=done.xyz,
+    )
+
+
+def _serve(wire: Connection, other: Connection) -> None:
+    """The process: one job, one answer; it ends when its parent is gone."""
+    other.close()
+    with suppress(OSError, AttributeError):
+        os.nice(10)  # the foreground comes first
+    try:
+        wire.send(close(wire.recv()))
+    except (EOFError, BrokenPipeError):
+        return
+
+
+class Closing:
+    """At most one job at a time behind the scenes."""
+
+    def __init__(self) -> None:
+        self._process: Any = None
+        self._wire: Connection | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a job is under way."""
+        return self._process is not None
+
+    def start(self, job: Job) -> None:
+        """Begins a job."""
+        context = multiprocessing.get_context("spawn")
+        self._wire, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs, self._wire), daemon=True)
+        self._process.start()
+        theirs.close()
+        self._wire.send(job)
+
+    def outcome(self) -> Closed | None:
+        """The outcome, once there is one; then another job may begin."""
+        if self._process is None or self._wire is None:
+            return None
+        done: Closed | None = None
+        try:
+            if self._wire.poll(0):
+                done = self._wire.recv()
+            elif self._process.is_alive():
+                return None
+        except (EOFError, OSError):
+            done = None
+        self.stop()
+        return done or _nothing((), "its process ended early")
+
+    def stop(self) -> None:
+        """Ends the job, if there is one."""
+        if self._process is not None:
+            if self._process.is_alive():
+                self._process.join(0.2)
+                self._process.terminate()
+            self._process.join(5)
+            self._process = None
+        if self._wire is not None:
+            self._wire.close()
+            self._wire = None

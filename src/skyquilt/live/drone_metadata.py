@@ -1,0 +1,119 @@
+"""Where a photo is by its metadata, corrected by what earlier photos of its source have shown."""
+
+from collections import defaultdict, deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.priors import choose_frame
+from skyquilt.geometry.frames import (
+    angle_difference_deg,
+    angles_from_cam_R_map,
+    cam_R_map_from_angles,
+)
+from skyquilt.live.members import Member, Members
+from skyquilt.live.settings import LiveSettings
+from skyquilt.model.poses import Pose
+from skyquilt.ortho.height_cells import HeightCells
+
+NOMINAL_M = 50.0
+"""Height above ground where nothing tells it."""
+RECENT = 15
+"""Photos of one source by which the next one's metadata are corrected."""
+
+
+class Metadata:
+    """First poses, and what settled photos teach about those to come."""
+
+    def __init__(self, members: Members, heights: HeightCells, settings: LiveSettings) -> None:
+        """What was learned before a restart is learned again, in the same order."""
+        self.members, self.heights, self.settings = members, heights, settings
+        self._recent: dict[str, deque[tuple[float, float]]] = defaultdict(
+            lambda: deque(maxlen=RECENT)
+        )
+        self._misfit: deque[float] = deque(maxlen=60)
+        for member in sorted(members.by_id.values(), key=lambda m: m.tried):
+            self._remember(member)
+
+    def frame_from(self, member: Member) -> bool:
+        """Makes the map's frame from the first photo that knows where it is."""
+        if self.members.frame is None and member.photo.position is not None:
+            self.members.set_frame(choose_frame([member.photo], self.settings.crs))
+        return self.members.frame is not None
+
+    def first(self, member: Member) -> Pose | None:
+        """A pose from metadata, corrected by what earlier photos of the same source have shown;
+        None without place.
+        """
+        prior = member.prior
+        if prior is None or not np.isfinite(prior.map_C[:2]).all():
+            return None
+        turn, lift = self._corrections(member)
+        yaw = prior.yaw_deg - turn if np.isfinite(prior.yaw_deg) else 0.0
+        datum = self.members.frame.vertical_datum if self.members.frame else "unknown"
+        z = prior.map_C[2]
+        if np.isfinite(lift):
+            z = z + lift if np.isfinite(z) else lift
+        elif not np.isfinite(z) or (datum == "takeoff" and z < 3):
+            z = self.ground_at(prior.map_C) + NOMINAL_M
+        R = cam_R_map_from_angles(
+            yaw,
+            0.0 if abs(turn) > 90 else prior.pitch_deg,
+            0.0 if abs(turn) > 90 else prior.roll_deg,
+        )
+        return Pose(cam_R_map=R, map_C=np.array([prior.map_C[0], prior.map_C[1], z]))
+
+    def _corrections(self, member: Member) -> tuple[float, float]:
+        """How far recent photos of the source reported headings (deg) and heights (m) wrongly."""
+        found = self._recent.get(f"{member.source}|{member.photo.camera_key}")
+        if not found:
+            return 0.0, np.nan
+        turns = np.array([t for t, _ in found][-3:])
+        turns = turns[np.isfinite(turns)]
+        unit = np.exp(1j * np.radians(turns))
+        agreed = len(turns) > 0 and abs(unit.mean()) > 0.97
+        turn = float(np.degrees(np.angle(unit.mean()))) if agreed else 0.0
+        lifts = np.array([x for _, x in found])
+        lift = float(np.median(lifts[np.isfinite(lifts)])) if np.isfinite(lifts).any() else np.nan
+        return (turn if abs(turn) > 10 else 0.0), lift
+
+    def learn(self, member: Member) -> None:
+        """Compares what a photo that has just settled reported with where it is; `member.learned`
+        keeps it.
+        """
+        assert member.pose is not None
+        assert member.prior is not None
+        yaw, _, _ = angles_from_cam_R_map(member.pose.cam_R_map)
+        off = member.pose.map_C - member.prior.map_C
+        turn = (
+            angle_difference_deg(member.prior.yaw_deg, yaw)
+            if np.isfinite(member.prior.yaw_deg)
+            else np.nan
+        )
+        lift = float(off[2]) if np.isfinite(off[2]) else float(member.pose.map_C[2])
+        member.learned = float(turn), lift, float(np.hypot(off[0], off[1]))
+        self._remember(member)
+
+    def _remember(self, member: Member) -> None:
+        if member.learned is None:
+            return
+        turn, lift, misfit = member.learned
+        self._recent[f"{member.source}|{member.photo.camera_key}"].append((turn, lift))
+        if np.isfinite(misfit):
+            self._misfit.append(misfit)
+
+    def ground_at(self, xyz: NDArray[Any]) -> float:
+        """Height of the ground near a place in m."""
+        reach = 60.0
+        x, y = float(xyz[0]), float(xyz[1])
+        near = (
+            self.heights.median((x - reach, y - reach, x + reach, y + reach))
+            if np.isfinite(x + y)
+            else None
+        )
+        return near if near is not None else float(self.members.ledger.meta("ground", 0.0))
+
+    def scatter(self) -> float:
+        """Deviation per axis in m of reported positions as the map has shown it."""
+        return float(np.median(self._misfit)) / 1.18 if len(self._misfit) >= 5 else 0.0

@@ -1,0 +1,76 @@
+"""What those who look on are told: each sentence is a row of the ledger, in the transaction of what
+it tells.
+"""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from skyquilt.live.members import Member, Members
+from skyquilt.live.tile_drawing import Canvas
+from skyquilt.raster.tile_store import Address
+
+MOST_BOXES = 24
+"""Parts that a change of the map is told by."""
+
+
+class News:
+    """Of photos and of tiles."""
+
+    def __init__(self, members: Members, canvas: Canvas) -> None:
+        self.members, self.ledger, self.canvas = members, members.ledger, canvas
+
+    def photo(self, member: Member, **more: Any) -> None:
+        """The state of a photo, and `more` of it."""
+        photo = member.photo
+        said = {
+            "id": member.id,
+            "name": photo.name,
+            "source": member.source,
+            "state": member.state,
+            "time": photo.time.isoformat() if photo.time else None,
+        }
+        self.ledger.tell("photo", {**said, **more})
+
+    def superseded(self, member: Member) -> None:
+        """A preview that has given way."""
+        self.ledger.tell(
+            "photo", {"id": member.id, "name": member.photo.name, "state": "superseded"}
+        )
+
+    def place(self, member: Member) -> tuple[list[list[float]], list[float]]:
+        """Footprint and centre of a photo on the map, in degrees."""
+        assert member.pose is not None
+        outline = self.canvas.outline(member.id)
+        ring = [] if outline is None else self.members.lonlat(outline)
+        return ring, self.members.lonlat(member.pose.map_C[None, :2])[0]
+
+    def tiles(self, addresses: Iterable[Address]) -> None:
+        """Where the map has changed, by layer: as a whole, and by parts, so that the rest need not
+        be fetched again.
+        """
+        by_layer: dict[str, set[Address]] = {}
+        for a in addresses:
+            by_layer.setdefault(a.layer, set()).add(a)
+        for layer, changed in by_layer.items():
+            boxes = [self._degrees(a) for a in sorted(_gathered(changed))]
+            low, high = np.min(boxes, axis=0).tolist(), np.max(boxes, axis=0).tolist()
+            whole = [low[0], low[1], high[2], high[3]]
+            self.ledger.tell(
+                "tiles", {"layer": layer, "bounds": whole, "boxes": boxes, "count": len(changed)}
+            )
+
+    def _degrees(self, address: Address) -> list[float]:
+        """West, south, east, north in degrees of all corners of a tile."""
+        west, south, east, north = address.grid(self.canvas.gsd).bounds
+        corners = np.array([[west, south], [west, north], [east, south], [east, north]])
+        found = np.array(self.members.lonlat(corners))
+        return [*found.min(0).tolist(), *found.max(0).tolist()]
+
+
+def _gathered(changed: set[Address]) -> set[Address]:
+    """The same ground in few tiles: coarser ones where there are many."""
+    while len(changed) > MOST_BOXES:
+        changed = {a.parent for a in changed}
+    return changed

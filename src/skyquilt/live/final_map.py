@@ -1,0 +1,69 @@
+"""The end of a flight: the batch story on the photos that were accepted, from features that are
+there already.
+"""
+
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+from skyquilt.errors import NoPhotosError
+from skyquilt.live.ledger import Ledger
+from skyquilt.live.live_map import FINISHED, PHOTOS
+from skyquilt.live.settings import LiveSettings
+from skyquilt.model.event import Event
+from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.workflows.mosaic import iter_mosaic
+
+NAMED = "named"
+"""Photos under names that people know, for the final map's files."""
+
+
+def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
+    """Makes `folder/finished`, the batch mosaic; the live map stays as it is.
+
+    Raises:
+        SkyquiltError: as `iter_mosaic`; NoPhotosError where no photo was accepted.
+    """
+    ledger = Ledger(folder, write=False)
+    try:
+        rows = ledger.rows(
+            "select id, name, file from photo where state not in ('superseded', 'refused') order by"
+            " id"
+        )
+    finally:
+        ledger.close()
+    if not rows:
+        raise NoPhotosError(f"{folder} holds no accepted photo; there is nothing to finish")
+    paths = named(folder, [(int(i), str(n), str(f)) for i, n, f in rows])
+    wanted = MosaicSettings(
+        features=settings.features, crs=settings.crs, thermal_unit=settings.thermal_unit
+    )
+    # asked for again after more photos have come, the final map is made anew; what was computed
+    # before is found
+    yield from iter_mosaic(paths, folder / FINISHED, wanted, overwrite=True)
+
+
+def named(folder: Path, photos: list[tuple[int, str, str]]) -> list[Path]:
+    """Links to accepted photos (number, name, file) whose names are harmless and tell what was
+    sent.
+    """
+    home = folder / NAMED
+    shutil.rmtree(home, ignore_errors=True)
+    home.mkdir()
+    taken: set[str] = set()
+    paths = []
+    for number, name, file in photos:
+        stem = re.sub(r"[^A-Za-z0-9_-]", "_", Path(name).stem)[:80].strip("_") or "photo"
+        plain = f"{stem}{Path(file).suffix}"
+        if plain.lower() in taken:
+            plain = f"{stem}-{number}{Path(file).suffix}"
+        taken.add(plain.lower())
+        target = home / plain
+        try:
+            os.link(folder / PHOTOS / file, target)
+        except OSError:  # a file system without hard links
+            shutil.copyfile(folder / PHOTOS / file, target)
+        paths.append(target)
+    return paths

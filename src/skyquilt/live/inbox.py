@@ -1,0 +1,138 @@
+"""Photos accepted for good: a file lies durably in the survey's folder before a row says that it
+was received.
+
+Contents name the files; names that senders give are only ever text.
+"""
+
+import errno
+import hashlib
+import os
+import time
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+
+from skyquilt.errors import OutputError
+from skyquilt.live.crash_points import reached
+from skyquilt.live.ledger import Ledger
+
+ENDINGS = {
+    b"\xff\xd8\xff": ".jpg",
+    b"II*\x00": ".tif",
+    b"MM\x00*": ".tif",
+    b"II+\x00": ".tif",
+    b"\x89PNG": ".png",
+}
+"""First bytes of files that may be photos."""
+BLOCK = 1 << 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Arrived:
+    """A file that lies in the survey's folder, not accepted yet."""
+
+    path: Path
+    """Where."""
+    digest: str
+    """BLAKE2b of its content (hex)."""
+    size: int
+    """Bytes."""
+
+
+def ending_of(head: bytes) -> str | None:
+    """The ending that a file's first bytes deserve; None where it is no photo."""
+    return next((end for magic, end in ENDINGS.items() if head.startswith(magic)), None)
+
+
+class Inbox:
+    """The folder of accepted photos."""
+
+    def __init__(
+        self, ledger: Ledger, folder: Path, *, most_bytes: int = 500_000_000, tidy: bool = True
+    ) -> None:
+        """Photos go to `folder`; one file may have at most `most_bytes`. `tidy`: removes what a
+        crash left of some.
+        """
+        self.ledger, self.folder, self.most_bytes = ledger, folder, most_bytes
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for left in folder.glob("*.partial") if tidy else ():
+                left.unlink()
+        except OSError as error:
+            raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
+
+    def bring(self, blocks: Iterable[bytes]) -> Arrived | None:
+        """Writes a file's bytes durably under the name of their content; None where they are no
+        photo.
+
+        Raises:
+            OutputError: the disk is full, or the file is larger than allowed.
+        """
+        rest = iter(blocks)
+        first = next(rest, b"")
+        ending = ending_of(first)
+        if ending is None:
+            return None
+        partial = self.folder / f"{time.monotonic_ns():x}-{os.getpid()}.partial"
+        digest, size = hashlib.blake2b(digest_size=16), 0
+        try:
+            with partial.open("wb") as file:
+                for block in chain((first,), rest):
+                    size += len(block)
+                    if size > self.most_bytes:
+                        raise OutputError(
+                            f"a photo may have {self.most_bytes} bytes, this one has more"
+                        )
+                    digest.update(block)
+                    file.write(block)
+                file.flush()
+                os.fsync(file.fileno())
+            reached("photo file synced")
+            path = self.folder / (digest.hexdigest() + ending)
+            partial.replace(path)
+            synced(self.folder)
+            reached("photo file named")
+        except OSError as error:
+            _gone(partial)
+            raise _refusal(self.folder, error) from error
+        except BaseException:
+            _gone(partial)
+            raise
+        return Arrived(path=path, digest=digest.hexdigest(), size=size)
+
+    def copy(self, source: Path) -> Arrived | None:
+        """Brings a file from elsewhere."""
+        with source.open("rb") as file:
+            first = file.read(BLOCK)
+            return self.bring(_blocks(first, file)) if first else None
+
+
+def _blocks(first: bytes, file: object) -> Iterable[bytes]:
+    yield first
+    while block := file.read(BLOCK):  # type: ignore[attr-defined]
+        yield block
+
+
+def synced(folder: Path) -> None:
+    """Makes names in a folder durable; systems without that promise nothing."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def _gone(path: Path) -> None:
+    with suppress(OSError):
+        path.unlink()
+
+
+def _refusal(folder: Path, error: OSError) -> OutputError:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return OutputError(
+            f"the disk is full: {folder} cannot take another photo. Make room and send it again"
+        )
+    return OutputError(f"cannot write to {folder}: {error.strerror or error}")

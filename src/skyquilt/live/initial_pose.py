@@ -1,0 +1,95 @@
+"""The first look at a photo: it is on the map by its metadata at once."""
+
+import json
+from dataclasses import asdict
+
+import numpy as np
+
+from skyquilt.engine.pixel_cache import PixelCache
+from skyquilt.errors import UnreadablePhotoError
+from skyquilt.live.crash_points import reached
+from skyquilt.live.drone_metadata import Metadata
+from skyquilt.live.events import News
+from skyquilt.live.members import Member, Queues
+from skyquilt.live.redraw_queue import Showing
+from skyquilt.live.update import Update
+from skyquilt.ortho.orthomosaic import round_gsd
+
+ABOVE_M = 50.0
+"""Flying height where nothing tells it."""
+
+
+class Arriving:
+    """Photos received become photos placed, or photos that wait for a place."""
+
+    def __init__(
+        self, metadata: Metadata, pixels: PixelCache, showing: Showing, news: News, queues: Queues
+    ) -> None:
+        self.metadata, self.pixels = metadata, pixels
+        self.showing, self.news, self.queues = showing, news, queues
+        self.members, self.canvas = metadata.members, showing.canvas
+        self.ledger = metadata.members.ledger
+
+    def place(self, member: Member) -> Update:
+        """Places the photo, which heads the queue of those received."""
+        if self.metadata.frame_from(member) and self.canvas.gsd == 0:
+            self._begin(member)
+        preview = self._preview(member)
+        known = preview.pose if preview is not None else None
+        pose = known if known is not None else self.metadata.first(member)
+        try:
+            self.pixels(member.id)
+        except UnreadablePhotoError as error:
+            return self._unreadable(member, str(error))
+        with self.ledger.change():
+            member.pose, member.state = pose, "waiting" if pose is None else "placed"
+            self.members.save(member)
+            if preview is not None:
+                preview.state = "superseded"
+                self.members.save(preview)
+                self.news.superseded(preview)
+            self.news.photo(member)
+        reached("photo placed")
+        if preview is not None:
+            self.showing.gone(preview.id)
+        self.queues.received.popleft()
+        self.queues.untried.append(member)
+        if pose is not None:
+            self.showing.show(member)
+        return Update(what=member.state, photo=member.id)
+
+    def _preview(self, member: Member) -> Member | None:
+        """The smaller picture of the same shot that came first."""
+        row = self.ledger.row("select about from photo where id = ?", member.id)
+        about = json.loads(row[0]) if row is not None and row[0] else {}
+        known = (self.members.by_id[i] for i in about.get("preview", ()) if i in self.members.by_id)
+        return next(known, None)
+
+    def _begin(self, member: Member) -> None:
+        """The map's frame and pixels, for good."""
+        prior, photo, frame = member.prior, member.photo, self.members.frame
+        assert prior is not None
+        assert frame is not None
+        takeoff = frame.vertical_datum == "takeoff"
+        pose = self.metadata.first(member)
+        above = max(float(pose.map_C[2]), 5.0) if takeoff and pose is not None else ABOVE_M
+        asked = self.metadata.settings.gsd_cm
+        gsd = asked / 100 if asked else round_gsd(3 * above / photo.focal.px)
+        ground = 0.0 if takeoff else float(prior.map_C[2]) - above
+        ground = ground if np.isfinite(ground) else 0.0
+        cell = max(0.04 * above, 4 * gsd)
+        self.canvas.gsd, self.canvas.ground, self.metadata.heights.cell = gsd, ground, cell
+        with self.ledger.change():
+            self.ledger.put_meta("frame", asdict(frame))
+            self.ledger.put_meta("gsd", gsd)
+            self.ledger.put_meta("cell", cell)
+            self.ledger.put_meta("ground", ground)
+            self.ledger.tell("map", {"crs": frame.crs, "gsd": gsd})
+
+    def _unreadable(self, member: Member, reason: str) -> Update:
+        with self.ledger.change():
+            member.state, member.pose = "refused", None
+            self.ledger.set_photo(member.id, state="refused", reason=reason, pose=None)
+            self.news.photo(member, reason=reason)
+        self.queues.received.popleft()
+        return Update(what="refused", photo=member.id, text=f"{member.photo.name}: {reason}")

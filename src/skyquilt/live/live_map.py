@@ -1,0 +1,253 @@
+"""The live map: photos in any order become a map that is always there, photo by photo.
+
+Read `LiveMap.work`: one unit of work at a time, the most urgent first. Everything that must survive
+is in the ledger, the tile store and the folder of photos before the next unit begins; a restart
+reads them and goes on.
+"""
+
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from skyquilt.engine.pixel_cache import PixelCache
+from skyquilt.engine.store import Store
+from skyquilt.errors import OutputError, UsageError
+from skyquilt.live.adjustment_schedule import Blocks, Schedule
+from skyquilt.live.apply_adjustment import Adopting
+from skyquilt.live.background_adjustment import Closing, close
+from skyquilt.live.drone_metadata import Metadata
+from skyquilt.live.events import News
+from skyquilt.live.free_memory import give_back
+from skyquilt.live.inbox import Inbox
+from skyquilt.live.initial_pose import Arriving
+from skyquilt.live.ledger import Ledger
+from skyquilt.live.links import Linking
+from skyquilt.live.local_pose import Placing
+from skyquilt.live.members import Members, Queues
+from skyquilt.live.neighbours import Neighbours
+from skyquilt.live.photo_intake import Intake, Refused
+from skyquilt.live.redraw_queue import Showing
+from skyquilt.live.refinement import Refining
+from skyquilt.live.settings import LiveSettings
+from skyquilt.live.tile_drawing import Canvas
+from skyquilt.live.update import Update
+from skyquilt.model import features, poses
+from skyquilt.ortho.height_cells import HeightCells
+from skyquilt.photos.pixels import read_color
+from skyquilt.raster.tile_store import TileStore
+from skyquilt.workflows.methods import MosaicSettings, methods
+from skyquilt.workflows.photo_features import Looked
+
+PHOTOS, TILES, FINISHED = "photos", "tiles.db", "finished"
+"""Where accepted photos, the map's tiles and the final map lie in the survey's folder."""
+STORE = Path(FINISHED) / ".skyquilt" / "store"
+FULL_BYTES = 120_000_000
+"""Full-size photos at hand."""
+TOGETHER = 4
+"""Photos placed before they are drawn, where several wait: they share tiles."""
+TIDY = 4
+"""Photos after which free memory is given back."""
+
+
+class LiveMap:
+    """A survey's folder while it is written; one at a time."""
+
+    def __init__(self, folder: Path, settings: LiveSettings | None = None) -> None:
+        """Opens the folder, or takes up what an earlier run left.
+
+        Raises:
+            OutputError: it cannot be written. UsageError: it was begun with other settings.
+        """
+        cv2.setNumThreads(1)
+        self.folder, self.settings = Path(folder), settings or LiveSettings()
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
+        self.ledger = Ledger(self.folder, write=True)
+        self._same_settings()
+        self.inbox = Inbox(self.ledger, self.folder / PHOTOS, most_bytes=self.settings.most_bytes)
+        self.intake = Intake(self.ledger, self.inbox, self.settings)
+        self.tiles = TileStore(self.folder / TILES, write=True)
+        self.methods = methods(MosaicSettings(features=self.settings.features))
+        registry = {c.__name__: c for c in (Looked, features.Features, poses.Pose)}
+        self.store = Store(folder=self.folder / STORE, registry=registry)
+        self.closing = Closing()
+        self._room = TOGETHER
+        self._load()
+
+    def _same_settings(self) -> None:
+        known, asked = self.ledger.meta("settings"), self.settings.shaping()
+        if known is None:
+            self.ledger.put_meta("settings", asked)
+        elif differing := ", ".join(k for k in asked if known.get(k) != asked[k]):
+            raise UsageError(
+                f"{self.folder} was begun with other settings ({differing}); use the same, or"
+                " another folder"
+            )
+
+    def _load(self) -> None:
+        """Everything in memory, from what is durable: after a start, and after a write that
+        failed.
+        """
+        self.members = Members(self.ledger, self.inbox, self.settings.thermal_unit)
+        self.queues = Queues(self.members.by_id.values())
+        self.schedule = Schedule.read(self.ledger)
+        self.full = PixelCache(read=self._pixels, budget_bytes=FULL_BYTES)
+        self.heights = HeightCells(cell=float(self.ledger.meta("cell", 2.0)))
+        known = np.array(self.ledger.rows("select * from height"), np.float64).reshape(-1, 3)
+        self.heights.put(known[:, :2].astype(np.int64), known[:, 2])
+        metadata = Metadata(self.members, self.heights, self.settings)
+        neighbours = Neighbours(self.members, metadata)
+        self.linking = Linking(self.members, self.methods, self.store, self.full)
+        placing = Placing(self.members, metadata, neighbours, self.linking, self.settings)
+        self.canvas = Canvas(self.tiles, self.heights, self.full, self.members.by_id, self.store)
+        self.canvas.gsd = float(self.ledger.meta("gsd", 0.0))
+        self.canvas.ground = float(self.ledger.meta("ground", 0.0))
+        news = News(self.members, self.canvas)
+        self.showing = Showing(self.members, self.canvas, news)
+        self.arriving = Arriving(metadata, self.full, self.showing, news, self.queues)
+        self.refining = Refining(placing, self.showing, news, self.queues, self.schedule)
+        self.adopting = Adopting(self.refining)
+        store = self.folder / STORE
+        self.blocks = Blocks(
+            self.members, self.schedule, self.settings, self.folder, store, self.methods
+        )
+
+    def _pixels(self, number: int) -> Any:
+        return read_color(self.members.by_id[number].photo)
+
+    # -- adding
+
+    def add(self, path: Path, source: str = "") -> Update:
+        """Accepts one photo and brings the map up to date with it."""
+        done = self.intake.take_file(path, source or path.parent.name)
+        if isinstance(done, Refused):
+            return Update(what="refused", text=f"{done.name}: {done.reason}")
+        last = Update(
+            what="noted", photo=done.id, text="it was there already" if done.duplicate else ""
+        )
+        for update in self.drain():
+            if update.photo == done.id and update.what != "drawn":
+                last = update
+        return last
+
+    def drain(self) -> Iterator[Update]:
+        """Works until nothing is left but what background work may bring."""
+        while (update := self.work()) is not None:
+            yield update
+
+    def settle(self) -> Iterator[Update]:
+        """Works until nothing is left, loops closed and all."""
+        while True:
+            yield from self.drain()
+            if not self.closing.busy:
+                return
+            time.sleep(0.02)
+
+    # -- working
+
+    def work(self) -> Update | None:
+        """The most urgent unit of work; None when there is none.
+
+        Raises:
+            OutputError: the disk is full; nothing accepted is lost, and the same unit is done when
+                there is room.
+        """
+        began = time.perf_counter()
+        try:
+            self.queues.received.extend(self.members.take_up())
+            update = self._next()
+        except OutputError:
+            self.closing.stop()
+            self._load()
+            raise
+        if update is None:
+            return None
+        return Update(**{**asdict(update), "seconds": time.perf_counter() - began})
+
+    def _next(self) -> Update | None:
+        if self.settings.deterministic:
+            return self._drawn_first() or self._one_by_one() or self._drawn_last()
+        return (
+            (self._placed() if self._room else None)
+            or self._drawn_first()
+            or self._adopted()
+            or self._refined()
+            or self._drawn_last()
+            or self._behind()
+        )
+
+    def _one_by_one(self) -> Update | None:
+        """Each photo is placed, refined, and its block adjusted before the next one is looked at.
+
+        Poses then follow from the photos and their order alone, whatever happened between them.
+        """
+        if not self.schedule.checked:
+            job = self.blocks.due(self.canvas.ground, idle=False)
+            if job is not None:
+                return self.adopting.adopt(close(job))
+            self.schedule.checked = True
+        return self._refined() or self._placed()
+
+    def _placed(self) -> Update | None:
+        if not self.queues.received:
+            return None
+        self._room = max(0, self._room - 1)
+        self.blocks.last_arrival = time.monotonic()
+        first = self.queues.received[0]
+        if first.id % TIDY == 0:
+            give_back()
+        return self.arriving.place(first)
+
+    def _refined(self) -> Update | None:
+        """In two units, so that a photo that comes meanwhile need not wait for both."""
+        if not self.queues.untried or self.members.frame is None:
+            return None
+        member = self.queues.untried[0]
+        if member.state != "superseded" and not self.linking.has_features(member.id):
+            self.linking.features(member.id)
+            return Update(what="noted", photo=member.id)
+        return self.refining.refine(member)
+
+    def _drawn_first(self) -> Update | None:
+        """Who came first is seen first: photos that come while others are drawn are placed after
+        them.
+        """
+        update = self.showing.draw(self.showing.urgent) if self.showing.urgent else None
+        self._room = 0 if self.showing.urgent else TOGETHER
+        return update
+
+    def _drawn_last(self) -> Update | None:
+        if self.showing.pending:
+            return self.showing.take_note()
+        if self.showing.dirty:
+            return self.showing.draw_moved()
+        return self.showing.draw_newest() if self.showing.later else None
+
+    def _adopted(self) -> Update | None:
+        done = self.closing.outcome()
+        return None if done is None else self.adopting.adopt(done)
+
+    def _behind(self) -> Update | None:
+        """Loops closed and blocks bundled in a process of their own."""
+        if self.closing.busy:
+            return None
+        job = self.blocks.due(self.canvas.ground, idle=True)
+        if job is None:
+            return None
+        self.closing.start(job)
+        return Update(
+            what="noted", text=f"{len(job.ids)} photos are adjusted together in the background"
+        )
+
+    def close(self) -> None:
+        """Ends; what is written stays."""
+        self.closing.stop()
+        self.tiles.close()
+        self.ledger.close()

@@ -1,0 +1,202 @@
+"""Where a photo is by its links: settled among a bounded number of neighbours."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.bundle import Bundle
+from skyquilt.alignment.local_adjustment import Incremental, Settled, Window
+from skyquilt.errors import AlignmentError
+from skyquilt.live.drone_metadata import Metadata
+from skyquilt.live.links import Linking
+from skyquilt.live.members import Member, Members
+from skyquilt.live.neighbours import Neighbours
+from skyquilt.live.settings import YOUNG, LiveSettings
+from skyquilt.model.camera import Camera
+from skyquilt.model.features import Link
+from skyquilt.model.poses import Alignment, Pose
+
+RING = 8
+"""Held photos around those that may move."""
+MOVING = 2
+"""Linked photos that settle together with a new one."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Change:
+    """What placing one photo did."""
+
+    moved: dict[int, Pose]
+    """New poses, by photo."""
+    cameras: dict[str, Camera]
+    """New calibrations."""
+    camera_of: dict[int, str]
+    """Calibrations of the photos moved."""
+    links: dict[tuple[int, int], Link | None]
+    """Pairs compared; None = they do not match."""
+    xyz: NDArray[np.float64]
+    """(P, 3) ground points in m."""
+    reason: str = ""
+    """Why the photo is not held by links, where it is not."""
+
+
+class Placing:
+    """Settles single photos; nothing is written."""
+
+    def __init__(
+        self,
+        members: Members,
+        metadata: Metadata,
+        neighbours: Neighbours,
+        linking: Linking,
+        settings: LiveSettings,
+    ) -> None:
+        self.members, self.settings = members, settings
+        self.metadata, self.neighbours, self.linking = metadata, neighbours, linking
+        self.settle = Incremental()
+        self.young = Bundle(per_photo=150, sharpen=None)
+
+    def refine(self, member: Member) -> Change:
+        """Compares a photo with its neighbours and settles it among them; nothing is written."""
+        links = self.linking.compared(member, self.neighbours.of(member, member.pose))
+        good = {key: k for key, k in links.items() if k is not None}
+        if not good:
+            why = (
+                "no neighbour shows the same ground recognisably"
+                if links
+                else "nothing is near it yet"
+            )
+            return Change(
+                moved={}, cameras={}, camera_of={}, links=links, xyz=np.zeros((0, 3)), reason=why
+            )
+        return self._joined(member, links, good)
+
+    def _joined(
+        self,
+        member: Member,
+        links: dict[tuple[int, int], Link | None],
+        good: dict[tuple[int, int], Link],
+    ) -> Change:
+        whole = {member.id}
+        for a, _ in good:
+            whole |= self.members.block(a)
+        if self.settings.reposition and len(whole) <= YOUNG:
+            done = self._bundled(sorted(whole), good)
+            if isinstance(done, Alignment):
+                ids = sorted(whole)
+                return Change(
+                    moved={ids[k]: p for k, p in done.poses.items()},
+                    cameras=dict(done.cameras),
+                    camera_of={ids[k]: done.camera_of[k] for k in done.poses},
+                    links=links,
+                    xyz=done.ties.xyz,
+                    reason=done.rejected.get(ids.index(member.id), ""),
+                )
+        return self._settled(member, links, good)
+
+    def _bundled(self, ids: Sequence[int], good: dict[tuple[int, int], Link]) -> Alignment | None:
+        """A small block bundled as a whole."""
+        where = {i: k for k, i in enumerate(ids)}
+        links = [_renumbered(k, where) for k in [*self.linking.links_among(ids), *good.values()]]
+        members = [self.members.by_id[i] for i in ids]
+        priors = [m.prior for m in members if m.prior is not None]
+        assert self.members.frame is not None
+        try:
+            return self.young(
+                [m.photo for m in members],
+                self.members.frame,
+                priors,
+                [self.linking.features(i) for i in ids],
+                links,
+            )
+        except (AlignmentError, np.linalg.LinAlgError, ValueError):
+            return None
+
+    def _settled(
+        self,
+        member: Member,
+        links: dict[tuple[int, int], Link | None],
+        good: dict[tuple[int, int], Link],
+    ) -> Change:
+        """A photo that joins a larger block: its window adjusted, everything around it held."""
+        direct = sorted({a for a, _ in good if self.members.by_id[a].pose is not None})
+        by_strength = sorted(direct, key=lambda a: (-len(good[a, member.id]), a))
+        moving = set(by_strength[:MOVING]) if self.settings.reposition else set()
+        ring = {
+            j
+            for i in moving
+            for j in self.members.by_id[i].links
+            if self.members.by_id[j].pose is not None
+        }
+        ring -= {member.id, *direct}
+        kept = sorted(ring, key=lambda j: (-len(self.members.by_id[j].links & moving), j))[:RING]
+        ids = sorted({member.id, *direct, *kept})
+        held = frozenset(ids) - moving - {member.id}
+        done = self.settle(self.window(member, ids, held, list(good.values())))
+        if not isinstance(done, Settled):
+            return Change(
+                moved={},
+                cameras={},
+                camera_of={},
+                links=links,
+                xyz=np.zeros((0, 3)),
+                reason=done.reason,
+            )
+        for key in done.dropped:
+            links[ids[key[0]], ids[key[1]]] = None
+        moved = {ids[k]: p for k, p in done.poses.items()}
+        camera_of = {i: self.members.by_id[i].camera for i in moved} | {member.id: done.camera}
+        return Change(moved=moved, cameras={}, camera_of=camera_of, links=links, xyz=done.xyz)
+
+    def window(
+        self, member: Member, ids: Sequence[int], held: frozenset[int], more: Sequence[Link]
+    ) -> Window:
+        """A window of these photos; `more` links than those written down."""
+        where = {i: k for k, i in enumerate(ids)}
+        members = [self.members.by_id[i] for i in ids]
+        known = {(k.a, k.b) for k in more}
+        free = set(ids) - held  # what links held photos to each other moves nothing
+        links = [
+            *(k for k in self.linking.links_among(ids, free) if (k.a, k.b) not in known),
+            *more,
+        ]
+        placed = {where[m.id]: m.pose for m in members if m.pose is not None and m.id != member.id}
+        cameras: dict[str, Camera] = {}
+        for m in members:
+            cameras[m.photo.camera_key] = self.members.cameras.get(
+                m.photo.camera_key
+            ) or self.members.camera(m)
+            if m.camera:
+                cameras[m.camera] = self.members.camera(m)
+        at = (
+            member.pose.map_C
+            if member.pose is not None
+            else members[0].pose.map_C
+            if members[0].pose
+            else np.zeros(3)
+        )
+        return Window(
+            photos=[m.photo for m in members],
+            priors=[m.prior for m in members if m.prior is not None],
+            features=[self.linking.features(i) for i in ids],
+            links=[_renumbered(k, where) for k in links],
+            poses=placed,
+            cameras=cameras,
+            camera_of={where[m.id]: m.camera for m in members},
+            new=where[member.id],
+            held=frozenset(where[i] for i in held),
+            ground=self.metadata.ground_at(at),
+            sigma_xy=self.metadata.scatter(),
+        )
+
+
+def _renumbered(link: Link, where: dict[int, int]) -> Link:
+    return Link(
+        a=where[link.a],
+        b=where[link.b],
+        index_a=link.index_a,
+        index_b=link.index_b,
+        b_S_a=link.b_S_a,
+    )

@@ -1,0 +1,224 @@
+"""What the mapping holds in memory of each photo, and how that is written down and read again."""
+
+import json
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from pyproj import Transformer
+
+from skyquilt.alignment.priors import photo_prior
+from skyquilt.live.inbox import Inbox
+from skyquilt.live.ledger import Ledger
+from skyquilt.model.camera import PARAMETERS, Camera
+from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.model.poses import MapFrame, Pose, Prior
+from skyquilt.photos.read import read_photo
+
+ON_MAP = ("placed", "refined")
+"""States of photos that are drawn."""
+
+
+@dataclass(kw_only=True, eq=False)
+class Member:
+    """One accepted photo."""
+
+    id: int
+    """Number, in order of acceptance."""
+    photo: Photo
+    """What its file says."""
+    prior: Prior | None = None
+    """That in the map's frame; None until there is one."""
+    source: str
+    """Who sent it: a folder, a drone."""
+    state: str
+    """received, waiting, placed, refined, superseded or refused."""
+    pose: Pose | None = None
+    """Where it is."""
+    camera: str = ""
+    """Name of its calibration."""
+    tried: int = 0
+    """Which one it was to be compared with its neighbours, counted from 1; 0 = it has yet to be."""
+    again: int = 0
+    """Counts from 1 when a photo without place has met one that it links to and is to be tried
+    again.
+    """
+    learned: tuple[float, float, float] | None = None
+    """By how much its metadata were found wrong: heading in degrees, height in m, place in m; NaN =
+    not known.
+    """
+    links: set[int] = field(default_factory=set)
+    """Photos it is linked to."""
+
+
+class Queues:
+    """Photos that are waiting for something."""
+
+    def __init__(self, members: Iterable[Member]) -> None:
+        """As they would be without a restart in between."""
+        known = list(members)
+        self.received = deque(m for m in known if m.state == "received")
+        """To be placed by their metadata, in order of acceptance."""
+        untried = [m for m in known if m.state in ("placed", "waiting") and not m.tried]
+        self.untried = deque(sorted(untried, key=lambda m: (m.again, m.id)))
+        """To be compared with their neighbours."""
+        lost = [m for m in known if m.state == "waiting" and m.tried]
+        self.lost = sorted(lost, key=lambda m: m.tried)
+        """Compared, and without a place still."""
+
+
+class Members:
+    """All accepted photos, blocks of linked ones, the frame and the cameras; what changes is
+    written by `save`.
+    """
+
+    def __init__(self, ledger: Ledger, inbox: Inbox, thermal_unit: str | None = None) -> None:
+        """Reads what the ledger holds; `thermal_unit` as photos were accepted with."""
+        self.ledger, self.inbox, self.thermal_unit = ledger, inbox, thermal_unit
+        self.by_id: dict[int, Member] = {}
+        self.block_of: dict[int, int] = {}
+        self.blocks: dict[int, set[int]] = {}
+        self.cameras: dict[str, Camera] = {}
+        self.frame: MapFrame | None = None
+        self._last = 0
+        self._to_map: Transformer | None = None
+        self._to_wgs: Transformer | None = None
+        if found := ledger.meta("frame"):
+            self.set_frame(MapFrame(**{**found, "origin": tuple(found["origin"])}))
+        for key, body in ledger.rows("select key, body from camera order by key"):
+            self.cameras[str(key)] = Camera(**json.loads(body))
+        self.take_up()
+        for a, b in ledger.rows("select a, b from link where body is not null order by a, b"):
+            self.joined(int(a), int(b))
+
+    def set_frame(self, frame: MapFrame) -> None:
+        """The map's frame, once and for all."""
+        self.frame = frame
+        self._to_map = Transformer.from_crs(4326, frame.crs, always_xy=True)
+        self._to_wgs = Transformer.from_crs(frame.crs, 4326, always_xy=True)
+        for member in self.by_id.values():
+            member.prior = photo_prior(member.photo, frame, self._to_map)
+
+    def take_up(self) -> list[Member]:
+        """Photos that were accepted since the last look, in order."""
+        query = (
+            "select id, name, source, file, state, pose, camera, about from photo where id > ?"
+            " order by id"
+        )
+        new = []
+        for number, name, source, file, state, pose, camera, about in self.ledger.rows(
+            query, self._last
+        ):
+            self._last = int(number)
+            photo = read_photo(self.inbox.folder / file, name=name, thermal_unit=self.thermal_unit)
+            if isinstance(photo, RejectedPhoto):
+                self.ledger.set_photo(number, state="refused", reason=photo.reason)
+                continue
+            member = Member(
+                id=int(number),
+                photo=photo,
+                source=source,
+                state=state,
+                camera=camera or "",
+                pose=pose_from(json.loads(pose)) if pose else None,
+                **_about(json.loads(about) if about else {}),
+            )
+            if self.frame is not None:
+                member.prior = photo_prior(photo, self.frame, self._to_map)
+            self.by_id[member.id] = member
+            self.block_of[member.id] = member.id
+            self.blocks[member.id] = {member.id}
+            new.append(member)
+        return new
+
+    def joined(self, a: int, b: int) -> None:
+        """Notes a link; a block is named by its first photo, in whatever order its links were
+        found.
+        """
+        if a not in self.by_id or b not in self.by_id:
+            return
+        self.by_id[a].links.add(b)
+        self.by_id[b].links.add(a)
+        one, other = sorted((self.block_of[a], self.block_of[b]))
+        if one == other:
+            return
+        self.blocks[one] |= self.blocks[other]
+        for i in self.blocks.pop(other):
+            self.block_of[i] = one
+
+    def block(self, photo: int) -> set[int]:
+        """Photos that hang together with this one."""
+        return self.blocks[self.block_of[photo]]
+
+    def camera(self, member: Member) -> Camera:
+        """The calibration of a photo: what the map has found, else what the photo says."""
+        known = self.cameras.get(member.camera) or self.cameras.get(member.photo.camera_key)
+        photo = member.photo
+        if known is not None:
+            return known
+        return photo.calibration or Camera.ideal(
+            width=photo.width, height=photo.height, focal=photo.focal.px
+        )
+
+    def on_map(self) -> Iterator[Member]:
+        """Photos that are drawn, in order."""
+        return (m for m in self.by_id.values() if m.state in ON_MAP and m.pose is not None)
+
+    def save(self, member: Member, **more: Any) -> None:
+        """Writes down where a photo is (inside a transaction of the ledger)."""
+        self.ledger.set_photo(
+            member.id,
+            state=member.state,
+            camera=member.camera,
+            pose=json.dumps(pose_record(member.pose)) if member.pose is not None else None,
+            **more,
+        )
+
+    def save_cameras(self, cameras: dict[str, Camera]) -> None:
+        """Keeps calibrations (inside a transaction of the ledger)."""
+        self.cameras.update(cameras)
+        with self.ledger.change() as db:
+            for key, camera in cameras.items():
+                body = {n: float(getattr(camera, n)) for n in PARAMETERS}
+                body |= {"width": camera.width, "height": camera.height}
+                db.execute("insert or replace into camera values (?, ?)", (key, json.dumps(body)))
+
+    def lonlat(self, xy: np.ndarray) -> list[list[float]]:
+        """Longitude and latitude of map coordinates (n, 2) in m."""
+        assert self.frame is not None
+        assert self._to_wgs is not None
+        x0, y0 = self.frame.origin
+        lon, lat = self._to_wgs.transform(np.asarray(xy)[:, 0] + x0, np.asarray(xy)[:, 1] + y0)
+        return [[round(float(a), 8), round(float(b), 8)] for a, b in zip(lon, lat, strict=True)]
+
+
+def _about(said: dict[str, Any]) -> dict[str, Any]:
+    """The fields of a member that its row holds as JSON."""
+    learned = said.get("learned")
+    return {
+        "tried": int(said.get("tried", 0)),
+        "again": int(said.get("again", 0)),
+        "learned": None
+        if learned is None
+        else tuple(np.nan if v is None else float(v) for v in learned),
+    }
+
+
+def about_record(member: Member, why: str) -> dict[str, Any]:
+    """What a row holds as JSON of a photo that was compared with its neighbours."""
+    learned = None
+    if member.learned is not None:
+        learned = [v if np.isfinite(v) else None for v in member.learned]
+    return {"tried": member.tried, "again": member.again, "learned": learned, "why": why}
+
+
+def pose_record(pose: Pose) -> dict[str, list[float]]:
+    """A pose for JSON; floats come back bit for bit."""
+    return {"R": pose.cam_R_map.ravel().tolist(), "C": pose.map_C.tolist()}
+
+
+def pose_from(record: dict[str, list[float]]) -> Pose:
+    """The pose of such a record."""
+    return Pose(cam_R_map=np.array(record["R"]).reshape(3, 3), map_C=np.array(record["C"]))

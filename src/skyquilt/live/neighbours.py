@@ -1,0 +1,100 @@
+"""Which photos a new one is compared with: an index of where they were taken from."""
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.live.drone_metadata import Metadata
+from skyquilt.live.members import Member, Members
+from skyquilt.live.settings import NEIGHBOURS
+from skyquilt.model.poses import Pose
+
+CELL_M = 30.0
+"""Side of the cells of the index."""
+
+
+class Neighbours:
+    """Photos that have been compared before, by place."""
+
+    def __init__(self, members: Members, metadata: Metadata) -> None:
+        self.members, self.metadata = members, metadata
+        self._grid: dict[tuple[int, int], set[int]] = defaultdict(set)
+        self._cell_of: dict[int, tuple[int, int]] = {}
+        for member in members.on_map():
+            if member.tried:
+                self.indexed(member)
+
+    def indexed(self, member: Member) -> None:
+        """Enters a photo that others may be compared with, or moves it."""
+        if member.pose is None:
+            return
+        c, r = np.floor(member.pose.map_C[:2] / CELL_M).astype(int).tolist()
+        old = self._cell_of.get(member.id)
+        if old is not None and old != (c, r):
+            self._grid[old].discard(member.id)
+        self._cell_of[member.id] = (c, r)
+        self._grid[c, r].add(member.id)
+
+    @staticmethod
+    def aim(pose: Pose, ground: float) -> NDArray[np.float64]:
+        """Where the middle of a photo lies (2,) in m on a ground of that height."""
+        ray = pose.cam_R_map[2]
+        drop = (ground - pose.map_C[2]) / min(float(ray[2]), -0.3)
+        return np.asarray(pose.map_C[:2] + ray[:2] * drop)
+
+    def of(self, member: Member, pose: Pose | None, most: int = NEIGHBOURS) -> list[int]:
+        """Photos of the same spectrum, compared before, nearest first; the latest where nothing
+        tells the place.
+        """
+        if pose is None:
+            return self._latest(member, most)
+        photo = member.photo
+        ground = self.metadata.ground_at(pose.map_C)
+        at = self.aim(pose, ground)
+        above = max(float(pose.map_C[2]) - ground, 2.0)
+        reach = (
+            above * max(photo.width, photo.height) / photo.focal.px + 2 * self.metadata.scatter()
+        )
+        found = []
+        for i in self._near(at, reach + above):
+            other = self.members.by_id[i]
+            if i == member.id or other.photo.band != photo.band or other.state == "superseded":
+                continue
+            apart = (
+                np.inf
+                if other.pose is None
+                else float(np.hypot(*(self.aim(other.pose, ground) - at)))
+            )
+            if apart <= reach:
+                found.append((apart, i))
+        return [i for _, i in sorted(found)[:most]]
+
+    def _near(self, at: NDArray[Any], reach: float) -> list[int]:
+        """Photos taken from above a square around a place; cameras that look aslant stand beside
+        what they see.
+        """
+        rings = int(np.ceil(reach / CELL_M))
+        c, r = np.floor(at / CELL_M).astype(int).tolist()
+        return [
+            i
+            for dc in range(-rings, rings + 1)
+            for dr in range(-rings, rings + 1)
+            for i in self._grid.get((c + dc, r + dr), ())
+        ]
+
+    def _latest(self, member: Member, most: int) -> list[int]:
+        found = []
+        for i in reversed(self.members.by_id):
+            other = self.members.by_id[i]
+            if (
+                other.tried
+                and other.pose is not None
+                and other.photo.band == member.photo.band
+                and i != member.id
+            ):
+                found.append((other.source != member.source, i))
+            if len(found) >= most:
+                break
+        return [i for _, i in sorted(found, key=lambda f: f[0])]

@@ -1,0 +1,179 @@
+"""Photos accepted: checked, durable, told apart from what is there already."""
+
+import json
+import re
+import time
+import unicodedata
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from skyquilt.errors import OutputError
+from skyquilt.live.crash_points import reached
+from skyquilt.live.inbox import Arrived, Inbox
+from skyquilt.live.ledger import Ledger
+from skyquilt.live.settings import LiveSettings
+from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.photos.read import read_photo
+
+MOST_PIXELS = 400_000_000
+"""Larger pictures are refused before they are decoded."""
+NAME = 200
+"""Most characters of a name that are kept."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Accepted:
+    """A photo that is safe."""
+
+    id: int
+    """Its number."""
+    name: str
+    """Its name."""
+    duplicate: bool = False
+    """True where its very content was there already."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refused:
+    """A file that is no photo for the map: false in `if`."""
+
+    name: str
+    """Its name."""
+    reason: str
+    """Why, a phrase."""
+
+    def __bool__(self) -> bool:
+        return False
+
+
+def shown_name(name: str) -> str:
+    """A name as text to show: last part of any path, no control characters, bounded; never used as
+    a path.
+    """
+    last = re.split(r"[\\/]", name)[-1] or "photo"
+    text = "".join(c if unicodedata.category(c)[0] != "C" else "?" for c in last)
+    return text[:NAME] or "photo"
+
+
+class Intake:
+    """The one door for photos; safe to use from several threads."""
+
+    def __init__(self, ledger: Ledger, inbox: Inbox, settings: LiveSettings) -> None:
+        self.ledger, self.inbox, self.settings = ledger, inbox, settings
+
+    def take(self, blocks: Iterable[bytes], name: str, source: str) -> Accepted | Refused:
+        """Accepts a file's bytes; when this returns `Accepted`, no crash can lose the photo.
+
+        Raises:
+            OutputError: the disk is full; nothing was accepted and nothing is lost.
+        """
+        name, source = shown_name(name), shown_name(source)
+        if self._full():
+            return self.refuse(
+                name, source, f"this map takes {self.settings.most_photos} photos at most"
+            )
+        arrived = self.inbox.bring(blocks)
+        if arrived is None:
+            return self.refuse(
+                name, source, "it is neither JPEG, TIFF nor PNG inside, whatever its name says"
+            )
+        return self._enter(arrived, name, source)
+
+    def take_file(self, path: Path, source: str) -> Accepted | Refused:
+        """Accepts a copy of a file that is complete."""
+        with path.open("rb") as file:
+            return self.take(iter(lambda: file.read(1 << 20), b""), path.name, source)
+
+    def _full(self) -> bool:
+        found = self.ledger.row("select count(*) from photo")
+        return found is not None and found[0] >= self.settings.most_photos
+
+    def refuse(self, name: str, source: str, reason: str) -> Refused:
+        """Writes down and tells that a file takes no part."""
+        self.ledger.refuse(name, source, reason)
+        return Refused(name=name, reason=reason)
+
+    def _enter(self, arrived: Arrived, name: str, source: str) -> Accepted | Refused:
+        known = self.ledger.row("select id, name from photo where digest = ?", arrived.digest)
+        if known is not None:
+            return Accepted(id=int(known[0]), name=str(known[1]), duplicate=True)
+        photo = read_photo(arrived.path, name=name, thermal_unit=self.settings.thermal_unit)
+        reason = photo.reason if isinstance(photo, RejectedPhoto) else _too_large(photo)
+        if isinstance(photo, RejectedPhoto) or reason:
+            _gone(arrived.path)
+            return self.refuse(name, source, reason)
+        try:
+            return self._row(arrived, photo, name, source)
+        except OutputError:
+            _gone(arrived.path)
+            raise
+
+    def _row(self, arrived: Arrived, photo: Photo, name: str, source: str) -> Accepted | Refused:
+        shot = shot_of(photo)
+        with self.ledger.change() as db:
+            known = self.ledger.row("select id, name from photo where digest = ?", arrived.digest)
+            if known is not None:
+                return Accepted(id=int(known[0]), name=str(known[1]), duplicate=True)
+            same = self.ledger.rows(
+                "select id, name, width from photo where shot = ? and width != ? and state !="
+                " 'superseded'"
+                " and state != 'refused'",
+                shot,
+                photo.width,
+            )
+            larger = next((n for _, n, w in same if w > photo.width), None)
+            if larger is not None:
+                _gone(arrived.path)
+                return self.refuse(
+                    name, source, f"it is a smaller copy of {larger}, which is there already"
+                )
+            cursor = db.execute(
+                "insert into photo(digest, name, source, file, bytes, received, shot, width, state,"
+                " about)"
+                " values (?, ?, ?, ?, ?, ?, ?, ?, 'received', ?)",
+                (
+                    arrived.digest,
+                    name,
+                    source,
+                    arrived.path.name,
+                    arrived.size,
+                    time.time(),
+                    shot,
+                    photo.width,
+                    json.dumps({"preview": [int(i) for i, _, _ in same]}),
+                ),
+            )
+            number = int(cursor.lastrowid or 0)
+            said = {"id": number, "name": name, "source": source, "state": "received"}
+            self.ledger.tell("photo", said)
+        reached("photo row committed")
+        return Accepted(id=number, name=name)
+
+
+def shot_of(photo: Photo) -> str:
+    """What a preview and the full picture of one shot have in common; of photos without a time,
+    nothing.
+    """
+    if photo.time is None or photo.position is None:
+        return photo.digest
+    size = f"{photo.width}x{photo.height}"
+    camera = " ".join(part for part in photo.camera_key.split() if part != size)
+    shape = round(photo.width / photo.height, 1)
+    place = f"{photo.position.latitude_deg:.7f} {photo.position.longitude_deg:.7f}"
+    return f"{camera}|{photo.band}|{shape}|{photo.time.isoformat()}|{place}"
+
+
+def _too_large(photo: Photo) -> str:
+    if photo.width * photo.height <= MOST_PIXELS:
+        return ""
+    return (
+        f"it claims {photo.width} x {photo.height} px, and {MOST_PIXELS // 10**6} megapixels are"
+        " the most"
+    )
+
+
+def _gone(path: Path) -> None:
+    with suppress(OSError):
+        path.unlink()

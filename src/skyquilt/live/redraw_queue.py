@@ -1,0 +1,168 @@
+"""Which tiles are to be drawn, the most urgent first, and when what was drawn is told."""
+
+import json
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.live.crash_points import reached
+from skyquilt.live.events import News
+from skyquilt.live.members import Member, Members, pose_from, pose_record
+from skyquilt.live.tile_drawing import LEAST_MOVE, NEWEST, Canvas
+from skyquilt.live.update import Update
+from skyquilt.model.poses import Pose
+from skyquilt.raster.tile_store import Address
+
+DRAWN_AT_ONCE = 12
+"""Tiles drawn in one unit of work; of those of a new photo, twice as many."""
+NOTED_AT_ONCE = 8
+"""Photos whose places are taken note of in one unit of work."""
+Queue = dict[Address, set[int]]
+"""Tiles to draw, in order, and the photos that have changed on each."""
+
+
+class Showing:
+    """The map as it should look, against what the tiles show."""
+
+    def __init__(self, members: Members, canvas: Canvas, news: News) -> None:
+        """What is drawn stays, what moved since is drawn."""
+        self.members, self.ledger, self.canvas, self.news = members, members.ledger, canvas, news
+        self.urgent: Queue = {}
+        self.dirty: Queue = {}
+        self.later: Queue = {a: set() for a in canvas.owed()}
+        self.pending: dict[int, None] = {}
+        self._drawn: dict[int, Pose] = {}
+        self._rims: dict[int, NDArray[np.float64]] = {}
+        self._to_draw: set[int] = set()
+        self._fresh: dict[str, list[Address]] = {}
+        self._take_up()
+
+    def _take_up(self) -> None:
+        rows = self.ledger.rows("select id, footprint from photo where footprint != ''")
+        drawn = {int(i): json.loads(d)["pose"] for i, d in rows}
+        for member in self.members.on_map():
+            addresses = self.canvas.place(member, self.members.camera(member))
+            pose = pose_from(drawn[member.id]) if member.id in drawn else None
+            rim = self.canvas.outline(member.id)
+            if pose is not None and rim is not None and not self.canvas.moved(member, pose):
+                self._drawn[member.id], self._rims[member.id] = pose, rim
+            else:
+                self._to_draw.add(member.id)
+                _add(self.dirty, addresses, member.id)
+
+    def show(self, member: Member) -> None:
+        """A photo has come and is to be seen at once."""
+        self._to_draw.add(member.id)
+        _add(self.urgent, self.canvas.place(member, self.members.camera(member)), member.id)
+
+    def changed(self, member: Member) -> None:
+        """A photo looks different now, which will be taken note of when there is time."""
+        self._to_draw.add(member.id)
+        self.pending[member.id] = None
+
+    def moved(self, member: Member) -> None:
+        """A photo has moved; it is drawn again where that shows."""
+        drawn = self._drawn.get(member.id)
+        if drawn is None or self.canvas.moved(member, drawn):
+            self.changed(member)
+
+    def take_note(self) -> Update:
+        """Finds the tiles that some of the changed photos lie on."""
+        some = list(self.pending)[:NOTED_AT_ONCE]
+        for number in some:
+            member = self.members.by_id[number]
+            del self.pending[number]
+            if member.state == "superseded":
+                continue
+            addresses = self.canvas.place(member, self.members.camera(member))
+            if self._looks_as_drawn(number):
+                self._to_draw.discard(number)
+            else:
+                self._to_draw.add(number)
+                _add(self.dirty, addresses, number)
+        return Update(what="noted")
+
+    def _looks_as_drawn(self, number: int) -> bool:
+        """Whether a photo's rim, where poses, lenses and heights show most, lies where it was
+        drawn.
+        """
+        rim, drawn = self.canvas.outline(number), self._rims.get(number)
+        if rim is None or drawn is None or rim.shape != drawn.shape:
+            return False
+        return bool(np.abs(rim - drawn).max() < LEAST_MOVE * self.canvas.gsd)
+
+    def gone(self, number: int) -> None:
+        """A photo takes no part any more."""
+        _add(self.dirty, self.canvas.remove(number), number)
+
+    def draw(self, queue: Queue, rule: str = "") -> Update:
+        """Some of the dirty tiles; when no more are, what was drawn is written down and told."""
+        some = list(queue)[: DRAWN_AT_ONCE * (2 if queue is self.urgent else 1)]
+        return self._drawn_some(queue, some, rule)
+
+    def draw_moved(self) -> Update:
+        """The same for photos that moved, and soon after, their pictures still at hand, for the
+        other layers.
+        """
+        ready = self._newest()
+        if len(ready) >= DRAWN_AT_ONCE:
+            return self._drawn_some(self.later, ready[:DRAWN_AT_ONCE], NEWEST)
+        return self.draw(self.dirty)
+
+    def draw_newest(self) -> Update:
+        """The same for the layers that show the newest photo on top."""
+        return self.draw(self.later, NEWEST)
+
+    def _newest(self) -> list[Address]:
+        return [a for a in self.later if a not in self.dirty]
+
+    def _drawn_some(self, queue: Queue, some: Sequence[Address], rule: str) -> Update:
+        parts = {a: queue[a] if rule else queue[a] | self.dirty.get(a, set()) for a in some}
+        written = self.canvas.draw(parts, rule)
+        for address, changed in parts.items():
+            queue.pop(address, None)
+            if not rule:
+                self.dirty.pop(address, None)
+                self.later.setdefault(address, set()).update(changed)
+        self._fresh.setdefault(rule, []).extend(written)
+        tiles = len(written)
+        if not queue:
+            tiles += self._told(rule)
+        return Update(what="drawn", tiles=tiles)
+
+    def _told(self, rule: str) -> int:
+        """The coarser levels, and the news for those who look on."""
+        raised = self.canvas.finish(rule)
+        shown = [] if rule else [i for i in self._to_draw if not self._waits(i)]
+        with self.ledger.change():
+            for i in sorted(shown):
+                self._drawn_now(self.members.by_id[i])
+            self.news.tiles(self._fresh.pop(rule, []))
+        reached("drawing told")
+        self._to_draw.difference_update(shown)
+        return raised
+
+    def _waits(self, number: int) -> bool:
+        """Whether tiles of a photo are still to be drawn."""
+        return number in self.pending or any(
+            a in self.dirty or a in self.urgent for a in self.canvas.tiles_of(number)
+        )
+
+    def _drawn_now(self, member: Member) -> None:
+        if member.pose is None or member.state == "superseded":
+            self.ledger.set_photo(member.id, footprint="")
+            return
+        ring, at = self.news.place(member)
+        self.ledger.set_photo(
+            member.id, footprint={"ring": ring, "at": at, "pose": pose_record(member.pose)}
+        )
+        self._drawn[member.id] = member.pose
+        if (rim := self.canvas.outline(member.id)) is not None:
+            self._rims[member.id] = rim
+        self.news.photo(member, ring=ring, at=at)
+
+
+def _add(queue: Queue, addresses: Iterable[Address], number: int) -> None:
+    for address in addresses:
+        queue.setdefault(address, set()).add(number)

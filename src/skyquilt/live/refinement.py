@@ -1,0 +1,142 @@
+"""The second look at a photo: linked to its neighbours and settled among them."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.live.adjustment_schedule import Schedule
+from skyquilt.live.crash_points import reached
+from skyquilt.live.events import News
+from skyquilt.live.links import link_bytes
+from skyquilt.live.local_pose import Change, Placing
+from skyquilt.live.members import Member, Queues, about_record
+from skyquilt.live.redraw_queue import Showing
+from skyquilt.live.update import Update
+from skyquilt.model.poses import Pose
+
+LOOP = 12
+"""Steps along links beyond which a new link closes a loop."""
+LOST = 2
+"""Photos waiting for links that a photo which settles is compared with."""
+
+
+class Refining:
+    """All that one photo changes becomes true at once: links, poses, heights, what was learned,
+    what is due next.
+    """
+
+    def __init__(
+        self, placing: Placing, showing: Showing, news: News, queues: Queues, schedule: Schedule
+    ) -> None:
+        self.placing, self.showing, self.news = placing, showing, news
+        self.queues, self.schedule = queues, schedule
+        self.members, self.ledger = placing.members, placing.members.ledger
+        self._tried = max((m.tried for m in self.members.by_id.values()), default=0)
+
+    def refine(self, member: Member) -> Update:
+        """Settles the photo, which heads the queue of those not tried."""
+        if member.state == "superseded":
+            self.queues.untried.popleft()
+            return Update(what="noted", photo=member.id)
+        change = self.placing.refine(member)
+        found = self._found(member, change)
+        self._commit(member, change, found)
+        self.queues.untried.popleft()
+        self._requeue(member, found)
+        return Update(
+            what="refined" if member.state == "refined" else "loose",
+            photo=member.id,
+            moved=tuple(change.moved),
+            text=change.reason,
+        )
+
+    def _commit(self, member: Member, change: Change, found: list[Member]) -> None:
+        far = self._distance(member, change) > LOOP
+        for a, b in (key for key, k in change.links.items() if k is not None):
+            self.members.joined(a, b)
+        self._tried += 1
+        with self.ledger.change():
+            links = [
+                (a, b, None if k is None else link_bytes(k)) for (a, b), k in change.links.items()
+            ]
+            self.ledger.put_links(links)
+            self.members.save_cameras(change.cameras)
+            member.tried = self._tried
+            self.heights(change.xyz, known=bool(change.cameras))
+            self.move(change.moved, change.camera_of)
+            if member.state == "refined":
+                self.placing.metadata.learn(member)
+                self.schedule.refined(member.id, loop=far)
+            self.members.save(
+                member, about=about_record(member, change.reason), reason=change.reason
+            )
+            for lost in found:
+                lost.tried, lost.again = 0, self._tried
+                self.members.save(lost, about=about_record(lost, ""))
+            self.schedule.write(self.ledger)
+            self.news.photo(member, reason=change.reason)
+        reached("photo refined")
+        self.placing.neighbours.indexed(member)
+
+    def move(self, moved: dict[int, Pose], camera_of: dict[int, str]) -> None:
+        """New poses of photos (inside a transaction of the ledger)."""
+        for i, pose in moved.items():
+            member = self.members.by_id[i]
+            member.pose, member.camera = pose, camera_of.get(i, member.camera)
+            if member.state != "superseded":
+                member.state = "refined"
+            self.members.save(member, reason="")
+            self.placing.neighbours.indexed(member)
+            if member.state == "refined":
+                self.showing.moved(member)
+
+    def heights(self, xyz: NDArray[np.float64], *, known: bool, anew: bool = False) -> None:
+        """Takes in ground points (P, 3) (inside a transaction); `known`: they come from calibrated
+        cameras.
+        """
+        cells = self.placing.metadata.heights
+        touched, z = cells.add(xyz, anew=anew)
+        with self.ledger.change() as db:
+            values = [
+                (c, r, height) for (c, r), height in zip(touched.tolist(), z.tolist(), strict=True)
+            ]
+            db.executemany("insert or replace into height values (?, ?, ?)", values)
+            if known and len(xyz):
+                ground = float(np.median(xyz[:, 2]))
+                self.ledger.put_meta("ground", ground)
+                self.showing.canvas.ground = ground
+
+    def _distance(self, member: Member, change: Change) -> int:
+        """Steps along known links between the photos that this one links; more than LOOP = it
+        closes a loop.
+        """
+        ends = [
+            i for key, k in change.links.items() if k is not None for i in key if i != member.id
+        ]
+        if len(ends) < 2:
+            return 0
+        known, rim = {ends[0]}, {ends[0]}
+        for step in range(LOOP + 1):
+            if set(ends) <= known:
+                return step
+            rim = {j for i in rim for j in self.members.by_id[i].links} - known
+            known |= rim
+        return LOOP + 1
+
+    def _found(self, member: Member, change: Change) -> list[Member]:
+        """Photos that wait for links and link to this one, now that it settles."""
+        if member.id not in change.moved:
+            return []
+        lost = [m for m in self.queues.lost if m.photo.band == member.photo.band][-LOST:]
+        return [m for m in lost if self._links(m, member)]
+
+    def _links(self, lost: Member, member: Member) -> bool:
+        return any(k is not None for k in self.placing.linking.compared(lost, [member.id]).values())
+
+    def _requeue(self, member: Member, found: Iterable[Member]) -> None:
+        for lost in found:
+            self.queues.lost.remove(lost)
+            self.queues.untried.append(lost)
+        if member.state == "waiting":
+            self.queues.lost.append(member)

@@ -1,0 +1,275 @@
+"""The growing map drawn: a tile is a function of the photos that see it, drawn anew where those
+look different.
+"""
+
+import os
+from collections import OrderedDict, defaultdict
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.engine.executor import in_order
+from skyquilt.engine.pixel_cache import PixelCache
+from skyquilt.engine.store import Store
+from skyquilt.imaging.views import View, footprint
+from skyquilt.live.crash_points import reached
+from skyquilt.live.members import Member
+from skyquilt.live.newest_blend import Newest
+from skyquilt.live.reduced_pictures import SmallPictures, measured
+from skyquilt.model.camera import Camera
+from skyquilt.model.poses import Pose
+from skyquilt.model.raster import Window
+from skyquilt.model.surface import Surface
+from skyquilt.ortho.blend import Blend, Feather
+from skyquilt.ortho.compose import Composed, Composer
+from skyquilt.ortho.height_cells import HeightCells
+from skyquilt.ortho.plan import Plan
+from skyquilt.raster.tile_store import SIDE, Address, Tile, TileStore, covering
+
+NEWEST = "-newest"
+"""End of the names of layers that show the newest photo instead of the most vertical view."""
+MOST_VIEWS = 24
+"""Photos that a tile is composed from."""
+LEAST_MOVE = 0.6
+"""Map pixels by which a photo must have moved to be drawn again."""
+DRAWINGS = 96
+"""Tiles at hand with what they were composed from: where photos change, only their parts are drawn.
+"""
+THREADS = min(2, os.cpu_count() or 1)
+"""Tiles drawn side by side."""
+WHOLE = Window(row=0, column=0, height=SIDE, width=SIDE)
+RULES: dict[str, Blend] = {"": Feather(width_px=2.0), NEWEST: Newest()}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drawing:
+    """A tile that was composed."""
+
+    plan: Plan
+    """Which photos show where on it."""
+    composed: Composed
+    """How it looks."""
+
+
+def layer_of(member: Member) -> str:
+    """The layer that shows a photo: one per spectrum."""
+    return member.photo.band
+
+
+class Canvas:
+    """Which photos see which tile, and the tiles themselves."""
+
+    def __init__(
+        self,
+        tiles: TileStore,
+        heights: HeightCells,
+        full: PixelCache,
+        members: dict[int, Member],
+        store: Store,
+    ) -> None:
+        self.tiles, self.heights, self.members = tiles, heights, members
+        self.gsd = 0.0
+        self.ground = 0.0
+        self._views: dict[int, View] = {}
+        self._seen: dict[int, tuple[Address, ...]] = {}
+        self._raised: set[Address] = set()
+        self._met: set[Address] = set()
+        self._shown: dict[Address, tuple[int, ...]] = {}
+        self._kept: OrderedDict[Address, Drawing] = OrderedDict()
+        self._by_tile: dict[Address, set[int]] = defaultdict(set)
+        self._pictures = SmallPictures(full, members, store)
+
+    def place(self, member: Member, camera: Camera) -> set[Address]:
+        """Takes note of where a photo is now; the tiles that may look different."""
+        assert member.pose is not None
+        old = self._seen.get(member.id, ())
+        view = self._view(member, camera, member.pose)
+        if view is None:
+            return self.remove(member.id)
+        low, high = view.footprint.min(0), view.footprint.max(0)
+        now = tuple(covering(layer_of(member), 0, self.gsd, (low[0], low[1], high[0], high[1])))
+        if len(now) > 4000:  # a photo that sees the horizon
+            return self.remove(member.id)
+        for address in old:
+            self._by_tile[address].discard(member.id)
+        for address in now:
+            self._by_tile[address].add(member.id)
+        self._views[member.id], self._seen[member.id] = view, now
+        return set(old) | set(now)
+
+    def remove(self, number: int) -> set[Address]:
+        """Forgets a photo; the tiles that may look different."""
+        old = self._seen.pop(number, ())
+        for address in old:
+            self._by_tile[address].discard(number)
+        self._views.pop(number, None)
+        return set(old)
+
+    def _view(self, member: Member, camera: Camera, pose: Pose) -> View | None:
+        longest = self._pictures.longest(member, self.gsd, self.ground)
+        scale = longest / max(camera.width, camera.height)
+        w, h = (
+            (round(camera.width * scale), round(camera.height * scale))
+            if scale < 1
+            else (camera.width, camera.height)
+        )
+        scale = w / camera.width
+        small = replace(
+            camera,
+            width=w,
+            height=h,
+            focal=camera.focal * scale,
+            cx=(camera.cx + 0.5) * scale - 0.5,
+            cy=(camera.cy + 0.5) * scale - 0.5,
+        )
+        x, y, z = pose.map_C.tolist()
+        reach = 1.5 * abs(z - self.ground)
+        outline = footprint(small, pose, self.surface((x - reach, y - reach, x + reach, y + reach)))
+        return (
+            View(photo=member.id, camera=small, pose=pose, footprint=outline)
+            if len(outline)
+            else None
+        )
+
+    def surface(self, bounds: Iterable[float]) -> Surface:
+        """Heights over bounds in m."""
+        return self.heights.surface(bounds, self.ground)
+
+    def tiles_of(self, number: int) -> tuple[Address, ...]:
+        """Tiles of level 0 that a photo may show in."""
+        return self._seen.get(number, ())
+
+    def outline(self, number: int) -> NDArray[np.float64] | None:
+        """Footprint (k, 2) in m of a photo on the map."""
+        view = self._views.get(number)
+        return None if view is None else view.footprint
+
+    def moved(self, member: Member, drawn: Pose) -> bool:
+        """Whether a photo lies so far from where it was drawn that it shows."""
+        assert member.pose is not None
+        camera = member.photo
+        above = max(float(drawn.map_C[2]) - self.ground, 1.0)
+        shift = np.abs(member.pose.map_C - drawn.map_C).max()
+        turn = (
+            np.abs(member.pose.cam_R_map - drawn.cam_R_map).max()
+            * above
+            * (1 + camera.width / 2 / camera.focal.px)
+        )
+        return bool(max(shift, turn) > LEAST_MOVE * self.gsd)
+
+    def covering(self, x: float, y: float) -> list[int]:
+        """Photos whose footprint holds a point (m, map frame), the most vertical view first."""
+        found = []
+        for layer in {a.layer for a in self._by_tile}:
+            for address in covering(layer, 0, self.gsd, (x, y, x, y)):
+                found += list(self._by_tile.get(address, ()))
+        return sorted(set(found))
+
+    def draw(self, dirty: Mapping[Address, Collection[int]], rule: str = "") -> list[Address]:
+        """Draws tiles of level 0 (addresses of the plain layer) on which these photos have changed.
+
+        A tile stays as it is where none of them shows, before or now. Returns those written;
+        `finish` does the coarser ones.
+        """
+        drawn = list(in_order(lambda a: self._drawn(a, dirty[a], rule), list(dirty), jobs=THREADS))
+        for at, drawing, _ in drawn:
+            self._keep(at, drawing)
+        written = [(at, tile) for at, _, tile in drawn if tile is not None]
+        newest = (
+            [at for at, _, _ in drawn]
+            if rule
+            else [replace(a, layer=a.layer + NEWEST) for a in dirty]
+        )
+        self.tiles.put(written, owing=() if rule else newest)
+        reached("tiles written")
+        self._met.update(newest if rule else ())
+        self._raised.update(at for at, _ in written)
+        return [at for at, _ in written]
+
+    def _drawn(
+        self, address: Address, changed: Collection[int], rule: str
+    ) -> tuple[Address, "Drawing | None", Tile | None]:
+        """The tile's address in its own layer, what it was made from, and how it looks; None = as
+        before.
+        """
+        at = replace(address, layer=address.layer + rule)
+        compose, kept = self._composer(address, RULES[rule]), self._kept.get(at)
+        plan = compose.plan(WHOLE, earlier=kept.plan if kept else None) if compose else None
+        shown = tuple(plan.shown) if plan else ()
+        if self._shown.get(at) == shown and not set(shown).intersection(changed):
+            return at, kept, None
+        self._shown[at] = shown
+        if compose is None or plan is None or not shown:
+            return at, None, self._empty(address.layer) if self.tiles.version(at) > 0 else None
+        composed = compose.redrawn(plan, kept.plan, kept.composed) if kept else compose.drawn(plan)
+        tile = self._tile(composed)
+        if tile is None and self.tiles.version(at) > 0:
+            tile = self._empty(address.layer)
+        return at, Drawing(plan=plan, composed=composed), tile
+
+    def _keep(self, at: Address, drawing: "Drawing | None") -> None:
+        self._kept.pop(at, None)
+        if drawing is not None:
+            self._kept[at] = drawing
+        while len(self._kept) > DRAWINGS:
+            self._kept.popitem(last=False)
+
+    def finish(self, rule: str = "") -> int:
+        """Makes the coarser tiles above all that was drawn since; returns how many."""
+        changed = {a for a in self._raised if a.layer.endswith(NEWEST) == bool(rule)}
+        met = self._met if rule else set[Address]()
+        self._raised -= changed
+        raised = self.tiles.raise_levels(changed, settled=met) if changed or met else 0
+        self._met -= met
+        return raised
+
+    def owed(self) -> list[Address]:
+        """Tiles (addresses of the plain layer) whose newest-on-top fellows show less than they
+        do.
+        """
+        return [replace(a, layer=a.layer.removesuffix(NEWEST)) for a in self.tiles.owed()]
+
+    def _composer(self, address: Address, blend: Blend) -> Composer | None:
+        """What a tile is drawn with; None where no photo sees it."""
+        grid = address.grid(self.gsd)
+        inside = [
+            v
+            for i in sorted(self._by_tile.get(address, ()))
+            if (v := self._views.get(i)) is not None
+        ]
+        if len(inside) > MOST_VIEWS:
+            middle = np.array([grid.west + SIDE * self.gsd / 2, grid.north - SIDE * self.gsd / 2])
+            inside.sort(key=lambda v: float(np.hypot(*(v.pose.map_C[:2] - middle))))
+            inside = sorted(inside[:MOST_VIEWS], key=lambda v: v.photo)
+        if not inside:
+            return None
+        west, south, east, north = grid.bounds
+        rim = 8 * self.heights.cell
+        values = measured(self.members[inside[0].photo])
+        return Composer(
+            grid=grid,
+            views=inside,
+            surface=self.surface((west - rim, south - rim, east + rim, north + rim)),
+            blend=blend,
+            pixels=self._pictures,
+            bands=1 if values else 3,
+            dtype=np.dtype(np.float32 if values else np.uint8),
+        )
+
+    @staticmethod
+    def _tile(done: Composed) -> Tile | None:
+        shown = done.photo >= 0
+        if done.pixels.dtype.kind == "f":
+            shown &= np.isfinite(done.pixels[..., 0])
+        return Tile(pixels=np.nan_to_num(done.pixels), shown=shown) if shown.any() else None
+
+    def _empty(self, layer: str) -> Tile:
+        thermal = layer.startswith("thermal")
+        pixels = (
+            np.zeros((SIDE, SIDE, 1), np.float32)
+            if thermal
+            else np.zeros((SIDE, SIDE, 3), np.uint8)
+        )
+        return Tile(pixels=pixels, shown=np.zeros((SIDE, SIDE), bool))

@@ -1,0 +1,89 @@
+"""The live story as events: folders watched, photos mapped, the final map made when it is asked
+for.
+"""
+
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from skyquilt.errors import OutputError, SkyquiltError
+from skyquilt.live.final_map import iter_finish
+from skyquilt.live.folder_watch import Watch
+from skyquilt.live.live_map import LiveMap
+from skyquilt.live.photo_intake import Refused
+from skyquilt.live.settings import LiveSettings
+from skyquilt.live.update import Update
+from skyquilt.model.event import Event, Note, Result
+
+IDLE_S = 0.01
+"""Between looks when nothing is to be done."""
+FULL_S = 2.0
+"""Pause when the disk is full."""
+STEADY_S = 5.0
+"""With `finish`: no new photo for so long means that the flight is over."""
+
+
+def iter_live(
+    folders: Sequence[Path],
+    live: LiveMap,
+    *,
+    finish: bool = False,
+    stop: threading.Event | None = None,
+) -> Iterator[Event | Update]:
+    """Maps photos as they come into folders or by other ways into `live`, until `stop`.
+
+    `finish`: ends when no photo has come for some seconds, with the final map. Every pause and
+    refusal is told.
+
+    Raises:
+        UsageError: a folder is missing.
+    """
+    stop = stop or threading.Event()
+    watches = [Watch(folder=f, intake=live.intake) for f in folders]
+    busy_since = time.monotonic()
+    while not stop.is_set():
+        try:
+            yield from _taken(watches)
+            update = live.work()
+        except OutputError as error:
+            yield Note(text=str(error), warning=True)
+            stop.wait(FULL_S)
+            continue
+        if update is not None:
+            busy_since = time.monotonic()
+            yield update
+            continue
+        growing = any(w.growing for w in watches) or live.closing.busy
+        if finish and not growing and time.monotonic() - busy_since > STEADY_S:
+            yield from _finished(live, live.settings)
+            return
+        if live.ledger.meta("finish") == "asked" and not growing:
+            yield from _finished(live, live.settings)
+        stop.wait(IDLE_S)
+
+
+def _taken(watches: Sequence[Watch]) -> Iterator[Event]:
+    for watch in watches:
+        for done in watch.look():
+            if isinstance(done, Refused):
+                yield Note(text=f"{done.name} was left out: {done.reason}", warning=True)
+
+
+def _finished(live: LiveMap, settings: LiveSettings) -> Iterator[Event]:
+    """The final map; a failure is told and the live map goes on."""
+    live.ledger.put_meta("finish", "running")
+    live.ledger.tell("finish", {"state": "running", "text": "the final map is being made"})
+    try:
+        for happened in iter_finish(live.folder, settings):
+            yield happened
+            if isinstance(happened, Result):
+                live.ledger.put_meta("finish", "done")
+                live.ledger.tell(
+                    "finish",
+                    {"state": "done", "text": "the final map is there, beside the live one"},
+                )
+    except SkyquiltError as error:
+        live.ledger.put_meta("finish", "failed")
+        live.ledger.tell("finish", {"state": "failed", "text": f"no final map: {error}"})
+        yield Note(text=f"no final map: {error}", warning=True)

@@ -1,0 +1,111 @@
+"""Candidate pairs: near neighbours by position, neighbours in time, and look-alikes."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.geometry.neighbours import nearest
+from skyquilt.model.features import Features
+
+Pair = tuple[int, int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nearest:
+    """Photos whose footprints can overlap by the measured positions.
+
+    Altitudes lie (A2 of the methods), so the footprint is not computed from them here: the caller
+    gives the ground distance within which photos overlap, learnt from links already found, or None
+    to take neighbours only.
+    """
+
+    neighbours: int = 12
+    """Most neighbours by distance per photo."""
+    version: ClassVar[int] = 1
+
+    def __call__(self, map_xy: NDArray[Any], reach_m: float | None = None) -> list[Pair]:
+        """Pairs i < j of photos with positions (n, 2) in m (NaN where unknown), nearest first."""
+        known = np.flatnonzero(np.isfinite(map_xy).all(1))
+        if len(known) < 2:
+            return []
+        distance, index = nearest(
+            map_xy[known], map_xy[known], min(self.neighbours + 1, len(known))
+        )
+        found: dict[Pair, float] = {}
+        for row, (ds, js) in enumerate(zip(distance, index, strict=True)):
+            for d, j in zip(ds, js, strict=True):
+                if j != row and (reach_m is None or d <= reach_m):
+                    i, k = sorted((int(known[row]), int(known[j])))
+                    found[i, k] = float(d)
+        return sorted(found, key=lambda pair: (found[pair], pair))
+
+
+def sequence(count: int, step: int = 1) -> list[Pair]:
+    """Each photo with the next `step` photos in order of capture."""
+    return [(i, i + k) for k in range(1, step + 1) for i in range(count - k)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Retrieval:
+    """VLAD vectors (Jegou et al. 2010) over a vocabulary learnt from the survey itself."""
+
+    words: int = 64
+    """Size of the vocabulary."""
+    neighbours: int = 12
+    """Most similar photos paired with each photo asked about."""
+    exhaustive_below: int = 25
+    """Surveys of fewer photos are paired completely: retrieval could only lose."""
+    sample: int = 400
+    """Descriptors per photo, the largest keypoints first."""
+    seed: int = 0
+    """Seed of the vocabulary."""
+    version: ClassVar[int] = 1
+
+    def __call__(self, features: list[Features], asked: list[int] | None = None) -> list[Pair]:
+        """Pairs i < j for the photos asked about (all by default)."""
+        n = len(features)
+        rows = list(range(n)) if asked is None else asked
+        if n < self.exhaustive_below:
+            return sorted({(min(i, j), max(i, j)) for i in rows for j in range(n) if i != j})
+        vectors = self._vectors(features)
+        pairs: set[Pair] = set()
+        for i in rows:
+            similarity = vectors @ vectors[i]
+            similarity[i] = -2
+            for j in np.argsort(-similarity)[: self.neighbours]:
+                pairs.add((min(i, int(j)), max(i, int(j))))
+        return sorted(pairs)
+
+    def _vectors(self, features: list[Features]) -> NDArray[np.float32]:
+        chosen = [f.unit[np.argsort(-f.size)[: self.sample]] for f in features]
+        words = self._vocabulary(np.concatenate(chosen))
+        return np.stack([_vlad(d, words) for d in chosen])
+
+    def _vocabulary(self, descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+        """k-means centres on at most 20,000 descriptors, on the unit sphere."""
+        rng = np.random.default_rng(self.seed)
+        data = descriptors[rng.permutation(len(descriptors))[:20000]]
+        words = data[: self.words].copy()
+        for _ in range(8):
+            nearest = (data @ words.T).argmax(1)
+            for w in range(len(words)):
+                members = data[nearest == w]
+                if len(members):
+                    words[w] = members.mean(0)
+            words /= np.maximum(np.linalg.norm(words, axis=1, keepdims=True), 1e-9)
+        return words
+
+
+def _vlad(descriptors: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Residuals to the nearest words, summed, normalised per word and as a whole: unit
+    vector (words * D,).
+    """
+    total = np.zeros_like(words)
+    if len(descriptors):
+        nearest = (descriptors @ words.T).argmax(1)
+        np.add.at(total, nearest, descriptors - words[nearest])
+    total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)
+    flat = total.ravel()
+    return flat / max(float(np.linalg.norm(flat)), 1e-9)

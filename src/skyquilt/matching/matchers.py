@@ -1,0 +1,121 @@
+"""Putative matches of two photos by their descriptors: mutual nearest neighbours, nearest one way,
+and nearest within a radius of an expected place.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.model.features import Features, Matches
+
+
+def similarities(a: Features, b: Features) -> NDArray[np.float32]:
+    """(len(a), len(b)) dot products of unit descriptors: 1 equal, 0 unrelated.
+
+    Raises:
+        ValueError: the descriptors are of different kinds.
+    """
+    if a.binary != b.binary or a.descriptors.shape[1] != b.descriptors.shape[1]:
+        kinds = [f"{'binary' if f.binary else 'real'} of {f.descriptors.shape[1]}" for f in (a, b)]
+        raise ValueError(f"descriptors of one kind expected, got {kinds[0]} and {kinds[1]}")
+    return np.asarray(a.unit @ b.unit.T)
+
+
+def no_matches() -> Matches:
+    """None at all."""
+    return Matches(index_a=np.zeros(0, np.int64), index_b=np.zeros(0, np.int64))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mutual:
+    """Each other's nearest, and clearly nearer than the second nearest."""
+
+    ratio: float = 0.85
+    """Largest distance to the nearest over distance to the second nearest; Hamming's of binary
+    descriptors.
+    """
+    version: ClassVar[int] = 3
+
+    def __call__(self, a: Features, b: Features) -> Matches:
+        """Putative matches of two photos."""
+        if len(a) < 2 or len(b) < 2:
+            return Matches(index_a=np.zeros(0, np.int64), index_b=np.zeros(0, np.int64))
+        similarity = similarities(a, b)
+        rows = np.arange(len(a))
+        best = similarity.argmax(1)
+        first = similarity[rows, best].copy()
+        similarity[rows, best] = -1.0
+        second = similarity.max(1)
+        similarity[rows, best] = first
+        # 1 - s is d^2 / 2 of unit vectors, but twice the distance itself of bits
+        ratio = self.ratio if a.binary else self.ratio**2
+        clear = np.flatnonzero((1 - first) < ratio * (1 - second))
+        # who is nearest the other way round matters for the clear ones only
+        mutual = similarity[:, best[clear]].max(0) <= first[clear]
+        kept = clear[mutual]
+        return Matches(index_a=kept, index_b=best[kept])
+
+
+@dataclass(frozen=True, kw_only=True)
+class OneWay:
+    """Each feature of a with its nearest in b, where the second nearest is clearly farther [Y
+    5.2.1].
+    """
+
+    threshold: float = 1.2
+    """A match is kept when this times its squared distance is less than that of the second nearest.
+    """
+    version: ClassVar[int] = 1
+
+    def __call__(self, a: Features, b: Features) -> Matches:
+        """Putative matches of two pictures; several of a may share one of b."""
+        if not len(a) or len(b) < 2:
+            return no_matches()
+        # of unit vectors, d^2 = 2 (1 - s); of bits, half of that is the share of those that differ
+        distance = 1 - similarities(a, b)
+        best = distance.argmin(1)
+        rows = np.arange(len(a))
+        first = distance[rows, best].copy()
+        distance[rows, best] = np.inf
+        kept = np.flatnonzero(self.threshold * first < distance.min(1))
+        return Matches(index_a=kept, index_b=best[kept])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Guided:
+    """Each other's nearest among those within a radius of the expected place."""
+
+    radius_px: float = 100.0
+    """Farthest that a match lies from where it is expected, px of the full photo b."""
+    ratio: float = 0.9
+    """Largest distance to the nearest over distance to the second nearest within the radius."""
+    distance: float = 0.8
+    """Largest distance of two unit descriptors (0 equal, sqrt 2 unrelated): a circle may hold no
+    second to compare with. Of binary ones, half of it is the largest share of bits that differ.
+    """
+    version: ClassVar[int] = 1
+
+    def __call__(self, a: Features, b: Features, predicted: NDArray[np.float64]) -> Matches:
+        """Putative matches; `predicted` (len(a), 2) px of b, NaN where nothing is known, which
+        matches nothing.
+        """
+        if predicted.shape != (len(a), 2):
+            raise ValueError(
+                f"a place for each of {len(a)} keypoints expected, got {predicted.shape}"
+            )
+        if not len(a) or not len(b):
+            return no_matches()
+        off = predicted[:, None] - b.px[None]
+        near = np.einsum("abi,abi->ab", off, off) <= self.radius_px**2
+        similarity = np.where(near, similarities(a, b), -1.0)
+        rows, best = np.arange(len(a)), similarity.argmax(1)
+        first = similarity[rows, best].copy()
+        mutual = similarity.argmax(0)[best] == rows
+        similarity[rows, best] = -1.0
+        power = 1 if a.binary else 2
+        clear = (1 - first) < self.ratio**power * (1 - similarity.max(1))
+        close = 1 - first <= self.distance**power / (1 if a.binary else 2)
+        kept = np.flatnonzero(mutual & clear & close & (first > -1))
+        return Matches(index_a=kept, index_b=best[kept])

@@ -1,1 +1,0 @@
-"""Stage: figures that judge a result (part G of the methods)."""

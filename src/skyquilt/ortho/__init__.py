@@ -1,0 +1,1 @@
+"""Heights of the ground, and photos drawn on them: the orthomosaic."""

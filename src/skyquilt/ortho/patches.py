@@ -1,0 +1,92 @@
+"""Small orthorectified pieces of single photos."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.imaging.views import View, inside, project_nodes
+from skyquilt.model.surface import Surface
+from skyquilt.ortho.compose import PhotoPixels
+
+SIDE = 64
+"""Pixels of a patch's side."""
+COARSE = 8
+"""Pixels between exactly projected points of a patch."""
+
+
+def grey_patches(
+    view: View,
+    surface: Surface,
+    pixels: PhotoPixels,
+    xy: NDArray[Any],
+    gsd: float,
+    *,
+    side: int = SIDE,
+) -> list[NDArray[np.float32] | None]:
+    """What a photo shows around map points xy (n, 2) in m: grey (side, side) each, north up;
+    None where it does not see all of it.
+    """
+    nodes = (np.arange(-1, side // COARSE + 1) + 0.5) * COARSE - side / 2
+    shape = (len(xy), len(nodes), len(nodes))
+    gx = np.broadcast_to(xy[:, 0, None, None] + nodes * gsd, shape)
+    gy = np.broadcast_to(xy[:, 1, None, None] - nodes[:, None] * gsd, shape)
+    n = project_nodes(view, gx, gy, surface.at(gx, gy))
+    whole = np.asarray(inside(view.camera, n.u, n.v).all((1, 2)))
+    return [
+        _cut_out(view, pixels, n.u[k], n.v[k], side) if whole[k] else None for k in range(len(xy))
+    ]
+
+
+def _cut_out(
+    view: View, pixels: PhotoPixels, nu: NDArray[Any], nv: NDArray[Any], side: int
+) -> NDArray[np.float32]:
+    """The grey patch (side, side) whose nodes lie at these photo pixels."""
+    size = ((side // COARSE + 2) * COARSE,) * 2
+    inner = slice(COARSE, COARSE + side)
+    u, v = (cv2.resize(m, size, interpolation=cv2.INTER_LINEAR)[inner, inner] for m in (nu, nv))
+    x0, y0 = int(u.min()) - 1, int(v.min()) - 1
+    part = pixels(view.photo)[y0 : int(v.max()) + 3, x0 : int(u.max()) + 3]
+    if part.ndim == 3:
+        part = cv2.cvtColor(part, cv2.COLOR_RGB2GRAY) if part.shape[2] == 3 else part[..., 0]
+    return np.asarray(
+        cv2.remap(
+            part.astype(np.float32),
+            u - x0,
+            v - y0,
+            cv2.INTER_CUBIC,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+    )
+
+
+def grey_pairs(
+    first: Sequence[View],
+    second: Sequence[View],
+    xy: NDArray[Any],
+    surface: Surface,
+    pixels: PhotoPixels,
+    gsd: float,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Patches (n, 64, 64) of two photos each around map points (n, 2), and whether both see them
+    whole.
+    """
+    patches = np.zeros((2, len(xy), SIDE, SIDE), np.float32)
+    seen = np.zeros((2, len(xy)), bool)
+    sides: dict[int, list[tuple[int, int]]] = {}
+    views = (first, second)
+    for which, row in enumerate(views):
+        for k, view in enumerate(row):
+            sides.setdefault(view.photo, []).append((which, k))
+    for (
+        asked
+    ) in sides.values():  # a photo's patches at once: it is decoded once, and projected in one go
+        which, k = asked[0]
+        at = np.array([place for _, place in asked])
+        found = grey_patches(views[which][k], surface, pixels, xy[at], gsd)
+        for (which, k), patch in zip(asked, found, strict=True):
+            if patch is not None:
+                patches[which, k], seen[which, k] = patch, True
+    return patches[0], patches[1], np.asarray(seen.all(0))

@@ -1,0 +1,356 @@
+"""The comparing story: every method of alignment on one survey, side by side (Y Table 6.1, Fig.
+6.4; A Tables 1, 2).
+"""
+
+import csv
+import io
+import json
+import math
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skyquilt import __version__
+from skyquilt.engine.folder import STATE
+from skyquilt.engine.store import Store
+from skyquilt.errors import AlignmentError, OutputError, UsageError
+from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
+from skyquilt.model.photo import ControlPoint, Photo, PointObservation
+from skyquilt.model.poses import Alignment
+from skyquilt.papers.comparison_page import comparison_page
+from skyquilt.photos.gcp import read_gcp_list
+from skyquilt.photos.survey import read_survey
+from skyquilt.raster.atomic import write_text
+from skyquilt.report.page import write_page
+from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.workflows.mosaic import REGISTRY, iter_mosaic
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "position": {"method": "position"},
+    "pose": {"method": "pose"},
+    "image": {"method": "image"},
+    "image-overview": {"method": "image", "image_search": "overview"},
+    "hybrid": {"method": "hybrid", "optimiser": "surfaces"},
+    "hybrid-anneal": {"method": "hybrid", "optimiser": "anneal"},
+    "flightline": {"method": "flightline"},
+    "bundle": {"method": "bundle"},
+}
+"""Name of a column -> what it changes of the settings."""
+TRUSTED = ("pose", "hybrid")
+"""Methods shown a second time with metadata trusted, where repair changed something."""
+MOST_POINTS = 6
+"""Points between which distances are compared."""
+FILES = ("compare.json", "report.html")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompareSettings:
+    """What a comparison can be asked for."""
+
+    mosaic: MosaicSettings
+    """What all methods share."""
+    variants: tuple[str, ...] = tuple(VARIANTS)
+    """Columns, of `VARIANTS`."""
+    first: int | None = None
+    """Only this many photos, the first in order of capture; None = all."""
+    known: Path | None = None
+    """Points of known place (gcp_list.txt), used to judge only, never to align."""
+
+    def __post_init__(self) -> None:
+        strange = [v for v in self.variants if v not in VARIANTS]
+        if strange or not self.variants:
+            raise UsageError(
+                f"--methods {','.join(strange) or 'nothing'}: choose of {', '.join(VARIANTS)}"
+            )
+        if self.first is not None and self.first < 2:
+            raise UsageError(f"--first {self.first}: a comparison needs two photos or more")
+
+
+def iter_compare(
+    folder: Path, output: Path, settings: CompareSettings, *, overwrite: bool = False
+) -> Iterator[Event]:
+    """Runs every method into a folder of its own below `output`, then writes compare.json and
+    report.html.
+
+    Raises:
+        SkyquiltError: the photos, the output or an option is wrong; a method that cannot place the
+            photos is no error but a row with its reason.
+    """
+    _checked(output, overwrite)
+    shared = settings.mosaic
+    survey = read_survey(
+        folder, geo=shared.geo, cameras=shared.cameras, thermal_unit=shared.thermal_unit
+    )
+    photos = survey.photos[: settings.first] if settings.first else survey.photos
+    source: Path | Sequence[Path] = [p.path for p in photos] if settings.first else folder
+    base, says = _judged_by(photos, output, settings)
+    rows: dict[str, dict[str, Any]] = {}
+    for name in _in_turn(settings.variants, base.distances is None):
+        asked = replace(base, **VARIANTS[name])
+        rows[name] = yield from _run(name, source, output / name, asked, overwrite)
+        if name == "bundle" and base.distances is None and "metrics" in rows[name]:
+            base, says = _by_bundle(photos, output, base)
+            if (
+                base.distances is not None
+            ):  # judge bundle itself too: only the end of its run is made anew
+                again = yield from _run(
+                    name, source, output / name, replace(base, **VARIANTS[name]), True
+                )
+                times = {k: rows[name]["metrics"][k] for k in ("seconds", "cpu_seconds")}
+                rows[name] = {**again, "metrics": {**again["metrics"], **times}}
+        if (
+            name in TRUSTED
+            and settings.mosaic.repair
+            and rows[name].get("metrics", {}).get("metadata_conflicts")
+        ):
+            told = replace(asked, repair=False, distances=base.distances)
+            rows[f"{name}-trusted"] = yield from _run(
+                f"{name}-trusted", source, output / f"{name}-trusted", told, overwrite
+            )
+    order = [n for v in settings.variants for n in (v, f"{v}-trusted") if n in rows]
+    record = _record({n: rows[n] for n in order}, [p.name for p in photos], says, folder)
+    write_text(output / "compare.json", json.dumps(record, indent=1, allow_nan=False))
+    write_page(output / "report.html", comparison_page(record, _previews(output, order)))
+    yield Result(output=output, metrics=record)
+
+
+def _checked(output: Path, overwrite: bool) -> None:
+    taken = output.is_dir() and any(p.name in FILES for p in output.iterdir())
+    if output.exists() and not output.is_dir():
+        raise OutputError(f"{output} is a file; the output is a folder")
+    if taken and not overwrite:
+        raise OutputError(
+            f"{output} already holds a comparison; add --overwrite to replace it, or choose another"
+            " folder"
+        )
+
+
+def _in_turn(variants: Sequence[str], needs_bundle: bool) -> list[str]:
+    """Bundle first where its points give the distances that the others are judged by."""
+    if needs_bundle and "bundle" in variants:
+        return ["bundle", *(v for v in variants if v != "bundle")]
+    return list(variants)
+
+
+def _run(
+    name: str,
+    source: Path | Sequence[Path],
+    output: Path,
+    settings: MosaicSettings,
+    overwrite: bool,
+) -> Generator[Event, None, dict[str, Any]]:
+    """One method: its stages are told under its name."""
+    told: list[str] = []
+    try:
+        for happened in iter_mosaic(source, output, settings, overwrite=overwrite):
+            if isinstance(happened, Result):
+                return {"metrics": dict(happened.metrics), "notes": told}
+            if isinstance(happened, Note):
+                told.append(happened.text)
+            elif isinstance(happened, StageStarted | StageProgress | StageFinished):
+                yield replace(happened, stage=f"{name}: {happened.stage}")
+    except AlignmentError as error:
+        yield Note(text=f"{name}: {error}", warning=True)
+        return {"refused": str(error), "notes": told}
+    raise RuntimeError("the story ended without a result")
+
+
+def _judged_by(
+    photos: Sequence[Photo], output: Path, settings: CompareSettings
+) -> tuple[MosaicSettings, str]:
+    """Settings with the distances to judge by, and where those come from."""
+    base = settings.mosaic
+    if base.distances is not None:
+        return base, f"known distances of {base.distances.name}"
+    if settings.known is None:
+        return base, "no distances are known"
+    control, _ = read_gcp_list(settings.known, [p.name for p in photos])
+    seen = [c for c in control if c.observations][:MOST_POINTS]
+    if len(seen) < 2:
+        return base, f"fewer than two points of {settings.known.name} are seen"
+    path = _write_distances(output / "distances.csv", _between(seen))
+    return replace(
+        base, distances=path
+    ), f"distances between {len(seen)} points of {settings.known.name}"
+
+
+Row = tuple[str, str, float, Any, Any]
+
+
+def _between(points: Sequence[ControlPoint]) -> list[Row]:
+    """Horizontal distances between all points, with all their sightings paired."""
+    rows: list[Row] = []
+    for k, a in enumerate(points):
+        for b in points[k + 1 :]:
+            metres = math.hypot(a.x - b.x, a.y - b.y)
+            rows += [
+                (a.name, b.name, metres, oa, ob) for oa in a.observations for ob in b.observations
+            ]
+    return rows
+
+
+def _write_distances(path: Path, rows: Sequence[Row]) -> Path:
+    text = io.StringIO()
+    table = csv.writer(text)
+    table.writerow(
+        ["point_a", "point_b", "metres", "px_a", "py_a", "image_a", "px_b", "py_b", "image_b"]
+    )
+    for a, b, metres, oa, ob in rows:
+        table.writerow(
+            [
+                a,
+                b,
+                f"{metres:.4f}",
+                f"{oa.x:.3f}",
+                f"{oa.y:.3f}",
+                oa.photo,
+                f"{ob.x:.3f}",
+                f"{ob.y:.3f}",
+                ob.photo,
+            ]
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_text(path, text.getvalue())
+    return path
+
+
+def _by_bundle(
+    photos: Sequence[Photo], output: Path, base: MosaicSettings
+) -> tuple[MosaicSettings, str]:
+    """Distances between tie points of the bundle run: measured in its model, not on the ground."""
+    alignment = alignment_of(output / "bundle")
+    points = tie_targets(alignment, [p.name for p in photos]) if alignment is not None else []
+    if len(points) < 2:
+        return base, "no distances are known"
+    path = _write_distances(output / "distances.csv", _between(points))
+    return replace(base, distances=path), (
+        f"distances between {len(points)} tie points as the bundle adjustment has them:"
+        " measured in a model, not on the ground"
+    )
+
+
+def alignment_of(run: Path) -> Alignment | None:
+    """The alignment of a run just made."""
+    store = Store(folder=run / STATE / "store", registry=REGISTRY)
+    found = sorted(
+        (run / STATE / "store" / "alignment").glob("*.npz"), key=lambda p: p.stat().st_mtime
+    )
+    kept = store.get("alignment", found[-1].stem) if found else None
+    return kept if isinstance(kept, Alignment) else None
+
+
+def tie_targets(alignment: Alignment, names: Sequence[str]) -> list[ControlPoint]:
+    """Tie points on the ground, seen three times or more, far from one another, as points with
+    sightings.
+
+    Low ones: a point on a roof or a crown lies elsewhere in a map over level ground, whoever made
+    it.
+    """
+    ties = alignment.ties
+    count = np.bincount(ties.point, minlength=len(ties.xyz))
+    worst = np.zeros(len(count))
+    np.maximum.at(worst, ties.point, np.linalg.norm(ties.residual_px, axis=1))
+    low = ties.xyz[:, 2] < np.percentile(ties.xyz[:, 2], 40) if len(ties.xyz) else np.zeros(0, bool)
+    good = np.flatnonzero((count >= 3) & (worst < 2) & low)
+    if len(good) < 2:
+        return []
+    xy = ties.xyz[good][:, :2]
+    chosen = [int(np.argmin(np.linalg.norm(xy - np.median(xy, axis=0), axis=1)))]
+    while len(chosen) < min(MOST_POINTS, len(good)):
+        chosen.append(
+            int(np.min([np.linalg.norm(xy - xy[c], axis=1) for c in chosen], axis=0).argmax())
+        )
+    return [
+        ControlPoint(
+            name=f"P{k + 1}",
+            x=float(xy[c, 0]),
+            y=float(xy[c, 1]),
+            z=None,
+            crs=alignment.frame.crs or "",
+            observations=tuple(
+                PointObservation(
+                    photo=names[int(ties.photo[s])], x=float(ties.px[s, 0]), y=float(ties.px[s, 1])
+                )
+                for s in np.flatnonzero(ties.point == good[c])
+            ),
+        )
+        for k, c in enumerate(chosen)
+    ]
+
+
+def _record(
+    rows: Mapping[str, Mapping[str, Any]], photos: Sequence[str], says: str, folder: Path
+) -> dict[str, Any]:
+    """What compare.json says: a column per method, after the columns of Y Table 6.1 and A Tables 1
+    and 2.
+    """
+    return {
+        "title": folder.name,
+        "version": __version__,
+        "photos": list(photos),
+        "judged_by": says,
+        "methods": {name: _column(row) for name, row in rows.items()},
+    }
+
+
+def _column(row: Mapping[str, Any]) -> dict[str, Any]:
+    if "refused" in row:
+        return {"refused": row["refused"]}
+    m = row["metrics"]
+    q = m["quality"]
+    return {
+        "placed": m["photos_used"],
+        "blocks": m["blocks"],
+        "distances": [
+            {**d, "error_m": None if d["on_map"] is None else round(d["on_map"] - d["metres"], 4)}
+            for d in q.get("distances", [])
+        ],
+        **{
+            k: q[k]
+            for k in ("alpha", "lambda_spat", "lambda_spat_of_table", "lambda_corr", "lambda")
+        },
+        "geolocation_mae_m": q.get("geolocation_mae_m"),
+        "geolocation_rms_m": q.get("geolocation_rms_m"),
+        "ste_per_inlier_px2": q.get("ste_per_inlier_px2"),
+        "seam_disparity_px": m["seam_disparity_px"],
+        "seconds": m["seconds"]["total"],
+        "align_seconds": m["seconds"].get("align"),
+        "cpu_seconds": m["cpu_seconds"],
+        "photos": q["photos"],
+        "correlation_with_last_of_photo": q["correlation_with_last_of_photo"],
+        "correlation_with_map_of_photo": q["correlation_with_map_of_photo"],
+        "off_position_over_width": q["off_position_over_width"],
+        "notes": [*m["notes"]],
+    }
+
+
+def _previews(output: Path, names: Sequence[str]) -> dict[str, Any]:
+    """Small pictures (h, w, 4) of the mosaics, from their overviews."""
+    import rasterio
+
+    out = {}
+    for name in names:
+        path = output / name / "mosaic.tif"
+        if not path.is_file():
+            continue
+        with rasterio.open(path) as source:
+            factor = max(1.0, max(source.width, source.height) / 900)
+            shape = (max(1, int(source.height / factor)), max(1, int(source.width / factor)))
+            bands = source.read(out_shape=(source.count, *shape))
+            mask = source.dataset_mask(out_shape=shape)
+        out[name] = _rgba(bands, mask)
+    return out
+
+
+def _rgba(bands: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    if bands.dtype != np.uint8:
+        values = bands.astype(np.float32)
+        low, high = np.nanpercentile(np.where(mask > 0, values, np.nan), [1, 99])
+        bands = np.clip(
+            (np.nan_to_num(values, nan=low) - low) / max(high - low, 1e-6) * 255, 0, 255
+        ).astype(np.uint8)
+    grey_or_rgb = bands[:3] if len(bands) >= 3 else np.repeat(bands[:1], 3, 0)
+    return np.dstack([*grey_or_rgb, mask.astype(np.uint8)])

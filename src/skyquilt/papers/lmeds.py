@@ -1,0 +1,83 @@
+"""Least median of squares (Rousseeuw 1984): no threshold to choose, but more than half of the
+matches must be right.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from skyquilt.geometry.transforms import MINIMAL, Model, symmetric_transfer_errors
+from skyquilt.matching.estimate import Doubles, Estimate, NoEstimate
+from skyquilt.matching.frame import estimated
+from skyquilt.matching.search import search
+
+_MEDIAN = 2 * np.log(2)
+"""Median of a chi-square of two degrees of freedom: of a transfer error in x and y, over its
+variance.
+"""
+_FAR = 9.21
+"""99 % quantile of the same."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lmeds:
+    """The model with the least median symmetric transfer error; inliers from the sigma that the
+    median tells.
+    """
+
+    model: Model = "homography"
+    """What is estimated."""
+    confidence: float = 0.9999
+    """That one sample was free of outliers when half of the matches are outliers: the number of
+    samples.
+    """
+    max_iterations: int = 5000
+    """Cap of the samples."""
+    max_sigma_px: float = 10.0
+    """Largest standard deviation of the inliers, per axis, that is believed: more outliers than
+    half show in it.
+    """
+    minimum: int = 8
+    """Fewest inliers of an estimate."""
+    seed: int = 0
+    """Of the samples: equal seeds give equal results."""
+    version: ClassVar[int] = 1
+
+    def __call__(self, a: ArrayLike, b: ArrayLike) -> Estimate | NoEstimate:
+        """b_H_a from matches a, b (N, 2) px, or why there is none."""
+        return estimated(
+            "LMedS",
+            self.model,
+            a,
+            b,
+            minimum=self.minimum,
+            settle=self._limit,
+            find=lambda a, b: search(
+                self.model,
+                a,
+                b,
+                confidence=self.confidence,
+                cap=self.max_iterations,
+                seed=self.seed,
+                cost=lambda e: np.median(e, 1),
+                support=lambda e: len(e) // 2,
+            ),
+        )
+
+    def _limit(self, H: Doubles, a: Doubles, b: Doubles) -> tuple[Doubles, float] | NoEstimate:
+        variance = self._variance(float(np.median(symmetric_transfer_errors(H, a, b))), len(a))
+        if not variance <= self.max_sigma_px**2:
+            scatter = f"{np.sqrt(variance):.1f} px, above {self.max_sigma_px:g} px"
+            return NoEstimate(
+                reason=f"the matches scatter by {scatter}: half of them or more are wrong"
+            )
+        return H, 2 * _FAR * variance
+
+    def _variance(self, median: float, count: int) -> float:
+        """Of the inliers' transfer errors per axis, px^2; half of the STE is one way's square, few
+        matches fit too well (Rousseeuw and Leroy 1987, 5.1: 1 + 5 / (n - p)).
+        """
+        small = 1 + 5 / max(count - MINIMAL[self.model], 1)
+        return float(max(median / 2 / _MEDIAN * small**2, 1e-6))

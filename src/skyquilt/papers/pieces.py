@@ -1,0 +1,143 @@
+"""Pieces of a mosaic that was built without metadata, laid on the map."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.similarity_graph import fit_similarity
+from skyquilt.alignment.start import NOMINAL_HEIGHT_M
+from skyquilt.model.poses import Pose, Prior
+from skyquilt.papers.planar import planar_pose
+
+Array = NDArray[np.float64]
+GAP = 0.1
+"""Space between pieces whose place is unknown, over the size of the larger."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Piece:
+    """Photos registered to one another."""
+
+    plane_H_cam: dict[int, Array]
+    """By photo: homography (3, 3) from its undistorted image plane to the plane of the piece (x
+    right, y down).
+    """
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Laid:
+    """Pieces on the map."""
+
+    poses: dict[int, Pose]
+    """By photo."""
+    metric: bool
+    """False where even the scale had to be assumed."""
+
+
+def lay(pieces: Sequence[Piece], priors: Sequence[Prior], height_m: float | None) -> Laid:
+    """Every piece by one similarity, 4 degrees of freedom, that takes the photos' middles to their
+    positions.
+
+    That tells where on Earth the mosaic lies and changes nothing inside a piece. A piece without
+    two positions is scaled by the height above ground (`height_m`, else heights above take-off,
+    else a nominal one) and turned as its photos report; without any position it is put beside the
+    others.
+    """
+    poses: dict[int, Pose] = {}
+    metric = True
+    east = None
+    for piece in pieces:
+        map_H_plane, known, placed = _similarity(piece, priors, height_m)
+        metric &= known
+        own = _posed(piece, map_H_plane)
+        if not placed and own:
+            own, east = _beside(own, piece, map_H_plane, east)
+        poses |= own
+    return Laid(poses=poses, metric=metric)
+
+
+def _posed(piece: Piece, map_H_plane: Array) -> dict[int, Pose]:
+    """Photos of a piece on the map, without those that it left degenerate."""
+    poses = {}
+    for photo, plane_H_cam in piece.plane_H_cam.items():
+        try:
+            poses[photo] = planar_pose(map_H_plane @ plane_H_cam)
+        except ValueError:
+            continue
+    return poses
+
+
+def centre(H: Array) -> complex:
+    """Where a homography takes the image centre (the principal point), as x + iy."""
+    return complex(H[0, 2] / H[2, 2], H[1, 2] / H[2, 2])
+
+
+def _similarity(
+    piece: Piece, priors: Sequence[Prior], height_m: float | None
+) -> tuple[Array, bool, bool]:
+    """(3, 3) from the piece's plane to the map; whether its scale and whether its place are
+    known.
+    """
+    photos = list(piece.plane_H_cam)
+    # a map's y runs north where a plane's runs down: conjugate
+    plane = np.conj([centre(piece.plane_H_cam[i]) for i in photos])
+    position = np.array([complex(*priors[i].map_C[:2]) for i in photos])
+    known = np.isfinite(position)
+    sigma = np.array([priors[i].sigma_C[0] for i in photos])
+    spread = float(np.abs(position[known] - position[known].mean()).max()) if known.any() else 0.0
+    if known.sum() >= 2 and spread > 2 * float(np.median(sigma[known])):
+        g, c, _ = fit_similarity(plane[known], position[known], sigma[known])
+        return _matrix(g, c), True, True
+    height, metric = _height(piece, priors, height_m)
+    g = height * _turn(piece, priors)
+    if not known.any():
+        return _matrix(g, 0j), metric, False
+    return _matrix(g, complex(np.mean(position[known] - g * plane[known]))), metric, True
+
+
+def _matrix(g: complex, c: complex) -> Array:
+    """The similarity z -> g conj(z) + c as a matrix: x + iy of a plane with y down to the map."""
+    return np.array([[g.real, g.imag, c.real], [g.imag, -g.real, c.imag], [0, 0, 1]])
+
+
+def _height(piece: Piece, priors: Sequence[Prior], height_m: float | None) -> tuple[float, bool]:
+    """Metres per unit of the plane, in which a photo of scale 1 hangs one focal length above the
+    ground.
+    """
+    heights = np.array([priors[i].map_C[2] for i in piece.plane_H_cam])
+    if height_m is not None:
+        return height_m, True
+    if np.isfinite(heights).any() and np.nanmedian(heights) > 1:
+        return float(np.nanmedian(heights)), True
+    return NOMINAL_HEIGHT_M, False
+
+
+def _turn(piece: Piece, priors: Sequence[Prior]) -> complex:
+    """Direction that brings the photos' tops to the reported headings; 1 where none is reported."""
+    units = []
+    for photo, H in piece.plane_H_cam.items():
+        if np.isfinite(priors[photo].yaw_deg):
+            top = -(H[:2, 1] * H[2, 2] - H[:2, 2] * H[2, 1])
+            seen = np.conj(complex(top[0], top[1]))
+            units.append(1j * np.exp(-1j * np.radians(priors[photo].yaw_deg)) / (seen / abs(seen)))
+    return (
+        complex(np.mean(units) / abs(np.mean(units)))
+        if units and abs(np.mean(units)) > 1e-6
+        else 1 + 0j
+    )
+
+
+def _beside(
+    poses: dict[int, Pose], piece: Piece, map_H_plane: Array, east: float | None
+) -> tuple[dict[int, Pose], float]:
+    """The piece moved east of the ones before it, and its own eastern end."""
+    x = np.array([p.map_C[0] for p in poses.values()])
+    reach = float(max(p.map_C[2] for p in poses.values()))
+    if east is None:
+        return poses, float(x.max()) + reach
+    shift = np.eye(3)
+    shift[0, 2] = east + GAP * reach - (float(x.min()) - reach)
+    moved = _posed(piece, shift @ map_H_plane)
+    return moved, float(max(p.map_C[0] for p in moved.values())) + reach

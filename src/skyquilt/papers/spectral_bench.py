@@ -1,0 +1,125 @@
+"""The thesis's Tables 6.4 and 6.5 on any list of pairs, and what it could not have: the truth."""
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from skyquilt import __version__
+from skyquilt.coregistration.methods import REGISTRATIONS
+from skyquilt.coregistration.pictures import guess_of, open_picture
+from skyquilt.coregistration.workflow import outcome_of
+from skyquilt.engine.clock import Clock, cpu_seconds
+from skyquilt.engine.folder import claim
+from skyquilt.errors import UsageError
+from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
+from skyquilt.model.photo import RejectedPhoto
+from skyquilt.model.registration import RefusedRegistration, Registration
+from skyquilt.papers.bench_page import bench_page
+from skyquilt.papers.overlap_error import overlap_error
+from skyquilt.papers.pair_list import Pair, read_pairs
+from skyquilt.raster.atomic import write_text
+
+CONTRACT = ("bench.json", "report.html")
+"""Files of a finished run."""
+DEFAULT = ("auto", "sift", "surf", "usurf", "rfae", "surf+rfae")
+"""Methods compared unasked: the default one and the columns of Tables 6.4 and 6.5."""
+STAGE = "pairs"
+
+
+def iter_spectral_bench(
+    pairs: Path | str,
+    output: Path | str,
+    methods: Sequence[str] = DEFAULT,
+    *,
+    overwrite: bool = False,
+) -> Iterator[Event]:
+    """Registers every pair of a list by every method; the last event is the `Result`.
+
+    Raises:
+        UsageError: an unknown method.
+        SideFileError: a malformed list.
+        OutputError: the output cannot be written.
+    """
+    output = Path(output)
+    if unknown := [m for m in methods if m not in REGISTRATIONS]:
+        raise UsageError(f"--method {unknown[0]!r} is not one of {', '.join(REGISTRATIONS)}")
+    listed = read_pairs(Path(pairs))
+    claim(output, CONTRACT, overwrite=overwrite)
+    began, total = Clock.now(), len(listed) * len(methods)
+    yield StageStarted(stage=STAGE, total=total)
+    rows: list[dict[str, Any]] = []
+    for pair in listed:
+        for method in methods:
+            rows.append(judged(pair, method))
+            yield StageProgress(stage=STAGE, done=len(rows), total=total)
+    seconds, cpu = Clock.now()
+    yield StageFinished(
+        stage=STAGE,
+        seconds=round(seconds - began[0], 3),
+        cpu_seconds=round(cpu - began[1], 3),
+        reused=False,
+    )
+    for line in totals(rows, methods):
+        yield Note(text=line)
+    record = {"pairs": rows, "methods": list(methods), "list": str(pairs), "version": __version__}
+    write_text(output / "report.html", bench_page(record))
+    write_text(output / "bench.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
+    yield Result(output=output, metrics=record)
+
+
+def judged(pair: Pair, method: str) -> dict[str, Any]:
+    """One row of bench.json: a pair registered by a method and held against the truth."""
+    since = cpu_seconds()
+    outcome, shapes = _registered(pair, method)
+    spent = round(cpu_seconds() - since, 3)
+    row = {"class": pair.kind, "source": pair.source, "method": method}
+    if isinstance(outcome, RefusedRegistration):
+        return row | {
+            "accepted": False,
+            "right": False,
+            "error_px": None,
+            "q": 0.0,
+            "inliers": outcome.inliers,
+            "seconds": spent,
+            "reason": outcome.reason,
+        }
+    error = min(overlap_error(outcome.b_H_a, pair.b_H_a, *shapes), 1e6)
+    return row | {
+        "accepted": True,
+        "right": error < pair.tolerance_px,
+        "error_px": round(error, 3),
+        "q": round(outcome.q, 4),
+        "inliers": len(outcome.px_a),
+        "seconds": spent,
+        "reason": outcome.note,
+    }
+
+
+def totals(rows: Sequence[dict[str, Any]], methods: Sequence[str]) -> list[str]:
+    """A sentence per method."""
+    lines = []
+    for method in methods:
+        of = [r for r in rows if r["method"] == method]
+        accepted, right = sum(r["accepted"] for r in of), sum(r["right"] for r in of)
+        time = sum(r["seconds"] for r in of) / len(of)
+        lines.append(
+            f"{method}: {accepted} of {len(of)} accepted, {right} right, {accepted - right} wrong;"
+            f" {time:.2f} s of CPU a pair"
+        )
+    return lines
+
+
+def _registered(
+    pair: Pair, method: str
+) -> tuple[Registration | RefusedRegistration, tuple[tuple[int, int], tuple[int, int]]]:
+    opened = [open_picture(path) for path in (pair.a, pair.b)]
+    a, b = opened
+    for name, one in zip("AB", opened, strict=True):
+        if isinstance(one, RejectedPhoto):
+            refusal = RefusedRegistration(
+                reason=f"picture {name} ({one.name}) cannot be used: {one.reason}"
+            )
+            return refusal, ((0, 0), (0, 0))
+    assert not isinstance(a, RejectedPhoto) and not isinstance(b, RejectedPhoto)
+    return outcome_of(a, b, method, guess_of(a, b)), ((a.height, a.width), (b.height, b.width))

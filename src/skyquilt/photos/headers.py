@@ -1,0 +1,298 @@
+"""What a file says before its pixels: JPEG segments, size, type, EXIF, XMP, raw thermal data."""
+
+import hashlib
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO, Literal
+
+import numpy as np
+from PIL import Image
+
+from skyquilt.errors import UnreadablePhotoError
+from skyquilt.photos.tags import Exif, Xmp, parse_exif, parse_xmp, read_tiff_tags
+
+if TYPE_CHECKING:
+    import tifffile
+
+
+SOI, EOI, SOS = 0xD8, 0xD9, 0xDA
+APP1, APP3 = 0xE1, 0xE3
+_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_BARE = frozenset({0x01, *range(0xD0, 0xD8)})  # markers without a length
+_EXIF = b"Exif\x00"
+_XMP = b"http://ns.adobe.com/xap/1.0/\x00"
+_XMP_MORE = b"http://ns.adobe.com/xmp/extension/\x00"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JpegHeader:
+    """What stands before the first scan."""
+
+    width: int
+    """Width in px as coded."""
+    height: int
+    """Height in px as coded."""
+    channels: int
+    """Colour components: 1, 3 or 4."""
+    segments: tuple[tuple[int, bytes], ...]
+    """Marker and payload of every APP segment, in the order of the file."""
+    scan_offset: int
+    """Byte at which the first scan begins."""
+
+    @property
+    def exif(self) -> bytes:
+        """The EXIF block (a TIFF without pixels), empty where there is none."""
+        found = (p[6:] for m, p in self.segments if m == APP1 and p.startswith(_EXIF))
+        return next(found, b"")
+
+    @property
+    def xmp(self) -> tuple[bytes, ...]:
+        """XMP packets: the main one and the extended one joined from its parts."""
+        main = [p[len(_XMP) :] for m, p in self.segments if m == APP1 and p.startswith(_XMP)]
+        parts = [
+            p[len(_XMP_MORE) :] for m, p in self.segments if m == APP1 and p.startswith(_XMP_MORE)
+        ]
+        parts.sort(key=lambda p: int.from_bytes(p[36:40], "big"))  # GUID 32, length 4, offset 4
+        more = b"".join(p[40:] for p in parts)
+        return (*main, more) if more else tuple(main)
+
+    def joined(self, marker: int, prefix: bytes = b"") -> bytes:
+        """Payloads of one marker that start with `prefix`, the prefix dropped, one after
+        another.
+        """
+        return b"".join(
+            p[len(prefix) :] for m, p in self.segments if m == marker and p.startswith(prefix)
+        )
+
+
+def _next_marker(file: BinaryIO) -> int:
+    byte = file.read(1)
+    if byte != b"\xff":
+        raise UnreadablePhotoError("its JPEG header is broken or cut off")
+    while byte == b"\xff":  # fill bytes may precede a marker
+        byte = file.read(1)
+    if not byte:
+        raise UnreadablePhotoError("its JPEG header is cut off")
+    return byte[0]
+
+
+def _payload(file: BinaryIO) -> bytes:
+    length = int.from_bytes(file.read(2), "big") - 2
+    payload = file.read(max(length, 0))
+    if length < 0 or len(payload) < length:
+        raise UnreadablePhotoError("its JPEG header is cut off")
+    return payload
+
+
+def read_jpeg_header(file: BinaryIO) -> JpegHeader:
+    """Walk the segments up to the first scan.
+
+    Raises `UnreadablePhotoError` where the header is broken, cut off or declares no image.
+    """
+    file.seek(2)
+    segments: list[tuple[int, bytes]] = []
+    frame: tuple[int, int, int] | None = None
+    while (marker := _next_marker(file)) != SOS:
+        if marker in _BARE:
+            continue
+        if marker == EOI:
+            raise UnreadablePhotoError("it is a JPEG without an image in it")
+        payload = _payload(file)
+        if marker in _FRAMES and len(payload) >= 6:
+            frame = (
+                int.from_bytes(payload[3:5], "big"),
+                int.from_bytes(payload[1:3], "big"),
+                payload[5],
+            )
+        elif 0xE0 <= marker <= 0xEF:
+            segments.append((marker, payload))
+    if frame is None or 0 in frame:
+        raise UnreadablePhotoError("it is a JPEG that declares no image size")
+    return JpegHeader(
+        width=frame[0],
+        height=frame[1],
+        channels=frame[2],
+        segments=tuple(segments),
+        scan_offset=file.tell(),
+    )
+
+
+def has_end(file: BinaryIO, scan_offset: int) -> bool:
+    """Whether the pixels are closed by an end-of-image marker.
+
+    Inside the coded pixels FF D9 cannot occur (FF is stuffed), so the first one after the scan's
+    start is the image's own end, whatever previews or padding follow it. The tail is tried first,
+    as it mostly lies there.
+    """
+    size = file.seek(0, io.SEEK_END)
+    file.seek(max(scan_offset, size - 2))
+    if file.read(2) == b"\xff\xd9":
+        return True
+    file.seek(scan_offset)
+    last = b""
+    while block := file.read(1 << 20):
+        if b"\xff\xd9" in last + block:
+            return True
+        last = block[-1:]
+    return False
+
+
+Dtype = Literal["uint8", "uint16", "float32"]
+Kind = Literal["jpeg", "tiff", "png"]
+_WHOLE = 1 << 20
+_END = 1 << 18
+_TIFF_MAGIC = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Header:
+    """The head of one image file."""
+
+    kind: Kind
+    """Format by content, whatever the name says."""
+    width: int
+    """Width in px."""
+    height: int
+    """Height in px."""
+    channels: int
+    """Bands without alpha."""
+    dtype: Dtype
+    """Type of the decoded pixels."""
+    exif: Exif
+    """EXIF tags."""
+    xmp: Xmp
+    """XMP properties."""
+    jpeg: JpegHeader | None = None
+    """The segments, of a JPEG."""
+
+
+def read_header(path: Path) -> Header:
+    """Read the head of an image; raises `UnreadablePhotoError` with the reason, nothing else."""
+    try:
+        with path.open("rb") as file:
+            kind = _kind(file)
+            return {"jpeg": _jpeg, "tiff": _tiff, "png": _png}[kind](file)
+    except UnreadablePhotoError:
+        raise
+    except OSError as error:
+        raise UnreadablePhotoError(f"it cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # tifffile and Pillow raise many kinds on garbage
+        raise UnreadablePhotoError(
+            f"its header is broken ({type(error).__name__}: {error})"
+        ) from error
+
+
+def content_digest(path: Path) -> str:
+    """BLAKE2b of the file (hex); of a JPEG over 1 MiB of its size, first and last 256 KiB.
+
+    Coded pixels shift everything behind a change, so the ends betray it; other formats are hashed
+    whole.
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    with path.open("rb") as file:
+        size = file.seek(0, io.SEEK_END)
+        file.seek(0)
+        if size > _WHOLE and file.read(2) == b"\xff\xd8":
+            file.seek(0)
+            digest.update(str(size).encode() + file.read(_END))
+            file.seek(size - _END)
+        else:
+            file.seek(0)
+        while block := file.read(_WHOLE):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _kind(file: BinaryIO) -> Kind:
+    head = file.read(8)
+    if not head:
+        raise UnreadablePhotoError("it is empty (0 bytes)")
+    if head[:2] == b"\xff\xd8":
+        return "jpeg"
+    if head[:4] in _TIFF_MAGIC:
+        return "tiff"
+    if head == b"\x89PNG\r\n\x1a\n":
+        return "png"
+    raise UnreadablePhotoError("it is neither JPEG, TIFF nor PNG inside, whatever its name says")
+
+
+def _jpeg(file: BinaryIO) -> Header:
+    head = read_jpeg_header(file)
+    if not has_end(file, head.scan_offset):
+        raise UnreadablePhotoError("it is cut off: its JPEG data never end")
+    return Header(
+        kind="jpeg",
+        width=head.width,
+        height=head.height,
+        channels=1 if head.channels == 1 else 3,
+        dtype="uint8",
+        exif=parse_exif(head.exif),
+        xmp=parse_xmp(head.xmp),
+        jpeg=head,
+    )
+
+
+def _tiff(file: BinaryIO) -> Header:
+    import tifffile  # most photos are JPEGs
+
+    exif = read_tiff_tags(file)
+    file.seek(0)
+    with tifffile.TiffFile(file) as tiff:
+        page = tiff.pages[0]
+        if not isinstance(page, tifffile.TiffPage) or page.dtype is None:
+            raise UnreadablePhotoError("it is a TIFF of a kind that cannot be decoded")
+        _check_extent(page, file)
+        packet = page.tags[700].value if 700 in page.tags else b""
+        alpha = sum(int(e) in (1, 2) for e in page.extrasamples)
+        return Header(
+            kind="tiff",
+            width=int(page.imagewidth),
+            height=int(page.imagelength),
+            channels=int(page.samplesperpixel) - alpha,
+            dtype=_stored_as(page.dtype),
+            exif=exif,
+            xmp=parse_xmp((packet,) if isinstance(packet, bytes) and packet else ()),
+        )
+
+
+def _check_extent(page: "tifffile.TiffPage", file: BinaryIO) -> None:
+    need = max(
+        (o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=False)), default=0
+    )
+    have = file.seek(0, io.SEEK_END)
+    if need > have:
+        raise UnreadablePhotoError(
+            f"it is cut off: its pixels need {need} bytes, the file has {have}"
+        )
+
+
+def _stored_as(dtype: "np.dtype[np.generic]") -> Dtype:
+    if dtype == np.uint8:
+        return "uint8"
+    if dtype == np.uint16:
+        return "uint16"
+    if dtype.kind in "iuf":
+        return "float32"
+    raise UnreadablePhotoError(f"its pixels are of type {dtype}; whole or real numbers are needed")
+
+
+def _png(file: BinaryIO) -> Header:
+    file.seek(-12, io.SEEK_END)
+    if b"IEND" not in file.read(12):
+        raise UnreadablePhotoError("it is cut off: its PNG data never end")
+    file.seek(0)
+    with Image.open(file) as image:
+        packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+        packet = packet.encode() if isinstance(packet, str) else packet
+        block = image.info.get("exif") or b""
+        gray = image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
+        return Header(
+            kind="png",
+            width=image.width,
+            height=image.height,
+            channels=1 if gray else 3,
+            dtype="uint16" if image.mode.startswith("I") else "uint8",
+            exif=parse_exif(block.removeprefix(b"Exif\x00\x00")),
+            xmp=parse_xmp((packet,) if packet else ()),
+        )

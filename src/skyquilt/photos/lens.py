@@ -1,0 +1,189 @@
+"""The focal length of a photo, by a camera database and by what the photo itself says."""
+
+import csv
+import math
+import re
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Literal
+
+from skyquilt.model.camera import Camera
+from skyquilt.model.photo import Focal
+from skyquilt.photos import tags as tag
+from skyquilt.photos.tags import Exif
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sensor:
+    """One row of `sensors.csv`."""
+
+    make: str
+    """As in EXIF."""
+    model: str
+    """As in EXIF."""
+    image_width: int | None
+    """Long side in px of the images this row is for; None = all of the model."""
+    width_mm: float
+    """Length of the sensor's long side in mm."""
+    focal_mm: float | None
+    """Focal length of a lens that cannot be changed, in mm; used where EXIF has none."""
+    shutter: Literal["rolling", "global", ""]
+    """`global` stands for mechanical shutters too."""
+    band: Literal["visible", "thermal"]
+    """Spectrum."""
+
+
+def _plain(text: str) -> str:
+    return re.sub(r"[^a-z0-9+]", "", text.lower())
+
+
+def _row(row: dict[str, str]) -> Sensor:
+    return Sensor(
+        make=row["make"],
+        model=row["model"],
+        image_width=int(row["image_width"]) if row["image_width"] else None,
+        width_mm=float(row["sensor_width_mm"]),
+        focal_mm=float(row["focal_mm"]) if row["focal_mm"] else None,
+        shutter=row["shutter"],  # type: ignore[arg-type]
+        band=row["band"],  # type: ignore[arg-type]
+    )
+
+
+@cache
+def _table() -> dict[str, tuple[Sensor, ...]]:
+    text = files("skyquilt.photos").joinpath("sensors.csv").read_text("utf-8")
+    table: dict[str, tuple[Sensor, ...]] = {}
+    for row in map(_row, csv.DictReader(text.splitlines())):
+        table[_plain(row.model)] = (*table.get(_plain(row.model), ()), row)
+    return table
+
+
+def find_sensor(*, model: str, long_side: int) -> Sensor | None:
+    """The row for an EXIF model name and the long side in px of its images as taken; None if
+    unknown.
+
+    A model with rows for several image sizes (a visible and a thermal eye) needs the right size.
+    """
+    rows = _table().get(_plain(model), ())
+    exact = [r for r in rows if r.image_width == long_side]
+    general = [r for r in rows if r.image_width is None]
+    return next(iter(exact + general), None)
+
+
+_DIAGONAL_35MM = math.hypot(36.0, 24.0)
+_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+_PLAUSIBLE = (0.2, 60.0)
+"""A focal length outside these multiples of the long side is a slip of the pen, not a lens."""
+_MOST_ZOOM = 16.0
+_APART = 1.2
+"""Focal lengths that differ by more than this factor contradict each other; 35 mm values are
+rounded.
+"""
+
+
+def native_scale(exif: Exif, width: int, height: int) -> tuple[float, str]:
+    """How many px of the file stand for one px as taken, and a note where the sizes disagree in
+    shape.
+
+    EXIF keeps the size the camera wrote; a reduced copy still carries it. 1.0 where EXIF says
+    nothing.
+    """
+    x, y = exif.number(tag.PIXELS_X), exif.number(tag.PIXELS_Y)
+    if not x or not y or x < 1 or y < 1:
+        return 1.0, ""
+    long, short = max(x, y), min(x, y)
+    scale = max(width, height) / long
+    if abs(min(width, height) / short / scale - 1) > 0.02:
+        return scale, (
+            f"EXIF says {x:.0f}x{y:.0f} px, the file has {width}x{height}: cropped or padded, so"
+            " the focal "
+            "length and any calibration in the metadata are uncertain."
+        )
+    return scale, ""
+
+
+def find_focal(
+    *,
+    exif: Exif,
+    sensor: Sensor | None,
+    calibration: Camera | None,
+    width: int,
+    height: int,
+    thermal: bool = False,
+) -> Focal:
+    """The first of: calibrated, mm on the sensor, focal-plane resolution, 35 mm equivalent, a
+    guess.
+    """
+    candidates = (
+        _calibrated(calibration),
+        _on_sensor(exif, sensor, width, height),
+        _on_plane(exif, width, height),
+        _from_35mm(exif, width, height),
+    )
+    long = max(width, height)
+    for found in candidates:
+        if found and _PLAUSIBLE[0] * long <= found.px <= _PLAUSIBLE[1] * long:
+            return found
+    px, share = (1.15 * width, 0.30) if thermal else (0.85 * long, 0.25)
+    return Focal(px=px, sigma_px=share * px, source="guess")
+
+
+def digital_zoom(exif: Exif) -> float:
+    """By how much the camera enlarged the middle of its image; 1.0 where EXIF says nothing."""
+    zoom = exif.number(tag.ZOOM) or 1.0
+    return zoom if 1.0 < zoom <= _MOST_ZOOM else 1.0
+
+
+def focal_notes(exif: Exif, sensor: Sensor | None, width: int, height: int) -> tuple[str, ...]:
+    """Where EXIF's ways to the focal length disagree, and a digital zoom."""
+    zoom = digital_zoom(exif)
+    zoomed = (
+        f"It was taken with a digital zoom of {zoom:g}; the focal length counts it in."
+        if zoom > 1
+        else ""
+    )
+    direct = _on_sensor(exif, sensor, width, height) or _on_plane(exif, width, height)
+    rounded = _from_35mm(exif, width, height)
+    if direct and rounded and not 1 / _APART < direct.px / rounded.px < _APART:
+        return zoomed, (
+            f"Its focal length in mm means {direct.px:.0f} px, its 35 mm equivalent"
+            f" {rounded.px:.0f} px; "
+            "one of them is wrong."
+        )
+    return (zoomed,)
+
+
+def _calibrated(camera: Camera | None) -> Focal | None:
+    if camera is None:
+        return None
+    sigma = camera.sigmas[0] if camera.sigmas else 0.01 * camera.focal
+    return Focal(px=camera.focal, sigma_px=sigma, source="calibrated")
+
+
+def _on_sensor(exif: Exif, sensor: Sensor | None, width: int, height: int) -> Focal | None:
+    if sensor is None:
+        return None
+    written = exif.number(tag.FOCAL_MM)
+    mm = written or sensor.focal_mm
+    if not mm or mm < 0:
+        return None
+    px = mm / sensor.width_mm * max(width, height) * digital_zoom(exif)
+    return Focal(px=px, sigma_px=(0.02 if written else 0.05) * px, source="sensor")
+
+
+def _on_plane(exif: Exif, width: int, height: int) -> Focal | None:
+    mm, resolution = exif.number(tag.FOCAL_MM), exif.number(tag.PLANE_X)
+    unit = _MM_PER_UNIT.get(int(exif.number(tag.PLANE_UNIT) or 2))
+    if not mm or not resolution or unit is None or mm < 0 or resolution < 0:
+        return None
+    px = mm * resolution / unit * native_scale(exif, width, height)[0] * digital_zoom(exif)
+    return Focal(px=px, sigma_px=0.03 * px, source="focal-plane")
+
+
+def _from_35mm(exif: Exif, width: int, height: int) -> Focal | None:
+    mm = exif.number(tag.FOCAL_35MM)
+    if not mm or mm < 0:
+        return None
+    px = mm / _DIAGONAL_35MM * math.hypot(width, height)
+    return Focal(px=px, sigma_px=0.05 * px, source="35mm")

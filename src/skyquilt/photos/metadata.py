@@ -1,0 +1,283 @@
+"""What a photo says of itself: position, angles, capture time, the program that wrote it.
+
+XMP comes before EXIF, since makers put the better figure there; every height has its datum.
+"""
+
+import math
+import re
+from datetime import UTC, datetime, timedelta, timezone
+
+from skyquilt.geometry.frames import belly_from_gimbal
+from skyquilt.model.photo import Attitude, Datum, GeoPosition
+from skyquilt.photos import tags as tag
+from skyquilt.photos.tags import Exif, Xmp, as_number, as_text
+
+_HEIGHTS = (-500.0, 9500.0)
+_RTK_FLOAT, _RTK_FIXED = 34, 50
+_DRONE_SIGMA = (1.5, 3.0)
+_CAMERA_SIGMA = (5.0, 15.0)
+"""Horizontal and vertical deviation in m where nothing says more; a camera's receiver is no
+autopilot's.
+"""
+
+
+def read_position(exif: Exif, xmp: Xmp) -> tuple[GeoPosition | None, tuple[str, ...]]:
+    """The measured position, or None, with sentences on what was void or insane."""
+    notes: list[str] = []
+    found = _place(_xmp_degrees(xmp), "XMP", notes)
+    source = "xmp"
+    if found is None:
+        found, source = _place(_exif_degrees(exif), "EXIF", notes), "exif"
+    if found is None:
+        return None, tuple(notes or ["It carries no GPS position."])
+    takeoff, sea, ellipsoid = _heights(exif, xmp, notes)
+    sigma_xy, sigma_z = _sigmas(exif, xmp, drone=_flown(xmp))
+    altitude, datum = _best_height(takeoff, sea, ellipsoid)
+    position = GeoPosition(
+        latitude_deg=found[0],
+        longitude_deg=found[1],
+        altitude_m=altitude,
+        datum=datum,
+        sigma_xy_m=sigma_xy,
+        sigma_z_m=sigma_z,
+        source=source,
+        takeoff_m=takeoff,
+        sea_level_m=sea,
+        ellipsoid_m=ellipsoid,
+    )
+    return position, tuple(notes)
+
+
+def why_void(latitude: float | None, longitude: float | None) -> str:
+    """Why a pair of degrees is no position; empty when it is one."""
+    if latitude is None or longitude is None:
+        return "one of latitude and longitude is missing or no number"
+    if latitude == 0 and longitude == 0:
+        return "it is (0, 0), which receivers write without a fix"
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180):
+        return f"({latitude:g}, {longitude:g}) lies outside the globe"
+    return ""
+
+
+def _place(
+    pair: tuple[float | None, float | None] | None, origin: str, notes: list[str]
+) -> tuple[float, float] | None:
+    if pair is None:
+        return None
+    reason = why_void(*pair)
+    if reason:
+        notes.append(f"The GPS position in {origin} is void: {reason}.")
+        return None
+    return pair[0] or 0.0, pair[1] or 0.0
+
+
+def _xmp_degrees(xmp: Xmp) -> tuple[float | None, float | None] | None:
+    """DJI's `GpsLongtitude` is its own spelling; other makers use the same names."""
+    names = ("GpsLatitude",), ("GpsLongitude", "GpsLongtitude")
+    if not any(xmp.text(*n) for n in names):
+        return None
+    return xmp.number(*names[0]), xmp.number(*names[1])
+
+
+def _exif_degrees(exif: Exif) -> tuple[float | None, float | None] | None:
+    if tag.GPS_LAT not in exif.gps and tag.GPS_LON not in exif.gps:
+        return None
+    latitude = _sexagesimal(exif.gps.get(tag.GPS_LAT), as_text(exif.gps.get(tag.GPS_LAT_REF)))
+    longitude = _sexagesimal(exif.gps.get(tag.GPS_LON), as_text(exif.gps.get(tag.GPS_LON_REF)))
+    return latitude, longitude
+
+
+def _sexagesimal(value: object, reference: str) -> float | None:
+    parts = list(value) if isinstance(value, (tuple, list)) else [value]
+    numbers = [as_number(part) for part in parts[:3]]
+    if not numbers or numbers[0] is None:
+        return None
+    degrees = sum((n or 0.0) / 60**i for i, n in enumerate(numbers))
+    if any(n is None for n in numbers) or not math.isfinite(degrees):
+        return None
+    return float(-degrees if reference.upper()[:1] in ("S", "W") else degrees)
+
+
+def _heights(
+    exif: Exif, xmp: Xmp, notes: list[str]
+) -> tuple[float | None, float | None, float | None]:
+    """Heights above take-off, sea level and the ellipsoid in m."""
+    written = as_number(exif.gps.get(tag.GPS_ALT))
+    if written is not None and as_number(exif.gps.get(tag.GPS_ALT_REF)) == 1:
+        written = -written
+    absolute = xmp.number("AbsoluteAltitude")
+    absolute = _sane(absolute if absolute is not None else written, "altitude", notes)
+    takeoff = _sane(xmp.number("RelativeAltitude"), "height above take-off", notes)
+    if _is_rtk(xmp):
+        return takeoff, None, absolute
+    return takeoff, absolute, None
+
+
+def _sane(height: float | None, what: str, notes: list[str]) -> float | None:
+    if height is None or _HEIGHTS[0] <= height <= _HEIGHTS[1]:
+        return height
+    notes.append(f"The {what} of {height:g} m is no flying height on this planet and was ignored.")
+    return None
+
+
+def _flown(xmp: Xmp) -> bool:
+    """Whether an autopilot wrote the metadata."""
+    return any(key.startswith(("drone-", "Camera:")) for key in xmp.values)
+
+
+def _is_rtk(xmp: Xmp) -> bool:
+    flag = xmp.number("RtkFlag")
+    return flag in (_RTK_FLOAT, _RTK_FIXED) or xmp.text("AltitudeType") == "RtkAlt"
+
+
+def _best_height(
+    takeoff: float | None, sea: float | None, ellipsoid: float | None
+) -> tuple[float | None, Datum]:
+    """RTK's ellipsoid height, else take-off (a barometer, steady over a flight), else sea level."""
+    if ellipsoid is not None:
+        return ellipsoid, "ellipsoid"
+    if takeoff is not None:
+        return takeoff, "takeoff"
+    return sea, "sea_level" if sea is not None else "unknown"
+
+
+def _sigmas(exif: Exif, xmp: Xmp, *, drone: bool) -> tuple[float, float]:
+    """Horizontal and vertical standard deviation in m: RTK's own, an accuracy tag, or what is
+    usual.
+    """
+    xy, z = _DRONE_SIGMA if drone else _CAMERA_SIGMA
+    error = as_number(exif.gps.get(tag.GPS_ERROR))
+    xy = xmp.number("Camera:GPSXYAccuracy", "GPSXYAccuracy") or error or xy
+    z = xmp.number("Camera:GPSZAccuracy", "GPSZAccuracy") or z
+    if xmp.number("RtkFlag") in (_RTK_FLOAT, _RTK_FIXED):
+        east, north, up = (xmp.number(f"RtkStd{axis}") for axis in ("Lon", "Lat", "Hgt"))
+        xy = max(east or 0.0, north or 0.0) or xy
+        z = up or z
+    return max(xy, 0.01), max(z, 0.01)
+
+
+_GIMBAL = (
+    ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"),
+    ("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree"),
+)
+_LOOKS_DOWN_AT_MINUS_90 = -45.0
+
+
+def read_attitude(xmp: Xmp) -> tuple[Attitude | None, tuple[str, ...]]:
+    """Belly angles, or None, with sentences on what is missing.
+
+    `Gimbal*Degree` (DJI, Autel) and `drone-parrot:Camera*Degree` are gimbal angles (pitch -90 =
+    nadir). Pix4D's `Camera:Yaw/Pitch/Roll` (senseFly, Parrot Sequoia, MicaSense) count as belly
+    angles do: pitch 0 = nadir. Some write -90 there for nadir, and are taken so: no survey looks
+    backwards to the horizon.
+    """
+    for names in _GIMBAL:
+        yaw, pitch, roll = (xmp.number(name) for name in names)
+        if yaw is not None:
+            return _from_gimbal(yaw, pitch, roll, "xmp-gimbal")
+    yaw, pitch, roll = (xmp.number(f"Camera:{a}") for a in ("Yaw", "Pitch", "Roll"))
+    if yaw is None:
+        return None, ("It carries no camera angles.",)
+    if pitch is not None and pitch < _LOOKS_DOWN_AT_MINUS_90:
+        return _from_gimbal(yaw, pitch, roll, "xmp-camera")
+    attitude = Attitude(
+        yaw_deg=yaw, pitch_deg=pitch or 0.0, roll_deg=roll or 0.0, source="xmp-camera"
+    )
+    return attitude, ()
+
+
+def read_flight_yaw(xmp: Xmp) -> float | None:
+    """Heading of the aircraft in degrees clockwise from north; None where it is not given."""
+    return xmp.number("FlightYawDegree", "DroneYawDegree")
+
+
+def _from_gimbal(
+    yaw: float, pitch: float | None, roll: float | None, source: str
+) -> tuple[Attitude, tuple[str, ...]]:
+    notes = (
+        ()
+        if pitch is not None
+        else ("It gives a gimbal yaw but no pitch; straight down is assumed.",)
+    )
+    belly = belly_from_gimbal(yaw, -90.0 if pitch is None else pitch, roll or 0.0)
+    attitude = Attitude(yaw_deg=belly[0], pitch_deg=belly[1], roll_deg=belly[2], source=source)
+    return attitude, notes
+
+
+_MOMENT = re.compile(
+    r"(\d{4})[:\-/.](\d\d)[:\-/.](\d\d)[ T](\d\d):(\d\d):(\d\d)(\.\d+)?\s*(Z|[+-]\d\d:?\d\d)?"
+)
+
+
+def read_time(exif: Exif, xmp: Xmp) -> datetime | None:
+    """EXIF DateTimeOriginal with sub-seconds and offset, else the GPS clock (UTC), else XMP; None
+    if none.
+    """
+    moment = parse_moment(exif.text(tag.TAKEN), exif.text(tag.SUBSEC), exif.text(tag.OFFSET))
+    if moment is None:
+        moment = _gps_time(exif)
+    if moment is None:
+        moment = parse_moment(
+            xmp.text("exif:DateTimeOriginal", "xmp:CreateDate", "photoshop:DateCreated")
+        )
+    return moment or parse_moment(exif.text(tag.MODIFIED))
+
+
+def modified_time(exif: Exif) -> datetime | None:
+    """EXIF DateTime: when the file was last written by something that says so."""
+    return parse_moment(exif.text(tag.MODIFIED))
+
+
+def parse_moment(text: str, subseconds: str = "", offset: str = "") -> datetime | None:
+    """`2016:06:23 16:31:59` (also ISO 8601) with sub-seconds and `+02:00` inside or apart; else
+    None.
+    """
+    found = _MOMENT.match(text.strip())
+    if not found:
+        return None
+    fraction = found[7] or (f".{subseconds}" if subseconds.isdigit() else "")
+    try:
+        moment = datetime(*(int(found[i]) for i in range(1, 7)))  # type: ignore[arg-type]
+        moment += timedelta(seconds=float(fraction or 0))
+        return moment.replace(tzinfo=_zone(found[8] or offset))
+    except (ValueError, OverflowError):
+        return None
+
+
+def _zone(text: str) -> timezone | None:
+    found = re.fullmatch(r"([+-])(\d\d):?(\d\d)", text.strip())
+    if not found:
+        return UTC if text.strip() == "Z" else None
+    away = timedelta(hours=int(found[2]), minutes=int(found[3]))
+    return timezone(-away if found[1] == "-" else away)
+
+
+def _gps_time(exif: Exif) -> datetime | None:
+    clock = exif.gps.get(tag.GPS_TIME)
+    parts = [as_number(p) for p in clock] if isinstance(clock, (tuple, list)) else []
+    day = parse_moment(as_text(exif.gps.get(tag.GPS_DATE)) + " 00:00:00")
+    if day is None or len(parts) != 3 or None in parts:
+        return None
+    hours, minutes, seconds = (p or 0.0 for p in parts)
+    try:
+        return (day + timedelta(hours=hours, minutes=minutes, seconds=seconds)).replace(tzinfo=UTC)
+    except OverflowError:
+        return None
+
+
+_PROGRAMS = re.compile(
+    r"photo ?viewer|photoshop|lightroom|camera"
+    r" raw|adobe|gimp|paint|microsoft|windows|picasa|snapseed|acdsee|"
+    r"xnview|irfanview|faststone|imagemagick|graphicsmagick|darktable|rawtherapee|capture"
+    r" one|affinity|"
+    r"pixelmator|digikam|gthumb|shotwell|photos \d|preview|mac"
+    r" os|macos|luminar|dxo|corel|photoscape|"
+    r"google|instagram|pix4d|agisoft|metashape|opencv|matlab|ffmpeg|dji photo|silkypix|topaz",
+    re.IGNORECASE,
+)
+
+
+def find_editor(exif: Exif, xmp: Xmp) -> str | None:
+    """The program that EXIF or XMP names, if it is no camera's firmware; else None."""
+    named = (exif.text(tag.SOFTWARE), xmp.text("xmp:CreatorTool"), xmp.text("softwareAgent"))
+    return next((name for name in named if _PROGRAMS.search(name)), None)

@@ -1,1 +1,0 @@
-"""Stories: the only place where stages meet."""

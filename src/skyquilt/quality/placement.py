@@ -1,0 +1,169 @@
+"""The quality function of the thesis, for any method: lambda, its two parts, and the graphs beside
+them (Y 6.1).
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.engine.clock import Steps
+from skyquilt.imaging.plane import view_patch
+from skyquilt.imaging.views import View, on_ground
+from skyquilt.model.photo import KnownDistance, PointObservation
+from skyquilt.model.poses import Alignment, Prior
+from skyquilt.ortho.orthomosaic import Ground
+from skyquilt.quality.geolocation import geolocation_errors
+from skyquilt.quality.replay import (
+    Replay,
+    lambda_corr,
+    lambda_quality,
+    lambda_spat,
+    lambda_spat_of_table,
+    replay,
+)
+from skyquilt.workflows.photo_features import Intake, Pictures
+
+ACROSS = 400
+"""Width in px of the photos that are compared: the thesis's scale."""
+
+
+def judge(
+    taken: Intake,
+    alignment: Alignment,
+    priors: Sequence[Prior],
+    ground: Ground,
+    pictures: Pictures,
+    known: Sequence[KnownDistance],
+    alpha: float,
+    order: Sequence[int],
+) -> Steps[dict[str, Any]]:
+    """Replays the placements in the order given at one ground resolution, and measures known
+    distances.
+    """
+    yield 0, 1
+    views = {v.photo: v for v in ground.views}
+    order = tuple(i for i in order if i in views)
+    wide = max(view.camera.width for view in ground.views)
+    gsd = ground.native_gsd * wide / ACROSS
+    seen = replay(view_patch(pictures(i, ACROSS), views[i], ground.surface, gsd) for i in order)
+    off = np.array([np.hypot(*(alignment.poses[i].map_C - priors[i].map_C)[:2]) for i in order])
+    figures = _figures(seen, taken, views, ground, known, alpha) | _geolocation(
+        alignment, priors, order
+    )
+    off = off / (ground.native_gsd * wide)
+    figures |= _joins(alignment) | {
+        "photos": [taken.photos[i].name for i in order],
+        "correlation_with_last_of_photo": [_short(c) for c in seen.with_last],
+        "correlation_with_map_of_photo": [_short(c) for c in seen.with_overview],
+        "off_position_over_width": [_short(o) for o in off],
+    }
+    yield 1, 1
+    return figures
+
+
+def _figures(
+    seen: Replay,
+    taken: Intake,
+    views: dict[int, View],
+    ground: Ground,
+    known: Sequence[KnownDistance],
+    alpha: float,
+) -> dict[str, Any]:
+    corr = lambda_corr(seen.with_overview)
+    out: dict[str, Any] = {
+        "alpha": alpha,
+        "lambda_corr": _short(corr),
+        "lambda_spat": None,
+        "lambda_spat_of_table": None,
+        "lambda": None,
+        "correlation_with_last": _mean(seen.with_last),
+    }
+    rows, actual, found = [], [], []
+    index = {p.name: i for i, p in enumerate(taken.photos)}
+    for distance in known:
+        ends = [
+            _place(o, index, views, ground)
+            for o in (distance.observations_a, distance.observations_b)
+        ]
+        there = [e for e in ends if e is not None]
+        metres = float(np.linalg.norm((there[0] - there[1])[:2])) if len(there) == 2 else None
+        rows.append(
+            {"a": distance.a, "b": distance.b, "metres": distance.metres, "on_map": _short(metres)}
+        )
+        if metres is not None:
+            actual.append(distance.metres)
+            found.append(metres)
+    if actual:
+        spat = lambda_spat(actual, found)
+        out |= {
+            "lambda_spat": _short(spat),
+            "lambda_spat_of_table": _short(lambda_spat_of_table(actual, found)),
+            "lambda": _short(lambda_quality(spat, corr, alpha=alpha)),
+        }
+    return out | ({"distances": rows} if rows else {})
+
+
+def _place(
+    sightings: Sequence[PointObservation],
+    index: dict[str, int],
+    views: dict[int, View],
+    ground: Ground,
+) -> NDArray[np.float64] | None:
+    """Where the map shows a point: by the sighting that looks most steeply down, whose photo wins
+    there.
+    """
+    best, place = np.inf, None
+    for sighting in sightings:
+        view = views.get(index.get(sighting.photo, -1))
+        if view is None:
+            continue
+        xyz = on_ground(view, np.array([[sighting.x, sighting.y]]), ground.surface)[0]
+        off = xyz - view.pose.map_C
+        score = float(np.hypot(*off[:2]) / max(abs(off[2]), 1e-6))
+        if score < best:
+            best, place = score, xyz
+    return place
+
+
+def _geolocation(
+    alignment: Alignment, priors: Sequence[Prior], order: Sequence[int]
+) -> dict[str, Any]:
+    """MAE and RMS per axis at the photos' centres against their reported positions (A Table 2)."""
+    if alignment.frame.crs is None or not order:
+        return {}
+    errors = geolocation_errors(
+        np.array([alignment.poses[i].map_C for i in order]),
+        np.array([priors[i].map_C for i in order]),
+    )
+    axes = ("x", "y", "z")
+    return {
+        "geolocation_mae_m": {a: _short(v) for a, v in zip(axes, errors.mae_m, strict=True)},
+        "geolocation_rms_m": {a: _short(v) for a, v in zip(axes, errors.rms_m, strict=True)},
+    }
+
+
+def _joins(alignment: Alignment) -> dict[str, Any]:
+    """STE per inlier (A 15) over the registrations of a method that has them, px^2 of the working
+    image.
+    """
+    ste = np.array([j.ste_px2 for j in alignment.joins])
+    ste = ste[np.isfinite(ste)]
+    if not len(ste):
+        return {}
+    return {
+        "ste_per_inlier_px2": {
+            "median": _short(float(np.median(ste))),
+            "worst": _short(float(ste.max())),
+        }
+    }
+
+
+def _mean(values: NDArray[np.float64]) -> float | None:
+    known = values[np.isfinite(values)]
+    return _short(float(known.mean())) if len(known) else None
+
+
+def _short(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else round(value, 4)

@@ -1,0 +1,161 @@
+"""How good the result is, in figures: everything that goes into metrics.json but times."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.model.camera import PARAMETERS
+from skyquilt.model.event import MetadataConflict
+from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.model.poses import Alignment, Prior
+from skyquilt.ortho.orthomosaic import Drawn, Ground
+from skyquilt.quality.geolocation import gps_residuals
+from skyquilt.workflows.links import Links
+
+
+def _round(value: float | None, digits: int = 4) -> float | None:
+    return None if value is None or not np.isfinite(value) else round(float(value), digits)
+
+
+def xyz(values: Sequence[float] | NDArray[Any] | None) -> dict[str, float | None] | None:
+    """Three figures by axis."""
+    if values is None or not np.isfinite(np.asarray(values, float)).any():
+        return None
+    return {axis: _round(v) for axis, v in zip("xyz", values, strict=True)}
+
+
+def _rms(values: NDArray[np.float64]) -> float:
+    """NaN for none."""
+    return float(np.sqrt((values**2).mean())) if len(values) else np.nan
+
+
+def alignment_figures(alignment: Alignment, priors: Sequence[Prior]) -> dict[str, Any]:
+    """Blocks, residuals, calibration, control."""
+    error = np.linalg.norm(alignment.ties.residual_px, axis=1)
+    rms_px = float(np.sqrt((error**2).mean())) if len(error) else None
+    residual = gps_residuals(alignment, priors) if alignment.frame.crs else np.zeros((0, 3))
+    rms = [_rms(axis[np.isfinite(axis)]) for axis in residual.T]
+    loo = alignment.loo_rms_m if alignment.frame.crs else None
+    return {
+        "blocks": [len(b) for b in alignment.blocks],
+        "gps_residual_rms_m": xyz(rms),
+        "gps_leave_one_out_rms_m": xyz(
+            np.where(np.isfinite(rms), loo, np.nan) if loo is not None else None
+        ),
+        "reprojection_error_px": {"mean": _round(error.mean()), "rms": _round(rms_px)}
+        if len(error)
+        else None,
+        "tie_points": len(alignment.ties.xyz),
+        "sightings": len(alignment.ties.point),
+        **control_figures(alignment),
+    }
+
+
+def control_figures(alignment: Alignment) -> dict[str, Any]:
+    """Control and check points.
+
+    Where heights count from the take-off point (or nobody knows), and no control point ties them to
+    the survey's, both differ by a constant: the median, told apart from the errors.
+    """
+    points = alignment.control
+    dz = np.array([c.error_m[2] for c in points], float)
+    tied = alignment.frame.vertical_datum not in ("takeoff", "unknown") or any(
+        not c.check for c in points
+    )
+    offset = 0.0 if tied or not np.isfinite(dz).any() else float(np.nanmedian(dz))
+    rows = [
+        {
+            "name": c.name,
+            "check": c.check,
+            "dx_m": _round(c.error_m[0]),
+            "dy_m": _round(c.error_m[1]),
+            "dz_m": _round(z - offset),
+            "reprojection_px": _round(c.reprojection_px),
+            "sightings": c.sightings,
+        }
+        for c, z in zip(points, dz, strict=True)
+    ]
+    return {"control": rows, "control_height_offset_m": _round(offset) if points else None}
+
+
+def camera_figures(photos: Sequence[Photo], alignment: Alignment) -> dict[str, Any]:
+    """Intrinsics with deviations and what the metadata said of the focal length."""
+    out: dict[str, Any] = {}
+    for i in sorted(alignment.poses):
+        key = alignment.camera_of[i]
+        if key in out:
+            continue
+        camera, focal = alignment.cameras[key], photos[i].focal
+        sigmas = camera.sigmas or (None,) * len(PARAMETERS)
+        out[key] = {
+            name: {"value": _round(value, 6), "sigma": _round(sigma, 6)}
+            for name, value, sigma in zip(PARAMETERS, camera.vector, sigmas, strict=True)
+        }
+        out[key]["focal"] |= {
+            "prior": _round(focal.px, 2),
+            "prior_sigma": _round(focal.sigma_px, 2),
+            "source": focal.source,
+        }
+    return out
+
+
+def figures(
+    *,
+    photos: Sequence[Photo],
+    total: int,
+    rejected: Sequence[RejectedPhoto],
+    priors: Sequence[Prior],
+    links: Links,
+    alignment: Alignment,
+    ground: Ground,
+    drawn: Drawn,
+    seams: Mapping[str, Any],
+    conflicts: Sequence[MetadataConflict],
+    notes: Sequence[str],
+) -> dict[str, Any]:
+    """The figures of a run, without times."""
+    seen = drawn.views > 0
+    cell = drawn.views_grid.gsd**2
+    return {
+        "method": alignment.method,
+        "why": alignment.why,
+        "photos_total": total,
+        "photos_used": len(ground.views),
+        "photos_rejected": {r.name: r.reason for r in rejected},
+        "gsd_m": ground.grid.gsd,
+        "native_gsd_m": _round(ground.native_gsd, 5),
+        "crs": alignment.frame.crs,
+        "georeferenced": alignment.frame.crs is not None,
+        "vertical_datum": alignment.frame.vertical_datum,
+        "size_px": [ground.grid.width, ground.grid.height],
+        "area_m2": _round(float(seen.sum()) * cell, 1),
+        **_holes(seen, cell),
+        "views_per_cell_mean": _round(float(drawn.views[seen].mean()) if seen.any() else None, 2),
+        **alignment_figures(alignment, priors),
+        "links": len(links.links),
+        "pairs_rejected": _reasons([r.reason for r in links.rejected]),
+        "seam_disparity_px": seams,
+        "metadata_conflicts": [asdict(c) for c in conflicts],
+        "cameras": camera_figures(photos, alignment),
+        "notes": list(notes),
+    }
+
+
+def _holes(seen: NDArray[np.bool_], cell_m2: float) -> dict[str, float]:
+    """Places inside the map that no photo shows: how many, and their area in m2."""
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(
+        np.pad(~seen, 1, constant_values=True).astype(np.uint8), connectivity=4
+    )
+    outside = labels[0, 0]
+    sizes = [int(stats[k, cv2.CC_STAT_AREA]) for k in range(1, count) if k != outside]
+    return {"holes": len(sizes), "holes_m2": round(sum(sizes) * cell_m2, 1)}
+
+
+def _reasons(reasons: Sequence[str]) -> dict[str, int]:
+    """How often each reason occurs, details in brackets left out."""
+    short = [r.split(" (")[0] for r in reasons]
+    return {r: short.count(r) for r in sorted(set(short))}

@@ -1,0 +1,138 @@
+"""Seam disparity: how far two photos disagree about the ground where the mosaic changes between
+them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.imaging.gradients import NOISE, has_texture
+from skyquilt.imaging.registration import RADIUS, shifts_between
+from skyquilt.quality.seam_points import SeamPoint
+
+LEAST_MEASURED = 0.6
+"""Share of the attempted points that must be measured for the figures to stand."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PatchPairs:
+    """What two photos show around each of n points, each orthorectified at the native
+    resolution.
+    """
+
+    a: NDArray[np.float32]
+    """(n, S, S) grey patches of the points' first photos; S about 64."""
+    b: NDArray[np.float32]
+    """(n, S, S) of their second photos, on the same ground."""
+    seen: NDArray[np.bool_]
+    """(n,) whether both photos see the whole patch."""
+
+
+class PatchSource(Protocol):
+    """Whoever can orthorectify: cuts both photos' patches around points of a seam."""
+
+    def __call__(self, points: Sequence[SeamPoint], /) -> PatchPairs:
+        """The patches, centred on the points, in their order."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeamSample:
+    """One attempted point."""
+
+    row: float
+    """Row in the label raster."""
+    column: float
+    """Column in the label raster."""
+    a: int
+    """Label on one side."""
+    b: int
+    """Label on the other."""
+    dx: float
+    """Displacement of b's patch against a's in native px, east."""
+    dy: float
+    """Displacement of b's patch against a's in native px, south."""
+    ok: bool
+    """False: no trustworthy displacement was found."""
+    reason: str
+    """Why not; empty if it was."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SeamReport:
+    """Seam disparity of a mosaic; the figures are None where nothing was measured."""
+
+    median_px: float | None
+    """Median displacement in px of the native ground resolution."""
+    p95_px: float | None
+    """95th percentile in px."""
+    median_cm: float | None
+    """Median in cm on the ground."""
+    p95_cm: float | None
+    """95th percentile in cm."""
+    measured: int
+    """Points with a trustworthy displacement."""
+    attempted: int
+    """Points whose patches both photos see whole and with texture."""
+    samples: tuple[SeamSample, ...]
+    """All attempted points."""
+
+    @property
+    def stands(self) -> bool:
+        """Whether enough of the attempted points were measured for the figures to be believed."""
+        return self.measured > 0 and self.measured >= LEAST_MEASURED * self.attempted
+
+
+def seam_disparity(
+    points: Sequence[SeamPoint],
+    patches: PatchSource,
+    *,
+    gsd_m: float,
+    radius: int = RADIUS,
+    noise: float = NOISE,
+) -> SeamReport:
+    """Measures the displacement at points of seams.
+
+    `gsd_m` is the ground size of a patch's pixel in m, `radius` the largest displacement looked for
+    in px and `noise` the standard deviation of a value in the patches' unit. A weak summit is a
+    failure, not absent: it counts as attempted.
+    """
+    if not points:
+        return _report([], gsd_m)
+    pairs = patches(points)
+    attempt = np.flatnonzero(pairs.seen)
+    attempt = attempt[
+        has_texture(pairs.a[attempt], noise=noise) & has_texture(pairs.b[attempt], noise=noise)
+    ]
+    shifts = shifts_between(pairs.a[attempt], pairs.b[attempt], radius=radius)
+    samples = [
+        SeamSample(
+            row=points[k].row,
+            column=points[k].column,
+            a=points[k].a,
+            b=points[k].b,
+            dx=shift.dx,
+            dy=shift.dy,
+            ok=shift.ok,
+            reason=shift.reason,
+        )
+        for k, shift in zip(attempt.tolist(), shifts, strict=True)
+    ]
+    return _report(samples, gsd_m)
+
+
+def _report(samples: list[SeamSample], gsd_m: float) -> SeamReport:
+    """Figures of the samples."""
+    length = np.array([np.hypot(s.dx, s.dy) for s in samples if s.ok])
+    median, p95 = np.percentile(length, [50, 95]).tolist() if length.size else (None, None)
+    return SeamReport(
+        median_px=median,
+        p95_px=p95,
+        median_cm=None if median is None else median * gsd_m * 100,
+        p95_cm=None if p95 is None else p95 * gsd_m * 100,
+        measured=len(length),
+        attempted=len(samples),
+        samples=tuple(samples),
+    )

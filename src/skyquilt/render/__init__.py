@@ -1,1 +1,0 @@
-"""Stage: poses, surface and photos -> map pixels."""

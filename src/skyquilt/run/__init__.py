@@ -1,1 +1,0 @@
-"""How it runs: store, pixel cache, journal, executor."""

@@ -1,0 +1,91 @@
+"""The server's addresses. It reads what the mapping has written and hands in what clients send;
+poses are not its business.
+"""
+
+from pathlib import Path
+
+from fastapi import FastAPI, Response
+from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
+from fastapi.staticfiles import StaticFiles
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from skyquilt import __version__
+from skyquilt.server.event_endpoints import Listening
+from skyquilt.server.gate import Gate, Writer
+from skyquilt.server.guard import HEADERS, Guard
+from skyquilt.server.images import Images
+from skyquilt.server.layer_endpoints import Overlays
+from skyquilt.server.map_endpoints import STATIC, Maps
+from skyquilt.server.photo_endpoints import PhotoList
+from skyquilt.server.survey import Survey
+from skyquilt.server.upload_endpoints import Receiving
+from skyquilt.server.wms_endpoints import WmsService
+
+
+def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) -> FastAPI:
+    """The application."""
+    app = FastAPI(
+        title="Skyquilt",
+        version=__version__,
+        docs_url=None,
+        redoc_url=None,
+        description="A map that grows while drones fly: tiles, WMS, photos, layers, news.",
+    )
+    gate, images = Gate(survey, guard, writer, folder), Images(survey)
+    maps, wms, listed = Maps(gate, images), WmsService(gate, images), PhotoList(gate)
+    received, layers, news = Receiving(gate), Overlays(gate), Listening(gate)
+    app.state.ending = news.ending
+
+    get, post = {"methods": ["GET"]}, {"methods": ["POST"]}
+    for path, work, options in (
+        ("/", maps.page, {**get, "include_in_schema": False}),
+        ("/info", maps.info, get),
+        ("/tiles/{z}/{x}/{y}", maps.tile, {**get, "response_class": Response}),
+        ("/tiles.json", maps.tilejson, get),
+        ("/wms", wms.wms, {**get, "response_class": Response}),
+        ("/export", maps.export, {**get, "response_class": FileResponse}),
+        ("/photos", listed.photos, get),
+        ("/photos", received.upload, post),
+        ("/photos/uploads", received.upload_begin, post),
+        ("/photos/uploads/{number}", received.upload_state, {"methods": ["HEAD"]}),
+        ("/photos/uploads/{number}", received.upload_part, {"methods": ["PATCH"]}),
+        ("/photos/{number}", listed.photo, get),
+        ("/photos/{number}/file", listed.photo_file, {**get, "response_class": FileResponse}),
+        ("/layers", layers.layer_list, get),
+        ("/layers", layers.layer_post, post),
+        ("/layers/{name}", layers.layer_get, {**get, "response_class": Response}),
+        ("/layers/{name}", layers.layer_delete, {"methods": ["DELETE"]}),
+        ("/events", news.events, {**get, "response_class": StreamingResponse}),
+        ("/finish", layers.finish, post),
+    ):
+        app.add_api_route(path, work, **options)
+    app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    app.add_middleware(Guarded, guard=guard)
+    return app
+
+
+class Guarded:
+    """Every request is meant for this server, every answer carries the headers."""
+
+    def __init__(self, app: ASGIApp, guard: Guard) -> None:
+        self.app, self.guard = app, guard
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        if self.guard.knows(Headers(scope=scope).get("host", "")):
+            await self.app(scope, receive, with_headers)
+            return
+        refused = JSONResponse({"detail": "this server answers to localhost only"}, 421)
+        await refused(scope, receive, with_headers)

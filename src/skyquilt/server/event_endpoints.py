@@ -1,0 +1,72 @@
+"""News for those who look on, as server-sent events."""
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator
+
+from fastapi import Request
+from fastapi.responses import StreamingResponse
+
+from skyquilt import __version__
+from skyquilt.server.gate import Gate
+from skyquilt.server.survey import LiveSurvey
+
+WAIT_S = 0.1
+"""Between looks for news at most."""
+LISTEN_S = 0.02
+"""Between looks whether there may be any."""
+KEEP_ALIVE_S = 15.0
+"""A comment is sent to quiet listeners so often, so that the connection is known to live."""
+
+
+class Listening:
+    """The address of news."""
+
+    def __init__(self, gate: Gate) -> None:
+        self.gate = gate
+        self.ending = threading.Event()
+
+    async def events(self, request: Request, after: int | None = None) -> StreamingResponse:
+        """Server-sent events: photo, tiles, layer, note, refused, finish; `Last-Event-ID` or
+        `after` take them up.
+        """
+        said = request.headers.get("last-event-id", "")
+        start = (
+            int(said)
+            if said.isdigit()
+            else after
+            if after is not None
+            else self.gate.survey.version()
+        )
+        return StreamingResponse(
+            self._news(request, start),
+            media_type="text/event-stream",
+            headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
+        )
+
+    async def _news(self, request: Request, last: int) -> AsyncIterator[str]:
+        yield f": skyquilt {__version__}\nretry: 1000\n\n"
+        quiet = 0.0
+        while not self.ending.is_set() and not await request.is_disconnected():
+            told = (
+                self.gate.survey.ledger.told(last)
+                if isinstance(self.gate.survey, LiveSurvey)
+                else []
+            )
+            for number, kind, body in told:
+                yield f"id: {number}\nevent: {kind}\ndata: {body}\n\n"
+                last = number
+            quiet = 0.0 if told else quiet + WAIT_S
+            if quiet >= KEEP_ALIVE_S:
+                quiet = 0.0
+                yield ": still here\n\n"
+            if len(told) < 100:
+                await self._pause()
+
+    async def _pause(self) -> None:
+        """Until there may be news."""
+        known = self.gate.survey.stamp()
+        for _ in range(round(WAIT_S / LISTEN_S)):
+            await asyncio.sleep(LISTEN_S)
+            if self.gate.survey.stamp() != known:
+                return

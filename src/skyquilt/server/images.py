@@ -1,0 +1,157 @@
+"""Map pictures as bytes, kept until what they show changes."""
+
+import hashlib
+import json
+import threading
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import imagecodecs
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.raster.map_source import MERCATOR, Bounds, MapSource, between, mercator, picture
+from skyquilt.server.survey import LiveSurvey, Survey
+
+KEPT = 3000
+"""Tiles kept in memory."""
+TILE = 256
+"""Pixels of a web tile's side."""
+
+
+def image_bytes(rgba: NDArray[np.uint8], form: str, *, transparent: bool = True) -> bytes:
+    """RGBA (h, w, 4) as PNG, WebP or JPEG; without transparency on white."""
+    if not transparent or form == "image/jpeg":
+        alpha = rgba[..., 3:].astype(np.uint16)
+        rgb = ((rgba[..., :3] * alpha + 255 * (255 - alpha)) // 255).astype(np.uint8)
+        picture_, bgr = rgb, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    else:
+        picture_, bgr = rgba, cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA)
+    if form == "image/webp":  # the codec's quickest way takes a third of the time of its usual one
+        return bytes(imagecodecs.webp_encode(np.ascontiguousarray(picture_), level=80, method=0))
+    options = {
+        "image/png": (".png", [cv2.IMWRITE_PNG_COMPRESSION, 1]),
+        "image/jpeg": (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 85]),
+    }
+    ending, settings = options[form]
+    good, data = cv2.imencode(ending, bgr, settings)
+    if not good:
+        raise ValueError(f"a picture of {picture_.shape} cannot be written as {form}")
+    return data.tobytes()
+
+
+@dataclass(frozen=True, kw_only=True)
+class WebTile:
+    """A web tile, as it is sent."""
+
+    data: bytes | None
+    """WebP; None where the map has nothing."""
+
+    @cached_property
+    def tag(self) -> str:
+        """What browsers know its content by (ETag)."""
+        return f'"{hashlib.blake2b(self.data or b"", digest_size=8).hexdigest()}"'
+
+
+class Images:
+    """Web tiles of a survey."""
+
+    def __init__(self, survey: Survey) -> None:
+        self.survey = survey
+        self._kept: OrderedDict[tuple[str, int, int, int], WebTile] = OrderedDict()
+        self._lock = threading.Lock()
+        self._known, self._stamp = survey.version(), survey.stamp()
+        self._scales: dict[str, tuple[int, tuple[float, float]]] = {}
+
+    def kept(self, layer: str, z: int, x: int, y: int) -> WebTile | None:
+        """A web tile that is at hand and shows the map as it is; None where it would have to be
+        drawn.
+        """
+        self._forget_changed()
+        key = (layer, z, x, y)
+        with self._lock:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+            return self._kept.get(key)
+
+    def tile(self, layer: str, z: int, x: int, y: int) -> WebTile:
+        """A web tile."""
+        if (found := self.kept(layer, z, x, y)) is not None:
+            return found
+        before = self._known
+        source = self.survey.layers()[layer]
+        rgba = picture(
+            source, "EPSG:3857", mercator(z, x, y), TILE, TILE, self.scale(layer, source)
+        )
+        made = WebTile(data=None if rgba is None else image_bytes(rgba, "image/webp"))
+        with self._lock:
+            if self._known == before:  # else it may have changed while it was drawn
+                self._kept[layer, z, x, y] = made
+                while len(self._kept) > KEPT:
+                    self._kept.popitem(last=False)
+        return made
+
+    def scale(self, layer: str, source: MapSource) -> tuple[float, float] | None:
+        """Values shown as black and as white: the 2nd and 98th percentile of a measured layer,
+        renewed as it grows.
+        """
+        if not layer.startswith("thermal") and layer not in ("mosaic", "finished"):
+            return None
+        version = self.survey.version()
+        known = self._scales.get(layer)
+        if known is not None and version - known[0] < 50:
+            return known[1]
+        bounds = source.bounds()
+        part = (
+            None
+            if bounds is None
+            else source.part(bounds, max(bounds[2] - bounds[0], bounds[3] - bounds[1]) / 512)
+        )
+        if part is None or part.pixels.dtype == np.uint8 or not part.shown.any():
+            return None
+        low, high = np.percentile(part.pixels[..., 0][part.shown], [2, 98])
+        self._scales[layer] = (version, (float(low), float(high)))
+        return float(low), float(high)
+
+    def _forget_changed(self) -> None:
+        """Drops tiles that show what was drawn anew since the last look."""
+        survey, stamp = self.survey, self.survey.stamp()
+        if not isinstance(survey, LiveSurvey) or stamp == self._stamp:
+            return
+        while told := survey.ledger.told(self._known):
+            changed = [json.loads(b) for _, kind, b in told if kind == "tiles"]
+            with self._lock:
+                for said in changed:
+                    self._drop(said)
+                self._known = told[-1][0]
+        self._stamp = stamp
+
+    def _drop(self, said: Mapping[str, Any]) -> None:
+        keys = [k for k in self._kept if k[0] == said["layer"]]
+        if not keys:
+            return
+        boxes = np.array(changed_boxes(said))
+        for k in np.flatnonzero(_meet(np.array([k[1:] for k in keys], float), boxes)).tolist():
+            del self._kept[keys[k]]
+
+
+def changed_boxes(said: Mapping[str, Any]) -> list[Bounds]:
+    """Where news of tiles say that the map has changed, in EPSG:3857."""
+    to_web = between("EPSG:4326", "EPSG:3857")
+    found = []
+    for west, south, east, north in said.get("boxes") or [said["bounds"]]:
+        found.append(to_web.transform_bounds(west, south, east, north))
+    return found
+
+
+def _meet(tiles: NDArray[np.float64], boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether web tiles (n, 3) z, x, y touch any of boxes (m, 4) in EPSG:3857."""
+    size = (2 * MERCATOR / 2 ** tiles[:, 0])[:, None]
+    west, north = tiles[:, 1:2] * size - MERCATOR, MERCATOR - tiles[:, 2:3] * size
+    beside = (west >= boxes[:, 2]) | (west + size <= boxes[:, 0])
+    above = (north - size >= boxes[:, 3]) | (north <= boxes[:, 1])
+    return np.asarray((~(beside | above)).any(1), bool)

@@ -1,0 +1,139 @@
+"""The map itself: page, web tiles, TileJSON, exports."""
+
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from anyio import CapacityLimiter, to_thread
+from fastapi import HTTPException, Request, Response
+from fastapi.responses import FileResponse
+from starlette.background import BackgroundTask
+
+from skyquilt import __version__
+from skyquilt.raster.map_source import between
+from skyquilt.server.export import write_cog
+from skyquilt.server.gate import Gate
+from skyquilt.server.images import Images
+from skyquilt.server.survey import LiveSurvey
+
+STATIC = Path(__file__).parent / "static"
+DRAWN_AT_ONCE = 2
+"""Tiles drawn at a time: more would not be quicker, and take turns from others."""
+
+
+class Maps:
+    """Addresses of maps."""
+
+    def __init__(self, gate: Gate, images: Images) -> None:
+        self.gate, self.images = gate, images
+        self._drawing = CapacityLimiter(DRAWN_AT_ONCE)
+
+    def page(self) -> FileResponse:
+        """The viewer."""
+        return FileResponse(STATIC / "index.html", headers={"Cache-Control": "no-cache"})
+
+    def info(self) -> dict[str, Any]:
+        """What there is: layers with their extent in degrees, counts, the newest event's number."""
+        found = []
+        for name, source in self.gate.survey.layers().items():
+            bounds = source.bounds()
+            box = (
+                None
+                if bounds is None
+                else between(source.crs, "EPSG:4326").transform_bounds(*bounds)
+            )
+            found.append({"name": name, "crs": source.crs, "bounds": box})
+        counts = (
+            self.gate.survey.ledger.counts() if isinstance(self.gate.survey, LiveSurvey) else {}
+        )
+        finish = (
+            self.gate.survey.ledger.meta("finish")
+            if isinstance(self.gate.survey, LiveSurvey)
+            else None
+        )
+        return {
+            "layers": found,
+            "growing": self.gate.survey.growing and self.gate.writer is not None,
+            "counts": counts,
+            "event": self.gate.survey.version(),
+            "version": __version__,
+            "token": self.gate.guard.token is not None,
+            "finish": finish,
+        }
+
+    async def tile(
+        self, request: Request, z: int, x: int, y: int, layer: str | None = None
+    ) -> Response:
+        """A web tile (EPSG:3857, 256 px, WebP); 204 where the map has nothing, 304 where the client
+        has it.
+        """
+        name = self.gate.layer(layer)
+        if not (0 <= z <= 26 and 0 <= x < 2**z and 0 <= y < 2**z):
+            raise HTTPException(404, f"there is no tile {z}/{x}/{y}")
+        found = self.images.kept(name, z, x, y)
+        if found is None:
+            found = await to_thread.run_sync(self.images.tile, name, z, x, y, limiter=self._drawing)
+        headers = {"Cache-Control": "no-cache", "ETag": found.tag}
+        if found.tag in request.headers.get("if-none-match", ""):
+            return Response(status_code=304, headers=headers)
+        if found.data is None:
+            return Response(status_code=204, headers=headers)
+        return Response(found.data, media_type="image/webp", headers=headers)
+
+    def tilejson(self, request: Request, layer: str | None = None) -> dict[str, Any]:
+        """TileJSON 3.0."""
+        name = self.gate.layer(layer)
+        source = self.gate.survey.layers()[name]
+        bounds = source.bounds()
+        box = (
+            None
+            if bounds is None
+            else list(between(source.crs, "EPSG:4326").transform_bounds(*bounds))
+        )
+        return {
+            "tilejson": "3.0.0",
+            "name": name,
+            "scheme": "xyz",
+            "minzoom": 0,
+            "maxzoom": 24,
+            "tiles": [f"{request.base_url}tiles/{{z}}/{{x}}/{{y}}?layer={name}"],
+            **({"bounds": box} if box else {}),
+        }
+
+    def export(self, bbox: str, layer: str | None = None) -> FileResponse:
+        """A part of a layer as Cloud Optimized GeoTIFF; `bbox`: west,south,east,north in
+        degrees.
+        """
+        name = self.gate.layer(layer)
+        source = self.gate.survey.layers()[name]
+        try:
+            west, south, east, north = (float(v) for v in bbox.split(","))
+        except ValueError as error:
+            raise HTTPException(400, "bbox is west,south,east,north in degrees") from error
+        if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
+            raise HTTPException(400, "bbox holds no area; it is west,south,east,north in degrees")
+        bounds = between("EPSG:4326", source.crs).transform_bounds(west, south, east, north)
+        extent = source.bounds()
+        if extent is None:
+            raise HTTPException(404, "the map is empty")
+        bounds = (
+            max(bounds[0], extent[0]),
+            max(bounds[1], extent[1]),
+            min(bounds[2], extent[2]),
+            min(bounds[3], extent[3]),
+        )
+        handle, path = tempfile.mkstemp(suffix=".tif")
+        os.close(handle)
+        gone = BackgroundTask(Path(path).unlink, missing_ok=True)
+        done = (
+            None
+            if bounds[0] >= bounds[2] or bounds[1] >= bounds[3]
+            else write_cog(source, bounds, Path(path), 0.0)
+        )
+        if done is None:
+            Path(path).unlink(missing_ok=True)
+            raise HTTPException(404, "the map has nothing there")
+        return FileResponse(
+            path, media_type="image/tiff", filename="skyquilt-export.tif", background=gone
+        )

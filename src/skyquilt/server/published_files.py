@@ -1,0 +1,116 @@
+"""Files of the growing map for programs that open files: `map.mbtiles` and a snapshot,
+`map.tif`.
+"""
+
+import json
+import math
+import threading
+import time
+from pathlib import Path
+
+from skyquilt.errors import OutputError
+from skyquilt.live.crash_points import reached
+from skyquilt.raster.map_source import MERCATOR, Bounds, between, mercator, picture
+from skyquilt.raster.mbtiles import touched, write_mbtiles
+from skyquilt.server.export import write_cog
+from skyquilt.server.images import TILE, changed_boxes, image_bytes
+from skyquilt.server.survey import LiveSurvey
+
+PAUSE_S = 3.0
+"""Between looks for what has changed."""
+SNAPSHOT_S = 20.0
+"""Between snapshots, at least."""
+MOST_TILES = 3000
+"""Web tiles written in one go; the rest follows in the next."""
+ZOOMS = 7
+"""Zooms of the MBTiles file, from the map's own resolution upwards."""
+
+
+class Publishing:
+    """Writes both files when the map has changed; as a context manager in a thread of its own."""
+
+    def __init__(self, survey: LiveSurvey, folder: Path) -> None:
+        self.survey, self.folder = survey, folder
+        self._known = 0
+        self._boxes: list[Bounds] = []
+        self._snapshot, self._stale = 0.0, True
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True, name="publishing")
+
+    def __enter__(self) -> "Publishing":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stop.set()
+        self._thread.join(30)
+
+    def _run(self) -> None:
+        while not self._stop.wait(PAUSE_S):
+            try:
+                self.step()
+            except OutputError:
+                # the disk is full: tried again when there is room; the mapping says so to the user
+                continue
+
+    def step(self, *, now: bool = False) -> None:
+        """Brings both files up to date; the snapshot not more often than every `SNAPSHOT_S`, unless
+        `now`.
+        """
+        layer = next(iter(self.survey.layers()), None)
+        if layer is None or layer in ("finished", "base"):
+            return
+        self._look(layer)
+        if self._boxes:
+            self._tiles(layer)
+            self._stale = True
+        if self._stale and (now or time.monotonic() - self._snapshot > SNAPSHOT_S):
+            self._snapshot, self._stale = time.monotonic(), False
+            source = self.survey.layers()[layer]
+            bounds = source.bounds()
+            if bounds is not None:
+                write_cog(source, bounds, self.folder / "map.tif", 0.0)
+        reached("published")
+
+    def _look(self, layer: str) -> None:
+        """Notes where the map has changed."""
+        while told := self.survey.ledger.told(self._known):
+            for _, kind, body in told:
+                said = json.loads(body)
+                if kind == "tiles" and said["layer"] == layer:
+                    self._boxes += changed_boxes(said)
+            self._known = told[-1][0]
+
+    def _tiles(self, layer: str) -> None:
+        source = self.survey.layers()[layer]
+        extent = source.bounds()
+        gsd = float(self.survey.ledger.meta("gsd"))
+        if extent is None:
+            return
+        west, south, east, north = between(source.crs, "EPSG:4326").transform_bounds(*extent)
+        fine = math.log2(2 * MERCATOR / TILE * math.cos(math.radians((south + north) / 2)) / gsd)
+        top = min(24, round(fine))
+        wanted = [
+            (z, x, y)
+            for z in range(max(0, top - ZOOMS + 1), top + 1)
+            for x, y in sorted(touched(self._boxes, z))
+        ]
+        made = []
+        for z, x, y in wanted:
+            if self._stop.is_set():
+                return
+            rgba = picture(source, "EPSG:3857", mercator(z, x, y), TILE, TILE)
+            made.append((z, x, y, None if rgba is None else image_bytes(rgba, "image/webp")))
+            if len(made) >= MOST_TILES:
+                self._write(made, layer, (west, south, east, north), top)
+                made = []
+        self._write(made, layer, (west, south, east, north), top)
+        self._boxes = []
+
+    def _write(
+        self, made: list[tuple[int, int, int, bytes | None]], layer: str, bounds: Bounds, top: int
+    ) -> None:
+        zooms = (max(0, top - ZOOMS + 1), top)
+        write_mbtiles(
+            self.folder / "map.mbtiles", made, name=f"Skyquilt {layer}", bounds=bounds, zooms=zooms
+        )

@@ -1,0 +1,111 @@
+"""The server in a thread of its own, on a socket that is bound before anything else begins."""
+
+import socket
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from skyquilt.errors import UsageError
+from skyquilt.server.guard import Guard
+from skyquilt.server.survey import Survey
+
+NEEDED = "the live map and its viewer need some more packages: pip install 'skyquilt[live]'"
+
+
+def bound(host: str, port: int) -> socket.socket:
+    """A listening socket; port 0 = a free one.
+
+    Raises:
+        UsageError: the address is taken, or none of this machine's.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    # named as TCP, so that answers are sent at once and not held back for acknowledgements (Nagle)
+    listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((host, port))
+    except OSError as error:
+        listening.close()
+        raise UsageError(
+            f"cannot listen on {host}:{port} ({error.strerror}); choose another --port or --host"
+        ) from error
+    listening.listen(512)  # who comes before the server is up waits a moment
+    return listening
+
+
+@dataclass(kw_only=True)
+class Serving:
+    """A running server; as a context manager it ends with its block."""
+
+    survey: Survey
+    """What it shows."""
+    guard: Guard
+    """Who may write."""
+    folder: Path
+    """The survey's folder."""
+    writer: Any = None
+    """The growing map, where there is one."""
+    port: int = 0
+    """Where it listens; 0 = a free port, to be read afterwards."""
+    listening: socket.socket | None = None
+    """A socket that listens already; None = one is made."""
+    _parts: dict[str, Any] = field(default_factory=dict)
+
+    def __enter__(self) -> Self:
+        """Starts it.
+
+        Raises:
+            UsageError: packages are missing, or the address is taken.
+        """
+        try:
+            import uvicorn
+
+            from skyquilt.server.app import make_app
+        except ImportError as error:
+            raise UsageError(NEEDED) from error
+        listening = self.listening or bound(self.guard.host, self.port)
+        self.port = int(listening.getsockname()[1])
+        app = make_app(self.survey, self.guard, self.writer, self.folder)
+        config = uvicorn.Config(
+            app,
+            log_level="error",
+            timeout_graceful_shutdown=1,
+            limit_concurrency=1000,
+            server_header=False,
+        )
+        server = uvicorn.Server(config)
+        thread = threading.Thread(
+            target=server.run, kwargs={"sockets": [listening]}, daemon=True, name="viewer"
+        )
+        thread.start()
+        self._parts = {
+            "server": server,
+            "thread": thread,
+            "socket": listening,
+            "ending": app.state.ending,
+        }
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._parts["ending"].set()
+        self._parts["server"].should_exit = True
+        self._parts["thread"].join(5)
+        self._parts["socket"].close()
+
+    @property
+    def url(self) -> str:
+        """Where to look."""
+        return address(self.guard.host, self.port)
+
+
+def address(host: str, port: int) -> str:
+    """What to type into a browser."""
+    host = "127.0.0.1" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+    return f"http://{host}:{port}/"

@@ -1,0 +1,310 @@
+"""What the server shows: a survey that grows, or a finished run, behind one face."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from skyquilt.errors import UsageError
+from skyquilt.live.ledger import NAME, Ledger
+from skyquilt.raster.map_source import FileSource, MapSource, TileSource, between
+from skyquilt.raster.read_map import open_map
+from skyquilt.raster.tile_store import TileStore
+
+PHOTOS, TILES, FINISHED, NAMED = "photos", "tiles.db", "finished", "named"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shown:
+    """One photo as viewers see it."""
+
+    id: int
+    """Number."""
+    name: str
+    """Name, to be escaped."""
+    state: str
+    """received, waiting, placed, refined, superseded or refused."""
+    record: Mapping[str, Any]
+    """All that is told of it."""
+    ring: tuple[tuple[float, float], ...]
+    """Footprint, longitude and latitude."""
+    path: Path | None
+    """Its file, where it still lies there."""
+
+
+class Survey(Protocol):
+    """What the server needs to know."""
+
+    growing: bool
+    """Whether photos may still come."""
+
+    def layers(self) -> dict[str, MapSource]:
+        """Maps by name, the one to show first first."""
+
+    def photos(self) -> list[Shown]:
+        """All photos in order."""
+
+    def photo(self, number: int) -> Shown | None:
+        """One photo."""
+
+    def version(self) -> int:
+        """A number that grows with every change."""
+
+    def stamp(self) -> int:
+        """A number that differs where something may have changed; cheap."""
+
+
+def open_survey(folder: Path, base: Path | None = None) -> "LiveSurvey | FinishedSurvey":
+    """The survey in a folder.
+
+    Raises:
+        UsageError: it holds none.
+    """
+    if (folder / NAME).is_file():
+        return LiveSurvey(folder, base=base)
+    if (folder / "mosaic.tif").is_file():
+        return FinishedSurvey(folder, base=base)
+    raise UsageError(
+        f"{folder} holds neither a live survey ({NAME}) nor a finished run (mosaic.tif); name the"
+        " folder given to -o"
+    )
+
+
+def base_map(path: Path | None) -> dict[str, MapSource]:
+    """An older orthophoto as a layer; none where none is given.
+
+    Raises:
+        UsageError: it is no georeferenced raster.
+    """
+    if path is None:
+        return {}
+    if open_map(path) is None or not FileSource(path=path).crs:
+        raise UsageError(f"--base {path} is no georeferenced map that GDAL reads")
+    return {"base": FileSource(path=path)}
+
+
+class LiveSurvey:
+    """A survey's folder that another part of the program writes."""
+
+    growing = True
+
+    def __init__(self, folder: Path, *, base: Path | None = None) -> None:
+        """Opens it for reading; `base` is an older orthophoto.
+
+        Raises:
+            OutputError: it cannot be read. UsageError: `base` is no map.
+        """
+        self.folder, self.base = folder, base_map(base)
+        self.ledger = Ledger(folder, write=False)
+        self.tiles = TileStore(folder / TILES, write=False)
+
+    def layers(self) -> dict[str, MapSource]:
+        """Layers of the tiles, and the final map where there is one."""
+        frame, gsd = self.ledger.meta("frame"), self.ledger.meta("gsd")
+        found: dict[str, MapSource] = {}
+        if frame and gsd:
+            x, y = frame["origin"]
+            for layer in sorted(
+                self.tiles.layers(), key=lambda n: (not n.startswith("visible"), n)
+            ):
+                found[layer] = TileSource(
+                    tiles=self.tiles, layer=layer, crs=frame["crs"], origin=(x, y), gsd=gsd
+                )
+        final = self.folder / FINISHED / "mosaic.tif"
+        if final.is_file():
+            found["finished"] = FileSource(path=final)
+        return found | self.base
+
+    def photos(self) -> list[Shown]:
+        """All accepted photos."""
+        query = (
+            "select id, name, source, state, reason, footprint, file, received from photo order"
+            " by id"
+        )
+        return [self._shown(row) for row in self.ledger.rows(query)]
+
+    def photo(self, number: int) -> Shown | None:
+        """One accepted photo."""
+        query = (
+            "select id, name, source, state, reason, footprint, file, received from photo where"
+            " id = ?"
+        )
+        row = self.ledger.row(query, number)
+        return None if row is None else self._shown(row)
+
+    def _shown(self, row: tuple[Any, ...]) -> Shown:
+        number, name, source, state, reason, place, file, received = row
+        held = json.loads(place) if place else {}
+        ring = tuple((float(a), float(b)) for a, b in held.get("ring", ()))
+        record = {
+            "id": number,
+            "name": name,
+            "source": source,
+            "state": state,
+            "reason": reason,
+            "at": held.get("at"),
+            "ring": [list(p) for p in ring],
+            "received": received,
+        }
+        path = self.folder / PHOTOS / file
+        return Shown(id=int(number), name=name, state=state, record=record, ring=ring, path=path)
+
+    def refused(self) -> list[dict[str, Any]]:
+        """Files that were refused, the latest first."""
+        rows = self.ledger.rows(
+            "select name, source, reason, at from refused order by id desc limit 200"
+        )
+        return [
+            {"name": n, "source": s, "reason": r, "at": a, "state": "refused"}
+            for n, s, r, a in rows
+        ]
+
+    def version(self) -> int:
+        """Number of the newest event."""
+        return self.ledger.last_event()
+
+    def stamp(self) -> int:
+        """Of the ledger's file."""
+        return self.ledger.stamp()
+
+
+class FinishedSurvey:
+    """The folder of a finished run."""
+
+    growing = False
+
+    def __init__(self, folder: Path, *, base: Path | None = None) -> None:
+        """Reads what the run wrote.
+
+        Raises:
+            UsageError: it is not georeferenced, or `base` is no map.
+        """
+        self.folder, self.base = folder, base_map(base)
+        self._photos: list[Shown] = []
+        self._source = FileSource(path=folder / "mosaic.tif")
+        if not self._source.crs:
+            raise UsageError(
+                f"{folder / 'mosaic.tif'} is not georeferenced; open report.html instead"
+            )
+        home = _photo_folder(folder)
+        shots = json.loads((folder / "shots.geojson").read_text(encoding="utf-8"))["features"]
+        prints = json.loads((folder / "footprints.geojson").read_text(encoding="utf-8"))
+        rings = {
+            f["properties"]["filename"]: f["geometry"]["coordinates"][0] for f in prints["features"]
+        }
+        for k, shot in enumerate(shots, 1):
+            name = shot["properties"]["filename"]
+            self._photos.append(self._shown(k, name, shot, rings.get(name, []), home))
+
+    def _shown(
+        self, k: int, name: str, shot: dict[str, Any], ring: list[Any], home: Path | None
+    ) -> Shown:
+        x, y = shot["properties"]["translation"][:2]
+        lon, lat = between(self._source.crs, "EPSG:4326").transform(x, y)
+        corners = np.array(_flat(ring))
+        path = home / name if home is not None else None
+        inside = (
+            path is not None and home is not None and path.resolve().is_relative_to(home.resolve())
+        )
+        ring_ll = tuple((float(a), float(b)) for a, b in corners.reshape(-1, 2))
+        return Shown(
+            id=k,
+            name=name,
+            state="refined",
+            record={
+                "id": k,
+                "name": name,
+                "source": shot["properties"]["camera"],
+                "state": "refined",
+                "reason": "",
+                "at": [lon, lat],
+                "ring": [list(p) for p in ring_ll],
+            },
+            ring=ring_ll,
+            path=path if inside and path is not None and path.is_file() else None,
+        )
+
+    def layers(self) -> dict[str, MapSource]:
+        """The mosaic."""
+        return {"mosaic": self._source, **self.base}
+
+    def photos(self) -> list[Shown]:
+        """All placed photos."""
+        return self._photos
+
+    def photo(self, number: int) -> Shown | None:
+        """One placed photo."""
+        return self._photos[number - 1] if 0 < number <= len(self._photos) else None
+
+    def refused(self) -> list[dict[str, Any]]:
+        """Photos left out."""
+        try:
+            metrics = json.loads((self.folder / "metrics.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return []
+        return [
+            {"name": n, "reason": r, "state": "refused"}
+            for n, r in metrics.get("photos_rejected", {}).items()
+        ]
+
+    def version(self) -> int:
+        """It does not change."""
+        return 1
+
+    def stamp(self) -> int:
+        """Neither does this."""
+        return 1
+
+
+def _flat(ring: list[Any]) -> list[Any]:
+    while ring and isinstance(ring[0][0], list):
+        ring = ring[0]
+    return [p[:2] for p in ring]
+
+
+def _photo_folder(folder: Path) -> Path | None:
+    """Where the photos of a run lie, as its run.toml says; those of a live survey's final map lie
+    beside it.
+    """
+    import tomllib
+
+    try:
+        said = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8")).get("photos")
+    except (OSError, ValueError):
+        return None
+    beside = folder.parent / NAMED
+    places = [Path(str(said))] if said else []
+    return next((p for p in (*places, beside) if p.is_dir()), None)
+
+
+def covering(photos: list[Shown], lon: float, lat: float) -> list[Shown]:
+    """Photos whose footprint holds a point, the one that looks down most steeply (nearest centre)
+    first.
+    """
+    found = []
+    for photo in photos:
+        if photo.state == "superseded" or len(photo.ring) < 3 or photo.record.get("at") is None:
+            continue
+        ring = np.array(photo.ring)
+        if (
+            (ring.min(0) <= (lon, lat)).all()
+            and (ring.max(0) >= (lon, lat)).all()
+            and _holds(ring, lon, lat)
+        ):
+            x, y = photo.record["at"]
+            found.append(
+                (((x - lon) * np.cos(np.radians(lat))) ** 2 + (y - lat) ** 2, photo.id, photo)
+            )
+    return [p for _, _, p in sorted(found, key=lambda f: f[:2])]
+
+
+def _holds(ring: np.ndarray, x: float, y: float) -> bool:
+    """Whether a polygon holds a point: the parity of crossings."""
+    a, b = ring, np.roll(ring, -1, axis=0)
+    straddles = (a[:, 1] > y) != (b[:, 1] > y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = a[:, 0] + (y - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
+    return bool((straddles & (x < at)).sum() % 2)

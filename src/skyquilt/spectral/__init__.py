@@ -1,1 +1,0 @@
-"""Stage: two pictures of different spectra -> a registration, or a refusal with its reason."""

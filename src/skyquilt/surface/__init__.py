@@ -1,1 +1,0 @@
-"""Stage: poses and tie points -> heights."""

@@ -1,0 +1,1 @@
+"""The thermal map on the visual map's grid."""

@@ -1,0 +1,64 @@
+"""Two blocks joined by the heights under them [Yahyanejad 2013, 5.2.3, (5.8)].
+
+Pictures of both surfaces find the rough place, as pictures do everywhere; heights measured anew, as
+densely as the photos allow, find the exact one.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.coregistration.heights import AlignHeights
+from skyquilt.model.raster import Grid
+from skyquilt.model.registration import Matrix, RefusedRegistration, Registration
+from skyquilt.model.surface import HeightField
+from skyquilt.ortho.dense import Dense
+from skyquilt.workflows.scene import Scene
+
+
+def finer(
+    visual: Scene,
+    thermal: Scene,
+    outcome: Registration,
+    dense: Dense | None = None,
+    align: AlignHeights | None = None,
+) -> Registration | RefusedRegistration:
+    """A registration of the maps, px of the visual to px of the thermal one, sharpened by heights;
+    or why heights do not confirm it.
+    """
+    fields = [_heights(scene, dense or Dense()) for scene in (visual, thermal)]
+    if fields[0] is None or fields[1] is None:
+        return RefusedRegistration(
+            reason="fewer than two photos of a map look down, so nothing tells heights"
+        )
+    metres = [_metres_of_px(scene.ground.grid) for scene in (visual, thermal)]
+    start = metres[1] @ outcome.b_H_a @ np.linalg.inv(metres[0])
+    fit = (align or AlignHeights())(fields[0], fields[1], start)
+    if isinstance(fit, RefusedRegistration):
+        return fit
+    matrix = np.linalg.inv(metres[1]) @ fit.b_H_a @ metres[0]
+    told = {
+        "cells": float(fit.cells),
+        "residual_m": round(fit.residual_m, 4),
+        "halves_apart_m": round(fit.apart_m, 4),
+    }
+    return replace(
+        outcome,
+        model="similarity",
+        b_H_a=matrix / matrix[2, 2],
+        evidence={**outcome.evidence, **told},
+    )
+
+
+def _heights(scene: Scene, dense: Dense) -> HeightField | None:
+    held = set(scene.alignment.held)
+    views = [v for v in scene.ground.views if v.photo in held and v.pose.cam_H_map is None]
+    return dense(scene.ground.surface, views, scene.ground.grid, scene.grey)
+
+
+def _metres_of_px(grid: Grid) -> Matrix:
+    """(3, 3) takes px of a block's map to m in its frame."""
+    x, y = (float(f(np.array(0))) for f in (grid.x, grid.y))
+    found: NDArray[np.float64] = np.array([[grid.gsd, 0, x], [0, -grid.gsd, y], [0, 0, 1.0]])
+    return found

@@ -1,0 +1,194 @@
+"""Thermal photos on the poses and the surface of the visual ones, where one drone took both."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from skyquilt.alignment.pose import reported_camera
+from skyquilt.coregistration.pictures import guess_of, open_picture
+from skyquilt.coregistration.rig import FindRig, Rig, RigPair
+from skyquilt.coregistration.workflow import outcome_of
+from skyquilt.geometry.transforms import transfer
+from skyquilt.imaging.grey import shrink
+from skyquilt.imaging.views import make_views
+from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.model.poses import Alignment, Pose, no_ties
+from skyquilt.model.raster import Window
+from skyquilt.model.registration import RefusedRegistration, Registration
+from skyquilt.ortho.blend import Blend
+from skyquilt.ortho.compose import Composer
+from skyquilt.ortho.exposure import NEUTRAL, Exposure
+from skyquilt.ortho.orthomosaic import geotransform
+from skyquilt.ortho.radiometry import balances_drift, drift_of, value_tags
+from skyquilt.photos.pixels import read_color
+from skyquilt.photos.together import taken_together
+from skyquilt.raster import CogWriter, RasterSpec
+from skyquilt.workflows.methods import Methods, MosaicSettings
+from skyquilt.workflows.photo_features import THUMBNAIL
+from skyquilt.workflows.scene import Scene
+
+MOST_PAIRS = 12
+"""Pairs that are registered, spread over the flight: each costs a second or two."""
+KNOWN_FOCAL = 0.01
+"""Relative deviation of the thermal focal length below which it is not estimated."""
+_GRID = 6
+"""Points per side by which a registered pair tells its rotation."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Rigged:
+    """Thermal photos placed by the rig."""
+
+    rig: Rig
+    """The cameras against one another."""
+    photos: tuple[Photo, ...]
+    """Thermal photos that were taken together with a placed visual one."""
+    alignment: Alignment
+    """Their poses in the visual map's frame."""
+
+
+def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistration:
+    """Thermal photos on visual poses, or why not."""
+    visual = scene.taken.photos
+    pairs = [(i, j) for i, j in taken_together(visual, thermal) if i in scene.alignment.poses]
+    if len(pairs) < FindRig.minimum:
+        return RefusedRegistration(
+            reason=f"{len(pairs)} thermal photos were taken together with a visual one, by time or"
+            " name"
+        )
+    if any(scene.alignment.poses[i].cam_H_map is not None for i, _ in pairs):
+        return RefusedRegistration(
+            reason="the visual photos have no poses in space; use --method bundle"
+        )
+    first = thermal[pairs[0][1]]
+    kinds = {(thermal[j].camera_key, thermal[j].channels, thermal[j].dtype) for _, j in pairs}
+    if len(kinds) > 1:
+        return RefusedRegistration(
+            reason=f"the thermal photos are of {len(kinds)} cameras or kinds"
+        )
+    asked = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, MOST_PAIRS).astype(int))]
+    told = [p for i, j in asked if (p := _registered(scene, i, thermal[j])) is not None]
+    rig = FindRig(free=_freedom(first))(told, reported_camera(first))
+    if isinstance(rig, RefusedRegistration):
+        return rig
+    poses = {k: _turned(scene.alignment.poses[i], rig) for k, (i, _) in enumerate(pairs)}
+    alignment = Alignment(
+        method="rig",
+        why="both cameras flew together",
+        frame=scene.alignment.frame,
+        poses=poses,
+        cameras={"thermal": rig.camera_b},
+        camera_of=dict.fromkeys(poses, "thermal"),
+        blocks=(tuple(poses),),
+        ties=no_ties(),
+    )
+    return Rigged(rig=rig, photos=tuple(thermal[j] for _, j in pairs), alignment=alignment)
+
+
+def _freedom(photo: Photo) -> float:
+    """Share by which the focal length may be wrong: three deviations."""
+    if photo.calibration is not None or photo.focal.sigma_px < KNOWN_FOCAL * photo.focal.px:
+        return 0.0
+    return float(min(3 * photo.focal.sigma_px / photo.focal.px, 1.0))
+
+
+def _turned(pose: Pose, rig: Rig) -> Pose:
+    return Pose(cam_R_map=rig.b_R_a @ pose.cam_R_map, map_C=pose.map_C)
+
+
+def _registered(scene: Scene, index: int, thermal: Photo) -> RigPair | None:
+    """Correspondences over the overlap of two photos taken together; None where they cannot be
+    registered.
+    """
+    a, b = open_picture(scene.taken.photos[index].path), open_picture(thermal.path)
+    if isinstance(a, RejectedPhoto) or isinstance(b, RejectedPhoto):
+        return None
+    outcome = outcome_of(a, b, "auto", guess_of(a, b))
+    if not isinstance(outcome, Registration):
+        return None
+    x, y = np.meshgrid(
+        *(np.linspace(0.05, 0.95, _GRID, dtype=np.float64) * size for size in (b.width, b.height))
+    )
+    px_b = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
+    px_a = transfer(np.asarray(np.linalg.inv(outcome.b_H_a), np.float64), px_b)
+    inside = ((px_a > 0) & (px_a < [a.width - 1, a.height - 1])).all(1)
+    if inside.sum() < _GRID:
+        return None
+    return RigPair(px_a=px_a[inside], px_b=px_b[inside], camera_a=scene.alignment.camera(index))
+
+
+def drift_of_rigged(
+    found: Rigged, scene: Scene, parts: Methods, settings: MosaicSettings
+) -> Exposure:
+    """What brings the thermal frames to one level, if they are to be."""
+    unit, ground = found.photos[0].unit, scene.ground
+    if not balances_drift(settings, unit):
+        return NEUTRAL
+    views = make_views(found.alignment, ground.surface)
+    frames = {v.photo: shrink(read_color(found.photos[v.photo]), THUMBNAIL)[0] for v in views}
+    return drift_of(views, frames, ground.surface, ground.grid.bounds, unit, parts, settings)
+
+
+def draw_rigged(
+    path: Path, found: Rigged, scene: Scene, blend: Blend, exposure: Exposure = NEUTRAL
+) -> None:
+    """thermal.tif on the visual map's grid and surface, values resampled only, but for their
+    drift.
+    """
+    first, grid = found.photos[0], scene.ground.grid
+    kind, real = np.dtype(first.dtype), np.dtype(first.dtype).kind == "f"
+    compose = Composer(
+        grid=grid,
+        views=make_views(found.alignment, scene.ground.surface),
+        surface=scene.ground.surface,
+        blend=blend,
+        pixels=lambda i: read_color(found.photos[i]),
+        bands=first.channels,
+        dtype=kind,
+        exposure=exposure,
+    )
+    spec = RasterSpec(
+        width=grid.width,
+        height=grid.height,
+        bands=first.channels,
+        dtype=kind.name,
+        transform=geotransform(grid, found.alignment),
+        crs=found.alignment.frame.crs,
+        compress="deflate",
+        nodata=float("nan") if real else None,
+        mask=not real,
+        band_units=(first.unit,) * first.channels if first.unit else (),
+        tags={"SOFTWARE": "Skyquilt"} | value_tags(first.unit, exposure),
+    )
+    with CogWriter(path, spec) as writer:
+        for block in writer.blocks():
+            window = Window(
+                row=block.row0, column=block.col0, height=block.height, width=block.width
+            )
+            composed = compose(window)
+            writer.write_block(block, composed.pixels, composed.photo >= 0)
+
+
+def rig_figures(found: Rigged, total: int) -> dict[str, Any]:
+    """What metrics.json says under `thermal`."""
+    rig, first = found.rig, found.photos[0]
+    return {
+        "route": "rig",
+        "routes_refused": {},
+        "unit": first.unit,
+        "thermal_H_visual": np.eye(3).tolist(),
+        "model": "rotation",
+        "inliers": rig.agreeing,
+        "evidence": {
+            "pairs": rig.pairs,
+            "pairs_agreeing": rig.agreeing,
+            "spread_deg": round(rig.spread_deg, 4),
+            "focal_px": round(rig.camera_b.focal, 2),
+        },
+        "thermal_R_visual": rig.b_R_a.tolist(),
+        "photos_used": len(found.photos),
+        "photos_total": total,
+    }

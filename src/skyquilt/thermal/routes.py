@@ -1,0 +1,205 @@
+"""How the thermal map finds its place on the visual one: the routes, and which of them is
+believed.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.coregistration.methods import registration_method
+from skyquilt.coregistration.pictures import Source, guess_of, open_picture
+from skyquilt.coregistration.refine_registration import Settle
+from skyquilt.coregistration.subpixel import Sharpen
+from skyquilt.errors import RefusedError
+from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registration
+
+ROUTES = ("auto", "rig", "maps", "pairs", "heights", "positions")
+"""How the thermal map finds its place: by the rig where one drone took both, by the pictures of
+both maps, by pairs of photos, by heights, or by its positions alone; auto takes the first of these
+that can be believed.
+"""
+SETTLE = Settle(free=Sharpen(freedom="affine", steps=12))
+"""How a believed registration of maps gets exact: with the freedom that pictures support."""
+FAR_M = 1000.0
+"""Distance between the nearest photos of two flights beyond which they show different places."""
+Outcome = Registration | RefusedRegistration
+_NO_PHOTOS = RefusedRegistration(reason="the photos behind the maps are not at hand")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Joined:
+    """How the thermal map was laid on the visual one."""
+
+    route: str
+    """One of `ROUTES` but `auto`."""
+    thermal_H_visual: NDArray[np.float64]
+    """(3, 3) takes px of the visual map to those of the thermal map."""
+    outcome: Registration | None
+    """The registration it rests on; None for positions."""
+    refused: tuple[tuple[str, str], ...]
+    """Routes tried in vain, and why."""
+
+
+def join(
+    a: Source,
+    b: Source,
+    surfaces: tuple[Path, Path],
+    route: str,
+    *,
+    pairs: Callable[[], Outcome] = lambda: _NO_PHOTOS,
+    finer: Callable[[Registration], Outcome] = lambda outcome: outcome,
+) -> Joined:
+    """The place of the thermal map b on the visual map a.
+
+    `auto` takes the first of pictures, pairs and heights that can be believed.
+    `pairs` registers pairs of the photos behind both maps, px of a to px of b; `finer` sharpens a
+    registration by heights measured in those photos.
+
+    Raises:
+        RefusedError: the one route asked for cannot be believed.
+    """
+    guess = guess_of(a, b)
+    if guess is None and route == "positions":
+        raise RefusedError(
+            "the two maps have no common place: one of them is not georeferenced; use"
+            " --thermal-route maps"
+        )
+    ways: dict[str, Callable[[], Outcome]] = {
+        "maps": lambda: _registered(a, b, a.picture, b.picture, guess),
+        "pairs": pairs,
+        "heights": lambda: _by_heights(a, b, surfaces, guess, finer),
+    }
+    refused: list[tuple[str, str]] = []
+    for name in ways if route == "auto" else (route,) if route in ways else ():
+        outcome = ways[name]()
+        if isinstance(outcome, Registration):
+            return Joined(
+                route=name, thermal_H_visual=outcome.b_H_a, outcome=outcome, refused=tuple(refused)
+            )
+        refused.append((name, outcome.reason))
+    if guess is None or route not in ("auto", "positions"):
+        told = "; ".join(f"by {name}: {why}" for name, why in refused)
+        raise RefusedError(
+            f"the thermal map cannot be laid on the visual one ({told}); both maps are in the"
+            " output"
+        )
+    full = b.full_S_picture @ guess.b_H_a @ np.linalg.inv(a.full_S_picture)
+    return Joined(
+        route="positions", thermal_H_visual=full / full[2, 2], outcome=None, refused=tuple(refused)
+    )
+
+
+def _by_heights(
+    a: Source,
+    b: Source,
+    surfaces: tuple[Path, Path],
+    guess: Guess | None,
+    finer: Callable[[Registration], Outcome],
+) -> Outcome:
+    """Both surfaces as pictures on the grids of their maps [Y 5.8], then the heights themselves."""
+    if not all(path.is_file() for path in surfaces):
+        return RefusedRegistration(reason="a map has no surface.tif")
+    one, other = (heights_on(source, path) for source, path in zip((a, b), surfaces, strict=True))
+    outcome = _registered(a, b, one, other, guess)
+    return finer(outcome) if isinstance(outcome, Registration) else outcome
+
+
+def heights_on(source: Source, surface: Path) -> Picture:
+    """The heights of a run on the grid of its map's picture, the general slope taken away: what
+    stands out of the ground is what both surfaces share, whatever their heights count from.
+    """
+    ground = opened(surface)
+    rows, columns = source.picture.shape
+    seen = source.picture.valid
+    fine = _sampled(ground, source)
+    valid = np.isfinite(fine) if seen is None else seen & np.isfinite(fine)
+    y, x = np.mgrid[0:rows, 0:columns]
+    basis = np.stack([np.ones(valid.sum()), x[valid], y[valid]], 1)
+    plane, *_ = np.linalg.lstsq(basis[::97], fine[valid][::97], rcond=None)
+    flat = np.where(valid, fine - (plane[0] + plane[1] * x + plane[2] * y), np.nan)
+    return Picture(values=np.asarray(flat, np.float32), valid=valid)
+
+
+def _sampled(ground: Source, source: Source) -> NDArray[np.float32]:
+    """The heights at the pixels (h, w) of a map's picture: both rasters are north up, their grids
+    are not the same.
+    """
+    assert ground.place is not None and source.place is not None
+    g, s, full = ground.place.affine, source.place.affine, source.full_S_picture
+    rows, columns = source.picture.shape
+    x = s[2] + s[0] * (full[0, 0] * np.arange(columns) + full[0, 2] + 0.5)
+    y = s[5] + s[4] * (full[1, 1] * np.arange(rows) + full[1, 2] + 0.5)
+    column, row = np.meshgrid((x - g[2]) / g[0] - 0.5, (y - g[5]) / g[4] - 0.5)
+    values = ground.picture.values.astype(np.float32)
+    return np.asarray(
+        cv2.remap(
+            values,
+            column.astype(np.float32),
+            row.astype(np.float32),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+    )
+
+
+def _registered(a: Source, b: Source, one: Picture, other: Picture, guess: Guess | None) -> Outcome:
+    """In px of the files."""
+    outcome = registration_method("auto")(one, other, guess)
+    if isinstance(outcome, RefusedRegistration):
+        return outcome
+    outcome = SETTLE(one, other, outcome)
+    full_a, full_b = a.full_S_picture, b.full_S_picture
+    matrix = full_b @ outcome.b_H_a @ np.linalg.inv(full_a)
+    moved_a, moved_b = (
+        px @ S[:2, :2].T + S[:2, 2] for px, S in ((outcome.px_a, full_a), (outcome.px_b, full_b))
+    )
+    return replace(outcome, b_H_a=matrix / matrix[2, 2], px_a=moved_a, px_b=moved_b)
+
+
+def refuse_apart(visual: Sequence[Photo], thermal: Sequence[Photo]) -> None:
+    """Refuses flights over different places, before anything is computed.
+
+    Raises:
+        RefusedError: all positions of the one lie far from all of the other.
+    """
+    places = [
+        np.radians(
+            [(p.position.latitude_deg, p.position.longitude_deg) for p in photos if p.position]
+        )
+        for photos in (visual, thermal)
+    ]
+    if not all(len(p) for p in places):
+        return
+    a, b = (p[:, None] * [1, np.cos(places[0][0, 0])] for p in places)
+    nearest = 6.371e6 * float(np.linalg.norm(a - b.transpose(1, 0, 2), axis=2).min())
+    if nearest > FAR_M:
+        raise RefusedError(
+            f"the thermal photos lie {nearest / 1000:.1f} km from the visual ones, by their"
+            " positions; give the two"
+            " flights over one place"
+        )
+
+
+def opened(path: Path) -> Source:
+    """A map of ours, read to be registered.
+
+    Raises:
+        RefusedError: it cannot be used.
+    """
+    found = open_picture(path)
+    if isinstance(found, RejectedPhoto):
+        raise RefusedError(f"{path} cannot be used for the registration: {found.reason}")
+    return found
+
+
+def as_registration(joined: Joined) -> Registration:
+    """The join as a registration to be drawn."""
+    if joined.outcome is not None:
+        return joined.outcome
+    none = np.zeros((0, 2))
+    return Registration(model="affine", b_H_a=joined.thermal_H_visual, px_a=none, px_b=none)

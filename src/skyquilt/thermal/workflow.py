@@ -1,0 +1,225 @@
+"""The story of two spectra: a visual map, and the thermal map on its grid.
+
+    visual mosaic -> thermal mosaic -> registration of the two -> thermal.tif on the visual grid
+    visual mosaic -> photos taken together -> their cameras' rotation -> thermal.tif on the visual
+    poses
+
+Where one drone took both, by times or names, the cameras' rotation is found once, and the thermal
+photos are drawn where the visual ones were. Otherwise both flights become maps by themselves, each
+by its own adjustment. What their positions leave open, a few metres, the registration of the
+finished maps closes [Yahyanejad 2013, 5.2.3]: of the pictures, or of the heights under them, which
+look alike in every spectrum, by day and night, in summer and winter (5.8). Where none is to be
+believed, the thermal map lies where its own positions put it, and says so.
+"""
+
+from collections.abc import Generator, Iterator, Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.coregistration.files import overlays, resample_onto
+from skyquilt.coregistration.pictures import Source
+from skyquilt.coregistration.workflow import residual
+from skyquilt.engine.clock import Clock
+from skyquilt.errors import RefusedError, UsageError
+from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarted
+from skyquilt.model.registration import RefusedRegistration, Registration
+from skyquilt.ortho.radiometry import recorded_tags, value_figures
+from skyquilt.photos.survey import read_survey
+from skyquilt.photos.together import taken_together
+from skyquilt.thermal.by_heights import finer
+from skyquilt.thermal.by_pairs import by_pairs
+from skyquilt.thermal.by_rig import draw_rigged, drift_of_rigged, rig_figures, rigged
+from skyquilt.thermal.files import write_figures, write_overlays, write_section
+from skyquilt.thermal.routes import ROUTES, Joined, as_registration, join, opened, refuse_apart
+from skyquilt.workflows.methods import MosaicSettings, methods
+from skyquilt.workflows.mosaic import iter_mosaic
+from skyquilt.workflows.scene import Scene, scene_of_run
+
+FOLDER = "thermal"
+"""Folder of the thermal run, below the visual one's."""
+
+
+def iter_thermal(
+    photos: Path | str,
+    thermal: Path | str,
+    output: Path | str,
+    settings: MosaicSettings | None = None,
+    *,
+    route: str = "auto",
+    overwrite: bool = False,
+    rerun_from: str | None = None,
+) -> Iterator[Event]:
+    """Makes the visual map and the thermal map on its grid; the last event is the `Result` of both.
+
+    Raises:
+        RefusedError: the one route asked for cannot be believed; both maps are there by then.
+        SkyquiltError: anything else a user can mend.
+    """
+    asked, output = settings or MosaicSettings(), Path(output)
+    settings = replace(asked, thermal_unit=None)
+    heated = replace(asked, thermal_unit=asked.thermal_unit or "auto")
+    if route not in ROUTES:
+        raise UsageError(f"--thermal-route {route!r} is not one of {', '.join(ROUTES)}")
+    if not Path(thermal).is_dir():
+        raise UsageError(f"--thermal {thermal} is no folder; give the folder of the thermal photos")
+    heats = read_survey(Path(thermal), thermal_unit=heated.thermal_unit)
+    refuse_apart(read_survey(Path(photos), geo=settings.geo).photos, heats.photos)
+    if not any(p.band == "thermal" for p in heats.photos):
+        yield Note(
+            text=f"no photo in {thermal} is known to be thermal; they are mapped as they are",
+            warning=True,
+        )
+    visual = yield from _told(
+        iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
+    )
+    refused: tuple[tuple[str, str], ...] = ()
+    if route in ("auto", "rig"):
+        began = Clock.now()
+        yield StageStarted(stage="rig", total=0)
+        result = _by_rig(photos, thermal, visual, heated)
+        yield _finished("rig", began)
+        if isinstance(result, Result):
+            yield result
+            return
+        if route == "rig":
+            raise RefusedError(
+                f"the thermal photos cannot be laid on the visual poses: {result.reason}; use"
+                " --thermal-route auto"
+            )
+        refused = (("rig", result.reason),)
+    own = replace(
+        heated,
+        gcp=None,
+        geo=None,
+        cameras=None,
+        bounds=None,
+        boundary=None,
+        gsd_cm=None,
+        crs=visual.metrics["crs"] or settings.crs,
+        compress="auto",
+    )
+    yield Note(
+        text="the thermal photos become a map of their own, then it is laid on the visual one"
+    )
+    heat = yield from _told(
+        iter_mosaic(thermal, output / FOLDER, own, overwrite=overwrite, rerun_from=rerun_from)
+    )
+    began = Clock.now()
+    yield StageStarted(stage="join", total=0)
+    a, b = (opened(result.output / "mosaic.tif") for result in (visual, heat))
+
+    @cache
+    def scenes() -> tuple[Scene, Scene]:
+        return scene_of_run(photos, visual, settings), scene_of_run(thermal, heat, own)
+
+    joined = join(
+        a,
+        b,
+        (visual.output / "surface.tif", heat.output / "surface.tif"),
+        route,
+        pairs=lambda: by_pairs(*scenes()),
+        finer=lambda outcome: finer(*scenes(), outcome),
+    )
+    joined = replace(joined, refused=(*refused, *joined.refused))
+    resample_onto(
+        output / "thermal.tif", a, b, joined.thermal_H_visual, recorded_tags(heat.metrics)
+    )
+    figures = {"thermal": _figures(joined, heat, b)}
+    _leave(output, overlays(a, b, as_registration(joined)), visual.metrics, figures)
+    yield _finished("join", began)
+    yield from (
+        Note(text=f"registration by {name} was refused: {why}", warning=True)
+        for name, why in joined.refused
+    )
+    yield Result(output=output, metrics={**visual.metrics, **figures})
+
+
+def _finished(stage: str, began: tuple[float, float]) -> StageFinished:
+    now = Clock.now()
+    return StageFinished(
+        stage=stage,
+        seconds=round(now[0] - began[0], 3),
+        cpu_seconds=round(now[1] - began[1], 3),
+        reused=False,
+    )
+
+
+def _by_rig(
+    photos: Path | str, thermal: Path | str, visual: Result, settings: MosaicSettings
+) -> Result | RefusedRegistration:
+    """thermal.tif from the visual poses, where one drone took both, or why not."""
+    survey = read_survey(Path(thermal), thermal_unit=settings.thermal_unit)
+    if not taken_together(read_survey(Path(photos), geo=settings.geo).photos, survey.photos):
+        return RefusedRegistration(
+            reason="no thermal photo was taken together with a visual one, by time or name"
+        )
+    scene = scene_of_run(photos, visual, replace(settings, thermal_unit=None))
+    found = rigged(scene, survey.photos)
+    if isinstance(found, RefusedRegistration):
+        return found
+    output = visual.output
+    parts = methods(settings)
+    exposure = drift_of_rigged(found, scene, parts, settings)
+    draw_rigged(output / "thermal.tif", found, scene, parts.blend, exposure)
+    none = np.zeros((0, 2))
+    same = Registration(model="identity", b_H_a=np.eye(3), px_a=none, px_b=none)
+    figures = {"thermal": rig_figures(found, len(survey.photos) + len(survey.rejected))}
+    figures["thermal"] |= value_figures(found.photos, exposure, settings)
+    pictures = overlays(opened(output / "mosaic.tif"), opened(output / "thermal.tif"), same)
+    _leave(output, pictures, visual.metrics, figures)
+    return Result(output=output, metrics={**visual.metrics, **figures})
+
+
+def _leave(
+    output: Path,
+    pictures: list[NDArray[np.uint8]],
+    visual: Mapping[str, Any],
+    figures: dict[str, Any],
+) -> None:
+    """Overlays, the report's section, and last the figures."""
+    write_overlays(output, pictures)
+    write_section(output, opened(output / "thermal.tif"), pictures, figures["thermal"])
+    write_figures(output, visual, figures)
+
+
+def _told(events: Iterator[Event]) -> Generator[Event, None, Result]:
+    """All events but the last; returns the result."""
+    found: Result | None = None
+    for happened in events:
+        if isinstance(happened, Result):
+            found = happened
+        else:
+            yield happened
+    if found is None:
+        raise RuntimeError("the story ended without a result")
+    return found
+
+
+def _figures(joined: Joined, heat: Result, b: Source) -> dict[str, Any]:
+    m, outcome = heat.metrics, joined.outcome
+    exact = (
+        outcome is not None and "cells" in outcome.evidence
+    )  # by heights everywhere, not by those places
+    error = residual(outcome) if outcome and len(outcome.px_a) and not exact else None
+    return {
+        "route": joined.route,
+        "routes_refused": dict(joined.refused),
+        "unit": b.unit,
+        "thermal_H_visual": joined.thermal_H_visual.tolist(),
+        "model": outcome.model if outcome else "positions",
+        "inliers": len(outcome.px_a) if outcome else 0,
+        "evidence": dict(outcome.evidence) if outcome else {},
+        "residual_px": error,
+        "residual_m": None if error is None else round(error * float(m["gsd_m"]), 4),
+        "thermal_values": m.get("thermal_values"),
+        "photos_used": m["photos_used"],
+        "photos_total": m["photos_total"],
+        "gsd_m": m["gsd_m"],
+        "blocks": m["blocks"],
+        "method": m["method"],
+    }

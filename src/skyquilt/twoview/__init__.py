@@ -1,1 +1,0 @@
-"""Stage: Matches -> Link or RejectedLink."""

@@ -1,0 +1,1 @@
+"""The batch workflow: a folder of photos becomes a map."""
