@@ -3,7 +3,7 @@ problems.
 
     python -m benchmarks.adjustment [--runs 5]
 
-Both get the same sightings and positions as priors, Cauchy's loss, focal length and radial
+Both get the same observations and positions as priors, Cauchy's loss, focal length and radial
 distortion free, one thread, and stop at their default tolerance; the table says how far from the
 exact minimum each stopped.
 """
@@ -30,7 +30,7 @@ SIZES = {
     "18 photos": {"lines": 3, "per_line": 6, "points": 1000},
     "75 photos": {"lines": 5, "per_line": 15, "points": 8200},
 }
-"""Name -> layout: about 4000 and 46,000 sightings."""
+"""Name -> layout: about 4000 and 46,000 observations."""
 
 
 def problem_of(layout: dict[str, int]) -> tuple[Problem, State]:

@@ -129,7 +129,7 @@ def cost(survey: Path, gsd: float) -> None:
                 break
             seconds = time.process_time() - began
             what = "drawn first" if update.what == "drawn" and first else update.what
-            first = first and not (update.what == "drawn" and not live.showing.urgent)
+            first = first and not (update.what == "drawn" and not live.redraw.urgent)
             steps[what] = steps.get(what, 0.0) + seconds
         shown = sum(steps.get(k, 0.0) for k in ("accepted", "placed", "drawn first"))
         for key, seconds in {**steps, "to the event": shown, "all": sum(steps.values())}.items():
@@ -144,9 +144,9 @@ def cost(survey: Path, gsd: float) -> None:
 
 def watch(url: str, visible: dict[str, float]) -> None:
     """Follows the news as a browser does and fetches the tile at each photo's centre."""
-    with urllib.request.urlopen(f"{url}events?after=0") as news:
+    with urllib.request.urlopen(f"{url}events?after=0") as map_events:
         kind = ""
-        for raw in news:
+        for raw in map_events:
             line = raw.decode().rstrip()
             if line.startswith("event: "):
                 kind = line[7:]

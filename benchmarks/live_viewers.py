@@ -73,10 +73,10 @@ class Browser:
         import urllib.request
 
         drawn: dict[str, tuple[int, list[float]]] = {}
-        with urllib.request.urlopen(f"{self.url}events?after=0") as news:
+        with urllib.request.urlopen(f"{self.url}events?after=0") as map_events:
             last = self.page.evaluate("() => skyquilt.state.last")
             number = 0
-            for raw in news:
+            for raw in map_events:
                 line = raw.decode().rstrip()
                 if line.startswith("id: "):
                     number = int(line[4:])

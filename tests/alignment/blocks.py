@@ -1,4 +1,4 @@
-"""Simulated blocks: cameras over rolling ground, their sightings with noise and lies, and priors
+"""Simulated blocks: cameras over rolling ground, their observations with noise and lies, and priors
 that err.
 """
 
@@ -23,7 +23,7 @@ class Block:
     start: State
     truth: State
     wrong: np.ndarray
-    """(N,) sightings that are lies."""
+    """(N,) observations that are lies."""
 
 
 def seen_by(R, C, K, X):

@@ -1,4 +1,6 @@
-"""The same problem in pycolmap's words: positions as priors, sightings of 1 px, no other prior."""
+"""The same problem in pycolmap's words: positions as priors, observations of 1 px, no other
+prior.
+"""
 
 import numpy as np
 import pycolmap

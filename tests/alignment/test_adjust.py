@@ -120,8 +120,8 @@ def test_the_covariance_is_the_dense_inverse_s(small):
 
 
 def test_the_gradient_is_the_slope_of_the_robust_cost():
-    """Cauchy on sightings, pseudo-Huber on priors: g = half the derivative of the cost, so weights
-    fit losses.
+    """Cauchy on observations, pseudo-Huber on priors: g = half the derivative of the cost, so
+    weights fit losses.
     """
     block = make_block(4, lines=1, per_line=3, points=30, lies=0.1, loss_px=2.0, loss_prior=1.5)
     problem = replace(
@@ -196,7 +196,7 @@ def test_the_sparse_adjustment_ends_where_the_dense_one_does(monkeypatch):
 # what it finds
 
 
-def test_exact_sightings_give_the_exact_block():
+def test_exact_observations_give_the_exact_block():
     """No noise at all, positions exact: the truth is the minimum, from a start metres and degrees
     away.
     """
@@ -238,7 +238,7 @@ def test_a_block_with_lies_is_recovered_within_its_deviations():
         right = residuals_px(problem, found.state)
         spare = right.size - 3 * len(found.state.X) - mask.sum()
         assert np.sqrt((right**2).sum() / spare) == pytest.approx(0.3, rel=0.06)
-    # Cauchy's weights overstate the deviations of Gaussian sightings by 27 %: 1 / 1.27 = 0.79
+    # Cauchy's weights overstate the deviations of Gaussian observations by 27 %: 1 / 1.27 = 0.79
     assert 0.6 < np.mean(ratios) < 1.05
     # a common shift of 1.5 / sqrt(18) = 0.35 m remains, and the block bends a little
     assert 0.15 < np.mean(errors) < 0.9
@@ -350,7 +350,7 @@ def test_surveyed_points_hold_the_block():
 
 
 def strip(seed):
-    """One line of 20 photos; sightings with a bending systematic error of the lens that nobody
+    """One line of 20 photos; observations with a bending systematic error of the lens that nobody
     models.
     """
     lens = np.array([700.0, 399.5, 299.5, -0.006, 0.0, 0.0, 0.0, 0.0])

@@ -53,7 +53,7 @@ def test_both_find_the_same_minimum(free, options, cauchy, lies):
 
 
 def test_the_pixel_convention_matters():
-    """Had COLMAP's half pixel been forgotten, the sightings would be off by it: the comparison
+    """Had COLMAP's half pixel been forgotten, the observations would be off by it: the comparison
     would notice.
     """
     block = make_block(1, lines=2, per_line=3, points=60)

@@ -364,7 +364,7 @@ def focal_errors(count, control):
 
 @pytest.mark.slow
 def test_the_focal_length_s_deviation_is_honest():
-    """It may be cautious (sightings count for less than they are, as real ones err together) but
+    """It may be cautious (observations count for less than they are, as real ones err together) but
     not boast.
     """
     assert 0.3 < focal_errors(12, control=False) < 1.3

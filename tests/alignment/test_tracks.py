@@ -110,7 +110,7 @@ def random_tracks(seed, count=800, photos=12):
     return Tracks(point=point, photo=photo, px=px, sigma_px=np.full(len(point), 0.3))
 
 
-def test_only_drops_tracks_left_with_one_sighting():
+def test_only_drops_tracks_left_with_one_observation():
     tracks = random_tracks(0)
     keep = np.random.default_rng(1).random(len(tracks.point)) < 0.4
     left = tracks.only(keep)

@@ -8,7 +8,7 @@ from skyquilt.calibration.solve import solve
 from skyquilt.calibration.start import start_camera, start_pose
 from skyquilt.geometry.camera import project
 from skyquilt.model.board import Board, BoardView
-from skyquilt.model.calibration import BoardPose, Sightings, rms
+from skyquilt.model.calibration import BoardPose, Observations, rms
 from skyquilt.model.camera import PARAMETERS, Camera
 from tests.calibration.boards import BOARD, CAMERA, MIDDLE, poses
 
@@ -53,7 +53,7 @@ def test_without_noise_the_camera_is_exact():
 
 def test_leaving_the_perspective_bias_in_shows():
     """Poses absorb most of it, and the focal length the rest."""
-    seen = [Calibrate().sightings(v, BOARD) for v in views(noise=0.0)]
+    seen = [Calibrate().observations(v, BOARD) for v in views(noise=0.0)]
     start = start_camera(seen, width=640, height=480)
     raw = solve(seen, start, [start_pose(s, start) for s in seen])
     assert abs(raw.camera.focal - CAMERA.focal) > 0.5
@@ -63,7 +63,7 @@ def test_leaving_the_perspective_bias_in_shows():
 def test_the_fit_agrees_with_opencv():
     corners = Calibrate(marks="corners", tolerance=0.0)
     found = corners(views(), BOARD)
-    every = [corners.sightings(v, BOARD) for v in views()]
+    every = [corners.observations(v, BOARD) for v in views()]
     flags = cv2.CALIB_FIX_ASPECT_RATIO
     K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
     error, K, k, *_ = cv2.calibrateCamera(
@@ -158,5 +158,5 @@ def test_what_a_programmer_can_do_wrong():
         Calibrate()(views()[:1], BOARD)
     with pytest.raises(ValueError, match="3 x 3"):
         Board(columns=2, rows=5, square_m=0.1)
-    flat = Sightings(name="", board=BOARD.centres[0], px=np.zeros((7, 2)))
+    flat = Observations(name="", board=BOARD.centres[0], px=np.zeros((7, 2)))
     assert len(flat.px) == 7

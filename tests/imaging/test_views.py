@@ -23,7 +23,7 @@ from skyquilt.imaging.views import (
 from skyquilt.model.camera import Camera
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
-from tests.render.scenes import CAMERA, FLAT, GRID, block, ground_of, view
+from tests.ortho.scenes import CAMERA, FLAT, GRID, block, ground_of, view
 
 
 def test_a_footprint_is_the_rim_on_the_ground():

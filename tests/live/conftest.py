@@ -16,7 +16,7 @@ from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.workflow import iter_live
 from skyquilt.server.guard import Guard
-from skyquilt.server.server_thread import Serving
+from skyquilt.server.server_thread import ServerThread
 from skyquilt.server.survey import LiveSurvey
 from skyquilt.simulate import FlightSettings, simulate
 from skyquilt.simulate.camera import Lens
@@ -133,7 +133,7 @@ def served(
         daemon=True,
     )
     guard = guard or Guard()
-    with Serving(
+    with ServerThread(
         survey=LiveSurvey(folder), guard=guard, folder=folder, writer=live, port=port
     ) as serving:
         mapping.start()

@@ -14,7 +14,7 @@ from skyquilt.live import inbox
 from skyquilt.live.folder_watch import Watch
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
-from skyquilt.server.published_files import Publishing
+from skyquilt.server.published_files import PublishedFiles
 from skyquilt.server.survey import LiveSurvey
 
 
@@ -70,7 +70,7 @@ def main(folder: Path, photos: Path, point: str, count: int) -> None:
     signal.setitimer(
         signal.ITIMER_REAL, 0
     )  # the work is done; dying while it is reported would mean nothing
-    Publishing(LiveSurvey(folder), folder).step(now=True)
+    PublishedFiles(LiveSurvey(folder), folder).step(now=True)
     poses = {
         m.photo.name: [m.pose.map_C.tolist(), m.pose.cam_R_map.tolist()]
         for m in live.members.on_map()

@@ -231,7 +231,7 @@ def test_two_spectra_lie_beside_each_other_on_either_side_of_the_handle(page, bo
         site.until(lambda: all(p["ring"] for p in site.web.get("/photos").json()["photos"]))
         site.until(
             lambda: (
-                not (site.live.queues.untried or site.live.showing.dirty or site.live.showing.later)
+                not (site.live.queues.untried or site.live.redraw.dirty or site.live.redraw.later)
             )
         )
         page.goto(site.url)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from skyquilt.live.crash_points import POINTS
-from tests.stories.conftest import relabel
+from tests.end_to_end.conftest import relabel
 
 KILLS = int(os.environ.get("SKYQUILT_KILLS", "5"))
 """Kills at random moments; more can be asked for."""

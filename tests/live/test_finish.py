@@ -22,7 +22,7 @@ from skyquilt.errors import UsageError
 from skyquilt.live.settings import LiveSettings
 from skyquilt.raster.map_source import mercator
 from skyquilt.server.guard import Guard
-from skyquilt.server.server_thread import Serving
+from skyquilt.server.server_thread import ServerThread
 from skyquilt.server.survey import open_survey
 from tests.interrupts import hears_interrupts
 from tests.live.conftest import served
@@ -72,7 +72,7 @@ def finished(flight, tmp_path_factory):
 def looked_at(folder, base=None):
     """The viewer on a folder that nobody writes."""
     with (
-        Serving(
+        ServerThread(
             survey=open_survey(folder, base=base), guard=Guard(token="looking-only"), folder=folder
         ) as site,
         httpx.Client(base_url=site.url, timeout=60) as web,

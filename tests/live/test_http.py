@@ -22,7 +22,7 @@ from PIL import Image
 from skyquilt.errors import UsageError
 from skyquilt.live.settings import LiveSettings
 from skyquilt.server.guard import Guard
-from skyquilt.server.published_files import Publishing
+from skyquilt.server.published_files import PublishedFiles
 from skyquilt.server.survey import LiveSurvey
 from tests.live.conftest import served
 
@@ -243,7 +243,7 @@ def test_export_is_a_georeferenced_cog(site, tmp_path):
 
 def test_files_for_other_programs(site):
     survey = LiveSurvey(site.folder)
-    Publishing(survey, site.folder).step(now=True)
+    PublishedFiles(survey, site.folder).step(now=True)
     with sqlite3.connect(site.folder / "map.mbtiles") as db:
         about = dict(db.execute("select name, value from metadata"))
         z, x, y, data = db.execute(

@@ -23,7 +23,7 @@ def test_two_spectra_are_two_layers_and_temperatures_stay_temperatures(both, tmp
                 assert site.send(path).is_success
         site.until(lambda: all(p["ring"] for p in site.web.get("/photos").json()["photos"]))
         live = site.live
-        site.until(lambda: not live.queues.untried and not live.showing.dirty)
+        site.until(lambda: not live.queues.untried and not live.redraw.dirty)
         names = [n["name"] for n in site.web.get("/info").json()["layers"]]
         assert names[0] == "visible"
         assert "thermal" in names

@@ -49,7 +49,7 @@ def test_points_of_the_list_of_control_points(tmp_path):
     assert d.observations_a[0].x == 0 and d.observations_b[0].x == 1
 
 
-def test_points_written_as_sightings(tmp_path):
+def test_points_written_as_observations(tmp_path):
     (d,) = read(tmp_path, "point_a, point_b, metres\n100.5 200 one.jpg, 7 8 two.jpg, 9.25\n")
     assert (d.observations_a[0].photo, d.observations_a[0].x, d.metres) == ("one.jpg", 100.5, 9.25)
 

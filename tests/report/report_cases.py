@@ -75,7 +75,7 @@ def shots(n, *, name="IMG_{:04d}.JPG", rng=None):
     return made
 
 
-def run(n=18, *, sightings=6000, samples=800, **changes):
+def run(n=18, *, observations=6000, samples=800, **changes):
     """A whole run of n photos."""
     rng = np.random.default_rng(0)
     taken = shots(n, rng=rng)
@@ -86,7 +86,7 @@ def run(n=18, *, sightings=6000, samples=800, **changes):
     y, x = np.mgrid[:height, :width]
     preview = np.dstack([x % 256, y % 256, (x + y) % 256, np.full_like(x, 255)]).astype(np.uint8)
     preview[:20, :30, 3] = 0
-    px = rng.uniform(0, 1, (sightings, 2)) * (4000, 2250)
+    px = rng.uniform(0, 1, (observations, 2)) * (4000, 2250)
     made = {
         "metrics": metrics(n),
         "preview": preview,

@@ -112,7 +112,7 @@ def test_any_part_may_stand_alone(part):
 
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_few_photos(n):
-    page = Page(build_report(run(n, sightings=3, samples=1)))
+    page = Page(build_report(run(n, observations=3, samples=1)))
     assert f"{n} of {n + 1}" in page.text
 
 
@@ -218,7 +218,7 @@ def test_drawings_hold_finite_numbers_only():
 
 
 def test_two_thousand_photos_stay_small_and_quick():
-    data = run(2000, sightings=400_000, samples=20_000)
+    data = run(2000, observations=400_000, samples=20_000)
     start = time.process_time()
     text = build_report(data)
     assert time.process_time() - start < 3

@@ -51,9 +51,9 @@ class Normal:
     V: Array
     """(P, 3, 3) point blocks."""
     Wp: Array
-    """(N, 6, 3) photo-point block of each sighting."""
+    """(N, 6, 3) photo-point block of each observation."""
     Wc: Array
-    """(N, q, 3) camera-point block of each sighting."""
+    """(N, q, 3) camera-point block of each observation."""
     gp: Array
     """(n, 6) gradient."""
     gc: Array
@@ -97,8 +97,8 @@ def _pseudo_huber(squared: Array, scale: float) -> tuple[Array, Array]:
 
 
 def _by_point(problem: Problem, values: Array, count: int) -> Array:
-    """Sums of values (N, ...) of each point's sightings: (count, ...). Sightings are sorted by
-    point.
+    """Sums of values (N, ...) of each point's observations: (count, ...). Observations are sorted
+    by point.
     """
     flat = values.reshape(len(values), -1)
     starts = np.searchsorted(problem.point, np.arange(count))
@@ -119,7 +119,7 @@ def _by_photo(problem: Problem, rows: Array, count: int) -> Array:
     return out
 
 
-def _sighting_weights(problem: Problem, residual: Array) -> tuple[Array, float]:
+def _observation_weights(problem: Problem, residual: Array) -> tuple[Array, float]:
     weight, cost = _cauchy((residual**2).sum(1), problem.loss_px)
     return weight * problem.trust, float(cost.sum()) * problem.trust
 
@@ -149,7 +149,7 @@ def _add_diagonal(blocks: Array, offset: int, values: Array) -> None:
 def normal_equations(problem: Problem, state: State) -> Normal:
     """Normal equations of the reweighted problem at a state."""
     lin = linearise(problem, state)
-    weight, cost = _sighting_weights(problem, lin.residual)
+    weight, cost = _observation_weights(problem, lin.residual)
     root = np.sqrt(weight)[:, None, None]
     e, J_point = lin.residual[..., None] * root, lin.J_point * root
     rows = np.concatenate([lin.J_photo, lin.J_camera, lin.residual[..., None]], 2) * root
@@ -184,11 +184,11 @@ def normal_equations(problem: Problem, state: State) -> Normal:
 def robust_cost(problem: Problem, state: State) -> float:
     """Robust cost of a state."""
     error = np.nan_to_num(residuals_px(problem, state)) / problem.sigma_px[:, None]
-    return _sighting_weights(problem, error)[1] + _prior_terms(problem, state)[1]
+    return _observation_weights(problem, error)[1] + _prior_terms(problem, state)[1]
 
 
 def _chunks(problem: Problem, count: int) -> list[tuple[int, int]]:
-    """Ranges of sightings covering whole points, about 6000 sightings each."""
+    """Ranges of observations covering whole points, about 6000 observations each."""
     starts = np.searchsorted(problem.point, np.arange(count + 1))
     cuts = [0]
     while cuts[-1] < len(problem.point):
@@ -245,7 +245,7 @@ class Reduced:
         return S
 
     def _chunk(self, lo: int, hi: int) -> tuple[NDArray[np.int64], Array, slice]:
-        """Unknowns touched by sightings [lo, hi), their rows of W L^-T (u, 3p), and the points'
+        """Unknowns touched by observations [lo, hi), their rows of W L^-T (u, 3p), and the points'
         slice.
         """
         p, N, q = self.problem, self.normal, self.q
@@ -315,7 +315,7 @@ class Reduced:
 def polish_points(problem: Problem, state: State) -> State:
     """One Gauss-Newton step of the points alone."""
     residual, J_point = linearised_points(problem, state)
-    weight, _ = _sighting_weights(problem, residual)
+    weight, _ = _observation_weights(problem, residual)
     rows = np.concatenate([J_point, residual[..., None]], 2) * np.sqrt(weight)[:, None, None]
     sums = _by_point(problem, np.swapaxes(rows[:, :, :3], 1, 2) @ rows, len(state.X))
     pull = np.where(np.isfinite(problem.X0), 1 / problem.sigma_X**2, 0.0)
@@ -339,7 +339,7 @@ def adjust(
     straightens moves along a curve, and without that its long steps would all be refused.
 
     Args:
-        problem: sightings and priors.
+        problem: observations and priors.
         state: where to start.
         iterations: most steps to take.
         tolerance: relative decrease of the cost at which it counts as converged.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import adjust, covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
-from skyquilt.alignment.least_squares_matching import GreyPicture, Sharpen
+from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
 from skyquilt.alignment.start import Start, find_start
@@ -34,12 +34,12 @@ class Bundle:
     `6t` (and tangential).
     """
     per_photo: int = 400
-    """Sightings per photo in the adjustment; all the others are triangulated afterwards."""
+    """Observations per photo in the adjustment; all the others are triangulated afterwards."""
     repair: bool = True
     """Treat metadata as measurements that may lie; False believes them to their stated deviations.
     """
-    sharpen: Sharpen | None = field(default_factory=Sharpen)
-    """Registration of sightings in larger pictures; None leaves keypoints as they were found."""
+    match_observations: LeastSquaresMatching | None = field(default_factory=LeastSquaresMatching)
+    """Registration of observations in larger pictures; None leaves keypoints as they were found."""
     version: ClassVar[int] = 4
 
     def __call__(
@@ -52,8 +52,8 @@ class Bundle:
         control: Sequence[Control] = (),
         grey: GreyPicture | None = None,
     ) -> Alignment:
-        """Aligns the photos that hang together by links; `grey` gives pictures to sharpen sightings
-        in.
+        """Aligns the photos that hang together by links; `grey` gives pictures to match
+        observations in.
 
         Raises:
             AlignmentError: no two photos are linked.
@@ -67,8 +67,8 @@ class Bundle:
         used = setup.sensor_tracks(tracks)
         problem, state = setup.problem(thin(used, sizes, per_photo=self.per_photo))
         problem, state = _rough(problem, state)
-        if grey is not None and self.sharpen is not None:
-            used = _sharpened(used, photos, setup, problem, state, self.sharpen, grey)
+        if grey is not None and self.match_observations is not None:
+            used = _sharpened(used, photos, setup, problem, state, self.match_observations, grey)
             problem, _ = setup.problem(thin(used, sizes, per_photo=self.per_photo))
             state = triangulated(problem, state)
         problem, state = _fine(problem, state)
@@ -84,16 +84,18 @@ def _sharpened(
     setup: Setup,
     problem: Problem,
     state: State,
-    sharpen: Sharpen,
+    match_observations: LeastSquaresMatching,
     grey: GreyPicture,
 ) -> Tracks:
-    """Tracks (sensor pixels) with sightings registered in larger pictures."""
+    """Tracks (sensor pixels) with observations registered in larger pictures."""
     everything, _ = setup.problem(tracks)
     xyz = triangulated(everything, state).X
     cameras, camera_of = camera_records(photos, setup, state, None)
     poses = pose_records(setup, state)
     filed = replace(tracks, px=setup.file_px(tracks.photo, tracks.px))
-    sharp = sharpen(filed, xyz, poses, {i: cameras[k] for i, k in camera_of.items()}, grey)
+    sharp = match_observations(
+        filed, xyz, poses, {i: cameras[k] for i, k in camera_of.items()}, grey
+    )
     return replace(sharp, px=setup.file_px(sharp.photo, sharp.px))
 
 
@@ -117,8 +119,8 @@ def _fine(problem: Problem, state: State) -> tuple[Problem, State]:
 
 
 def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]:
-    """Without the sightings off by more than `limit` deviations, and points then seen once; control
-    stays.
+    """Without the observations off by more than `limit` deviations, and points then seen once;
+    control stays.
     """
     error = np.linalg.norm(residuals_px(problem, state), axis=1) / problem.sigma_px
     pinned = np.asarray(np.isfinite(problem.X0).any(1))
@@ -198,7 +200,9 @@ def leave_one_out(
 
 
 def ground_points(tracks: Tracks, setup: Setup, problem: Problem, state: State) -> TiePoints:
-    """All tracks triangulated with the final poses; bad sightings and unstable points dropped."""
+    """All tracks triangulated with the final poses; bad observations and unstable points
+    dropped.
+    """
     everything, _ = setup.problem(tracks)
     everything = replace(everything, loss_px=2.0)
     whole = triangulated(everything, state)
@@ -255,6 +259,6 @@ def _outcome(
 
 
 def _variance_factor(problem: Problem, state: State) -> float:
-    """Robust variance of the whitened sightings."""
+    """Robust variance of the whitened observations."""
     e = residuals_px(problem, state) / problem.sigma_px[:, None]
     return float((1.48 * np.nanmedian(np.abs(e))) ** 2)

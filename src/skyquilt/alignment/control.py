@@ -41,7 +41,7 @@ class Control:
 def control_in_frame(
     points: Sequence[ControlPoint], photos: Sequence[Photo], frame: MapFrame
 ) -> tuple[Control, ...]:
-    """Control points in map coordinates; sightings in unknown photos are left out, points never
+    """Control points in map coordinates; observations in unknown photos are left out, points never
     seen too.
     """
     index = {p.name: i for i, p in enumerate(photos)} | {
@@ -73,16 +73,16 @@ def control_in_frame(
 
 
 def _placed(control: Control, setup: Setup) -> tuple[NDArray[np.int64], Array]:
-    """Rows and sensor pixels of the sightings in placed photos."""
+    """Rows and sensor pixels of the observations in placed photos."""
     mine = np.isin(control.photo, setup.members)
     photo = control.photo[mine]
     return np.searchsorted(setup.members, photo), setup.file_px(photo, control.px[mine])
 
 
-def _sightings(
+def _observations(
     control: Sequence[Control], setup: Setup
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Point numbers, rows and sensor pixels of all sightings."""
+    """Point numbers, rows and sensor pixels of all observations."""
     parts = [_placed(c, setup) for c in control]
     point = np.repeat(np.arange(len(parts)), [len(row) for row, _ in parts])
     row = np.concatenate([row for row, _ in parts] or [np.zeros(0, int)])
@@ -93,7 +93,7 @@ def _alone(
     control: Sequence[Control], setup: Setup, problem: Problem, state: State
 ) -> tuple[Problem, State]:
     """The control points alone, seen by the poses as they are, intersected from their rays."""
-    point, row, px = _sightings(control, setup)
+    point, row, px = _observations(control, setup)
     empty = np.full((len(control), 3), np.nan)
     own_problem = replace(
         problem,
@@ -191,7 +191,7 @@ def _with_points(
     problem: Problem, state: State, setup: Setup, fit: Sequence[Control]
 ) -> tuple[Problem, State]:
     """Tie points and control points together."""
-    point, row, px = _sightings(fit, setup)
+    point, row, px = _observations(fit, setup)
     P = len(state.X)
     surveyed = np.array([c.xyz for c in fit])
     X, _ = intersected(fit, setup, problem, state)
@@ -222,7 +222,7 @@ def residuals_of_control(
             check=c.check,
             error_m=x - c.xyz,
             reprojection_px=float(r),
-            sightings=len(_placed(c, setup)[0]),
+            observations=len(_placed(c, setup)[0]),
         )
         for c, x, r in zip(control, X, rms, strict=True)
     )

@@ -1,8 +1,9 @@
-"""Sightings made sharper: keypoints found in small pictures, moved to where larger pictures agree.
+"""Observations made sharper: keypoints found in small pictures, moved to where larger pictures
+agree.
 
-With poses nearly right, every sighting of a point is a patch of the same ground: rectified to the
-ground, the patches differ by a translation, which is what the sightings' errors are. One sighting
-stays and the others follow it.
+With poses nearly right, every observation of a point is a patch of the same ground: rectified to
+the ground, the patches differ by a translation, which is what the observations' errors are. One
+observation stays and the others follow it.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,23 +24,25 @@ Array = NDArray[np.float64]
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Grey picture (h, w) of a photo (index), its longest side at most the px given."""
 MARGIN = 3
-"""Pixels by which a sighting may move."""
+"""Pixels by which a observation may move."""
 BATCH = 4000
-"""Sightings registered at a time: bounds the memory."""
+"""Observations registered at a time: bounds the memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sharpen:
-    """Registration of all sightings of a point to the most central one."""
+class LeastSquaresMatching:
+    """Registration of all observations of a point to the most central one."""
 
     side: int = 15
     """Pixels of a patch's side, in the picture it is cut from."""
     longest: int = 1000
     """Longest side in px of the pictures."""
     agree: float = 0.75
-    """Least correlation of two sightings; others stay as they were found, with their deviation."""
+    """Least correlation of two observations; others stay as they were found, with their
+    deviation.
+    """
     sigma: float = 0.12
-    """Standard deviation of a sharpened sighting in px of the picture."""
+    """Standard deviation of a sharpened observation in px of the picture."""
     version: ClassVar[int] = 1
 
     def __call__(
@@ -50,7 +53,7 @@ class Sharpen:
         cameras: Mapping[int, Camera],
         grey: GreyPicture,
     ) -> Tracks:
-        """Tracks (file pixels) with sharper sightings; `xyz` (count, 3): their points in the map
+        """Tracks (file pixels) with sharper observations; `xyz` (count, 3): their points in the map
         frame.
         """
         anchor = self._anchors(tracks, cameras)
@@ -84,7 +87,7 @@ class Sharpen:
         return np.concatenate([s for s, _ in parts]), np.concatenate([c for _, c in parts])
 
     def _anchors(self, tracks: Tracks, cameras: Mapping[int, Camera]) -> NDArray[np.int64]:
-        """The most central sighting of each track (count,)."""
+        """The most central observation of each track (count,)."""
         size = np.array(
             [(cameras[p].width, cameras[p].height) for p in tracks.photo.tolist()], float
         )
@@ -100,7 +103,7 @@ class Sharpen:
         cameras: Mapping[int, Camera],
         grey: GreyPicture,
     ) -> tuple[NDArray[np.uint8], Array]:
-        """Patches (N, s + 2 margin, ...) of all sightings rectified to the level ground of their
+        """Patches (N, s + 2 margin, ...) of all observations rectified to the level ground of their
         point, centred where each was seen, and the pictures' scales (N,): sensor px per px.
         """
         full = self.side + 2 * MARGIN
@@ -147,7 +150,7 @@ class Sharpen:
         shift: Array,
         scale: Array,
     ) -> Array:
-        """Sensor pixels (m, 2) of sightings moved by shifts (m, 2) in patch px."""
+        """Sensor pixels (m, 2) of observations moved by shifts (m, 2) in patch px."""
         moved = tracks.px[rows].copy()
         for photo in np.unique(tracks.photo[rows]).tolist():
             own = np.flatnonzero(tracks.photo[rows] == photo)

@@ -33,7 +33,7 @@ DISAGREE = 0.12
 """
 STAGES = ((2.0, 20.0, 40.0, 3e-2), (0.8, 6.0, 12.0, 1e-2), (0.0, 2.5, 5.0, 1e-2))
 """Rounds of an adjustment: from which median misfit in px of the new photo on, width of the loss in
-px, residual in px beyond which sightings go, and tolerance.
+px, residual in px beyond which observations go, and tolerance.
 """
 TURNED = "/turned"
 """End of the names of calibrations of files that were rewritten upside down."""
@@ -68,15 +68,15 @@ class Window:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Settled:
+class AdjustedWindow:
     """A window after its adjustment."""
 
     poses: dict[int, Pose]
     """New poses of the new photo and of those that were free to move."""
     camera: str
     """Name of the new photo's calibration."""
-    sightings: int
-    """Sightings that hold the new photo."""
+    observations: int
+    """Observations that hold the new photo."""
     xyz: NDArray[np.float64]
     """(P, 3) points of the ground in m."""
     dropped: tuple[tuple[int, int], ...]
@@ -84,7 +84,7 @@ class Settled:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Unsettled:
+class NotAdjusted:
     """Why the links do not place a photo: false in `if`."""
 
     reason: str
@@ -95,23 +95,23 @@ class Unsettled:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Incremental:
+class LocalAdjustment:
     """Similarity from the links, then a bundle adjustment of the window."""
 
     per_photo: int = 120
-    """Sightings per photo in the adjustment."""
+    """Observations per photo in the adjustment."""
     least: int = 12
-    """Fewest sightings that hold a photo."""
+    """Fewest observations that hold a photo."""
     version: ClassVar[int] = 1
 
-    def __call__(self, window: Window) -> Settled | Unsettled:
+    def __call__(self, window: Window) -> AdjustedWindow | NotAdjusted:
         """Places the new photo and settles the free ones."""
         plane = {i: _similarity(window, i) for i in window.poses}
         dropped: tuple[tuple[int, int], ...] = ()
         if window.new not in window.poses:
             guess = _guess(window, plane)
             if guess is None:
-                return Unsettled(reason="its links contradict each other")
+                return NotAdjusted(reason="its links contradict each other")
             plane[window.new], agreeing = guess
             own = [(k.a, k.b) for k in window.links if window.new in (k.a, k.b)]
             dropped = tuple(key for key in own if key not in agreeing)
@@ -121,18 +121,18 @@ class Incremental:
         sizes = [(p.width, p.height) for p in window.photos]
         problem, state = setup.problem(thin(tracks, sizes, per_photo=self.per_photo))
         if not len(problem.px):
-            return Unsettled(reason="no sightings are left")
+            return NotAdjusted(reason="no observations are left")
         row = int(np.searchsorted(setup.members, window.new))
         problem, state = _adjusted(problem, triangulated(problem, state), row)
-        sightings = int((problem.photo == row).sum())
-        if sightings < self.least:
-            return Unsettled(reason=f"only {sightings} tie points hold it")
+        observations = int((problem.photo == row).sum())
+        if observations < self.least:
+            return NotAdjusted(reason=f"only {observations} tie points hold it")
         moved = {i: p for i, p in pose_records(setup, state).items() if i not in window.held}
         key = window.photos[window.new].camera_key
-        return Settled(
+        return AdjustedWindow(
             poses=moved,
             camera=key + TURNED if setup.turned[window.new] else key,
-            sightings=sightings,
+            observations=observations,
             xyz=state.X,
             dropped=dropped,
         )

@@ -1,4 +1,4 @@
-"""A bundle adjustment problem: unknowns, sightings, and priors with their deviations."""
+"""A bundle adjustment problem: unknowns, observations, and priors with their deviations."""
 
 from dataclasses import dataclass, replace
 
@@ -39,16 +39,16 @@ class State:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Problem:
-    """What was measured. Sightings are sorted by point."""
+    """What was measured. Observations are sorted by point."""
 
     point: Index
-    """(N,) point of each sighting, ascending."""
+    """(N,) point of each observation, ascending."""
     photo: Index
-    """(N,) photo of each sighting."""
+    """(N,) photo of each observation."""
     px: Array
     """(N, 2) in px."""
     sigma_px: Array
-    """(N,) standard deviation of each sighting in px."""
+    """(N,) standard deviation of each observation in px."""
     camera: Index
     """(n,) camera of each photo."""
     free: NDArray[np.bool_]
@@ -70,25 +70,25 @@ class Problem:
     sigma_X: Array
     """(P, 3) deviations of `X0`."""
     loss_px: float
-    """Scale of the Cauchy loss on sightings, in units of their deviation."""
+    """Scale of the Cauchy loss on observations, in units of their deviation."""
     loss_C: float = 3.0
     """Scale of the pseudo-Huber loss on positions, in units of their deviation: a GPS may lie."""
     loss_R: float = 2.0
     """Scale of the pseudo-Huber loss on attitudes: a gimbal may lie."""
     trust: float = 1.0
-    """Factor on the cost of sightings. Errors of neighbouring sightings are correlated (lens model,
-    rolling shutter, features of one kind); a photo's hundreds of sightings weigh like some dozens
-    of independent ones.
+    """Factor on the cost of observations. Errors of neighbouring observations are correlated (lens
+    model, rolling shutter, features of one kind); a photo's hundreds of observations weigh like
+    some dozens of independent ones.
     """
 
     def with_loss(self, loss_px: float) -> "Problem":
-        """The same problem with another scale of the loss on sightings."""
+        """The same problem with another scale of the loss on observations."""
         return replace(self, loss_px=loss_px)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Linearised:
-    """Whitened residuals and Jacobians of the sightings."""
+    """Whitened residuals and Jacobians of the observations."""
 
     residual: Array
     """(N, 2) in deviations."""
@@ -99,11 +99,11 @@ class Linearised:
     J_point: Array
     """(N, 2, 3)."""
     behind: NDArray[np.bool_]
-    """(N,) sightings whose point lies behind its camera: ignored."""
+    """(N,) observations whose point lies behind its camera: ignored."""
 
 
 def _local(problem: Problem, state: State) -> tuple[Array, NDArray[np.bool_]]:
-    """Points of all sightings in camera coordinates (N, 3), and which lie behind."""
+    """Points of all observations in camera coordinates (N, 3), and which lie behind."""
     d = state.X[problem.point] - state.C[problem.photo]
     local = np.einsum("nij,nj->ni", state.R[problem.photo], d)
     behind = local[:, 2] < 1e-6

@@ -18,7 +18,7 @@ from skyquilt.model.poses import Pose, Prior
 Array = NDArray[np.float64]
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 INDEPENDENT = 40
-"""Independent sightings that a photo's many correlated ones are worth."""
+"""Independent observations that a photo's many correlated ones are worth."""
 YAW_LIE_DEG = 20.0
 """A reported yaw further than this from the pixels' is no measurement of it."""
 
@@ -46,7 +46,7 @@ class Setup:
     z_ground: float
     """Height of the ground plane of the start."""
     base: Problem
-    """The problem without sightings."""
+    """The problem without observations."""
     start_R: Array
     """(n, 3, 3)."""
     start_C: Array

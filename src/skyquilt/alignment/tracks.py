@@ -14,10 +14,10 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tracks:
-    """Sightings sorted by track."""
+    """Observations sorted by track."""
 
     point: Index
-    """(N,) track of each sighting, 0 .. count-1, ascending."""
+    """(N,) track of each observation, 0 .. count-1, ascending."""
     photo: Index
     """(N,) photo."""
     px: NDArray[np.float64]
@@ -30,10 +30,10 @@ class Tracks:
         """Number of tracks."""
         return int(self.point[-1]) + 1 if len(self.point) else 0
 
-    def only(self, sighting: NDArray[np.bool_]) -> "Tracks":
-        """The sightings marked, less tracks left with one; renumbered."""
-        point = self.point[sighting]
-        keep = np.flatnonzero(sighting)[np.bincount(point, minlength=self.count)[point] >= 2]
+    def only(self, observation: NDArray[np.bool_]) -> "Tracks":
+        """The observations marked, less tracks left with one; renumbered."""
+        point = self.point[observation]
+        keep = np.flatnonzero(observation)[np.bincount(point, minlength=self.count)[point] >= 2]
         _, renumbered = np.unique(self.point[keep], return_inverse=True)
         return Tracks(
             point=renumbered.astype(np.int64),

@@ -1,4 +1,4 @@
-"""Points from sightings with known poses."""
+"""Points from observations with known poses."""
 
 from dataclasses import replace
 

@@ -13,7 +13,7 @@ from skyquilt.calibration.solve import Solution, solve
 from skyquilt.calibration.square_image import centroid_bias
 from skyquilt.calibration.start import start_camera, start_pose
 from skyquilt.model.board import Board, BoardView
-from skyquilt.model.calibration import BoardPose, Calibration, Marks, Sightings, rms
+from skyquilt.model.calibration import BoardPose, Calibration, Marks, Observations, rms
 from skyquilt.model.camera import PARAMETERS, Camera
 
 Array = NDArray[np.float64]
@@ -52,14 +52,14 @@ class Calibrate:
                 "two views or more of one size expected, got"
                 f" {[(v.width, v.height) for v in views]}"
             )
-        seen = [self.sightings(v, board) for v in views]
+        seen = [self.observations(v, board) for v in views]
         start = start_camera(seen, width=views[0].width, height=views[0].height)
         poses = [start_pose(s, start) for s in seen]
         rough = solve(seen, start, poses, ("focal",))
         rough = solve(seen, rough.camera, rough.poses, ("focal", "k1"))
         return self._reduced(seen, rough, board)
 
-    def sightings(self, view: BoardView, board: Board) -> Sightings:
+    def observations(self, view: BoardView, board: Board) -> Observations:
         """The marks of a view that count."""
         points, px = (
             (board.corners, view.corners)
@@ -69,14 +69,14 @@ class Calibrate:
         known = np.isfinite(px[..., 0])
         if self.marks == "centres":
             known &= board.inner  # what lies beside the others may be anything [Y 5.1.3]
-        return Sightings(
+        return Observations(
             name=view.name,
             board=points[known],
             px=px[known],
             rounding_px=view.rounding_px[known] if self.marks == "centres" else 0.0,
         )
 
-    def _reduced(self, seen: Sequence[Sightings], rough: Solution, board: Board) -> Calibration:
+    def _reduced(self, seen: Sequence[Observations], rough: Solution, board: Board) -> Calibration:
         """Fits all parameters, and again without those that are smaller than their tolerance."""
         free, dropped = list(PARAMETERS), []
         solution, used = self._fit(seen, rough, free, board)
@@ -99,15 +99,15 @@ class Calibrate:
             camera=_widened(solution.camera, full, free),
             free=tuple(free),
             dropped=tuple(dropped),
-            sightings=tuple(used),
+            observations=tuple(used),
             poses=solution.poses,
             residuals=solution.residuals,
         )
 
     def _fit(
-        self, seen: Sequence[Sightings], start: Solution, free: Sequence[str], board: Board
-    ) -> tuple[Solution, Sequence[Sightings]]:
-        """The minimum, and the sightings corrected with it."""
+        self, seen: Sequence[Observations], start: Solution, free: Sequence[str], board: Board
+    ) -> tuple[Solution, Sequence[Observations]]:
+        """The minimum, and the observations corrected with it."""
         solution, used = start, seen
         for _ in range(self.rounds if self.marks == "centres" else 1):
             used = self.corrected(seen, solution.camera, solution.poses, board)
@@ -115,8 +115,8 @@ class Calibrate:
         return solution, used
 
     def corrected(
-        self, seen: Sequence[Sightings], camera: Camera, poses: Sequence[BoardPose], board: Board
-    ) -> list[Sightings]:
+        self, seen: Sequence[Observations], camera: Camera, poses: Sequence[BoardPose], board: Board
+    ) -> list[Observations]:
         """Images of centres instead of centroids of images; corners as they are."""
         if self.marks == "corners":
             return list(seen)
@@ -131,7 +131,7 @@ class Calibrate:
         """Residuals (n, 2) in px of a view that had no part in a camera: only its pose is
         fitted.
         """
-        seen = [self.sightings(view, board)]
+        seen = [self.observations(view, board)]
         poses: Sequence[BoardPose] = [start_pose(seen[0], camera)]
         residuals = np.zeros((0, 2))
         for _ in range(self.rounds if self.marks == "centres" else 1):
@@ -169,4 +169,6 @@ def strangers(calibration: Calibration, *, times: float = 4.0) -> dict[str, floa
     """
     each = np.array([rms(r) for r in calibration.residuals])
     limit = times * float(np.median(each))
-    return {s.name: float(e) for s, e in zip(calibration.sightings, each, strict=True) if e > limit}
+    return {
+        s.name: float(e) for s, e in zip(calibration.observations, each, strict=True) if e > limit
+    }

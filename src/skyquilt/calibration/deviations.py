@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.calibration.linearised import linearised
-from skyquilt.model.calibration import BoardPose, Sightings
+from skyquilt.model.calibration import BoardPose, Observations
 from skyquilt.model.camera import PARAMETERS, Camera
 
 Array = NDArray[np.float64]
@@ -14,7 +14,10 @@ _FEWEST = 4
 
 
 def sigmas(
-    views: Sequence[Sightings], camera: Camera, poses: Sequence[BoardPose], columns: Sequence[int]
+    views: Sequence[Observations],
+    camera: Camera,
+    poses: Sequence[BoardPose],
+    columns: Sequence[int],
 ) -> tuple[float, ...]:
     """Standard deviations in the order of `PARAMETERS`, 0 for what was held (`columns` says what
     was not).
@@ -57,7 +60,10 @@ def sigmas(
 
 
 def _jackknife(
-    views: Sequence[Sightings], camera: Camera, poses: Sequence[BoardPose], columns: Sequence[int]
+    views: Sequence[Observations],
+    camera: Camera,
+    poses: Sequence[BoardPose],
+    columns: Sequence[int],
 ) -> Array:
     """Variances of the intrinsics from what leaving out one view after the other moves, to first
     order; zero for fewer than four views.

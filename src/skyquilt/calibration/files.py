@@ -118,7 +118,7 @@ def _view_record(view: BoardView, centres: Calibration, k: int) -> dict[str, Any
     return {
         "name": view.name,
         "frames": view.frames,
-        "squares": len(centres.sightings[k].px),
+        "squares": len(centres.observations[k].px),
         "rms_px": round(rms(centres.residuals[k]), 4),
         "contrast": round(view.contrast, 2),
         "distance_m": round(float(np.linalg.norm(t)), 4),
@@ -140,7 +140,7 @@ def _calibration_record(found: Calibration, judged: Judged) -> dict[str, Any]:
             for name in PARAMETERS
         },
         "dropped": {n: {"value": v, "tolerance": t} for n, v, t in found.dropped},
-        "points": sum(len(s.px) for s in found.sightings),
+        "points": sum(len(s.px) for s in found.observations),
         "rms_px": round(found.rms_px, 4),
         "mean_error_px": [round(x, 4), round(y, 4)],
         "held_out_px": {by: round(e, 4) for by, e in judged.held_out_px[found.marks].items()},

@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.geometry.camera import project_with_derivatives
-from skyquilt.model.calibration import BoardPose, Sightings
+from skyquilt.model.calibration import BoardPose, Observations
 from skyquilt.model.camera import PARAMETERS, Camera
 
 Array = NDArray[np.float64]
 
 
 def linearised(
-    view: Sightings, camera: Camera, pose: BoardPose, columns: Sequence[int]
+    view: Observations, camera: Camera, pose: BoardPose, columns: Sequence[int]
 ) -> tuple[Array, Array]:
     """Derivatives (n, 2, columns + 6) of a view's points by intrinsics (columns of `PARAMETERS`)
     and pose, and residuals (n, 2) in px.

@@ -215,7 +215,7 @@ def _pattern(data: CalibrationInput, found: Calibration) -> Figure:
     """Fig. 6.8: the mean error at every point of the pattern, over all views."""
     board = data.board
     square = board.square_m
-    where = np.concatenate([s.board[:, :2] for s in found.sightings]) / square
+    where = np.concatenate([s.board[:, :2] for s in found.observations]) / square
     error = np.concatenate(found.residuals)
     nodes, index = np.unique(np.round(where, 3), axis=0, return_inverse=True)
     count = np.bincount(index.ravel())

@@ -13,7 +13,7 @@ from skyquilt.calibration.deviations import sigmas
 from skyquilt.calibration.linearised import linearised
 from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import rotation_from_vector
-from skyquilt.model.calibration import BoardPose, Sightings
+from skyquilt.model.calibration import BoardPose, Observations
 from skyquilt.model.camera import PARAMETERS, Camera
 
 Array = NDArray[np.float64]
@@ -40,7 +40,7 @@ def moved(pose: BoardPose, step: Array) -> BoardPose:
 
 
 def solve(
-    views: Sequence[Sightings],
+    views: Sequence[Observations],
     camera: Camera,
     poses: Sequence[BoardPose],
     free: Sequence[str] = PARAMETERS,
@@ -83,7 +83,7 @@ class _State:
     cost: float
 
 
-def _state(views: Sequence[Sightings], camera: Camera, poses: Sequence[BoardPose]) -> _State:
+def _state(views: Sequence[Observations], camera: Camera, poses: Sequence[BoardPose]) -> _State:
     predicted = [project(camera, p(v.board)) for v, p in zip(views, poses, strict=True)]
     cost = sum(float(((v.px - q) ** 2).sum()) for v, q in zip(views, predicted, strict=True))
     cost = cost if np.isfinite(cost) and camera.focal > 0 else np.inf
@@ -91,7 +91,7 @@ def _state(views: Sequence[Sightings], camera: Camera, poses: Sequence[BoardPose
 
 
 def _normal(
-    views: Sequence[Sightings], state: _State, columns: Sequence[int]
+    views: Sequence[Observations], state: _State, columns: Sequence[int]
 ) -> tuple[Array, Array]:
     """Normal matrix and right-hand side: intrinsics first, then six per view."""
     own = len(columns)

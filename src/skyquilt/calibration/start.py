@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.model.calibration import BoardPose, Sightings
+from skyquilt.model.calibration import BoardPose, Observations
 from skyquilt.model.camera import Camera
 
 Array = NDArray[np.float64]
 
 
-def start_camera(views: Sequence[Sightings], *, width: int, height: int) -> Camera:
+def start_camera(views: Sequence[Observations], *, width: int, height: int) -> Camera:
     """An ideal camera whose focal length in px follows from the tilt of the boards; the longer side
     where no board is tilted.
     """
@@ -37,7 +37,7 @@ def start_camera(views: Sequence[Sightings], *, width: int, height: int) -> Came
     )
 
 
-def start_pose(view: Sightings, camera: Camera) -> BoardPose:
+def start_pose(view: Observations, camera: Camera) -> BoardPose:
     """The pose of a board from its homography."""
     h = np.linalg.inv(camera.matrix) @ _homography(view)
     h /= (np.linalg.norm(h[:, 0]) + np.linalg.norm(h[:, 1])) / 2
@@ -46,6 +46,6 @@ def start_pose(view: Sightings, camera: Camera) -> BoardPose:
     return BoardPose(cam_R_board=u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt, cam_t=h[:, 2])
 
 
-def _homography(view: Sightings) -> Array:
+def _homography(view: Observations) -> Array:
     """px_H_board (3, 3) from the board's plane in m."""
     return np.asarray(cv2.findHomography(view.board[:, :2], view.px, 0)[0], np.float64)

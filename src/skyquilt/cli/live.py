@@ -76,7 +76,7 @@ def command(
         from skyquilt.live.settings import LiveSettings
         from skyquilt.live.workflow import iter_live
         from skyquilt.server.guard import Guard
-        from skyquilt.server.server_process import Asked, ServingApart
+        from skyquilt.server.server_process import ServerConfig, ServerProcess
     settings = LiveSettings(
         gsd_cm=gsd,
         crs=crs,
@@ -90,8 +90,8 @@ def command(
     guard = Guard(host=host, token=token)
     live = LiveMap(output, settings)
     try:
-        asked = Asked(folder=output, settings=settings, guard=guard, base=base)
-        with ServingApart(asked=asked, port=port) as serving:
+        asked = ServerConfig(folder=output, settings=settings, guard=guard, base=base)
+        with ServerProcess(asked=asked, port=port) as serving:
             events = iter_live(inbox, live, finish=finish)
             show_live(events, serving.url, mode="quiet" if quiet else "json" if json else "normal")
     finally:

@@ -13,7 +13,7 @@ from skyquilt.model.event import Event, Note, Result, StageStarted
 def show_live(events: Iterable[Event | Update], url: str, *, mode: str) -> None:
     """Consumes the story; mode `normal`, `quiet` or `json`."""
     if mode == "json":
-        _line({"event": "Serving", "url": url})
+        _line({"event": "ServerThread", "url": url})
     elif mode == "normal":
         sys.stdout.write(f"{url} shows the map; Ctrl-C ends, the same command goes on\n")
     for happened in events:

@@ -25,7 +25,7 @@ def command(
     tilt: Annotated[
         float, typer.Option(help="Standard deviation of pitch and roll, degrees.")
     ] = 0.3,
-    noise: Annotated[float, typer.Option(help="Standard deviation of a sighting, px.")] = 0.3,
+    noise: Annotated[float, typer.Option(help="Standard deviation of a observation, px.")] = 0.3,
     flights: Annotated[
         int, typer.Option(help="Strips flown with different seeds; curves are medians.")
     ] = 5,

@@ -25,10 +25,10 @@ def command(
     """Show a map in a browser, with all photos that cover any point. Nothing is changed."""
     with ends_at_once():
         from skyquilt.server.guard import Guard
-        from skyquilt.server.server_thread import Serving
+        from skyquilt.server.server_thread import ServerThread
         from skyquilt.server.survey import open_survey
     survey = open_survey(folder, base=base)
     guard = Guard(host=host, token="looking-only")  # nothing can be written: there is no writer
-    with Serving(survey=survey, guard=guard, folder=folder, port=port) as serving:
+    with ServerThread(survey=survey, guard=guard, folder=folder, port=port) as serving:
         typer.echo(f"{serving.url} shows {folder}; Ctrl-C ends")
         threading.Event().wait()

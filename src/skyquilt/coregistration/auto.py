@@ -10,7 +10,7 @@ from skyquilt.coregistration.decision import Decide, distinctness
 from skyquilt.coregistration.everywhere import Everywhere
 from skyquilt.coregistration.orientation import Orientation, Pyramid
 from skyquilt.coregistration.structure import StructureMatches, sharpened
-from skyquilt.coregistration.subpixel import Fit, Sharpen
+from skyquilt.coregistration.subpixel import Fit, SubpixelRefinement
 from skyquilt.coregistration.usable import both_usable
 from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistration, Registration
 
@@ -92,7 +92,9 @@ class Auto:
         found = distinct(_sharpened(a, b, places, 5), a.shape, 2, 8)
         found.sort(key=lambda c: -distinctness(a, b, c.b_H_a))
         a, b = pyramid.at(_DECIDE)
-        fits = [Sharpen()(a, b, pyramid.moved(c.b_H_a, _SELECT, _DECIDE)) for c in found[:3]]
+        fits = [
+            SubpixelRefinement()(a, b, pyramid.moved(c.b_H_a, _SELECT, _DECIDE)) for c in found[:3]
+        ]
         kept = distinct([Candidate(b_H_a=f.b_H_a, score=f.score) for f in fits], a.shape, 2, 3)
         return [f for f in fits if any(f.b_H_a is c.b_H_a for c in kept)]
 
@@ -100,5 +102,5 @@ class Auto:
 def _sharpened(
     a: Orientation, b: Orientation, places: Sequence[Matrix], steps: int
 ) -> list[Candidate]:
-    fits = [Sharpen(steps=steps)(a, b, place) for place in places]
+    fits = [SubpixelRefinement(steps=steps)(a, b, place) for place in places]
     return [Candidate(b_H_a=fit.b_H_a, score=fit.score) for fit in fits]

@@ -17,7 +17,7 @@ from skyquilt.coregistration.orientation import (
     spectra,
     warped,
 )
-from skyquilt.coregistration.subpixel import Fit, Freedom, Sharpen
+from skyquilt.coregistration.subpixel import Fit, Freedom, SubpixelRefinement
 from skyquilt.model.registration import Matrix, RefusedRegistration, Registration
 
 Outcome = Registration | RefusedRegistration
@@ -61,7 +61,7 @@ class Decide:
         freedoms: tuple[Freedom, ...] = ("affine", "homography")
         model: Freedom = "similarity"
         for freer in freedoms:
-            other = Sharpen(freedom=freer)(a, b, fit.b_H_a)
+            other = SubpixelRefinement(freedom=freer)(a, b, fit.b_H_a)
             if other.correlation > (1 + self.gain) * fit.correlation:
                 model, fit, agreement = freer, other, self.agree(a, b, other.b_H_a)
         full = self._finest(pyramid, pyramid.full(fit.b_H_a, pyramid.last), model)
@@ -81,7 +81,7 @@ class Decide:
         larger = pyramid.finest(self.finest)
         if larger is None:
             return full
-        fit = Sharpen(freedom=model, steps=3)(*larger, between(*larger, full))
+        fit = SubpixelRefinement(freedom=model, steps=3)(*larger, between(*larger, full))
         return full_size(*larger, fit.b_H_a)
 
 

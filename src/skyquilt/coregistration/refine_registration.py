@@ -22,7 +22,7 @@ from skyquilt.coregistration.orientation import (
     orientation,
     shrunken,
 )
-from skyquilt.coregistration.subpixel import Fit, Sharpen
+from skyquilt.coregistration.subpixel import Fit, SubpixelRefinement
 from skyquilt.coregistration.usable import Usable, both_usable
 from skyquilt.geometry.transforms import fit, transfer
 from skyquilt.model.registration import Matrix, Picture, RefusedRegistration, Registration
@@ -32,14 +32,16 @@ _JUDGED = 256.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Settle:
+class RefineRegistration:
     """Sharpens by colours, or by brightness, as stiffly as two adjusted blocks differ."""
 
     side: float = 1000.0
     """Px of the square whose area the pictures are shrunken to."""
-    rigid: Sharpen = field(default_factory=lambda: Sharpen(freedom="similarity", steps=25))
+    rigid: SubpixelRefinement = field(
+        default_factory=lambda: SubpixelRefinement(freedom="similarity", steps=25)
+    )
     """How they are sharpened."""
-    free: Sharpen | None = None
+    free: SubpixelRefinement | None = None
     """A freer way, taken where it pays; None where there is none."""
     gain: float = 0.02
     """Relative gain in correlation that the freer way must bring."""
@@ -71,9 +73,9 @@ class Settle:
                 told = {"by_colour": 1.0, "colour_surprise": round(surprise, 3)}
                 return _placed(outcome, colours, target, found, told)
         grey = orientation(one.grey, one.valid, self.side)
-        settled = self._fitted(grey, target, start, start)
+        refined = self._fitted(grey, target, start, start)
         told = {"by_colour": 0.0} if a.values.ndim == 3 else {}
-        return outcome if settled is None else _placed(outcome, grey, target, settled, told)
+        return outcome if refined is None else _placed(outcome, grey, target, refined, told)
 
     def _confirmed(
         self, colours: Orientation | None, other: Usable, start: Matrix
@@ -94,7 +96,7 @@ class Settle:
 
     def _fitted(
         self, fields: Orientation, target: Orientation, begin: Matrix, start: Matrix
-    ) -> tuple[Fit, Sharpen] | None:
+    ) -> tuple[Fit, SubpixelRefinement] | None:
         """The place found from `begin`, in px of the target, and the way; None where it lies far
         from the start.
         """
@@ -114,7 +116,7 @@ def _placed(
     outcome: Registration,
     fields: Orientation,
     target: Orientation,
-    found: tuple[Fit, Sharpen],
+    found: tuple[Fit, SubpixelRefinement],
     told: dict[str, float],
 ) -> Registration:
     fit, way = found

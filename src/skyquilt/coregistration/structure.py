@@ -9,7 +9,7 @@ from skyquilt.coregistration.decision import Decide
 from skyquilt.coregistration.index_features import IndexFeatures, index_features, mutual
 from skyquilt.coregistration.log_gabor import phase
 from skyquilt.coregistration.orientation import Pyramid, shrunken
-from skyquilt.coregistration.subpixel import Fit, Sharpen
+from skyquilt.coregistration.subpixel import Fit, SubpixelRefinement
 from skyquilt.coregistration.usable import Usable, both_usable
 from skyquilt.model.estimate import NoEstimate
 from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistration, Registration
@@ -94,5 +94,7 @@ def sharpened(pyramid: Pyramid, b_H_a: Matrix, level: int) -> Fit:
     """A transform of the pictures' pixels sharpened at a level, then at the last one, in whose px
     it is.
     """
-    rough = Sharpen()(*pyramid.at(level), pyramid.small(b_H_a, level))
-    return Sharpen()(*pyramid.at(pyramid.last), pyramid.moved(rough.b_H_a, level, pyramid.last))
+    rough = SubpixelRefinement()(*pyramid.at(level), pyramid.small(b_H_a, level))
+    return SubpixelRefinement()(
+        *pyramid.at(pyramid.last), pyramid.moved(rough.b_H_a, level, pyramid.last)
+    )

@@ -44,7 +44,7 @@ class Fit:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sharpen:
+class SubpixelRefinement:
     """Gauss-Newton steps, each accepted only where it raises the correlation."""
 
     freedom: Freedom = "similarity"

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from skyquilt.live.background_adjustment import Job
+from skyquilt.live.background_adjustment import AdjustmentJob
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.members import Members
 from skyquilt.live.settings import CLOSING, GROWTH, PART, SWEEPING, LiveSettings
@@ -92,7 +92,7 @@ class Blocks:
         self.folder, self.store, self.methods = folder, store, parts
         self.last_arrival = time.monotonic()
 
-    def due(self, ground: float, *, idle: bool) -> Job | None:
+    def due(self, ground: float, *, idle: bool) -> AdjustmentJob | None:
         """The block, or part of one, that should be adjusted as a whole now; `ground`: its height
         in m.
         """
@@ -143,7 +143,7 @@ class Blocks:
 
     def _job(
         self, ids: list[int], held: frozenset[int], ground: float, *, sweep: bool
-    ) -> Job | None:
+    ) -> AdjustmentJob | None:
         members = [self.members.by_id[i] for i in ids]
         frame = self.members.frame
         if frame is None or any(m.prior is None for m in members):
@@ -151,7 +151,7 @@ class Blocks:
         cameras: dict[str, Camera] = {}
         for m in members:
             cameras[m.camera or m.photo.camera_key] = self.members.camera(m)
-        return Job(
+        return AdjustmentJob(
             ids=tuple(ids),
             held=held,
             photos=tuple(m.photo for m in members),

@@ -3,29 +3,33 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.live.background_adjustment import Closed
-from skyquilt.live.crash_points import reached
+from skyquilt.live.background_adjustment import BlockAdjustment
+from skyquilt.live.crash_points import hit
 from skyquilt.live.members import Member, about_record
-from skyquilt.live.refinement import Refining
+from skyquilt.live.refinement import Refinement
 from skyquilt.live.settings import CLOSING
 from skyquilt.live.update import Update
 from skyquilt.model.poses import Pose
 
 
-class Adopting:
+class ApplyAdjustment:
     """New poses of a block; what was placed meanwhile follows its neighbours and is settled
     again.
     """
 
-    def __init__(self, refining: Refining) -> None:
-        self.refining, self.members, self.ledger = refining, refining.members, refining.ledger
-        self.schedule, self.showing, self.queues = (
-            refining.schedule,
-            refining.showing,
-            refining.queues,
+    def __init__(self, refinement: Refinement) -> None:
+        self.refinement, self.members, self.ledger = (
+            refinement,
+            refinement.members,
+            refinement.ledger,
+        )
+        self.schedule, self.redraw, self.queues = (
+            refinement.schedule,
+            refinement.redraw,
+            refinement.queues,
         )
 
-    def adopt(self, done: Closed) -> Update:
+    def apply(self, done: BlockAdjustment) -> Update:
         """Takes it over, in one transaction."""
         if not done.poses:
             return self._failed(done.problem)
@@ -38,13 +42,13 @@ class Adopting:
         self.schedule.ended()
         with self.ledger.change():
             self.members.save_cameras(done.cameras)
-            self.refining.heights(done.xyz, known=bool(done.cameras), anew=True)
-            self.refining.move(done.poses, done.camera_of)
+            self.refinement.heights(done.xyz, known=bool(done.cameras), anew=True)
+            self.refinement.move(done.poses, done.camera_of)
             for member in since:
                 self._follow(member, steps)
             self.schedule.write(self.ledger)
             self.ledger.tell("note", {"text": text})
-        reached("block closed")
+        hit("block closed")
         if done.cameras:  # heights and calibrations changed: all of the block looks different
             self._show(done)
         return Update(what="closed", moved=tuple(done.poses), text=text)
@@ -55,17 +59,17 @@ class Adopting:
             self.schedule.write(self.ledger)
         return Update(what="noted", text=f"a block could not be adjusted as a whole: {problem}")
 
-    def _since(self, done: Closed) -> list[Member]:
+    def _since(self, done: BlockAdjustment) -> list[Member]:
         """Photos that have joined the block since the job began; of large blocks, none."""
         block = self.members.block(next(iter(done.poses)))
         if len(block) > CLOSING:
             return []
         return [self.members.by_id[i] for i in sorted(block - set(done.ids))]
 
-    def _show(self, done: Closed) -> None:
+    def _show(self, done: BlockAdjustment) -> None:
         for i in done.poses:
             if self.members.by_id[i].state == "refined":
-                self.showing.changed(self.members.by_id[i])
+                self.redraw.changed(self.members.by_id[i])
 
     def _follow(self, member: Member, steps: dict[int, NDArray[np.float64]]) -> None:
         near = [steps[j] for j in sorted(member.links) if j in steps]
@@ -73,7 +77,7 @@ class Adopting:
             return
         step = np.median(np.array(near), axis=0)
         pose = Pose(cam_R_map=member.pose.cam_R_map, map_C=member.pose.map_C + step)
-        self.refining.move({member.id: pose}, {member.id: member.camera})
+        self.refinement.move({member.id: pose}, {member.id: member.camera})
         if member not in self.queues.untried:
             member.tried = 0
             self.members.save(member, about=about_record(member, ""))

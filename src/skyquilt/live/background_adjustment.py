@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.bundle import Bundle
-from skyquilt.alignment.local_adjustment import Incremental, Settled, Window
+from skyquilt.alignment.local_adjustment import AdjustedWindow, LocalAdjustment, Window
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import AlignmentError, SkyquiltError
 from skyquilt.live.ledger import Ledger
@@ -32,11 +32,11 @@ from skyquilt.model.surface import Surface
 from skyquilt.ortho.orthomosaic import Ground, survey_ground
 from skyquilt.photos.pixels import read_color
 from skyquilt.workflows.methods import Methods, MosaicSettings
-from skyquilt.workflows.photo_features import THUMBNAIL, Looked, Pictures
+from skyquilt.workflows.photo_features import THUMBNAIL, PhotoFeatures, Pictures
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Job:
+class AdjustmentJob:
     """What to bundle."""
 
     ids: tuple[int, ...]
@@ -69,7 +69,7 @@ class Job:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Closed:
+class BlockAdjustment:
     """The outcome."""
 
     ids: tuple[int, ...]
@@ -86,7 +86,7 @@ class Closed:
     """Why there is no outcome, where there is none."""
 
 
-def close(job: Job) -> Closed:
+def adjust_block(job: AdjustmentJob) -> BlockAdjustment:
     """Does the work."""
     try:
         ledger = Ledger(job.folder, write=False)
@@ -95,7 +95,7 @@ def close(job: Job) -> Closed:
         finally:
             ledger.close()
         store = Store(
-            folder=job.store, registry={c.__name__: c for c in (Looked, Features, Surface)}
+            folder=job.store, registry={c.__name__: c for c in (PhotoFeatures, Features, Surface)}
         )
         features = [_features(p, store, job.methods) for p in job.photos]
         return _part(job, links, features) if job.held else _whole(job, links, features, store)
@@ -103,8 +103,8 @@ def close(job: Job) -> Closed:
         return _nothing(job.ids, str(error))
 
 
-def _nothing(ids: tuple[int, ...], problem: str) -> Closed:
-    return Closed(
+def _nothing(ids: tuple[int, ...], problem: str) -> BlockAdjustment:
+    return BlockAdjustment(
         ids=ids, poses={}, cameras={}, camera_of={}, xyz=np.zeros((0, 3)), problem=problem
     )
 
@@ -117,7 +117,7 @@ def _features(photo: Photo, store: Store, methods: Methods) -> Features:
     return found
 
 
-def _links(job: Job, ledger: Ledger) -> list[Link]:
+def _links(job: AdjustmentJob, ledger: Ledger) -> list[Link]:
     where = {i: k for k, i in enumerate(job.ids)}
     links = []
     for i in job.ids:
@@ -129,11 +129,13 @@ def _links(job: Job, ledger: Ledger) -> list[Link]:
     return links
 
 
-def _whole(job: Job, links: Sequence[Link], features: Sequence[Features], store: Store) -> Closed:
+def _whole(
+    job: AdjustmentJob, links: Sequence[Link], features: Sequence[Features], store: Store
+) -> BlockAdjustment:
     pictures = Pictures(job.photos, lambda i: read_color(job.photos[i]), store)
     done = Bundle()(job.photos, job.frame, job.priors, features, links, (), pictures)
     xyz = _swept(done, pictures, job, store) if job.sweep else done.ties.xyz
-    return Closed(
+    return BlockAdjustment(
         ids=job.ids,
         poses={job.ids[k]: p for k, p in done.poses.items()},
         cameras=dict(done.cameras),
@@ -142,7 +144,9 @@ def _whole(job: Job, links: Sequence[Link], features: Sequence[Features], store:
     )
 
 
-def _swept(done: Alignment, pictures: Pictures, job: Job, store: Store) -> NDArray[np.float64]:
+def _swept(
+    done: Alignment, pictures: Pictures, job: AdjustmentJob, store: Store
+) -> NDArray[np.float64]:
     """(P, 3) the ground as the batch story finds it, at the nodes of its grid below the photos."""
     steps = survey_ground(done, pictures, job.methods, MosaicSettings(), store)
     while True:
@@ -167,7 +171,9 @@ def _swept(done: Alignment, pictures: Pictures, job: Job, store: Store) -> NDArr
     return np.asarray(xyz[seen.ravel() > 0], np.float64)
 
 
-def _part(job: Job, links: Sequence[Link], features: Sequence[Features]) -> Closed:
+def _part(
+    job: AdjustmentJob, links: Sequence[Link], features: Sequence[Features]
+) -> BlockAdjustment:
     where = {i: k for k, i in enumerate(job.ids)}
     free = next(i for i in job.ids if i not in job.held)
     window = Window(
@@ -183,11 +189,11 @@ def _part(job: Job, links: Sequence[Link], features: Sequence[Features]) -> Clos
         ground=job.ground,
         sigma_xy=0.0,
     )
-    done = Incremental(per_photo=60)(window)
-    if not isinstance(done, Settled):
+    done = LocalAdjustment(per_photo=60)(window)
+    if not isinstance(done, AdjustedWindow):
         raise AlignmentError(done.reason)
     moved = {job.ids[k]: p for k, p in done.poses.items()}
-    return Closed(
+    return BlockAdjustment(
         ids=job.ids,
         poses=moved,
         cameras={},
@@ -202,12 +208,12 @@ def _serve(wire: Connection, other: Connection) -> None:
     with suppress(OSError, AttributeError):
         os.nice(10)  # the foreground comes first
     try:
-        wire.send(close(wire.recv()))
+        wire.send(adjust_block(wire.recv()))
     except (EOFError, BrokenPipeError):
         return
 
 
-class Closing:
+class BackgroundAdjustment:
     """At most one job at a time behind the scenes."""
 
     def __init__(self) -> None:
@@ -219,7 +225,7 @@ class Closing:
         """Whether a job is under way."""
         return self._process is not None
 
-    def start(self, job: Job) -> None:
+    def start(self, job: AdjustmentJob) -> None:
         """Begins a job."""
         context = multiprocessing.get_context("spawn")
         self._wire, theirs = context.Pipe()
@@ -228,11 +234,11 @@ class Closing:
         theirs.close()
         self._wire.send(job)
 
-    def outcome(self) -> Closed | None:
+    def outcome(self) -> BlockAdjustment | None:
         """The outcome, once there is one; then another job may begin."""
         if self._process is None or self._wire is None:
             return None
-        done: Closed | None = None
+        done: BlockAdjustment | None = None
         try:
             if self._wire.poll(0):
                 done = self._wire.recv()

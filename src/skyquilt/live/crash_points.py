@@ -27,6 +27,6 @@ watcher: Callable[[str], None] = _nothing
 """Called with the name of each point that is reached; a test puts its own here."""
 
 
-def reached(name: str) -> None:
+def hit(name: str) -> None:
     """Says that a point is passed."""
     watcher(name)

@@ -15,7 +15,7 @@ MOST_BOXES = 24
 """Parts that a change of the map is told by."""
 
 
-class News:
+class MapEvents:
     """Of photos and of tiles."""
 
     def __init__(self, members: Members, canvas: Canvas) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from skyquilt.errors import UsageError
 from skyquilt.live.closed_files import ClosedFiles
-from skyquilt.live.crash_points import reached
+from skyquilt.live.crash_points import hit
 from skyquilt.live.inbox import ending_of
 from skyquilt.live.photo_intake import Accepted, Intake, Refused
 from skyquilt.model.photo import RejectedPhoto
@@ -109,7 +109,7 @@ class Watch:
         self._seen[key] = known.stamp
         with self.intake.ledger.change() as db:
             db.execute("insert or replace into seen values (?, ?, ?)", (key, *known.stamp))
-        reached("folder seen")
+        hit("folder seen")
         return done
 
     def _candidates(

@@ -15,7 +15,7 @@ from itertools import chain
 from pathlib import Path
 
 from skyquilt.errors import OutputError
-from skyquilt.live.crash_points import reached
+from skyquilt.live.crash_points import hit
 from skyquilt.live.ledger import Ledger
 
 ENDINGS = {
@@ -89,11 +89,11 @@ class Inbox:
                     file.write(block)
                 file.flush()
                 os.fsync(file.fileno())
-            reached("photo file synced")
+            hit("photo file synced")
             path = self.folder / (digest.hexdigest() + ending)
             partial.replace(path)
             synced(self.folder)
-            reached("photo file named")
+            hit("photo file named")
         except OSError as error:
             _gone(partial)
             raise _refusal(self.folder, error) from error

@@ -7,11 +7,11 @@ import numpy as np
 
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.errors import UnreadablePhotoError
-from skyquilt.live.crash_points import reached
+from skyquilt.live.crash_points import hit
 from skyquilt.live.drone_metadata import Metadata
-from skyquilt.live.events import News
+from skyquilt.live.events import MapEvents
 from skyquilt.live.members import Member, Queues
-from skyquilt.live.redraw_queue import Showing
+from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.live.update import Update
 from skyquilt.ortho.orthomosaic import round_gsd
 
@@ -19,15 +19,20 @@ ABOVE_M = 50.0
 """Flying height where nothing tells it."""
 
 
-class Arriving:
+class InitialPose:
     """Photos received become photos placed, or photos that wait for a place."""
 
     def __init__(
-        self, metadata: Metadata, pixels: PixelCache, showing: Showing, news: News, queues: Queues
+        self,
+        metadata: Metadata,
+        pixels: PixelCache,
+        redraw: RedrawQueue,
+        map_events: MapEvents,
+        queues: Queues,
     ) -> None:
         self.metadata, self.pixels = metadata, pixels
-        self.showing, self.news, self.queues = showing, news, queues
-        self.members, self.canvas = metadata.members, showing.canvas
+        self.redraw, self.map_events, self.queues = redraw, map_events, queues
+        self.members, self.canvas = metadata.members, redraw.canvas
         self.ledger = metadata.members.ledger
 
     def place(self, member: Member) -> Update:
@@ -47,15 +52,15 @@ class Arriving:
             if preview is not None:
                 preview.state = "superseded"
                 self.members.save(preview)
-                self.news.superseded(preview)
-            self.news.photo(member)
-        reached("photo placed")
+                self.map_events.superseded(preview)
+            self.map_events.photo(member)
+        hit("photo placed")
         if preview is not None:
-            self.showing.gone(preview.id)
+            self.redraw.gone(preview.id)
         self.queues.received.popleft()
         self.queues.untried.append(member)
         if pose is not None:
-            self.showing.show(member)
+            self.redraw.show(member)
         return Update(what=member.state, photo=member.id)
 
     def _preview(self, member: Member) -> Member | None:
@@ -90,6 +95,6 @@ class Arriving:
         with self.ledger.change():
             member.state, member.pose = "refused", None
             self.ledger.set_photo(member.id, state="refused", reason=reason, pose=None)
-            self.news.photo(member, reason=reason)
+            self.map_events.photo(member, reason=reason)
         self.queues.received.popleft()
         return Update(what="refused", photo=member.id, text=f"{member.photo.name}: {reason}")

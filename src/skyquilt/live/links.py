@@ -12,7 +12,7 @@ from skyquilt.engine.store import Store, digest
 from skyquilt.live.members import Member, Members
 from skyquilt.model.features import Features, Link
 from skyquilt.workflows.methods import Methods
-from skyquilt.workflows.photo_features import THUMBNAIL, Looked, look
+from skyquilt.workflows.photo_features import THUMBNAIL, PhotoFeatures, look
 
 FEATURES_KEPT = 48
 """Photos whose features stay at hand."""
@@ -22,7 +22,7 @@ LINKS_KEPT = 1500
 """Links decoded and at hand, of some kilobytes each."""
 
 
-class Linking:
+class LiveLinks:
     """Compares photos."""
 
     def __init__(
@@ -42,7 +42,7 @@ class Linking:
             return self._features[number]
         photo = self.members.by_id[number].photo
         key = digest(photo.digest, self.methods.sift, THUMBNAIL)
-        looked: Looked = self.store.get_or(
+        looked: PhotoFeatures = self.store.get_or(
             "features", key, lambda: look(photo, number, self.pixels, self.methods, self.store)
         )
         self._features[number] = looked.features

@@ -18,21 +18,21 @@ from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
 from skyquilt.errors import OutputError, UsageError
 from skyquilt.live.adjustment_schedule import Blocks, Schedule
-from skyquilt.live.apply_adjustment import Adopting
-from skyquilt.live.background_adjustment import Closing, close
+from skyquilt.live.apply_adjustment import ApplyAdjustment
+from skyquilt.live.background_adjustment import BackgroundAdjustment, adjust_block
 from skyquilt.live.drone_metadata import Metadata
-from skyquilt.live.events import News
+from skyquilt.live.events import MapEvents
 from skyquilt.live.free_memory import give_back
 from skyquilt.live.inbox import Inbox
-from skyquilt.live.initial_pose import Arriving
+from skyquilt.live.initial_pose import InitialPose
 from skyquilt.live.ledger import Ledger
-from skyquilt.live.links import Linking
-from skyquilt.live.local_pose import Placing
+from skyquilt.live.links import LiveLinks
+from skyquilt.live.local_pose import LocalPose
 from skyquilt.live.members import Members, Queues
 from skyquilt.live.neighbours import Neighbours
 from skyquilt.live.photo_intake import Intake, Refused
-from skyquilt.live.redraw_queue import Showing
-from skyquilt.live.refinement import Refining
+from skyquilt.live.redraw_queue import RedrawQueue
+from skyquilt.live.refinement import Refinement
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.tile_drawing import Canvas
 from skyquilt.live.update import Update
@@ -41,7 +41,7 @@ from skyquilt.ortho.height_cells import HeightCells
 from skyquilt.photos.pixels import read_color
 from skyquilt.raster.tile_store import TileStore
 from skyquilt.workflows.methods import MosaicSettings, methods
-from skyquilt.workflows.photo_features import Looked
+from skyquilt.workflows.photo_features import PhotoFeatures
 
 PHOTOS, TILES, FINISHED = "photos", "tiles.db", "finished"
 """Where accepted photos, the map's tiles and the final map lie in the survey's folder."""
@@ -75,9 +75,9 @@ class LiveMap:
         self.intake = Intake(self.ledger, self.inbox, self.settings)
         self.tiles = TileStore(self.folder / TILES, write=True)
         self.methods = methods(MosaicSettings(features=self.settings.features))
-        registry = {c.__name__: c for c in (Looked, features.Features, poses.Pose)}
+        registry = {c.__name__: c for c in (PhotoFeatures, features.Features, poses.Pose)}
         self.store = Store(folder=self.folder / STORE, registry=registry)
-        self.closing = Closing()
+        self.background = BackgroundAdjustment()
         self._room = TOGETHER
         self._load()
 
@@ -104,16 +104,18 @@ class LiveMap:
         self.heights.put(known[:, :2].astype(np.int64), known[:, 2])
         metadata = Metadata(self.members, self.heights, self.settings)
         neighbours = Neighbours(self.members, metadata)
-        self.linking = Linking(self.members, self.methods, self.store, self.full)
-        placing = Placing(self.members, metadata, neighbours, self.linking, self.settings)
+        self.live_links = LiveLinks(self.members, self.methods, self.store, self.full)
+        local_pose = LocalPose(self.members, metadata, neighbours, self.live_links, self.settings)
         self.canvas = Canvas(self.tiles, self.heights, self.full, self.members.by_id, self.store)
         self.canvas.gsd = float(self.ledger.meta("gsd", 0.0))
         self.canvas.ground = float(self.ledger.meta("ground", 0.0))
-        news = News(self.members, self.canvas)
-        self.showing = Showing(self.members, self.canvas, news)
-        self.arriving = Arriving(metadata, self.full, self.showing, news, self.queues)
-        self.refining = Refining(placing, self.showing, news, self.queues, self.schedule)
-        self.adopting = Adopting(self.refining)
+        map_events = MapEvents(self.members, self.canvas)
+        self.redraw = RedrawQueue(self.members, self.canvas, map_events)
+        self.initial_pose = InitialPose(metadata, self.full, self.redraw, map_events, self.queues)
+        self.refinement = Refinement(
+            local_pose, self.redraw, map_events, self.queues, self.schedule
+        )
+        self.apply_adjustment = ApplyAdjustment(self.refinement)
         store = self.folder / STORE
         self.blocks = Blocks(
             self.members, self.schedule, self.settings, self.folder, store, self.methods
@@ -146,7 +148,7 @@ class LiveMap:
         """Works until nothing is left, loops closed and all."""
         while True:
             yield from self.drain()
-            if not self.closing.busy:
+            if not self.background.busy:
                 return
             time.sleep(0.02)
 
@@ -164,7 +166,7 @@ class LiveMap:
             self.queues.received.extend(self.members.take_up())
             update = self._next()
         except OutputError:
-            self.closing.stop()
+            self.background.stop()
             self._load()
             raise
         if update is None:
@@ -177,7 +179,7 @@ class LiveMap:
         return (
             (self._placed() if self._room else None)
             or self._drawn_first()
-            or self._adopted()
+            or self._applied()
             or self._refined()
             or self._drawn_last()
             or self._behind()
@@ -191,7 +193,7 @@ class LiveMap:
         if not self.schedule.checked:
             job = self.blocks.due(self.canvas.ground, idle=False)
             if job is not None:
-                return self.adopting.adopt(close(job))
+                return self.apply_adjustment.apply(adjust_block(job))
             self.schedule.checked = True
         return self._refined() or self._placed()
 
@@ -203,51 +205,51 @@ class LiveMap:
         first = self.queues.received[0]
         if first.id % TIDY == 0:
             give_back()
-        return self.arriving.place(first)
+        return self.initial_pose.place(first)
 
     def _refined(self) -> Update | None:
         """In two units, so that a photo that comes meanwhile need not wait for both."""
         if not self.queues.untried or self.members.frame is None:
             return None
         member = self.queues.untried[0]
-        if member.state != "superseded" and not self.linking.has_features(member.id):
-            self.linking.features(member.id)
+        if member.state != "superseded" and not self.live_links.has_features(member.id):
+            self.live_links.features(member.id)
             return Update(what="noted", photo=member.id)
-        return self.refining.refine(member)
+        return self.refinement.refine(member)
 
     def _drawn_first(self) -> Update | None:
         """Who came first is seen first: photos that come while others are drawn are placed after
         them.
         """
-        update = self.showing.draw(self.showing.urgent) if self.showing.urgent else None
-        self._room = 0 if self.showing.urgent else TOGETHER
+        update = self.redraw.draw(self.redraw.urgent) if self.redraw.urgent else None
+        self._room = 0 if self.redraw.urgent else TOGETHER
         return update
 
     def _drawn_last(self) -> Update | None:
-        if self.showing.pending:
-            return self.showing.take_note()
-        if self.showing.dirty:
-            return self.showing.draw_moved()
-        return self.showing.draw_newest() if self.showing.later else None
+        if self.redraw.pending:
+            return self.redraw.take_note()
+        if self.redraw.dirty:
+            return self.redraw.draw_moved()
+        return self.redraw.draw_newest() if self.redraw.later else None
 
-    def _adopted(self) -> Update | None:
-        done = self.closing.outcome()
-        return None if done is None else self.adopting.adopt(done)
+    def _applied(self) -> Update | None:
+        done = self.background.outcome()
+        return None if done is None else self.apply_adjustment.apply(done)
 
     def _behind(self) -> Update | None:
         """Loops closed and blocks bundled in a process of their own."""
-        if self.closing.busy:
+        if self.background.busy:
             return None
         job = self.blocks.due(self.canvas.ground, idle=True)
         if job is None:
             return None
-        self.closing.start(job)
+        self.background.start(job)
         return Update(
             what="noted", text=f"{len(job.ids)} photos are adjusted together in the background"
         )
 
     def close(self) -> None:
         """Ends; what is written stays."""
-        self.closing.stop()
+        self.background.stop()
         self.tiles.close()
         self.ledger.close()

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.bundle import Bundle
-from skyquilt.alignment.local_adjustment import Incremental, Settled, Window
+from skyquilt.alignment.local_adjustment import AdjustedWindow, LocalAdjustment, Window
 from skyquilt.errors import AlignmentError
 from skyquilt.live.drone_metadata import Metadata
-from skyquilt.live.links import Linking
+from skyquilt.live.links import LiveLinks
 from skyquilt.live.members import Member, Members
 from skyquilt.live.neighbours import Neighbours
 from skyquilt.live.settings import YOUNG, LiveSettings
@@ -42,7 +42,7 @@ class Change:
     """Why the photo is not held by links, where it is not."""
 
 
-class Placing:
+class LocalPose:
     """Settles single photos; nothing is written."""
 
     def __init__(
@@ -50,17 +50,17 @@ class Placing:
         members: Members,
         metadata: Metadata,
         neighbours: Neighbours,
-        linking: Linking,
+        live_links: LiveLinks,
         settings: LiveSettings,
     ) -> None:
         self.members, self.settings = members, settings
-        self.metadata, self.neighbours, self.linking = metadata, neighbours, linking
-        self.settle = Incremental()
-        self.young = Bundle(per_photo=150, sharpen=None)
+        self.metadata, self.neighbours, self.live_links = metadata, neighbours, live_links
+        self.adjust_locally = LocalAdjustment()
+        self.young = Bundle(per_photo=150, match_observations=None)
 
     def refine(self, member: Member) -> Change:
         """Compares a photo with its neighbours and settles it among them; nothing is written."""
-        links = self.linking.compared(member, self.neighbours.of(member, member.pose))
+        links = self.live_links.compared(member, self.neighbours.of(member, member.pose))
         good = {key: k for key, k in links.items() if k is not None}
         if not good:
             why = (
@@ -94,12 +94,12 @@ class Placing:
                     xyz=done.ties.xyz,
                     reason=done.rejected.get(ids.index(member.id), ""),
                 )
-        return self._settled(member, links, good)
+        return self._adjusted_locally(member, links, good)
 
     def _bundled(self, ids: Sequence[int], good: dict[tuple[int, int], Link]) -> Alignment | None:
         """A small block bundled as a whole."""
         where = {i: k for k, i in enumerate(ids)}
-        links = [_renumbered(k, where) for k in [*self.linking.links_among(ids), *good.values()]]
+        links = [_renumbered(k, where) for k in [*self.live_links.links_among(ids), *good.values()]]
         members = [self.members.by_id[i] for i in ids]
         priors = [m.prior for m in members if m.prior is not None]
         assert self.members.frame is not None
@@ -108,13 +108,13 @@ class Placing:
                 [m.photo for m in members],
                 self.members.frame,
                 priors,
-                [self.linking.features(i) for i in ids],
+                [self.live_links.features(i) for i in ids],
                 links,
             )
         except (AlignmentError, np.linalg.LinAlgError, ValueError):
             return None
 
-    def _settled(
+    def _adjusted_locally(
         self,
         member: Member,
         links: dict[tuple[int, int], Link | None],
@@ -134,8 +134,8 @@ class Placing:
         kept = sorted(ring, key=lambda j: (-len(self.members.by_id[j].links & moving), j))[:RING]
         ids = sorted({member.id, *direct, *kept})
         held = frozenset(ids) - moving - {member.id}
-        done = self.settle(self.window(member, ids, held, list(good.values())))
-        if not isinstance(done, Settled):
+        done = self.adjust_locally(self.window(member, ids, held, list(good.values())))
+        if not isinstance(done, AdjustedWindow):
             return Change(
                 moved={},
                 cameras={},
@@ -159,7 +159,7 @@ class Placing:
         known = {(k.a, k.b) for k in more}
         free = set(ids) - held  # what links held photos to each other moves nothing
         links = [
-            *(k for k in self.linking.links_among(ids, free) if (k.a, k.b) not in known),
+            *(k for k in self.live_links.links_among(ids, free) if (k.a, k.b) not in known),
             *more,
         ]
         placed = {where[m.id]: m.pose for m in members if m.pose is not None and m.id != member.id}
@@ -180,7 +180,7 @@ class Placing:
         return Window(
             photos=[m.photo for m in members],
             priors=[m.prior for m in members if m.prior is not None],
-            features=[self.linking.features(i) for i in ids],
+            features=[self.live_links.features(i) for i in ids],
             links=[_renumbered(k, where) for k in links],
             poses=placed,
             cameras=cameras,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from skyquilt.errors import OutputError
-from skyquilt.live.crash_points import reached
+from skyquilt.live.crash_points import hit
 from skyquilt.live.inbox import Arrived, Inbox
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.settings import LiveSettings
@@ -148,7 +148,7 @@ class Intake:
             number = int(cursor.lastrowid or 0)
             said = {"id": number, "name": name, "source": source, "state": "received"}
             self.ledger.tell("photo", said)
-        reached("photo row committed")
+        hit("photo row committed")
         return Accepted(id=number, name=name)
 
 

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.live.crash_points import reached
-from skyquilt.live.events import News
+from skyquilt.live.crash_points import hit
+from skyquilt.live.events import MapEvents
 from skyquilt.live.members import Member, Members, pose_from, pose_record
 from skyquilt.live.tile_drawing import LEAST_MOVE, NEWEST, Canvas
 from skyquilt.live.update import Update
@@ -22,12 +22,17 @@ Queue = dict[Address, set[int]]
 """Tiles to draw, in order, and the photos that have changed on each."""
 
 
-class Showing:
+class RedrawQueue:
     """The map as it should look, against what the tiles show."""
 
-    def __init__(self, members: Members, canvas: Canvas, news: News) -> None:
+    def __init__(self, members: Members, canvas: Canvas, map_events: MapEvents) -> None:
         """What is drawn stays, what moved since is drawn."""
-        self.members, self.ledger, self.canvas, self.news = members, members.ledger, canvas, news
+        self.members, self.ledger, self.canvas, self.map_events = (
+            members,
+            members.ledger,
+            canvas,
+            map_events,
+        )
         self.urgent: Queue = {}
         self.dirty: Queue = {}
         self.later: Queue = {a: set() for a in canvas.owed()}
@@ -138,8 +143,8 @@ class Showing:
         with self.ledger.change():
             for i in sorted(shown):
                 self._drawn_now(self.members.by_id[i])
-            self.news.tiles(self._fresh.pop(rule, []))
-        reached("drawing told")
+            self.map_events.tiles(self._fresh.pop(rule, []))
+        hit("drawing told")
         self._to_draw.difference_update(shown)
         return raised
 
@@ -153,14 +158,14 @@ class Showing:
         if member.pose is None or member.state == "superseded":
             self.ledger.set_photo(member.id, footprint="")
             return
-        ring, at = self.news.place(member)
+        ring, at = self.map_events.place(member)
         self.ledger.set_photo(
             member.id, footprint={"ring": ring, "at": at, "pose": pose_record(member.pose)}
         )
         self._drawn[member.id] = member.pose
         if (rim := self.canvas.outline(member.id)) is not None:
             self._rims[member.id] = rim
-        self.news.photo(member, ring=ring, at=at)
+        self.map_events.photo(member, ring=ring, at=at)
 
 
 def _add(queue: Queue, addresses: Iterable[Address], number: int) -> None:

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.live.adjustment_schedule import Schedule
-from skyquilt.live.crash_points import reached
-from skyquilt.live.events import News
+from skyquilt.live.crash_points import hit
+from skyquilt.live.events import MapEvents
 from skyquilt.live.links import link_bytes
-from skyquilt.live.local_pose import Change, Placing
+from skyquilt.live.local_pose import Change, LocalPose
 from skyquilt.live.members import Member, Queues, about_record
-from skyquilt.live.redraw_queue import Showing
+from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.live.update import Update
 from skyquilt.model.poses import Pose
 
@@ -21,17 +21,22 @@ LOST = 2
 """Photos waiting for links that a photo which settles is compared with."""
 
 
-class Refining:
+class Refinement:
     """All that one photo changes becomes true at once: links, poses, heights, what was learned,
     what is due next.
     """
 
     def __init__(
-        self, placing: Placing, showing: Showing, news: News, queues: Queues, schedule: Schedule
+        self,
+        local_pose: LocalPose,
+        redraw: RedrawQueue,
+        map_events: MapEvents,
+        queues: Queues,
+        schedule: Schedule,
     ) -> None:
-        self.placing, self.showing, self.news = placing, showing, news
+        self.local_pose, self.redraw, self.map_events = local_pose, redraw, map_events
         self.queues, self.schedule = queues, schedule
-        self.members, self.ledger = placing.members, placing.members.ledger
+        self.members, self.ledger = local_pose.members, local_pose.members.ledger
         self._tried = max((m.tried for m in self.members.by_id.values()), default=0)
 
     def refine(self, member: Member) -> Update:
@@ -39,7 +44,7 @@ class Refining:
         if member.state == "superseded":
             self.queues.untried.popleft()
             return Update(what="noted", photo=member.id)
-        change = self.placing.refine(member)
+        change = self.local_pose.refine(member)
         found = self._found(member, change)
         self._commit(member, change, found)
         self.queues.untried.popleft()
@@ -66,7 +71,7 @@ class Refining:
             self.heights(change.xyz, known=bool(change.cameras))
             self.move(change.moved, change.camera_of)
             if member.state == "refined":
-                self.placing.metadata.learn(member)
+                self.local_pose.metadata.learn(member)
                 self.schedule.refined(member.id, loop=far)
             self.members.save(
                 member, about=about_record(member, change.reason), reason=change.reason
@@ -75,9 +80,9 @@ class Refining:
                 lost.tried, lost.again = 0, self._tried
                 self.members.save(lost, about=about_record(lost, ""))
             self.schedule.write(self.ledger)
-            self.news.photo(member, reason=change.reason)
-        reached("photo refined")
-        self.placing.neighbours.indexed(member)
+            self.map_events.photo(member, reason=change.reason)
+        hit("photo refined")
+        self.local_pose.neighbours.indexed(member)
 
     def move(self, moved: dict[int, Pose], camera_of: dict[int, str]) -> None:
         """New poses of photos (inside a transaction of the ledger)."""
@@ -87,15 +92,15 @@ class Refining:
             if member.state != "superseded":
                 member.state = "refined"
             self.members.save(member, reason="")
-            self.placing.neighbours.indexed(member)
+            self.local_pose.neighbours.indexed(member)
             if member.state == "refined":
-                self.showing.moved(member)
+                self.redraw.moved(member)
 
     def heights(self, xyz: NDArray[np.float64], *, known: bool, anew: bool = False) -> None:
         """Takes in ground points (P, 3) (inside a transaction); `known`: they come from calibrated
         cameras.
         """
-        cells = self.placing.metadata.heights
+        cells = self.local_pose.metadata.heights
         touched, z = cells.add(xyz, anew=anew)
         with self.ledger.change() as db:
             values = [
@@ -105,7 +110,7 @@ class Refining:
             if known and len(xyz):
                 ground = float(np.median(xyz[:, 2]))
                 self.ledger.put_meta("ground", ground)
-                self.showing.canvas.ground = ground
+                self.redraw.canvas.ground = ground
 
     def _distance(self, member: Member, change: Change) -> int:
         """Steps along known links between the photos that this one links; more than LOOP = it
@@ -132,7 +137,9 @@ class Refining:
         return [m for m in lost if self._links(m, member)]
 
     def _links(self, lost: Member, member: Member) -> bool:
-        return any(k is not None for k in self.placing.linking.compared(lost, [member.id]).values())
+        return any(
+            k is not None for k in self.local_pose.live_links.compared(lost, [member.id]).values()
+        )
 
     def _requeue(self, member: Member, found: Iterable[Member]) -> None:
         for lost in found:

@@ -14,7 +14,7 @@ from skyquilt.engine.executor import in_order
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
 from skyquilt.imaging.views import View, footprint
-from skyquilt.live.crash_points import reached
+from skyquilt.live.crash_points import hit
 from skyquilt.live.members import Member
 from skyquilt.live.newest_blend import Newest
 from skyquilt.live.reduced_pictures import SmallPictures, measured
@@ -183,7 +183,7 @@ class Canvas:
             else [replace(a, layer=a.layer + NEWEST) for a in dirty]
         )
         self.tiles.put(written, owing=() if rule else newest)
-        reached("tiles written")
+        hit("tiles written")
         self._met.update(newest if rule else ())
         self._raised.update(at for at, _ in written)
         return [at for at, _ in written]
@@ -221,7 +221,7 @@ class Canvas:
         changed = {a for a in self._raised if a.layer.endswith(NEWEST) == bool(rule)}
         met = self._met if rule else set[Address]()
         self._raised -= changed
-        raised = self.tiles.raise_levels(changed, settled=met) if changed or met else 0
+        raised = self.tiles.raise_levels(changed, drawn=met) if changed or met else 0
         self._met -= met
         return raised
 

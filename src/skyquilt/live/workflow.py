@@ -54,7 +54,7 @@ def iter_live(
             busy_since = time.monotonic()
             yield update
             continue
-        growing = any(w.growing for w in watches) or live.closing.busy
+        growing = any(w.growing for w in watches) or live.background.busy
         if finish and not growing and time.monotonic() - busy_since > STEADY_S:
             yield from _finished(live, live.settings)
             return

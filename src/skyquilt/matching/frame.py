@@ -23,16 +23,23 @@ Search = Callable[[Doubles, Doubles], Found | None]
 """The best model through random samples of matches a, b (N, 2) px; None when no sample determines
 one.
 """
-Settle = Callable[[NDArray[Any], Doubles, Doubles], tuple[Doubles, float] | NoEstimate]
+Finalise = Callable[[NDArray[Any], Doubles, Doubles], tuple[Doubles, float] | NoEstimate]
 """b_H_a of a search -> the one to polish, and the largest symmetric transfer error of an inlier in
 px^2.
 """
 
 
 def estimated(
-    name: str, model: str, a: ArrayLike, b: ArrayLike, *, minimum: int, find: Search, settle: Settle
+    name: str,
+    model: str,
+    a: ArrayLike,
+    b: ArrayLike,
+    *,
+    minimum: int,
+    find: Search,
+    finalise: Finalise,
 ) -> Estimate | NoEstimate:
-    """b_H_a from matches a, b (N, 2) px by a loss that `find` and `settle` know, or why there is
+    """b_H_a from matches a, b (N, 2) px by a loss that `find` and `finalise` know, or why there is
     none.
     """
     a, b = matched(a, b)
@@ -41,10 +48,10 @@ def estimated(
     found = find(a, b)
     if found is None:
         return NoEstimate(reason=f"no {model} passes through the matches")
-    settled = settle(found.b_H_a, a, b)
-    if isinstance(settled, NoEstimate):
-        return settled
-    H, inliers = polished(model, settled[0], a, b, settled[1])
+    final = finalise(found.b_H_a, a, b)
+    if isinstance(final, NoEstimate):
+        return final
+    H, inliers = polished(model, final[0], a, b, final[1])
     if (feeble := weak(model, int(inliers.sum()), len(a), minimum)) is not None:
         return feeble
     return Estimate(

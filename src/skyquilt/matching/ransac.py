@@ -41,7 +41,7 @@ class Ransac:
             a,
             b,
             minimum=self.minimum,
-            settle=lambda H, a, b: (H, limit),
+            finalise=lambda H, a, b: (H, limit),
             find=lambda a, b: search(
                 self.model,
                 a,

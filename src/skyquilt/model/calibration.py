@@ -28,7 +28,7 @@ class BoardPose:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sightings:
+class Observations:
     """Points of the board seen in one view."""
 
     name: str
@@ -55,7 +55,7 @@ class Calibration:
     """Name, value and tolerance of each coefficient that was smaller than its tolerance, in the
     order of dropping.
     """
-    sightings: tuple[Sightings, ...]
+    observations: tuple[Observations, ...]
     """One per view, px of centres corrected for perspective and distortion."""
     poses: tuple[BoardPose, ...]
     """One per view."""

@@ -162,7 +162,7 @@ class Survey:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PointObservation:
-    """One sighting of a control point in a photo."""
+    """One observation of a control point in a photo."""
 
     photo: str
     """Photo.name."""

@@ -89,14 +89,14 @@ class Pose:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TiePoints:
-    """Points on the ground and their sightings."""
+    """Points on the ground and their observations."""
 
     xyz: Array
     """(P, 3) in m in the map frame."""
     point: NDArray[np.int64]
-    """(N,) index into `xyz` of each sighting, ascending."""
+    """(N,) index into `xyz` of each observation, ascending."""
     photo: NDArray[np.int64]
-    """(N,) index of the photo of each sighting."""
+    """(N,) index of the photo of each observation."""
     px: Array
     """(N, 2) where it was seen."""
     residual_px: Array
@@ -114,8 +114,8 @@ class ControlResidual:
     error_m: Array
     """(3,) solution minus survey in m: x, y, z (NaN where the survey gives no height)."""
     reprojection_px: float
-    """RMS over its sightings in px."""
-    sightings: int
+    """RMS over its observations in px."""
+    observations: int
     """Number of photos that show it."""
 
 

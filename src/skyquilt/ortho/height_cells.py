@@ -127,12 +127,12 @@ def _filled(z: NDArray[np.float32], otherwise: float) -> NDArray[np.float32]:
     if known.sum() < 4:
         return np.full(z.shape, np.median(z[known]) if known.any() else otherwise, np.float32)
     value, weight = np.where(known, z, 0).astype(np.float32), known.astype(np.float32)
-    out, settled = np.full(z.shape, np.float32(np.median(z[known]))), np.zeros(z.shape, bool)
+    out, filled = np.full(z.shape, np.float32(np.median(z[known]))), np.zeros(z.shape, bool)
     for sigma in (1.0, 2.5, 6.0):
         w = cv2.GaussianBlur(weight, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
         v = cv2.GaussianBlur(value, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT) / np.maximum(
             w, 1e-6
         )
-        now = (w > 0.08) & ~settled
-        out[now], settled = v[now], settled | now
+        now = (w > 0.08) & ~filled
+        out[now], filled = v[now], filled | now
     return np.asarray(cv2.medianBlur(out, 3), np.float32)

@@ -69,7 +69,7 @@ def planned(
     x, y, z = node_places(grid, surface, window.grown(margin))
     known: Mapping[int, Nodes] = {}
     if earlier is not None:
-        z, same = _settled(z, earlier, grid.gsd)
+        z, same = _kept_heights(z, earlier, grid.gsd)
         known = earlier.projected if same else known
     views = overlapping(views, x, y)
     low = blend.rank(np.arange(len(views)), least_scores(views, x, y, z))
@@ -105,7 +105,7 @@ def planned(
     )
 
 
-def _settled(z: NDArray[Any], earlier: Plan, gsd: float) -> tuple[NDArray[Any], bool]:
+def _kept_heights(z: NDArray[Any], earlier: Plan, gsd: float) -> tuple[NDArray[Any], bool]:
     """Heights (r, c): the earlier ones but where the new ones shift a photo visibly; whether that
     is nowhere.
     """

@@ -181,7 +181,7 @@ Row = tuple[str, str, float, Any, Any]
 
 
 def _between(points: Sequence[ControlPoint]) -> list[Row]:
-    """Horizontal distances between all points, with all their sightings paired."""
+    """Horizontal distances between all points, with all their observations paired."""
     rows: list[Row] = []
     for k, a in enumerate(points):
         for b in points[k + 1 :]:
@@ -244,7 +244,7 @@ def alignment_of(run: Path) -> Alignment | None:
 
 def tie_targets(alignment: Alignment, names: Sequence[str]) -> list[ControlPoint]:
     """Tie points on the ground, seen three times or more, far from one another, as points with
-    sightings.
+    observations.
 
     Low ones: a point on a roof or a crown lies elsewhere in a map over level ground, whoever made
     it.

@@ -53,7 +53,7 @@ class Lmeds:
             a,
             b,
             minimum=self.minimum,
-            settle=self._limit,
+            finalise=self._limit,
             find=lambda a, b: search(
                 self.model,
                 a,

@@ -55,7 +55,7 @@ class Magsac:
             b,
             minimum=self.minimum,
             find=self._usac if self.model == "homography" else self._search,
-            settle=lambda H, a, b: (self._reweighted(H, a, b), limit),
+            finalise=lambda H, a, b: (self._reweighted(H, a, b), limit),
         )
 
     @property

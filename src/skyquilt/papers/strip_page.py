@@ -154,7 +154,8 @@ def _how(found: Mapping[str, Any]) -> Section:
         f" {s['lens']['height']} px from"
         f" {s['height']:g} m, overlap {100 * s['overlap']:.0f} %, pitch and roll of {s['tilt']:g}"
         " degrees (sigma).",
-        "Points are simulated sightings, not pixels: the boards' corners, and points on things up"
+        "Points are simulated observations, not pixels: the boards' corners, and points on things"
+        " up"
         " to"
         f" {s['relief']:g} m high"
         f" ({100 * s['things']:.0f} % of all), with {s['noise']:g} px of noise. Which point is"

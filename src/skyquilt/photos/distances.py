@@ -1,8 +1,8 @@
 """Known distances on the ground: a CSV with the header `point_a,point_b,metres`.
 
 Where the points are seen is told in one of three ways: by further columns
-`px_a,py_a,image_a,px_b,py_b,image_b`, several rows for several sightings; by writing a point as `px
-py image`; or by the names of points in gcp_list.txt. Pixels have their centres at integers, as
+`px_a,py_a,image_a,px_b,py_b,image_b`, several rows for several observations; by writing a point as
+`px py image`; or by the names of points in gcp_list.txt. Pixels have their centres at integers, as
 there.
 """
 
@@ -30,7 +30,7 @@ def read_distances(
     """
     rows = _rows(path)
     names, known = PhotoNames(photo_names), {c.name: c.observations for c in control}
-    sightings: dict[str, dict[tuple[str, float, float], PointObservation]] = {}
+    observations: dict[str, dict[tuple[str, float, float], PointObservation]] = {}
     lengths: dict[tuple[str, str], float] = {}
     strangers: list[str] = []
     for place, row in rows:
@@ -52,7 +52,7 @@ def read_distances(
                 if photo is None:
                     strangers.append(seen.photo)
                 else:
-                    sightings.setdefault(label, {})[photo, seen.x, seen.y] = PointObservation(
+                    observations.setdefault(label, {})[photo, seen.x, seen.y] = PointObservation(
                         photo=photo, x=seen.x, y=seen.y
                     )
     if strangers:
@@ -66,8 +66,8 @@ def read_distances(
             a=a,
             b=b,
             metres=metres,
-            observations_a=tuple(sightings[a].values()),
-            observations_b=tuple(sightings[b].values()),
+            observations_a=tuple(observations[a].values()),
+            observations_b=tuple(observations[b].values()),
         )
         for (a, b), metres in lengths.items()
     )
@@ -105,7 +105,7 @@ def _observations(
     known: Mapping[str, Sequence[PointObservation]],
     place: str,
 ) -> Sequence[PointObservation]:
-    """Sightings that a row tells of one end."""
+    """Observations that a row tells of one end."""
     words = [row.get(f"{c}_{end}", "").strip() for c in ("px", "py", "image")]
     if not any(words):
         if known.get(label):

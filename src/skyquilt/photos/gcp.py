@@ -1,9 +1,9 @@
 """OpenDroneMap's `gcp_list.txt`: a coordinate system, then `x y z px py image [name] [check]`.
 
-Rows with one name, or without names the same x, y and z, are sightings of one point. z may be NaN.
-Pixels have their centres at integers. A check point, kept out of the adjustment, has a name that
-starts with `check` or the word `check` in the eighth column: both are extensions that OpenDroneMap
-reads over.
+Rows with one name, or without names the same x, y and z, are observations of one point. z may be
+NaN. Pixels have their centres at integers. A check point, kept out of the adjustment, has a name
+that starts with `check` or the word `check` in the eighth column: both are extensions that
+OpenDroneMap reads over.
 """
 
 from collections.abc import Iterable
@@ -16,7 +16,7 @@ from skyquilt.photos.side_rows import PhotoNames, finite, number, read_crs, read
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Sighting:
+class _Observation:
     x: float
     y: float
     z: float | None
@@ -44,21 +44,21 @@ def read_gcp_list(
     if len(lines) < 2:
         raise SideFileError(
             f"{path.name} has {len(lines)} lines; expected a coordinate system and one line per"
-            " sighting."
+            " observation."
         )
     crs = read_crs(lines[0][1], file=path.name)
     epsg = crs.to_epsg()
-    sightings = [_sighting(text, f"{path.name}, line {i}") for i, text in lines[1:]]
+    observations = [_observation(text, f"{path.name}, line {i}") for i, text in lines[1:]]
     names = PhotoNames(photo_names)
-    strangers = sorted({s.image for s in sightings if names.find(s.image) is None})
-    if all(names.find(s.image) is None for s in sightings):
+    strangers = sorted({s.image for s in observations if names.find(s.image) is None})
+    if all(names.find(s.image) is None for s in observations):
         raise SideFileError(
             f"{path.name} names {sentence_of(strangers)}; no photo of the survey is called that. "
             "Correct the image names in its sixth column."
         )
-    groups: dict[str, list[_Sighting]] = {}
-    for sighting in sightings:
-        groups.setdefault(sighting.key, []).append(sighting)
+    groups: dict[str, list[_Observation]] = {}
+    for observation in observations:
+        groups.setdefault(observation.key, []).append(observation)
     system = f"EPSG:{epsg}" if epsg else crs.to_string()
     points = [_point(i, group, system, names, path) for i, group in enumerate(groups.values(), 1)]
     return tuple(p for p in points if p.observations), _notes(path, strangers, points)
@@ -77,7 +77,7 @@ def _notes(path: Path, strangers: list[str], points: list[ControlPoint]) -> tupl
     return tuple(n for n in (missing, lost) if n)
 
 
-def _sighting(line: str, place: str) -> _Sighting:
+def _observation(line: str, place: str) -> _Observation:
     words = line.split("\t") if line.count("\t") >= 5 else line.split()
     words = [w.strip() for w in words if w.strip()]
     numbers = [number(w) for w in words[:5]]
@@ -90,7 +90,7 @@ def _sighting(line: str, place: str) -> _Sighting:
         )
     name = words[6] if len(words) > 6 else ""
     check = name.lower().startswith("check") or (len(words) > 7 and words[7].lower() == "check")
-    return _Sighting(
+    return _Observation(
         x=x or 0.0,
         y=y or 0.0,
         z=finite(z),
@@ -102,7 +102,9 @@ def _sighting(line: str, place: str) -> _Sighting:
     )
 
 
-def _point(i: int, group: list[_Sighting], crs: str, names: PhotoNames, path: Path) -> ControlPoint:
+def _point(
+    i: int, group: list[_Observation], crs: str, names: PhotoNames, path: Path
+) -> ControlPoint:
     first = group[0]
     label = first.name or f"point {i}"
     if len({(s.x, s.y, s.z) for s in group}) > 1:

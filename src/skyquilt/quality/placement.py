@@ -29,7 +29,7 @@ ACROSS = 400
 """Width in px of the photos that are compared: the thesis's scale."""
 
 
-def judge(
+def placement_quality(
     taken: Intake,
     alignment: Alignment,
     priors: Sequence[Prior],
@@ -106,20 +106,20 @@ def _figures(
 
 
 def _place(
-    sightings: Sequence[PointObservation],
+    observations: Sequence[PointObservation],
     index: dict[str, int],
     views: dict[int, View],
     ground: Ground,
 ) -> NDArray[np.float64] | None:
-    """Where the map shows a point: by the sighting that looks most steeply down, whose photo wins
-    there.
+    """Where the map shows a point: by the observation that looks most steeply down, whose photo
+    wins there.
     """
     best, place = np.inf, None
-    for sighting in sightings:
-        view = views.get(index.get(sighting.photo, -1))
+    for observation in observations:
+        view = views.get(index.get(observation.photo, -1))
         if view is None:
             continue
-        xyz = on_ground(view, np.array([[sighting.x, sighting.y]]), ground.surface)[0]
+        xyz = on_ground(view, np.array([[observation.x, observation.y]]), ground.surface)[0]
         off = xyz - view.pose.map_C
         score = float(np.hypot(*off[:2]) / max(abs(off[2]), 1e-6))
         if score < best:

@@ -75,7 +75,7 @@ def control_figures(alignment: Alignment) -> dict[str, Any]:
             "dy_m": _round(c.error_m[1]),
             "dz_m": _round(z - offset),
             "reprojection_px": _round(c.reprojection_px),
-            "sightings": c.sightings,
+            "sightings": c.observations,
         }
         for c, z in zip(points, dz, strict=True)
     ]

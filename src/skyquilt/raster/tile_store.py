@@ -38,7 +38,7 @@ PUT = (
     " body = excluded.body"
 )
 TOP = "select 1 from tile where layer=? and level=? limit 1"
-SETTLED = "delete from owed where layer=? and level=? and row=? and col=?"
+PAID = "delete from owed where layer=? and level=? and row=? and col=?"
 
 
 @dataclass(frozen=True, order=True)
@@ -186,13 +186,13 @@ class TileStore:
         tiles: Sequence[tuple[Address, Tile]],
         *,
         owing: Iterable[Address] = (),
-        settled: Iterable[Address] = (),
+        drawn: Iterable[Address] = (),
     ) -> None:
         """Writes tiles, all in one transaction; the coarser ones above them are made by
         `raise_levels`.
 
         `owing`: tiles of other layers that are to follow; they are remembered until they are
-        `settled`.
+        `drawn`.
 
         Raises:
             OutputError: the disk is full.
@@ -205,7 +205,7 @@ class TileStore:
                 self._db.executemany(
                     "insert or ignore into owed values (?, ?, ?, ?)", map(_key, owing)
                 )
-                self._db.executemany(SETTLED, map(_key, settled))
+                self._db.executemany(PAID, map(_key, drawn))
                 self._db.execute("commit")
             except sqlite3.Error as error:
                 if self._db.in_transaction:
@@ -221,9 +221,9 @@ class TileStore:
             found = self._db.execute("select layer, level, row, col from owed").fetchall()
         return [Address(str(layer), int(z), int(r), int(c)) for layer, z, r, c in found]
 
-    def raise_levels(self, changed: Iterable[Address], *, settled: Iterable[Address] = ()) -> int:
+    def raise_levels(self, changed: Iterable[Address], *, drawn: Iterable[Address] = ()) -> int:
         """Makes every coarser tile above those of level 0 that changed; returns how many.
-        `settled`: as for `put`.
+        `drawn`: as for `put`.
         """
         done: dict[Address, Tile] = {}
         level = sorted(set(changed))
@@ -233,7 +233,7 @@ class TileStore:
                 tile = self._halved(parent, done)
                 if tile is not None:
                     done[parent] = tile
-        self.put(list(done.items()), settled=settled)
+        self.put(list(done.items()), drawn=drawn)
         return len(done)
 
     def _halved(self, parent: Address, fresh: dict[Address, Tile]) -> Tile | None:

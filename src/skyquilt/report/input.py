@@ -32,7 +32,7 @@ class Shot:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraResiduals:
-    """Sightings of tie points in all photos of one camera."""
+    """Observations of tie points in all photos of one camera."""
 
     camera: str
     """Name of its calibration."""

@@ -29,7 +29,7 @@ from skyquilt.report.svg import (
 
 COLUMNS, ROWS = 8, 6
 FEWEST = 10
-"""Sightings a cell of the image needs for its mean."""
+"""Observations a cell of the image needs for its mean."""
 MOST_CAMERAS = 6
 CELLS = 61
 """Cells per side of the density picture."""
@@ -49,7 +49,7 @@ def residuals_section(data: ReportInput) -> Section:
         *(_field(r) for r in cameras[:MOST_CAMERAS]),
     ]
     if (more := len(cameras) - MOST_CAMERAS) > 0:
-        blocks.append(Missing(why=f"{count(more, 'camera')} with fewer sightings not drawn."))
+        blocks.append(Missing(why=f"{count(more, 'camera')} with fewer observations not drawn."))
     return Section(
         id="residuals",
         title="Reprojection residuals",
@@ -96,9 +96,9 @@ def _density(residual: NDArray[Any]) -> Figure:
         (WIDTH - axes.width) / 2,
     )
     beyond = int((~inside).sum())
-    outside = f" {count(beyond, 'sighting')} further out not drawn." if beyond else ""
+    outside = f" {count(beyond, 'observation')} further out not drawn." if beyond else ""
     caption = (
-        f"{count(len(residual), 'sighting')}. A round, centred cloud is noise; a shifted or "
+        f"{count(len(residual), 'observation')}. A round, centred cloud is noise; a shifted or "
         f"long one is a fault.{outside}"
     )
     return Figure(svg=svg, title=title, caption=caption)
@@ -145,7 +145,7 @@ def _lengths(residual: NDArray[Any]) -> Figure:
     return Figure(
         svg=svg,
         title=title,
-        caption=caption + (f" {count(beyond, 'sighting')} beyond." if beyond else ""),
+        caption=caption + (f" {count(beyond, 'observation')} beyond." if beyond else ""),
     )
 
 
@@ -162,7 +162,7 @@ def _field(r: CameraResiduals) -> Figure:
     ]
     frame += [path(f"M1 {1 + k * height / ROWS:.1f}h{body:.1f}", "grid") for k in range(1, ROWS)]
     if not len(at):
-        why = f"No part of the image has {FEWEST} sightings; too few for a mean."
+        why = f"No part of the image has {FEWEST} observations; too few for a mean."
         return Figure(svg=drawing(frame, title, WIDTH, height + 2), title=title, caption=why)
     length = np.linalg.norm(mean, axis=1)
     longest = float(length.max())
@@ -175,7 +175,8 @@ def _field(r: CameraResiduals) -> Figure:
     left = systematic(r, mean, n)
     judged = "good" if left <= 0.15 else "fair" if left <= 0.5 else "poor"
     caption = (
-        f"{count(int(n.sum()), 'sighting')} in cells of {FEWEST} or more. With the share of chance "
+        f"{count(int(n.sum()), 'observation')} in cells of {FEWEST} or more. With the share of"
+        " chance "
         "taken off, "
         f"{fixed(left, 2)} px RMS are systematic: {judged} (good up to 0.15 px, fair up to 0.5). "
         "Arrows that point in or out all round would be a wrong radial distortion."
@@ -199,7 +200,7 @@ def systematic(r: CameraResiduals, mean: NDArray[Any], n: NDArray[Any]) -> float
 
 def mean_field(r: CameraResiduals) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
     """Centres (k, 2) in px, mean residuals (k, 2) in px and counts (k,) of cells with enough
-    sightings.
+    observations.
     """
     column = np.clip((r.px[:, 0] + 0.5) / r.width * COLUMNS, 0, COLUMNS - 1).astype(np.int64)
     row = np.clip((r.px[:, 1] + 0.5) / r.height * ROWS, 0, ROWS - 1).astype(np.int64)

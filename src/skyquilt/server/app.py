@@ -11,16 +11,16 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from skyquilt import __version__
-from skyquilt.server.event_endpoints import Listening
-from skyquilt.server.gate import Gate, Writer
+from skyquilt.server.context import Context, Writer
+from skyquilt.server.event_endpoints import EventEndpoints
 from skyquilt.server.guard import HEADERS, Guard
 from skyquilt.server.images import Images
-from skyquilt.server.layer_endpoints import Overlays
-from skyquilt.server.map_endpoints import STATIC, Maps
-from skyquilt.server.photo_endpoints import PhotoList
+from skyquilt.server.layer_endpoints import LayerEndpoints
+from skyquilt.server.map_endpoints import STATIC, MapEndpoints
+from skyquilt.server.photo_endpoints import PhotoEndpoints
 from skyquilt.server.survey import Survey
-from skyquilt.server.upload_endpoints import Receiving
-from skyquilt.server.wms_endpoints import WmsService
+from skyquilt.server.upload_endpoints import UploadEndpoints
+from skyquilt.server.wms_endpoints import WmsEndpoints
 
 
 def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) -> FastAPI:
@@ -32,10 +32,18 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         redoc_url=None,
         description="A map that grows while drones fly: tiles, WMS, photos, layers, news.",
     )
-    gate, images = Gate(survey, guard, writer, folder), Images(survey)
-    maps, wms, listed = Maps(gate, images), WmsService(gate, images), PhotoList(gate)
-    received, layers, news = Receiving(gate), Overlays(gate), Listening(gate)
-    app.state.ending = news.ending
+    context, images = Context(survey, guard, writer, folder), Images(survey)
+    maps, wms, listed = (
+        MapEndpoints(context, images),
+        WmsEndpoints(context, images),
+        PhotoEndpoints(context),
+    )
+    received, layers, events = (
+        UploadEndpoints(context),
+        LayerEndpoints(context),
+        EventEndpoints(context),
+    )
+    app.state.ending = events.ending
 
     get, post = {"methods": ["GET"]}, {"methods": ["POST"]}
     for path, work, options in (
@@ -56,7 +64,7 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         ("/layers", layers.layer_post, post),
         ("/layers/{name}", layers.layer_get, {**get, "response_class": Response}),
         ("/layers/{name}", layers.layer_delete, {"methods": ["DELETE"]}),
-        ("/events", news.events, {**get, "response_class": StreamingResponse}),
+        ("/events", events.events, {**get, "response_class": StreamingResponse}),
         ("/finish", layers.finish, post),
     ):
         app.add_api_route(path, work, **options)

@@ -1,4 +1,4 @@
-"""News for those who look on, as server-sent events."""
+"""MapEvents for those who look on, as server-sent events."""
 
 import asyncio
 import threading
@@ -8,7 +8,7 @@ from fastapi import Request
 from fastapi.responses import StreamingResponse
 
 from skyquilt import __version__
-from skyquilt.server.gate import Gate
+from skyquilt.server.context import Context
 from skyquilt.server.survey import LiveSurvey
 
 WAIT_S = 0.1
@@ -19,11 +19,11 @@ KEEP_ALIVE_S = 15.0
 """A comment is sent to quiet listeners so often, so that the connection is known to live."""
 
 
-class Listening:
+class EventEndpoints:
     """The address of news."""
 
-    def __init__(self, gate: Gate) -> None:
-        self.gate = gate
+    def __init__(self, context: Context) -> None:
+        self.context = context
         self.ending = threading.Event()
 
     async def events(self, request: Request, after: int | None = None) -> StreamingResponse:
@@ -36,7 +36,7 @@ class Listening:
             if said.isdigit()
             else after
             if after is not None
-            else self.gate.survey.version()
+            else self.context.survey.version()
         )
         return StreamingResponse(
             self._news(request, start),
@@ -49,8 +49,8 @@ class Listening:
         quiet = 0.0
         while not self.ending.is_set() and not await request.is_disconnected():
             told = (
-                self.gate.survey.ledger.told(last)
-                if isinstance(self.gate.survey, LiveSurvey)
+                self.context.survey.ledger.told(last)
+                if isinstance(self.context.survey, LiveSurvey)
                 else []
             )
             for number, kind, body in told:
@@ -65,8 +65,8 @@ class Listening:
 
     async def _pause(self) -> None:
         """Until there may be news."""
-        known = self.gate.survey.stamp()
+        known = self.context.survey.stamp()
         for _ in range(round(WAIT_S / LISTEN_S)):
             await asyncio.sleep(LISTEN_S)
-            if self.gate.survey.stamp() != known:
+            if self.context.survey.stamp() != known:
                 return

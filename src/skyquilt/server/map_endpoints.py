@@ -12,8 +12,8 @@ from starlette.background import BackgroundTask
 
 from skyquilt import __version__
 from skyquilt.raster.map_source import between
+from skyquilt.server.context import Context
 from skyquilt.server.export import write_cog
-from skyquilt.server.gate import Gate
 from skyquilt.server.images import Images
 from skyquilt.server.survey import LiveSurvey
 
@@ -22,11 +22,11 @@ DRAWN_AT_ONCE = 2
 """Tiles drawn at a time: more would not be quicker, and take turns from others."""
 
 
-class Maps:
+class MapEndpoints:
     """Addresses of maps."""
 
-    def __init__(self, gate: Gate, images: Images) -> None:
-        self.gate, self.images = gate, images
+    def __init__(self, context: Context, images: Images) -> None:
+        self.context, self.images = context, images
         self._drawing = CapacityLimiter(DRAWN_AT_ONCE)
 
     def page(self) -> FileResponse:
@@ -36,7 +36,7 @@ class Maps:
     def info(self) -> dict[str, Any]:
         """What there is: layers with their extent in degrees, counts, the newest event's number."""
         found = []
-        for name, source in self.gate.survey.layers().items():
+        for name, source in self.context.survey.layers().items():
             bounds = source.bounds()
             box = (
                 None
@@ -45,20 +45,22 @@ class Maps:
             )
             found.append({"name": name, "crs": source.crs, "bounds": box})
         counts = (
-            self.gate.survey.ledger.counts() if isinstance(self.gate.survey, LiveSurvey) else {}
+            self.context.survey.ledger.counts()
+            if isinstance(self.context.survey, LiveSurvey)
+            else {}
         )
         finish = (
-            self.gate.survey.ledger.meta("finish")
-            if isinstance(self.gate.survey, LiveSurvey)
+            self.context.survey.ledger.meta("finish")
+            if isinstance(self.context.survey, LiveSurvey)
             else None
         )
         return {
             "layers": found,
-            "growing": self.gate.survey.growing and self.gate.writer is not None,
+            "growing": self.context.survey.growing and self.context.writer is not None,
             "counts": counts,
-            "event": self.gate.survey.version(),
+            "event": self.context.survey.version(),
             "version": __version__,
-            "token": self.gate.guard.token is not None,
+            "token": self.context.guard.token is not None,
             "finish": finish,
         }
 
@@ -68,7 +70,7 @@ class Maps:
         """A web tile (EPSG:3857, 256 px, WebP); 204 where the map has nothing, 304 where the client
         has it.
         """
-        name = self.gate.layer(layer)
+        name = self.context.layer(layer)
         if not (0 <= z <= 26 and 0 <= x < 2**z and 0 <= y < 2**z):
             raise HTTPException(404, f"there is no tile {z}/{x}/{y}")
         found = self.images.kept(name, z, x, y)
@@ -83,8 +85,8 @@ class Maps:
 
     def tilejson(self, request: Request, layer: str | None = None) -> dict[str, Any]:
         """TileJSON 3.0."""
-        name = self.gate.layer(layer)
-        source = self.gate.survey.layers()[name]
+        name = self.context.layer(layer)
+        source = self.context.survey.layers()[name]
         bounds = source.bounds()
         box = (
             None
@@ -105,8 +107,8 @@ class Maps:
         """A part of a layer as Cloud Optimized GeoTIFF; `bbox`: west,south,east,north in
         degrees.
         """
-        name = self.gate.layer(layer)
-        source = self.gate.survey.layers()[name]
+        name = self.context.layer(layer)
+        source = self.context.survey.layers()[name]
         try:
             west, south, east, north = (float(v) for v in bbox.split(","))
         except ValueError as error:

@@ -5,17 +5,17 @@ from typing import Annotated, Any
 from fastapi import HTTPException, Query
 from fastapi.responses import FileResponse
 
-from skyquilt.server.gate import Gate
+from skyquilt.server.context import Context
 from skyquilt.server.survey import Shown, covering
 
 Degrees = Annotated[float, Query(ge=-180, le=180)]
 
 
-class PhotoList:
+class PhotoEndpoints:
     """Addresses of photos."""
 
-    def __init__(self, gate: Gate) -> None:
-        self.gate = gate
+    def __init__(self, context: Context) -> None:
+        self.context = context
 
     def photos(
         self, lon: Degrees | None = None, lat: Annotated[float | None, Query(ge=-90, le=90)] = None
@@ -23,10 +23,10 @@ class PhotoList:
         """All photos; with `lon` and `lat` in degrees those that cover the point, the most vertical
         first.
         """
-        everything = self.gate.survey.photos()
+        everything = self.context.survey.photos()
         if lon is not None and lat is not None:
             return {"photos": [p.record for p in covering(everything, lon, lat)]}
-        refused = self.gate.survey.refused() if hasattr(self.gate.survey, "refused") else []
+        refused = self.context.survey.refused() if hasattr(self.context.survey, "refused") else []
         return {"photos": [p.record for p in everything], "refused": refused}
 
     def photo(self, number: int) -> dict[str, Any]:
@@ -34,7 +34,7 @@ class PhotoList:
         return dict(self._known(number).record)
 
     def _known(self, number: int) -> Shown:
-        found = self.gate.survey.photo(number)
+        found = self.context.survey.photo(number)
         if found is None:
             raise HTTPException(404, f"there is no photo {number}")
         return found

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from skyquilt.errors import OutputError
-from skyquilt.live.crash_points import reached
+from skyquilt.live.crash_points import hit
 from skyquilt.raster.map_source import MERCATOR, Bounds, between, mercator, picture
 from skyquilt.raster.mbtiles import touched, write_mbtiles
 from skyquilt.server.export import write_cog
@@ -26,7 +26,7 @@ ZOOMS = 7
 """Zooms of the MBTiles file, from the map's own resolution upwards."""
 
 
-class Publishing:
+class PublishedFiles:
     """Writes both files when the map has changed; as a context manager in a thread of its own."""
 
     def __init__(self, survey: LiveSurvey, folder: Path) -> None:
@@ -37,7 +37,7 @@ class Publishing:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True, name="publishing")
 
-    def __enter__(self) -> "Publishing":
+    def __enter__(self) -> "PublishedFiles":
         self._thread.start()
         return self
 
@@ -70,7 +70,7 @@ class Publishing:
             bounds = source.bounds()
             if bounds is not None:
                 write_cog(source, bounds, self.folder / "map.tif", 0.0)
-        reached("published")
+        hit("published")
 
     def _look(self, layer: str) -> None:
         """Notes where the map has changed."""

@@ -21,17 +21,17 @@ from skyquilt.live.live_map import PHOTOS
 from skyquilt.live.photo_intake import Intake
 from skyquilt.live.settings import LiveSettings
 from skyquilt.server.guard import Guard
-from skyquilt.server.published_files import Publishing
-from skyquilt.server.server_thread import Serving, address, bound
+from skyquilt.server.published_files import PublishedFiles
+from skyquilt.server.server_thread import ServerThread, address, bound
 from skyquilt.server.survey import LiveSurvey
 
 PATIENCE_S = 60.0
 """How long the process may take to begin."""
 NICE = 5
-"""Placing photos comes first."""
+"""LocalPose photos comes first."""
 
 
-class Door:
+class UploadEndpoint:
     """Where photos and layers are handed in; the mapping finds them in the ledger."""
 
     def __init__(self, folder: Path, settings: LiveSettings) -> None:
@@ -41,7 +41,7 @@ class Door:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Asked:
+class ServerConfig:
     """What the process is to serve."""
 
     folder: Path
@@ -55,13 +55,13 @@ class Asked:
 
 
 @dataclass(kw_only=True)
-class ServingApart:
+class ServerProcess:
     """A running server and the files it publishes; as a context manager it ends with its block.
 
     Should its process die, another one takes its place on the same socket.
     """
 
-    asked: Asked
+    asked: ServerConfig
     """What it serves."""
     port: int = 0
     """Where it listens; 0 = a free port, to be read afterwards."""
@@ -129,7 +129,9 @@ class ServingApart:
         return address(self.asked.guard.host, self.port)
 
 
-def _serve(listening: socket.socket, asked: Asked, wire: Connection, other: Connection) -> None:
+def _serve(
+    listening: socket.socket, asked: ServerConfig, wire: Connection, other: Connection
+) -> None:
     """The process: serves until its parent closes the wire, or is gone."""
     other.close()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
@@ -137,16 +139,16 @@ def _serve(listening: socket.socket, asked: Asked, wire: Connection, other: Conn
         os.nice(NICE)
     try:
         survey = LiveSurvey(asked.folder, base=asked.base)
-        door = Door(asked.folder, asked.settings)
+        door = UploadEndpoint(asked.folder, asked.settings)
         with (
-            Serving(
+            ServerThread(
                 survey=survey,
                 guard=asked.guard,
                 folder=asked.folder,
                 writer=door,
                 listening=listening,
             ),
-            Publishing(LiveSurvey(asked.folder), asked.folder),
+            PublishedFiles(LiveSurvey(asked.folder), asked.folder),
         ):
             wire.send("")
             with suppress(EOFError, OSError):

@@ -36,7 +36,7 @@ def bound(host: str, port: int) -> socket.socket:
 
 
 @dataclass(kw_only=True)
-class Serving:
+class ServerThread:
     """A running server; as a context manager it ends with its block."""
 
     survey: Survey

@@ -42,7 +42,7 @@ class Survey(Protocol):
     """Whether photos may still come."""
 
     def layers(self) -> dict[str, MapSource]:
-        """Maps by name, the one to show first first."""
+        """MapEndpoints by name, the one to show first first."""
 
     def photos(self) -> list[Shown]:
         """All photos in order."""

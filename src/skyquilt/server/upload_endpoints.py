@@ -8,15 +8,15 @@ from fastapi.responses import JSONResponse
 
 from skyquilt.errors import OutputError
 from skyquilt.live.photo_intake import Accepted, Intake, shown_name
-from skyquilt.server.gate import Gate
+from skyquilt.server.context import Context
 from skyquilt.server.uploads import Uploads
 
 
-class Receiving:
+class UploadEndpoints:
     """Addresses of uploads."""
 
-    def __init__(self, gate: Gate) -> None:
-        self.gate = gate
+    def __init__(self, context: Context) -> None:
+        self.context = context
 
     async def upload(
         self, request: Request, name: str = "photo", source: str = "upload"
@@ -24,7 +24,7 @@ class Receiving:
         """Takes a photo (the body). It answers when the photo is safe: 201, 200 for a duplicate,
         422 refused.
         """
-        writer, uploads = self.gate.writing(request)
+        writer, uploads = self.context.writing(request)
         held = self._begun(uploads, name, source, self._length(request))
         try:
             size = await self._received(request, held.id, writer.intake.inbox.most_bytes)
@@ -41,8 +41,8 @@ class Receiving:
     def _length(self, request: Request) -> int:
         text = request.headers.get("content-length", "0")
         size = int(text) if text.isdigit() else 0
-        assert self.gate.writer is not None
-        most = self.gate.writer.intake.inbox.most_bytes
+        assert self.context.writer is not None
+        most = self.context.writer.intake.inbox.most_bytes
         if size > most:
             raise HTTPException(413, f"a photo may have {most} bytes, this one has {size}")
         return size
@@ -61,10 +61,10 @@ class Receiving:
         return held
 
     async def _received(self, request: Request, number: str, most: int) -> int:
-        assert self.gate.uploads is not None
+        assert self.context.uploads is not None
         size = 0
         try:
-            with self.gate.uploads.path(number).open("ab") as file:
+            with self.context.uploads.path(number).open("ab") as file:
                 async for block in request.stream():
                     size += len(block)
                     if size > most:
@@ -79,9 +79,9 @@ class Receiving:
         return size
 
     def _handed_in(self, intake: Intake, number: str, name: str, source: str) -> JSONResponse:
-        assert self.gate.uploads is not None
+        assert self.context.uploads is not None
         try:
-            with self.gate.uploads.path(number).open("rb") as file:
+            with self.context.uploads.path(number).open("rb") as file:
                 done = intake.take(iter(lambda: file.read(1 << 20), b""), name, source)
         except OutputError as error:
             raise HTTPException(507, str(error)) from error
@@ -98,7 +98,7 @@ class Receiving:
         self, request: Request, name: str, size: Annotated[int, Query(ge=1)], source: str = "upload"
     ) -> JSONResponse:
         """Begins a resumable upload of `size` bytes; its parts go to /photos/uploads/{id}."""
-        writer, uploads = self.gate.writing(request)
+        writer, uploads = self.context.writing(request)
         if size > writer.intake.inbox.most_bytes:
             raise HTTPException(
                 413, f"a photo may have {writer.intake.inbox.most_bytes} bytes, this one has {size}"
@@ -110,7 +110,7 @@ class Receiving:
 
     def upload_state(self, request: Request, number: str) -> Response:
         """How far a resumable upload is: header `Upload-Offset`."""
-        _, uploads = self.gate.writing(request)
+        _, uploads = self.context.writing(request)
         held = uploads.get(number)
         if held is None:
             raise HTTPException(404, "there is no such upload")
@@ -120,7 +120,7 @@ class Receiving:
 
     async def upload_part(self, request: Request, number: str) -> JSONResponse:
         """Appends a part at header `Upload-Offset`; the last one makes it a photo."""
-        writer, uploads = self.gate.writing(request)
+        writer, uploads = self.context.writing(request)
         held = uploads.get(number)
         if held is None:
             raise HTTPException(404, "there is no such upload")

@@ -5,23 +5,23 @@ from fastapi import Request, Response
 from fastapi.responses import JSONResponse
 
 from skyquilt.raster.map_source import between, picture
-from skyquilt.server.gate import Gate
+from skyquilt.server.context import Context
 from skyquilt.server.images import Images, image_bytes
 from skyquilt.server.survey import covering
 from skyquilt.server.wms import WmsError, asked, capabilities, map_request, refusal
 
 
-class WmsService:
+class WmsEndpoints:
     """Capabilities, pictures, and photos below a pixel."""
 
-    def __init__(self, gate: Gate, images: Images) -> None:
-        self.gate, self.images = gate, images
+    def __init__(self, context: Context, images: Images) -> None:
+        self.context, self.images = context, images
 
     def wms(self, request: Request) -> Response:
         """WMS 1.1.1 and 1.3.0."""
         query = asked(request.query_params)
         version = query.get("VERSION", query.get("WMTVER", "1.3.0"))
-        known = self.gate.survey.layers()
+        known = self.context.survey.layers()
         try:
             what = query.get("REQUEST", "").lower()
             if what in ("getcapabilities", "capabilities"):
@@ -42,7 +42,7 @@ class WmsService:
             return Response(refusal(error, version), media_type=kind, status_code=400)
 
     def _map(self, query: dict[str, str], version: str) -> Response:
-        known = self.gate.survey.layers()
+        known = self.context.survey.layers()
         want = map_request(query, known)
         out = None
         for name in want.layers:
@@ -58,7 +58,7 @@ class WmsService:
         )
 
     def _feature_info(self, query: dict[str, str]) -> Response:
-        want = map_request(query, self.gate.survey.layers())
+        want = map_request(query, self.context.survey.layers())
         try:
             i, j = int(query.get("I", query.get("X", ""))), int(query.get("J", query.get("Y", "")))
         except ValueError as error:
@@ -71,5 +71,5 @@ class WmsService:
         lon, lat = (
             between(want.crs, "EPSG:4326").transform(x, y) if want.crs != "EPSG:4326" else (x, y)
         )
-        found = [p.record for p in covering(self.gate.survey.photos(), lon, lat)]
+        found = [p.record for p in covering(self.context.survey.photos(), lon, lat)]
         return JSONResponse({"lon": lon, "lat": lat, "photos": found})

@@ -22,7 +22,7 @@ _MARGIN_PX = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sighting:
+class Observation:
     """A target in a photo."""
 
     point: str
@@ -133,14 +133,14 @@ def _three(values: Doubles) -> tuple[float, float, float]:
     return x, y, z
 
 
-def sightings(
+def observations(
     settings: Control,
     country: Country,
     scene: Scene,
     lens: Lens,
     shots: Sequence[Shot],
     reports: Sequence[Report],
-) -> list[Sighting]:
+) -> list[Observation]:
     """Where the targets are seen, nothing standing in between."""
     if not country.targets:
         return []
@@ -158,7 +158,9 @@ def sightings(
                 )
                 dx, dy = rng.normal(0, settings.pixel_noise, 2)
                 found.append(
-                    Sighting(point=target.name, photo=shot.name, x=float(x + dx), y=float(y + dy))
+                    Observation(
+                        point=target.name, photo=shot.name, x=float(x + dx), y=float(y + dy)
+                    )
                 )
     return found
 
@@ -183,15 +185,15 @@ def _in_sight(scene: Scene, eye: Doubles, point: Doubles) -> bool:
 
 
 def write_gcp_list(
-    path: Path, crs: str, points: Sequence[Surveyed], seen: Sequence[Sighting]
+    path: Path, crs: str, points: Sequence[Surveyed], seen: Sequence[Observation]
 ) -> None:
     """OpenDroneMap's `gcp_list.txt`; a check point says so in the eighth column."""
     by_name = {point.target.name: point for point in points}
     lines = [crs]
-    for sighting in sorted(seen, key=lambda s: (s.point, s.photo)):
-        point = by_name[sighting.point]
+    for observation in sorted(seen, key=lambda s: (s.point, s.photo)):
+        point = by_name[observation.point]
         x, y, z = point.measured
-        words = [f"{x:.3f}", f"{y:.3f}", f"{z:.3f}", f"{sighting.x:.2f}", f"{sighting.y:.2f}"]
-        words += [sighting.photo, sighting.point] + ["check"] * point.target.check
+        words = [f"{x:.3f}", f"{y:.3f}", f"{z:.3f}", f"{observation.x:.2f}", f"{observation.y:.2f}"]
+        words += [observation.photo, observation.point] + ["check"] * point.target.check
         lines.append("\t".join(words))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

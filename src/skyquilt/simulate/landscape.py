@@ -23,7 +23,7 @@ _ESTATE_M = 400.0
 """
 
 
-def settle(bounds: tuple[float, float, float, float], seed: int) -> Layout:
+def landscape(bounds: tuple[float, float, float, float], seed: int) -> Layout:
     """The layout over map bounds (x0, y0, x1, y1) in m."""
     rng = np.random.default_rng([seed, 11])
     frame = Frame(angle=float(np.radians(rng.uniform(8, 28))))

@@ -9,7 +9,7 @@ import numpy as np
 
 from skyquilt.errors import OutputError
 from skyquilt.simulate.camera import Lens
-from skyquilt.simulate.control import lay_out, sightings, survey, write_gcp_list
+from skyquilt.simulate.control import lay_out, observations, survey, write_gcp_list
 from skyquilt.simulate.exif import Body, write_jpeg, write_tiff
 from skyquilt.simulate.expose import exposer, footprint
 from skyquilt.simulate.flight import Shot, Waypoint, fly, plan, site
@@ -186,7 +186,7 @@ def _write(world: World, output: Path) -> Iterator[Progress]:
     taken = yield from _photograph(world, scene, output)
     points = survey(settings.control, country, world.place)
     visible = world.visible
-    found = sightings(
+    found = observations(
         settings.control, country, scene, visible.lens, visible.shots, visible.reports
     )
     seen = [replace(s, photo=s.photo + ".jpg") for s in found]

@@ -14,7 +14,7 @@ from skyquilt.simulate.canvas import Canvas
 from skyquilt.simulate.fields import paint_borders, paint_parcels, paint_ponds, paint_roads
 from skyquilt.simulate.grid import Floats, Grid
 from skyquilt.simulate.ground import Ground
-from skyquilt.simulate.landscape import settle
+from skyquilt.simulate.landscape import landscape
 from skyquilt.simulate.layout import Layout
 from skyquilt.simulate.light import lit, shadow_reach, shine
 from skyquilt.simulate.noise import Noise
@@ -74,7 +74,7 @@ class Country:
     @cached_property
     def layout(self) -> Layout:
         """What lies where."""
-        return Layout() if self.settings.kind == "chessboard" else settle(self.bounds, self.seed)
+        return Layout() if self.settings.kind == "chessboard" else landscape(self.bounds, self.seed)
 
     @cached_property
     def noise(self) -> Noise:

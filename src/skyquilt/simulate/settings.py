@@ -107,7 +107,7 @@ class Control:
     accuracy: float = 0.02
     """Standard deviation of each surveyed coordinate, m."""
     pixel_noise: float = 0.3
-    """Standard deviation of each sighting, px."""
+    """Standard deviation of each observation, px."""
 
 
 @dataclass(frozen=True, kw_only=True)

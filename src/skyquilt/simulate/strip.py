@@ -49,7 +49,7 @@ class StripSettings:
     square: float = 1.0
     """Side of a board's square, m."""
     noise: float = 0.3
-    """Standard deviation of a sighting, px per axis."""
+    """Standard deviation of a observation, px per axis."""
     tilt: float = 0.3
     """Standard deviation of pitch and of roll, degrees: held by hand, from above."""
     views: int = 30
@@ -86,9 +86,9 @@ class Strip:
     """What the camera saw, and what was there."""
 
     ids: tuple[Doubles, ...]
-    """Per photo (N,), which point of the ground each sighting is of, increasing."""
+    """Per photo (N,), which point of the ground each observation is of, increasing."""
     px: tuple[Doubles, ...]
-    """Per photo (N, 2), sightings with noise."""
+    """Per photo (N, 2), observations with noise."""
     targets: tuple[Doubles, ...]
     """Per photo (4, 2) px without noise: corners, in order around it, of the board square of four
     by four below it.

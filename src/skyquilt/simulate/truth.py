@@ -13,7 +13,7 @@ from rasterio.transform import from_origin
 from rasterio.windows import Window
 
 from skyquilt.simulate.camera import Lens
-from skyquilt.simulate.control import Sighting, Surveyed
+from skyquilt.simulate.control import Observation, Surveyed
 from skyquilt.simulate.expose import footprint
 from skyquilt.simulate.flight import Shot
 from skyquilt.simulate.grid import Grid
@@ -47,7 +47,7 @@ def write_truth(
     start: Start,
     taken: Sequence[Taken],
     points: Sequence[Surveyed],
-    seen: Sequence[Sighting],
+    seen: Sequence[Observation],
 ) -> None:
     """`truth.json`: everything that an adjustment could be judged by."""
     lenses = {"visible": settings.lens}
@@ -106,7 +106,7 @@ def _photo(taken: Taken, place: Place, start: Start) -> dict[str, Any]:
     }
 
 
-def _point(point: Surveyed, seen: Sequence[Sighting]) -> dict[str, Any]:
+def _point(point: Surveyed, seen: Sequence[Observation]) -> dict[str, Any]:
     target = point.target
     return {
         "name": target.name,

@@ -1,7 +1,7 @@
 """Two blocks joined by their pairs [Yahyanejad 2013, 5.2.3, (5.7)].
 
 Visual and thermal photos that show the same ground are registered one by one, each laid flat by the
-pose and the surface of its own block, so that height no longer parts them, and settled by their
+pose and the surface of its own block, so that height no longer parts them, and refined by their
 colours, since the sun draws all of them aside in one direction, which no adjustment would notice.
 Their correspondences are then in both maps already, and one transform is fitted to all, in balance.
 """
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from skyquilt.coregistration.methods import registration_method
 from skyquilt.coregistration.propagation import PairPoints, Propagate
-from skyquilt.coregistration.refine_registration import Settle
+from skyquilt.coregistration.refine_registration import RefineRegistration
 from skyquilt.geometry.transforms import transfer
 from skyquilt.imaging.views import View
 from skyquilt.model.raster import Grid, Window
@@ -29,7 +29,7 @@ LEAST_OVERLAP = 0.4
 """Share of the thermal footprint that the visual one must show."""
 _REACH_M = 6.0
 """By how much the positions of two flights may differ."""
-SETTLE = Settle()
+REFINE = RefineRegistration()
 """How a believed pair gets exact: as stiff as what two adjusted blocks differ by; a freer model
 follows shadows.
 """
@@ -113,15 +113,15 @@ def _registered(visual: Scene, thermal: Scene, a: View, b: View) -> tuple[PairPo
     outcome = registration_method("auto")(*flat, guess)
     if not isinstance(outcome, Registration):
         return None
-    settled = SETTLE(*flat, outcome)
-    px_a, px_b = _points(flat, settled)
+    refined = REFINE(*flat, outcome)
+    px_a, px_b = _points(flat, refined)
     points = PairPoints(
         a=a.photo,
         b=b.photo,
         px_a=_on_map(visual, grid_a, px_a),
         px_b=_on_map(thermal, grid_b, px_b),
     )
-    return points, settled.evidence.get("by_colour", 0.0) > 0
+    return points, refined.evidence.get("by_colour", 0.0) > 0
 
 
 def _flat(scene: Scene, view: View, grid: Grid) -> Picture:

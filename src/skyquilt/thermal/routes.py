@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from skyquilt.coregistration.methods import registration_method
 from skyquilt.coregistration.pictures import Source, guess_of, open_picture
-from skyquilt.coregistration.refine_registration import Settle
-from skyquilt.coregistration.subpixel import Sharpen
+from skyquilt.coregistration.refine_registration import RefineRegistration
+from skyquilt.coregistration.subpixel import SubpixelRefinement
 from skyquilt.errors import RefusedError
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registration
@@ -23,7 +23,7 @@ ROUTES = ("auto", "rig", "maps", "pairs", "heights", "positions")
 both maps, by pairs of photos, by heights, or by its positions alone; auto takes the first of these
 that can be believed.
 """
-SETTLE = Settle(free=Sharpen(freedom="affine", steps=12))
+REFINE = RefineRegistration(free=SubpixelRefinement(freedom="affine", steps=12))
 """How a believed registration of maps gets exact: with the freedom that pictures support."""
 FAR_M = 1000.0
 """Distance between the nearest photos of two flights beyond which they show different places."""
@@ -152,7 +152,7 @@ def _registered(a: Source, b: Source, one: Picture, other: Picture, guess: Guess
     outcome = registration_method("auto")(one, other, guess)
     if isinstance(outcome, RefusedRegistration):
         return outcome
-    outcome = SETTLE(one, other, outcome)
+    outcome = REFINE(one, other, outcome)
     full_a, full_b = a.full_S_picture, b.full_S_picture
     matrix = full_b @ outcome.b_H_a @ np.linalg.inv(full_a)
     moved_a, moved_b = (

@@ -43,7 +43,7 @@ def choose_method(asked: str, photos: int, links: int, positions: int) -> tuple[
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Known:
+class AlignmentInputs:
     """What the methods of alignment may draw on."""
 
     intake: Intake
@@ -63,7 +63,7 @@ class Known:
 
 
 def place(
-    known: Known, methods: Methods, settings: MosaicSettings, store: Store
+    known: AlignmentInputs, methods: Methods, settings: MosaicSettings, store: Store
 ) -> Steps[Alignment]:
     """Poses and calibration of the survey."""
     positions = sum(bool(np.isfinite(p.map_C[:2]).all()) for p in known.priors)
@@ -84,7 +84,7 @@ def place(
     return alignment
 
 
-def _key(known: Known, methods: Methods, way: object) -> str:
+def _key(known: AlignmentInputs, methods: Methods, way: object) -> str:
     photos = [
         (p.digest, p.name, p.camera_key, p.focal, p.calibration, p.editor)
         for p in known.intake.photos
@@ -102,7 +102,7 @@ def _key(known: Known, methods: Methods, way: object) -> str:
     )
 
 
-Align = Callable[[Known, Methods, Repaired | None], Alignment]
+Align = Callable[[AlignmentInputs, Methods, Repaired | None], Alignment]
 
 
 def _way(method: str, methods: Methods) -> tuple[Align, object]:
@@ -117,7 +117,7 @@ def _way(method: str, methods: Methods) -> tuple[Align, object]:
     }[method]
 
 
-def repaired_metadata(known: Known) -> Repaired | None:
+def repaired_metadata(known: AlignmentInputs) -> Repaired | None:
     """What the metadata say where the pixels of links do not contradict; None without links."""
     if not known.links.links:
         return None
@@ -127,7 +127,7 @@ def repaired_metadata(known: Known) -> Repaired | None:
     )
 
 
-def _bundle(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
+def _bundle(known: AlignmentInputs, methods: Methods, repaired: Repaired | None) -> Alignment:
     photos = known.intake.photos
     points = control_in_frame(known.control, photos, known.frame)
     return methods.bundle(
@@ -141,22 +141,24 @@ def _bundle(known: Known, methods: Methods, repaired: Repaired | None) -> Alignm
     )
 
 
-def _pose(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
+def _pose(known: AlignmentInputs, methods: Methods, repaired: Repaired | None) -> Alignment:
     return _by_metadata(methods.by_pose, known, repaired)
 
 
-def _position(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
+def _position(known: AlignmentInputs, methods: Methods, repaired: Repaired | None) -> Alignment:
     return _by_metadata(methods.by_position, known, repaired)
 
 
-def _by_metadata(method: ByMetadata, known: Known, repaired: Repaired | None) -> Alignment:
+def _by_metadata(
+    method: ByMetadata, known: AlignmentInputs, repaired: Repaired | None
+) -> Alignment:
     if repaired is None:
         return method(known.intake.photos, known.frame, known.priors)
     placed = method(known.intake.photos, known.frame, repaired.priors, repaired.heights_m)
     return replace(placed, notes=(*placed.notes, *repaired.notes))
 
 
-def _image(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
+def _image(known: AlignmentInputs, methods: Methods, repaired: Repaired | None) -> Alignment:
     from skyquilt.matching.levelled import Level
     from skyquilt.papers.overview import ByOverview
 
@@ -169,7 +171,7 @@ def _image(known: Known, methods: Methods, repaired: Repaired | None) -> Alignme
     return method(photos, known.frame, known.priors, features, known.order)
 
 
-def _least_height(known: Known) -> float | None:
+def _least_height(known: AlignmentInputs) -> float | None:
     """Least height above take-off in m, which stands for that above ground in (4.9); None where
     none is reported.
     """
@@ -179,21 +181,21 @@ def _least_height(known: Known) -> float | None:
     return float(known_heights.min()) if takeoff and len(known_heights) else None
 
 
-def _hybrid(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
+def _hybrid(known: AlignmentInputs, methods: Methods, repaired: Repaired | None) -> Alignment:
     placed = _by_metadata(methods.by_pose, known, repaired)
     priors = known.priors if repaired is None else repaired.priors
     assert methods.hybrid is not None, "configured where it is asked for"
     return methods.hybrid(placed, known.intake.photos, priors, known.order, known.pictures)
 
 
-def _flightline(known: Known, methods: Methods, repaired: Repaired | None) -> Alignment:
+def _flightline(known: AlignmentInputs, methods: Methods, repaired: Repaired | None) -> Alignment:
     assert methods.by_flightline is not None, "configured where it is asked for"
     return methods.by_flightline(
         known.intake.photos, known.frame, known.priors, known.intake.features, known.order
     )
 
 
-def _named(alignment: Alignment, known: Known) -> Alignment:
+def _named(alignment: Alignment, known: AlignmentInputs) -> Alignment:
     """With a reason for photos that the sequence does not name."""
     missing = set(range(len(known.intake.photos))) - set(known.order)
     reasons = dict.fromkeys(missing, "the sequence does not name it")

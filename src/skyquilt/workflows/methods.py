@@ -126,7 +126,7 @@ class MosaicSettings:
     lines: str = "heading"
     """One of `LINES`: how method `flightline` tells lines apart."""
     distances: Path | None = None
-    """Known distances (CSV) by which the map is judged."""
+    """AlignmentInputs distances (CSV) by which the map is judged."""
     height_m: float | None = None
     """Height above ground for methods without tie points, where altitudes do not tell it."""
     heading_deg: float | None = None

@@ -58,7 +58,7 @@ ARTEFACTS = {
 REGISTRY = {
     c.__name__: c
     for c in (
-        intake.Looked,
+        intake.PhotoFeatures,
         features.Features,
         features.Link,
         features.RejectedLink,
@@ -124,7 +124,7 @@ def iter_mosaic(
     frame = choose_frame(taken.photos, settings.crs, control)
     prior = priors(taken.photos, frame)
     links = yield from clock.stage("links", _links(taken, prior, parts, settings, store, jobs))
-    known = placing.Known(
+    known = placing.AlignmentInputs(
         intake=taken,
         frame=frame,
         priors=prior,
@@ -159,7 +159,7 @@ def iter_mosaic(
     drawn = yield from clock.stage(
         "mosaic", drawing.draw(run.path, compose, alignment, settings, store, key, unit, jobs)
     )
-    judging_it = quality.judge(
+    judging_it = quality.placement_quality(
         taken, alignment, prior, ground, pictures, distances, settings.alpha, known.order
     )
     seams, judged = yield from clock.stage(

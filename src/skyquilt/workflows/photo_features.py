@@ -19,7 +19,8 @@ from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.workflows.methods import Methods
 
 PICTURE = 1000
-"""Longest side in px of the grey pictures kept for sharpening sightings and the search of heights.
+"""Longest side in px of the grey pictures kept for sharpening observations and the search of
+heights.
 """
 KEPT_BYTES = 150_000_000
 """Grey pictures held in memory at a time; the others wait in the store."""
@@ -30,7 +31,7 @@ THUMBNAIL = 256
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Looked:
+class PhotoFeatures:
     """What one look at a photo's pixels gives."""
 
     features: Features
@@ -45,7 +46,7 @@ class Intake:
 
     photos: tuple[Photo, ...]
     """In order of capture."""
-    looked: tuple[Looked, ...]
+    looked: tuple[PhotoFeatures, ...]
     """One per photo."""
     rejected: tuple[RejectedPhoto, ...]
     """Photos whose pixels could not be read."""
@@ -106,7 +107,9 @@ def thumbnail_of(pixels: NDArray[Any]) -> NDArray[Any]:
     )
 
 
-def look(photo: Photo, index: int, cache: PhotoPixels, methods: Methods, store: Store) -> Looked:
+def look(
+    photo: Photo, index: int, cache: PhotoPixels, methods: Methods, store: Store
+) -> PhotoFeatures:
     """Features and thumbnail of a photo; its grey picture goes to the store.
 
     Raises:
@@ -127,7 +130,7 @@ def look(photo: Photo, index: int, cache: PhotoPixels, methods: Methods, store: 
         else shrink(rough, PICTURE)[0]
     )
     small, _ = shrink(source, longest)
-    return Looked(
+    return PhotoFeatures(
         features=methods.sift.of_shrunken(small, pixels.shape[:2]), thumbnail=thumbnail_of(rough)
     )
 
@@ -142,7 +145,7 @@ def take_in(
     """
     cv2.setNumThreads(1)  # parallel over photos instead
 
-    def one(index: int) -> Looked | RejectedPhoto:
+    def one(index: int) -> PhotoFeatures | RejectedPhoto:
         photo = photos[index]
         try:
             key = digest(photo.digest, methods.sift, THUMBNAIL)
@@ -154,7 +157,7 @@ def take_in(
     for result in in_order(one, range(len(photos)), jobs=jobs):
         results.append(result)
         yield len(results), len(photos)
-    good = [(p, r) for p, r in zip(photos, results, strict=True) if isinstance(r, Looked)]
+    good = [(p, r) for p, r in zip(photos, results, strict=True) if isinstance(r, PhotoFeatures)]
     bad = tuple(r for r in results if isinstance(r, RejectedPhoto))
     if not good:
         raise NoPhotosError(

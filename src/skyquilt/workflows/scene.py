@@ -69,7 +69,7 @@ def scene_of(
     prior = priors(taken.photos, frame)
     links = yield from clock.stage("links", linking.link_up(taken, prior, parts, store, jobs))
     names = [p.name for p in taken.photos]
-    known = placing.Known(
+    known = placing.AlignmentInputs(
         intake=taken,
         frame=frame,
         priors=prior,

@@ -1,0 +1,171 @@
+"""Registration of two spectra against simulated truth, and everything that must be refused."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from skyquilt.coregistration.methods import registration_method
+from skyquilt.coregistration.structure import StructureMatches
+from skyquilt.model.estimate import NoEstimate
+from skyquilt.model.registration import Guess, Picture, RefusedRegistration
+from tests.coregistration.scenes import error, layout, pair, spectrum, turned
+
+SHAPE = (400, 480)
+
+
+@pytest.fixture(scope="module")
+def auto():
+    return registration_method("auto")
+
+
+@pytest.mark.parametrize(("scale", "degrees"), [(0.85, 137.0), (1.2, -64.0)])
+def test_any_rotation_is_found_to_a_part_of_a_pixel(auto, scale, degrees):
+    truth = turned(scale, degrees, SHAPE, SHAPE, (9.0, -14.0))
+    a, b = pair(truth, seed=int(degrees) % 7)
+    found = auto(Picture(values=a), Picture(values=b))
+    assert found, found.reason
+    assert (
+        1e-4 < error(found.b_H_a, truth) < 0.3
+    )  # an error of exactly 0 would mean the truth had leaked
+
+
+def test_the_search_alone_finds_it_too(auto):
+    blind = replace(
+        auto, propose=StructureMatches(estimate=lambda a, b: NoEstimate(reason="not asked"))
+    )
+    truth = turned(1.15, 251.0, SHAPE, SHAPE, (-20.0, 11.0))
+    a, b = pair(truth, seed=3)
+    found = blind(Picture(values=a), Picture(values=b))
+    assert found and error(found.b_H_a, truth) < 0.5
+
+
+def test_sizes_may_differ(auto):
+    truth = turned(0.55, 12.0, SHAPE, (256, 320))
+    a, b = pair(truth, shape_b=(256, 320), seed=4)
+    found = auto(Picture(values=a), Picture(values=b))
+    assert found and error(found.b_H_a, truth) < 0.4
+
+
+def test_reversed_contrast_changes_nothing(auto):
+    truth = turned(1.0, 20.0, SHAPE, SHAPE)
+    a, _ = pair(np.eye(3), seed=5)
+    _, b = pair(truth, seed=5)
+    negative = np.where(b > 4, 255 - b, 0).astype(np.uint8)
+    found = auto(Picture(values=a), Picture(values=negative))
+    assert found and error(found.b_H_a, truth) < 0.5
+
+
+def test_perspective_is_freed_where_the_pictures_show_it(auto):
+    truth = turned(1.0, 5.0, SHAPE, SHAPE)
+    truth[2, :2] = [1.5e-4, -1e-4]
+    a, b = pair(truth, seed=6)
+    found = auto(Picture(values=a), Picture(values=b))
+    assert found and found.model == "homography"
+    assert error(found.b_H_a, truth) < 0.6
+
+
+def test_measured_values_with_gaps(auto):
+    truth = turned(1.0, 33.0, SHAPE, SHAPE)
+    a, b = pair(truth, seed=8)
+    celsius = np.where(b > 4, 12 + b / 40, np.nan).astype(np.float32)
+    found = auto(Picture(values=a), Picture(values=celsius))
+    assert found and error(found.b_H_a, truth) < 0.5
+
+
+def test_inliers_lie_where_the_transform_puts_them(auto):
+    truth = turned(0.9, -20.0, SHAPE, SHAPE)
+    a, b = pair(truth, seed=9)
+    found = auto(Picture(values=a), Picture(values=b))
+    there = np.c_[found.px_a, np.ones(len(found.px_a))] @ truth.T
+    distance = np.linalg.norm(there[:, :2] - found.px_b, axis=1)
+    assert len(distance) >= 9 and np.median(distance) < 1.0 and distance.max() < 6
+    assert found.evidence["patches_agreeing"] == len(found.px_a) <= found.evidence["patches"]
+
+
+def test_a_good_guess_is_used_and_a_wrong_one_does_no_harm(auto):
+    truth = turned(1.0, 95.0, SHAPE, SHAPE)
+    a, b = pair(truth, seed=10)
+    right = Guess(b_H_a=turned(1.05, 92.0, SHAPE, SHAPE, (15, 10)))
+    wrong = Guess(b_H_a=turned(1.0, 10.0, SHAPE, SHAPE))
+    for guess in (right, wrong):
+        found = auto(Picture(values=a), Picture(values=b), guess)
+        assert found and error(found.b_H_a, truth) < 0.5
+
+
+@pytest.mark.slow  # the quick tests have one in test_register
+@pytest.mark.parametrize("seed", range(8))
+def test_unrelated_pictures_are_refused_with_figures(auto, seed):
+    a = np.clip(spectrum(layout(seed=seed), seed), 0, 255).astype(np.uint8)
+    b = np.clip(spectrum(layout(seed=50 + seed), seed), 0, 255).astype(np.uint8)
+    refused = auto(Picture(values=a), Picture(values=b))
+    assert isinstance(refused, RefusedRegistration) and not refused
+    assert "not confirmed" in refused.reason
+    assert refused.evidence["surprise"] < 3.5  # well below the 5 that acceptance asks for
+
+
+@pytest.mark.slow
+def test_mirrored_pictures_are_refused(auto):
+    a, b = pair(np.eye(3), seed=11)
+    assert not auto(Picture(values=a), Picture(values=np.ascontiguousarray(b[:, ::-1])))
+
+
+SCENE = np.clip(spectrum(layout(seed=1), 1), 0, 255).astype(np.uint8)
+BAD = {
+    "blank": (np.full(SHAPE, 90, np.uint8), "blank or saturated"),
+    "black": (np.zeros(SHAPE, np.uint8), "blank or saturated"),
+    "saturated": (np.where(SCENE > 250, SCENE, 255).astype(np.uint8), "blank or saturated"),
+    "nothing measured": (np.full(SHAPE, np.nan, np.float32), "blank or saturated"),
+    "tiny": (SCENE[:40, :200], "200 x 40 px"),
+    "flat 16 bits": (8000 + (np.indices(SHAPE).sum(0) % 2).astype(np.uint16), "no contrast"),
+    "flat degrees": (
+        (20 + 0.01 * (np.indices(SHAPE).sum(0) % 3)).astype(np.float32),
+        "no contrast",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+@pytest.mark.parametrize("method", ["auto", "rfae", "structure"])
+def test_what_shows_nothing_is_refused_by_every_method(what, method):
+    values, reason = BAD[what]
+    register = registration_method(method)
+    for a, b, name in ((SCENE, values, "B"), (values, SCENE, "A")):
+        refused = register(Picture(values=a), Picture(values=b))
+        assert not refused
+        assert reason in refused.reason and f"picture {name}" in refused.reason
+
+
+@pytest.mark.slow
+def test_noise_is_refused(auto):
+    rng = np.random.default_rng(0)
+    a, b = (np.clip(rng.normal(120, 30, SHAPE), 0, 255).astype(np.uint8) for _ in "ab")
+    assert not auto(Picture(values=a), Picture(values=b))
+
+
+@pytest.mark.slow
+def test_a_frame_of_noise_over_a_common_frame_is_refused(auto):
+    """A black frame is no picture: two unrelated pictures turned by one angle have it in common."""
+    turn = cv2.getRotationMatrix2D((240, 200), 30, 0.8)
+    a, b = (
+        cv2.warpAffine(
+            np.clip(spectrum(layout(seed=s), s), 10, 255).astype(np.uint8), turn, (480, 400)
+        )
+        for s in (20, 21)
+    )
+    assert not auto(Picture(values=a), Picture(values=b))
+
+
+@pytest.mark.slow
+def test_large_pictures_are_sharpened_at_a_finer_resolution(auto):
+    """Without it a pixel of the verdict is seven of these pictures'."""
+    shape = (1500, 2000)
+    truth = turned(0.95, 70.0, shape, shape, (30, -20))
+    labels = np.kron(layout(375, 500, 1), np.ones((4, 4), int)).astype(np.int32)
+    a = np.clip(spectrum(labels, 1, blur=1.5), 0, 255).astype(np.uint8)
+    b = cv2.warpPerspective(spectrum(labels, 2, blur=1.5), truth, (2000, 1500))
+    pictures = Picture(values=a), Picture(values=np.clip(b, 0, 255).astype(np.uint8))
+    coarse = replace(auto, decide=replace(auto.decide, finest=1e9))(*pictures)
+    fine = auto(*pictures)
+    assert error(fine.b_H_a, truth, shape) < 0.15 < error(coarse.b_H_a, truth, shape) < 1.5

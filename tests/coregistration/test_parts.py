@@ -1,0 +1,237 @@
+"""The parts of the search, each against a slow loop, another library or an algebraic property."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy import stats
+
+from skyquilt.coregistration.agreement import Agree, _fisher
+from skyquilt.coregistration.candidates import (
+    Candidate,
+    Nearby,
+    corners,
+    distinct,
+    peaks,
+    same_view,
+    similarity,
+)
+from skyquilt.coregistration.decision import distinctness
+from skyquilt.coregistration.everywhere import Everywhere, _Plane
+from skyquilt.coregistration.orientation import (
+    between,
+    full_size,
+    orientation,
+    spectra,
+    turned,
+    warped,
+)
+from skyquilt.coregistration.subpixel import SubpixelRefinement
+from skyquilt.coregistration.usable import usable
+from skyquilt.model.registration import Picture
+from tests.coregistration.scenes import error, layout, pair, spectrum
+from tests.coregistration.scenes import turned as turned_by
+
+SHAPE = (400, 480)
+
+
+def of(picture, side=128.0, valid=None):
+    found = usable(Picture(values=picture, valid=valid))
+    return orientation(found.grey, found.valid, side)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return np.clip(spectrum(layout(seed=2), 2), 0, 255).astype(np.uint8)
+
+
+def test_fields_know_no_contrast(scene):
+    a, b = of(scene), of(255 - scene)
+    assert np.abs(a.fields - b.fields).max() < 1e-3
+    assert np.abs(a.fields).max() > 1  # not because they are empty
+
+
+def test_a_quarter_turn_of_the_picture_turns_the_fields(scene):
+    square = scene[:400, :400]
+    a, b = of(square, 400.0), of(np.ascontiguousarray(np.rot90(square, -1)), 400.0)
+    quarter = np.array([[0, -1, 399], [1, 0, 0], [0, 0, 1.0]])  # clockwise on the screen
+    moved, valid = warped(a, quarter, b.shape)
+    both = (valid > 0.5) & (b.valid > 0.5)
+    assert both.mean() > 0.9
+    assert np.abs(moved - b.fields)[both].max() < 0.02
+
+
+def test_turning_is_a_group(scene):
+    a = of(scene).fields
+    assert np.allclose(turned(turned(a, 0.3), 0.5), turned(a, 0.8), atol=1e-5)
+    assert np.allclose(turned(a, np.pi), a, atol=1e-5)  # an orientation is one of 180 degrees
+    assert np.abs(turned(a, np.pi / 2)[..., :2] + a[..., :2]).max() < 1e-5
+
+
+def test_resolutions_and_full_size_are_inverse(scene):
+    a, b = of(scene, 90.0), of(scene[:300], 110.0)
+    h = np.array([[0.9, 0.1, 5], [-0.1, 0.95, 8], [1e-4, -2e-4, 1]])
+    assert np.allclose(full_size(a, b, between(a, b, h)), h)
+
+
+def test_spectra_are_those_of_complex_fields(scene):
+    fields = of(scene, 40.0).fields
+    first = np.fft.fft2(fields[..., 0] + 1j * fields[..., 1], s=(64, 64))
+    assert np.abs(spectra(fields, (64, 64))[0] - first).max() < 1e-3 * np.abs(first).max()
+
+
+@pytest.mark.parametrize("turn", [0.0, np.pi])
+def test_a_correlation_is_the_sum_over_the_overlap(scene, turn):
+    """One place of the FFT's surface against the warp and the sum written out, both halves of the
+    turn.
+    """
+    a, b = of(scene, 60.0), of(scene[30:, 20:], 60.0)
+    plane, scale, angle = _Plane.of(a, b), 1.1, 0.4
+    fields = {t > angle: (f, o) for t, f, o in plane.correlations(a, scale, angle)}
+    field, overlap = fields[turn > 0]
+    middle = np.array([(a.shape[1] - 1) / 2, (a.shape[0] - 1) / 2])
+    for x, y in ((0, 0), (5, plane.side - 7), (plane.side - 11, 3)):
+        place = plane.place(x, y, flipped=turn > 0)
+        moved, valid = warped(a, similarity(scale, angle + turn, middle, place), b.shape)
+        assert field[y, x] == pytest.approx(
+            (moved * b.fields).sum(dtype=float), abs=0.03 * float(np.abs(field).max())
+        )
+        assert overlap[y, x] == pytest.approx(
+            float((valid * b.valid).sum()), rel=0.15
+        )  # counted on a grid of 4 px
+
+
+@pytest.mark.parametrize("degrees", [205.0])
+def test_everywhere_has_the_truth_among_its_best(degrees):
+    truth = turned_by(1.0, degrees, SHAPE, SHAPE, (12, -8))
+    a, b = (of(p, 80.0) for p in pair(truth, seed=1))
+    best = distinct(Everywhere(smallest=0.93, largest=1.08)(a, b), a.shape, 3, 3)
+    small = between(a, b, truth)
+    assert (
+        min(
+            np.linalg.norm(corners(c.b_H_a, a.shape) - corners(small, a.shape), axis=1).max()
+            for c in best
+        )
+        < 4
+    )
+
+
+def test_nearby_finds_what_lies_near_a_guess():
+    truth = turned_by(1.1, 4.0, SHAPE, SHAPE, (25, -18))
+    a, b = (of(p, 128.0) for p in pair(truth, seed=2))
+    best = distinct(Nearby()(a, b, same_view(SHAPE, SHAPE)), a.shape, 3, 1)[0]
+    off = corners(best.b_H_a, a.shape) - corners(between(a, b, truth), a.shape)
+    assert np.linalg.norm(off, axis=1).max() < 4
+
+
+@pytest.mark.parametrize("freedom", ["similarity", "affine", "homography"])
+def test_sharpening_goes_to_a_part_of_a_pixel(freedom):
+    truth = turned_by(1.05, 20.0, SHAPE, SHAPE)
+    if freedom != "similarity":
+        truth[:2, :2] @= np.array([[1.03, 0.02], [0.0, 0.98]])
+    if freedom == "homography":
+        truth[2, :2] = [5e-5, -8e-5]
+    a, b = (of(p, 256.0) for p in pair(truth, seed=3))
+    start = between(a, b, truth) @ np.array([[1, 0.004, 1.5], [-0.004, 1, -1.2], [0, 0, 1]])
+    fit = SubpixelRefinement(freedom=freedom, steps=12)(a, b, start)
+    assert error(full_size(a, b, fit.b_H_a), truth) < 0.25 < error(full_size(a, b, start), truth)
+    assert fit.correlation > 0.4
+
+
+def test_sharpening_never_makes_it_worse(scene):
+    a, b = of(scene), of(np.ascontiguousarray(scene[::-1]))
+    for shift in (0.0, 9.0):
+        start = np.array([[1, 0, shift], [0, 1, -shift], [0, 0, 1.0]])
+        before = SubpixelRefinement(steps=0)(a, b, start).correlation
+        assert SubpixelRefinement()(a, b, start).correlation >= before
+
+
+def test_distinct_keeps_the_best_of_those_that_agree():
+    def at(x, score):
+        return Candidate(b_H_a=np.array([[1, 0, x], [0, 1, 0], [0, 0, 1.0]]), score=score)
+
+    kept = distinct([at(0, 1.0), at(0.5, 3.0), at(10, 2.0), at(11, 1.5)], (50, 60), 2.0, 10)
+    assert [(c.b_H_a[0, 2], c.score) for c in kept] == [(0.5, 3.0), (10, 2.0)]
+    assert len(distinct(kept, (50, 60), 2.0, 1)) == 1
+
+
+def test_peaks_wrap_around():
+    field = np.zeros((20, 30))
+    field[0, 0], field[19, 29], field[10, 10] = 5, 4, 3
+    assert list(peaks(field, 3)) == [(5.0, 0, 0), (3.0, 10, 10)]
+
+
+def test_fisher_is_fishers():
+    ranks = np.random.default_rng(0).uniform(0.001, 1, 25)
+    assert _fisher(ranks) == pytest.approx(-np.log10(stats.combine_pvalues(ranks, "fisher").pvalue))
+    assert _fisher(np.zeros(0)) == 0
+
+
+def test_agreement_is_uniform_for_unrelated_pictures_and_large_for_related_ones():
+    surprises = []
+    for seed in range(7):
+        a, b = (
+            of(np.clip(spectrum(layout(seed=s), s), 0, 255).astype(np.uint8), 200.0)
+            for s in (seed, 60 + seed)
+        )
+        surprises.append(Agree()(a, b, np.eye(3)).surprise)
+    assert np.median(surprises) < 1.0 and max(surprises) < 3  # places not chosen: a p-value
+    truth = turned_by(1.0, 10.0, SHAPE, SHAPE)
+    a, b = (of(p, 256.0) for p in pair(truth, seed=4))
+    small = between(a, b, truth)
+    found = Agree()(a, b, small)
+    assert found.surprise > 10 and len(found.px) > 0.8 * found.patches
+    off = Agree()(a, b, np.array([[1, 0, 6], [0, 1, 0], [0, 0, 1.0]]) @ small)
+    assert off.surprise < found.surprise / 2 and not len(off.px)
+
+
+def test_agreement_tells_the_shift(scene):
+    a = of(scene, 256.0)
+    found = Agree(near=3)(a, a, np.array([[1, 0, 2], [0, 1, -1], [0, 0, 1.0]]))
+    assert np.abs(np.median(found.shift, axis=0) - [-2, 1]).max() < 0.05
+    half = Agree()(a, a, np.array([[1, 0, 0.5], [0, 1, -0.25], [0, 0, 1.0]]))
+    assert np.abs(np.median(half.shift, axis=0) - [-0.5, 0.25]).max() < 0.15
+
+
+def test_distinctness_of_a_picture_on_itself_and_beside(scene):
+    a = of(scene, 128.0)
+    beside = np.array([[1, 0, 20], [0, 1, 14], [0, 0, 1.0]])
+    assert distinctness(a, a, np.eye(3)) > 20 > 6 > distinctness(a, a, beside)
+
+
+def test_a_frame_is_no_picture(scene):
+    bright = np.clip(scene, 30, 220)
+    framed = cv2.warpAffine(bright, cv2.getRotationMatrix2D((240, 200), 25, 0.9), (480, 400))
+    whole = cv2.warpAffine(
+        np.ones_like(scene), cv2.getRotationMatrix2D((240, 200), 25, 0.9), (480, 400)
+    )
+    found = usable(Picture(values=framed))
+    assert (found.valid != (whole > 0)).mean() < 0.01
+    bright[:3], bright[-3:], bright[:, :3], bright[:, -3:] = 100, 100, 100, 100
+    assert usable(Picture(values=bright)).valid.all()  # dark and bright places inside are picture
+
+
+def test_what_is_given_as_invalid_stays_so(scene):
+    valid = np.zeros(SHAPE, bool)
+    valid[50:300, 40:400] = True
+    assert (usable(Picture(values=scene, valid=valid)).valid <= valid).all()
+
+
+def test_colour_is_brightness(scene):
+    rgb = np.dstack([scene, scene, scene])
+    assert (
+        np.abs(usable(Picture(values=rgb)).grey - usable(Picture(values=scene)).grey).max() < 0.01
+    )
+
+
+def test_fishers_tail_is_scipys():
+    from scipy.stats import chi2
+
+    from skyquilt.coregistration.agreement import _fisher
+
+    rng = np.random.default_rng(0)
+    for n in (1, 2, 9, 40):
+        ranks = rng.uniform(1e-4, 1, n)
+        assert np.isclose(
+            _fisher(ranks), -chi2.logsf(-2 * np.log(ranks).sum(), 2 * n) / np.log(10), rtol=1e-9
+        )
+    assert _fisher(np.zeros(0)) == 0.0 and _fisher(np.ones(3)) == 0.0

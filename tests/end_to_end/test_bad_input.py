@@ -1,0 +1,574 @@
+"""Photos that are missing, broken, foreign or lying: a clear sentence each, and no good photo
+lost.
+"""
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import piexif
+import pytest
+import tifffile
+from PIL import Image
+
+from skyquilt.errors import UnreadablePhotoError
+from tests.end_to_end.conftest import (
+    HIGH,
+    WIDE,
+    keep,
+    named,
+    other_camera,
+    pixels_of,
+    relabel,
+    taken_apart,
+)
+from tests.photos.conftest import jpeg_bytes, with_segment
+
+pytestmark = pytest.mark.filterwarnings(
+    "error::RuntimeWarning", "error::scipy.linalg.LinAlgWarning"
+)
+
+# nothing to map
+
+
+def test_an_empty_folder(mosaic, tmp_path):
+    (tmp_path / "empty").mkdir()
+    told = mosaic(tmp_path / "empty").refused(3, "no photo", "it holds nothing", "JPEG")
+    assert not told.output.exists()
+
+
+def test_a_folder_that_does_not_exist(mosaic, tmp_path):
+    told = mosaic(tmp_path / "nowhere").refused(2, "nowhere", "does not exist", "give a folder")
+    assert not told.output.exists()
+
+
+def test_a_folder_of_other_files(mosaic, tmp_path):
+    folder = tmp_path / "other"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("hello")
+    (folder / "flight.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(100))
+    mosaic(folder).refused(3, "only other files", "flight.mp4", "notes.txt")
+
+
+def test_no_photo_is_readable(mosaic, photos):
+    for path in named(photos):
+        path.write_bytes(path.read_bytes()[:2000])
+    mosaic(photos).refused(3, "none of the 9 image files", "SIM_0001.jpg", "copy them again")
+
+
+@pytest.mark.slow
+def test_no_photo_can_be_decoded(mosaic, photos):
+    for path in named(photos):
+        garble(path)
+    mosaic(photos).refused(3, "none of 9 photos could be decoded", "damaged")
+
+
+# bad photos among good ones
+
+
+def garble(path: Path) -> None:
+    """Random bytes in place of the scan; header, length and end marker stay."""
+    data = bytearray(path.read_bytes())
+    start = data.rindex(b"\xff\xda") + 14
+    data[start:-2] = (
+        np.random.default_rng(1).integers(0, 255, len(data) - start - 2, np.uint8).tobytes()
+    )
+    path.write_bytes(bytes(data))
+
+
+def truncated(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def cut_but_ended(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2] + b"\xff\xd9")
+
+
+def emptied(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def late(*values):
+    return pytest.param(*values, marks=pytest.mark.slow)
+
+
+def renamed_text(path: Path) -> None:
+    path.write_text("these are no pixels\n" * 100)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (truncated, "cut off"),
+        (garble, "damaged"),
+        late(cut_but_ended, "damaged"),
+        late(emptied, "0 bytes"),
+        late(renamed_text, "neither JPEG, TIFF nor PNG"),
+    ],
+)
+def test_one_bad_photo_costs_that_photo_only(mosaic, photos, spoil, reason):
+    bad = named(photos)[4]
+    spoil(bad)
+    told = mosaic(photos).made()
+    assert list(told.metrics["photos_rejected"]) == [bad.name]
+    assert reason in told.metrics["photos_rejected"][bad.name]
+    assert (told.metrics["photos_total"], told.metrics["photos_used"]) == (9, 8)
+    assert f"left out: {bad.name}: " in told.out
+    assert bad.name in (told.output / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_all_kinds_of_bad_at_once(mosaic, photos):
+    for path, spoil in zip(named(photos), (truncated, emptied, garble, renamed_text), strict=False):
+        spoil(path)
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 5
+    assert len(told.metrics["photos_rejected"]) == 4
+
+
+@pytest.mark.slow
+def test_a_photo_that_cannot_be_read_any_more_when_the_map_is_drawn(mosaic, photos, monkeypatch):
+    """A disk goes away in the middle: the file is named, and the same command resumes."""
+    from skyquilt.workflows import mosaic as story
+
+    read, seen = story.read_color, set()
+
+    def once(photo):
+        if photo.name in seen and photo.name == "SIM_0005.jpg":
+            raise UnreadablePhotoError("it cannot be read (Input/output error)")
+        seen.add(photo.name)
+        return read(photo)
+
+    monkeypatch.setattr(story, "read_color", once)
+    monkeypatch.setattr(story, "pixel_budget", lambda settings: 0)
+    mosaic(photos).refused(1, "SIM_0005.jpg", "Input/output error", "same command again")
+    monkeypatch.undo()
+    assert mosaic(photos).made().metrics["photos_used"] == 9
+
+
+def test_png_tiff_and_video_among_jpegs(mosaic, photos):
+    first, second = named(photos)[:2]
+    block = taken_apart(first.read_bytes())[0]
+    Image.fromarray(pixels_of(first)).save(photos / "SIM_0001.png", exif=block)
+    first.unlink()
+    tifffile.imwrite(photos / "SIM_0002.tif", pixels_of(second), photometric="rgb")
+    second.unlink()
+    (photos / "DJI_0001.MP4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(1000))
+    (photos / "._SIM_0003.jpg").write_bytes(b"\0\5\x16\7")
+    told = mosaic(photos).made()
+    assert told.metrics["photos_total"] == 9
+    assert told.metrics["photos_used"] == 9
+    assert told.metrics["photos_rejected"] == {}
+
+
+def test_two_cameras_are_both_used(mosaic, photos, flight):
+    for path in named(photos)[-4:]:
+        path.unlink()
+    others = other_camera(flight, photos)
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 5 + len(others)
+    assert len(told.metrics["cameras"]) == 2
+    assert "There are 2 cameras" in told.notes
+    first, second = (c["focal"]["value"] for c in told.metrics["cameras"].values())
+    assert sorted([first, second])[0] == pytest.approx(0.75 * max(first, second), rel=0.05)
+
+
+@pytest.mark.slow
+def test_colour_and_single_band_mixed(mosaic, photos):
+    """A map has one kind of pixel: the frequent one; the others are named."""
+    grey = named(photos)[:2]
+    for path in grey:
+        block, xmp, _ = taken_apart(path.read_bytes())
+        data = jpeg_bytes(np.asarray(Image.fromarray(pixels_of(path)).convert("L")))
+        data = with_segment(data, 0xE1, b"http://ns.adobe.com/xap/1.0/\x00" + xmp.encode())
+        path.write_bytes(with_segment(data, 0xE1, block))
+    told = mosaic(photos).made()
+    assert set(told.metrics["photos_rejected"]) == {p.name for p in grey}
+    assert all("differ from the survey's" in r for r in told.metrics["photos_rejected"].values())
+    assert told.metrics["photos_used"] == 7
+
+
+@pytest.mark.slow
+def test_sizes_of_one_pixel_are_refused_not_met_with_a_crash(mosaic, photos):
+    Image.new("RGB", (1, 1)).save(photos / "dot.jpg")
+    Image.new("RGB", (40, 2000)).save(photos / "sliver.jpg")
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+    assert "1x1 px" in told.metrics["photos_rejected"]["dot.jpg"]
+    assert "sliver.jpg" in told.metrics["photos_rejected"]
+
+
+@pytest.mark.slow
+def test_a_black_photo(mosaic, photos):
+    """It has no features: it lies where its metadata say, and is named."""
+    path = named(photos)[4]
+    block, xmp, _ = taken_apart(path.read_bytes())
+    data = jpeg_bytes(np.zeros((HIGH, WIDE, 3), np.uint8))
+    data = with_segment(data, 0xE1, b"http://ns.adobe.com/xap/1.0/\x00" + xmp.encode())
+    path.write_bytes(with_segment(data, 0xE1, block))
+    told = mosaic(photos).made()
+    assert told.metrics["photos_total"] == 9
+    assert path.name in told.notes
+    assert max(told.metrics["blocks"]) == 8
+
+
+@pytest.mark.slow
+def test_copies_are_left_out_and_named(mosaic, photos):
+    first = named(photos)[0]
+    shutil.copy(first, photos / "copy of 1.jpg")
+    shutil.copy(first, photos / "zz.JPG")
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+    assert len(told.metrics["photos_rejected"]) == 2
+    assert all("same file content" in r for r in told.metrics["photos_rejected"].values())
+    assert "2 files are copies" in told.notes
+
+
+@pytest.mark.slow
+def test_the_same_picture_saved_anew(mosaic, photos):
+    """Other bytes, same place and pixels: coincident positions must not break anything."""
+    first = named(photos)[0]
+    block, xmp, _ = taken_apart(first.read_bytes())
+    data = jpeg_bytes(pixels_of(first))
+    data = with_segment(data, 0xE1, b"http://ns.adobe.com/xap/1.0/\x00" + xmp.encode())
+    (photos / "again.jpg").write_bytes(with_segment(data, 0xE1, block))
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 10
+
+
+# few photos
+
+
+def test_one_photo(mosaic, photos):
+    keep(photos, 4)
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 1
+    assert told.metrics["crs"] == "EPSG:32633"
+    assert told.metrics["method"] == "pose"
+
+
+def test_one_photo_without_metadata(mosaic, photos):
+    (only,) = keep(photos, 4)
+    relabel(only, strip=True)
+    told = mosaic(photos, "--gsd", "20").made()
+    assert told.metrics["photos_used"] == 1
+    assert told.metrics["crs"] is None
+    assert "not georeferenced" in told.err
+
+
+def test_one_photo_with_heights_above_sea_level_only(mosaic, photos):
+    (only,) = keep(photos, 4)
+    relabel(only, drop=["xmp"])
+    mosaic(photos).refused(4, "heights above ground", "sea level", "--height")
+    mosaic(photos, "--method", "position", "--height", "60", output=photos.parent / "two").made()
+
+
+@pytest.mark.parametrize("numbers", [(0, 1), (0, 1, 2)])
+@pytest.mark.slow
+def test_few_photos_in_one_line(mosaic, photos, numbers):
+    keep(photos, *numbers)
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == len(numbers)
+    assert told.metrics["blocks"] == [len(numbers)]
+
+
+def unrelated(photos: Path) -> tuple[Path, Path]:
+    """Two photos that show nothing in common (one is mirrored, which no flight does)."""
+    a, b = keep(photos, 0, 8)
+    block, xmp, _ = taken_apart(b.read_bytes())
+    data = jpeg_bytes(pixels_of(b)[:, ::-1])
+    data = with_segment(data, 0xE1, b"http://ns.adobe.com/xap/1.0/\x00" + xmp.encode())
+    b.write_bytes(with_segment(data, 0xE1, block))
+    return a, b
+
+
+def test_two_photos_without_overlap_lie_where_they_say(mosaic, photos):
+    unrelated(photos)
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 2
+    assert told.metrics["method"] == "pose"
+    assert "no two photos could be linked" in told.metrics["why"]
+
+
+def test_two_photos_without_overlap_or_positions(mosaic, photos):
+    for path in unrelated(photos):
+        relabel(path, strip=True)
+    mosaic(photos).refused(4, "no two of 2 photos", "none has a position", "--geo")
+
+
+# positions
+
+
+@pytest.mark.slow
+def test_gps_zero_zero_of_all(mosaic, photos):
+    for path in named(photos):
+        relabel(path, place=(0.0, 0.0))
+    told = mosaic(photos).made()
+    assert told.metrics["crs"] is None
+    assert told.metrics["photos_used"] == 9
+    assert told.metrics["gps_residual_rms_m"] is None
+    assert "GPS" in told.notes
+
+
+@pytest.mark.slow
+def test_gps_zero_zero_of_one(mosaic, photos):
+    relabel(named(photos)[3], place=(0.0, 0.0))
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+    assert told.metrics["blocks"] == [9]
+    assert told.metrics["crs"] == "EPSG:32633"
+    assert "1 of 9 photos lack a usable GPS position" in told.notes
+
+
+def test_gps_of_one_photo_300_km_away(mosaic, photos, finished):
+    far = named(photos)[3]
+    relabel(far, place=(49.3, 14.3))
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+    assert told.metrics["blocks"] == [9]
+    assert f"{far.name} claims to lie" in told.notes
+    w, h = told.metrics["size_px"]
+    assert max(w, h) < 1000
+    assert (
+        any(c["photo"] == far.name for c in told.metrics["metadata_conflicts"])
+        or far.name in told.notes
+    )
+
+
+@pytest.mark.slow
+def test_gps_of_one_photo_400_m_away(mosaic, photos):
+    """Too near to be absurd by itself: the pixels say that it lies."""
+    far = named(photos)[3]
+    relabel(far, place=(46.6035, 14.3))
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+    assert told.metrics["blocks"] == [9]
+
+
+def test_gps_of_one_of_two_photos_300_km_away(mosaic, photos):
+    _, b = keep(photos, 0, 1)
+    relabel(b, place=(49.3, 14.3))
+    told = mosaic(photos).refused(2, "km wide", "positions", "--geo")
+    assert "claim to lie 301 km apart" in told.err
+
+
+@pytest.mark.slow
+def test_all_positions_the_same(mosaic, photos):
+    for path in named(photos):
+        relabel(path, place=(46.6, 14.3))
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+    assert told.metrics["crs"] is None
+    assert "All 9 positions are one and the same" in told.notes
+
+
+# heights
+
+
+@pytest.mark.slow
+def test_height_of_one_photo_off_by_100_m(mosaic, photos):
+    wrong = named(photos)[4]
+    relabel(wrong, heights=100.0)
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+    assert [c["photo"] for c in told.metrics["metadata_conflicts"] if c["field"] == "altitude"] == [
+        wrong.name
+    ]
+
+
+@pytest.mark.slow
+def test_all_heights_off_by_100_m(mosaic, photos, finished):
+    """The positions hold the scale, so the map is as large as it was."""
+    for path in named(photos):
+        relabel(path, heights=100.0)
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+    assert max(told.metrics["size_px"]) < 1000
+
+
+@pytest.mark.slow
+def test_negative_heights(mosaic, photos):
+    for path in named(photos):
+        relabel(path, heights=-200.0)
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+
+
+def test_negative_heights_by_pose(mosaic, photos):
+    for path in named(photos):
+        relabel(path, heights=-200.0)
+    mosaic(photos, "--method", "pose", "--trust-metadata").refused(4, "--height")
+    told = mosaic(
+        photos, "--method", "pose", output=photos.parent / "two"
+    ).made()  # image scale and positions tell the height
+    assert told.metrics["photos_used"] == 9
+
+
+@pytest.mark.slow
+def test_heights_missing(mosaic, photos):
+    for path in named(photos):
+        relabel(path, drop=["altitude"])
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+    assert told.metrics["crs"] == "EPSG:32633"
+
+
+@pytest.mark.slow
+def test_heights_missing_by_pose(mosaic, photos):
+    for path in named(photos):
+        relabel(path, drop=["altitude"])
+    mosaic(photos, "--method", "pose", "--trust-metadata").refused(4, "--height")
+    mosaic(photos, "--method", "pose", "--height", "60", output=photos.parent / "two").made()
+
+
+# cameras
+
+
+@pytest.mark.slow
+def test_focal_length_missing(mosaic, photos):
+    for path in named(photos):
+        relabel(path, drop=["focal"])
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+    assert "focal length is guessed" in told.notes
+
+
+@pytest.mark.slow
+def test_rolling_shutter_is_named_as_not_modelled(mosaic, photos):
+    for path in named(photos):
+        relabel(path, xmp={"ShutterType": "Electronic"})
+    told = mosaic(photos).made()
+    assert "shutter, not modelled" in told.notes
+    assert "shutter" in (told.output / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_angles_missing(mosaic, photos):
+    for path in named(photos):
+        relabel(path, drop=["xmp"])
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+
+
+def test_camera_aimed_at_the_horizon_by_pose(mosaic, photos):
+    for path in named(photos):
+        text = path.read_bytes()
+        path.write_bytes(
+            text.replace(b'GimbalPitchDegree="-9', b'GimbalPitchDegree="-0').replace(
+                b'GimbalPitchDegree="-8', b'GimbalPitchDegree="-0'
+            )
+        )
+    mosaic(photos, "--method", "pose").refused(2, "horizon")
+
+
+# no metadata at all
+
+
+@pytest.mark.slow
+def test_all_metadata_stripped(mosaic, photos):
+    for path in named(photos):
+        relabel(path, strip=True)
+    told = mosaic(photos).made()
+    m = told.metrics
+    assert (m["photos_used"], m["blocks"], m["crs"], m["georeferenced"]) == (9, [9], None, False)
+    assert m["gps_residual_rms_m"] is None
+    assert m["gps_leave_one_out_rms_m"] is None
+    assert "not georeferenced" in told.err
+    assert "not georeferenced" in told.out
+
+
+def test_all_metadata_stripped_but_control_points(mosaic, photos, flight):
+    for path in named(photos):
+        relabel(path, strip=True)
+    told = mosaic(photos, "--gcp", flight / "gcp_list.txt").made()
+    m = told.metrics
+    assert m["crs"] == "EPSG:32633"
+    assert m["georeferenced"]
+    errors = [np.hypot(c["dx_m"], c["dy_m"]) for c in m["control"] if not c["check"]]
+    assert len(errors) >= 3
+    assert max(errors) < 0.2
+
+
+@pytest.mark.slow
+def test_two_control_points_are_too_few_without_metadata(mosaic, photos, flight):
+    for path in named(photos):
+        relabel(path, strip=True)
+    lines = (flight / "gcp_list.txt").read_text().splitlines()
+    names = list(dict.fromkeys(line.split("\t")[6] for line in lines[1:] if "chk" not in line))[:2]
+    few = photos.parent / "few.txt"
+    few.write_text(
+        "\n".join([lines[0], *(line for line in lines[1:] if line.split("\t")[6] in names)])
+    )
+    mosaic(photos, "--gcp", few).refused(4, "3 control points", "2")
+
+
+# names
+
+
+def test_names_with_spaces_accents_and_markup(mosaic, photos):
+    strange = [
+        "Überflug 1.jpg",
+        "畑 02.jpg",
+        "<script>alert('x')</script>&.jpg".replace("/", "\N{DIVISION SLASH}"),
+        "a'b\"c #%20.jpg",
+    ]
+    folder = photos.parent / "Größe & Höhe"
+    folder.mkdir()
+    for path, name in zip(named(photos), strange, strict=False):
+        path.rename(folder / name)
+    for path in named(photos):
+        path.rename(folder / path.name)
+    truncated(folder / strange[2])
+    told = mosaic(folder, output=photos.parent / "aus gabe é").made()
+    assert told.metrics["photos_used"] == 8
+    assert list(told.metrics["photos_rejected"]) == [strange[2]]
+    page = (told.output / "report.html").read_text(encoding="utf-8")
+    assert "<script>alert('x')" not in page
+    assert "&lt;script&gt;alert(" in page or "\\u003cscript\\u003ealert(" in page
+
+
+@pytest.mark.slow
+def test_names_that_are_no_text(mosaic, photos):
+    """Linux allows any bytes in names."""
+    first = named(photos)[0]
+    try:
+        first.rename(photos / os.fsdecode(b"\xff\xfe.jpg"))
+    except OSError:
+        pytest.skip("this file system wants names to be text")
+    (photos / "bad.jpg").write_bytes(b"")
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+
+
+@pytest.mark.slow
+def test_subfolders_with_equal_names(mosaic, photos):
+    for number, path in enumerate(named(photos)):
+        sub = photos / f"card {number % 2}"
+        sub.mkdir(exist_ok=True)
+        path.rename(sub / f"DJI_{number // 2:04d}.jpg")
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+
+
+@pytest.mark.slow
+def test_a_broken_link_and_an_unreadable_folder(mosaic, photos):
+    (photos / "gone.jpg").symlink_to(photos / "nowhere.jpg")
+    (photos / "folder.jpg").mkdir()
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9
+    assert "gone.jpg" in told.metrics["photos_rejected"]
+
+
+@pytest.mark.slow
+def test_metadata_of_another_kind_than_foreseen(mosaic, photos):
+    path = named(photos)[2]
+    block, xmp, picture = taken_apart(path.read_bytes())
+    exif = piexif.load(block)
+    exif["GPS"][piexif.GPSIFD.GPSLatitude] = ((0, 0), (0, 0), (0, 0))
+    data = with_segment(
+        picture, 0xE1, b"http://ns.adobe.com/xap/1.0/\x00" + xmp.replace('"+', '"NaN').encode()
+    )
+    path.write_bytes(with_segment(data, 0xE1, piexif.dump(exif)))
+    told = mosaic(photos).made()
+    assert told.metrics["photos_used"] == 9

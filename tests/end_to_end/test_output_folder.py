@@ -1,0 +1,470 @@
+"""The output folder: who may write there, what full disks, Ctrl-C and kill -9 leave, what is made
+again.
+"""
+
+import errno
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+
+from skyquilt.engine.folder import CONTRACT
+from skyquilt.workflows.mosaic import STAGES
+from tests.end_to_end.conftest import leftovers, named
+from tests.interrupts import hears_interrupts
+
+pytestmark = pytest.mark.filterwarnings(
+    "error::RuntimeWarning", "error::scipy.linalg.LinAlgWarning"
+)
+SLOWER = ("--features", "800", "--gsd", "11", "--jobs", "2")
+"""Options with which each stage lasts long enough to be interrupted."""
+RASTERS = ("mosaic.tif", "provenance.tif", "views.tif", "surface.tif")
+
+
+def late(value):
+    return pytest.param(value, marks=pytest.mark.slow)
+
+
+def same_result(a: Path, b: Path) -> None:
+    """Equal rasters and equal figures, times aside."""
+    for name in RASTERS:
+        with rasterio.open(a / name) as x, rasterio.open(b / name) as y:
+            assert x.transform == y.transform, name
+            assert np.array_equal(x.read(), y.read(), equal_nan=True), name
+    figures = []
+    for folder in (a, b):
+        m = json.loads((folder / "metrics.json").read_text())
+        figures.append(
+            {
+                k: v
+                for k, v in m.items()
+                if k
+                not in (
+                    "seconds",
+                    "cpu_seconds",
+                    "peak_memory_mb",
+                    "cpu_seconds_of_stage",
+                    "peak_memory_mb_of_stage",
+                )
+            }
+        )
+    assert figures[0] == figures[1]
+
+
+# who may write
+
+
+def test_output_below_a_file(mosaic, flight, tmp_path):
+    (tmp_path / "file").write_text("x")
+    mosaic(flight / "photos", output=tmp_path / "file" / "out").refused(
+        5, "cannot write to", "another output folder"
+    )
+    mosaic(flight / "photos", output=tmp_path / "file").refused(5, "is a file", "folder")
+    assert (tmp_path / "file").read_text() == "x"
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A function that mounts a disk of some size; skipped where that is not permitted."""
+    mounted = []
+
+    def mount(size: str, *options: str) -> Path:
+        place = tmp_path / "disk"
+        place.mkdir(exist_ok=True)
+        words = [
+            "mount",
+            "-t",
+            "tmpfs",
+            "-o",
+            ",".join([f"size={size}", *options]),
+            "tmpfs",
+            str(place),
+        ]
+        try:
+            subprocess.run(words, check=True, capture_output=True)
+        except (OSError, subprocess.CalledProcessError):
+            pytest.skip("mounting is not permitted here")
+        mounted.append(place)
+        return place
+
+    yield mount
+    for place in mounted:
+        subprocess.run(["umount", "-l", str(place)], check=False)
+
+
+def remount(place: Path, options: str) -> None:
+    subprocess.run(
+        ["mount", "-o", f"remount,{options}", str(place)], check=True, capture_output=True
+    )
+
+
+def test_output_on_a_read_only_disk(mosaic, flight, small_disk):
+    disk = small_disk("2m", "ro")
+    mosaic(flight / "photos", output=disk / "out").refused(
+        5, "cannot write to", "Read-only file system"
+    )
+
+
+@pytest.mark.slow
+def test_results_that_may_not_be_replaced(mosaic, flight, small_disk):
+    """The former results stay whole when they cannot be replaced."""
+    disk = small_disk("30m")
+    mosaic(flight / "photos", output=disk / "out").made()
+    before = (disk / "out" / "mosaic.tif").read_bytes()
+    remount(disk, "ro")
+    told = mosaic(flight / "photos", "--blend", "first", "--overwrite", output=disk / "out")
+    assert told.code == 5, told.err
+    assert "Traceback" not in told.err
+    assert (disk / "out" / "mosaic.tif").read_bytes() == before
+    remount(disk, "rw")
+
+
+@pytest.mark.parametrize("size", ["700k", *map(late, ("8k", "100k", "1200k", "1600k", "2m"))])
+def test_a_full_disk(mosaic, flight, small_disk, finished, size):
+    """Wherever it fills up: a sentence, no half file, and with more room the same command goes
+    on.
+    """
+    disk = small_disk(size)
+    told = mosaic(flight / "photos", output=disk / "out")
+    if told.code == 0:
+        pytest.skip("there was room enough")
+    assert told.code == 5, told.err
+    assert "disk is full" in told.err
+    assert "Traceback" not in told.err
+    assert leftovers(disk) == []
+    assert "metrics.json" not in [p.name for p in (disk / "out").iterdir()]
+    for name in RASTERS:
+        if (disk / "out" / name).exists():
+            with rasterio.open(disk / "out" / name) as raster:
+                raster.read()
+    remount(disk, "size=60m")
+    same_result(mosaic(flight / "photos", output=disk / "out").made().output, finished)
+
+
+@pytest.mark.parametrize(
+    "stage", ["alignment", *map(late, ("features", "links", "surface", "blocks"))]
+)
+def test_a_disk_that_fills_up_while_intermediate_results_are_stored(
+    mosaic, flight, finished, monkeypatch, stage
+):
+    write = Path.write_bytes
+
+    def full(path, data):
+        if path.parent.name == stage:
+            write(path, data[: len(data) // 2])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    told = mosaic(flight / "photos").refused(5, "disk is full", "make room", "same command again")
+    monkeypatch.undo()
+    same_result(mosaic(flight / "photos", output=told.output).made().output, finished)
+
+
+@pytest.mark.slow
+def test_photos_on_a_read_only_disk(mosaic, flight, small_disk, tmp_path):
+    disk = small_disk("20m")
+    shutil.copytree(flight / "photos", disk / "photos")
+    remount(disk, "ro")
+    mosaic(disk / "photos", output=tmp_path / "out").made()
+
+
+# who may be replaced
+
+
+@pytest.mark.slow
+def test_a_folder_of_other_files_is_left_alone(mosaic, flight, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.doc").write_text("years of work")
+    told = mosaic(flight / "photos")
+    assert told.code == 5
+    assert "already holds other files; add --overwrite" in told.err
+    told = mosaic(flight / "photos", "--rerun-from", "features")
+    assert told.code == 5
+    told = mosaic(flight / "photos", "--overwrite").made()
+    assert (tmp_path / "out" / "thesis.doc").read_text() == "years of work"
+
+
+def test_another_run_is_replaced_only_when_asked_for(mosaic, flight):
+    output = mosaic(flight / "photos").made().output
+    before = {n: (output / n).read_bytes() for n in CONTRACT}
+    told = mosaic(flight / "photos", "--blend", "first")
+    assert told.code == 5
+    assert "already holds another run" in told.err
+    assert "--overwrite" in told.err
+    assert {n: (output / n).read_bytes() for n in CONTRACT} == before
+    told = mosaic(flight / "photos", "--blend", "first", "--overwrite", "--json").made()
+    reused = {e["stage"]: e["reused"] for e in told.events if e["event"] == "StageFinished"}
+    assert reused == {s: s in ("features", "links", "align", "surface") for s in STAGES[1:]}
+
+
+def test_the_same_run_again_does_nothing(mosaic, flight, finished):
+    output = mosaic(flight / "photos").made().output
+    times = {n: (output / n).stat().st_mtime_ns for n in CONTRACT}
+    told = mosaic(flight / "photos", "--json").made()
+    assert [e["event"] for e in told.events] == ["Note", "Result"]
+    assert "nothing to do" in told.events[0]["text"]
+    assert {n: (output / n).stat().st_mtime_ns for n in CONTRACT} == times
+    same_result(output, finished)
+
+
+@pytest.mark.slow
+def test_other_threads_and_memory_are_the_same_run(mosaic, flight):
+    mosaic(flight / "photos").made()
+    assert "nothing to do" in mosaic(flight / "photos", "--jobs", "1", "--memory", "2").made().err
+
+
+@pytest.mark.parametrize(
+    "lost", [*map(late, ("report.html", "mosaic.tif", "metrics.json", "run.toml"))]
+)
+def test_a_file_that_was_deleted_is_made_again(mosaic, flight, finished, lost):
+    output = mosaic(flight / "photos").made().output
+    (output / lost).unlink()
+    told = mosaic(flight / "photos", "--json").made()
+    reused = {e["stage"]: e["reused"] for e in told.events if e["event"] == "StageFinished"}
+    assert all(reused[s] for s in ("features", "links", "align", "surface"))
+    assert reused["mosaic"] == (lost != "mosaic.tif")
+    same_result(output, finished)
+
+
+@pytest.mark.parametrize("stage", ["mosaic", *(late(s) for s in STAGES[1:] if s != "mosaic")])
+def test_rerun_from_each_stage(mosaic, flight, finished, stage):
+    output = mosaic(flight / "photos").made().output
+    told = mosaic(flight / "photos", "--rerun-from", stage, "--json").made()
+    reused = {e["stage"]: e["reused"] for e in told.events if e["event"] == "StageFinished"}
+    stored = {"features", "links", "align", "surface", "mosaic"}
+    first = STAGES.index(stage)
+    assert reused == {s: s in stored and k + 1 < first for k, s in enumerate(STAGES[1:])}
+    same_result(output, finished)
+
+
+def test_damaged_intermediate_results_are_made_again(mosaic, flight, finished):
+    output = mosaic(flight / "photos").made().output
+    for number, path in enumerate(sorted((output / ".skyquilt" / "store").rglob("*.npz"))):
+        data = path.read_bytes()
+        path.write_bytes(
+            (b"", data[:100], data[: len(data) // 2], data[:-1], bytes(len(data)))[number % 5]
+        )
+    (output / "report.html").unlink()
+    mosaic(flight / "photos").made()
+    same_result(output, finished)
+
+
+@pytest.mark.slow
+def test_a_damaged_state_is_another_run_not_a_crash(mosaic, flight):
+    output = mosaic(flight / "photos").made().output
+    (output / ".skyquilt" / "run.json").write_text('{"key": ')
+    told = mosaic(flight / "photos")
+    assert told.code == 5
+    assert "--overwrite" in told.err
+
+
+@pytest.mark.slow
+def test_damaged_figures_of_a_finished_run_are_made_again(mosaic, flight):
+    output = mosaic(flight / "photos").made().output
+    (output / "metrics.json").write_text('{"photos_total": ')
+    assert mosaic(flight / "photos").made().metrics["photos_used"] == 9
+
+
+# output and photos in one place
+
+
+def test_the_folder_of_photos_itself_is_no_output(mosaic, photos):
+    before = sorted(p.name for p in photos.iterdir())
+    for options in ((), ("--overwrite",)):
+        told = mosaic(photos, *options, output=photos)
+        assert told.code == 2
+        assert "holds the photos" in told.err
+    assert sorted(p.name for p in photos.iterdir()) == before
+
+
+@pytest.mark.slow
+def test_an_output_inside_the_folder_of_photos_is_no_input(mosaic, photos):
+    mosaic(photos, output=photos / "map").made()
+    told = mosaic(photos, output=photos / "map").made()
+    assert "nothing to do" in told.err
+    told = mosaic(photos, "--blend", "first", output=photos / "second map").made()
+    assert told.metrics["photos_total"] == 9
+
+
+@pytest.mark.slow
+def test_an_unfinished_output_inside_the_folder_of_photos_is_no_input_either(
+    mosaic, photos, monkeypatch
+):
+    from skyquilt.workflows import mosaic as story
+
+    def interrupted(*args, **words):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(story.reporting, "seams", interrupted)
+    told = mosaic(photos, output=photos / "map")
+    assert told.code == 130
+    assert (photos / "map" / "mosaic.tif").is_file()
+    assert not (photos / "map" / "run.toml").is_file()
+    monkeypatch.undo()
+    told = mosaic(photos, output=photos / "map").made()
+    assert (told.metrics["photos_total"], told.metrics["photos_rejected"]) == (9, {})
+
+
+# interrupts and kills
+
+
+class Running:
+    """The command in a process of its own, its events read as they come."""
+
+    def __init__(self, photos: Path, output: Path, *options: str) -> None:
+        words = [
+            sys.executable,
+            "-m",
+            "skyquilt",
+            "mosaic",
+            str(photos),
+            "-o",
+            str(output),
+            "--json",
+            *options,
+        ]
+        self.process = subprocess.Popen(
+            words,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=dict(os.environ),
+            preexec_fn=hears_interrupts,
+        )
+
+    def until(self, event: str, stage: str, count: int = 1) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            record = json.loads(line)
+            count -= record["event"] == event and record.get("stage") == stage
+            if count == 0:
+                return
+        raise AssertionError(
+            f"no {event} of {stage}: {self.process.stderr.read() if self.process.stderr else ''}"
+        )
+
+    def signalled(self, number: int) -> tuple[int, float, str]:
+        """Exit code, seconds until the end, standard error."""
+        begun = time.perf_counter()
+        self.process.send_signal(number)
+        _, err = self.process.communicate(timeout=60)
+        return self.process.returncode, time.perf_counter() - begun, err
+
+
+@pytest.fixture(scope="module")
+def undisturbed(flight, tmp_path_factory) -> Path:
+    """The slower run without a disturbance."""
+    from tests.end_to_end.conftest import skyquilt
+
+    output = tmp_path_factory.mktemp("undisturbed") / "out"
+    code, _, err = skyquilt("mosaic", flight / "photos", "-o", output, *SLOWER)
+    assert code == 0, err
+    return output
+
+
+MOMENTS = [
+    ("StageStarted", "features", 1),
+    ("StageProgress", "features", 3),
+    ("StageStarted", "links", 1),
+    ("StageStarted", "align", 1),
+    ("StageStarted", "surface", 1),
+    ("StageStarted", "mosaic", 1),
+    ("StageStarted", "measure", 1),
+    ("StageStarted", "report", 1),
+]
+
+
+@pytest.mark.parametrize("moment", [MOMENTS[1], *map(late, (MOMENTS[0], *MOMENTS[2:]))])
+def test_ctrl_c_ends_soon_and_the_same_command_resumes(
+    mosaic, flight, tmp_path, undisturbed, moment
+):
+    running = Running(flight / "photos", tmp_path / "out", *SLOWER)
+    running.until(*moment)
+    code, seconds, err = running.signalled(signal.SIGINT)
+    assert code == 130, err
+    assert seconds < 3, f"it took {seconds:.1f} s to end"
+    assert (
+        err.strip().splitlines()[-1]
+        == "skyquilt: interrupted; run the same command again to resume"
+    )
+    assert "Traceback" not in err
+    assert not (tmp_path / "out" / "metrics.json").exists()
+    same_result(mosaic(flight / "photos", *SLOWER, quick=False).made().output, undisturbed)
+
+
+@pytest.mark.parametrize("delay", [0.3, *map(late, (0.1, 0.2, 0.5, 0.8))])
+def test_ctrl_c_while_the_program_is_still_loading(flight, tmp_path, delay):
+    running = Running(flight / "photos", tmp_path / "out", *SLOWER)
+    time.sleep(delay)
+    code, seconds, err = running.signalled(signal.SIGINT)
+    assert code == 130, err
+    assert seconds < 3
+    assert "Traceback" not in err
+
+
+@pytest.mark.slow
+def test_ctrl_c_twice(flight, tmp_path):
+    running = Running(flight / "photos", tmp_path / "out", *SLOWER)
+    running.until("StageStarted", "features")
+    running.process.send_signal(signal.SIGINT)
+    time.sleep(0.02)
+    code, seconds, err = running.signalled(signal.SIGINT)
+    assert code == 130, err
+    assert seconds < 3
+
+
+@pytest.mark.parametrize(
+    "moment",
+    [
+        ("StageProgress", "features", 4),
+        late(("StageStarted", "links", 1)),
+        late(("StageStarted", "mosaic", 1)),
+        late(("StageFinished", "mosaic", 1)),
+        late(("StageStarted", "report", 1)),
+    ],
+)
+def test_kill_9_and_the_same_command_resumes(mosaic, flight, tmp_path, undisturbed, moment):
+    running = Running(flight / "photos", tmp_path / "out", *SLOWER)
+    running.until(*moment)
+    code, _, _ = running.signalled(signal.SIGKILL)
+    assert code == -signal.SIGKILL
+    told = mosaic(flight / "photos", *SLOWER, "--json", quick=False).made()
+    reused = {e["stage"]: e["reused"] for e in told.events if e["event"] == "StageFinished"}
+    before = STAGES[1 : STAGES.index(moment[1])]
+    assert all(reused[s] for s in before if s in ("features", "links", "align", "surface"))
+    same_result(told.output, undisturbed)
+
+
+@pytest.mark.slow
+def test_kill_9_between_blocks_of_a_map_of_several(mosaic, flight, tmp_path):
+    """Two of four blocks and more are in the spool: only the others are drawn again."""
+    options = ("--features", "300", "--surface", "ties", "--gsd", "4", "--jobs", "1")
+    running = Running(flight / "photos", tmp_path / "out", *options)
+    running.until("StageProgress", "mosaic", 2)
+    running.signalled(signal.SIGKILL)
+    told = mosaic(flight / "photos", *options, "--json", quick=False).made()
+    steps = [e for e in told.events if e["event"] == "StageProgress" and e["stage"] == "mosaic"]
+    assert steps[0]["total"] == 4
+    assert len(steps) <= 2
+    other = mosaic(flight / "photos", *options, quick=False, output=tmp_path / "other").made()
+    same_result(told.output, other.output)
+
+
+@pytest.mark.slow
+def test_photos_that_come_later_are_added_without_looking_at_the_others_again(mosaic, photos):
+    late = named(photos)[-1].rename(photos.parent / "late.jpg")
+    mosaic(photos).made()
+    late.rename(photos / "late.jpg")
+    told = mosaic(photos)
+    assert told.code == 5
+    assert "other photos or other settings" in told.err
+    assert mosaic(photos, "--overwrite").made().metrics["photos_used"] == 9

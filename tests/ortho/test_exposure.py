@@ -1,0 +1,195 @@
+"""Gains of known size are found again; black and white stay; two gains are one."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyquilt.model.raster import Window
+from skyquilt.ortho import exposure
+from skyquilt.ortho.exposure import NEUTRAL, Balance, Exposure, odds_table, with_odds
+from tests.ortho.scenes import FLAT, GRID, block, composer, photograph
+
+gains = st.floats(-1.5, 1.5)
+
+
+def odds_scaled(x, g):
+    """Value 0..255 with its odds multiplied by exp(g), by the definition."""
+    x = np.asarray(x, float) / 255
+    with np.errstate(divide="ignore"):
+        return 255 / (1 + (1 - x) / np.maximum(x, 1e-300) * np.exp(-g))
+
+
+@given(st.lists(gains, min_size=1, max_size=4))
+def test_tables_scale_the_odds(g):
+    table = odds_table(np.array(g, np.float32))
+    assert table.shape == (1, 256, len(g)) and table.dtype == np.uint8
+    for band, gain in enumerate(g):
+        assert (
+            np.abs(table[0, :, band] - odds_scaled(np.arange(256), np.float32(gain))).max() <= 0.51
+        )
+        assert table[0, 0, band] == 0 and table[0, 255, band] == 255
+        assert (np.diff(table[0, :, band].astype(int)) >= 0).all()
+
+
+@given(gains, gains)
+def test_two_gains_are_one(g, h):
+    """exp(g) after exp(h) is exp(g + h): exactly, but for rounding between."""
+    x = np.arange(256)
+    assert odds_scaled(odds_scaled(x, g), h) == pytest.approx(odds_scaled(x, g + h), abs=1e-9)
+    one, two, both = (odds_table(np.array([v], np.float32))[0, :, 0] for v in (g, h, g + h))
+    slope = np.exp(abs(h))  # of the second table at its steepest
+    assert np.abs(two[one].astype(int) - both).max() <= 1 + 0.5 * slope
+
+
+@given(st.integers(0, 10**6), st.sampled_from([1, 3]))
+def test_fields_of_odds_are_the_tables_pixel_by_pixel(seed, bands):
+    rng = np.random.default_rng(seed)
+    pixels = rng.integers(0, 256, (20, 30, bands)).astype(np.uint8)
+    pixels[0], pixels[1] = 0, 255
+    g = rng.uniform(-1, 1, (20, 30, bands)).astype(np.float32)
+    out = with_odds(pixels, np.exp(g))
+    assert out.dtype == np.uint8 and out.shape == pixels.shape
+    assert np.abs(out - odds_scaled(pixels, g)).max() <= 0.51
+    assert not out[0].any() and (out[1] == 255).all()
+
+
+@pytest.fixture(scope="module")
+def lit():
+    """Six photos of one ground, each under its own gain per band."""
+    views = block()
+    rng = np.random.default_rng(1)
+    true = {v.photo: rng.uniform(-0.3, 0.3) + rng.uniform(-0.05, 0.05, 3) for v in views}
+    pictures = {}
+    for v in views:
+        grey = np.clip(photograph(v), 12, 240)
+        pictures[v.photo] = np.rint(
+            np.dstack([odds_scaled(grey, g) for g in true[v.photo]])
+        ).astype(np.uint8)
+    return views, pictures, true
+
+
+def test_gains_are_found_again(lit):
+    """What was multiplied in comes out, to a common factor per band, to 0.02 in log odds."""
+    views, pictures, true = lit
+    found = Balance()(views, pictures, FLAT, GRID.bounds)
+    mine = np.array([found.gains[v.photo] for v in views])
+    expected = -np.array([true[v.photo] for v in views])
+    error = (mine - mine.mean(0)) - (expected - expected.mean(0))
+    assert np.abs(error).max() < 0.02
+    assert np.median(mine, axis=0) == pytest.approx(0, abs=1e-6)
+    assert np.abs(expected).max() > 0.2  # there was something to find
+    assert not any(found.uneven(v.photo) for v in views)
+
+
+def test_the_map_loses_its_patches(lit):
+    views, pictures, _ = lit
+    whole = Window(row=0, column=0, height=GRID.height, width=GRID.width)
+    neutral = {
+        v.photo: np.rint(np.dstack([np.clip(photograph(v), 12, 240)] * 3)).astype(np.uint8)
+        for v in views
+    }
+    target = composer(views, neutral, GRID, bands=3)(whole)
+
+    def spread(exposure):
+        made = composer(views, pictures, GRID, bands=3, exposure=exposure)(whole)
+        ok = target.photo >= 0
+        off = made.pixels[ok].astype(float) - target.pixels[ok]
+        return float(np.std([off[target.photo[ok] == v.photo].mean() for v in views]))
+
+    before, after = spread(NEUTRAL), spread(Balance()(views, pictures, FLAT, GRID.bounds))
+    assert before > 5 and after < 0.12 * before
+
+
+def test_vignetting_is_found_as_a_field(lit):
+    """Every photo falls by a quarter per x^2 and y^2; the prior of 0.15 holds back, the sign and no
+    more is sure.
+    """
+    views, _, _ = lit
+    x, y = np.meshgrid(np.linspace(-1, 1, 400), np.linspace(-1, 1, 300))
+    dark = -0.25 * (x * x + y * y)
+    pictures = {
+        v.photo: np.rint(odds_scaled(np.clip(photograph(v), 12, 240), dark))[..., None].astype(
+            np.uint8
+        )
+        for v in views
+    }
+    found = Balance()(views, pictures, FLAT, GRID.bounds)
+    assert all(found.uneven(v.photo) for v in views)
+    squares = np.array([found.fields[v.photo][2:4] for v in views])
+    assert squares.min() > 0.03 and 0.07 < squares.mean() < 0.26
+    loose = Balance(sigma_field=2.0)(views, pictures, FLAT, GRID.bounds)
+    squares = np.array([loose.fields[v.photo][2:4] for v in views])
+    assert squares.mean() > 0.13
+
+
+def test_moving_things_do_not_count(lit):
+    """A white car park that one photo alone shows, on a tenth of it."""
+    views, pictures, true = lit
+    spoilt = {k: p.copy() for k, p in pictures.items()}
+    spoilt[views[2].photo][100:180, 100:260] = 235
+    a = Balance()(views, pictures, FLAT, GRID.bounds).gains
+    b = Balance()(views, spoilt, FLAT, GRID.bounds).gains
+    assert max(np.abs(a[k] - b[k]).max() for k in a) < 0.06
+
+
+def test_nothing_to_compare(lit):
+    views, pictures, _ = lit
+    assert Balance()(views[:1], pictures, FLAT, GRID.bounds) is NEUTRAL
+    assert Balance()(views, {}, FLAT, GRID.bounds) is NEUTRAL
+    black = {v.photo: np.zeros((300, 400, 3), np.uint8) for v in views}
+    assert Balance()(views, black, FLAT, GRID.bounds) is NEUTRAL
+
+
+def test_measured_values_are_never_touched(lit):
+    views, _, _ = lit
+    values = {v.photo: np.full((300, 400, 1), 21.5, np.float32) for v in views}
+    exposure = Exposure(
+        gains={v.photo: np.array([0.7], np.float32) for v in views},
+        fields={v.photo: np.ones(5, np.float32) for v in views},
+    )
+    made = composer(views, values, GRID, dtype=np.float32, exposure=exposure)(
+        Window(row=64, column=64, height=64, width=64)
+    )
+    assert made.pixels == pytest.approx(21.5)
+
+
+def stated_plainly(terms, row, point, y, ridge, count):
+    """The robust solution by full matrices: of each point's samples the weighted mean is taken off,
+    then least squares.
+    """
+    k = terms.shape[1]
+    A = np.zeros((len(y), count * k))
+    for sample, photo in enumerate(row):
+        A[sample, photo * k : (photo + 1) * k] = terms[sample]
+    w, x = np.ones(len(y)), np.zeros((count * k, y.shape[1]))
+    same = (point[:, None] == point).astype(float)
+    for _ in range(6):
+        mean = same * w / (same @ w)[:, None]
+        root = np.sqrt(w)[:, None]
+        B, z = root * (A - mean @ A), root * (y - mean @ y)
+        pull = np.diag(np.tile(ridge, count) * exposure.SIGMA_LEVEL**2 * exposure.CORRELATED)
+        before, x = x, np.linalg.solve(B.T @ B + pull, -B.T @ z)
+        if np.abs(x - before).max() < exposure.SETTLED:
+            break
+        level = y + A @ x
+        w = 1 / (1 + ((level - mean @ level) ** 2).mean(1) / 0.25**2)
+    return x.reshape(count, k, -1)
+
+
+@pytest.mark.parametrize("dense", [1, 1000])
+@pytest.mark.parametrize(("k", "bands"), [(6, 1), (1, 3)])
+def test_blocks_give_what_full_matrices_give(k, bands, dense, monkeypatch):
+    monkeypatch.setattr(exposure, "DENSE", dense)
+    rng = np.random.default_rng(k)
+    seen = rng.random((60, 7)) < 0.5
+    seen[0] = False
+    seen[1] = True
+    point, row = np.nonzero(seen)
+    shuffled = rng.permutation(len(row))
+    _, point = np.unique(point[shuffled], return_inverse=True)
+    row = row[shuffled]
+    terms = np.concatenate([np.ones((len(row), 1)), rng.uniform(-1, 1, (len(row), k - 1))], 1)
+    y, ridge = rng.normal(0, 0.4, (len(row), bands)), rng.uniform(1, 50, k)
+    found = exposure._robust_differences(terms, row, point, y, ridge, 7)
+    assert np.abs(found - stated_plainly(terms, row, point, y, ridge, 7)).max() < 1e-9

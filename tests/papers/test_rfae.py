@@ -1,0 +1,150 @@
+"""The thesis's methods: their equations against other libraries, their choices by Q, their nine
+inliers.
+"""
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from skyquilt.coregistration.methods import registration_method
+from skyquilt.model.estimate import NoEstimate
+from skyquilt.model.features import DESCRIPTOR_UNIT, Features
+from skyquilt.model.registration import Picture, RefusedRegistration, Registration
+from skyquilt.papers.rfae import BetterByQ, Outliers, best, binary_edges, gradient_magnitude
+from skyquilt.quality.registration_quality import spread_quality
+from tests.coregistration.scenes import error, layout, spectrum, turned
+
+SHAPE = (400, 480)
+
+
+@pytest.fixture(scope="module")
+def alike():
+    """One picture twice, turned: what features are made for."""
+    import cv2
+
+    truth = turned(0.9, 15.0, SHAPE, SHAPE)
+    a = np.clip(spectrum(layout(seed=1), 1), 0, 255).astype(np.uint8)
+    return a, cv2.warpPerspective(a, truth, (480, 400)), truth
+
+
+def test_edges_are_sobels_normalised():
+    picture = np.random.default_rng(0).integers(0, 255, (40, 50)).astype(np.uint8)
+    x, y = (ndimage.sobel(picture.astype(float), axis) / 4 for axis in (1, 0))
+    expected = np.hypot(x, y) / np.hypot(x, y)[1:-1, 1:-1].max()
+    magnitude = gradient_magnitude(picture)
+    inner = (slice(1, -1),) * 2
+    assert magnitude.max() == pytest.approx(1.0)
+    ratio = magnitude[inner] / np.maximum(expected[inner], 1e-9)
+    assert np.ptp(ratio) < 1e-3  # proportional; the largest value may lie at the border
+    for theta in (0.2, 0.4, 0.6):
+        edges = binary_edges(magnitude, theta)
+        assert set(np.unique(edges)) == {0, 255}
+        assert ((edges == 255) == (magnitude > theta)).all()
+
+
+def test_a_picture_without_edges_has_none():
+    assert not binary_edges(gradient_magnitude(np.full((20, 20), 7, np.uint8)), 0.2).any()
+
+
+@pytest.mark.parametrize("method", ["usurf", "surf+rfae", "structure"])
+def test_methods_register_what_they_are_made_for(method, alike):
+    a, b, truth = alike
+    found = registration_method(method)(Picture(values=a), Picture(values=b))
+    assert found, found.reason
+    assert found.model == "similarity" and len(found.px_a) >= 9
+    assert error(found.b_H_a, truth) < (1.5 if method != "structure" else 0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["sift", "rfae-sift"])
+def test_sift_of_43_levels(method, alike):
+    a, b, truth = alike
+    found = registration_method(method)(Picture(values=a), Picture(values=b))
+    assert found and error(found.b_H_a, truth) < 1.0
+
+
+def test_q_is_that_of_the_inliers_in_a(alike):
+    a, b, _ = alike
+    found = registration_method("surf")(Picture(values=a), Picture(values=b))
+    assert found.q == spread_quality(found.px_a, 480, 400, delta=48.0)
+
+
+def registration(q):
+    return Registration(
+        model="similarity", b_H_a=np.eye(3), px_a=np.zeros((9, 2)), px_b=np.zeros((9, 2)), q=q
+    )
+
+
+def test_the_highest_q_wins_and_refusals_lose():
+    refused = RefusedRegistration(reason="none", evidence={"matches": 3.0})
+    assert best([registration(0.2), refused, registration(0.5), registration(0.1)]).q == 0.5
+    assert (
+        best([refused, RefusedRegistration(reason="more", evidence={"matches": 8.0})]).reason
+        == "more"
+    )
+    methods = tuple(lambda a, b, g=None, q=q: registration(q) for q in (0.3, 0.6, 0.4))
+    nothing = Picture(values=np.zeros((4, 4)))
+    assert BetterByQ(methods=methods)(nothing, nothing).q == 0.6
+
+
+def test_outliers_keep_the_estimator_with_the_higher_q():
+    from skyquilt.matching.matchers import OneWay
+    from skyquilt.model.estimate import Estimate
+
+    def features(seed):
+        px = np.random.default_rng(seed).uniform(0, 100, (30, 2))
+        unit = np.eye(30, dtype=np.float32) * DESCRIPTOR_UNIT
+        return Features(
+            px=px,
+            size=np.ones(30, np.float32),
+            descriptors=np.minimum(unit, 255).astype(np.uint8),
+            scale=1.0,
+        )
+
+    def estimator(count):
+        def estimate(a, b):
+            return Estimate(
+                model="similarity",
+                b_H_a=np.eye(3) * count,
+                inliers=np.arange(len(a)) < count,
+                ste_per_inlier=0.0,
+                iterations=1,
+                capped=False,
+                method="",
+            )
+
+        return estimate
+
+    relate = Outliers(
+        match=OneWay(),
+        quality=spread_quality,
+        estimators=(
+            estimator(9),
+            lambda a, b: NoEstimate(reason="no"),
+            estimator(25),
+            estimator(12),
+        ),
+    )
+    found = relate(features(0), features(1), (100, 100))
+    assert len(found.px_a) == 25 and found.evidence["matches"] == 30
+
+
+def test_one_way_matching_against_a_loop():
+    from skyquilt.matching.matchers import OneWay
+
+    rng = np.random.default_rng(4)
+
+    def features(n):
+        d = rng.integers(0, 120, (n, 16)).astype(np.uint8)
+        return Features(px=np.zeros((n, 2)), size=np.ones(n, np.float32), descriptors=d, scale=1.0)
+
+    a, b = features(40), features(30)
+    found = OneWay(threshold=1.2)(a, b)
+    expected = []
+    for i, u in enumerate(a.unit):
+        squared = sorted((float(((u - v) ** 2).sum()), j) for j, v in enumerate(b.unit))
+        if 1.2 * squared[0][0] < squared[1][0]:
+            expected.append((i, squared[0][1]))
+    assert list(zip(found.index_a.tolist(), found.index_b.tolist(), strict=True)) == expected
+    assert 0 < len(expected) < 40
+    assert not len(OneWay()(a, features(1)))
