@@ -21,7 +21,7 @@ import rasterio
 
 from skyquilt import simulate as sim
 from skyquilt.quality.map_error import map_error
-from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.mosaic import mosaic
 
 WINDOWS = {

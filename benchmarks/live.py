@@ -171,13 +171,16 @@ def seams(survey: Path, gsd: float) -> None:
     from skyquilt.live.live_map import LiveMap
     from skyquilt.live.settings import LiveSettings
     from skyquilt.model.poses import Alignment, no_ties
-    from skyquilt.ortho import orthomosaic as drawing
+    from skyquilt.ortho import orthomosaic
     from skyquilt.ortho.exposure import NEUTRAL
+    from skyquilt.ortho.ground import Ground, round_gsd
     from skyquilt.photos.pixels import read_color
-    from skyquilt.workflows import photo_features as intake
-    from skyquilt.workflows import run_report as reporting
-    from skyquilt.workflows.methods import MosaicSettings, methods
-    from skyquilt.workflows.mosaic import REGISTRY, mosaic
+    from skyquilt.quality.seam_measurement import measure_seams
+    from skyquilt.settings import MosaicSettings
+    from skyquilt.workflows.flow import REGISTRY
+    from skyquilt.workflows.methods import methods_for
+    from skyquilt.workflows.mosaic import mosaic
+    from skyquilt.workflows.photo_features import find_features
 
     home = Path(tempfile.mkdtemp())
     live = LiveMap(home / "live", LiveSettings(gsd_cm=gsd))
@@ -193,8 +196,8 @@ def seams(survey: Path, gsd: float) -> None:
     store = Store(folder=home / "store", registry=REGISTRY)
     cache = PixelCache(read=lambda i: read_color(photos[i]), budget_bytes=600_000_000)
     settings = MosaicSettings(balance=False)
-    parts = methods(settings)
-    taken = drain(intake.take_in(photos, cache, parts, store, 2))
+    methods = methods_for(settings)
+    found = drain(find_features(photos, cache, methods.detector, store, 2))
     alignment = Alignment(
         method="live",
         why="",
@@ -210,17 +213,17 @@ def seams(survey: Path, gsd: float) -> None:
     surface = live.canvas.surface(bounds)
     views = make_views(alignment, surface)
     native = native_gsd(views, surface)
-    ground = drawing.Ground(
+    ground = Ground(
         surface=surface,
         views=tuple(views),
-        grid=grid_of(views, drawing.round_gsd(native)),
+        grid=grid_of(views, round_gsd(native)),
         native_gsd=native,
     )
-    compose = drawing.composer(taken, ground, alignment, NEUTRAL, parts, cache)
-    drawn = drain(
-        drawing.draw(home, compose, alignment, settings, store, "live", drawing.unit_of(taken), 2)
+    compose = orthomosaic.composer(found.photos, ground, NEUTRAL, methods.blend, cache)
+    steps = orthomosaic.draw(
+        home, compose, alignment, settings.output, None, store, "live", photos[0].unit, 2
     )
-    of_live = drain(reporting.seams(compose, drawn, ground)).figures
+    of_live = drain(measure_seams(compose, drain(steps), ground)).figures
     of_batch = mosaic(survey, home / "batch").metrics["seam_disparity_px"]
     print("live: ", of_live)
     print("batch:", of_batch)

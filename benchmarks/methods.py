@@ -26,9 +26,9 @@ import numpy as np
 from skyquilt import simulate as sim
 from skyquilt.errors import SkyquiltError
 from skyquilt.quality.geolocation import geolocation_errors
+from skyquilt.settings import MosaicSettings
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
-from skyquilt.workflows.methods import MosaicSettings
 from skyquilt.workflows.mosaic import mosaic
 
 LINES = 6

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.mosaic import mosaic
 
 ASKED = {
@@ -132,36 +132,16 @@ def strip_all(source: Path, target: Path) -> Path:
 
 def control_from_full_run(source: Path, work: Path) -> Path:
     """A gcp_list.txt of three far-apart tie points of the full run; 40 others are check points."""
-    from skyquilt.alignment.priors import choose_frame, priors
-    from skyquilt.engine.pixel_cache import PixelCache
+    from skyquilt.engine.clock import Clock, result_of
     from skyquilt.engine.store import Store
-    from skyquilt.photos.pixels import read_color
-    from skyquilt.photos.survey import read_survey
-    from skyquilt.workflows import align as placing
-    from skyquilt.workflows import links as linking
-    from skyquilt.workflows import photo_features as intake
-    from skyquilt.workflows.methods import methods
-    from skyquilt.workflows.mosaic import REGISTRY
+    from skyquilt.settings import InputSettings
+    from skyquilt.workflows.flow import REGISTRY, align_photos
+    from skyquilt.workflows.methods import methods_for
+    from skyquilt.workflows.survey_input import read_input
 
-    settings = MosaicSettings()
-    parts, store = methods(settings), Store(folder=work / "full-store", registry=REGISTRY)
-    photos = read_survey(source).photos
-    cache = PixelCache(read=lambda i: read_color(photos[i]), budget_bytes=0)
-    taken = drain(intake.take_in(photos, cache, parts, store, 2))
-    frame = choose_frame(photos, None)
-    prior = priors(photos, frame)
-    pictures = intake.Pictures(photos, cache, store)
-    links = drain(linking.link_up(taken, prior, parts, store, 2))
-    known = placing.Known(
-        intake=taken,
-        frame=frame,
-        priors=prior,
-        links=links,
-        control=(),
-        order=range(len(photos)),
-        pictures=pictures,
-    )
-    aligned = drain(placing.place(known, parts, settings, store))
+    settings, store = MosaicSettings(), Store(folder=work / "full-store", registry=REGISTRY)
+    clock, given = Clock(store=store, began=Clock.now()), read_input(source, InputSettings())
+    aligned = result_of(align_photos(given, methods_for(settings), settings, clock)).alignment
     ties, frame = aligned.ties, aligned.frame
     seen = np.bincount(ties.point)
     good = np.flatnonzero(seen >= 3)
@@ -185,15 +165,6 @@ def control_from_full_run(source: Path, work: Path) -> Path:
     target = work / "gcp_list.txt"
     target.write_text("\n".join(lines) + "\n")
     return target
-
-
-def drain(steps):
-    """The result of a stage run without its events."""
-    try:
-        while True:
-            next(steps)
-    except StopIteration as stop:
-        return stop.value
 
 
 if __name__ == "__main__":

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from skyquilt.model.event import Event, Result
+from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import FlightSettings, simulate
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
-from skyquilt.workflows.methods import MosaicSettings
 from skyquilt.workflows.mosaic import iter_mosaic
 
 

@@ -39,7 +39,7 @@ def test_the_story_of_a_small_survey_waits_for_nothing_it_does_not_need():
     """
     code = (
         "import sys, skyquilt.workflows.mosaic as m; from skyquilt.workflows.methods import *;"
-        " methods(MosaicSettings());"
+        " methods_for(MosaicSettings());"
         "print(*(m for m in ('scipy', 'rasterio', 'shapely', 'tifffile') if m in sys.modules))"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -6,6 +6,9 @@ The public names. They are imported when first used, so that `import skyquilt` c
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+import skyquilt.catalogue  # noqa: F401  names the methods
+from skyquilt.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from skyquilt import simulate
     from skyquilt.coregistration.workflow import register
@@ -15,15 +18,13 @@ if TYPE_CHECKING:
     from skyquilt.model.photo import Photo, Survey
     from skyquilt.model.poses import Alignment
     from skyquilt.photos.survey import read_survey
-    from skyquilt.workflows.methods import MosaicSettings
+    from skyquilt.settings import MosaicSettings
     from skyquilt.workflows.mosaic import iter_mosaic, mosaic
-
-__version__ = "0.1.0"
 
 _HOME = {
     "Alignment": "skyquilt.model.poses",
     "Camera": "skyquilt.model.camera",
-    "MosaicSettings": "skyquilt.workflows.methods",
+    "MosaicSettings": "skyquilt.settings",
     "Photo": "skyquilt.model.photo",
     "Result": "skyquilt.model.event",
     "SkyquiltError": "skyquilt.errors",

@@ -296,10 +296,10 @@ def test_help_names_every_method():
     from typer.testing import CliRunner
 
     from skyquilt.cli.app import app
-    from skyquilt.coregistration.methods import REGISTRATIONS
+    from skyquilt import registry
 
     told = (
         CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(app, ["register", "--help"]).output
     )
-    assert [name for name in REGISTRATIONS if name not in told] == []
+    assert [name for name in registry.names("registration") if name not in told] == []
     assert "Exit codes" in told

@@ -10,7 +10,7 @@ from rasterio.warp import Resampling, reproject
 
 from skyquilt.depth.workflow import depth, iter_depth
 from skyquilt.errors import OutputError, RefusedError, UsageError
-from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.settings import MosaicSettings
 
 SETTINGS = MosaicSettings(gsd_cm=25, features=3000, jobs=2)
 

@@ -12,12 +12,12 @@ import rasterio
 from skyquilt.errors import NoPhotosError, RefusedError
 from skyquilt.model.event import Note, Result
 from skyquilt.quality.map_error import map_error
+from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import FlightSettings, simulate
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route, Thermal
 from skyquilt.simulate.weather import Weather
 from skyquilt.thermal.workflow import iter_thermal
-from skyquilt.workflows.methods import MosaicSettings
 from tests.end_to_end.conftest import relabel
 
 SETTINGS = MosaicSettings(jobs=2)

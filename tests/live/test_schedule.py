@@ -7,7 +7,8 @@ import pytest
 
 from skyquilt.live.adjustment_schedule import Blocks, Schedule
 from skyquilt.live.settings import CLOSING, GROWTH, PART, LiveSettings
-from skyquilt.workflows.methods import MosaicSettings, methods
+from skyquilt.settings import MosaicSettings
+from skyquilt.workflows.methods import methods_for
 
 
 def blocks_of(*sizes, closed=(), since=1, loop=None):
@@ -23,7 +24,7 @@ def blocks_of(*sizes, closed=(), since=1, loop=None):
         blocks=sets, by_id=by_id, block_of=block_of, block=lambda i: sets[block_of[i]]
     )
     schedule = Schedule(closed_at=dict(zip(sets, closed, strict=False)), since=since, loop=loop)
-    parts = methods(MosaicSettings())
+    parts = methods_for(MosaicSettings())
     blocks = Blocks(members, schedule, LiveSettings(), Path(), Path(), parts)
     blocks._job = lambda ids, held, ground, sweep: (ids, held)
     return blocks

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from skyquilt.model.raster import Grid
-from skyquilt.ortho.orthomosaic import PROVENANCE, _reduced, _thinned, preview_factor, round_gsd
+from skyquilt.ortho.companions import PROVENANCE, _reduced, _thinned, preview_factor
+from skyquilt.ortho.ground import round_gsd
 
 
 def test_provenance_is_taken_from_the_middle_of_its_cell():

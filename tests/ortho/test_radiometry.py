@@ -7,7 +7,7 @@ import pytest
 
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
 from skyquilt.ortho.radiometry import balances_drift, recorded_tags, value_tags
-from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.settings import PictureSettings
 
 
 @pytest.mark.parametrize(
@@ -23,7 +23,7 @@ from skyquilt.workflows.methods import MosaicSettings
     ],
 )
 def test_whose_drift_is_balanced(unit, asked, balance, done):
-    settings = MosaicSettings(balance_thermal=asked, balance=balance)
+    settings = PictureSettings(balance_thermal=asked, balance=balance)
     assert balances_drift(settings, unit) is done
 
 

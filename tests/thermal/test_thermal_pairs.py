@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.model.event import Result
+from skyquilt.engine.clock import result_of
+from skyquilt.settings import MosaicSettings
 from skyquilt.thermal.by_pairs import by_pairs, overlapping
-from skyquilt.workflows.methods import MosaicSettings
-from skyquilt.workflows.mosaic import mosaic
-from skyquilt.workflows.scene import scene_of_run
+from skyquilt.workflows.mosaic import make_map
+from skyquilt.workflows.survey_input import read_input
 
 SETTINGS = MosaicSettings(gsd_cm=15, jobs=2)
 OFF = (2.1, -1.2)
@@ -21,20 +21,23 @@ OFF = (2.1, -1.2)
 @pytest.fixture(scope="module")
 def scene(flight, tmp_path_factory):
     output = tmp_path_factory.mktemp("pairs") / "out"
-    result = mosaic(flight / "photos", output, SETTINGS)
-    return scene_of_run(flight / "photos", Result(output=output, metrics=result.metrics), SETTINGS)
+    given = read_input(flight / "photos", SETTINGS.input)
+    return result_of(make_map(given, output, SETTINGS)).scene()
 
 
 @pytest.fixture(scope="module")
 def other(scene):
     """The same block in negative, its frame displaced."""
-    x, y = scene.alignment.frame.origin
-    frame = replace(scene.alignment.frame, origin=(x + OFF[0], y + OFF[1]))
-    return replace(
-        scene,
-        alignment=replace(scene.alignment, frame=frame),
-        pixels=lambda i: 255 - scene.pixels(i),
-    )
+    x, y = scene.aligned.alignment.frame.origin
+    placed = in_frame(scene, (x + OFF[0], y + OFF[1]))
+    pixels = scene.aligned.pixels
+    return replace(placed, aligned=replace(placed.aligned, pixels=lambda i: 255 - pixels(i)))
+
+
+def in_frame(scene, origin):
+    alignment = scene.aligned.alignment
+    moved = replace(alignment, frame=replace(alignment.frame, origin=origin))
+    return replace(scene, aligned=replace(scene.aligned, alignment=moved))
 
 
 def test_a_misplaced_block_is_brought_back(scene, other):
@@ -50,6 +53,6 @@ def test_a_misplaced_block_is_brought_back(scene, other):
 
 
 def test_blocks_that_share_no_ground_are_refused(scene, other):
-    far = replace(other.alignment.frame, origin=(other.alignment.frame.origin[0] + 5000, 0.0))
-    found = by_pairs(scene, replace(other, alignment=replace(other.alignment, frame=far)))
+    far = other.aligned.alignment.frame.origin[0] + 5000
+    found = by_pairs(scene, in_frame(other, (far, 0.0)))
     assert not found and found.reason.startswith("0 of 0 overlapping pairs")

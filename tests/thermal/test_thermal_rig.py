@@ -12,8 +12,8 @@ from skyquilt.geometry.camera import project, rays
 from skyquilt.geometry.frames import angle_deg, cam_R_map_from_angles
 from skyquilt.model.camera import Camera
 from skyquilt.model.event import Result
+from skyquilt.settings import MosaicSettings
 from skyquilt.thermal.workflow import iter_thermal
-from skyquilt.workflows.methods import MosaicSettings
 
 HEAT = Camera.ideal(width=320, height=256, focal=400.0)
 TURN = cam_R_map_from_angles(2.0, 1.0, -1.5) @ cam_R_map_from_angles(0, 0, 0).T

@@ -12,7 +12,7 @@ from skyquilt.live.settings import LiveSettings
 from skyquilt.model.event import Note
 from skyquilt.papers import compare
 from skyquilt.papers.compare import CompareSettings, iter_compare
-from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.mosaic import iter_mosaic
 
 

@@ -13,7 +13,7 @@ from pyproj import Transformer
 
 from skyquilt.model.event import Result, StageFinished, StageStarted
 from skyquilt.quality.map_error import map_error
-from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.mosaic import iter_mosaic
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyquilt import __version__
-from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.run_files import source_commit, write_run
 
 

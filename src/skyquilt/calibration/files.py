@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt import __version__
 from skyquilt.calibration.board_views import Seen
 from skyquilt.calibration.figures import Judged
 from skyquilt.calibration.page import CalibrationInput, calibration_page, plots
@@ -21,6 +20,7 @@ from skyquilt.model.board import Board, BoardView
 from skyquilt.model.calibration import Calibration, rms
 from skyquilt.model.camera import PARAMETERS, Camera
 from skyquilt.raster.atomic import whole_file, write_text
+from skyquilt.version import __version__
 
 PLOTS = (
     "reprojection_centres.svg",

@@ -4,7 +4,6 @@ from typing import Annotated
 
 import typer
 
-from skyquilt import __version__
 from skyquilt.cli import calibrate as calibrate_command
 from skyquilt.cli import compare as compare_command
 from skyquilt.cli import depth as depth_command
@@ -17,6 +16,7 @@ from skyquilt.cli import simulate as simulate_command
 from skyquilt.cli import spectral_bench as spectral_bench_command
 from skyquilt.cli import strip_test as strip_test_command
 from skyquilt.cli import view as view_command
+from skyquilt.version import __version__
 
 EXIT_CODES = (
     "Exit codes: 0 done, 1 other errors, 2 wrong options, 3 no readable photo, 4 photos cannot be"

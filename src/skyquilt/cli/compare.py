@@ -58,6 +58,25 @@ def command(
     cameras: Cameras = None,
     thermal_unit: ThermalUnit = None,
     height: Annotated[float | None, typer.Option(help="Height above ground in m.")] = None,
+    detector: Annotated[
+        str | None,
+        typer.Option(
+            help="Features, in place of each method's own: sift, surf, usurf, harris, orb, akaze.",
+            show_default="sift",
+        ),
+    ] = None,
+    matcher: Annotated[
+        str | None,
+        typer.Option(help="Matches of two photos: mutual, guided, one-way.", show_default="mutual"),
+    ] = None,
+    estimator: Annotated[
+        str | None,
+        typer.Option(
+            help="What tells right matches from wrong: ransac, lmeds, magsac, ste; for image also"
+            " ncc, phase, ecc, mi.",
+            show_default="each method's own",
+        ),
+    ] = None,
     alpha: Annotated[float, typer.Option(help="Weight of distances against looks, 0 to 1.")] = 0.5,
     lines: Annotated[
         str, typer.Option(help="How flight lines are told apart: heading, distance.")
@@ -76,7 +95,7 @@ def command(
     with ends_at_once():
         from skyquilt.cli.progress import show
         from skyquilt.papers.compare import VARIANTS, CompareSettings, iter_compare
-        from skyquilt.workflows.methods import MosaicSettings
+        from skyquilt.settings import MosaicSettings
 
     mode = mode_of(quiet=quiet, json=json)
     shared = MosaicSettings(
@@ -86,14 +105,19 @@ def command(
         thermal_unit=thermal_unit,
         height_m=height,
         alpha=alpha,
-        lines=lines,
         repair=repair,
         seed=seed,
         jobs=jobs,
         distances=distances,
     )
     asked = tuple(m.strip() for m in methods.split(",")) if methods is not None else tuple(VARIANTS)
-    settings = CompareSettings(mosaic=shared, variants=asked, first=first, known=known)
+    named = {"detector": detector, "matcher": matcher, "estimator": estimator}
+    given = [(k, v) for k, v in named.items() if v is not None]
+    if lines != "heading":
+        given.append(("lines", lines))
+    settings = CompareSettings(
+        mosaic=shared, variants=asked, first=first, known=known, given=tuple(given)
+    )
     events = iter_compare(photos, output, settings, overwrite=overwrite)
     show(events, mode=mode, summary=summary)
 

@@ -60,7 +60,7 @@ def command(
     with ends_at_once():
         from skyquilt.cli.progress import show
         from skyquilt.depth.workflow import iter_depth
-        from skyquilt.workflows.methods import MosaicSettings
+        from skyquilt.settings import MosaicSettings
 
     mode = mode_of(quiet=quiet, json=json)
     settings = MosaicSettings(

@@ -1,205 +1,225 @@
 """`skyquilt mosaic`: a folder of photos to a georeferenced orthomosaic."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.options import (
-    THERMAL_UNITS,
-    UNIT_UNSAID,
-    Cameras,
-    Crs,
-    Features,
-    Gsd,
-    Jobs,
-    Json,
-    Output,
-    Overwrite,
-    Photos,
-    Quiet,
-    Repair,
-    Verbose,
-    mode_of,
-)
+from skyquilt.cli.options import THERMAL_UNITS, UNIT_UNSAID, Photos, mode_of
 from skyquilt.errors import UsageError
 
 if TYPE_CHECKING:
     from skyquilt.model.event import Result
 
 
+COMMON, INPUT, METHOD, CAMERA = "Options most people need", "Input", "Method", "Cameras"
+PICTURE, FILES, THERMAL, RUN = "Surface and picture", "Files", "Thermal", "Running"
+IMAGE, HYBRID = "Method image", "Method hybrid, and lambda of any method"
+FLIGHTLINE, POSITION = "Method flightline", "Method position"
+
+
+def option(panel: str, text: str, *names: str, default: str | None = None) -> Any:
+    """An option in a panel of the help; `default` says in words what stands for None."""
+    shown: bool | str = True if default is None else default
+    return typer.Option(*names, help=text, rich_help_panel=panel, show_default=shown)
+
+
 def command(
     photos: Photos,
-    output: Output,
-    method: Annotated[
-        str,
-        typer.Option(
-            help="How photos are aligned: auto, bundle, position, pose, image, hybrid, flightline."
-        ),
-    ] = "auto",
-    gsd: Gsd = None,
-    crs: Crs = None,
+    output: Annotated[Path, option(COMMON, "Folder for the results.", "--output", "-o")],
+    gsd: Annotated[
+        float | None, option(COMMON, "Ground size of a map pixel in cm.", default="the photos' own")
+    ] = None,
     gcp: Annotated[
         Path | None,
-        typer.Option(help="Control points.", show_default="gcp_list.txt among the photos, if any"),
+        option(COMMON, "Control points.", default="gcp_list.txt among the photos, if any"),
     ] = None,
+    crs: Annotated[
+        str | None, option(COMMON, "Output CRS, e.g. EPSG:32633.", default="local UTM")
+    ] = None,
+    thermal: Annotated[
+        Path | None,
+        option(
+            COMMON, "Folder of thermal photos: their map is laid on the visual one as thermal.tif."
+        ),
+    ] = None,
+    overwrite: Annotated[
+        bool, option(COMMON, "Replace the results of another run in OUTPUT.", "--overwrite")
+    ] = False,
     geo: Annotated[
         Path | None,
-        typer.Option(
-            help="Positions: geo.txt, CSV, .MRK or .SRT.",
-            show_default="geo.txt among the photos, if any",
+        option(
+            INPUT,
+            "Positions: geo.txt, CSV, .MRK or .SRT.",
+            default="geo.txt among the photos, if any",
         ),
     ] = None,
-    cameras: Cameras = None,
-    bounds: Annotated[
-        str | None, typer.Option(help="west,south,east,north in the output CRS.")
-    ] = None,
-    boundary: Annotated[
+    cameras: Annotated[Path | None, option(INPUT, "Calibrations (cameras.json).")] = None,
+    distances: Annotated[
         Path | None,
-        typer.Option(help="Polygon to cut the map to: GeoJSON, KML, GeoPackage, Shapefile."),
+        option(INPUT, "Known distances (CSV: point_a, point_b, metres) to judge the map by."),
     ] = None,
-    surface: Annotated[
+    sequence: Annotated[
         str,
-        typer.Option(help="Heights: ties (tie points alone) or sweep (refined from the pictures)."),
-    ] = "sweep",
-    blend: Annotated[
-        str, typer.Option(help="Where photos meet: auto, feather, first, average, multiband.")
-    ] = "auto",
-    feather: Annotated[float, typer.Option(help="Width of feathered seams in map pixels.")] = 6.0,
-    balance: Annotated[
-        bool, typer.Option("--balance/--no-balance", help="Bring photos to one brightness.")
+        option(
+            INPUT,
+            "Order that methods image, hybrid and flightline take photos in: time, name, or a file"
+            " of names.",
+        ),
+    ] = "time",
+    repair: Annotated[
+        bool, option(INPUT, "Whether metadata may be wrong.", "--repair-metadata/--trust-metadata")
     ] = True,
-    balance_thermal: Annotated[
-        bool | None,
-        typer.Option(
-            "--balance-thermal/--raw-thermal",
-            help="Balance the drift between thermal frames on their overlaps, or leave values as"
-            " recorded.",
-            show_default="temperatures balanced, counts raw",
+    method: Annotated[
+        str,
+        option(
+            METHOD,
+            "How photos are aligned: auto, bundle, position, pose, image, hybrid, flightline.",
+        ),
+    ] = "auto",
+    detector: Annotated[
+        str | None,
+        option(METHOD, "Features: sift, surf, usurf, harris, orb, akaze.", default="sift"),
+    ] = None,
+    matcher: Annotated[
+        str | None,
+        option(
+            METHOD,
+            "Matches of two photos: mutual (each other's nearest), guided (near the place that"
+            " metadata predict), one-way.",
+            default="mutual",
         ),
     ] = None,
-    compress: Annotated[
-        str, typer.Option(help="auto, jpeg, or lossless: deflate, zstd, lzw, none.")
-    ] = "auto",
-    quality: Annotated[int, typer.Option(help="JPEG quality.")] = 85,
-    distortion: Annotated[
+    estimator: Annotated[
         str | None,
-        typer.Option(
-            help="Lens terms to calibrate, or, for methods that do not, to keep of a known"
-            " calibration: none, 2, 4,"
-            " 6 (radial order), 6t (and tangential).",
-            show_default="4 to calibrate, 6t to keep",
+        option(
+            METHOD,
+            "What tells right matches from wrong: ransac, lmeds, magsac, ste (the article's); for"
+            " image also ncc, phase, ecc, mi, which compare pixels.",
+            default="magsac for links, ransac for image, ste for flightline",
         ),
     ] = None,
     transform: Annotated[
         str | None,
-        typer.Option(
-            help="How two photos may differ: translation, similarity, affine, homography.",
-            show_default="similarity for image, homography for flightline",
+        option(
+            METHOD,
+            "How two photos may differ, for image and flightline: translation, similarity, affine,"
+            " homography.",
+            default="similarity for image, homography for flightline",
         ),
     ] = None,
+    features: Annotated[int, option(METHOD, "Features per photo.")] = 1200,
+    distortion: Annotated[
+        str | None,
+        option(
+            CAMERA,
+            "Lens terms to calibrate, or, for methods that do not, to keep of a known calibration:"
+            " none, 2, 4, 6 (radial order), 6t (and tangential).",
+            default="4 to calibrate, 6t to keep",
+        ),
+    ] = None,
+    height: Annotated[
+        float | None, option(CAMERA, "Height above ground in m, for methods that do not find it.")
+    ] = None,
+    surface: Annotated[
+        str,
+        option(PICTURE, "Heights: ties (tie points alone) or sweep (refined from the pictures)."),
+    ] = "sweep",
+    bounds: Annotated[
+        str | None, option(PICTURE, "west,south,east,north in the output CRS.")
+    ] = None,
+    boundary: Annotated[
+        Path | None,
+        option(PICTURE, "Polygon to cut the map to: GeoJSON, KML, GeoPackage, Shapefile."),
+    ] = None,
+    blend: Annotated[
+        str, option(PICTURE, "Where photos meet: auto, feather, first, average, multiband.")
+    ] = "auto",
+    feather: Annotated[float, option(PICTURE, "Width of feathered seams in map pixels.")] = 6.0,
+    balance: Annotated[
+        bool, option(PICTURE, "Bring photos to one brightness.", "--balance/--no-balance")
+    ] = True,
+    compress: Annotated[
+        str, option(FILES, "auto, jpeg, or lossless: deflate, zstd, lzw, none.")
+    ] = "auto",
+    quality: Annotated[int, option(FILES, "JPEG quality.")] = 85,
+    thermal_route: Annotated[
+        str,
+        option(
+            THERMAL,
+            "How the thermal map finds its place: rig (both cameras on one drone: on the visual"
+            " poses), maps (the pictures of both), pairs (of photos), heights (the surfaces under"
+            " them), positions (GPS alone), auto (the first that can be believed).",
+        ),
+    ] = "auto",
+    thermal_unit: Annotated[
+        str | None,
+        option(THERMAL, THERMAL_UNITS, default=f"auto with --thermal; else {UNIT_UNSAID}"),
+    ] = None,
+    balance_thermal: Annotated[
+        bool | None,
+        option(
+            THERMAL,
+            "Balance the drift between thermal frames on their overlaps, or leave values as"
+            " recorded.",
+            "--balance-thermal/--raw-thermal",
+            default="temperatures balanced, counts raw",
+        ),
+    ] = None,
+    jobs: Annotated[int, option(RUN, "Threads; 0 = all processors.")] = 0,
+    memory: Annotated[
+        float | None, option(RUN, "Memory to stay within, in GB.", default="1.2")
+    ] = None,
+    seed: Annotated[int, option(RUN, "Of everything random; equal seeds give equal maps.")] = 0,
+    rerun_from: Annotated[
+        str | None,
+        option(
+            RUN,
+            "Make everything anew from this stage on: features, links, align, surface, balance,"
+            " mosaic, measure, report.",
+        ),
+    ] = None,
+    quiet: Annotated[bool, option(RUN, "Say nothing but errors.", "--quiet", "-q")] = False,
+    verbose: Annotated[
+        bool, option(RUN, "Say more: every stage's time.", "--verbose", "-v")
+    ] = False,
+    json: Annotated[bool, option(RUN, "Print one JSON object per event.", "--json")] = False,
     levelled: Annotated[
         bool,
-        typer.Option(
-            "--levelled/--no-levelled",
-            help="Register by features of the dominant plane, for method image.",
-        ),
+        option(IMAGE, "Register by features of the dominant plane.", "--levelled/--no-levelled"),
     ] = True,
     image_search: Annotated[
         str,
-        typer.Option(
-            help="What method image registers a photo to: chain (the last photo), overview (the"
-            " whole map so far)."
+        option(
+            IMAGE,
+            "What a photo is registered to: chain (the last photo), overview (the whole map so"
+            " far).",
         ),
     ] = "chain",
     relief: Annotated[
         float | None,
-        typer.Option(
-            help="Largest height variation on the ground in m, for --levelled.",
-            show_default="a tenth of the height",
+        option(
+            IMAGE,
+            "Largest height variation on the ground in m, for --levelled.",
+            default="a tenth of the height",
         ),
     ] = None,
     alpha: Annotated[
-        float, typer.Option(help="Weight of distances against looks, 0 to 1, for method hybrid.")
+        float, option(HYBRID, "Weight of distances against looks in lambda, 0 to 1.")
     ] = 0.5,
     optimiser: Annotated[
         str,
-        typer.Option(
-            help="How method hybrid searches: surfaces (correlation), anneal (simulated annealing)."
-        ),
+        option(HYBRID, "How it searches: surfaces (correlation), anneal (simulated annealing)."),
     ] = "surfaces",
-    seed: Annotated[
-        int, typer.Option(help="Of everything random; equal seeds give equal maps.")
-    ] = 0,
-    sequence: Annotated[
-        str,
-        typer.Option(
-            help="Order that methods image, hybrid and flightline take photos in: time, name, or a"
-            " file of names."
-        ),
-    ] = "time",
     lines: Annotated[
         str,
-        typer.Option(
-            help="How method flightline tells lines apart: heading, or distance (as in the paper)."
-        ),
+        option(FLIGHTLINE, "How lines are told apart: heading, or distance (as in the article)."),
     ] = "heading",
-    distances: Annotated[
-        Path | None,
-        typer.Option(
-            help="Known distances (CSV: point_a, point_b, metres) by which the map is judged."
-        ),
-    ] = None,
-    height: Annotated[
-        float | None,
-        typer.Option(help="Height above ground in m, for methods that do not find it."),
-    ] = None,
     heading: Annotated[
         float | None,
-        typer.Option(
-            help="Heading of all photos in degrees, for method position.",
-            show_default="the commonest reported",
-        ),
+        option(POSITION, "Heading of all photos in degrees.", default="the commonest reported"),
     ] = None,
-    repair: Repair = True,
-    features: Features = 1200,
-    thermal: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of thermal photos: their map is laid on the visual one as thermal.tif."
-        ),
-    ] = None,
-    thermal_unit: Annotated[
-        str | None,
-        typer.Option(help=THERMAL_UNITS, show_default=f"auto with --thermal; else {UNIT_UNSAID}"),
-    ] = None,
-    thermal_route: Annotated[
-        str,
-        typer.Option(
-            help="How the thermal map finds its place: rig (both cameras on one drone: on the"
-            " visual poses), maps (the"
-            " pictures of both), pairs (of photos), heights (the surfaces under them), positions"
-            " (GPS alone), auto (the"
-            " first that can be believed)."
-        ),
-    ] = "auto",
-    jobs: Jobs = 0,
-    memory: Annotated[
-        float | None, typer.Option(help="Memory to stay within, in GB.", show_default="1.2")
-    ] = None,
-    rerun_from: Annotated[
-        str | None,
-        typer.Option(
-            help="Make everything anew from this stage on: features, links, align, surface,"
-            " balance, mosaic,"
-            " measure, report."
-        ),
-    ] = None,
-    overwrite: Overwrite = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-    json: Json = False,
 ) -> None:
     """Turn a folder of drone photos into a georeferenced, orthorectified mosaic.
 
@@ -207,7 +227,7 @@ def command(
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
-        from skyquilt.workflows.methods import MosaicSettings
+        from skyquilt.settings import MosaicSettings
         from skyquilt.workflows.mosaic import STAGES, iter_mosaic
 
     if rerun_from is not None and rerun_from not in STAGES[1:]:
@@ -215,14 +235,25 @@ def command(
     mode = mode_of(quiet=quiet, json=json, verbose=verbose)
     settings = MosaicSettings(
         method=method,
-        gsd_cm=gsd,
-        crs=crs,
         gcp=gcp,
         geo=geo,
         cameras=cameras,
+        distances=distances,
+        sequence=sequence,
+        repair=repair,
+        detector=detector,
+        matcher=matcher,
+        estimator=estimator,
+        transform=transform,
+        features=features,
+        distortion=distortion,
+        height_m=height,
+        heading_deg=heading,
+        surface=surface,
+        gsd_cm=gsd,
+        crs=crs,
         bounds=parse_bounds(bounds),
         boundary=boundary,
-        surface=surface,
         blend=blend,
         feather_px=feather,
         balance=balance,
@@ -230,23 +261,15 @@ def command(
         thermal_unit=thermal_unit,
         compress=compress,
         quality=quality,
-        distortion=distortion,
-        transform=transform,
+        jobs=jobs,
+        memory_gb=memory,
+        seed=seed,
         levelled=levelled,
         image_search=image_search,
         relief_m=relief,
         alpha=alpha,
         optimiser=optimiser,
-        seed=seed,
-        sequence=sequence,
         lines=lines,
-        distances=distances,
-        height_m=height,
-        heading_deg=heading,
-        repair=repair,
-        features=features,
-        jobs=jobs,
-        memory_gb=memory,
     )
     if thermal is None:
         events = iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)

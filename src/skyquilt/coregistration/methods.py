@@ -1,24 +1,14 @@
-"""Words -> ways to register two pictures of different spectra; apart from `config`, since a mosaic
-needs none of it.
-"""
+"""Ways to register two pictures of different spectra, by name."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+from skyquilt import registry
 from skyquilt.coregistration.auto import Auto
 from skyquilt.coregistration.structure import Structure, StructureMatches
-from skyquilt.matching.matchers import OneWay
 from skyquilt.matching.ransac import Ransac
-from skyquilt.matching.sift import Sift
 from skyquilt.model.registration import Registers
-from skyquilt.papers.lmeds import Lmeds
-from skyquilt.papers.rfae import BetterByQ, ByFeatures, Outliers, Rfae
-from skyquilt.papers.surf import Surf
-from skyquilt.quality.registration_quality import spread_quality
-from skyquilt.workflows.methods import one_of
+from skyquilt.settings import one_of
 
-REGISTRATIONS = ("auto", "sift", "surf", "usurf", "rfae", "rfae-sift", "surf+rfae", "structure")
-"""Ways to register two pictures of different spectra."""
 SAMPLES = 1000
 """Most samples drawn for a similarity: enough for 7 % of right matches."""
 INLIERS = 9
@@ -30,44 +20,38 @@ class RegisterSettings:
     """Everything a registration of two pictures can be asked for."""
 
     method: str = "auto"
-    """One of `REGISTRATIONS`."""
+    """A registered way of registration."""
     use_metadata: bool = True
     """Whether metadata and places are tried first; what they say is a guess only."""
 
     def __post_init__(self) -> None:
-        one_of("--method", self.method, REGISTRATIONS)
+        one_of("--method", self.method, registry.names("registration"))
 
 
 def registration_method(name: str) -> Registers:
-    """The registration that a word names, with the thesis's parameters [Y 5.2, Fig. 5.8]."""
-    one_of("--method", name, REGISTRATIONS)
-    surf, sift = Surf(lobe=1, step=1), Sift(levels=43, root=False, longest=1000, count=3000)
-    structure = StructureMatches(
+    """The registration that a word names.
+
+    Raises:
+        UsageError: it names none.
+    """
+    one_of("--method", name, registry.names("registration"))
+    made: Registers = registry.load("registration", name)()
+    return made
+
+
+def auto() -> Auto:
+    """Orientation correlation, helped by structure matches, verified by patches."""
+    return Auto(propose=_proposals())
+
+
+def structure() -> Structure:
+    """A structure descriptor alone, verified by patches."""
+    return Structure(propose=_proposals())
+
+
+def _proposals() -> StructureMatches:
+    return StructureMatches(
         estimate=Ransac(
             model="similarity", minimum=INLIERS, threshold_px=4.0, max_iterations=5 * SAMPLES
         )
-    )
-    ways: dict[str, Callable[[], Registers]] = {
-        "auto": lambda: Auto(propose=structure),
-        "sift": lambda: ByFeatures(detect=sift, relate=_outliers()),
-        "surf": lambda: ByFeatures(detect=surf, relate=_outliers()),
-        "usurf": lambda: ByFeatures(detect=replace(surf, upright=True), relate=_outliers()),
-        "rfae": lambda: Rfae(detect=surf, relate=_outliers()),
-        "rfae-sift": lambda: Rfae(detect=sift, relate=_outliers()),
-        "structure": lambda: Structure(propose=structure),
-        "surf+rfae": lambda: BetterByQ(
-            methods=(registration_method("surf"), registration_method("rfae"))
-        ),
-    }
-    return ways[name]()
-
-
-def _outliers() -> Outliers:
-    return Outliers(
-        match=OneWay(),
-        quality=spread_quality,
-        estimators=(
-            Ransac(model="similarity", minimum=INLIERS, max_iterations=SAMPLES),
-            Lmeds(model="similarity", minimum=INLIERS, max_iterations=SAMPLES),
-        ),
     )

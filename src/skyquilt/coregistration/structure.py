@@ -1,9 +1,11 @@
 """Registration by a structure descriptor, verified like everything else by agreement of patches."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.coregistration.decision import Decide
 from skyquilt.coregistration.index_features import IndexFeatures, index_features, mutual
@@ -11,9 +13,10 @@ from skyquilt.coregistration.log_gabor import phase
 from skyquilt.coregistration.orientation import Pyramid, shrunken
 from skyquilt.coregistration.subpixel import Fit, SubpixelRefinement
 from skyquilt.coregistration.usable import Usable, both_usable
-from skyquilt.model.estimate import NoEstimate
+from skyquilt.model.estimate import Estimate, NoEstimate
 from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistration, Registration
-from skyquilt.papers.rfae import Estimator
+
+Estimator = Callable[[NDArray[Any], NDArray[Any]], Estimate | NoEstimate]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

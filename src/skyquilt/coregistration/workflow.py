@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from skyquilt import __version__
 from skyquilt.coregistration.files import CONTRACT, draw, page
 from skyquilt.coregistration.methods import RegisterSettings, registration_method
 from skyquilt.coregistration.pictures import Source, guess_of, open_picture
@@ -25,6 +24,7 @@ from skyquilt.model.photo import RejectedPhoto
 from skyquilt.model.registration import Guess, RefusedRegistration, Registration
 from skyquilt.quality.registration_quality import spread_quality
 from skyquilt.raster.atomic import write_text
+from skyquilt.version import __version__
 
 Outcome = Registration | RefusedRegistration
 STAGES = ("read", "register", "draw")

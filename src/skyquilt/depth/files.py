@@ -15,7 +15,7 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
-from skyquilt.ortho.orthomosaic import geotransform, preview_factor
+from skyquilt.ortho.companions import geotransform, preview_factor
 from skyquilt.raster import Block, CogWriter, RasterSpec
 from skyquilt.raster.atomic import whole_file
 

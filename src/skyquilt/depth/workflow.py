@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt import __version__
+from skyquilt import registry
 from skyquilt.depth.files import (
     FILES,
     PAIRS,
@@ -36,13 +36,13 @@ from skyquilt.engine.folder import STATE, claim
 from skyquilt.engine.store import Store
 from skyquilt.errors import RefusedError, UsageError
 from skyquilt.model.event import Event, Note, Result
-from skyquilt.model.photo import Survey
 from skyquilt.model.surface import Surface
-from skyquilt.photos.survey import read_survey
 from skyquilt.raster.atomic import write_text
-from skyquilt.workflows.methods import Methods, MosaicSettings, methods
-from skyquilt.workflows.mosaic import REGISTRY
-from skyquilt.workflows.scene import Scene, scene_of
+from skyquilt.settings import MosaicSettings
+from skyquilt.version import __version__
+from skyquilt.workflows.flow import REGISTRY, Scene, scene_of
+from skyquilt.workflows.methods import Methods, methods_for
+from skyquilt.workflows.survey_input import SurveyInput, read_input
 
 FEATURE_PX = 640
 """Longest side in px of the pictures searched for features: their disparities are the map, so they
@@ -85,12 +85,8 @@ def iter_depth(
     settings, output, began = settings or MosaicSettings(), Path(output), Clock.now()
     if route not in ROUTES:
         raise UsageError(f"--route {route!r} is not one of {', '.join(ROUTES)}")
-    survey = read_survey(
-        Path(photos) if isinstance(photos, str) else photos,
-        geo=settings.geo,
-        cameras=settings.cameras,
-        thermal_unit=settings.thermal_unit,
-    )
+    given = read_input(photos, settings.input)
+    survey = given.survey
     if len(survey.photos) < 2:
         raise UsageError("depth takes two photos at least, and here is one; give its neighbour too")
     if route == "auto":
@@ -101,7 +97,7 @@ def iter_depth(
         path.unlink(missing_ok=True)
     clock = Clock(store=Store(folder=output / STATE / "store", registry=REGISTRY), began=began)
     yield from (Note(text=n) for n in survey.notes)
-    scene, depth = yield from _by_route(route, survey, settings, relief_m, clock)
+    scene, depth = yield from _by_route(route, given, settings, relief_m, clock)
     record = yield from clock.stage("draw", _drawn(output, route, scene, depth))
     record |= {"cpu_seconds": round(clock.cpu_total(), 2), "photos_total": len(survey.photos)}
     write_text(output / "depth.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
@@ -131,29 +127,30 @@ def depth(
 
 
 def _by_route(
-    route: str, survey: Survey, settings: MosaicSettings, relief_m: float | None, clock: Clock
+    route: str, given: SurveyInput, settings: MosaicSettings, relief_m: float | None, clock: Clock
 ) -> Generator[Event, None, tuple[Scene, Depth]]:
-    parts = methods(settings)
-    parts = replace(parts, sift=replace(parts.sift, longest=FEATURE_PX))
+    methods = methods_for(settings)
+    detector = registry.load("detector", settings.matching.detector or "sift")
+    searched = detector(count=settings.matching.features, longest=FEATURE_PX)
+    methods = replace(methods, detector=searched)
     if route == "reconstruction":
-        scene = yield from scene_of(survey.photos, settings, parts, clock)
-        if not len(scene.alignment.ties.xyz):
+        scene = yield from scene_of(given, methods, settings, clock)
+        if not len(scene.aligned.alignment.ties.xyz):
             raise RefusedError(
                 "no tie points: the photos do not overlap recognisably, so nothing tells heights"
             )
         return scene, Depth(surface=scene.ground.surface)
-    parts = replace(parts, sweep=None)
+    methods = replace(methods, sweep=None)
     if route == "disparities":
-        scene = yield from scene_of(survey.photos, settings, parts, clock)
-        return scene, (
-            yield from clock.stage("disparities", _disparities(scene, parts, relief_m), keeps=False)
-        )
-    why = ""
-    for k in range(len(survey.photos) - 1):
-        scene = yield from scene_of(survey.photos[k : k + 2], settings, parts, clock)
-        found = yield from clock.stage(
-            "disparities", _disparities(scene, parts, relief_m, refuse=False), keeps=False
-        )
+        scene = yield from scene_of(given, methods, settings, clock)
+        steps = _disparities(scene, methods, relief_m)
+        return scene, (yield from clock.stage("disparities", steps, keeps=False))
+    why, photos = "", given.survey.photos
+    for k in range(len(photos) - 1):
+        pair = replace(given, survey=replace(given.survey, photos=photos[k : k + 2]))
+        scene = yield from scene_of(pair, methods, settings, clock)
+        steps = _disparities(scene, methods, relief_m, refuse=False)
+        found = yield from clock.stage("disparities", steps, keeps=False)
         if found.fields:
             return scene, found
         why = why or (found.without[0].reason if found.without else "they do not match")
@@ -161,7 +158,7 @@ def _by_route(
 
 
 def _disparities(
-    scene: Scene, parts: Methods, relief_m: float | None, *, refuse: bool = True
+    scene: Scene, methods: Methods, relief_m: float | None, *, refuse: bool = True
 ) -> Steps[Depth]:
     """Heights from the disparities of all linked pairs.
 
@@ -169,11 +166,11 @@ def _disparities(
         RefusedError: no pair tells a height, and `refuse` is set.
     """
     views = {v.photo: v for v in scene.ground.views}
-    features, z = scene.taken.features, float(np.median(scene.ground.surface.z))
+    features, z = scene.aligned.found.features, float(np.median(scene.ground.surface.z))
     fields: list[PairField] = []
     without: list[NoField] = []
-    for done, link in enumerate(scene.links.links):
-        yield done, len(scene.links.links)
+    for done, link in enumerate(scene.aligned.links.links):
+        yield done, len(scene.aligned.links.links)
         if link.a not in views or link.b not in views:
             continue
         pair = features[link.a], features[link.b]
@@ -186,7 +183,7 @@ def _disparities(
             )
         return Depth(surface=scene.ground.surface, without=tuple(without))
     xyz = OnePlane()([f.xyz for f in fields])
-    surface = parts.surface(xyz, scene.ground.grid.bounds)
+    surface = methods.surface(xyz, scene.ground.grid.bounds)
     return Depth(
         surface=replace(surface, source="disparities"), fields=tuple(fields), without=tuple(without)
     )
@@ -195,7 +192,7 @@ def _disparities(
 def _drawn(output: Path, route: str, scene: Scene, depth: Depth) -> Steps[dict[str, Any]]:
     """Writes all files but depth.json; returns what that says."""
     yield 0, 1
-    alignment, ground, photos = scene.alignment, scene.ground, scene.taken.photos
+    alignment, ground, photos = scene.aligned.alignment, scene.ground, scene.aligned.photos
     counted = alignment.frame.vertical_datum if route == "reconstruction" else "the dominant plane"
     unit = "m" if alignment.frame.metric else "arbitrary"
     tags = {"UNIT": unit, "ROUTE": route, "VERTICAL_DATUM": counted}
@@ -220,7 +217,7 @@ def _drawn(output: Path, route: str, scene: Scene, depth: Depth) -> Steps[dict[s
 def _record(
     route: str, scene: Scene, depth: Depth, z: NDArray[np.float32], unit: str, counted: str
 ) -> dict[str, Any]:
-    photos, grid, alignment = scene.taken.photos, scene.ground.grid, scene.alignment
+    photos, grid, alignment = scene.aligned.photos, scene.ground.grid, scene.aligned.alignment
     pairs = [
         {
             "a": photos[f.a].name,

@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Generator
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from skyquilt.engine.store import Store
 from skyquilt.model.event import Event, StageFinished, StageProgress, StageStarted
@@ -12,6 +12,16 @@ from skyquilt.model.event import Event, StageFinished, StageProgress, StageStart
 T = TypeVar("T")
 Steps = Generator[tuple[int, int] | Event, None, T]
 """A stage's work: yields (done, total) or events, returns its result."""
+
+
+def result_of(steps: Generator[Any, None, T]) -> T:
+    """What a generator of steps or events returns; what it yields is passed over."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as stop:
+            found: T = stop.value
+            return found
 
 
 def cpu_seconds() -> float:

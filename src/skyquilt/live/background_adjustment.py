@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.local_adjustment import AdjustedWindow, LocalAdjustment, Window
-from skyquilt.engine.store import Store, digest
+from skyquilt.engine.clock import result_of
+from skyquilt.engine.store import Store
 from skyquilt.errors import AlignmentError, SkyquiltError
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.links import link_from
@@ -29,10 +30,11 @@ from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior
 from skyquilt.model.surface import Surface
-from skyquilt.ortho.orthomosaic import Ground, survey_ground
+from skyquilt.ortho.ground import find_ground
 from skyquilt.photos.pixels import read_color
-from skyquilt.workflows.methods import Methods, MosaicSettings
-from skyquilt.workflows.photo_features import THUMBNAIL, PhotoFeatures, Pictures
+from skyquilt.settings import PictureSettings
+from skyquilt.workflows.methods import Methods
+from skyquilt.workflows.photo_features import GreyPictures, PhotoFeatures, features_key
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,7 +112,7 @@ def _nothing(ids: tuple[int, ...], problem: str) -> BlockAdjustment:
 
 
 def _features(photo: Photo, store: Store, methods: Methods) -> Features:
-    looked = store.get("features", digest(photo.digest, methods.sift, THUMBNAIL))
+    looked = store.get("features", features_key(photo, methods.detector))
     if looked is None:
         raise AlignmentError(f"the features of {photo.name} are gone from the store")
     found: Features = looked.features
@@ -132,7 +134,7 @@ def _links(job: AdjustmentJob, ledger: Ledger) -> list[Link]:
 def _whole(
     job: AdjustmentJob, links: Sequence[Link], features: Sequence[Features], store: Store
 ) -> BlockAdjustment:
-    pictures = Pictures(job.photos, lambda i: read_color(job.photos[i]), store)
+    pictures = GreyPictures(job.photos, lambda i: read_color(job.photos[i]), store)
     done = Bundle()(job.photos, job.frame, job.priors, features, links, (), pictures)
     xyz = _swept(done, pictures, job, store) if job.sweep else done.ties.xyz
     return BlockAdjustment(
@@ -145,16 +147,13 @@ def _whole(
 
 
 def _swept(
-    done: Alignment, pictures: Pictures, job: AdjustmentJob, store: Store
+    done: Alignment, pictures: GreyPictures, job: AdjustmentJob, store: Store
 ) -> NDArray[np.float64]:
     """(P, 3) the ground as the batch story finds it, at the nodes of its grid below the photos."""
-    steps = survey_ground(done, pictures, job.methods, MosaicSettings(), store)
-    while True:
-        try:
-            next(steps)
-        except StopIteration as end:
-            ground: Ground = end.value
-            break
+    methods = job.methods
+    ground = result_of(
+        find_ground(done, pictures, methods.surface, methods.sweep, PictureSettings(), store)
+    )
     surface = ground.surface
     rows, columns = np.mgrid[: surface.z.shape[0], : surface.z.shape[1]]
     xyz = np.column_stack(

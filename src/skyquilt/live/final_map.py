@@ -13,7 +13,7 @@ from skyquilt.live.ledger import Ledger
 from skyquilt.live.live_map import FINISHED, PHOTOS
 from skyquilt.live.settings import LiveSettings
 from skyquilt.model.event import Event
-from skyquilt.workflows.methods import MosaicSettings
+from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.mosaic import iter_mosaic
 
 NAMED = "named"

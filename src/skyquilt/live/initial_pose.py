@@ -13,7 +13,7 @@ from skyquilt.live.events import MapEvents
 from skyquilt.live.members import Member, Queues
 from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.live.update import Update
-from skyquilt.ortho.orthomosaic import round_gsd
+from skyquilt.ortho.ground import round_gsd
 
 ABOVE_M = 50.0
 """Flying height where nothing tells it."""

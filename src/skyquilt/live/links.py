@@ -8,11 +8,12 @@ import numpy as np
 
 from skyquilt.engine.codec import decode, encode
 from skyquilt.engine.pixel_cache import PixelCache
-from skyquilt.engine.store import Store, digest
+from skyquilt.engine.store import Store
 from skyquilt.live.members import Member, Members
 from skyquilt.model.features import Features, Link
+from skyquilt.workflows.links import link_pair
 from skyquilt.workflows.methods import Methods
-from skyquilt.workflows.photo_features import THUMBNAIL, PhotoFeatures, look
+from skyquilt.workflows.photo_features import photo_features
 
 FEATURES_KEPT = 48
 """Photos whose features stay at hand."""
@@ -40,15 +41,12 @@ class LiveLinks:
         if number in self._features:
             self._features.move_to_end(number)
             return self._features[number]
-        photo = self.members.by_id[number].photo
-        key = digest(photo.digest, self.methods.sift, THUMBNAIL)
-        looked: PhotoFeatures = self.store.get_or(
-            "features", key, lambda: look(photo, number, self.pixels, self.methods, self.store)
-        )
-        self._features[number] = looked.features
+        photo, pixels = self.members.by_id[number].photo, self.pixels
+        look = photo_features(photo, lambda: pixels(number), self.methods.detector, self.store)
+        self._features[number] = look.features
         while len(self._features) > FEATURES_KEPT:
             self._features.popitem(last=False)
-        return looked.features
+        return look.features
 
     def compared(self, member: Member, others: Sequence[int]) -> dict[tuple[int, int], Link | None]:
         """Links to others, one after the other until enough hold; None where a pair does not
@@ -59,11 +57,8 @@ class LiveLinks:
         for i in others:
             if sum(link is not None for link in found.values()) >= ENOUGH:
                 break
-            theirs = self.features(i)
-            matches = self.methods.mutual(theirs, own)
-            link = self.methods.verify(
-                i, member.id, theirs, own, matches, self.members.by_id[i].photo.width
-            )
+            two, photo = (self.features(i), own), self.members.by_id[i].photo
+            link = link_pair(i, member.id, two, photo, self.methods)
             found[i, member.id] = link if isinstance(link, Link) else None
         return found
 

@@ -40,7 +40,8 @@ from skyquilt.model import features, poses
 from skyquilt.ortho.height_cells import HeightCells
 from skyquilt.photos.pixels import read_color
 from skyquilt.raster.tile_store import TileStore
-from skyquilt.workflows.methods import MosaicSettings, methods
+from skyquilt.settings import MosaicSettings
+from skyquilt.workflows.methods import methods_for
 from skyquilt.workflows.photo_features import PhotoFeatures
 
 PHOTOS, TILES, FINISHED = "photos", "tiles.db", "finished"
@@ -74,7 +75,7 @@ class LiveMap:
         self.inbox = Inbox(self.ledger, self.folder / PHOTOS, most_bytes=self.settings.most_bytes)
         self.intake = Intake(self.ledger, self.inbox, self.settings)
         self.tiles = TileStore(self.folder / TILES, write=True)
-        self.methods = methods(MosaicSettings(features=self.settings.features))
+        self.methods = methods_for(MosaicSettings(features=self.settings.features))
         registry = {c.__name__: c for c in (PhotoFeatures, features.Features, poses.Pose)}
         self.store = Store(folder=self.folder / STORE, registry=registry)
         self.background = BackgroundAdjustment()

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from skyquilt.errors import UsageError
-from skyquilt.workflows.methods import THERMAL_UNITS, one_of
+from skyquilt.settings import THERMAL_UNITS, one_of
 
 NEIGHBOURS = 8
 """Most placed photos that a new one is compared with."""

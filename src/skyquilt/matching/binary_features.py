@@ -1,6 +1,6 @@
 """Binary features: ORB and AKAZE as OpenCV has them, spread over the image."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import cv2
@@ -55,6 +55,10 @@ class Orb:
         """Features of pixels (H, W[, C]) of a full sensor image."""
         return self.of_shrunken(shrink(image, self.longest)[0], image.shape[:2])
 
+    def counted(self, count: int) -> "Orb":
+        """The same with another number of keypoints at most."""
+        return replace(self, count=count)
+
     def of_shrunken(self, small: NDArray[Any], full: tuple[int, int]) -> Features:
         """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer
         to.
@@ -87,6 +91,10 @@ class Akaze:
     def __call__(self, image: NDArray[Any]) -> Features:
         """Features of pixels (H, W[, C]) of a full sensor image."""
         return self.of_shrunken(shrink(image, self.longest)[0], image.shape[:2])
+
+    def counted(self, count: int) -> "Akaze":
+        """The same with another number of keypoints at most."""
+        return replace(self, count=count)
 
     def of_shrunken(self, small: NDArray[Any], full: tuple[int, int]) -> Features:
         """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer

@@ -2,7 +2,7 @@
 and nearest within a radius of an expected place.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -89,13 +89,23 @@ class Guided:
 
     radius_px: float = 100.0
     """Farthest that a match lies from where it is expected, px of the full photo b."""
+    share: float = 0.15
+    """The same as a share of a photo's width, see `for_width`: positions err by metres and headings
+    by degrees.
+    """
+    height_m: float | None = None
+    """Height above ground in m by which places are predicted; None = heights above take-off."""
     ratio: float = 0.9
     """Largest distance to the nearest over distance to the second nearest within the radius."""
     distance: float = 0.8
     """Largest distance of two unit descriptors (0 equal, sqrt 2 unrelated): a circle may hold no
     second to compare with. Of binary ones, half of it is the largest share of bits that differ.
     """
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
+
+    def for_width(self, width: int) -> "Guided":
+        """The same with a radius that suits photos of this width in px."""
+        return replace(self, radius_px=self.share * width)
 
     def __call__(self, a: Features, b: Features, predicted: NDArray[np.float64]) -> Matches:
         """Putative matches; `predicted` (len(a), 2) px of b, NaN where nothing is known, which

@@ -8,6 +8,9 @@ import numpy as np
 
 from skyquilt.model.features import Features, Link, Matches, RejectedLink
 
+EPIPOLAR = {"magsac": cv2.USAC_MAGSAC, "ransac": cv2.FM_RANSAC, "lmeds": cv2.FM_LMEDS}
+"""OpenCV's estimators of a fundamental matrix, by name."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Verify:
@@ -17,8 +20,10 @@ class Verify:
 
     similarity_share: float = 0.03
     """Tolerance of the similarity as a share of the image width: room for relief and tilt."""
+    epipolar: str = "magsac"
+    """One of `EPIPOLAR`: the estimator of the epipolar geometry."""
     epipolar_px: float = 1.0
-    """MAGSAC threshold in px of the image that the features were found in."""
+    """Its threshold in px of the image that the features were found in (lmeds needs none)."""
     minimum: int = 15
     """Fewest inliers of a link."""
     scale: float = 1.7
@@ -75,7 +80,7 @@ class Verify:
         """Indices of those in `keep` that agree with one epipolar geometry."""
         try:
             _, inliers = cv2.findFundamentalMat(
-                pa[keep], pb[keep], cv2.USAC_MAGSAC, self.epipolar_px * scale, 0.999, 1000
+                pa[keep], pb[keep], EPIPOLAR[self.epipolar], self.epipolar_px * scale, 0.999, 1000
             )
         except cv2.error:
             return keep[:0]

@@ -3,7 +3,7 @@ about it.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +12,14 @@ from skyquilt.imaging.views import View
 from skyquilt.model.photo import Photo
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
-from skyquilt.workflows.methods import Methods, MosaicSettings
+from skyquilt.ortho.ground import Ground
+from skyquilt.settings import PictureSettings
 
 TAG = "DRIFT"
 """Tag of a raster of measured values: whether they are as recorded."""
 
 
-def balances_drift(settings: MosaicSettings, unit: str) -> bool:
+def balances_drift(settings: PictureSettings, unit: str) -> bool:
     """Whether frames of this unit are brought to one level.
 
     Degrees are unless somebody asks for values as recorded. Counts are only when asked: they are
@@ -31,21 +32,69 @@ def balances_drift(settings: MosaicSettings, unit: str) -> bool:
     return settings.balance and unit == "celsius"
 
 
+class DriftMethod(Protocol):
+    """Offsets of thermal frames from their overlaps."""
+
+    def __call__(
+        self,
+        views: Sequence[View],
+        thumbnails: Mapping[int, NDArray[Any]],
+        surface: Surface,
+        bounds: tuple[float, float, float, float],
+    ) -> dict[int, float]:
+        """Offset in the values' unit by photo."""
+        ...
+
+
+class BalanceMethod(Protocol):
+    """Exposure of 8-bit photos from their overlaps."""
+
+    def __call__(
+        self,
+        views: Sequence[View],
+        thumbnails: Mapping[int, NDArray[Any]],
+        surface: Surface,
+        bounds: tuple[float, float, float, float],
+    ) -> Exposure:
+        """What brings photos to one brightness."""
+        ...
+
+
+def balanced(
+    photos: Sequence[Photo],
+    thumbnails: Mapping[int, NDArray[Any]],
+    ground: Ground,
+    balance: BalanceMethod,
+    drift: DriftMethod,
+    settings: PictureSettings,
+) -> Exposure:
+    """Exposure of placed photos of one kind: of 8-bit pictures, or the drift of measured values;
+    neutral where neither is wanted. `thumbnails` are by photo (index).
+    """
+    bounds, unit = ground.grid.bounds, photos[0].unit
+    if unit:
+        return drift_of(ground.views, thumbnails, ground.surface, bounds, unit, drift, settings)
+    if not settings.balance or photos[0].dtype != "uint8":
+        return NEUTRAL
+    three = {i: t[..., None] if t.ndim == 2 else t for i, t in thumbnails.items()}
+    return balance(ground.views, three, ground.surface, bounds)
+
+
 def drift_of(
     views: Sequence[View],
     thumbnails: Mapping[int, NDArray[Any]],
     surface: Surface,
     bounds: tuple[float, float, float, float],
     unit: str,
-    parts: Methods,
-    settings: MosaicSettings,
+    drift: DriftMethod,
+    settings: PictureSettings,
 ) -> Exposure:
     """What brings frames of measured values to one level; neutral where they are to stay as
     recorded.
     """
     if not balances_drift(settings, unit):
         return NEUTRAL
-    return Exposure(gains={}, fields={}, offsets=parts.drift(views, thumbnails, surface, bounds))
+    return Exposure(gains={}, fields={}, offsets=drift(views, thumbnails, surface, bounds))
 
 
 def value_tags(unit: str, exposure: Exposure) -> dict[str, str]:
@@ -66,7 +115,7 @@ def _drift(*, balanced: bool) -> str:
 
 
 def value_figures(
-    photos: Sequence[Photo], exposure: Exposure, settings: MosaicSettings
+    photos: Sequence[Photo], exposure: Exposure, settings: PictureSettings
 ) -> dict[str, Any]:
     """What metrics.json says under `thermal_values`; nothing for pictures."""
     unit = photos[0].unit
@@ -85,7 +134,7 @@ def value_figures(
     }
 
 
-def _why(unit: str, exposure: Exposure, settings: MosaicSettings) -> str:
+def _why(unit: str, exposure: Exposure, settings: PictureSettings) -> str:
     if exposure.offsets:
         return (
             "one offset per frame, from overlaps, their median 0; --raw-thermal leaves values as"

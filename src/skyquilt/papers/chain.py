@@ -1,24 +1,28 @@
 """`image`, search `chain`: each photo registered to the one before it, without metadata (Y 4.2)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.inputs import GreyPicture
 from skyquilt.alignment.pose import reported_camera
+from skyquilt.imaging.plane import to_grid
 from skyquilt.model.camera import Camera
 from skyquilt.model.estimate import NoEstimate
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Join, MapFrame, Prior
+from skyquilt.papers.direct import Direct
 from skyquilt.papers.lens_order import of_order, to_working, working_K
 from skyquilt.papers.pieces import Piece, lay
 from skyquilt.papers.plane_registration import (
     Estimator,
     Leveller,
     Matcher,
+    implausible,
     plane_alignment,
     registered,
 )
@@ -43,7 +47,6 @@ class Chain:
     height_m: float | None = None
     """Height above ground in m that scales pieces without positions."""
     version: ClassVar[int] = 1
-    name: ClassVar[str] = "image"
 
     def __call__(
         self,
@@ -58,23 +61,14 @@ class Chain:
         """
         cameras = {p.camera_key: of_order(reported_camera(p), self.distortion) for p in photos}
         lens = [cameras[p.camera_key] for p in photos]
-        pieces: list[dict[int, Array]] = []
-        joins, notes = [], []
-        last = -1
-        for photo in order:
-            joined = self._join(photo, last, lens, features) if last >= 0 else None
-            if isinstance(joined, tuple):
-                last_H_photo, join = joined
-                pieces[-1][photo] = pieces[-1][last] @ last_H_photo
-                joins.append(join)
-            else:
-                if joined is not None:
-                    notes.append(broken(photos[photo].name, photos[last].name, joined.reason))
-                pieces.append({photo: np.eye(3)})
-            last = photo
-        laid = lay([Piece(plane_H_cam=p) for p in pieces], priors, self.height_m)
-        return plane_alignment(
-            self.name, frame, photos, laid.poses, laid.metric, cameras, pieces, joins, notes
+        return chained(
+            lambda photo, onto: self._join(photo, onto, lens, features),
+            photos,
+            frame,
+            priors,
+            order,
+            cameras,
+            self.height_m,
         )
 
     def _join(
@@ -93,6 +87,103 @@ class Chain:
             return found
         H = np.linalg.inv(working_K(lens[onto])) @ found[0] @ working_K(lens[photo])
         return H / H[2, 2], found[1]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DirectChain:
+    """The same chain by the pixels of photos instead of their features [methods B4]."""
+
+    register: Direct
+    """Registration of two pictures."""
+    distortion: str = "6t"
+    """Order of the lens model, fitted to the calibration that photos carry."""
+    longest: int = 640
+    """Longest side in px of the undistorted pictures that are registered."""
+    height_m: float | None = None
+    """Height above ground in m that scales pieces without positions."""
+    version: ClassVar[int] = 1
+
+    def __call__(
+        self,
+        photos: Sequence[Photo],
+        frame: MapFrame,
+        priors: Sequence[Prior],
+        order: Sequence[int],
+        grey: GreyPicture,
+    ) -> Alignment:
+        """Registers photos (indices) in the order given; where two do not match, a new piece
+        begins.
+        """
+        cameras = {p.camera_key: of_order(reported_camera(p), self.distortion) for p in photos}
+        lens = [cameras[p.camera_key] for p in photos]
+
+        def join(photo: int, onto: int) -> tuple[Array, Join] | NoEstimate:
+            flat = [self._flat(grey(i, self.longest), lens[i]) for i in (photo, onto)]
+            return self._join(photo, onto, flat[0], flat[1])
+
+        return chained(join, photos, frame, priors, order, cameras, self.height_m)
+
+    def _flat(self, picture: NDArray[np.uint8], camera: Camera) -> tuple[NDArray[Any], Array]:
+        """The undistorted picture, and plane_H_px (3, 3) from its px to the image plane."""
+        f = camera.focal * min(1.0, self.longest / max(camera.width, camera.height))
+        plane_H_grid = np.diag([1 / f, 1 / f, 1.0])
+        patch = to_grid(picture, camera, plane_H_grid)
+        assert patch is not None, "a photo's own image plane has no horizon"
+        shift = np.array([[1, 0, patch.column], [0, 1, patch.row], [0, 0, 1.0]])
+        return patch.pixels, plane_H_grid @ shift
+
+    def _join(
+        self, photo: int, onto: int, a: tuple[NDArray[Any], Array], b: tuple[NDArray[Any], Array]
+    ) -> tuple[Array, Join] | NoEstimate:
+        found = self.register(a[0], b[0])
+        if isinstance(found, NoEstimate):
+            return found
+        H = b[1] @ found.b_H_a @ np.linalg.inv(a[1])
+        if reason := implausible(H / H[2, 2], np.zeros(2)):
+            return NoEstimate(reason=reason)
+        return H / H[2, 2], Join(
+            photo=photo,
+            onto=onto,
+            matches=0,
+            inliers=0,
+            ste_px2=np.nan,
+            score=found.score,
+            moved_m=np.nan,
+            px=np.zeros((0, 2)),
+            d_px=np.zeros((0, 2)),
+            levelled=np.zeros(0, bool),
+        )
+
+
+def chained(
+    join: Callable[[int, int], tuple[Array, Join] | NoEstimate],
+    photos: Sequence[Photo],
+    frame: MapFrame,
+    priors: Sequence[Prior],
+    order: Sequence[int],
+    cameras: dict[str, Camera],
+    height_m: float | None,
+) -> Alignment:
+    """Photos one after the other: `join` gives onto_H_photo (3, 3) between undistorted image planes
+    of a photo and the one before it, or why they do not match: then a new piece begins.
+    """
+    pieces: list[dict[int, Array]] = []
+    joins, notes, last = [], [], -1
+    for photo in order:
+        joined = join(photo, last) if last >= 0 else None
+        if isinstance(joined, tuple):
+            last_H_photo, record = joined
+            pieces[-1][photo] = pieces[-1][last] @ last_H_photo
+            joins.append(record)
+        else:
+            if joined is not None:
+                notes.append(broken(photos[photo].name, photos[last].name, joined.reason))
+            pieces.append({photo: np.eye(3)})
+        last = photo
+    laid = lay([Piece(plane_H_cam=p) for p in pieces], priors, height_m)
+    return plane_alignment(
+        "image", frame, photos, laid.poses, laid.metric, cameras, pieces, joins, notes
+    )
 
 
 def broken(photo: str, before: str, reason: str) -> str:

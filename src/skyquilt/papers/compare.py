@@ -1,6 +1,4 @@
-"""The comparing story: every method of alignment on one survey, side by side (Y Table 6.1, Fig.
-6.4; A Tables 1, 2).
-"""
+"""Every method of alignment on one survey, side by side (Y Table 6.1, Fig. 6.4; A Tables 1, 2)."""
 
 import csv
 import io
@@ -13,20 +11,24 @@ from typing import Any
 
 import numpy as np
 
-from skyquilt import __version__
+from skyquilt import registry
 from skyquilt.engine.folder import STATE
-from skyquilt.engine.store import Store
-from skyquilt.errors import AlignmentError, OutputError, UsageError
+from skyquilt.engine.store import Store, digest
+from skyquilt.errors import AlignmentError, UsageError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
-from skyquilt.model.photo import ControlPoint, Photo, PointObservation
+from skyquilt.model.photo import ControlPoint, PointObservation
 from skyquilt.model.poses import Alignment
+from skyquilt.papers.compare_state import CompareState, taken_up
 from skyquilt.papers.comparison_page import comparison_page
 from skyquilt.photos.gcp import read_gcp_list
-from skyquilt.photos.survey import read_survey
 from skyquilt.raster.atomic import write_text
 from skyquilt.report.page import write_page
-from skyquilt.workflows.methods import MosaicSettings
-from skyquilt.workflows.mosaic import REGISTRY, iter_mosaic
+from skyquilt.settings import OPTION_OF, MosaicSettings
+from skyquilt.version import __version__
+from skyquilt.workflows.flow import REGISTRY
+from skyquilt.workflows.methods import methods_for
+from skyquilt.workflows.mosaic import make_map
+from skyquilt.workflows.survey_input import SurveyInput, read_input, run_key
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "position": {"method": "position"},
@@ -43,7 +45,6 @@ TRUSTED = ("pose", "hybrid")
 """Methods shown a second time with metadata trusted, where repair changed something."""
 MOST_POINTS = 6
 """Points between which distances are compared."""
-FILES = ("compare.json", "report.html")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +60,17 @@ class CompareSettings:
     known: Path | None = None
     """Points of known place (gcp_list.txt), used to judge only, never to align."""
 
+    given: tuple[tuple[str, Any], ...] = ()
+    """Settings of single methods (names and values); each column gets those that it takes."""
+
+    def asked(self, base: MosaicSettings, name: str) -> MosaicSettings:
+        """What a column is run with."""
+        return base.changed(**{**dict(self._own(name)), **VARIANTS[name]})
+
+    def _own(self, name: str) -> list[tuple[str, Any]]:
+        takes = registry.row("alignment", VARIANTS[name]["method"]).takes
+        return [(k, v) for k, v in self.given if OPTION_OF.get(k, k) in takes]
+
     def __post_init__(self) -> None:
         strange = [v for v in self.variants if v not in VARIANTS]
         if strange or not self.variants:
@@ -67,65 +79,112 @@ class CompareSettings:
             )
         if self.first is not None and self.first < 2:
             raise UsageError(f"--first {self.first}: a comparison needs two photos or more")
+        taken = {k for v in self.variants for k, _ in self._own(v)}
+        for setting, _ in self.given:
+            if setting not in taken:
+                option = OPTION_OF.get(setting, setting)
+                raise UsageError(f"--{option} has no effect on {', '.join(self.variants)}")
+        for name in self.variants:
+            self.asked(self.mosaic, name)  # a word that a column does not take is refused now
 
 
 def iter_compare(
     folder: Path, output: Path, settings: CompareSettings, *, overwrite: bool = False
 ) -> Iterator[Event]:
     """Runs every method into a folder of its own below `output`, then writes compare.json and
-    report.html.
+    report.html. A comparison that was stopped goes on: finished runs are not made again.
 
     Raises:
         SkyquiltError: the photos, the output or an option is wrong; a method that cannot place the
             photos is no error but a row with its reason.
     """
-    _checked(output, overwrite)
-    shared = settings.mosaic
-    survey = read_survey(
-        folder, geo=shared.geo, cameras=shared.cameras, thermal_unit=shared.thermal_unit
+    given = _first(read_input(folder, settings.mosaic.input), settings.first)
+    key = digest(
+        run_key(given, settings.mosaic, methods_for(settings.mosaic)), _content(settings.known)
     )
-    photos = survey.photos[: settings.first] if settings.first else survey.photos
-    source: Path | Sequence[Path] = [p.path for p in photos] if settings.first else folder
-    base, says = _judged_by(photos, output, settings)
-    rows: dict[str, dict[str, Any]] = {}
-    for name in _in_turn(settings.variants, base.distances is None):
-        asked = replace(base, **VARIANTS[name])
-        rows[name] = yield from _run(name, source, output / name, asked, overwrite)
-        if name == "bundle" and base.distances is None and "metrics" in rows[name]:
-            base, says = _by_bundle(photos, output, base)
-            if (
-                base.distances is not None
-            ):  # judge bundle itself too: only the end of its run is made anew
-                again = yield from _run(
-                    name, source, output / name, replace(base, **VARIANTS[name]), True
-                )
-                times = {k: rows[name]["metrics"][k] for k in ("seconds", "cpu_seconds")}
-                rows[name] = {**again, "metrics": {**again["metrics"], **times}}
-        if (
-            name in TRUSTED
-            and settings.mosaic.repair
-            and rows[name].get("metrics", {}).get("metadata_conflicts")
-        ):
-            told = replace(asked, repair=False, distances=base.distances)
-            rows[f"{name}-trusted"] = yield from _run(
-                f"{name}-trusted", source, output / f"{name}-trusted", told, overwrite
-            )
-    order = [n for v in settings.variants for n in (v, f"{v}-trusted") if n in rows]
-    record = _record({n: rows[n] for n in order}, [p.name for p in photos], says, folder)
+    state, goes_on = taken_up(output, key, overwrite=overwrite)
+    rows = _Rows(given, output, overwrite=overwrite or goes_on)  # runs below are its own
+    base, says = _judged_by(given, output, settings, state)
+    state.write(output)
+    for name in _in_turn(settings.variants, base.input.distances is None):
+        yield from rows.run(name, settings.asked(base, name))
+        if name == "bundle" and base.input.distances is None and rows.made(name):
+            base, says = _by_bundle(given, output, base)
+            if base.input.distances is not None:  # bundle is judged by them too, in a second run
+                state.judged_by, state.times = says, rows.times(name)
+                state.write(output)
+                yield from rows.run(name, settings.asked(base, name), again=True)
+        if name == "bundle" and rows.made(name):
+            rows.by_name[name]["metrics"] |= state.times
+        if name in TRUSTED and settings.mosaic.input.repair and rows.contradicted(name):
+            asked = settings.asked(base, name)
+            trusting = asked.changed(repair=False, detector=None, matcher=None, estimator=None)
+            yield from rows.run(f"{name}-trusted", trusting)
+    order = [n for v in settings.variants for n in (v, f"{v}-trusted") if n in rows.by_name]
+    names = [p.name for p in given.survey.photos]
+    record = _record({n: rows.by_name[n] for n in order}, names, says, folder)
     write_text(output / "compare.json", json.dumps(record, indent=1, allow_nan=False))
     write_page(output / "report.html", comparison_page(record, _previews(output, order)))
+    state.done = True
+    state.write(output)
     yield Result(output=output, metrics=record)
 
 
-def _checked(output: Path, overwrite: bool) -> None:
-    taken = output.is_dir() and any(p.name in FILES for p in output.iterdir())
-    if output.exists() and not output.is_dir():
-        raise OutputError(f"{output} is a file; the output is a folder")
-    if taken and not overwrite:
-        raise OutputError(
-            f"{output} already holds a comparison; add --overwrite to replace it, or choose another"
-            " folder"
-        )
+class _Rows:
+    """One run per column."""
+
+    def __init__(self, given: SurveyInput, output: Path, *, overwrite: bool) -> None:
+        self.given, self.output, self.overwrite = given, output, overwrite
+        self.by_name: dict[str, dict[str, Any]] = {}
+
+    def run(
+        self, name: str, settings: MosaicSettings, *, again: bool = False
+    ) -> Generator[Event, None, None]:
+        """Runs a method; its stages carry its name."""
+        told: list[str] = []
+        given, overwrite = self.given, self.overwrite or again
+        if settings.input.distances is not None:
+            known = read_input(given.source, settings.input).distances
+            given = replace(given, distances=known)
+        steps = make_map(given, self.output / name, settings, overwrite=overwrite)
+        try:
+            while True:
+                event = next(steps)
+                if isinstance(event, Note):
+                    told.append(event.text)
+                elif isinstance(event, StageStarted | StageProgress | StageFinished):
+                    yield replace(event, stage=f"{name}: {event.stage}")
+        except StopIteration as stop:
+            metrics = dict(stop.value.result.metrics)
+            self.by_name[name] = {"metrics": metrics, "notes": told}
+        except AlignmentError as error:
+            yield Note(text=f"{name}: {error}", warning=True)
+            self.by_name[name] = {"refused": str(error), "notes": told}
+
+    def made(self, name: str) -> bool:
+        """Whether a method placed the photos."""
+        return "metrics" in self.by_name[name]
+
+    def times(self, name: str) -> dict[str, Any]:
+        """Times of a run."""
+        return {k: self.by_name[name]["metrics"][k] for k in ("seconds", "cpu_seconds")}
+
+    def contradicted(self, name: str) -> bool:
+        """Whether a run found metadata that contradict the pixels."""
+        return bool(self.by_name[name].get("metrics", {}).get("metadata_conflicts"))
+
+
+def _first(given: SurveyInput, count: int | None) -> SurveyInput:
+    """Only so many photos, the first in order of capture."""
+    if count is None:
+        return given
+    photos = given.survey.photos[:count]
+    source = [p.path for p in photos]
+    return replace(given, source=source, survey=replace(given.survey, photos=photos))
+
+
+def _content(path: Path | None) -> bytes:
+    return path.read_bytes() if path is not None and path.is_file() else b""
 
 
 def _in_turn(variants: Sequence[str], needs_bundle: bool) -> list[str]:
@@ -135,46 +194,24 @@ def _in_turn(variants: Sequence[str], needs_bundle: bool) -> list[str]:
     return list(variants)
 
 
-def _run(
-    name: str,
-    source: Path | Sequence[Path],
-    output: Path,
-    settings: MosaicSettings,
-    overwrite: bool,
-) -> Generator[Event, None, dict[str, Any]]:
-    """One method: its stages are told under its name."""
-    told: list[str] = []
-    try:
-        for happened in iter_mosaic(source, output, settings, overwrite=overwrite):
-            if isinstance(happened, Result):
-                return {"metrics": dict(happened.metrics), "notes": told}
-            if isinstance(happened, Note):
-                told.append(happened.text)
-            elif isinstance(happened, StageStarted | StageProgress | StageFinished):
-                yield replace(happened, stage=f"{name}: {happened.stage}")
-    except AlignmentError as error:
-        yield Note(text=f"{name}: {error}", warning=True)
-        return {"refused": str(error), "notes": told}
-    raise RuntimeError("the story ended without a result")
-
-
 def _judged_by(
-    photos: Sequence[Photo], output: Path, settings: CompareSettings
+    given: SurveyInput, output: Path, settings: CompareSettings, state: CompareState
 ) -> tuple[MosaicSettings, str]:
     """Settings with the distances to judge by, and where those come from."""
-    base = settings.mosaic
-    if base.distances is not None:
-        return base, f"known distances of {base.distances.name}"
+    base, found = settings.mosaic, output / "distances.csv"
+    if state.judged_by and found.is_file():
+        return base.changed(distances=found), state.judged_by
+    if base.input.distances is not None:
+        return base, f"known distances of {base.input.distances.name}"
     if settings.known is None:
         return base, "no distances are known"
-    control, _ = read_gcp_list(settings.known, [p.name for p in photos])
+    control, _ = read_gcp_list(settings.known, [p.name for p in given.survey.photos])
     seen = [c for c in control if c.observations][:MOST_POINTS]
     if len(seen) < 2:
         return base, f"fewer than two points of {settings.known.name} are seen"
-    path = _write_distances(output / "distances.csv", _between(seen))
-    return replace(
-        base, distances=path
-    ), f"distances between {len(seen)} points of {settings.known.name}"
+    path = _write_distances(found, _between(seen))
+    says = f"distances between {len(seen)} points of {settings.known.name}"
+    return base.changed(distances=path), says
 
 
 Row = tuple[str, str, float, Any, Any]
@@ -218,15 +255,19 @@ def _write_distances(path: Path, rows: Sequence[Row]) -> Path:
 
 
 def _by_bundle(
-    photos: Sequence[Photo], output: Path, base: MosaicSettings
+    given: SurveyInput, output: Path, base: MosaicSettings
 ) -> tuple[MosaicSettings, str]:
     """Distances between tie points of the bundle run: measured in its model, not on the ground."""
     alignment = alignment_of(output / "bundle")
-    points = tie_targets(alignment, [p.name for p in photos]) if alignment is not None else []
+    points = (
+        tie_targets(alignment, [p.name for p in given.survey.photos])
+        if alignment is not None
+        else []
+    )
     if len(points) < 2:
         return base, "no distances are known"
     path = _write_distances(output / "distances.csv", _between(points))
-    return replace(base, distances=path), (
+    return base.changed(distances=path), (
         f"distances between {len(points)} tie points as the bundle adjustment has them:"
         " measured in a model, not on the ground"
     )

@@ -116,3 +116,8 @@ class Ncc:
         angles = np.linspace(-self.turn, self.turn, 2 * turns + 1)
         scales = self.zoom ** np.linspace(-1, 1, 2 * zooms + 1) if zooms else np.ones(1)
         return [(float(angle), float(scale)) for scale in scales for angle in angles]
+
+
+def by_ncc(model: str) -> Ncc:
+    """Cross-correlation for photos of any heading: a `translation`, or a `similarity`."""
+    return Ncc() if model == "translation" else Ncc(turn=180.0)

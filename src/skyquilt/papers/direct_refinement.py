@@ -13,6 +13,7 @@ from skyquilt.geometry.transforms import transfer
 from skyquilt.imaging.grey import to_grey8
 from skyquilt.model.estimate import NoEstimate, Registration
 from skyquilt.papers.climb import at_level, climb, levels, motion, reduced
+from skyquilt.papers.direct import Direct, by_ncc
 from skyquilt.papers.phase import phase_shift, rotation_and_scale
 from skyquilt.papers.picture_similarity import mutual_information, ncc, warped
 
@@ -171,3 +172,37 @@ class MutualInformation:
             return NoEstimate(reason=f"weak peak ({score:.3f} of {self.minimum:g})")
         model = "similarity" if self.similarity else "translation"
         return Registration(model=model, b_H_a=H, score=score, overlap=share, method="MI")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Started:
+    """A refinement that begins where another registration ended."""
+
+    start: Direct
+    """Finds the rough place."""
+    refine: Direct
+    """Finds the exact one."""
+    version: ClassVar[int] = 1
+
+    def __call__(
+        self, a: NDArray[Any], b: NDArray[Any], start: Doubles | None = None
+    ) -> Registration | NoEstimate:
+        """b_H_a of two pictures (H, W[, C]), or why there is none."""
+        rough = self.start(a, b, start)
+        return rough if isinstance(rough, NoEstimate) else self.refine(a, b, rough.b_H_a)
+
+
+def by_phase(model: str) -> PhaseCorrelation:
+    """Phase correlation: a `translation`, or a `similarity`."""
+    return PhaseCorrelation(similarity=model == "similarity")
+
+
+def by_ecc(model: Literal["translation", "affine", "homography"]) -> Started:
+    """ECC from the place that cross-correlation finds."""
+    return Started(start=by_ncc("similarity"), refine=Ecc(model=model))
+
+
+def by_mutual_information(model: str) -> Started:
+    """Mutual information from the place that cross-correlation finds."""
+    similarity = model == "similarity"
+    return Started(start=by_ncc(model), refine=MutualInformation(similarity=similarity))

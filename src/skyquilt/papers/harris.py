@@ -1,6 +1,6 @@
 """Corners (Harris and Stephens 1988), described as upright or turned SURF at one fixed scale."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import cv2
@@ -42,6 +42,10 @@ class Harris:
     def __call__(self, image: NDArray[Any]) -> Features:
         """Features of pixels (H, W[, C]) of a full sensor image."""
         return self.of_shrunken(shrink(image, self.longest)[0], image.shape[:2])
+
+    def counted(self, count: int) -> "Harris":
+        """The same with another number of keypoints at most."""
+        return replace(self, count=count)
 
     def of_shrunken(self, small: NDArray[Any], full: tuple[int, int]) -> Features:
         """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer

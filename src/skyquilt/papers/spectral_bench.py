@@ -5,13 +5,11 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from skyquilt import __version__
-from skyquilt.coregistration.methods import REGISTRATIONS
+from skyquilt import registry
 from skyquilt.coregistration.pictures import guess_of, open_picture
 from skyquilt.coregistration.workflow import outcome_of
 from skyquilt.engine.clock import Clock, cpu_seconds
 from skyquilt.engine.folder import claim
-from skyquilt.errors import UsageError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.model.registration import RefusedRegistration, Registration
@@ -19,6 +17,8 @@ from skyquilt.papers.bench_page import bench_page
 from skyquilt.papers.overlap_error import overlap_error
 from skyquilt.papers.pair_list import Pair, read_pairs
 from skyquilt.raster.atomic import write_text
+from skyquilt.settings import one_of
+from skyquilt.version import __version__
 
 CONTRACT = ("bench.json", "report.html")
 """Files of a finished run."""
@@ -42,8 +42,8 @@ def iter_spectral_bench(
         OutputError: the output cannot be written.
     """
     output = Path(output)
-    if unknown := [m for m in methods if m not in REGISTRATIONS]:
-        raise UsageError(f"--method {unknown[0]!r} is not one of {', '.join(REGISTRATIONS)}")
+    for name in methods:
+        one_of("--method", name, registry.names("registration"))
     listed = read_pairs(Path(pairs))
     claim(output, CONTRACT, overwrite=overwrite)
     began, total = Clock.now(), len(listed) * len(methods)

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from skyquilt import __version__
 from skyquilt.errors import OutputError, UsageError
 from skyquilt.model.event import Event, Result, StageFinished, StageProgress, StageStarted
 from skyquilt.papers.strip_chain import VARIANTS, calibrated, chained
 from skyquilt.papers.strip_page import strip_page
 from skyquilt.raster.atomic import write_text
 from skyquilt.simulate import StripSettings, fly_strip
+from skyquilt.version import __version__
 
 FILES = ("strip.json", "report.html")
 

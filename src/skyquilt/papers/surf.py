@@ -1,6 +1,6 @@
 """SURF and upright SURF of our own (Bay, Ess, Tuytelaars and Van Gool 2008)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -55,6 +55,10 @@ class Surf:
         """Features of pixels (H, W[, C]) of a full sensor image."""
         return self.of_shrunken(shrink(image, self.longest)[0], image.shape[:2])
 
+    def counted(self, count: int) -> "Surf":
+        """The same with another number of keypoints at most."""
+        return replace(self, count=count)
+
     def of_shrunken(self, small: NDArray[Any], full: tuple[int, int]) -> Features:
         """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer
         to.
@@ -75,6 +79,11 @@ class Surf:
             scale=scale,
             descriptors=signed_bytes(vectors),
         )
+
+
+def upright_surf(**fields: Any) -> Surf:
+    """SURF without orientation."""
+    return Surf(upright=True, **fields)
 
 
 def signed_bytes(vectors: NDArray[np.float32]) -> NDArray[np.int8]:

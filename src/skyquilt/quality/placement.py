@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from skyquilt.engine.clock import Steps
 from skyquilt.imaging.plane import view_patch
 from skyquilt.imaging.views import View, on_ground
-from skyquilt.model.photo import KnownDistance, PointObservation
+from skyquilt.model.photo import KnownDistance, Photo, PointObservation
 from skyquilt.model.poses import Alignment, Prior
-from skyquilt.ortho.orthomosaic import Ground
+from skyquilt.ortho.ground import GreyPicture, Ground
 from skyquilt.quality.geolocation import geolocation_errors
 from skyquilt.quality.replay import (
     Replay,
@@ -23,18 +23,17 @@ from skyquilt.quality.replay import (
     lambda_spat_of_table,
     replay,
 )
-from skyquilt.workflows.photo_features import Intake, Pictures
 
 ACROSS = 400
 """Width in px of the photos that are compared: the thesis's scale."""
 
 
 def placement_quality(
-    taken: Intake,
+    photos: Sequence[Photo],
     alignment: Alignment,
     priors: Sequence[Prior],
     ground: Ground,
-    pictures: Pictures,
+    grey: GreyPicture,
     known: Sequence[KnownDistance],
     alpha: float,
     order: Sequence[int],
@@ -47,14 +46,14 @@ def placement_quality(
     order = tuple(i for i in order if i in views)
     wide = max(view.camera.width for view in ground.views)
     gsd = ground.native_gsd * wide / ACROSS
-    seen = replay(view_patch(pictures(i, ACROSS), views[i], ground.surface, gsd) for i in order)
+    seen = replay(view_patch(grey(i, ACROSS), views[i], ground.surface, gsd) for i in order)
     off = np.array([np.hypot(*(alignment.poses[i].map_C - priors[i].map_C)[:2]) for i in order])
-    figures = _figures(seen, taken, views, ground, known, alpha) | _geolocation(
+    figures = _figures(seen, photos, views, ground, known, alpha) | _geolocation(
         alignment, priors, order
     )
     off = off / (ground.native_gsd * wide)
     figures |= _joins(alignment) | {
-        "photos": [taken.photos[i].name for i in order],
+        "photos": [photos[i].name for i in order],
         "correlation_with_last_of_photo": [_short(c) for c in seen.with_last],
         "correlation_with_map_of_photo": [_short(c) for c in seen.with_overview],
         "off_position_over_width": [_short(o) for o in off],
@@ -65,7 +64,7 @@ def placement_quality(
 
 def _figures(
     seen: Replay,
-    taken: Intake,
+    photos: Sequence[Photo],
     views: dict[int, View],
     ground: Ground,
     known: Sequence[KnownDistance],
@@ -81,7 +80,7 @@ def _figures(
         "correlation_with_last": _mean(seen.with_last),
     }
     rows, actual, found = [], [], []
-    index = {p.name: i for i, p in enumerate(taken.photos)}
+    index = {p.name: i for i, p in enumerate(photos)}
     for distance in known:
         ends = [
             _place(o, index, views, ground)

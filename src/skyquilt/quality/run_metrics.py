@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from skyquilt.model.camera import PARAMETERS
 from skyquilt.model.event import MetadataConflict
+from skyquilt.model.features import Link, RejectedLink
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import Alignment, Prior
-from skyquilt.ortho.orthomosaic import Drawn, Ground
+from skyquilt.ortho.companions import Drawn
+from skyquilt.ortho.ground import Ground
 from skyquilt.quality.geolocation import gps_residuals
-from skyquilt.workflows.links import Links
 
 
 def _round(value: float | None, digits: int = 4) -> float | None:
@@ -109,7 +110,8 @@ def figures(
     total: int,
     rejected: Sequence[RejectedPhoto],
     priors: Sequence[Prior],
-    links: Links,
+    links: Sequence[Link],
+    refused: Sequence[RejectedLink],
     alignment: Alignment,
     ground: Ground,
     drawn: Drawn,
@@ -136,8 +138,8 @@ def figures(
         **_holes(seen, cell),
         "views_per_cell_mean": _round(float(drawn.views[seen].mean()) if seen.any() else None, 2),
         **alignment_figures(alignment, priors),
-        "links": len(links.links),
-        "pairs_rejected": _reasons([r.reason for r in links.rejected]),
+        "links": len(links),
+        "pairs_rejected": _reasons([r.reason for r in refused]),
         "seam_disparity_px": seams,
         "metadata_conflicts": [asdict(c) for c in conflicts],
         "cameras": camera_figures(photos, alignment),

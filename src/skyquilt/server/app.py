@@ -10,7 +10,6 @@ from fastapi.staticfiles import StaticFiles
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from skyquilt import __version__
 from skyquilt.server.context import Context, Writer
 from skyquilt.server.event_endpoints import EventEndpoints
 from skyquilt.server.guard import HEADERS, Guard
@@ -21,6 +20,7 @@ from skyquilt.server.photo_endpoints import PhotoEndpoints
 from skyquilt.server.survey import Survey
 from skyquilt.server.upload_endpoints import UploadEndpoints
 from skyquilt.server.wms_endpoints import WmsEndpoints
+from skyquilt.version import __version__
 
 
 def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) -> FastAPI:

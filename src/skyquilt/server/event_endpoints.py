@@ -7,9 +7,9 @@ from collections.abc import AsyncIterator
 from fastapi import Request
 from fastapi.responses import StreamingResponse
 
-from skyquilt import __version__
 from skyquilt.server.context import Context
 from skyquilt.server.survey import LiveSurvey
+from skyquilt.version import __version__
 
 WAIT_S = 0.1
 """Between looks for news at most."""

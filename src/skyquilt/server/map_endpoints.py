@@ -10,12 +10,12 @@ from fastapi import HTTPException, Request, Response
 from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
-from skyquilt import __version__
 from skyquilt.raster.map_source import between
 from skyquilt.server.context import Context
 from skyquilt.server.export import write_cog
 from skyquilt.server.images import Images
 from skyquilt.server.survey import LiveSurvey
+from skyquilt.version import __version__
 
 STATIC = Path(__file__).parent / "static"
 DRAWN_AT_ONCE = 2

@@ -14,7 +14,7 @@ from skyquilt.model.raster import Grid
 from skyquilt.model.registration import Matrix, RefusedRegistration, Registration
 from skyquilt.model.surface import HeightField
 from skyquilt.ortho.dense import Dense
-from skyquilt.workflows.scene import Scene
+from skyquilt.workflows.flow import Scene
 
 
 def finer(
@@ -52,9 +52,9 @@ def finer(
 
 
 def _heights(scene: Scene, dense: Dense) -> HeightField | None:
-    held = set(scene.alignment.held)
+    held = set(scene.aligned.alignment.held)
     views = [v for v in scene.ground.views if v.photo in held and v.pose.cam_H_map is None]
-    return dense(scene.ground.surface, views, scene.ground.grid, scene.grey)
+    return dense(scene.ground.surface, views, scene.ground.grid, scene.aligned.grey)
 
 
 def _metres_of_px(grid: Grid) -> Matrix:

@@ -21,7 +21,7 @@ from skyquilt.model.raster import Grid, Window
 from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registration
 from skyquilt.ortho.blend import First
 from skyquilt.ortho.compose import Composer
-from skyquilt.workflows.scene import Scene
+from skyquilt.workflows.flow import Scene
 
 MOST_PAIRS = 24
 """Pairs that are registered, spread over the map: each costs a third of a second of CPU."""
@@ -64,7 +64,7 @@ def by_pairs(visual: Scene, thermal: Scene) -> Registration | RefusedRegistratio
 
 def overlapping(visual: Scene, thermal: Scene) -> list[tuple[View, View]]:
     """For thermal photos spread over the map, the visual photo that shows most of each."""
-    views = [v for v in thermal.ground.views if v.photo in thermal.alignment.held]
+    views = [v for v in thermal.ground.views if v.photo in thermal.aligned.alignment.held]
     spread = sorted(
         {int(k) for k in np.linspace(0, len(views) - 1, MOST_PAIRS)} if views else set()
     )
@@ -79,7 +79,8 @@ def overlapping(visual: Scene, thermal: Scene) -> list[tuple[View, View]]:
 
 def _shift(visual: Scene, thermal: Scene) -> NDArray[np.float64]:
     """(2,) m from the thermal block's frame to the visual one's."""
-    return np.subtract(thermal.alignment.frame.origin, visual.alignment.frame.origin)
+    ours, theirs = visual.aligned.alignment.frame, thermal.aligned.alignment.frame
+    return np.asarray(np.subtract(theirs.origin, ours.origin))
 
 
 def _share(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
@@ -126,13 +127,13 @@ def _registered(visual: Scene, thermal: Scene, a: View, b: View) -> tuple[PairPo
 
 def _flat(scene: Scene, view: View, grid: Grid) -> Picture:
     """One photo on a grid, by its pose and its block's surface."""
-    photo = scene.taken.photos[view.photo]
+    photo = scene.aligned.photos[view.photo]
     compose = Composer(
         grid=grid,
         views=[view],
         surface=scene.ground.surface,
         blend=First(),
-        pixels=scene.pixels,
+        pixels=scene.aligned.pixels,
         bands=photo.channels,
         dtype=np.dtype(photo.dtype),
     )

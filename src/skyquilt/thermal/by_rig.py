@@ -19,16 +19,16 @@ from skyquilt.model.poses import Alignment, Pose, no_ties
 from skyquilt.model.raster import Window
 from skyquilt.model.registration import RefusedRegistration, Registration
 from skyquilt.ortho.blend import Blend
+from skyquilt.ortho.companions import geotransform
 from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
-from skyquilt.ortho.orthomosaic import geotransform
-from skyquilt.ortho.radiometry import balances_drift, drift_of, value_tags
+from skyquilt.ortho.radiometry import DriftMethod, balances_drift, drift_of, value_tags
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.together import taken_together
 from skyquilt.raster import CogWriter, RasterSpec
-from skyquilt.workflows.methods import Methods, MosaicSettings
+from skyquilt.settings import PictureSettings
+from skyquilt.workflows.flow import Scene
 from skyquilt.workflows.photo_features import THUMBNAIL
-from skyquilt.workflows.scene import Scene
 
 MOST_PAIRS = 12
 """Pairs that are registered, spread over the flight: each costs a second or two."""
@@ -52,14 +52,14 @@ class Rigged:
 
 def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistration:
     """Thermal photos on visual poses, or why not."""
-    visual = scene.taken.photos
-    pairs = [(i, j) for i, j in taken_together(visual, thermal) if i in scene.alignment.poses]
+    visual, placed = scene.aligned.photos, scene.aligned.alignment
+    pairs = [(i, j) for i, j in taken_together(visual, thermal) if i in placed.poses]
     if len(pairs) < FindRig.minimum:
         return RefusedRegistration(
             reason=f"{len(pairs)} thermal photos were taken together with a visual one, by time or"
             " name"
         )
-    if any(scene.alignment.poses[i].cam_H_map is not None for i, _ in pairs):
+    if any(placed.poses[i].cam_H_map is not None for i, _ in pairs):
         return RefusedRegistration(
             reason="the visual photos have no poses in space; use --method bundle"
         )
@@ -74,11 +74,11 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
     rig = FindRig(free=_freedom(first))(told, reported_camera(first))
     if isinstance(rig, RefusedRegistration):
         return rig
-    poses = {k: _turned(scene.alignment.poses[i], rig) for k, (i, _) in enumerate(pairs)}
+    poses = {k: _turned(placed.poses[i], rig) for k, (i, _) in enumerate(pairs)}
     alignment = Alignment(
         method="rig",
         why="both cameras flew together",
-        frame=scene.alignment.frame,
+        frame=placed.frame,
         poses=poses,
         cameras={"thermal": rig.camera_b},
         camera_of=dict.fromkeys(poses, "thermal"),
@@ -103,7 +103,7 @@ def _registered(scene: Scene, index: int, thermal: Photo) -> RigPair | None:
     """Correspondences over the overlap of two photos taken together; None where they cannot be
     registered.
     """
-    a, b = open_picture(scene.taken.photos[index].path), open_picture(thermal.path)
+    a, b = open_picture(scene.aligned.photos[index].path), open_picture(thermal.path)
     if isinstance(a, RejectedPhoto) or isinstance(b, RejectedPhoto):
         return None
     outcome = outcome_of(a, b, "auto", guess_of(a, b))
@@ -117,11 +117,12 @@ def _registered(scene: Scene, index: int, thermal: Photo) -> RigPair | None:
     inside = ((px_a > 0) & (px_a < [a.width - 1, a.height - 1])).all(1)
     if inside.sum() < _GRID:
         return None
-    return RigPair(px_a=px_a[inside], px_b=px_b[inside], camera_a=scene.alignment.camera(index))
+    camera = scene.aligned.alignment.camera(index)
+    return RigPair(px_a=px_a[inside], px_b=px_b[inside], camera_a=camera)
 
 
 def drift_of_rigged(
-    found: Rigged, scene: Scene, parts: Methods, settings: MosaicSettings
+    found: Rigged, scene: Scene, drift: DriftMethod, settings: PictureSettings
 ) -> Exposure:
     """What brings the thermal frames to one level, if they are to be."""
     unit, ground = found.photos[0].unit, scene.ground
@@ -129,7 +130,7 @@ def drift_of_rigged(
         return NEUTRAL
     views = make_views(found.alignment, ground.surface)
     frames = {v.photo: shrink(read_color(found.photos[v.photo]), THUMBNAIL)[0] for v in views}
-    return drift_of(views, frames, ground.surface, ground.grid.bounds, unit, parts, settings)
+    return drift_of(views, frames, ground.surface, ground.grid.bounds, unit, drift, settings)
 
 
 def draw_rigged(

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.coregistration.pictures import Source
-from skyquilt.ortho.orthomosaic import coloured
+from skyquilt.ortho.companions import coloured
 from skyquilt.raster.atomic import whole_file, write_text
 from skyquilt.report.page import write_page
 from skyquilt.thermal.page import thermal_section, with_section

@@ -12,7 +12,7 @@ look alike in every spectrum, by day and night, in summer and winter (5.8). Wher
 believed, the thermal map lies where its own positions put it, and says so.
 """
 
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -27,18 +27,19 @@ from skyquilt.coregistration.workflow import residual
 from skyquilt.engine.clock import Clock
 from skyquilt.errors import RefusedError, UsageError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarted
+from skyquilt.model.photo import Survey
 from skyquilt.model.registration import RefusedRegistration, Registration
 from skyquilt.ortho.radiometry import recorded_tags, value_figures
-from skyquilt.photos.survey import read_survey
 from skyquilt.photos.together import taken_together
+from skyquilt.settings import MosaicSettings, PictureSettings
 from skyquilt.thermal.by_heights import finer
 from skyquilt.thermal.by_pairs import by_pairs
 from skyquilt.thermal.by_rig import draw_rigged, drift_of_rigged, rig_figures, rigged
 from skyquilt.thermal.files import write_figures, write_overlays, write_section
 from skyquilt.thermal.routes import ROUTES, Joined, as_registration, join, opened, refuse_apart
-from skyquilt.workflows.methods import MosaicSettings, methods
-from skyquilt.workflows.mosaic import iter_mosaic
-from skyquilt.workflows.scene import Scene, scene_of_run
+from skyquilt.workflows.flow import Scene
+from skyquilt.workflows.mosaic import FinishedMap, make_map
+from skyquilt.workflows.survey_input import read_input
 
 FOLDER = "thermal"
 """Folder of the thermal run, below the visual one's."""
@@ -61,27 +62,27 @@ def iter_thermal(
         SkyquiltError: anything else a user can mend.
     """
     asked, output = settings or MosaicSettings(), Path(output)
-    settings = replace(asked, thermal_unit=None)
-    heated = replace(asked, thermal_unit=asked.thermal_unit or "auto")
+    settings, heated = _settings_of_both(asked)
     if route not in ROUTES:
         raise UsageError(f"--thermal-route {route!r} is not one of {', '.join(ROUTES)}")
     if not Path(thermal).is_dir():
         raise UsageError(f"--thermal {thermal} is no folder; give the folder of the thermal photos")
-    heats = read_survey(Path(thermal), thermal_unit=heated.thermal_unit)
-    refuse_apart(read_survey(Path(photos), geo=settings.geo).photos, heats.photos)
-    if not any(p.band == "thermal" for p in heats.photos):
+    heats = read_input(thermal, heated.input)
+    given = read_input(photos, settings.input)
+    refuse_apart(given.survey.photos, heats.survey.photos)
+    if not any(p.band == "thermal" for p in heats.survey.photos):
         yield Note(
             text=f"no photo in {thermal} is known to be thermal; they are mapped as they are",
             warning=True,
         )
-    visual = yield from _told(
-        iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
+    visual = yield from make_map(
+        given, output, settings, overwrite=overwrite, rerun_from=rerun_from
     )
     refused: tuple[tuple[str, str], ...] = ()
     if route in ("auto", "rig"):
         began = Clock.now()
         yield StageStarted(stage="rig", total=0)
-        result = _by_rig(photos, thermal, visual, heated)
+        result = _by_rig(visual, heats.survey, asked.picture)
         yield _finished("rig", began)
         if isinstance(result, Result):
             yield result
@@ -92,51 +93,65 @@ def iter_thermal(
                 " --thermal-route auto"
             )
         refused = (("rig", result.reason),)
-    own = replace(
-        heated,
-        gcp=None,
-        geo=None,
-        cameras=None,
-        bounds=None,
-        boundary=None,
-        gsd_cm=None,
-        crs=visual.metrics["crs"] or settings.crs,
-        compress="auto",
-    )
     yield Note(
         text="the thermal photos become a map of their own, then it is laid on the visual one"
     )
-    heat = yield from _told(
-        iter_mosaic(thermal, output / FOLDER, own, overwrite=overwrite, rerun_from=rerun_from)
+    crs = visual.result.metrics["crs"] or settings.picture.crs
+    heat = yield from make_map(
+        heats, output / FOLDER, heated.changed(crs=crs), overwrite=overwrite, rerun_from=rerun_from
     )
-    began = Clock.now()
+    yield from _joined(visual, heat, route, refused)
+
+
+def _settings_of_both(asked: MosaicSettings) -> tuple[MosaicSettings, MosaicSettings]:
+    """Settings of the visual and of the thermal map: side files and areas are the visual map's."""
+    named = asked.input.sequence in ("time", "name")
+    heated = asked.changed(
+        thermal_unit=asked.input.thermal_unit or "auto",
+        gcp=None,
+        geo=None,
+        cameras=None,
+        distances=None,
+        sequence=asked.input.sequence if named else "time",
+        bounds=None,
+        boundary=None,
+        gsd_cm=None,
+        compress="auto",
+    )
+    return asked.changed(thermal_unit=None), heated
+
+
+def _joined(
+    visual: FinishedMap, heat: FinishedMap, route: str, refused: tuple[tuple[str, str], ...]
+) -> Iterator[Event]:
+    """thermal.tif by registration of the two maps, its report and figures."""
+    output, began = visual.result.output, Clock.now()
     yield StageStarted(stage="join", total=0)
-    a, b = (opened(result.output / "mosaic.tif") for result in (visual, heat))
+    a, b = (opened(made.result.output / "mosaic.tif") for made in (visual, heat))
 
     @cache
     def scenes() -> tuple[Scene, Scene]:
-        return scene_of_run(photos, visual, settings), scene_of_run(thermal, heat, own)
+        return visual.scene(), heat.scene()
 
     joined = join(
         a,
         b,
-        (visual.output / "surface.tif", heat.output / "surface.tif"),
+        (output / "surface.tif", heat.result.output / "surface.tif"),
         route,
         pairs=lambda: by_pairs(*scenes()),
         finer=lambda outcome: finer(*scenes(), outcome),
     )
     joined = replace(joined, refused=(*refused, *joined.refused))
-    resample_onto(
-        output / "thermal.tif", a, b, joined.thermal_H_visual, recorded_tags(heat.metrics)
-    )
-    figures = {"thermal": _figures(joined, heat, b)}
-    _leave(output, overlays(a, b, as_registration(joined)), visual.metrics, figures)
+    tags = recorded_tags(heat.result.metrics)
+    resample_onto(output / "thermal.tif", a, b, joined.thermal_H_visual, tags)
+    figures = {"thermal": _figures(joined, heat.result, b)}
+    _leave(output, overlays(a, b, as_registration(joined)), visual.result.metrics, figures)
     yield _finished("join", began)
     yield from (
         Note(text=f"registration by {name} was refused: {why}", warning=True)
         for name, why in joined.refused
     )
-    yield Result(output=output, metrics={**visual.metrics, **figures})
+    yield Result(output=output, metrics={**visual.result.metrics, **figures})
 
 
 def _finished(stage: str, began: tuple[float, float]) -> StageFinished:
@@ -150,29 +165,27 @@ def _finished(stage: str, began: tuple[float, float]) -> StageFinished:
 
 
 def _by_rig(
-    photos: Path | str, thermal: Path | str, visual: Result, settings: MosaicSettings
+    visual: FinishedMap, thermal: Survey, picture: PictureSettings
 ) -> Result | RefusedRegistration:
     """thermal.tif from the visual poses, where one drone took both, or why not."""
-    survey = read_survey(Path(thermal), thermal_unit=settings.thermal_unit)
-    if not taken_together(read_survey(Path(photos), geo=settings.geo).photos, survey.photos):
+    if not taken_together(visual.given.survey.photos, thermal.photos):
         return RefusedRegistration(
             reason="no thermal photo was taken together with a visual one, by time or name"
         )
-    scene = scene_of_run(photos, visual, replace(settings, thermal_unit=None))
-    found = rigged(scene, survey.photos)
+    scene = visual.scene()
+    found = rigged(scene, thermal.photos)
     if isinstance(found, RefusedRegistration):
         return found
-    output = visual.output
-    parts = methods(settings)
-    exposure = drift_of_rigged(found, scene, parts, settings)
-    draw_rigged(output / "thermal.tif", found, scene, parts.blend, exposure)
+    output, metrics = visual.result.output, visual.result.metrics
+    exposure = drift_of_rigged(found, scene, visual.methods.drift, picture)
+    draw_rigged(output / "thermal.tif", found, scene, visual.methods.blend, exposure)
     none = np.zeros((0, 2))
     same = Registration(model="identity", b_H_a=np.eye(3), px_a=none, px_b=none)
-    figures = {"thermal": rig_figures(found, len(survey.photos) + len(survey.rejected))}
-    figures["thermal"] |= value_figures(found.photos, exposure, settings)
+    figures = {"thermal": rig_figures(found, len(thermal.photos) + len(thermal.rejected))}
+    figures["thermal"] |= value_figures(found.photos, exposure, picture)
     pictures = overlays(opened(output / "mosaic.tif"), opened(output / "thermal.tif"), same)
-    _leave(output, pictures, visual.metrics, figures)
-    return Result(output=output, metrics={**visual.metrics, **figures})
+    _leave(output, pictures, metrics, figures)
+    return Result(output=output, metrics={**metrics, **figures})
 
 
 def _leave(
@@ -187,24 +200,10 @@ def _leave(
     write_figures(output, visual, figures)
 
 
-def _told(events: Iterator[Event]) -> Generator[Event, None, Result]:
-    """All events but the last; returns the result."""
-    found: Result | None = None
-    for happened in events:
-        if isinstance(happened, Result):
-            found = happened
-        else:
-            yield happened
-    if found is None:
-        raise RuntimeError("the story ended without a result")
-    return found
-
-
 def _figures(joined: Joined, heat: Result, b: Source) -> dict[str, Any]:
     m, outcome = heat.metrics, joined.outcome
-    exact = (
-        outcome is not None and "cells" in outcome.evidence
-    )  # by heights everywhere, not by those places
+    # a registration by heights rests on all cells, not on its corresponding points
+    exact = outcome is not None and "cells" in outcome.evidence
     error = residual(outcome) if outcome and len(outcome.px_a) and not exact else None
     return {
         "route": joined.route,

@@ -4,15 +4,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.executor import in_order
 from skyquilt.engine.store import Store, digest
 from skyquilt.matching.candidates import Pair, sequence
-from skyquilt.model.features import Link, RejectedLink
-from skyquilt.model.poses import Prior
+from skyquilt.matching.matchers import Guided
+from skyquilt.model.features import Features, Link, RejectedLink
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import MapFrame, Prior
+from skyquilt.workflows.expected_places import ExpectedPlaces
 from skyquilt.workflows.methods import Methods
-from skyquilt.workflows.photo_features import Intake
+from skyquilt.workflows.photo_features import FeaturedPhotos
 
 BATCH = 64
 """Pairs per stored artefact: what a kill can cost."""
@@ -22,44 +26,103 @@ BATCH = 64
 class Links:
     """Verified links and refused pairs."""
 
-    links: tuple[Link, ...]
+    links: tuple[Link, ...] = ()
     """Pairs that show the same ground."""
-    rejected: tuple[RejectedLink, ...]
+    rejected: tuple[RejectedLink, ...] = ()
     """Pairs that do not, with reasons."""
 
 
-def link_up(
-    intake: Intake, priors: Sequence[Prior], methods: Methods, store: Store, jobs: int
+def link_pair(
+    a: int,
+    b: int,
+    features: tuple[Features, Features],
+    photo: Photo,
+    methods: Methods,
+    expected: NDArray[np.float64] | None = None,
+) -> Link | RejectedLink:
+    """The link of photos a and b (numbers), or why there is none. `photo` is a.
+
+    `expected` (len(features of a), 2): where the keypoints of a lie in b by the metadata, in px,
+    NaN where they do not tell; only a guided matcher needs it.
+    """
+    if isinstance(methods.matcher, Guided):
+        assert expected is not None, "a guided matcher is told where to look"
+        matches = methods.matcher.for_width(photo.width)(*features, expected)
+    else:
+        matches = methods.matcher(*features)
+    return methods.verify(a, b, *features, matches, photo.width)
+
+
+class _Linker:
+    """Verifies pairs of one survey; artefacts are keyed by the photos and the methods."""
+
+    def __init__(
+        self,
+        found: FeaturedPhotos,
+        frame: MapFrame,
+        priors: Sequence[Prior],
+        methods: Methods,
+        store: Store,
+        jobs: int,
+    ) -> None:
+        self.found, self.methods, self.store, self.jobs = found, methods, store, jobs
+        self.features = found.features
+        self.expected: ExpectedPlaces | None = None
+        if isinstance(methods.matcher, Guided):
+            height = methods.matcher.height_m
+            self.expected = ExpectedPlaces(found.photos, frame, priors, height)
+
+    def one(self, pair: Pair) -> Link | RejectedLink:
+        a, b = pair
+        two = self.features[a], self.features[b]
+        places = None if self.expected is None else self.expected(a, b, two[0].px)
+        return link_pair(a, b, two, self.found.photos[a], self.methods, places)
+
+    def batch(self, pairs: Sequence[Pair]) -> list[Link | RejectedLink]:
+        """Links of a batch; the indices stored are those of this run."""
+        photos, methods = self.found.photos, self.methods
+        names = [(i, j, photos[i].digest, photos[j].digest) for i, j in pairs]
+        by = None if self.expected is None else self.expected.key
+        key = digest(names, methods.detector, methods.matcher, methods.verify, by)
+        return self.store.get_or(
+            "links", key, lambda: list(in_order(self.one, pairs, jobs=self.jobs))
+        )
+
+
+def link_photos(
+    found: FeaturedPhotos,
+    frame: MapFrame,
+    priors: Sequence[Prior],
+    methods: Methods,
+    store: Store,
+    jobs: int,
 ) -> Steps[Links]:
-    """Neighbours first; what they overlap tells how far the other candidates may lie apart."""
-    n = len(intake.photos)
+    """Links neighbours first; their overlap says how far apart other candidates may be."""
+    n = len(found.photos)
+    linker = _Linker(found, frame, priors, methods, store, jobs)
     xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
     lost = [i for i in range(n) if not np.isfinite(xy[i]).all()]
-    close = methods.nearest(xy)
-    first = list(dict.fromkeys([*sequence(n), *_closest(close, n, 2)]))
-    found: list[Link | RejectedLink] = []
+    first = list(dict.fromkeys([*sequence(n), *_closest(methods.nearest(xy), n, 2)]))
+    tried: list[Link | RejectedLink] = []
     for batch in _batches(first):
-        found += _verified(batch, intake, methods, store, jobs)
-        yield len(found), 2 * len(first)
-    reach = overlap_reach_m([k for k in found if isinstance(k, Link)], intake, xy)
+        tried += linker.batch(batch)
+        yield len(tried), 2 * len(first)
+    reach = overlap_reach_m([k for k in tried if isinstance(k, Link)], found, xy)
     rest = [p for p in methods.nearest(xy, reach) if p not in set(first)] if n > 2 else []
     if lost and n > 2:
-        asked = None if len(lost) == n else lost
-        rest += methods.retrieval(intake.features, asked)
+        rest += methods.retrieval(found.features, None if len(lost) == n else lost)
     rest = [p for p in dict.fromkeys(rest) if p not in set(first)]
     for batch in _batches(rest):
-        found += _verified(batch, intake, methods, store, jobs)
-        yield len(found), len(first) + len(rest)
+        tried += linker.batch(batch)
+        yield len(tried), len(first) + len(rest)
     return Links(
-        links=tuple(k for k in found if isinstance(k, Link)),
-        rejected=tuple(k for k in found if isinstance(k, RejectedLink)),
+        links=tuple(k for k in tried if isinstance(k, Link)),
+        rejected=tuple(k for k in tried if isinstance(k, RejectedLink)),
     )
 
 
 def _closest(pairs: Sequence[Pair], count: int, each: int) -> list[Pair]:
-    """Of pairs sorted by distance, those that are among the `each` closest of one of their
-    photos.
-    """
+    """Of pairs sorted by distance, those among the `each` closest of one of their photos."""
     degree = np.zeros(count, int)
     kept = []
     for i, j in pairs:
@@ -69,18 +132,20 @@ def _closest(pairs: Sequence[Pair], count: int, each: int) -> list[Pair]:
     return kept
 
 
-def overlap_reach_m(links: Sequence[Link], intake: Intake, xy: np.ndarray) -> float | None:
+def overlap_reach_m(
+    links: Sequence[Link], found: FeaturedPhotos, xy: NDArray[np.float64]
+) -> float | None:
     """Distance in m of positions beyond which photos hardly overlap, learnt from links; None if too
-    few tell.
+    few determine it.
 
-    A link gives the shift of the picture in px and the positions give it in m. Nothing here trusts
-    altitudes.
+    A link gives the shift of the picture in px and the positions give it in m. Altitudes are not
+    used.
     """
-    metres_per_px = []
+    metres_per_px, features = [], found.features
     for link in links:
-        pa = intake.features[link.a].px[link.index_a].mean(0)
-        pb = intake.features[link.b].px[link.index_b].mean(0)
-        size = np.array([intake.photos[link.a].width, intake.photos[link.a].height])
+        pa = features[link.a].px[link.index_a].mean(0)
+        pb = features[link.b].px[link.index_b].mean(0)
+        size = np.array([found.photos[link.a].width, found.photos[link.a].height])
         a, b = pa - size / 2, pb - size / 2
         moved = abs(link.b_S_a * complex(a[0], -a[1]) - complex(b[0], -b[1]))
         apart = float(np.hypot(*(xy[link.a] - xy[link.b])))
@@ -88,27 +153,9 @@ def overlap_reach_m(links: Sequence[Link], intake: Intake, xy: np.ndarray) -> fl
             metres_per_px.append(apart / moved)
     if len(metres_per_px) < 5:
         return None
-    photo = intake.photos[0]
+    photo = found.photos[0]
     return float(np.median(metres_per_px)) * 0.75 * max(photo.width, photo.height)
 
 
 def _batches(pairs: Sequence[Pair]) -> list[Sequence[Pair]]:
     return [pairs[k : k + BATCH] for k in range(0, len(pairs), BATCH)]
-
-
-def _verified(
-    pairs: Sequence[Pair], intake: Intake, methods: Methods, store: Store, jobs: int
-) -> list[Link | RejectedLink]:
-    """Links of a batch, stored under the photos' digests and the methods; indices are those of this
-    run.
-    """
-    photos, features = intake.photos, intake.features
-
-    def one(pair: Pair) -> Link | RejectedLink:
-        a, b = pair
-        matches = methods.mutual(features[a], features[b])
-        return methods.verify(a, b, features[a], features[b], matches, photos[a].width)
-
-    names = [(i, j, photos[i].digest, photos[j].digest) for i, j in pairs]
-    key = digest(names, methods.sift, methods.mutual, methods.verify)
-    return store.get_or("links", key, lambda: list(in_order(one, pairs, jobs=jobs)))

@@ -1,7 +1,10 @@
-"""Photos in: what they say, their features, and a thumbnail each, each photo decoded once."""
+"""One look at each photo: features, a thumbnail and a grey picture, all from one decoding.
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+Batch and live use `photo_features` alike, so that both find the same artefacts in a store.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -16,11 +19,10 @@ from skyquilt.errors import NoPhotosError, UnreadablePhotoError
 from skyquilt.imaging.grey import halved, shrink, to_grey8
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo, RejectedPhoto
-from skyquilt.workflows.methods import Methods
+from skyquilt.workflows.methods import Detector
 
 PICTURE = 1000
-"""Longest side in px of the grey pictures kept for sharpening observations and the search of
-heights.
+"""Longest side in px of the grey pictures kept for matching observations and the search of heights.
 """
 KEPT_BYTES = 150_000_000
 """Grey pictures held in memory at a time; the others wait in the store."""
@@ -41,24 +43,28 @@ class PhotoFeatures:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Intake:
-    """Photos that could be read, and what was seen in them."""
+class FeaturedPhotos:
+    """Photos that could be read, with their features."""
 
     photos: tuple[Photo, ...]
     """In order of capture."""
-    looked: tuple[PhotoFeatures, ...]
+    looks: tuple[PhotoFeatures, ...]
     """One per photo."""
     rejected: tuple[RejectedPhoto, ...]
-    """Photos whose pixels could not be read."""
+    """Photos that cannot be used, with reasons."""
 
     @property
     def features(self) -> list[Features]:
         """Features per photo."""
-        return [k.features for k in self.looked]
+        return [look.features for look in self.looks]
+
+    def thumbnails(self, photos: Sequence[int]) -> Mapping[int, NDArray[Any]]:
+        """Thumbnails of these photos, by index."""
+        return {i: self.looks[i].thumbnail for i in photos}
 
 
-class Pictures:
-    """Grey pictures of the photos, from the store, the last ones used at hand."""
+class GreyPictures:
+    """Grey pictures of photos, from the store; those used last stay in memory."""
 
     def __init__(self, photos: Sequence[Photo], pixels: PhotoPixels, store: Store) -> None:
         self._photos, self._pixels, self._store = photos, pixels, store
@@ -84,6 +90,11 @@ class Pictures:
         )
 
 
+def features_key(photo: Photo, detector: Detector) -> str:
+    """The key of a photo's features in the store."""
+    return digest(photo.digest, detector, THUMBNAIL)
+
+
 def picture_key(photo: Photo) -> str:
     """The key of a photo's grey picture in the store."""
     return digest(photo.digest, PICTURE)
@@ -98,8 +109,8 @@ def picture_of(pixels: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def thumbnail_of(pixels: NDArray[Any]) -> NDArray[Any]:
-    """The thumbnail of a photo's pixels, less a last odd row or column, which would cost more than
-    all others.
+    """The thumbnail of a photo's pixels. An odd last row or column is left out: it would make
+    averaging many times slower.
     """
     height, width = pixels.shape[:2]
     return np.ascontiguousarray(
@@ -107,38 +118,38 @@ def thumbnail_of(pixels: NDArray[Any]) -> NDArray[Any]:
     )
 
 
-def look(
-    photo: Photo, index: int, cache: PhotoPixels, methods: Methods, store: Store
+def photo_features(
+    photo: Photo, pixels: Callable[[], NDArray[Any]], detector: Detector, store: Store
 ) -> PhotoFeatures:
-    """Features and thumbnail of a photo; its grey picture goes to the store.
+    """Features and thumbnail of a photo, from the store or found now; its grey picture is stored
+    beside them. `pixels` decodes the photo.
 
     Raises:
         UnreadablePhotoError: its pixels cannot be decoded.
     """
-    pixels = cache(index)
+    return store.get_or(
+        "features", features_key(photo, detector), lambda: _look(photo, pixels(), detector, store)
+    )
+
+
+def _look(photo: Photo, pixels: NDArray[Any], detector: Detector, store: Store) -> PhotoFeatures:
     rough = halved(pixels, PICTURE)
     picture = picture_of(rough)
     store.put("pictures", picture_key(photo), picture)
-    longest = methods.sift.longest
-    # values of a sensor are made grey at the size they are searched at: what is equalised locally
-    # depends on it
-    source = (
-        pixels
-        if longest > PICTURE
-        else picture
-        if rough.dtype == np.uint8
-        else shrink(rough, PICTURE)[0]
-    )
-    small, _ = shrink(source, longest)
-    return PhotoFeatures(
-        features=methods.sift.of_shrunken(small, pixels.shape[:2]), thumbnail=thumbnail_of(rough)
-    )
+    longest = detector.longest
+    if longest > PICTURE:
+        source = pixels
+    # a sensor's values become grey at the size that is searched: equalising is local
+    else:
+        source = picture if rough.dtype == np.uint8 else shrink(rough, PICTURE)[0]
+    found = detector.of_shrunken(shrink(source, longest)[0], pixels.shape[:2])
+    return PhotoFeatures(features=found, thumbnail=thumbnail_of(rough))
 
 
-def take_in(
-    photos: Sequence[Photo], cache: PixelCache, methods: Methods, store: Store, jobs: int
-) -> Steps[Intake]:
-    """Looks at every photo, or finds in the store what an earlier look gave.
+def find_features(
+    photos: Sequence[Photo], pixels: PhotoPixels, detector: Detector, store: Store, jobs: int
+) -> Steps[FeaturedPhotos]:
+    """Features of every photo that can be decoded.
 
     Raises:
         NoPhotosError: not one photo's pixels could be read.
@@ -148,8 +159,7 @@ def take_in(
     def one(index: int) -> PhotoFeatures | RejectedPhoto:
         photo = photos[index]
         try:
-            key = digest(photo.digest, methods.sift, THUMBNAIL)
-            return store.get_or("features", key, lambda: look(photo, index, cache, methods, store))
+            return photo_features(photo, lambda: pixels(index), detector, store)
         except UnreadablePhotoError as error:
             return RejectedPhoto(name=photo.name, reason=str(error))
 
@@ -163,4 +173,28 @@ def take_in(
         raise NoPhotosError(
             f"none of {len(photos)} photos could be decoded; the first: {bad[0].reason}"
         )
-    return Intake(photos=tuple(p for p, _ in good), looked=tuple(k for _, k in good), rejected=bad)
+    return FeaturedPhotos(
+        photos=tuple(p for p, _ in good), looks=tuple(k for _, k in good), rejected=bad
+    )
+
+
+def of_one_kind(found: FeaturedPhotos) -> FeaturedPhotos:
+    """The photos whose pixels are of the most frequent kind: a map has one type of pixel."""
+    kinds = [(p.channels, p.dtype, p.band) for p in found.photos]
+    common = max(set(kinds), key=lambda k: (kinds.count(k), k))
+    keep = [i for i, k in enumerate(kinds) if k == common]
+    odd = tuple(
+        RejectedPhoto(
+            name=p.name,
+            reason=f"its pixels ({p.channels} x {p.dtype}, {p.band}) differ from the survey's"
+            f" ({common[0]} x {common[1]}, {common[2]})",
+        )
+        for p, k in zip(found.photos, kinds, strict=True)
+        if k != common
+    )
+    return replace(
+        found,
+        photos=tuple(found.photos[i] for i in keep),
+        looks=tuple(found.looks[i] for i in keep),
+        rejected=(*found.rejected, *odd),
+    )

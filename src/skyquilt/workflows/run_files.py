@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from skyquilt import __version__
 from skyquilt.geometry.camera_formats import camera_to_opensfm
 from skyquilt.geometry.frames import angles_from_cam_R_map, rotation_from_vector
 from skyquilt.imaging.views import View
@@ -19,6 +18,7 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment
 from skyquilt.raster import vector
 from skyquilt.raster.atomic import write_text
+from skyquilt.version import __version__
 
 MOST_POINTS = 20000
 """Tie points written to reconstruction.json."""

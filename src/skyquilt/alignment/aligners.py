@@ -1,0 +1,199 @@
+"""The aligners of every survey: `bundle`, `pose`, `position`, and `auto`, which chooses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.bundle import Bundle
+from skyquilt.alignment.control import control_in_frame
+from skyquilt.alignment.inputs import AlignmentInputs
+from skyquilt.alignment.pose import ByMetadata, ByPose, reported_camera
+from skyquilt.alignment.repair import Repaired, repair
+from skyquilt.errors import AlignmentError
+from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Alignment, Pose, Prior
+
+REQUESTED = "asked for"
+"""Why a method was used that a user named."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ByLinks:
+    """`bundle`: all linked photos adjusted at once; the others by their metadata."""
+
+    bundle: Bundle = field(default_factory=Bundle)
+    """The adjustment."""
+    version: ClassVar[int] = 1
+    needs_links: ClassVar[bool] = True
+
+    def __call__(self, inputs: AlignmentInputs) -> Alignment:
+        """Aligns the photos.
+
+        Raises:
+            AlignmentError: no two photos are linked.
+        """
+        control = control_in_frame(inputs.control, inputs.photos, inputs.frame)
+        found = self.bundle(
+            inputs.photos,
+            inputs.frame,
+            inputs.priors,
+            inputs.features,
+            inputs.links,
+            control,
+            inputs.grey,
+        )
+        return replace(with_loose_photos(found, inputs.photos, inputs.priors), why=REQUESTED)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ByReport:
+    """`pose` and `position`: photos where their metadata place them, repaired by links or not."""
+
+    method: ByMetadata
+    """Which metadata are used."""
+    repair: bool = True
+    """Whether links may correct the metadata."""
+    version: ClassVar[int] = 1
+
+    @property
+    def needs_links(self) -> bool:
+        """Only to repair metadata."""
+        return self.repair
+
+    def __call__(self, inputs: AlignmentInputs) -> Alignment:
+        """Places the photos.
+
+        Raises:
+            AlignmentError: positions or heights above ground are missing.
+        """
+        repaired = repaired_metadata(inputs) if self.repair else None
+        return replace(placed_by_metadata(self.method, inputs, repaired), why=REQUESTED)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Auto:
+    """Chooses by what the survey has: `bundle` where links hold photos together, else `pose`."""
+
+    bundle: ByLinks
+    """For linked photos."""
+    pose: ByReport
+    """For photos that only have positions."""
+    version: ClassVar[int] = 1
+    needs_links: ClassVar[bool] = True
+
+    def __call__(self, inputs: AlignmentInputs) -> Alignment:
+        """Aligns the photos; `why` is a sentence.
+
+        Raises:
+            AlignmentError: photos without links and without positions.
+        """
+        positions = sum(bool(np.isfinite(p.map_C[:2]).all()) for p in inputs.priors)
+        method, why = choose_method(len(inputs.photos), len(inputs.links), positions)
+        chosen = self.bundle if method == "bundle" else self.pose
+        return replace(chosen(inputs), why=why)
+
+
+def choose_method(photos: int, links: int, positions: int) -> tuple[str, str]:
+    """`bundle` or `pose`, and why, one sentence.
+
+    Raises:
+        AlignmentError: neither can place the photos.
+    """
+    if photos == 1:
+        return "pose", "one photo has nothing to be adjusted against"
+    if links:
+        where = (
+            "and positions place it"
+            if positions
+            else "but no positions: the map is not georeferenced"
+        )
+        return "bundle", f"{links} links hold the photos together, {where}"
+    if positions:
+        return "pose", "no two photos could be linked, so each lies where its metadata say"
+    raise AlignmentError(
+        f"no two of {photos} photos overlap recognisably and none has a position;"
+        " give positions with --geo, or photos that overlap by half or more"
+    )
+
+
+def by_pose(height_m: float | None, repair: bool) -> ByReport:
+    """The aligner `pose`."""
+    return ByReport(method=ByPose(height_m=height_m), repair=repair)
+
+
+def repaired_metadata(inputs: AlignmentInputs) -> Repaired | None:
+    """Metadata, corrected where the pixels of links contradict them; None without links."""
+    if not inputs.links:
+        return None
+    convergence = inputs.frame.convergence_deg
+    return repair(inputs.photos, inputs.priors, inputs.features, inputs.links, convergence)
+
+
+def placed_by_metadata(
+    method: ByMetadata, inputs: AlignmentInputs, repaired: Repaired | None
+) -> Alignment:
+    """Photos placed by reported or by repaired metadata."""
+    if repaired is None:
+        return method(inputs.photos, inputs.frame, inputs.priors)
+    placed = method(inputs.photos, inputs.frame, repaired.priors, repaired.heights_m)
+    return replace(placed, notes=(*placed.notes, *repaired.notes))
+
+
+def with_loose_photos(
+    alignment: Alignment, photos: Sequence[Photo], priors: Sequence[Prior]
+) -> Alignment:
+    """Adds photos without links, placed by their own metadata relative to the adjusted ones, with a
+    note each; photos that lack metadata are rejected.
+    """
+    poses, cameras = dict(alignment.poses), dict(alignment.cameras)
+    camera_of, rejected = dict(alignment.camera_of), dict(alignment.rejected)
+    blocks, notes = list(alignment.blocks), list(alignment.notes)
+    offset = _median_offset(alignment, priors)
+    for i, photo in enumerate(photos):
+        if i in poses:
+            continue
+        C = priors[i].map_C + offset
+        if alignment.frame.crs is None or _lacking(C, priors[i]):
+            lacking = _lacking(C, priors[i]) or "no heading"
+            reason = "it could not be linked to the other photos, and it has"
+            rejected[i] = rejected.get(i, f"{reason} {lacking} to place it by")
+            continue
+        rejected.pop(i, None)
+        R = cam_R_map_from_angles(priors[i].yaw_deg, priors[i].pitch_deg, priors[i].roll_deg)
+        poses[i] = Pose(cam_R_map=R, map_C=C)
+        cameras.setdefault(photo.camera_key, reported_camera(photo))
+        camera_of[i] = photo.camera_key
+        blocks.append((i,))
+        notes.append(
+            f"{photo.name} could not be linked to any other photo; it lies where its metadata say."
+        )
+    return replace(
+        alignment,
+        poses=poses,
+        cameras=cameras,
+        camera_of=camera_of,
+        rejected=rejected,
+        blocks=tuple(blocks),
+        notes=tuple(notes),
+    )
+
+
+def _median_offset(alignment: Alignment, priors: Sequence[Prior]) -> NDArray[np.float64]:
+    """(3,) m from reported to adjusted positions; 0 where nothing is known."""
+    apart = np.array([p.map_C - priors[i].map_C for i, p in alignment.poses.items()])
+    columns = apart.reshape(-1, 3).T
+    known = [c[np.isfinite(c)] for c in columns]
+    return np.array([np.median(c) if len(c) else 0.0 for c in known])
+
+
+def _lacking(C: NDArray[np.float64], prior: Prior) -> str:
+    """What a photo cannot be placed without; empty where nothing is missing."""
+    if not np.isfinite(C[:2]).all():
+        return "no position"
+    if not np.isfinite(C[2]):
+        return "no height"
+    return "" if np.isfinite(prior.yaw_deg) else "no heading"

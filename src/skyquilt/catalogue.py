@@ -1,0 +1,99 @@
+"""The methods of this package by name. Addresses only: a module is imported when its method is
+used.
+
+The rows of `skyquilt.papers` are added here, from above, so that nothing below knows them.
+"""
+
+from skyquilt.registry import register
+
+DETECTORS = {
+    "sift": "skyquilt.matching.sift:Sift",
+    "surf": "skyquilt.papers.surf:Surf",
+    "usurf": "skyquilt.papers.surf:upright_surf",
+    "harris": "skyquilt.papers.harris:Harris",
+    "orb": "skyquilt.matching.binary_features:Orb",
+    "akaze": "skyquilt.matching.binary_features:Akaze",
+}
+MATCHERS = {
+    "mutual": "skyquilt.matching.matchers:Mutual",
+    "guided": "skyquilt.matching.matchers:Guided",
+    "one-way": "skyquilt.matching.matchers:OneWay",
+}
+ESTIMATORS = {
+    "ransac": "skyquilt.matching.ransac:Ransac",
+    "lmeds": "skyquilt.papers.lmeds:Lmeds",
+    "magsac": "skyquilt.papers.magsac:Magsac",
+    "ste": "skyquilt.papers.ste:RansacSte",
+    "ncc": "skyquilt.papers.direct:by_ncc",
+    "phase": "skyquilt.papers.direct_refinement:by_phase",
+    "ecc": "skyquilt.papers.direct_refinement:by_ecc",
+    "mi": "skyquilt.papers.direct_refinement:by_mutual_information",
+}
+DIRECT = ("ncc", "phase", "ecc", "mi")
+"""Estimators that register pixels; the others estimate from matches of features."""
+REGISTRATIONS = {
+    "auto": "skyquilt.coregistration.methods:auto",
+    "sift": "skyquilt.papers.registrations:sift",
+    "surf": "skyquilt.papers.registrations:surf",
+    "usurf": "skyquilt.papers.registrations:usurf",
+    "rfae": "skyquilt.papers.registrations:rfae",
+    "rfae-sift": "skyquilt.papers.registrations:rfae_sift",
+    "surf+rfae": "skyquilt.papers.registrations:surf_and_rfae",
+    "structure": "skyquilt.coregistration.methods:structure",
+}
+TRANSFORMS = ("translation", "similarity", "affine", "homography")
+_ANY = tuple(DETECTORS)
+_LINKS = {
+    "detector": _ANY,
+    "matcher": ("mutual", "guided", "one-way"),
+    "estimator": ("ransac", "lmeds", "magsac"),
+}
+"""What methods take that verify links between photos; the estimator is that of their epipolar
+geometry.
+"""
+ALIGNMENTS: dict[str, tuple[str, dict[str, tuple[str, ...]]]] = {
+    "auto": ("skyquilt.workflows.methods:auto", _LINKS),
+    "bundle": ("skyquilt.workflows.methods:bundle", _LINKS),
+    "position": ("skyquilt.workflows.methods:position", {**_LINKS, "heading": ()}),
+    "pose": ("skyquilt.workflows.methods:pose", _LINKS),
+    "image": (
+        "skyquilt.papers.aligners:image",
+        {
+            "detector": _ANY,
+            "matcher": ("mutual", "one-way"),
+            "estimator": ("ransac", "lmeds", "magsac", "ste", *DIRECT),
+            "transform": TRANSFORMS,
+            "relief": (),
+            "levelled": (),
+            "image-search": ("chain", "overview"),
+        },
+    ),
+    "hybrid": ("skyquilt.papers.aligners:hybrid", {**_LINKS, "optimiser": ("anneal", "surfaces")}),
+    "flightline": (
+        "skyquilt.papers.aligners:flightline",
+        {
+            "detector": _ANY,
+            "matcher": ("mutual",),
+            "estimator": ("ste", "ransac", "lmeds", "magsac"),
+            "transform": TRANSFORMS,
+            "lines": ("heading", "distance"),
+        },
+    ),
+}
+
+
+def _register() -> None:
+    tables = {
+        "detector": DETECTORS,
+        "matcher": MATCHERS,
+        "estimator": ESTIMATORS,
+        "registration": REGISTRATIONS,
+    }
+    for stage, table in tables.items():
+        for name, make in table.items():
+            register(stage, name, make)
+    for name, (make, takes) in ALIGNMENTS.items():
+        register("alignment", name, make, takes)
+
+
+_register()

@@ -1,0 +1,156 @@
+"""What lies beside a map: which photo each place shows, how many photos see it, and a preview."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.imaging.grey import averaged
+from skyquilt.imaging.views import STEP
+from skyquilt.model.poses import Alignment
+from skyquilt.model.raster import Grid
+from skyquilt.ortho.compose import Composed, Composer
+
+PROVENANCE = 4
+"""Map pixels per provenance pixel."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BlockExtras:
+    """What a block of the map leaves beside its pixels."""
+
+    provenance: NDArray[np.uint32]
+    """Shot numbers from 1, 0 = none, every PROVENANCE-th pixel."""
+    views: NDArray[np.uint16]
+    """Photos that see each STEP-pixel cell."""
+    preview: NDArray[Any]
+    """(h, w, bands) the block, area-averaged to every `preview_factor`-th pixel."""
+    shown: NDArray[np.uint8]
+    """(h, w) opacity of the preview, 0 to 255."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drawn:
+    """The finished rasters' small companions."""
+
+    provenance: NDArray[np.uint32]
+    """As in provenance.tif."""
+    provenance_grid: Grid
+    """Its grid."""
+    views: NDArray[np.uint16]
+    """As in views.tif."""
+    views_grid: Grid
+    """Its grid."""
+    preview: NDArray[np.uint8]
+    """(h, w, 4) the map, reduced, RGBA."""
+    preview_grid: Grid
+    """Its grid."""
+
+
+def shot_numbers(compose: Composer) -> NDArray[np.uint32]:
+    """Number in shots.geojson of each photo; the last entry, which index -1 (no photo) finds,
+    is 0.
+    """
+    number = {v.photo: k + 1 for k, v in enumerate(sorted(compose.views, key=lambda v: v.photo))}
+    table = np.zeros(max(number) + 2, np.uint32)
+    table[list(number)] = list(number.values())
+    return table
+
+
+def extras_of(
+    composed: Composed, valid: NDArray[np.bool_], table: NDArray[np.uint32], factor: int
+) -> BlockExtras:
+    """What a composed block leaves; `table` gives shot numbers by photo, `factor` the preview's
+    reduction.
+    """
+    preview, shown = _reduced(composed.pixels, valid, factor)
+    numbers = table[np.where(_thinned(valid), _thinned(composed.photo), -1)]
+    return BlockExtras(provenance=numbers, views=composed.views, preview=preview, shown=shown)
+
+
+def _thinned(numbers: NDArray[Any]) -> NDArray[Any]:
+    """Every PROVENANCE-th pixel in both directions, from the middle of its cell."""
+    rows, columns = (
+        np.minimum(np.arange(PROVENANCE // 2, size + PROVENANCE // 2, PROVENANCE), size - 1)
+        for size in numbers.shape
+    )
+    return np.asarray(numbers[rows][:, columns])
+
+
+def preview_factor(grid: Grid) -> int:
+    """Map pixels per preview pixel: a power of two that brings the longest side to 1600 px or
+    less.
+    """
+    factor = 1
+    while max(grid.width, grid.height) / factor > 1600 and factor < 2048:
+        factor *= 2
+    return factor
+
+
+def _reduced(
+    pixels: NDArray[Any], valid: NDArray[np.bool_], factor: int
+) -> tuple[NDArray[Any], NDArray[np.uint8]]:
+    """Area averages of the valid pixels (h, w, bands), and how much of each cell is valid (0 to
+    255).
+    """
+    opaque = valid.view(np.uint8) * np.uint8(255)
+    size = (-(-pixels.shape[1] // factor), -(-pixels.shape[0] // factor))
+    share = np.asarray(averaged(opaque, size), np.uint8)
+    solid = np.nan_to_num(pixels) if pixels.dtype.kind == "f" else pixels
+    mean = averaged(solid, size).reshape(*share.shape, -1)
+    if share.min() < 255:  # pixels that are not valid are zero: divide by what was
+        whole = mean.astype(np.float32) * (255.0 / np.maximum(share, 1))[..., None]
+        mean = (np.minimum(whole, 255) if pixels.dtype == np.uint8 else whole).astype(pixels.dtype)
+    return mean, share
+
+
+def coloured(preview: NDArray[Any], shown: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """RGBA (h, w, 4) of a preview: pictures as they are, measured values from dark to bright
+    (inferno).
+    """
+    if preview.dtype == np.uint8 and preview.shape[2] == 3:
+        return np.dstack([preview, shown])
+    value = preview[..., 0].astype(np.float32)
+    seen = value[shown > 127]
+    low, high = np.percentile(seen, [1, 99]) if seen.size else (0.0, 1.0)
+    index = np.clip((value - low) / max(float(high - low), 1e-6) * 255, 0, 255).astype(np.uint8)
+    if preview.dtype == np.uint8:
+        return np.dstack([preview[..., :1]] * 3 + [shown])
+    return np.dstack([cv2.applyColorMap(index, cv2.COLORMAP_INFERNO)[..., ::-1], shown])
+
+
+class Companions:
+    """Provenance, views and preview, assembled from blocks."""
+
+    def __init__(self, grid: Grid, bands: int, dtype: np.dtype) -> None:
+        self.grid, self.factor = grid, preview_factor(grid)
+        self.fine, self.coarse, small = (
+            grid.coarser(PROVENANCE),
+            grid.coarser(STEP),
+            grid.coarser(self.factor),
+        )
+        self.provenance = np.zeros((self.fine.height, self.fine.width), np.uint32)
+        self.views = np.zeros((self.coarse.height, self.coarse.width), np.uint16)
+        self.preview = np.zeros((small.height, small.width, bands), dtype)
+        self.shown = np.zeros((small.height, small.width), np.uint8)
+
+    def add(self, row: int, column: int, extras: BlockExtras) -> None:
+        """Puts a block's extras in their place; its first pixel is at (row, column) of the map."""
+        for target, part, step in (
+            (self.provenance, extras.provenance, PROVENANCE),
+            (self.views, extras.views, STEP),
+            (self.preview, extras.preview, self.factor),
+            (self.shown, extras.shown, self.factor),
+        ):
+            r, c = row // step, column // step
+            target[r : r + part.shape[0], c : c + part.shape[1]] = part
+
+
+def geotransform(
+    grid: Grid, alignment: Alignment
+) -> tuple[float, float, float, float, float, float]:
+    """The six numbers of a north-up raster in the output CRS."""
+    x, y = alignment.frame.origin
+    return grid.gsd, 0.0, grid.west + x, 0.0, -grid.gsd, grid.north + y

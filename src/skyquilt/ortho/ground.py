@@ -1,0 +1,182 @@
+"""The ground of a map: heights, what each photo sees of them, and the map's grid."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.engine.clock import Steps
+from skyquilt.engine.store import Store, digest
+from skyquilt.errors import SideFileError, UsageError
+from skyquilt.imaging.views import View, grid_of, make_views, native_gsd
+from skyquilt.model.poses import Alignment
+from skyquilt.model.raster import Grid
+from skyquilt.model.surface import Surface
+from skyquilt.ortho.tie_surface import level
+from skyquilt.settings import PictureSettings
+
+GreyPicture = Callable[[int, int], NDArray[np.uint8]]
+"""Grey picture of a photo (index), its longest side at most the px given."""
+
+FINEST = 20
+"""Map pixels per photo pixel, along a side, that may be asked for."""
+MOST_PIXELS = 4e11
+"""Largest map."""
+WIDEST_M = 200_000.0
+"""Widest map: no drone flies further."""
+
+
+class SurfaceFromTies(Protocol):
+    """Heights from tie points."""
+
+    def __call__(self, xyz: NDArray[Any], bounds: tuple[float, float, float, float]) -> Surface:
+        """The surface over bounds (west, south, east, north in m) from points (n, 3) in m."""
+        ...
+
+
+class SurfaceFromPictures(Protocol):
+    """Heights refined by comparing pictures."""
+
+    def __call__(
+        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, /
+    ) -> Surface:
+        """The surface with better heights where pictures determine them."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ground:
+    """What the map is drawn on."""
+
+    surface: Surface
+    """Heights."""
+    views: tuple[View, ...]
+    """What each photo sees."""
+    grid: Grid
+    """The map's pixels."""
+    native_gsd: float
+    """Median ground size of a photo pixel in m."""
+
+
+def find_ground(
+    alignment: Alignment,
+    grey: GreyPicture,
+    ties: SurfaceFromTies,
+    sweep: SurfaceFromPictures | None,
+    picture: PictureSettings,
+    store: Store,
+) -> Steps[Ground]:
+    """Heights from tie points (level ground where there are none), refined by the sweep where there
+    is one, and the grid of the map.
+
+    Raises:
+        UsageError: the map would have no pixels, or absurdly many.
+    """
+    yield 0, 1
+    xyz = alignment.ties.xyz
+    flat = level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
+    rough = make_views(alignment, flat)
+    if not rough:
+        raise UsageError("no photo looks down at the ground: all see the horizon")
+    native = native_gsd(rough, flat)
+    gsd = picture.gsd_cm / 100 if picture.gsd_cm else round_gsd(native)
+    bounds = _local_bounds(picture, alignment)
+    _check_place(bounds, rough, picture, alignment)
+    wide = grid_of(rough, gsd, bounds)
+    _check_size(wide, native)
+    area = _widened(wide.bounds, 0.05 * max(wide.width, wide.height) * gsd)
+    key = digest(xyz, area, ties)
+    surface = store.get_or("surface", key, lambda: ties(xyz, area) if len(xyz) > 3 else flat)
+    views = tuple(make_views(alignment, surface))
+    grid = grid_of(views, gsd, bounds)
+    if sweep is not None and len(xyz) > 3:
+        held, known = set(alignment.held), surface
+        surface = store.get_or(
+            "surface",
+            digest(key, poses_digest(alignment), grid, sweep),
+            lambda: sweep(known, [v for v in views if v.photo in held], grid, grey),
+        )
+    yield 1, 1
+    return Ground(surface=surface, views=views, grid=grid, native_gsd=native)
+
+
+def _widened(
+    bounds: tuple[float, float, float, float], margin: float
+) -> tuple[float, float, float, float]:
+    west, south, east, north = bounds
+    return west - margin, south - margin, east + margin, north + margin
+
+
+def _check_place(
+    bounds: tuple[float, float, float, float] | None,
+    views: Sequence[View],
+    picture: PictureSettings,
+    alignment: Alignment,
+) -> None:
+    """Refuses an area that no photo shows."""
+    if bounds is None or any(v.overlaps(bounds) for v in views):
+        return
+    outline = np.concatenate([v.footprint for v in views]) + alignment.frame.origin
+    (west, south), (east, north) = outline.min(0), outline.max(0)
+    frame = alignment.frame.crs or "their own frame"
+    where = f"which cover {west:.0f},{south:.0f},{east:.0f},{north:.0f} in {frame}"
+    if picture.bounds is not None:
+        asked = ",".join(f"{b:g}" for b in picture.bounds)
+        raise UsageError(f"--bounds {asked} lies outside the photos, {where}")
+    raise SideFileError(
+        f"the area of --boundary {picture.boundary} lies outside the photos, {where}"
+    )
+
+
+def _check_size(grid: Grid, native: float) -> None:
+    """Refuses what nobody can want: a map far finer than the photos, or larger than any survey."""
+    size = f"{grid.width} x {grid.height} px"
+    wide = max(grid.width, grid.height) * grid.gsd
+    if grid.gsd < native / FINEST and wide < WIDEST_M:
+        raise UsageError(
+            f"--gsd {grid.gsd * 100:g} asks for {size}, more than {FINEST} times finer than the"
+            " photos,"
+            f" which show {native * 100:.2g} cm per pixel; leave --gsd out or choose one near that"
+        )
+    if wide > WIDEST_M or grid.width * grid.height > MOST_PIXELS:
+        raise UsageError(
+            f"the map would be {wide / 1000:.0f} km wide, {size} at {grid.gsd * 100:g} cm: the"
+            " positions of"
+            " some photos (or --bounds) must be wrong; correct them with --geo, or choose a larger"
+            " --gsd"
+        )
+
+
+def poses_digest(alignment: Alignment) -> str:
+    """What of an alignment shapes the map."""
+    order = sorted(alignment.poses)
+    placed = [(alignment.poses[i], alignment.camera(i).vector) for i in order]
+    return digest(order, placed, alignment.frame)
+
+
+def round_gsd(gsd: float) -> float:
+    """A ground resolution in m rounded to two digits."""
+    digits = 1 - int(np.floor(np.log10(gsd)))
+    return float(round(gsd, digits))
+
+
+def _local_bounds(
+    picture: PictureSettings, alignment: Alignment
+) -> tuple[float, float, float, float] | None:
+    """Bounds asked for, or those of the boundary, in the map frame."""
+    frame = alignment.frame
+    bounds = picture.bounds
+    if picture.boundary is not None and bounds is None:
+        if frame.crs is None:
+            raise UsageError(
+                "--boundary needs a georeferenced survey, and these photos have no positions"
+            )
+        from skyquilt.raster.boundary import read_boundary
+
+        bounds = read_boundary(picture.boundary, frame.crs).bounds
+    if bounds is None:
+        return None
+    x, y = frame.origin
+    return bounds[0] - x, bounds[1] - y, bounds[2] - x, bounds[3] - y

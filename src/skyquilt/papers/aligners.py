@@ -1,0 +1,237 @@
+"""The papers' alignments as aligners of the workflow: `image`, `hybrid`, `flightline`."""
+
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, cast
+
+import numpy as np
+
+from skyquilt import registry
+from skyquilt.alignment.aligners import (
+    REQUESTED,
+    ByReport,
+    by_pose,
+    placed_by_metadata,
+    repaired_metadata,
+)
+from skyquilt.alignment.inputs import AlignmentInputs
+from skyquilt.errors import UsageError
+from skyquilt.geometry.transforms import Model
+from skyquilt.matching.levelled import Level
+from skyquilt.model.poses import Alignment
+from skyquilt.papers.best_matches import Best
+from skyquilt.papers.chain import Chain, DirectChain
+from skyquilt.papers.flightline import ByFlightline
+from skyquilt.papers.hybrid import Hybrid
+from skyquilt.papers.hybrid_search import Anneal, Surfaces
+from skyquilt.papers.lens_order import WORKING_WIDTH
+from skyquilt.papers.overview import ByOverview
+from skyquilt.papers.plane_registration import Estimator
+from skyquilt.papers.rescued import Rescued
+from skyquilt.papers.ste import RansacSte
+from skyquilt.settings import MosaicSettings
+
+VLFEAT = 1.5**-0.5
+"""Ratio of distances that VLFeat's matcher asks for."""
+SECOND_PX2 = 12.0
+"""STE of an inlier, px^2 at 1500 px, where the threshold by deviations fails: 5.99 times one px,
+both ways.
+"""
+LEAST_INLIERS = 12
+"""Matches that must agree before two photos count as registered."""
+DIRECT = {
+    "ncc": ("similarity", "translation"),
+    "phase": ("similarity", "translation"),
+    "ecc": ("homography", "affine", "translation"),
+    "mi": ("similarity", "translation"),
+}
+"""Estimators that register pixels instead of features, and the transformations each one finds."""
+CHAIN_PX, OVERVIEW_PX = 6.0, 3.0
+"""Largest transfer error of an inlier in px of the working image, and of the overview."""
+OVERVIEW_WIDTH = 640
+"""Width in px of a photo in the overview."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ByImage:
+    """`image`: photos registered one after the other, to the last one or to the map so far."""
+
+    method: Chain | DirectChain | ByOverview
+    """Which of them."""
+    version: ClassVar[int] = 1
+    needs_links: ClassVar[bool] = False
+
+    def __call__(self, inputs: AlignmentInputs) -> Alignment:
+        """Registers the photos in their order."""
+        method = self.method
+        if not isinstance(method, DirectChain):
+            level = method.level
+            if isinstance(level, Level) and level.height_m is None:
+                method = replace(method, level=replace(level, height_m=_least_height(inputs)))
+        known = (inputs.photos, inputs.frame, inputs.priors)
+        if isinstance(method, Chain):
+            placed = method(*known, inputs.features, inputs.order)
+        elif isinstance(method, DirectChain):
+            placed = method(*known, inputs.order, inputs.grey)
+        else:
+            placed = method(*known, inputs.features, inputs.order, inputs.grey)
+        return _outside_named(replace(placed, why=REQUESTED), inputs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Corrected:
+    """`hybrid`: placed by metadata, each photo then corrected by its pixels."""
+
+    pose: ByReport
+    """First placement."""
+    hybrid: Hybrid
+    """Correction."""
+    version: ClassVar[int] = 1
+
+    @property
+    def needs_links(self) -> bool:
+        """Only to repair metadata."""
+        return self.pose.repair
+
+    def __call__(self, inputs: AlignmentInputs) -> Alignment:
+        """Places the photos in their order.
+
+        Raises:
+            AlignmentError: positions or heights above ground are missing.
+        """
+        repaired = repaired_metadata(inputs) if self.pose.repair else None
+        placed = placed_by_metadata(self.pose.method, inputs, repaired)
+        priors = inputs.priors if repaired is None else repaired.priors
+        found = self.hybrid(placed, inputs.photos, priors, inputs.order, inputs.grey)
+        return _outside_named(replace(found, why=REQUESTED), inputs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ByLines:
+    """`flightline`: lines mosaicked by themselves, then joined (A)."""
+
+    method: ByFlightline
+    """The article's method."""
+    version: ClassVar[int] = 1
+    needs_links: ClassVar[bool] = False
+
+    def __call__(self, inputs: AlignmentInputs) -> Alignment:
+        """Joins the photos.
+
+        Raises:
+            AlignmentError: lines cannot be told apart, or do not match.
+        """
+        found = self.method(
+            inputs.photos, inputs.frame, inputs.priors, inputs.features, inputs.order
+        )
+        return _outside_named(replace(found, why=REQUESTED), inputs)
+
+
+def image(settings: MosaicSettings) -> ByImage:
+    """Method `image`."""
+    if settings.matching.estimator in DIRECT:
+        return ByImage(method=_direct_chain(settings))
+    order, height = settings.camera.distortion or "6t", settings.camera.height_m
+    match = registry.load("matcher", settings.matching.matcher or "mutual")()
+    if settings.image.image_search == "chain":
+        chain = Chain(
+            match=match,
+            estimate=_estimator(settings, CHAIN_PX, "similarity"),
+            level=_level(settings, WORKING_WIDTH),
+            distortion=order,
+            height_m=height,
+        )
+        return ByImage(method=chain)
+    detect = registry.load("detector", settings.matching.detector or "sift")
+    overview = ByOverview(
+        detect=detect(longest=1_000_000),
+        match=match,
+        estimate=_estimator(settings, OVERVIEW_PX, "similarity"),
+        level=_level(settings, OVERVIEW_WIDTH),
+        distortion=order,
+        height_m=height,
+    )
+    return ByImage(method=overview)
+
+
+def _direct_chain(settings: MosaicSettings) -> DirectChain:
+    """`image` by pixels: no features, so nothing that concerns features may be asked for."""
+    name, asked = str(settings.matching.estimator), settings.matching
+    for option, value in (("detector", asked.detector), ("matcher", asked.matcher)):
+        if value is not None:
+            raise UsageError(f"--{option} would have no effect: --estimator {name} compares pixels")
+    if settings.image.image_search != "chain":
+        raise UsageError(f"--estimator {name} registers two photos: --image-search is chain")
+    model = asked.transform or DIRECT[name][0]
+    if model not in DIRECT[name]:
+        raise UsageError(
+            f"--estimator {name} finds {' or '.join(DIRECT[name])}; --transform is {model}"
+        )
+    return DirectChain(
+        register=registry.load("estimator", name)(model),
+        distortion=settings.camera.distortion or "6t",
+        height_m=settings.camera.height_m,
+    )
+
+
+def _estimator(settings: MosaicSettings, threshold_px: float, model: str) -> Estimator:
+    """The estimator that settings name, RANSAC if none, with the thresholds of its method."""
+    name, asked = settings.matching.estimator or "ransac", settings.matching.transform or model
+    options: dict[str, Any] = {} if name in ("lmeds", "ste") else {"threshold_px": threshold_px}
+    made: Estimator = registry.load("estimator", name)(
+        model=asked, minimum=LEAST_INLIERS, seed=settings.running.seed, **options
+    )
+    return made
+
+
+def _level(settings: MosaicSettings, width: int) -> Level | None:
+    if not settings.image.levelled:
+        return None
+    return Level(relief_m=settings.image.relief_m, height_m=settings.camera.height_m, width=width)
+
+
+def hybrid(settings: MosaicSettings) -> Corrected:
+    """Method `hybrid`."""
+    search = Anneal() if settings.hybrid.optimiser == "anneal" else Surfaces()
+    method = Hybrid(optimise=search, alpha=settings.hybrid.alpha, seed=settings.running.seed)
+    return Corrected(pose=by_pose(settings.camera.height_m, settings.input.repair), hybrid=method)
+
+
+def flightline(settings: MosaicSettings) -> ByLines:
+    """Method `flightline`; its own estimator is A's, helped out where its threshold fails."""
+    method = ByFlightline(
+        within=Best(count=150, ratio=VLFEAT),
+        across=Best(count=50, ratio=VLFEAT),
+        estimate=_lines_estimator(settings),
+        split="distance" if settings.flightline.lines == "distance" else "heading",
+        distortion=settings.camera.distortion or "none",
+    )
+    return ByLines(method=method)
+
+
+def _lines_estimator(settings: MosaicSettings) -> Estimator:
+    """A's estimator, as published and then with a fixed threshold, unless another one is named."""
+    if settings.matching.estimator not in (None, "ste"):
+        return _estimator(settings, CHAIN_PX, "homography")
+    model = cast(Model, settings.matching.transform or "homography")
+    seed = settings.running.seed
+    return Rescued(
+        first=RansacSte(model=model, seed=seed),
+        second=RansacSte(model=model, threshold_px2=SECOND_PX2, minimum=LEAST_INLIERS, seed=seed),
+    )
+
+
+def _least_height(inputs: AlignmentInputs) -> float | None:
+    """Least height above take-off in m, which stands for that above ground in (4.9); None where
+    none is reported.
+    """
+    heights = np.array([p.map_C[2] for p in inputs.priors])
+    plausible = heights[np.isfinite(heights) & (heights > 1)]
+    takeoff = inputs.frame.vertical_datum == "takeoff"
+    return float(plausible.min()) if takeoff and len(plausible) else None
+
+
+def _outside_named(alignment: Alignment, inputs: AlignmentInputs) -> Alignment:
+    """With a reason for photos that the sequence does not name."""
+    missing = set(range(len(inputs.photos))) - set(inputs.order)
+    reasons = dict.fromkeys(missing, "the sequence does not name it")
+    return replace(alignment, rejected={**alignment.rejected, **reasons})

@@ -1,0 +1,363 @@
+"""What a mosaic can be asked for, in groups: each stage gets the group that concerns it.
+
+Words are checked here, against the names that are registered; numbers against their limits.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from skyquilt import registry
+from skyquilt.errors import UsageError
+
+IMAGE_SEARCHES = ("chain", "overview")
+OPTIMISERS = ("anneal", "surfaces")
+LINES = ("heading", "distance")
+TRANSFORMS = ("translation", "similarity", "affine", "homography")
+BLENDS = ("feather", "first", "average", "multiband")
+COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
+SURFACES = ("sweep", "ties")
+THERMAL_UNITS = ("auto", "celsius", "kelvin", "decikelvin", "centikelvin", "counts")
+DISTORTIONS = ("none", "2", "4", "6", "6t")
+
+
+def one_of(option: str, value: str, allowed: Iterable[str]) -> None:
+    """Refuses a word that is none of those allowed.
+
+    Raises:
+        UsageError: the sentence lists them.
+    """
+    allowed = tuple(allowed)
+    if value not in allowed:
+        raise UsageError(f"{option} {value!r} is not one of {', '.join(allowed)}")
+
+
+def within(option: str, value: float | None, low: float, high: float) -> None:
+    """Refuses a number outside its limits; None passes.
+
+    Raises:
+        UsageError: it lies outside.
+    """
+    if value is not None and not low <= value <= high:
+        raise UsageError(f"{option} {value} lies outside {low} to {high}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class InputSettings:
+    """Files beside the photos, and how far metadata are believed."""
+
+    gcp: Path | None = None
+    """Control points (gcp_list.txt); None = the one in the folder of photos, if any."""
+    geo: Path | None = None
+    """Positions (geo.txt, CSV, MRK, SRT); None = the geo.txt in the folder of photos, if any."""
+    cameras: Path | None = None
+    """Calibrations (cameras.json)."""
+    distances: Path | None = None
+    """Known distances (CSV) by which the map is judged."""
+    sequence: str = "time"
+    """Order of the photos for methods that join them one by one: time, name, or a file of names."""
+    thermal_unit: str | None = None
+    """One of `THERMAL_UNITS`: what values of single-band TIFFs mean; None = found from the file, as
+    is whether they are thermal.
+    """
+    repair: bool = True
+    """Treat metadata as measurements that may be wrong."""
+
+    def __post_init__(self) -> None:
+        if self.thermal_unit is not None:
+            one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchingSettings:
+    """How photos are compared with one another."""
+
+    detector: str | None = None
+    """A registered detector of features; None = sift."""
+    matcher: str | None = None
+    """A registered matcher; None = mutual."""
+    estimator: str | None = None
+    """A registered estimator; None = the method's own: magsac for links, ransac for `image`, ste
+    for `flightline`.
+    """
+    transform: str | None = None
+    """One of `TRANSFORMS`: how two photos may differ, for methods `image` (None = similarity) and
+    `flightline` (None = homography).
+    """
+    features: int = 1200
+    """Features per photo."""
+
+    def __post_init__(self) -> None:
+        for stage in ("detector", "matcher", "estimator"):
+            word = getattr(self, stage)
+            if word is not None:
+                one_of(f"--{stage}", word, registry.names(stage))
+        if self.transform is not None:
+            one_of("--transform", self.transform, TRANSFORMS)
+        within("--features", self.features, 100, 50000)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraSettings:
+    """What is assumed or adjusted of the cameras."""
+
+    distortion: str | None = None
+    """One of `DISTORTIONS`: what self-calibration may change of the lens model (None = 4), or, for
+    methods that do not calibrate, the order fitted to a calibration that photos bring along (None =
+    6t; `flightline` none).
+    """
+    height_m: float | None = None
+    """Height above ground for methods without tie points, where altitudes do not give it."""
+    heading_deg: float | None = None
+    """Common heading for method `position`; None = the commonest reported one, north where none is.
+    """
+
+    def __post_init__(self) -> None:
+        if self.distortion is not None:
+            one_of("--distortion", self.distortion, DISTORTIONS)
+        within("--height", self.height_m, 0.5, 1e5)
+        within("--heading", self.heading_deg, -360, 360)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GroundSettings:
+    """The surface that photos are projected on."""
+
+    surface: str = "sweep"
+    """One of `SURFACES`: heights from tie points alone, or refined by a plane sweep."""
+
+    def __post_init__(self) -> None:
+        one_of("--surface", self.surface, SURFACES)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureSettings:
+    """The map's grid, and how photos become one picture."""
+
+    gsd_cm: float | None = None
+    """Ground size of a map pixel in cm; None = the photos' own."""
+    crs: str | None = None
+    """Output CRS as PROJ knows it; None = the local UTM zone."""
+    bounds: tuple[float, float, float, float] | None = None
+    """West, south, east, north in the output CRS."""
+    boundary: Path | None = None
+    """Polygon that the map is cut to."""
+    blend: str = "auto"
+    """One of `BLENDS`; auto = feather, and average for method `flightline`, whose blend it is."""
+    feather_px: float = 6.0
+    """Width of feathered seams in map pixels."""
+    balance: bool = True
+    """Bring photos to one brightness: 8-bit pictures; for measured values see `balance_thermal`."""
+    balance_thermal: bool | None = None
+    """Balance the drift between thermal frames on their overlaps; False leaves values as recorded.
+    None = temperatures, if `balance`, but not counts.
+    """
+
+    def __post_init__(self) -> None:
+        one_of("--blend", self.blend, ("auto", *BLENDS))
+        within("--gsd", self.gsd_cm, 0.05, 10000)
+        within("--feather", self.feather_px, 0, 10000)
+        b = self.bounds
+        if b and not (all(isfinite(v) for v in b) and b[0] < b[2] and b[1] < b[3]):
+            raise UsageError(
+                f"--bounds is west,south,east,north with west < east and south < north, got {b}"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputSettings:
+    """How the map is written."""
+
+    compress: str = "auto"
+    """One of `COMPRESSIONS`; auto = JPEG for 8-bit pictures, zstd for measured values."""
+    quality: int = 85
+    """JPEG quality."""
+
+    def __post_init__(self) -> None:
+        one_of("--compress", self.compress, COMPRESSIONS)
+        within("--quality", self.quality, 1, 100)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunningSettings:
+    """What a run may use; nothing here but `seed` changes the result."""
+
+    jobs: int = 0
+    """Threads; 0 = all processors."""
+    memory_gb: float | None = None
+    """Memory to plan with in GB; None = 1.2."""
+    seed: int = 0
+    """Of everything random in methods `image`, `hybrid`, `flightline`."""
+
+    def __post_init__(self) -> None:
+        within("--jobs", self.jobs, 0, 1024)
+        within("--memory", self.memory_gb, 0.5, 4096)
+        within("--seed", self.seed, 0, 2**32 - 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageSettings:
+    """Method `image` (Y 4.2)."""
+
+    levelled: bool = True
+    """Register by features of the dominant plane only."""
+    image_search: str = "chain"
+    """One of `IMAGE_SEARCHES`: against the last photo, or against the whole map so far."""
+    relief_m: float | None = None
+    """Largest height variation on the ground in m; None = a tenth of the flying height."""
+
+    def __post_init__(self) -> None:
+        one_of("--image-search", self.image_search, IMAGE_SEARCHES)
+        within("--relief", self.relief_m, 0, 1e4)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HybridSettings:
+    """Method `hybrid` (Y 4.1.2), and the thesis's quality function (Y 4.6)."""
+
+    alpha: float = 0.5
+    """Weight of distances against looks in lambda (Y 4.6), of any method's map."""
+    optimiser: str = "surfaces"
+    """One of `OPTIMISERS`: how `hybrid` maximises lambda."""
+
+    def __post_init__(self) -> None:
+        one_of("--optimiser", self.optimiser, OPTIMISERS)
+        within("--alpha", self.alpha, 0, 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightlineSettings:
+    """Method `flightline` (A)."""
+
+    lines: str = "heading"
+    """One of `LINES`: how flight lines are told apart."""
+
+    def __post_init__(self) -> None:
+        one_of("--lines", self.lines, LINES)
+
+
+GROUPS: dict[str, type] = {
+    "input": InputSettings,
+    "matching": MatchingSettings,
+    "camera": CameraSettings,
+    "ground": GroundSettings,
+    "picture": PictureSettings,
+    "output": OutputSettings,
+    "running": RunningSettings,
+    "image": ImageSettings,
+    "hybrid": HybridSettings,
+    "flightline": FlightlineSettings,
+}
+"""Groups by the name of their field."""
+GROUP_OF = {f.name: name for name, kind in GROUPS.items() for f in fields(kind)}
+"""Name of a setting -> the group it belongs to."""
+_ASKED = {
+    "detector": ("detector", None),
+    "matcher": ("matcher", None),
+    "estimator": ("estimator", None),
+    "transform": ("transform", None),
+    "relief": ("relief_m", None),
+    "levelled": ("levelled", True),
+    "image-search": ("image_search", "chain"),
+    "optimiser": ("optimiser", "surfaces"),
+    "lines": ("lines", "heading"),
+    "heading": ("heading_deg", None),
+}
+"""Options that belong to some methods only: the setting, and its value where nobody asked."""
+OPTION_OF = {setting: option for option, (setting, _) in _ASKED.items()}
+"""Setting -> option (without `--`), of those."""
+
+
+@dataclass(frozen=True, kw_only=True, init=False)
+class MosaicSettings:
+    """Everything a mosaic can be asked for; the defaults are meant to be right."""
+
+    method: str
+    """A registered alignment, or auto."""
+    input: InputSettings
+    """Side files and metadata."""
+    matching: MatchingSettings
+    """How photos are compared."""
+    camera: CameraSettings
+    """Cameras."""
+    ground: GroundSettings
+    """Surface."""
+    picture: PictureSettings
+    """Grid and picture."""
+    output: OutputSettings
+    """Files."""
+    running: RunningSettings
+    """Threads, memory, seed."""
+    image: ImageSettings
+    """Method `image`."""
+    hybrid: HybridSettings
+    """Method `hybrid`."""
+    flightline: FlightlineSettings
+    """Method `flightline`."""
+
+    def __init__(self, *, method: str = "auto", **options: Any) -> None:
+        """`options` are settings by their own names (`gsd_cm=2.0`), sorted into their groups, or
+        whole groups (`picture=PictureSettings(gsd_cm=2.0)`).
+
+        Raises:
+            UsageError: an impossible word or number, or an option that the method does not take.
+            TypeError: there is no such setting.
+        """
+        if unknown := [name for name in options if name not in GROUPS and name not in GROUP_OF]:
+            raise TypeError(f"there is no setting {', '.join(unknown)}")
+        object.__setattr__(self, "method", method)
+        one_of("--method", method, registry.names("alignment"))
+        for name, kind in GROUPS.items():
+            given = options.get(name) or kind()
+            changes = {f.name: getattr(given, f.name) for f in fields(kind)}
+            changes |= {k: v for k, v in options.items() if GROUP_OF.get(k) == name}
+            object.__setattr__(self, name, kind(**changes))
+        _check_taken(self)
+
+    def changed(self, **options: Any) -> "MosaicSettings":
+        """The same with other values of these settings, by their own names, or of the method."""
+        groups = {name: getattr(self, name) for name in GROUPS}
+        return MosaicSettings(**{"method": self.method, **groups, **options})
+
+    def __iter__(self) -> Iterator[tuple[str, Any]]:
+        """Names and values of all settings, the method first."""
+        yield "method", self.method
+        for setting, group in GROUP_OF.items():
+            yield setting, getattr(getattr(self, group), setting)
+
+    def as_table(self) -> dict[str, Any]:
+        """Names and values as written to run.toml; unset ones left out."""
+        return {k: str(v) if isinstance(v, Path) else v for k, v in self if v is not None}
+
+
+def _check_taken(settings: MosaicSettings) -> None:
+    """Refuses what the method does not take: an option without effect would mislead."""
+    takes, values = registry.row("alignment", settings.method).takes, dict(settings)
+    for option, (setting, unasked) in _ASKED.items():
+        value = values[setting]
+        if value == unasked:
+            continue
+        if option not in takes:
+            others = [n for n in registry.names("alignment") if _takes(n, option)]
+            raise UsageError(
+                f"--{option} is for --method {' or '.join(others)}; the method here is"
+                f" {settings.method}"
+            )
+        if takes[option] and value not in takes[option]:
+            raise UsageError(
+                f"--method {settings.method} takes --{option} {', '.join(takes[option])},"
+                f" not {value}"
+            )
+    if not settings.input.repair and settings.method in ("position", "pose", "hybrid"):
+        asked = [o for o in ("detector", "matcher", "estimator") if values[o] is not None]
+        if asked:
+            raise UsageError(
+                f"--{asked[0]} would have no effect: with --trust-metadata, method"
+                f" {settings.method} compares no photos"
+            )
+
+
+def _takes(method: str, option: str) -> bool:
+    return option in registry.row("alignment", method).takes

@@ -1,0 +1,320 @@
+"""The batch workflow in four steps, each a record made from the one before:
+
+    SurveyInput -> AlignedPhotos -> Ground -> DrawnMap -> metrics of the run
+
+Each step is a generator of events that returns its record. What a step needs stands in its
+signature. Results are looked up in the run's store before they are made, so the same steps over the
+same store cost nothing twice: that is how a run resumes, and how a later command gets at the photos
+and the ground of a finished map.
+"""
+
+import os
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from numpy.typing import NDArray
+
+from skyquilt.alignment.inputs import AlignmentInputs, GreyPicture
+from skyquilt.alignment.priors import choose_frame, priors
+from skyquilt.engine.clock import Clock, Steps
+from skyquilt.engine.pixel_cache import PixelCache
+from skyquilt.engine.store import Store, digest
+from skyquilt.errors import SkyquiltError, UnreadablePhotoError
+from skyquilt.model import camera, features, poses, raster, surface
+from skyquilt.model.event import Event, Note
+from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.model.poses import Alignment, MapFrame, Prior
+from skyquilt.ortho import companions, ground, orthomosaic
+from skyquilt.ortho.compose import Composer
+from skyquilt.ortho.exposure import Exposure
+from skyquilt.ortho.ground import Ground
+from skyquilt.ortho.radiometry import balanced
+from skyquilt.photos.pixels import read_color
+from skyquilt.settings import MosaicSettings, RunningSettings
+from skyquilt.workflows.links import Links, link_photos
+from skyquilt.workflows.methods import Methods
+from skyquilt.workflows.photo_features import (
+    FeaturedPhotos,
+    GreyPictures,
+    PhotoFeatures,
+    PhotoPixels,
+    find_features,
+    of_one_kind,
+)
+from skyquilt.workflows.survey_input import SurveyInput
+
+T = TypeVar("T")
+REGISTRY = {
+    c.__name__: c
+    for c in (
+        PhotoFeatures,
+        features.Features,
+        features.Link,
+        features.RejectedLink,
+        features.Matches,
+        camera.Camera,
+        poses.Alignment,
+        poses.MapFrame,
+        poses.Pose,
+        poses.TiePoints,
+        poses.ControlResidual,
+        poses.Join,
+        surface.Surface,
+        RejectedPhoto,
+        companions.BlockExtras,
+        raster.Grid,
+    )
+}
+"""Records that the store may hold."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AlignedPhotos:
+    """Photos with features, links and poses."""
+
+    given: SurveyInput
+    """The survey as it was read."""
+    found: FeaturedPhotos
+    """Photos that take part, with features; all indices refer to these."""
+    priors: tuple[Prior, ...]
+    """What the metadata say, one per photo."""
+    links: Links
+    """Which photos show the same ground; none for a method that needs none."""
+    order: tuple[int, ...]
+    """Photos in the order in which they are joined."""
+    alignment: Alignment
+    """Poses and calibration."""
+    pixels: PhotoPixels
+    """Full-size pixels of a photo by its index."""
+    grey: GreyPicture
+    """Grey picture of a photo."""
+
+    @property
+    def photos(self) -> tuple[Photo, ...]:
+        """The photos."""
+        return self.found.photos
+
+    @property
+    def rejected(self) -> list[RejectedPhoto]:
+        """All files and photos that are not in the map, with reasons."""
+        reasons, poses = self.alignment.rejected, self.alignment.poses
+        unplaced = [
+            RejectedPhoto(name=p.name, reason=reasons.get(i, "it could not be placed"))
+            for i, p in enumerate(self.photos)
+            if i not in poses
+        ]
+        return [*self.given.survey.rejected, *self.found.rejected, *unplaced]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scene:
+    """Aligned photos and the ground that they show."""
+
+    aligned: AlignedPhotos
+    """The photos."""
+    ground: Ground
+    """Heights, views and the map's grid."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DrawnMap:
+    """The rasters of a map."""
+
+    exposure: Exposure
+    """What brought the photos to one brightness."""
+    compose: Composer
+    """What drew them."""
+    drawn: companions.Drawn
+    """Their small companions: provenance, views, preview."""
+
+
+def align_photos(
+    given: SurveyInput, methods: Methods, settings: MosaicSettings, clock: Clock
+) -> Generator[Event, None, AlignedPhotos]:
+    """Features, links and poses of a survey.
+
+    Raises:
+        NoPhotosError: no photo can be decoded.
+        AlignmentError: the method cannot place the photos.
+    """
+    store, jobs = clock.store, settings.running.jobs or os.cpu_count() or 1
+    photos = given.survey.photos
+    cache = PixelCache(
+        read=lambda i: read_color(photos[i]), budget_bytes=pixel_budget(settings.running)
+    )
+    found = yield from clock.stage(
+        "features", find_features(photos, cache, methods.detector, store, jobs)
+    )
+    found = of_one_kind(found)
+    pixels = _pixels_of(found.photos, photos, cache)
+    grey = GreyPictures(found.photos, pixels, store)
+    frame = choose_frame(found.photos, settings.picture.crs, given.control)
+    reported = priors(found.photos, frame)
+    linking = _links(found, frame, reported, methods, store, jobs)
+    links = yield from clock.stage("links", linking)
+    known = AlignmentInputs(
+        photos=found.photos,
+        features=found.features,
+        frame=frame,
+        priors=reported,
+        links=links.links,
+        control=given.control,
+        order=_order(found.photos, given.rank),
+        grey=grey,
+    )
+    alignment = yield from clock.stage("align", _align(known, methods, store))
+    yield from (Note(text=n, warning=True) for n in alignment.notes)
+    return AlignedPhotos(
+        given=given,
+        found=found,
+        priors=tuple(reported),
+        links=links,
+        order=tuple(known.order),
+        alignment=alignment,
+        pixels=pixels,
+        grey=grey,
+    )
+
+
+def find_ground(
+    aligned: AlignedPhotos, methods: Methods, settings: MosaicSettings, clock: Clock
+) -> Generator[Event, None, Ground]:
+    """Heights and the map's grid.
+
+    Raises:
+        UsageError: the map would have no pixels, or absurdly many.
+    """
+    steps = ground.find_ground(
+        aligned.alignment,
+        aligned.grey,
+        methods.surface,
+        methods.sweep,
+        settings.picture,
+        clock.store,
+    )
+    return (yield from clock.stage("surface", steps))
+
+
+def draw_map(
+    aligned: AlignedPhotos,
+    on: Ground,
+    methods: Methods,
+    settings: MosaicSettings,
+    clock: Clock,
+    output: Path,
+    key: str,
+) -> Generator[Event, None, DrawnMap]:
+    """Exposure, then mosaic.tif, provenance.tif and views.tif in `output`; `key` names the run.
+
+    Raises:
+        OutputError: the disk is full or read-only.
+    """
+    photos, alignment = aligned.photos, aligned.alignment
+    thumbnails = aligned.found.thumbnails([v.photo for v in on.views])
+    exposure = yield from clock.stage(
+        "balance",
+        _at_once(
+            lambda: balanced(
+                photos, thumbnails, on, methods.balance, methods.drift, settings.picture
+            )
+        ),
+    )
+    compose = orthomosaic.composer(photos, on, exposure, methods.blend, aligned.pixels)
+    steps = orthomosaic.draw(
+        output,
+        compose,
+        alignment,
+        settings.output,
+        settings.picture.boundary,
+        clock.store,
+        orthomosaic.map_key(key, alignment, on, exposure),
+        photos[0].unit,
+        settings.running.jobs or os.cpu_count() or 1,
+    )
+    drawn = yield from clock.stage("mosaic", steps)
+    return DrawnMap(exposure=exposure, compose=compose, drawn=drawn)
+
+
+def scene_of(
+    given: SurveyInput, methods: Methods, settings: MosaicSettings, clock: Clock
+) -> Generator[Event, None, Scene]:
+    """Aligned photos and their ground, for workflows that draw no map of them."""
+    aligned = yield from align_photos(given, methods, settings, clock)
+    on = yield from find_ground(aligned, methods, settings, clock)
+    return Scene(aligned=aligned, ground=on)
+
+
+def pixel_budget(running: RunningSettings) -> int:
+    """Bytes for decoded photos: what the memory allowed leaves after code, features and tiles."""
+    return int(max(0.15, (running.memory_gb or 1.2) - 0.6) * 1e9)
+
+
+def _pixels_of(
+    photos: Sequence[Photo], all_photos: Sequence[Photo], cache: PixelCache
+) -> PhotoPixels:
+    """Pixels of the photos that take part, by their own indices. They could be read once: an error
+    names the one that cannot be read any more.
+    """
+    where = {p.name: i for i, p in enumerate(all_photos)}
+    index = [where[p.name] for p in photos]
+
+    def pixels(photo: int) -> NDArray[Any]:
+        try:
+            return cache(index[photo])
+        except UnreadablePhotoError as error:
+            raise SkyquiltError(
+                f"{photos[photo].path} could be read at first, and now {error}; see to its disk and"
+                " run the same command again to resume"
+            ) from error
+
+    return pixels
+
+
+def _order(photos: Sequence[Photo], rank: dict[str, int]) -> list[int]:
+    ranked = [(rank[p.name], i) for i, p in enumerate(photos) if p.name in rank]
+    return [i for _, i in sorted(ranked)]
+
+
+def _links(
+    found: FeaturedPhotos,
+    frame: MapFrame,
+    reported: Sequence[Prior],
+    methods: Methods,
+    store: Store,
+    jobs: int,
+) -> Steps[Links]:
+    """Links, unless the method of alignment does without."""
+    if not methods.align.needs_links or len(found.photos) < 2:
+        return Links()
+    return (yield from link_photos(found, frame, reported, methods, store, jobs))
+
+
+def _align(known: AlignmentInputs, methods: Methods, store: Store) -> Steps[Alignment]:
+    yield 0, 1
+    photos = [
+        (p.digest, p.name, p.camera_key, p.focal, p.calibration, p.editor) for p in known.photos
+    ]
+    held = [(k.a, k.b, k.index_a, k.index_b) for k in known.links]
+    key = digest(
+        photos,
+        known.frame,
+        list(known.priors),
+        held,
+        list(known.control),
+        methods.detector,
+        list(known.order),
+        methods.align,
+    )
+    alignment = store.get_or("alignment", key, lambda: methods.align(known))
+    yield 1, 1
+    return alignment
+
+
+def _at_once(work: Callable[[], T]) -> Steps[T]:
+    """A stage of one step."""
+    yield 0, 1
+    result = work()
+    yield 1, 1
+    return result
