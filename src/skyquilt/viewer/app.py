@@ -2,6 +2,9 @@
 poses are not its business.
 """
 
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 from fastapi import FastAPI, Response
@@ -18,23 +21,32 @@ from skyquilt.viewer.listening import Listening
 from skyquilt.viewer.maps import STATIC, Maps
 from skyquilt.viewer.overlays import Overlays
 from skyquilt.viewer.photo_list import PhotoList
-from skyquilt.viewer.receiving import Receiving
+from skyquilt.viewer.receiving import RESUMABLE, TUS, Receiving
 from skyquilt.viewer.survey import Survey
 from skyquilt.viewer.wms_service import WmsService
 
 
 def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) -> FastAPI:
     """The application."""
+    gate, images = Gate(survey, guard, writer), Images(survey)
+    received = Receiving(gate, folder)
+
+    @asynccontextmanager
+    async def sweeping(_: FastAPI) -> AsyncIterator[None]:
+        task = asyncio.create_task(received.uploads.sweeping())
+        yield
+        task.cancel()
+
     app = FastAPI(
+        lifespan=sweeping,
         title="Skyquilt",
         version=__version__,
         docs_url=None,
         redoc_url=None,
         description="A map that grows while drones fly: tiles, WMS, photos, layers, news.",
     )
-    gate, images = Gate(survey, guard, writer, folder), Images(survey)
     maps, wms, listed = Maps(gate, images), WmsService(gate, images), PhotoList(gate)
-    received, layers, news = Receiving(gate), Overlays(gate), Listening(gate)
+    layers, news = Overlays(gate), Listening(gate)
     app.state.ending = news.ending
 
     get, post = {"methods": ["GET"]}, {"methods": ["POST"]}
@@ -47,9 +59,12 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         ("/export", maps.export, {**get, "response_class": FileResponse}),
         ("/photos", listed.photos, get),
         ("/photos", received.upload, post),
-        ("/photos/uploads", received.upload_begin, post),
-        ("/photos/uploads/{number}", received.upload_state, {"methods": ["HEAD"]}),
-        ("/photos/uploads/{number}", received.upload_part, {"methods": ["PATCH"]}),
+        (RESUMABLE, received.upload_offer, {"methods": ["OPTIONS"]}),
+        (RESUMABLE, received.upload_begin, post),
+        (RESUMABLE + "/{number}", received.upload_offer, {"methods": ["OPTIONS"]}),
+        (RESUMABLE + "/{number}", received.upload_state, {"methods": ["HEAD"]}),
+        (RESUMABLE + "/{number}", received.upload_part, {"methods": ["PATCH"]}),
+        (RESUMABLE + "/{number}", received.upload_end, {"methods": ["DELETE"]}),
         ("/photos/{number}", listed.photo, get),
         ("/photos/{number}/file", listed.photo_file, {**get, "response_class": FileResponse}),
         ("/layers", layers.layer_list, get),
@@ -76,15 +91,21 @@ class Guarded:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
+        always, asked = HEADERS, Headers(scope=scope)
+        if scope["path"].startswith(RESUMABLE):
+            always = HEADERS | TUS
+            # tus: for clients that cannot send PATCH or DELETE
+            method = asked.get("x-http-method-override", scope["method"])
+            scope = {**scope, "method": method.upper()}
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
-                for name, value in HEADERS.items():
+                for name, value in always.items():
                     headers.setdefault(name, value)
             await send(message)
 
-        if self.guard.knows(Headers(scope=scope).get("host", "")):
+        if self.guard.knows(asked.get("host", "")):
             await self.app(scope, receive, with_headers)
             return
         refused = JSONResponse({"detail": "this server answers to localhost only"}, 421)
