@@ -1,6 +1,9 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from skyquilt.calibration.calibrate import Calibrate, strangers
 from skyquilt.calibration.held_out import error_px, hold_out
@@ -10,7 +13,7 @@ from skyquilt.geometry.camera import project
 from skyquilt.model.board import Board, BoardView
 from skyquilt.model.calibration import BoardPose, Observations, rms
 from skyquilt.model.camera import PARAMETERS, Camera
-from tests.calibration.boards import BOARD, CAMERA, MIDDLE, poses
+from tests.calibration.boards import BOARD, CAMERA, MIDDLE, frontal, poses
 
 
 def pose_of(simulated):
@@ -60,24 +63,52 @@ def test_leaving_the_perspective_bias_in_shows():
     assert rms(np.concatenate(raw.residuals)) > 0.004
 
 
-def test_the_fit_agrees_with_opencv():
-    corners = Calibrate(marks="corners", tolerance=0.0)
-    found = corners(views(), BOARD)
-    every = [corners.observations(v, BOARD) for v in views()]
-    flags = cv2.CALIB_FIX_ASPECT_RATIO
-    K = np.array([[600.0, 0, 320], [0, 600, 240], [0, 0, 1]])
-    error, K, k, *_ = cv2.calibrateCamera(
-        [s.board.astype(np.float32) for s in every],
-        [s.px.astype(np.float32) for s in every],
-        (640, 480),
-        K,
-        np.zeros(5),
-        flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS,
-    )
-    assert found.rms_px == pytest.approx(error, rel=1e-4)
-    assert found.camera.focal == pytest.approx(K[0, 0], abs=0.05)
-    assert found.camera.cx == pytest.approx(K[0, 2], abs=0.1)
-    assert [found.camera.k1, found.camera.k2] == pytest.approx(k.ravel()[:2].tolist(), abs=0.01)
+@pytest.mark.parametrize(
+    "free", [PARAMETERS, ("focal", "cx", "cy", "k1"), ("focal", "cx", "cy", "p1", "p2"), ("focal",)]
+)
+def test_the_fit_is_the_minimum_that_scipy_finds(free):
+    seen = [Calibrate(marks="corners").observations(v, BOARD) for v in views(count=5)]
+    start = replace(start_camera(seen, width=640, height=480), k1=-0.2, k2=0.05, p1=0.001)
+    at = [start_pose(s, start) for s in seen]
+    before = [p.cam_t.copy() for p in at]
+    found = solve(seen, start, at, free)
+    assert all((p.cam_t == t).all() for p, t in zip(at, before, strict=True))
+    columns = [PARAMETERS.index(n) for n in free]
+    held = [k for k in range(8) if k not in columns]
+    assert (found.camera.vector[held] == start.vector[held]).all()
+
+    def residuals(x):
+        vector = start.vector
+        vector[columns] = x[: len(free)] * scale
+        camera = replace(start, **dict(zip(PARAMETERS, vector.tolist(), strict=True)))
+        at = [
+            BoardPose(cam_R_board=cv2.Rodrigues(p[:3])[0], cam_t=p[3:])
+            for p in x[len(free) :].reshape(-1, 6)
+        ]
+        return np.concatenate(
+            [(s.px - project(camera, p(s.board))).ravel() for s, p in zip(seen, at, strict=True)]
+        )
+
+    scale = np.array([100.0, 100, 100, 0.1, 0.1, 0.1, 0.01, 0.01])[columns]
+    turns = [np.r_[cv2.Rodrigues(p.cam_R_board)[0].ravel(), p.cam_t] for p in found.poses]
+    here = np.r_[found.camera.vector[columns] / scale, np.ravel(turns)]
+    best = least_squares(residuals, here + 1e-4, xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    assert (np.concatenate(found.residuals) ** 2).sum() <= 2 * best.cost * (1 + 1e-6)
+    assert found.camera.focal == pytest.approx(best.x[0] * 100, abs=0.01)
+
+
+@pytest.mark.parametrize("marks", ["centres", "corners"])
+@pytest.mark.parametrize("count", [3, 5, 8])
+def test_boards_that_are_not_tilted_give_a_camera_that_admits_it(marks, count):
+    """Nothing tells the focal length from the distance."""
+    rng = np.random.default_rng(0)
+    seen = [
+        view(f"v{k}", pose_of(frontal(0.3 * k, (0.02 * k, 0.0, 1.6))), rng, 0.1)
+        for k in range(count)
+    ]
+    found = Calibrate(marks=marks)(seen, BOARD)
+    assert found.camera.focal > 0
+    assert found.sigma("focal") > 0.1 * found.camera.focal  # the command refuses it
 
 
 def test_small_coefficients_are_dropped_and_large_ones_stay():
@@ -123,8 +154,6 @@ def test_a_view_of_another_board_is_a_stranger():
     odd = views(count=1, seed=3)[0]
     shifted = odd.centroids.copy()
     shifted[2:4] += np.array([0.0, 6.0])
-    from dataclasses import replace
-
     found = Calibrate()([*seen, replace(odd, name="odd", centroids=shifted)], BOARD)
     assert list(strangers(found)) == ["odd"]
     assert strangers(Calibrate()(seen, BOARD)) == {}

@@ -295,8 +295,8 @@ def test_events(files, tmp_path):
 def test_help_names_every_method():
     from typer.testing import CliRunner
 
-    from skyquilt.cli.app import app
     from skyquilt import registry
+    from skyquilt.cli.app import app
 
     told = (
         CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(app, ["register", "--help"]).output

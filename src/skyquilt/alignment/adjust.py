@@ -7,6 +7,7 @@ needs them on tilt and on every intrinsic as well. The tests hold this code agai
 on problems that both can state.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ from skyquilt.alignment.problem import (
     linearised_points,
     residuals_px,
 )
+from skyquilt.geometry.levenberg_marquardt import levenberg_marquardt
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -345,26 +347,27 @@ def adjust(
         tolerance: relative decrease of the cost at which it counts as converged.
         damping: first damping, relative to the diagonal of the normal equations.
     """
-    cost = np.inf
-    for iteration in range(iterations):
+
+    def equations(state: State) -> tuple[float, Callable[[float], State]]:
         normal = normal_equations(problem, state)
-        cost, new_cost, accepted, candidate = normal.cost, np.inf, False, state
-        while not accepted and damping < 1e8:
-            try:
-                candidate = polish_points(
-                    problem, state.moved(*Reduced(problem, normal, damping).step())
-                )
-                new_cost = robust_cost(problem, candidate)
-            except np.linalg.LinAlgError:
-                new_cost = np.inf
-            accepted = bool(new_cost <= cost * (1 + 1e-12))
-            damping = max(damping / 4, 1e-9) if accepted else damping * 8
-        if not accepted:
-            return Adjusted(state=state, cost=cost, iterations=iteration, converged=True)
-        state = candidate
-        if cost - new_cost < tolerance * cost:
-            return Adjusted(state=state, cost=new_cost, iterations=iteration + 1, converged=True)
-    return Adjusted(state=state, cost=cost, iterations=iterations, converged=False)
+
+        def step(damping: float) -> State:
+            moved = state.moved(*Reduced(problem, normal, damping).step())
+            return polish_points(problem, moved)
+
+        return normal.cost, step
+
+    found = levenberg_marquardt(
+        state,
+        equations,
+        lambda state: robust_cost(problem, state),
+        iterations=iterations,
+        tolerance=tolerance,
+        damping=damping,
+    )
+    return Adjusted(
+        state=found.state, cost=found.cost, iterations=found.iterations, converged=found.converged
+    )
 
 
 def covariance(problem: Problem, state: State) -> Array | None:

@@ -32,7 +32,7 @@ class Calibrate:
     again.
     """
 
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     marks: Marks = "centres"
     """What is sighted."""
     tolerance: float = 3.0

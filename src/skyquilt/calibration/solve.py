@@ -1,24 +1,34 @@
-"""Intrinsics and board poses that leave the least squared reprojection error, with their
-covariance.
-"""
+"""Intrinsics and board poses that leave the least squared reprojection error, by OpenCV."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from skyquilt.calibration.deviations import sigmas
-from skyquilt.calibration.linearised import linearised
 from skyquilt.geometry.camera import project
-from skyquilt.geometry.frames import rotation_from_vector
 from skyquilt.model.calibration import BoardPose, Observations
 from skyquilt.model.camera import PARAMETERS, Camera
 
 Array = NDArray[np.float64]
-_ROUNDS = 60
-_STILL = 1e-10
+
+_ENOUGH = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+"""Steps of a fit at most, and the relative change that ends it."""
+_HELD = {
+    "k1": cv2.CALIB_FIX_K1,
+    "k2": cv2.CALIB_FIX_K2,
+    "k3": cv2.CALIB_FIX_K3,
+    "p1": cv2.CALIB_FIX_TANGENT_DIST,
+    "cx": cv2.CALIB_FIX_PRINCIPAL_POINT,
+}
+"""What holds a parameter; p2 goes with p1, and cy with cx."""
+_SHORTEST = 0.1
+"""Least focal length as a share of the longer side: boards that are not tilted can be explained by
+none at all, and wild distortion.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,85 +43,94 @@ class Solution:
     """Measured less predicted px (n, 2), per view."""
 
 
-def moved(pose: BoardPose, step: Array) -> BoardPose:
-    """A pose turned by a rotation vector (3) in rad in camera axes, then shifted (3) in m."""
-    R = rotation_from_vector(step[:3]) @ pose.cam_R_board
-    return BoardPose(cam_R_board=R, cam_t=pose.cam_t + step[3:])
-
-
 def solve(
     views: Sequence[Observations],
     camera: Camera,
     poses: Sequence[BoardPose],
     free: Sequence[str] = PARAMETERS,
 ) -> Solution:
-    """Levenberg and Marquardt over the intrinsics named in `free` and six parameters of each pose.
+    """The intrinsics named in `free`, the focal length among them, and the pose of each view;
+    begins at `camera` and `poses`. With nothing free, poses alone are fitted. Views that do not
+    determine the camera leave everything where it began; the deviations tell.
 
-    For the standard deviations see `deviations.sigmas`.
+    OpenCV tells the deviations that independent errors would have; those that count are larger,
+    see `deviations.sigmas`.
     """
+    if free:
+        camera, poses = _calibrated(views, camera, poses, free) or (camera, poses)
+    else:
+        poses = [_placed(view, camera, pose) for view, pose in zip(views, poses, strict=True)]
     columns = [PARAMETERS.index(name) for name in free]
-    best, damping = _state(views, camera, poses), 1e-3
-    normal, gradient = _normal(views, best, columns)
-    for _ in range(_ROUNDS):
-        step = np.asarray(
-            np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient), np.float64
-        )
-        tried = _state(views, *_moved(best, step, columns))
-        if tried.cost < best.cost:
-            gain = 1 - tried.cost / best.cost
-            best, damping = tried, max(damping / 10, 1e-12)
-            normal, gradient = _normal(views, best, columns)
-            if gain < _STILL:
-                break
-        elif damping > 1e8:
-            break
-        else:
-            damping *= 10
-    residuals = tuple(v.px - p for v, p in zip(views, best.predicted, strict=True))
+    predicted = _predicted(views, camera, poses)
     return Solution(
-        camera=replace(best.camera, sigmas=sigmas(views, best.camera, best.poses, columns)),
-        poses=tuple(best.poses),
-        residuals=residuals,
+        camera=replace(camera, sigmas=sigmas(views, camera, poses, columns)),
+        poses=tuple(poses),
+        residuals=tuple(v.px - p for v, p in zip(views, predicted, strict=True)),
     )
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _State:
-    camera: Camera
-    poses: Sequence[BoardPose]
-    predicted: Sequence[Array]
-    cost: float
+def _predicted(
+    views: Sequence[Observations], camera: Camera, poses: Sequence[BoardPose]
+) -> list[Array]:
+    return [project(camera, p(v.board)) for v, p in zip(views, poses, strict=True)]
 
 
-def _state(views: Sequence[Observations], camera: Camera, poses: Sequence[BoardPose]) -> _State:
-    predicted = [project(camera, p(v.board)) for v, p in zip(views, poses, strict=True)]
-    cost = sum(float(((v.px - q) ** 2).sum()) for v, q in zip(views, predicted, strict=True))
-    cost = cost if np.isfinite(cost) and camera.focal > 0 else np.inf
-    return _State(camera=camera, poses=poses, predicted=predicted, cost=cost)
+def _calibrated(
+    views: Sequence[Observations], camera: Camera, poses: Sequence[BoardPose], free: Sequence[str]
+) -> tuple[Camera, list[BoardPose]] | None:
+    """Camera and poses of the minimum; None where OpenCV refuses to begin there, or where what it
+    found is no camera that sees all boards.
+    """
+    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO
+    flags |= cv2.CALIB_USE_EXTRINSIC_GUESS
+    for name, flag in _HELD.items():
+        flags |= 0 if name in free else flag
+    turns, shifts = zip(*map(_vectors, poses), strict=True)
+    try:
+        _, K, k, turned, shifted, *_ = cv2.calibrateCameraExtended(
+            [v.board.astype(np.float32) for v in views],
+            [v.px.astype(np.float32) for v in views],
+            (camera.width, camera.height),
+            camera.matrix,
+            _distortion(camera),
+            turns,
+            shifts,
+            flags=flags,
+            criteria=_ENOUGH,
+        )
+    except cv2.error:  # a principal point outside the picture, say
+        return None
+    k1, k2, p1, p2, k3 = k.ravel()[:5].tolist()
+    values: dict[str, Any] = {"focal": K[0, 0], "cx": K[0, 2], "cy": K[1, 2]}
+    values |= {"k1": k1, "k2": k2, "k3": k3, "p1": p1, "p2": p2}
+    values = {name: float(value) for name, value in values.items()}
+    found = replace(camera, **values)
+    placed = [_pose(*p) for p in zip(turned, shifted, strict=True)]
+    seen = all(np.isfinite(px).all() for px in _predicted(views, found, placed))
+    shortest = _SHORTEST * max(camera.width, camera.height)
+    return (found, placed) if found.focal > shortest and seen else None
 
 
-def _normal(
-    views: Sequence[Observations], state: _State, columns: Sequence[int]
-) -> tuple[Array, Array]:
-    """Normal matrix and right-hand side: intrinsics first, then six per view."""
-    own = len(columns)
-    size = own + 6 * len(views)
-    normal, gradient = np.zeros((size, size)), np.zeros(size)
-    for k, (view, pose) in enumerate(zip(views, state.poses, strict=True)):
-        J, r = linearised(view, state.camera, pose, columns)
-        J, r = J.reshape(-1, own + 6), r.ravel()
-        where = np.r_[0:own, own + 6 * k : own + 6 * k + 6]
-        normal[np.ix_(where, where)] += J.T @ J
-        gradient[where] += J.T @ r
-    return normal, gradient
+def _placed(view: Observations, camera: Camera, pose: BoardPose) -> BoardPose:
+    turn, shift = cv2.solvePnPRefineLM(
+        view.board, view.px, camera.matrix, _distortion(camera), *_vectors(pose), _ENOUGH
+    )
+    return _pose(turn, shift)
 
 
-def _moved(state: _State, step: Array, columns: Sequence[int]) -> tuple[Camera, list[BoardPose]]:
-    own = len(columns)
-    vector = state.camera.vector
-    vector[list(columns)] += step[:own]
-    changed: dict[str, Any] = dict(zip(PARAMETERS, vector.tolist(), strict=True))
-    rest = step[own:].reshape(-1, 6)
-    return replace(state.camera, **changed), [
-        moved(p, s) for p, s in zip(state.poses, rest, strict=True)
-    ]
+def _vectors(pose: BoardPose) -> tuple[Array, Array]:
+    """Rotation vector and shift; OpenCV writes into what it is given, so they are copies."""
+    turn = np.asarray(cv2.Rodrigues(pose.cam_R_board)[0], np.float64)
+    return turn, pose.cam_t.reshape(3, 1).copy()
+
+
+def _pose(turn: ArrayLike, shift: ArrayLike) -> BoardPose:
+    R, _ = cv2.Rodrigues(np.asarray(turn, np.float64))
+    return BoardPose(
+        cam_R_board=np.asarray(R, np.float64), cam_t=np.asarray(shift, np.float64).ravel()
+    )
+
+
+def _distortion(camera: Camera) -> Array:
+    """In OpenCV's order."""
+    return np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])

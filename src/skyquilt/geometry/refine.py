@@ -2,9 +2,12 @@
 (12)].
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from skyquilt.geometry.levenberg_marquardt import levenberg_marquardt
 from skyquilt.geometry.transforms import inverse, normalisation, symmetric_transfer_errors
 
 Doubles = NDArray[np.float64]
@@ -45,37 +48,31 @@ def refine(model: str, H: Doubles, a: ArrayLike, b: ArrayLike, *, steps: int = 2
     Ta, Tb = both
     na, nb = a * Ta[0, 0] + Ta[:2, 2], b * Tb[0, 0] + Tb[:2, 2]
     start = Tb @ H @ inverse(Ta)
-    if not abs(start[2, 2]) > 1e-9:
+    before = symmetric_transfer_errors(H, a, b).sum()
+    if not (abs(start[2, 2]) > 1e-9 and np.isfinite(before)):
         return H
     found = _descend(_DIRECTIONS[model], start / start[2, 2], na, nb, steps)
     refined = inverse(Tb) @ found @ Ta
     refined = refined / refined[2, 2]
-    better = (
-        symmetric_transfer_errors(refined, a, b).sum() <= symmetric_transfer_errors(H, a, b).sum()
-    )
+    better = symmetric_transfer_errors(refined, a, b).sum() <= before
     return np.asarray(refined) if better else H
 
 
 def _descend(G: Doubles, H: Doubles, a: Doubles, b: Doubles, steps: int) -> Doubles:
-    damping, cost = 1e-4, symmetric_transfer_errors(H, a, b).sum()
-    for _ in range(steps):
+    def cost(H: Doubles) -> float:
+        return float(symmetric_transfer_errors(H, a, b).sum())
+
+    def linearise(H: Doubles) -> tuple[float, Callable[[float], Doubles]]:
         J, r = _linearised(G, H, a, b)
         JJ, Jr = J.T @ J, J.T @ r
-        if not (np.isfinite(JJ).all() and np.isfinite(Jr).all()):
-            break
-        improved = False
-        while not improved and damping < 1e6:
+
+        def step(damping: float) -> Doubles:
             damped = JJ + np.diag(damping * np.diag(JJ) + 1e-12)
-            tried = H + np.tensordot(np.linalg.solve(damped, -Jr), G, 1)
-            new = symmetric_transfer_errors(tried, a, b).sum()
-            improved = bool(new < cost)
-            damping = damping / 10 if improved else damping * 10
-        if not improved:
-            break
-        H, gain, cost = tried, (cost - new) / max(cost, 1e-300), new
-        if gain < 1e-8:
-            break
-    return H
+            return np.asarray(H + np.tensordot(np.linalg.solve(damped, -Jr), G, 1))
+
+        return float(r @ r), step
+
+    return levenberg_marquardt(H, linearise, cost, iterations=steps, tolerance=1e-8).state
 
 
 def _linearised(G: Doubles, H: Doubles, a: Doubles, b: Doubles) -> tuple[Doubles, Doubles]:

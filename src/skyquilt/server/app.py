@@ -2,6 +2,9 @@
 poses are not its business.
 """
 
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 from fastapi import FastAPI, Response
@@ -10,6 +13,7 @@ from fastapi.staticfiles import StaticFiles
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from skyquilt import __version__
 from skyquilt.server.context import Context, Writer
 from skyquilt.server.event_endpoints import EventEndpoints
 from skyquilt.server.guard import HEADERS, Guard
@@ -18,32 +22,36 @@ from skyquilt.server.layer_endpoints import LayerEndpoints
 from skyquilt.server.map_endpoints import STATIC, MapEndpoints
 from skyquilt.server.photo_endpoints import PhotoEndpoints
 from skyquilt.server.survey import Survey
-from skyquilt.server.upload_endpoints import UploadEndpoints
+from skyquilt.server.upload_endpoints import RESUMABLE, TUS, UploadEndpoints
 from skyquilt.server.wms_endpoints import WmsEndpoints
-from skyquilt.version import __version__
 
 
 def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) -> FastAPI:
     """The application."""
+    context, images = Context(survey, guard, writer), Images(survey)
+    received = UploadEndpoints(context, folder)
+
+    @asynccontextmanager
+    async def sweeping(_: FastAPI) -> AsyncIterator[None]:
+        task = asyncio.create_task(received.uploads.sweeping())
+        yield
+        task.cancel()
+
     app = FastAPI(
+        lifespan=sweeping,
         title="Skyquilt",
         version=__version__,
         docs_url=None,
         redoc_url=None,
         description="A map that grows while drones fly: tiles, WMS, photos, layers, news.",
     )
-    context, images = Context(survey, guard, writer, folder), Images(survey)
     maps, wms, listed = (
         MapEndpoints(context, images),
         WmsEndpoints(context, images),
         PhotoEndpoints(context),
     )
-    received, layers, events = (
-        UploadEndpoints(context),
-        LayerEndpoints(context),
-        EventEndpoints(context),
-    )
-    app.state.ending = events.ending
+    layers, news = LayerEndpoints(context), EventEndpoints(context)
+    app.state.ending = news.ending
 
     get, post = {"methods": ["GET"]}, {"methods": ["POST"]}
     for path, work, options in (
@@ -55,16 +63,19 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         ("/export", maps.export, {**get, "response_class": FileResponse}),
         ("/photos", listed.photos, get),
         ("/photos", received.upload, post),
-        ("/photos/uploads", received.upload_begin, post),
-        ("/photos/uploads/{number}", received.upload_state, {"methods": ["HEAD"]}),
-        ("/photos/uploads/{number}", received.upload_part, {"methods": ["PATCH"]}),
+        (RESUMABLE, received.upload_offer, {"methods": ["OPTIONS"]}),
+        (RESUMABLE, received.upload_begin, post),
+        (RESUMABLE + "/{number}", received.upload_offer, {"methods": ["OPTIONS"]}),
+        (RESUMABLE + "/{number}", received.upload_state, {"methods": ["HEAD"]}),
+        (RESUMABLE + "/{number}", received.upload_part, {"methods": ["PATCH"]}),
+        (RESUMABLE + "/{number}", received.upload_end, {"methods": ["DELETE"]}),
         ("/photos/{number}", listed.photo, get),
         ("/photos/{number}/file", listed.photo_file, {**get, "response_class": FileResponse}),
         ("/layers", layers.layer_list, get),
         ("/layers", layers.layer_post, post),
         ("/layers/{name}", layers.layer_get, {**get, "response_class": Response}),
         ("/layers/{name}", layers.layer_delete, {"methods": ["DELETE"]}),
-        ("/events", events.events, {**get, "response_class": StreamingResponse}),
+        ("/events", news.events, {**get, "response_class": StreamingResponse}),
         ("/finish", layers.finish, post),
     ):
         app.add_api_route(path, work, **options)
@@ -84,15 +95,21 @@ class Guarded:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
+        always, asked = HEADERS, Headers(scope=scope)
+        if scope["path"].startswith(RESUMABLE):
+            always = HEADERS | TUS
+            # tus: for clients that cannot send PATCH or DELETE
+            method = asked.get("x-http-method-override", scope["method"])
+            scope = {**scope, "method": method.upper()}
 
         async def with_headers(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
-                for name, value in HEADERS.items():
+                for name, value in always.items():
                     headers.setdefault(name, value)
             await send(message)
 
-        if self.guard.knows(Headers(scope=scope).get("host", "")):
+        if self.guard.knows(asked.get("host", "")):
             await self.app(scope, receive, with_headers)
             return
         refused = JSONResponse({"detail": "this server answers to localhost only"}, 421)

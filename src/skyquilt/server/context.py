@@ -1,6 +1,5 @@
 """What all addresses share: the survey, and who may write to it."""
 
-from pathlib import Path
 from typing import Protocol
 
 from fastapi import HTTPException, Request
@@ -9,7 +8,6 @@ from skyquilt.live.ledger import Ledger
 from skyquilt.live.photo_intake import Intake
 from skyquilt.server.guard import Guard
 from skyquilt.server.survey import Survey
-from skyquilt.server.uploads import Uploads
 
 
 class Writer(Protocol):
@@ -22,11 +20,8 @@ class Writer(Protocol):
 class Context:
     """Of one survey."""
 
-    def __init__(self, survey: Survey, guard: Guard, writer: Writer | None, folder: Path) -> None:
+    def __init__(self, survey: Survey, guard: Guard, writer: Writer | None) -> None:
         self.survey, self.guard, self.writer = survey, guard, writer
-        self.uploads = (
-            Uploads(folder / "uploads", most=guard.most_uploads) if writer is not None else None
-        )
 
     def layer(self, name: str | None) -> str:
         """The layer of a name, or the first one."""
@@ -40,12 +35,17 @@ class Context:
             )
         return str(name)
 
-    def writing(self, request: Request) -> tuple[Writer, Uploads]:
-        """Whether a request may write."""
-        if self.writer is None or self.uploads is None:
+    def growing(self) -> Writer:
+        """The growing map, where there is one."""
+        if self.writer is None:
             raise HTTPException(
                 405, "this survey is only looked at; 'skyquilt live' takes photos and layers"
             )
+        return self.writer
+
+    def writing(self, request: Request) -> Writer:
+        """The growing map, for a request that may write to it."""
+        writer = self.growing()
         given = request.headers.get("authorization") or request.headers.get("x-token")
         if not self.guard.admits(given):
             raise HTTPException(
@@ -56,4 +56,4 @@ class Context:
         origin = request.headers.get("origin")
         if origin is not None and origin.split("://")[-1] != request.headers.get("host", ""):
             raise HTTPException(403, "pages of other sites may not write here")
-        return self.writer, self.uploads
+        return writer

@@ -34,6 +34,12 @@ class Guard:
     """Most layers."""
     most_uploads: int = 200
     """Uploads under way at a time."""
+    upload_stall_s: float = 10.0
+    """An upload of which nothing comes for so long has lost its connection."""
+    upload_idle_s: float = 600.0
+    """One that nobody went on with for so long no longer counts as under way."""
+    upload_keep_s: float = 24 * 3600.0
+    """One that nobody went on with for so long is dropped."""
 
     def __post_init__(self) -> None:
         if self.token is None and not local(self.host):

@@ -37,7 +37,7 @@ class LayerEndpoints:
 
     async def layer_post(self, request: Request, name: str) -> JSONResponse:
         """Lays GeoJSON (the request's body) over the map, or replaces the layer of that name."""
-        writer, _ = self.context.writing(request)
+        writer = self.context.writing(request)
         data = b""
         async for block in request.stream():
             data += block
@@ -62,7 +62,7 @@ class LayerEndpoints:
 
     def layer_delete(self, request: Request, name: str) -> dict[str, str]:
         """Removes a layer."""
-        writer, _ = self.context.writing(request)
+        writer = self.context.writing(request)
         if not drop_layer(writer.ledger, name):
             raise HTTPException(404, "there is no such layer")
         return {"name": name}
@@ -71,7 +71,7 @@ class LayerEndpoints:
         """Asks for the final map: all photos adjusted together, drawn at full resolution, kept
         beside the live one.
         """
-        writer, _ = self.context.writing(request)
+        writer = self.context.writing(request)
         writer.ledger.put_meta("finish", "asked")
         writer.ledger.tell("finish", {"state": "asked"})
         return {"state": "asked"}

@@ -1,22 +1,46 @@
-"""Photos as they are handed in: in one piece, or in parts that survive a lost connection."""
+"""Photos as they are handed in: in one request, or in parts that survive a lost connection.
 
-from typing import Annotated, Any
+Parts follow the tus protocol for resumable uploads, version 1.0.0: its core, and its extensions
+creation, expiration and termination. What it leaves open: the answer to the last part tells what
+became of the photo, in `Photo-Id` and `Photo-State`, or refuses it with 422 and the reason.
+"""
 
-from fastapi import HTTPException, Query, Request, Response
+import asyncio
+import base64
+import os
+import re
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager, suppress
+from email.utils import formatdate
+from pathlib import Path
+from typing import BinaryIO
+
+from fastapi import HTTPException, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse
+from starlette.requests import ClientDisconnect
 
 from skyquilt.errors import OutputError
-from skyquilt.live.photo_intake import Accepted, Intake, shown_name
+from skyquilt.live.photo_intake import Accepted, Intake, Refused, shown_name
 from skyquilt.server.context import Context
-from skyquilt.server.uploads import Uploads
+from skyquilt.server.uploads import Upload, Uploads
+
+RESUMABLE = "/photos/uploads"
+"""The address of resumable uploads."""
+TUS = {"Tus-Resumable": "1.0.0"}
+"""Sent with every answer from there."""
+VERSIONS = {"Tus-Version": "1.0.0"}
+PART = "application/offset+octet-stream"
+"""Media type of a part."""
 
 
 class UploadEndpoints:
     """Addresses of uploads."""
 
-    def __init__(self, context: Context) -> None:
-        self.context = context
+    def __init__(self, context: Context, folder: Path) -> None:
+        self.context, self.uploads = context, Uploads(folder / "uploads", context.guard)
+
+    # -- in one request
 
     async def upload(
         self, request: Request, name: str = "photo", source: str = "upload"
@@ -24,126 +48,248 @@ class UploadEndpoints:
         """Takes a photo (the body). It answers when the photo is safe: 201, 200 for a duplicate,
         422 refused.
         """
-        writer, uploads = self.context.writing(request)
-        held = self._begun(uploads, name, source, self._length(request))
-        try:
-            size = await self._received(request, held.id, writer.intake.inbox.most_bytes)
-            if "content-length" in request.headers and size != int(
-                request.headers["content-length"]
-            ):
+        intake = self.context.writing(request).intake
+        most = intake.inbox.most_bytes
+        _check_size(_length(request), most, f"a photo may have {most} bytes")
+        upload = await run_in_threadpool(self._begun, name, source, most)
+        with self.uploads.writing(upload.id):
+            try:
+                await self._append(request, upload, f"a photo may have {most} bytes")
+                done = await run_in_threadpool(self._handed_in, intake, upload)
+            finally:
+                self.uploads.drop(upload.id)
+        if not isinstance(done, Accepted):
+            return _refusal(done)
+        said = {"id": done.id, "name": done.name, "state": _state(done)}
+        return JSONResponse(said, 200 if done.duplicate else 201)
+
+    # -- in parts (tus)
+
+    def upload_offer(self) -> Response:
+        """What of tus the server offers."""
+        most = self.context.growing().intake.inbox.most_bytes
+        offered = {"Tus-Extension": "creation,expiration,termination", "Tus-Max-Size": str(most)}
+        return Response(status_code=204, headers=VERSIONS | offered)
+
+    def upload_begin(self, request: Request) -> Response:
+        """Begins an upload of `Upload-Length` bytes; `Upload-Metadata` may hold `filename` and
+        `source`. `Location` tells where its parts go.
+        """
+        most = self._tus(request).inbox.most_bytes
+        size = _number(request, "upload-length")
+        if size is None:
+            raise HTTPException(400, "Upload-Length, the size of the photo in bytes, is needed")
+        _check_size(size, most, f"a photo may have {most} bytes", {"Tus-Max-Size": str(most)})
+        if size == 0:
+            raise HTTPException(422, "an empty file is no photo")
+        metadata = request.headers.get("upload-metadata", "")
+        about = metadata_of(metadata)
+        name = about.get("filename") or about.get("name") or "photo"
+        source = about.get("source") or "upload"
+        upload = self._begun(name, source, size, metadata)
+        told = {"Location": f"{RESUMABLE}/{upload.id}", **self._progress(upload)}
+        return Response(status_code=201, headers=told)
+
+    async def upload_state(self, request: Request, number: str) -> Response:
+        """How far an upload is: `Upload-Offset`."""
+        intake, upload = self._tus(request), self._known(number)
+        if self.uploads.offset(upload) == upload.size and not upload.outcome:
+            # All bytes are here, but the server ended or its disk was full before the photo was
+            # safe. The offset alone would tell the client that it is.
+            with self._alone(number):
+                answer = await self._finished(intake, upload)
+            if answer.status_code != 204:
+                return answer
+            upload = self._known(number)
+        told = self._progress(upload) | {"Upload-Length": str(upload.size)}
+        if upload.metadata:
+            told["Upload-Metadata"] = upload.metadata
+        return Response(headers=told | {"Cache-Control": "no-store"})
+
+    async def upload_part(self, request: Request, number: str) -> Response:
+        """Appends a part at `Upload-Offset`; the last one makes it a photo."""
+        intake, upload = self._tus(request), self._known(number)
+        if request.headers.get("content-type", "").split(";")[0].strip().lower() != PART:
+            raise HTTPException(415, f"a part has the Content-Type {PART}")
+        with self._alone(number):
+            offset = self.uploads.offset(upload)
+            if _number(request, "upload-offset") != offset:
                 raise HTTPException(
-                    400, "the connection was lost before the photo was whole; send it again"
+                    409, f"Upload-Offset is {offset} here", {"Upload-Offset": str(offset)}
                 )
-            return await run_in_threadpool(self._handed_in, writer.intake, held.id, name, source)
-        finally:
-            uploads.drop(held.id)
+            limit = f"the upload was announced with {upload.size} bytes"
+            _check_size(offset + _length(request), upload.size, limit)
+            if not upload.outcome:
+                await self._append(request, upload, limit)
+                if self.uploads.offset(upload) == upload.size:
+                    return await self._finished(intake, upload)
+        return Response(status_code=204, headers=self._progress(upload))
 
-    def _length(self, request: Request) -> int:
-        text = request.headers.get("content-length", "0")
-        size = int(text) if text.isdigit() else 0
-        assert self.context.writer is not None
-        most = self.context.writer.intake.inbox.most_bytes
-        if size > most:
-            raise HTTPException(413, f"a photo may have {most} bytes, this one has {size}")
-        return size
+    async def upload_end(self, request: Request, number: str) -> Response:
+        """Drops an upload; a photo that was accepted stays."""
+        self._tus(request)
+        self._known(number)
+        with self._alone(number):
+            self.uploads.drop(number)
+        return Response(status_code=204)
 
-    def _begun(self, uploads: Uploads, name: str, source: str, size: int) -> Any:
+    def _tus(self, request: Request) -> Intake:
+        """Where photos go, for a request that may write and speaks this version of tus."""
+        writer = self.context.writing(request)
+        if request.headers.get("tus-resumable") != TUS["Tus-Resumable"]:
+            raise HTTPException(412, "this is tus 1.0.0; say so in Tus-Resumable", VERSIONS)
+        return writer.intake
+
+    def _known(self, number: str) -> Upload:
+        upload = self.uploads.get(number)
+        if upload is None:
+            raise HTTPException(404, "there is no such upload, or it has expired")
+        return upload
+
+    @contextmanager
+    def _alone(self, number: str) -> Iterator[None]:
+        """While one request writes an upload, others may not."""
+        with self.uploads.writing(number) as mine:
+            if not mine:
+                raise HTTPException(423, "another request is writing this upload; try again later")
+            yield
+
+    def _progress(self, upload: Upload) -> dict[str, str]:
+        """Headers that tell how far an upload is."""
+        told = {"Upload-Offset": str(self.uploads.offset(upload)), **upload.outcome}
+        if not upload.outcome:
+            told["Upload-Expires"] = formatdate(self.uploads.expires(upload), usegmt=True)
+        return told
+
+    async def _finished(self, intake: Intake, upload: Upload) -> Response:
+        """Hands in an upload that is whole."""
+        done = await run_in_threadpool(self._handed_in, intake, upload)
+        if not isinstance(done, Accepted):
+            self.uploads.drop(upload.id)
+            return _refusal(done)
+        told = {"Photo-Id": str(done.id), "Photo-State": _state(done)}
+        self.uploads.accept(upload, told)
+        return Response(status_code=204, headers={"Upload-Offset": str(upload.size), **told})
+
+    # -- both
+
+    def _begun(self, name: str, source: str, size: int, metadata: str = "") -> Upload:
         try:
-            held = uploads.begin(shown_name(name), shown_name(source), size)
+            upload = self.uploads.begin(shown_name(name), shown_name(source), size, metadata)
         except OSError as error:
-            raise HTTPException(
-                507, f"the server's disk cannot take it ({error.strerror}); send it again later"
-            ) from error
-        if held is None:
+            raise _no_room(error) from error
+        if upload is None:
             raise HTTPException(
                 429, "too many uploads are under way; wait for some to end", {"Retry-After": "5"}
             )
-        return held
+        return upload
 
-    async def _received(self, request: Request, number: str, most: int) -> int:
-        assert self.context.uploads is not None
-        size = 0
+    async def _append(self, request: Request, upload: Upload, limit: str) -> None:
+        """Writes the body behind what is here of an upload. Of a connection that was lost, what
+        came counts; of a body that is too long or that the disk cannot take, nothing does.
+        """
+        path, before = self.uploads.path(upload), self.uploads.offset(upload)
         try:
-            with self.context.uploads.path(number).open("ab") as file:
-                async for block in request.stream():
-                    size += len(block)
-                    if size > most:
-                        raise HTTPException(
-                            413, f"a photo may have {most} bytes, this one has more"
-                        )
-                    file.write(block)
+            with path.open("ab") as file:
+                whole = await self._written(request, file, upload.size, limit)
+                file.flush()
+                await run_in_threadpool(os.fsync, file.fileno())
         except OSError as error:
-            raise HTTPException(
-                507, f"the server's disk cannot take it ({error.strerror}); send it again later"
-            ) from error
-        return size
+            _cut(path, before)
+            raise _no_room(error) from error
+        except HTTPException:
+            _cut(path, before)
+            raise
+        if not whole:
+            raise HTTPException(408, "the connection was lost before all was here; send the rest")
 
-    def _handed_in(self, intake: Intake, number: str, name: str, source: str) -> JSONResponse:
-        assert self.context.uploads is not None
+    async def _written(self, request: Request, file: BinaryIO, most: int, limit: str) -> bool:
+        """Writes the body to a file; false where the connection was lost before its end."""
+        size = file.tell()
         try:
-            with self.context.uploads.path(number).open("rb") as file:
-                done = intake.take(iter(lambda: file.read(1 << 20), b""), name, source)
+            async for block in _blocks(request, self.context.guard.upload_stall_s):
+                size += len(block)
+                _check_size(size, most, limit)
+                file.write(block)
+        except (ClientDisconnect, TimeoutError):
+            return False
+        return True
+
+    def _handed_in(self, intake: Intake, upload: Upload) -> Accepted | Refused:
+        try:
+            with self.uploads.path(upload).open("rb") as file:
+                blocks = iter(lambda: file.read(1 << 20), b"")
+                return intake.take(blocks, upload.name, upload.source)
         except OutputError as error:
             raise HTTPException(507, str(error)) from error
-        if not isinstance(done, Accepted):
-            return JSONResponse({"name": done.name, "state": "refused", "reason": done.reason}, 422)
-        said = {
-            "id": done.id,
-            "name": done.name,
-            "state": "duplicate" if done.duplicate else "received",
-        }
-        return JSONResponse(said, 200 if done.duplicate else 201)
 
-    def upload_begin(
-        self, request: Request, name: str, size: Annotated[int, Query(ge=1)], source: str = "upload"
-    ) -> JSONResponse:
-        """Begins a resumable upload of `size` bytes; its parts go to /photos/uploads/{id}."""
-        writer, uploads = self.context.writing(request)
-        if size > writer.intake.inbox.most_bytes:
-            raise HTTPException(
-                413, f"a photo may have {writer.intake.inbox.most_bytes} bytes, this one has {size}"
-            )
-        held = self._begun(uploads, name, source, size)
-        return JSONResponse(
-            {"id": held.id, "offset": 0}, 201, {"Location": f"/photos/uploads/{held.id}"}
-        )
 
-    def upload_state(self, request: Request, number: str) -> Response:
-        """How far a resumable upload is: header `Upload-Offset`."""
-        _, uploads = self.context.writing(request)
-        held = uploads.get(number)
-        if held is None:
-            raise HTTPException(404, "there is no such upload")
-        return Response(
-            headers={"Upload-Offset": str(held.offset), "Upload-Length": str(held.size)}
-        )
+def metadata_of(header: str) -> dict[str, str]:
+    """Keys and values of `Upload-Metadata`: pairs with commas between them, each a key and, after
+    a space, its value in Base64.
 
-    async def upload_part(self, request: Request, number: str) -> JSONResponse:
-        """Appends a part at header `Upload-Offset`; the last one makes it a photo."""
-        writer, uploads = self.context.writing(request)
-        held = uploads.get(number)
-        if held is None:
-            raise HTTPException(404, "there is no such upload")
-        if request.headers.get("upload-offset") != str(held.offset):
-            raise HTTPException(
-                409, f"Upload-Offset is {held.offset} here", {"Upload-Offset": str(held.offset)}
-            )
-        offset = held.offset
+    Raises:
+        HTTPException: 400, it is none.
+    """
+    found: dict[str, str] = {}
+    for pair in header.split(",") if header.strip() else []:
+        key, _, value = pair.strip().partition(" ")
         try:
-            async for block in request.stream():
-                if offset + len(block) > held.size:
-                    raise HTTPException(413, f"the upload was announced with {held.size} bytes")
-                offset = await run_in_threadpool(uploads.append, held, block) if block else offset
-        except OSError as error:
-            raise HTTPException(
-                507, f"the server's disk is full ({error.strerror}); send the rest later"
-            ) from error
-        if offset < held.size:
-            return JSONResponse(
-                {"id": number, "offset": offset}, 200, {"Upload-Offset": str(offset)}
-            )
-        answer = await run_in_threadpool(
-            self._handed_in, writer.intake, number, held.name, held.source
-        )
-        uploads.drop(number)
-        return answer
+            text = base64.b64decode(value.strip(), validate=True).decode(errors="replace")
+        except ValueError:
+            raise HTTPException(400, f"Upload-Metadata: {key[:60]!r} is no Base64") from None
+        if not key or key in found:
+            raise HTTPException(400, "Upload-Metadata: each value needs a key of its own")
+        found[key] = text
+    return found
+
+
+async def _blocks(request: Request, patience_s: float) -> AsyncIterator[bytes]:
+    """The body as it comes.
+
+    Raises:
+        TimeoutError: nothing came for `patience_s`.
+        ClientDisconnect: the connection was lost.
+    """
+    stream = request.stream()
+    while True:
+        async with asyncio.timeout(patience_s):
+            block = await anext(stream, None)
+        if block is None:
+            return
+        yield block
+
+
+def _length(request: Request) -> int:
+    """Bytes that the body is to have; 0 where the client does not say."""
+    return _number(request, "content-length") or 0
+
+
+def _number(request: Request, header: str) -> int | None:
+    """A header that holds a count of bytes; None where it is missing or holds something else."""
+    text = request.headers.get(header, "")
+    return int(text) if re.fullmatch("[0-9]{1,18}", text) else None
+
+
+def _check_size(size: int, most: int, limit: str, headers: dict[str, str] | None = None) -> None:
+    if size > most:
+        raise HTTPException(413, f"{limit}, this makes {size} or more", headers)
+
+
+def _cut(path: Path, size: int) -> None:
+    with suppress(OSError):
+        os.truncate(path, size)
+
+
+def _no_room(error: OSError) -> HTTPException:
+    return HTTPException(
+        507, f"the server's disk cannot take it ({error.strerror}); send it again later"
+    )
+
+
+def _state(done: Accepted) -> str:
+    return "duplicate" if done.duplicate else "received"
+
+
+def _refusal(done: Refused) -> JSONResponse:
+    return JSONResponse({"name": done.name, "state": "refused", "reason": done.reason}, 422)
