@@ -16,7 +16,7 @@ from skyquilt.imaging.views import STEP, View, grid_of, make_views, native_gsd
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
-from skyquilt.pipelines.intake import Intake, Pictures
+from skyquilt.pipelines.intake import Intake, Pictures, picture_recipe
 from skyquilt.pipelines.radiometry import drift_of, value_tags
 from skyquilt.raster import Block, CogWriter, RasterSpec, write_array
 from skyquilt.raster.spec import Compression
@@ -126,9 +126,10 @@ def survey_ground(
     grid = grid_of(views, gsd, bounds)
     if methods.sweep is not None and len(alignment.ties.xyz) > 3:
         sweep, known, held = methods.sweep, surface, set(alignment.held)
+        seen = sorted(held), picture_recipe()
         surface = store.get_or(
             "surface",
-            digest(key, poses_digest(alignment), grid, sweep),
+            digest(key, poses_digest(alignment), grid, sweep, seen),
             lambda: sweep(known, [v for v in views if v.photo in held], grid, pictures),
         )
     yield 1, 1

@@ -85,7 +85,22 @@ class Pictures:
 
 def picture_key(photo: Photo) -> str:
     """The key of a photo's grey picture in the store."""
-    return digest(photo.digest, PICTURE)
+    return digest(photo.digest, picture_recipe())
+
+
+def picture_recipe() -> tuple[Any, ...]:
+    """What grey pictures depend on besides their photos: part of the key of all made from them."""
+    return PICTURE, halved, shrink, to_grey8
+
+
+def features_key(photo: Photo, methods: Methods) -> str:
+    """The key of a photo's features and thumbnail in the store."""
+    return digest(photo.digest, features_recipe(methods))
+
+
+def features_recipe(methods: Methods) -> tuple[Any, ...]:
+    """What features and thumbnails depend on besides their photos."""
+    return methods.sift, THUMBNAIL, *picture_recipe()
 
 
 def picture_of(pixels: NDArray[Any]) -> NDArray[np.uint8]:
@@ -145,7 +160,7 @@ def take_in(
     def one(index: int) -> Looked | RejectedPhoto:
         photo = photos[index]
         try:
-            key = digest(photo.digest, methods.sift, THUMBNAIL)
+            key = features_key(photo, methods)
             return store.get_or("features", key, lambda: look(photo, index, cache, methods, store))
         except UnreadablePhotoError as error:
             return RejectedPhoto(name=photo.name, reason=str(error))

@@ -9,7 +9,7 @@ from skyquilt.config import Methods
 from skyquilt.model.features import Link, RejectedLink
 from skyquilt.model.poses import Prior
 from skyquilt.pairs.nearest import Pair, sequence
-from skyquilt.pipelines.intake import Intake
+from skyquilt.pipelines.intake import Intake, features_recipe
 from skyquilt.run.clock import Steps
 from skyquilt.run.executor import in_order
 from skyquilt.run.store import Store, digest
@@ -110,5 +110,5 @@ def _verified(
         return methods.verify(a, b, features[a], features[b], matches, photos[a].width)
 
     names = [(i, j, photos[i].digest, photos[j].digest) for i, j in pairs]
-    key = digest(names, methods.sift, methods.mutual, methods.verify)
+    key = digest(names, features_recipe(methods), methods.mutual, methods.verify)
     return store.get_or("links", key, lambda: list(in_order(one, pairs, jobs=jobs)))

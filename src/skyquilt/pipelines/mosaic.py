@@ -281,8 +281,8 @@ def _checked(survey: Survey, control: Sequence[ControlPoint], settings: MosaicSe
 def run_key(
     survey: Survey, control: Sequence[ControlPoint], settings: MosaicSettings, parts: Methods
 ) -> str:
-    """What a run depends on: content and metadata of its photos, side files, and the
-    settings that shape results.
+    """What a run depends on: content and metadata of its photos, side files, the
+    settings that shape results, and the constants of all that works on it.
     """
     shaping = {k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb")}
     files = (settings.boundary, settings.distances, Path(settings.sequence))
@@ -290,7 +290,7 @@ def run_key(
     photos = [
         (p.name, p.digest, p.position, p.attitude, p.focal, p.calibration) for p in survey.photos
     ]
-    return digest(photos, list(control), shaping, side, parts, __version__)
+    return digest(photos, list(control), shaping, side, parts, iter_mosaic, __version__)
 
 
 def pixel_budget(settings: MosaicSettings) -> int:

@@ -15,7 +15,7 @@ from skyquilt.errors import AlignmentError
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.model.photo import ControlPoint
 from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior
-from skyquilt.pipelines.intake import Intake, Pictures
+from skyquilt.pipelines.intake import Intake, Pictures, features_recipe
 from skyquilt.pipelines.linking import Links
 from skyquilt.run.clock import Steps
 from skyquilt.run.store import Store, digest
@@ -96,7 +96,7 @@ def _key(known: Known, methods: Methods, way: object) -> str:
         list(known.priors),
         held,
         list(known.control),
-        methods.sift,
+        features_recipe(methods),
         list(known.order),
         way,
     )

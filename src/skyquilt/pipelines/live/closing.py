@@ -29,10 +29,10 @@ from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior
 from skyquilt.model.surface import Surface
 from skyquilt.photos.pixels import read_color
 from skyquilt.pipelines.drawing import Ground, survey_ground
-from skyquilt.pipelines.intake import THUMBNAIL, Looked, Pictures
+from skyquilt.pipelines.intake import Looked, Pictures, features_key
 from skyquilt.pipelines.live.linking import link_from
 from skyquilt.run.ledger import Ledger
-from skyquilt.run.store import Store, digest
+from skyquilt.run.store import Store
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,7 +110,7 @@ def _nothing(ids: tuple[int, ...], problem: str) -> Closed:
 
 
 def _features(photo: Photo, store: Store, methods: Methods) -> Features:
-    looked = store.get("features", digest(photo.digest, methods.sift, THUMBNAIL))
+    looked = store.get("features", features_key(photo, methods))
     if looked is None:
         raise AlignmentError(f"the features of {photo.name} are gone from the store")
     found: Features = looked.features

@@ -8,11 +8,11 @@ import numpy as np
 
 from skyquilt.config import Methods
 from skyquilt.model.features import Features, Link
-from skyquilt.pipelines.intake import THUMBNAIL, Looked, look
+from skyquilt.pipelines.intake import Looked, features_key, look
 from skyquilt.pipelines.live.state import Member, Members
 from skyquilt.run.codec import decode, encode
 from skyquilt.run.pixel_cache import PixelCache
-from skyquilt.run.store import Store, digest
+from skyquilt.run.store import Store
 
 FEATURES_KEPT = 48
 """Photos whose features stay at hand."""
@@ -41,7 +41,7 @@ class Linking:
             self._features.move_to_end(number)
             return self._features[number]
         photo = self.members.by_id[number].photo
-        key = digest(photo.digest, self.methods.sift, THUMBNAIL)
+        key = features_key(photo, self.methods)
         looked: Looked = self.store.get_or(
             "features", key, lambda: look(photo, number, self.pixels, self.methods, self.store)
         )
