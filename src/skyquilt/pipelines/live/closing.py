@@ -5,14 +5,9 @@ The foreground goes on meanwhile; what it has placed since follows its neighbour
 is taken over.
 """
 
-import multiprocessing
-import os
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -31,6 +26,7 @@ from skyquilt.photos.pixels import read_color
 from skyquilt.pipelines.drawing import Ground, survey_ground
 from skyquilt.pipelines.intake import Looked, Pictures, features_key
 from skyquilt.pipelines.live.linking import link_from
+from skyquilt.run.background import Background
 from skyquilt.run.ledger import Ledger
 from skyquilt.run.store import Store
 
@@ -196,61 +192,31 @@ def _part(job: Job, links: Sequence[Link], features: Sequence[Features]) -> Clos
     )
 
 
-def _serve(wire: Connection, other: Connection) -> None:
-    """The process: one job, one answer; it ends when its parent is gone."""
-    other.close()
-    with suppress(OSError, AttributeError):
-        os.nice(10)  # the foreground comes first
-    try:
-        wire.send(close(wire.recv()))
-    except (EOFError, BrokenPipeError):
-        return
-
-
 class Closing:
     """At most one job at a time behind the scenes."""
 
     def __init__(self) -> None:
-        self._process: Any = None
-        self._wire: Connection | None = None
+        self._work: Background[Closed] | None = None
 
     @property
     def busy(self) -> bool:
-        """Whether a job is under way."""
-        return self._process is not None
+        """Whether a job is under way, or its outcome has not been fetched."""
+        return self._work is not None
 
     def start(self, job: Job) -> None:
         """Begins a job."""
-        context = multiprocessing.get_context("spawn")
-        self._wire, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, self._wire), daemon=True)
-        self._process.start()
-        theirs.close()
-        self._wire.send(job)
+        self._work = Background(close, job)
 
     def outcome(self) -> Closed | None:
         """The outcome, once there is one; then another job may begin."""
-        if self._process is None or self._wire is None:
+        if self._work is None or self._work.busy:
             return None
-        done: Closed | None = None
-        try:
-            if self._wire.poll(0):
-                done = self._wire.recv()
-            elif self._process.is_alive():
-                return None
-        except (EOFError, OSError):
-            done = None
+        done = self._work.outcome()
         self.stop()
         return done or _nothing((), "its process ended early")
 
     def stop(self) -> None:
         """Ends the job, if there is one."""
-        if self._process is not None:
-            if self._process.is_alive():
-                self._process.join(0.2)
-                self._process.terminate()
-            self._process.join(5)
-            self._process = None
-        if self._wire is not None:
-            self._wire.close()
-            self._wire = None
+        if self._work is not None:
+            self._work.stop()
+            self._work = None
