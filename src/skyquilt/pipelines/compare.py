@@ -14,19 +14,20 @@ from typing import Any
 import numpy as np
 
 from skyquilt import __version__
-from skyquilt.config import MosaicSettings
-from skyquilt.errors import AlignmentError, OutputError, UsageError
+from skyquilt.config import MosaicSettings, methods
+from skyquilt.errors import AlignmentError, UsageError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
-from skyquilt.model.photo import ControlPoint, Photo, PointObservation
+from skyquilt.model.photo import ControlPoint, Photo, PointObservation, Survey
 from skyquilt.model.poses import Alignment
 from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.photos.survey import read_survey
-from skyquilt.pipelines.mosaic import REGISTRY, iter_mosaic
+from skyquilt.pipelines.compare_state import CompareState, taken_up
+from skyquilt.pipelines.mosaic import REGISTRY, iter_mosaic, run_key, with_control
 from skyquilt.raster.atomic import write_text
 from skyquilt.report.comparison import comparison_page
 from skyquilt.report.page import write_page
 from skyquilt.run.folder import STATE
-from skyquilt.run.store import Store
+from skyquilt.run.store import Store, digest
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "position": {"method": "position"},
@@ -43,7 +44,6 @@ TRUSTED = ("pose", "hybrid")
 """Methods shown a second time with metadata trusted, where repair changed something."""
 MOST_POINTS = 6
 """Points between which distances are compared."""
-FILES = ("compare.json", "report.html")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,34 +73,37 @@ def iter_compare(
     folder: Path, output: Path, settings: CompareSettings, *, overwrite: bool = False
 ) -> Iterator[Event]:
     """Runs every method into a folder of its own below `output`, then writes compare.json and
-    report.html.
+    report.html. A comparison that was stopped goes on: finished runs are not made again.
 
     Raises:
         SkyquiltError: the photos, the output or an option is wrong; a method that cannot place the
             photos is no error but a row with its reason.
     """
-    _checked(output, overwrite)
     shared = settings.mosaic
     survey = read_survey(
         folder, geo=shared.geo, cameras=shared.cameras, thermal_unit=shared.thermal_unit
     )
     photos = survey.photos[: settings.first] if settings.first else survey.photos
     source: Path | Sequence[Path] = [p.path for p in photos] if settings.first else folder
-    base, says = _judged_by(photos, output, settings)
+    key = _key(replace(survey, photos=photos), source, settings)
+    state, goes_on = taken_up(output, key, overwrite=overwrite)
+    overwrite = overwrite or goes_on  # runs below are this comparison's own
+    base, says = _judged_by(photos, output, settings, state)
+    state.write(output)
     rows: dict[str, dict[str, Any]] = {}
     for name in _in_turn(settings.variants, base.distances is None):
         asked = replace(base, **VARIANTS[name])
         rows[name] = yield from _run(name, source, output / name, asked, overwrite)
         if name == "bundle" and base.distances is None and "metrics" in rows[name]:
             base, says = _by_bundle(photos, output, base)
-            if (
-                base.distances is not None
-            ):  # judge bundle itself too: only the end of its run is made anew
-                again = yield from _run(
-                    name, source, output / name, replace(base, **VARIANTS[name]), True
-                )
-                times = {k: rows[name]["metrics"][k] for k in ("seconds", "cpu_seconds")}
-                rows[name] = {**again, "metrics": {**again["metrics"], **times}}
+            if base.distances is not None:  # bundle itself is judged by them too, in a second run
+                state.judged_by = says
+                state.times = {k: rows[name]["metrics"][k] for k in ("seconds", "cpu_seconds")}
+                state.write(output)
+                asked = replace(base, **VARIANTS[name])
+                rows[name] = yield from _run(name, source, output / name, asked, True)
+        if name == "bundle" and "metrics" in rows[name]:
+            rows[name]["metrics"] |= state.times
         if (
             name in TRUSTED
             and settings.mosaic.repair
@@ -114,18 +117,18 @@ def iter_compare(
     record = _record({n: rows[n] for n in order}, [p.name for p in photos], says, folder)
     write_text(output / "compare.json", json.dumps(record, indent=1, allow_nan=False))
     write_page(output / "report.html", comparison_page(record, _previews(output, order)))
+    state.done = True
+    state.write(output)
     yield Result(output=output, metrics=record)
 
 
-def _checked(output: Path, overwrite: bool) -> None:
-    taken = output.is_dir() and any(p.name in FILES for p in output.iterdir())
-    if output.exists() and not output.is_dir():
-        raise OutputError(f"{output} is a file; the output is a folder")
-    if taken and not overwrite:
-        raise OutputError(
-            f"{output} already holds a comparison; add --overwrite to replace it, or choose another"
-            " folder"
-        )
+def _key(survey: Survey, source: Path | Sequence[Path], settings: CompareSettings) -> str:
+    """What the comparison is made from, whichever methods it has as columns."""
+    survey, control = with_control(survey, source, settings.mosaic)
+    points = settings.known
+    known = points.read_bytes() if points is not None and points.is_file() else b""
+    run = run_key(survey, control, settings.mosaic, methods(settings.mosaic))
+    return digest(run, known)
 
 
 def _in_turn(variants: Sequence[str], needs_bundle: bool) -> list[str]:
@@ -159,10 +162,12 @@ def _run(
 
 
 def _judged_by(
-    photos: Sequence[Photo], output: Path, settings: CompareSettings
+    photos: Sequence[Photo], output: Path, settings: CompareSettings, state: CompareState
 ) -> tuple[MosaicSettings, str]:
     """Settings with the distances to judge by, and where those come from."""
-    base = settings.mosaic
+    base, found = settings.mosaic, output / "distances.csv"
+    if state.judged_by and found.is_file():
+        return replace(base, distances=found), state.judged_by
     if base.distances is not None:
         return base, f"known distances of {base.distances.name}"
     if settings.known is None:
