@@ -26,7 +26,7 @@ class Row:
     """
 
 
-_ROWS: dict[str, dict[str, Row]] = {stage: {} for stage in STAGES}
+_rows: dict[str, dict[str, Row]] = {stage: {} for stage in STAGES}
 
 
 def register(
@@ -37,16 +37,16 @@ def register(
     Raises:
         ValueError: there is no such stage, or `make` is not `module:function`.
     """
-    if stage not in _ROWS or ":" not in make:
+    if stage not in _rows or ":" not in make:
         raise ValueError(
             f"a stage of {', '.join(STAGES)} and module:function expected, got {stage} and {make}"
         )
-    _ROWS[stage][name] = Row(make=make, takes=dict(takes or {}))
+    _rows[stage][name] = Row(make=make, takes=dict(takes or {}))
 
 
 def names(stage: str) -> tuple[str, ...]:
     """Names of a stage's methods, in the order of their registration."""
-    return tuple(_ROWS[stage])
+    return tuple(_rows[stage])
 
 
 def row(stage: str, name: str) -> Row:
@@ -55,7 +55,7 @@ def row(stage: str, name: str) -> Row:
     Raises:
         KeyError: there is none.
     """
-    return _ROWS[stage][name]
+    return _rows[stage][name]
 
 
 def load(stage: str, name: str) -> Callable[..., Any]:

@@ -1,6 +1,8 @@
 """The adjustment against pycolmap's Ceres on problems that both can state."""
 
 from dataclasses import replace
+from importlib import import_module
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -63,3 +65,12 @@ def test_the_pixel_convention_matters():
     theirs = image.project_point(block.truth.X[block.problem.point[k]])
     mine = residuals_px(block.problem, block.truth)[k] + block.problem.px[k]
     assert theirs - 0.5 == pytest.approx(mine, abs=1e-6)
+
+
+@pytest.mark.skipif(find_spec("pyceres") is not None, reason="pyceres gives costs their type")
+def test_pycolmap_alone_cannot_state_a_prior_on_tilt():
+    """A reason of docs/decisions.md for an adjuster of our own: once this fails, look again."""
+    pose = import_module("pycolmap").Rigid3d()
+    costs = import_module("pycolmap.cost_functions")
+    with pytest.raises(TypeError, match="ceres::CostFunction"):
+        costs.AbsolutePosePriorCost(np.eye(6), pose)

@@ -6,8 +6,7 @@ import pytest
 
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import OutputError
-from skyquilt.settings import MosaicSettings
-from skyquilt.workflows.methods import methods_for
+from skyquilt.workflows.methods import MosaicSettings, methods
 
 
 @pytest.fixture
@@ -85,10 +84,26 @@ def test_arrays_of_other_shape_or_type_are_other_inputs():
 
 
 def test_a_method_is_known_by_its_parameters_and_version(monkeypatch):
-    first = methods_for(MosaicSettings())
-    assert digest(first.detector) == digest(methods_for(MosaicSettings()).detector)
-    other = methods_for(MosaicSettings(features=500))
-    assert digest(first.detector) != digest(other.detector)
-    before = digest(first.align)
-    monkeypatch.setattr(type(first.align.bundle.bundle), "version", 99)
-    assert digest(first.align) != before
+    first = methods(MosaicSettings())
+    assert digest(first.sift) == digest(methods(MosaicSettings()).sift)
+    assert digest(first.sift) != digest(methods(MosaicSettings(features=500)).sift)
+    before = digest(first.bundle)
+    monkeypatch.setattr(type(first.bundle), "version", 99)
+    assert digest(first.bundle) != before
+
+
+def test_what_a_digest_does_not_know_is_refused():
+    """Its text says nothing of its value: two such things would share one key, or one have two."""
+    for value in (object(), {"a": object()}, lambda: 0, np.array([object()]), iter(())):
+        with pytest.raises(TypeError, match="key cannot be made of"):
+            digest(value)
+
+
+def test_a_digest_tells_keys_sets_and_bytes_by_value():
+    assert digest({1: "a"}) != digest({"1": "a"})
+    assert digest({3, 1, 2}) == digest(frozenset((1, 2, 3))) != digest((1, 2, 3))
+    assert len({digest(v) for v in (b"a", "a", 1j, Path("a") / "b")}) == 4
+
+
+def test_a_function_is_known_by_its_name_and_constants():
+    assert digest(digest) == digest(digest) != digest(pytest.raises)

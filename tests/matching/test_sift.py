@@ -107,10 +107,11 @@ def test_spreading_keeps_the_strongest_of_every_cell():
 
 
 @pytest.mark.xfail(
+    strict=True,
     reason="OpenCV keeps the strongest 1.4 x count of the whole photo before they are spread: on"
     " real photos a tenth of"
     " the cells stays bare. Spreading before describing mends it for 20 % more time and a higher"
-    " reprojection error."
+    " reprojection error.",
 )
 def test_no_corner_of_a_photo_stays_bare(picture):
     dull = picture.astype(float)

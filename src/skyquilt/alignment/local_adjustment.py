@@ -28,9 +28,6 @@ from skyquilt.model.poses import Pose, Prior
 
 HELD_M, HELD_RAD = 1e-3, 1e-5
 """Deviations of photos that are held."""
-DISAGREE = 0.12
-"""Links that put a photo further apart than this share of the flying height contradict each other.
-"""
 STAGES = ((2.0, 20.0, 40.0, 3e-2), (0.8, 6.0, 12.0, 1e-2), (0.0, 2.5, 5.0, 1e-2))
 """Rounds of an adjustment: from which median misfit in px of the new photo on, width of the loss in
 px, residual in px beyond which observations go, and tolerance.
@@ -102,6 +99,10 @@ class LocalAdjustment:
     """Observations per photo in the adjustment."""
     least: int = 12
     """Fewest observations that hold a photo."""
+    disagree: float = 0.12
+    """Links that put a photo further apart than this share of the flying height contradict each
+    other.
+    """
     version: ClassVar[int] = 1
 
     def __call__(self, window: Window) -> AdjustedWindow | NotAdjusted:
@@ -109,7 +110,7 @@ class LocalAdjustment:
         plane = {i: _similarity(window, i) for i in window.poses}
         dropped: tuple[tuple[int, int], ...] = ()
         if window.new not in window.poses:
-            guess = _guess(window, plane)
+            guess = _guess(window, plane, self.disagree)
             if guess is None:
                 return NotAdjusted(reason="its links contradict each other")
             plane[window.new], agreeing = guess
@@ -185,7 +186,7 @@ def _ideal(photo: Photo) -> Camera:
 
 
 def _guess(
-    window: Window, plane: Mapping[int, tuple[complex, complex]]
+    window: Window, plane: Mapping[int, tuple[complex, complex]], disagree: float
 ) -> tuple[tuple[complex, complex], set[tuple[int, int]]] | None:
     """The new photo's similarity that most of its links agree with, and those links."""
     found: list[tuple[complex, complex, float, tuple[int, int]]] = []
@@ -205,7 +206,7 @@ def _guess(
         return None
 
     def near(x: tuple[complex, complex, float, tuple[int, int]]) -> list[int]:
-        limit = DISAGREE * abs(x[0])
+        limit = disagree * abs(x[0])
         return [
             n
             for n, y in enumerate(found)

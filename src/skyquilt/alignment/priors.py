@@ -86,6 +86,19 @@ def _altitude(photo: Photo, datum: Datum) -> float:
     return np.nan if height is None else float(height)
 
 
+def empty_prior() -> Prior:
+    """What a photo says about its pose that has neither position nor attitude."""
+    return Prior(
+        map_C=np.full(3, np.nan),
+        sigma_C=np.full(3, np.inf),
+        yaw_deg=np.nan,
+        pitch_deg=0.0,
+        roll_deg=0.0,
+        sigma_yaw_deg=15.0,
+        sigma_tilt_deg=6.0,
+    )
+
+
 def photo_prior(photo: Photo, frame: MapFrame, to_map: Transformer | None) -> Prior:
     """What one photo says about its pose, in the map frame."""
     C, sigma = np.full(3, np.nan), np.array([np.inf, np.inf, np.inf])

@@ -6,23 +6,32 @@ import dataclasses
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
+from types import FunctionType
 from typing import Any, TypeVar
 
 import numpy as np
 
 from skyquilt.engine.codec import Registry, decode, encode
+from skyquilt.engine.constants import constants_of
 from skyquilt.engine.folder import refusal
 
 T = TypeVar("T")
 
 
 def digest(*parts: Any) -> str:
-    """Hash (hex) of anything made of strings, numbers, paths, tuples, dicts and dataclasses, by
-    value.
+    """Hash (hex) of what an artefact is made from, by value.
+
+    Parts are strings, numbers, paths, arrays, tuples, lists, sets, dicts and dataclasses of these,
+    and methods, classes and functions. A method (a dataclass that can be called) counts with its
+    fields, its version and the constants of the modules that it computes with (`constants_of`);
+    classes and functions count with their name and these constants.
+
+    Raises:
+        TypeError: a part is none of these, so that nobody can say when it has changed.
     """
     return hashlib.blake2b(
         json.dumps(_plain(parts), sort_keys=True).encode(), digest_size=16
@@ -30,24 +39,64 @@ def digest(*parts: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+    """The value in JSON's types."""
+    if isinstance(value, type | FunctionType):
+        return [_name(value), getattr(value, "version", 0), _constants(value)]
+    if dataclasses.is_dataclass(value):
         fields = {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-        return [type(value).__name__, getattr(type(value), "version", 0), fields]
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
+        method = _constants(type(value)) if callable(value) else ""
+        return [type(value).__name__, getattr(type(value), "version", 0), fields, method]
+    return _plain_data(value, _plain)
+
+
+def _plain_data(value: Any, inside: Callable[[Any], Any]) -> Any:
+    """The same for what is neither code nor record; `inside` does it for parts of containers."""
+    if isinstance(value, Mapping):
+        return {"dict": _sorted([inside(k), inside(v)] for k, v in value.items())}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [inside(v) for v in value]
+    if isinstance(value, set | frozenset):
+        return {"set": _sorted(inside(v) for v in value)}
+    if isinstance(value, np.generic):
+        return _plain_data(value.item(), inside)
     if value is None or isinstance(value, bool | int | float | str):
         return value
-    if isinstance(value, np.ndarray):
-        return [
-            value.dtype.str,
-            value.shape,
-            hashlib.blake2b(value.tobytes(), digest_size=16).hexdigest(),
-        ]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    return str(value)
+    if isinstance(value, complex):
+        return {"complex": [value.real, value.imag]}
+    if isinstance(value, bytes):
+        return {"bytes": value.hex()}
+    if isinstance(value, PurePath):
+        return str(value)
+    if isinstance(value, np.ndarray) and not value.dtype.hasobject:
+        content = hashlib.blake2b(value.tobytes(), digest_size=16).hexdigest()
+        return [value.dtype.str, value.shape, content]
+    raise TypeError(f"a key cannot be made of {type(value).__name__}: {value!r:.80}")
+
+
+def _constants(thing: type | FunctionType) -> str:
+    """One number for all constants that a class or a function computes with."""
+    values = {name: _constant(v) for name, v in constants_of(thing).items()}
+    content = json.dumps(values, sort_keys=True).encode()
+    return hashlib.blake2b(content, digest_size=16).hexdigest()
+
+
+def _constant(value: Any) -> Any:
+    """A constant in JSON's types; code in it (a table of functions) counts by name."""
+    if isinstance(value, type | FunctionType):
+        return {"code": f"{value.__module__}.{value.__qualname__}"}
+    if dataclasses.is_dataclass(value):
+        return [_constant(getattr(value, f.name)) for f in dataclasses.fields(value)]
+    return _plain_data(value, _constant)
+
+
+def _name(code: type | FunctionType) -> str:
+    if "<" in code.__qualname__:
+        raise TypeError(f"a key cannot be made of {code.__qualname__}: its name says too little")
+    return code.__qualname__
+
+
+def _sorted(parts: Iterable[Any]) -> list[Any]:
+    return sorted(parts, key=lambda part: json.dumps(part, sort_keys=True))
 
 
 @dataclass(kw_only=True)

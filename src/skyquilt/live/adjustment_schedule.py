@@ -146,7 +146,7 @@ class Blocks:
     ) -> AdjustmentJob | None:
         members = [self.members.by_id[i] for i in ids]
         frame = self.members.frame
-        if frame is None or any(m.prior is None for m in members):
+        if frame is None:
             return None
         cameras: dict[str, Camera] = {}
         for m in members:
@@ -155,7 +155,7 @@ class Blocks:
             ids=tuple(ids),
             held=held,
             photos=tuple(m.photo for m in members),
-            priors=tuple(m.prior for m in members if m.prior is not None),
+            priors=tuple(m.prior for m in members),
             frame=frame,
             poses={m.id: m.pose for m in members if m.pose is not None},
             cameras=cameras,

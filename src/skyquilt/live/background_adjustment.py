@@ -5,14 +5,9 @@ The foreground goes on meanwhile; what it has placed since follows its neighbour
 is taken over.
 """
 
-import multiprocessing
-import os
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +15,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.local_adjustment import AdjustedWindow, LocalAdjustment, Window
+from skyquilt.engine.background import Background
 from skyquilt.engine.clock import result_of
 from skyquilt.engine.store import Store
 from skyquilt.errors import AlignmentError, SkyquiltError
@@ -34,7 +30,12 @@ from skyquilt.ortho.ground import find_ground
 from skyquilt.photos.pixels import read_color
 from skyquilt.settings import PictureSettings
 from skyquilt.workflows.methods import Methods
-from skyquilt.workflows.photo_features import GreyPictures, PhotoFeatures, features_key
+from skyquilt.workflows.photo_features import (
+    GreyPictures,
+    PhotoFeatures,
+    features_key,
+    picture_recipe,
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -152,7 +153,15 @@ def _swept(
     """(P, 3) the ground as the batch story finds it, at the nodes of its grid below the photos."""
     methods = job.methods
     ground = result_of(
-        find_ground(done, pictures, methods.surface, methods.sweep, PictureSettings(), store)
+        find_ground(
+            done,
+            pictures,
+            methods.surface,
+            methods.sweep,
+            PictureSettings(),
+            store,
+            pictures=picture_recipe(),
+        )
     )
     surface = ground.surface
     rows, columns = np.mgrid[: surface.z.shape[0], : surface.z.shape[1]]
@@ -201,61 +210,31 @@ def _part(
     )
 
 
-def _serve(wire: Connection, other: Connection) -> None:
-    """The process: one job, one answer; it ends when its parent is gone."""
-    other.close()
-    with suppress(OSError, AttributeError):
-        os.nice(10)  # the foreground comes first
-    try:
-        wire.send(adjust_block(wire.recv()))
-    except (EOFError, BrokenPipeError):
-        return
-
-
 class BackgroundAdjustment:
     """At most one job at a time behind the scenes."""
 
     def __init__(self) -> None:
-        self._process: Any = None
-        self._wire: Connection | None = None
+        self._work: Background[BlockAdjustment] | None = None
 
     @property
     def busy(self) -> bool:
-        """Whether a job is under way."""
-        return self._process is not None
+        """Whether a job is under way, or its outcome has not been fetched."""
+        return self._work is not None
 
     def start(self, job: AdjustmentJob) -> None:
         """Begins a job."""
-        context = multiprocessing.get_context("spawn")
-        self._wire, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, self._wire), daemon=True)
-        self._process.start()
-        theirs.close()
-        self._wire.send(job)
+        self._work = Background(adjust_block, job)
 
     def outcome(self) -> BlockAdjustment | None:
         """The outcome, once there is one; then another job may begin."""
-        if self._process is None or self._wire is None:
+        if self._work is None or self._work.busy:
             return None
-        done: BlockAdjustment | None = None
-        try:
-            if self._wire.poll(0):
-                done = self._wire.recv()
-            elif self._process.is_alive():
-                return None
-        except (EOFError, OSError):
-            done = None
+        done = self._work.outcome()
         self.stop()
         return done or _nothing((), "its process ended early")
 
     def stop(self) -> None:
         """Ends the job, if there is one."""
-        if self._process is not None:
-            if self._process.is_alive():
-                self._process.join(0.2)
-                self._process.terminate()
-            self._process.join(5)
-            self._process = None
-        if self._wire is not None:
-            self._wire.close()
-            self._wire = None
+        if self._work is not None:
+            self._work.stop()
+            self._work = None

@@ -47,7 +47,7 @@ class Metadata:
         None without place.
         """
         prior = member.prior
-        if prior is None or not np.isfinite(prior.map_C[:2]).all():
+        if not np.isfinite(prior.map_C[:2]).all():
             return None
         turn, lift = self._corrections(member)
         yaw = prior.yaw_deg - turn if np.isfinite(prior.yaw_deg) else 0.0
@@ -83,7 +83,6 @@ class Metadata:
         keeps it.
         """
         assert member.pose is not None
-        assert member.prior is not None
         yaw, _, _ = angles_from_cam_R_map(member.pose.cam_R_map)
         off = member.pose.map_C - member.prior.map_C
         turn = (

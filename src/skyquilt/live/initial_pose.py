@@ -73,7 +73,6 @@ class InitialPose:
     def _begin(self, member: Member) -> None:
         """The map's frame and pixels, for good."""
         prior, photo, frame = member.prior, member.photo, self.members.frame
-        assert prior is not None
         assert frame is not None
         takeoff = frame.vertical_datum == "takeoff"
         pose = self.metadata.first(member)

@@ -101,13 +101,12 @@ class LocalPose:
         where = {i: k for k, i in enumerate(ids)}
         links = [_renumbered(k, where) for k in [*self.live_links.links_among(ids), *good.values()]]
         members = [self.members.by_id[i] for i in ids]
-        priors = [m.prior for m in members if m.prior is not None]
         assert self.members.frame is not None
         try:
             return self.young(
                 [m.photo for m in members],
                 self.members.frame,
-                priors,
+                [m.prior for m in members],
                 [self.live_links.features(i) for i in ids],
                 links,
             )
@@ -179,7 +178,7 @@ class LocalPose:
         )
         return Window(
             photos=[m.photo for m in members],
-            priors=[m.prior for m in members if m.prior is not None],
+            priors=[m.prior for m in members],
             features=[self.live_links.features(i) for i in ids],
             links=[_renumbered(k, where) for k in links],
             poses=placed,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from pyproj import Transformer
 
-from skyquilt.alignment.priors import photo_prior
+from skyquilt.alignment.priors import empty_prior, photo_prior
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import Ledger
 from skyquilt.model.camera import PARAMETERS, Camera
@@ -29,8 +29,8 @@ class Member:
     """Number, in order of acceptance."""
     photo: Photo
     """What its file says."""
-    prior: Prior | None = None
-    """That in the map's frame; None until there is one."""
+    prior: Prior = field(default_factory=empty_prior)
+    """What its metadata say in the map's frame; nothing until there is a frame."""
     source: str
     """Who sent it: a folder, a drone."""
     state: str

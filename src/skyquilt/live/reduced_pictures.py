@@ -64,7 +64,7 @@ class SmallPictures:
         if measured(member):
             small = self._shrunken(member)
             return small.astype(np.float32).reshape(*small.shape[:2], -1)[..., :1]
-        key = digest(member.photo.digest, self._longest[number], QUALITY)
+        key = digest(member.photo.digest, self._longest[number], QUALITY, shrink, to_grey8)
         body = self.store.get_or(STAGE, key, lambda: _encoded(self._shrunken(member)))
         return np.asarray(simplejpeg.decode_jpeg(body.tobytes()))
 

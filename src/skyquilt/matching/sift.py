@@ -11,9 +11,6 @@ from skyquilt.imaging.grey import full_px, shrink, to_grey8
 from skyquilt.matching.keypoints import spread
 from skyquilt.model.features import DESCRIPTOR_UNIT, Features
 
-SPARE = 1.2
-"""Keypoints described per keypoint kept: the choice that `spread` has."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class Sift:
@@ -34,6 +31,8 @@ class Sift:
     cells: int = 10
     """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare.
     """
+    spare: float = 1.2
+    """Keypoints described per keypoint kept: the choice that `spread` has."""
     version: ClassVar[int] = 5
 
     def __call__(self, image: NDArray[Any]) -> Features:
@@ -52,7 +51,7 @@ class Sift:
         # without precise upscaling OpenCV reports every keypoint a quarter pixel down and to the
         # right
         detector = cv2.SIFT.create(
-            int(SPARE * self.count),
+            int(self.spare * self.count),
             nOctaveLayers=self.levels,
             contrastThreshold=self.contrast,
             enable_precise_upscale=True,

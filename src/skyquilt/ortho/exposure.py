@@ -23,10 +23,6 @@ SETTLED = 1e-3
 """Change of log odds that no 8-bit level can show."""
 SIGMA_LEVEL = 0.15
 """Deviation in log odds of two photos' brightness of one ground point, all else equal."""
-EVEN = 0.1
-"""Fields smaller than this in log odds everywhere (6 of 255 on a middle grey) are left
-alone: it saves time.
-"""
 CORRELATED = 30.0
 """Neighbouring samples err alike: so many count as one."""
 DENSE = 1000
@@ -97,6 +93,10 @@ class Balance:
     """Prior deviation of a gain in log odds."""
     sigma_field: float = 0.15
     """Prior deviation of a term of the field in log odds."""
+    even: float = 0.1
+    """Fields smaller than this in log odds everywhere (6 of 255 on a middle grey) are left alone:
+    it saves time.
+    """
     version: ClassVar[int] = 2
 
     def __call__(
@@ -113,7 +113,26 @@ class Balance:
         samples = self._samples(usable, thumbnails, surface, bounds)
         if not len(samples.point):
             return NEUTRAL
-        return _solve(samples, [v.photo for v in usable], self.sigma_gain, self.sigma_field)
+        return self._solve(samples, [v.photo for v in usable])
+
+    def _solve(self, s: "Samples", photos: Sequence[int]) -> Exposure:
+        """log odds + gain + field is the same for all photos of a point: differences to the
+        point's mean vanish.
+        """
+        n, N = len(photos), len(s.point)
+        _, point = np.unique(s.point, return_inverse=True)
+        terms = np.concatenate([np.ones((N, 1)), _basis(s.place[:, 0], s.place[:, 1])], 1)
+        ridge = 1 / np.array([self.sigma_gain] + 5 * [self.sigma_field]) ** 2
+        x = _robust_differences(terms, s.row, point, s.log.mean(1, keepdims=True), ridge, n)[..., 0]
+        largest = np.abs(_basis(*np.meshgrid([-1, 0, 1], [-1, 0, 1])) @ x[:, 1:].T).max((0, 1))
+        fields = x[:, 1:] * (largest > self.even)[:, None]
+        even = s.log + (terms[:, 1:] * fields[s.row]).sum(1)[:, None]
+        gains = _robust_differences(terms[:, :1], s.row, point, even, ridge[:1], n)[:, 0]
+        gains = (gains - np.median(gains, axis=0)).astype(np.float32)
+        return Exposure(
+            gains=dict(zip(photos, gains, strict=True)),
+            fields=dict(zip(photos, fields.astype(np.float32), strict=True)),
+        )
 
     def _samples(
         self,
@@ -185,30 +204,6 @@ def _sampled(
     column = np.clip(np.rint((u + 0.5) * w / width - 0.5), 0, w - 1).astype(int)
     row = np.clip(np.rint((v + 0.5) * h / height - 0.5), 0, h - 1).astype(int)
     return np.asarray(smooth[row, column].astype(np.float64))
-
-
-def _solve(s: Samples, photos: Sequence[int], sigma_gain: float, sigma_field: float) -> Exposure:
-    """log odds + gain + field is the same for all photos of a point: differences to the
-    point's mean vanish.
-    """
-    n, N = len(photos), len(s.point)
-    _, point = np.unique(s.point, return_inverse=True)
-    terms = np.concatenate([np.ones((N, 1)), _basis(s.place[:, 0], s.place[:, 1])], 1)
-    ridge = 1 / np.array([sigma_gain] + 5 * [sigma_field]) ** 2
-    x = _robust_differences(terms, s.row, point, s.log.mean(1, keepdims=True), ridge, n)[..., 0]
-    fields = (
-        x[:, 1:]
-        * (np.abs(_basis(*np.meshgrid([-1, 0, 1], [-1, 0, 1])) @ x[:, 1:].T).max((0, 1)) > EVEN)[
-            :, None
-        ]
-    )
-    even = s.log + (terms[:, 1:] * fields[s.row]).sum(1)[:, None]
-    gains = _robust_differences(terms[:, :1], s.row, point, even, ridge[:1], n)[:, 0]
-    gains = (gains - np.median(gains, axis=0)).astype(np.float32)
-    return Exposure(
-        gains=dict(zip(photos, gains, strict=True)),
-        fields=dict(zip(photos, fields.astype(np.float32), strict=True)),
-    )
 
 
 def _robust_differences(

@@ -67,9 +67,12 @@ def find_ground(
     sweep: SurfaceFromPictures | None,
     picture: PictureSettings,
     store: Store,
+    *,
+    pictures: tuple[Any, ...] = (),
 ) -> Steps[Ground]:
     """Heights from tie points (level ground where there are none), refined by the sweep where there
-    is one, and the grid of the map.
+    is one, and the grid of the map. `pictures` says how the grey pictures are made: it is part of
+    the key under which a swept surface is stored.
 
     Raises:
         UsageError: the map would have no pixels, or absurdly many.
@@ -95,7 +98,7 @@ def find_ground(
         held, known = set(alignment.held), surface
         surface = store.get_or(
             "surface",
-            digest(key, poses_digest(alignment), grid, sweep),
+            digest(key, poses_digest(alignment), grid, sweep, sorted(held), pictures),
             lambda: sweep(known, [v for v in views if v.photo in held], grid, grey),
         )
     yield 1, 1

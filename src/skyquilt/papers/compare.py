@@ -27,8 +27,8 @@ from skyquilt.settings import OPTION_OF, MosaicSettings
 from skyquilt.version import __version__
 from skyquilt.workflows.flow import REGISTRY
 from skyquilt.workflows.methods import methods_for
-from skyquilt.workflows.mosaic import make_map
-from skyquilt.workflows.survey_input import SurveyInput, read_input, run_key
+from skyquilt.workflows.mosaic import make_map, run_key
+from skyquilt.workflows.survey_input import SurveyInput, read_input
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "position": {"method": "position"},

@@ -40,8 +40,10 @@ from skyquilt.workflows.photo_features import (
     GreyPictures,
     PhotoFeatures,
     PhotoPixels,
+    features_recipe,
     find_features,
     of_one_kind,
+    picture_recipe,
 )
 from skyquilt.workflows.survey_input import SurveyInput
 
@@ -193,6 +195,7 @@ def find_ground(
         methods.sweep,
         settings.picture,
         clock.store,
+        pictures=picture_recipe(),
     )
     return (yield from clock.stage("surface", steps))
 
@@ -303,7 +306,7 @@ def _align(known: AlignmentInputs, methods: Methods, store: Store) -> Steps[Alig
         list(known.priors),
         held,
         list(known.control),
-        methods.detector,
+        features_recipe(methods.detector),
         list(known.order),
         methods.align,
     )

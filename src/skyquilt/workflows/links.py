@@ -16,7 +16,7 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.poses import MapFrame, Prior
 from skyquilt.workflows.expected_places import ExpectedPlaces
 from skyquilt.workflows.methods import Methods
-from skyquilt.workflows.photo_features import FeaturedPhotos
+from skyquilt.workflows.photo_features import FeaturedPhotos, features_recipe
 
 BATCH = 64
 """Pairs per stored artefact: what a kill can cost."""
@@ -83,7 +83,8 @@ class _Linker:
         photos, methods = self.found.photos, self.methods
         names = [(i, j, photos[i].digest, photos[j].digest) for i, j in pairs]
         by = None if self.expected is None else self.expected.key
-        key = digest(names, methods.detector, methods.matcher, methods.verify, by)
+        recipe = features_recipe(methods.detector)
+        key = digest(names, recipe, methods.matcher, methods.verify, by)
         return self.store.get_or(
             "links", key, lambda: list(in_order(self.one, pairs, jobs=self.jobs))
         )

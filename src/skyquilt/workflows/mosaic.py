@@ -15,7 +15,7 @@ from typing import Any
 from skyquilt.alignment.conflicts import conflicts
 from skyquilt.engine.clock import Clock, Steps, result_of
 from skyquilt.engine.folder import STATE, RunFolder, open_run
-from skyquilt.engine.store import Store
+from skyquilt.engine.store import Store, digest
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.orthomosaic import SPOOL
@@ -24,6 +24,7 @@ from skyquilt.quality.placement import placement_quality
 from skyquilt.quality.run_metrics import figures
 from skyquilt.quality.seam_measurement import MeasuredSeams, measure_seams
 from skyquilt.settings import MosaicSettings
+from skyquilt.version import __version__
 from skyquilt.workflows.flow import (
     REGISTRY,
     AlignedPhotos,
@@ -36,7 +37,7 @@ from skyquilt.workflows.flow import (
 )
 from skyquilt.workflows.methods import Methods, methods_for
 from skyquilt.workflows.run_report import finish_run
-from skyquilt.workflows.survey_input import Source, SurveyInput, check_input, read_input, run_key
+from skyquilt.workflows.survey_input import Source, SurveyInput, check_input, read_input
 
 STAGES = ("read", "features", "links", "align", "surface", "balance", "mosaic", "measure", "report")
 """Stages in order."""
@@ -161,6 +162,20 @@ def make_map(
     run.mark("done")
     result = Result(output=run.path, metrics=metrics)
     return FinishedMap(result=result, given=given, methods=methods, settings=settings)
+
+
+def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> str:
+    """What a run depends on: content and metadata of its photos, side files, settings that shape
+    results, the methods, and the constants of all code that works on it.
+    """
+    shaping = {k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb")}
+    files = (settings.picture.boundary, settings.input.distances, Path(settings.input.sequence))
+    side = [p.read_bytes().hex() for p in files if p is not None and p.is_file()]
+    photos = [
+        (p.name, p.digest, p.position, p.attitude, p.focal, p.calibration)
+        for p in given.survey.photos
+    ]
+    return digest(photos, list(given.control), shaping, side, methods, make_map, __version__)
 
 
 def _measured(

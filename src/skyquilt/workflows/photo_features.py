@@ -91,13 +91,23 @@ class GreyPictures:
 
 
 def features_key(photo: Photo, detector: Detector) -> str:
-    """The key of a photo's features in the store."""
-    return digest(photo.digest, detector, THUMBNAIL)
+    """The key of a photo's features and thumbnail in the store."""
+    return digest(photo.digest, features_recipe(detector))
+
+
+def features_recipe(detector: Detector) -> tuple[Any, ...]:
+    """What features and thumbnails depend on besides their photos."""
+    return detector, THUMBNAIL, *picture_recipe()
 
 
 def picture_key(photo: Photo) -> str:
     """The key of a photo's grey picture in the store."""
-    return digest(photo.digest, PICTURE)
+    return digest(photo.digest, picture_recipe())
+
+
+def picture_recipe() -> tuple[Any, ...]:
+    """What grey pictures depend on besides their photos: part of the key of all made from them."""
+    return PICTURE, halved, shrink, to_grey8
 
 
 def picture_of(pixels: NDArray[Any]) -> NDArray[np.uint8]:

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from skyquilt.alignment.priors import choose_frame
-from skyquilt.engine.store import digest
 from skyquilt.errors import UsageError
 from skyquilt.model.photo import ControlPoint, KnownDistance, Survey
 from skyquilt.photos.distances import read_distances
@@ -13,8 +12,6 @@ from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.photos.sequence import sequence_of
 from skyquilt.photos.survey import read_survey
 from skyquilt.settings import InputSettings, MosaicSettings
-from skyquilt.version import __version__
-from skyquilt.workflows.methods import Methods
 
 Source = Path | Sequence[Path]
 """A folder of photos, or photos."""
@@ -91,17 +88,3 @@ def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> N
         from skyquilt.raster.boundary import read_boundary
 
         read_boundary(settings.picture.boundary, frame.crs)
-
-
-def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> str:
-    """What a run depends on: content and metadata of its photos, side files, settings that shape
-    results, and the methods.
-    """
-    shaping = {k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb")}
-    files = (settings.picture.boundary, settings.input.distances, Path(settings.input.sequence))
-    side = [p.read_bytes().hex() for p in files if p is not None and p.is_file()]
-    photos = [
-        (p.name, p.digest, p.position, p.attitude, p.focal, p.calibration)
-        for p in given.survey.photos
-    ]
-    return digest(photos, list(given.control), shaping, side, methods, __version__)

@@ -1,0 +1,214 @@
+"""A constant of a module that shapes a stored artefact is part of that artefact's key."""
+
+import ast
+import sys
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skyquilt import registry
+from skyquilt.engine.constants import constants_of, is_data
+from skyquilt.engine.store import digest
+from skyquilt.model.photo import Focal, Photo, Survey
+from skyquilt.ortho.compose import Composer
+from skyquilt.papers import aligners
+from skyquilt.settings import MosaicSettings
+from skyquilt.workflows.methods import Methods, methods_for
+from skyquilt.workflows.mosaic import make_map, run_key
+from skyquilt.workflows.photo_features import features_key, picture_key
+from skyquilt.workflows.survey_input import SurveyInput
+
+WAYS = (
+    MosaicSettings(),
+    MosaicSettings(method="image"),
+    MosaicSettings(method="image", image_search="overview"),
+    MosaicSettings(method="hybrid"),
+    MosaicSettings(method="hybrid", optimiser="anneal"),
+    MosaicSettings(method="flightline"),
+    *(MosaicSettings(method="image", estimator=e) for e in ("lmeds", "magsac", "ste")),
+    *(MosaicSettings(method="image", estimator=e) for e in ("ncc", "phase", "ecc", "mi")),
+    *(MosaicSettings(detector=d) for d in registry.names("detector")),
+    *(MosaicSettings(matcher=m) for m in registry.names("matcher")),
+)
+STAGES = ["matching", "alignment", "ortho", "imaging", "geometry", "papers"]
+IN_NO_KEY = {
+    "SIGMA_YAW_DEG": "repaired metadata are in the key of the alignment, by value",
+    "SIGMA_HEIGHT": "the same",
+    "YAW_DEG": "conflicts are told in the report and shape nothing",
+    **dict.fromkeys(
+        ("NOISE", "TEXTURE", "RIM", "_DERIVE", "_SMOOTH", "RADIUS", "MIN_PEAK", "BROAD_PEAK")
+        + ("APART", "MAX_RATIO", "SIDE", "COARSE"),
+        "seams are measured anew by every run",
+    ),
+}
+"""Constants of the stages that no method's key holds, and why that is right."""
+
+
+def photo() -> Photo:
+    return Photo(
+        name="a.jpg",
+        path=Path("a.jpg"),
+        digest="0",
+        width=640,
+        height=480,
+        channels=3,
+        dtype="uint8",
+        band="visible",
+        camera_key="c",
+        focal=Focal(px=500.0, sigma_px=50.0, source="guess"),
+        position=None,
+        attitude=None,
+        time=None,
+    )
+
+
+def given() -> SurveyInput:
+    survey = Survey(photos=(photo(),))
+    return SurveyInput(source=Path(), survey=survey, control=(), distances=(), rank={})
+
+
+def used() -> Methods:
+    return methods_for(MosaicSettings())
+
+
+KEYS = {
+    "features": lambda: features_key(photo(), used().detector),
+    "pictures": lambda: picture_key(photo()),
+    "links": lambda: digest(used().detector, used().matcher, used().verify),
+    "alignment": lambda: digest(used().align),
+    "surface": lambda: digest(used().surface),
+    "swept": lambda: digest(used().sweep),
+    "map": lambda: run_key(given(), MosaicSettings(), used()),
+}
+
+
+@pytest.mark.parametrize(
+    ("artefact", "constant"),
+    [
+        ("features", "DESCRIPTOR_UNIT"),
+        ("features", "PICTURE"),
+        ("features", "THUMBNAIL"),
+        ("pictures", "PICTURE"),
+        ("links", "DESCRIPTOR_UNIT"),
+        ("alignment", "INDEPENDENT"),
+        ("alignment", "YAW_LIE_DEG"),
+        ("alignment", "MOST_PAIRS"),
+        ("alignment", "NOMINAL_HEIGHT_M"),
+        ("alignment", "HALF_TURN"),
+        ("alignment", "DENSE_LIMIT"),
+        ("surface", "_SINGLE_TREE"),
+        ("swept", "BORDER_PX"),
+        ("swept", "TILE"),
+        ("map", "DENSE"),
+        ("map", "MOST_PADDED"),
+        ("map", "STILL"),
+        ("map", "PROVENANCE"),
+        ("map", "INDEPENDENT"),
+    ],
+)
+def test_another_constant_is_another_key(artefact, constant, monkeypatch):
+    before = KEYS[artefact]()
+    assert KEYS[artefact]() == before
+    places = [
+        tuple(place.rsplit(".", 1))
+        for place in constants_of(make_map)
+        if place.endswith(f".{constant}")
+    ]
+    for module, name in places:
+        monkeypatch.setattr(sys.modules[module], name, getattr(sys.modules[module], name) * 2)
+    assert KEYS[artefact]() != before
+
+
+def test_code_in_tables_counts_by_name():
+    assert is_data({"a": (len.__class__, photo)})
+    assert not is_data([object()])
+    assert constants_of(np.linalg.norm) == {}
+
+
+def test_every_number_of_the_stages_is_in_a_key():
+    """What a default map imports, functions included, read from the sources."""
+    covered = set(constants_of(make_map))
+    made = {name for way in WAYS for name in _of_methods(methods_for(way))}
+    made |= {*constants_of(Composer)}
+    lacking = [
+        f"{module}.{name}"
+        for module in sorted(_road(make_map.__module__) | _road(aligners.__name__))
+        for name in _numbers(module)
+        if name not in IN_NO_KEY
+        and f"{module}.{name}" not in (made if module.split(".")[1] in STAGES else covered)
+        and not _of_figures(module)
+    ]
+    assert not lacking, "\n".join(lacking)
+    assert len(covered) > 200
+
+
+def _of_figures(module: str) -> bool:
+    """Whether a module serves what is measured and told after the map is drawn, or writes it."""
+    return module.split(".")[1] in ("quality", "report", "raster")
+
+
+def _of_methods(value: object) -> Iterator[str]:
+    """Constants in the digest of a method and of the methods that are its fields."""
+    if is_dataclass(value):
+        if callable(value):
+            yield from constants_of(type(value))
+        for field in fields(value):
+            yield from _of_methods(getattr(value, field.name))
+
+
+@cache
+def _tree(module: str) -> ast.Module:
+    found = find_spec(module)
+    assert found is not None
+    assert found.origin is not None
+    return ast.parse(Path(found.origin).read_text())
+
+
+def _road(first: str) -> set[str]:
+    """Modules of ours that one imports, also inside functions, and those that these import."""
+    found: set[str] = set()
+    todo = [first]
+    while todo:
+        module = todo.pop()
+        if module not in found and find_spec(module) is not None:
+            found.add(module)
+            todo += _imports(_tree(module))
+    return found
+
+
+def _imports(tree: ast.AST) -> Iterator[str]:
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            continue
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("skyquilt"):
+            yield str(node.module)
+            inside = (f"{node.module}.{name.name}" for name in node.names)
+            yield from (name for name in inside if _is_module(name))
+        yield from _imports(node)
+
+
+def _is_module(name: str) -> bool:
+    try:
+        return find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False
+
+
+def _numbers(module: str) -> Iterator[str]:
+    """Upper-case names that a module sets to something with a number in it."""
+    for node in _tree(module).body:
+        targets = node.targets if isinstance(node, ast.Assign) else []
+        if isinstance(node, ast.AnnAssign):
+            targets = [node.target]
+        names = [n for t in targets for n in ast.walk(t) if isinstance(n, ast.Name)]
+        value = getattr(node, "value", None)
+        if value is not None and any(
+            isinstance(n, ast.Constant) and isinstance(n.value, int | float)
+            for n in ast.walk(value)
+        ):
+            yield from (n.id for n in names if n.id.isupper())

@@ -1,0 +1,132 @@
+"""A comparison that was stopped goes on with the same command."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from skyquilt.errors import OutputError
+from skyquilt.model.event import Result, StageFinished, StageStarted
+from skyquilt.papers.compare import CompareSettings, iter_compare
+from skyquilt.workflows.methods import MosaicSettings
+
+SETTINGS = CompareSettings(
+    mosaic=MosaicSettings(features=300, surface="ties", gsd_cm=30, jobs=2),
+    variants=("pose", "bundle"),
+    first=5,
+)
+"""No known distances: the bundle adjustment finds those that both methods are judged by."""
+
+
+def compared(photos, out, until=None, settings=SETTINGS):
+    """What a call tells of stages; it is stopped at the time that `until` (a stage) begins."""
+    told, times = [], 0
+    events = iter_compare(photos, out, settings)
+    for event in events:
+        if isinstance(event, StageStarted) and until is not None and event.stage == until[0]:
+            times += 1
+            if times == until[1]:
+                events.close()
+                return told
+        if isinstance(event, StageFinished):
+            told.append(event.stage)
+    assert isinstance(event, Result)
+    return told
+
+
+def record(out):
+    """compare.json without times."""
+    found = json.loads((out / "compare.json").read_text())
+    for column in found["methods"].values():
+        for key in ("seconds", "align_seconds", "cpu_seconds"):
+            column.pop(key)
+    return found
+
+
+@pytest.fixture(scope="module")
+def undisturbed(flight, tmp_path_factory):
+    out = tmp_path_factory.mktemp("undisturbed") / "out"
+    compared(flight / "photos", out)
+    found = record(out)
+    assert "measured in a model" in found["judged_by"]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("stage", "time", "not_again"),
+    [
+        ("bundle: align", 1, ()),
+        ("bundle: measure", 2, ()),  # in the second run, with distances
+        ("pose: mosaic", 1, ("bundle: mosaic", "bundle: report")),
+    ],
+)
+def test_what_was_finished_is_not_made_again(flight, tmp_path, undisturbed, stage, time, not_again):
+    out = tmp_path / "out"
+    before = compared(flight / "photos", out, (stage, time))
+    assert f"{stage.split(':')[0]}: features" in before
+    again = compared(flight / "photos", out)
+    assert not set(not_again) & set(again)
+    assert "pose: report" in again
+    assert record(out) == undisturbed
+
+
+def test_the_time_of_a_bundle_run_is_that_of_the_first_call(flight, tmp_path):
+    out = tmp_path / "out"
+    compared(flight / "photos", out, ("pose: features", 1))
+    first = json.loads((out / ".skyquilt" / "compare.json").read_text())["times"]["seconds"]
+    compared(flight / "photos", out)
+    column = json.loads((out / "compare.json").read_text())["methods"]["bundle"]
+    assert column["seconds"] == first["total"]
+    assert column["align_seconds"] == first["align"] > 0
+
+
+def test_another_comparison_is_refused(flight, tmp_path):
+    out = tmp_path / "out"
+    compared(flight / "photos", out, ("pose: features", 1))
+    other = replace(SETTINGS, mosaic=replace(SETTINGS.mosaic, gsd_cm=40))
+    with pytest.raises(OutputError, match=r"comparison of other photos or settings.*--overwrite"):
+        compared(flight / "photos", out, settings=other)
+    compared(flight / "photos", out)
+    with pytest.raises(OutputError, match=r"already holds a comparison; add --overwrite"):
+        compared(flight / "photos", out)
+
+
+def test_settings_that_were_refused_can_be_corrected(flight, tmp_path):
+    """A comparison that has not begun to work leaves the folder free for other settings."""
+    wrong = replace(SETTINGS, mosaic=replace(SETTINGS.mosaic, gsd_cm=30, crs="EPSG:4326"))
+    with pytest.raises(Exception, match="not projected"):
+        compared(flight / "photos", tmp_path / "out", settings=wrong)
+    compared(flight / "photos", tmp_path / "out", ("bundle: links", 1))
+
+
+def test_killed_between_methods_the_same_command_goes_on(flight, tmp_path, undisturbed):
+    out = tmp_path / "out"
+    words = [
+        "compare",
+        flight / "photos",
+        "-o",
+        out,
+        "--methods",
+        "pose,bundle",
+        "--gsd",
+        "30",
+        "--first",
+        "5",
+    ]
+    command = [sys.executable, "-m", "skyquilt", *map(str, words), "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        for line in process.stdout:
+            if "pose: links" in line:
+                os.kill(process.pid, signal.SIGKILL)
+                break
+    assert process.returncode == -signal.SIGKILL
+    again = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert again.returncode == 0, again.stderr
+    assert "bundle: mosaic" not in again.stdout
+    assert "pose: mosaic" in again.stdout
+    assert Path(out / "report.html").is_file()
