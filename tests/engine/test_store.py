@@ -6,7 +6,8 @@ import pytest
 
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import OutputError
-from skyquilt.workflows.methods import MosaicSettings, methods
+from skyquilt.settings import MosaicSettings
+from skyquilt.workflows.methods import methods_for
 
 
 @pytest.fixture
@@ -84,12 +85,13 @@ def test_arrays_of_other_shape_or_type_are_other_inputs():
 
 
 def test_a_method_is_known_by_its_parameters_and_version(monkeypatch):
-    first = methods(MosaicSettings())
-    assert digest(first.sift) == digest(methods(MosaicSettings()).sift)
-    assert digest(first.sift) != digest(methods(MosaicSettings(features=500)).sift)
-    before = digest(first.bundle)
-    monkeypatch.setattr(type(first.bundle), "version", 99)
-    assert digest(first.bundle) != before
+    first = methods_for(MosaicSettings())
+    assert digest(first.detector) == digest(methods_for(MosaicSettings()).detector)
+    other = methods_for(MosaicSettings(features=500))
+    assert digest(first.detector) != digest(other.detector)
+    before = digest(first.align)
+    monkeypatch.setattr(type(first.align.bundle.bundle), "version", 99)
+    assert digest(first.align) != before
 
 
 def test_what_a_digest_does_not_know_is_refused():
