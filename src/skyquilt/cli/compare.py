@@ -1,4 +1,4 @@
-"""`skyquilt compare`: all methods of alignment on one survey."""
+"""`skyquilt compare`: all alignment methods on one survey."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -32,13 +32,13 @@ def command(
         str | None,
         typer.Option(
             help="Columns, separated by commas: position, pose, image, image-overview, hybrid,"
-            " hybrid-anneal,"
-            " flightline, bundle.",
+            " hybrid-anneal, flightline, bundle.",
             show_default="all",
         ),
     ] = None,
     first: Annotated[
-        int | None, typer.Option(help="Only so many photos, the first ones.", show_default="all")
+        int | None,
+        typer.Option(help="Use only the first photos, at most this many.", show_default="all"),
     ] = None,
     distances: Annotated[
         Path | None,
@@ -49,7 +49,7 @@ def command(
     known: Annotated[
         Path | None,
         typer.Option(
-            help="Known points (gcp_list.txt) to judge by; they align nothing.",
+            help="Known points (gcp_list.txt) as check points; they are not used to align.",
             show_default="tie points of bundle",
         ),
     ] = None,
@@ -58,18 +58,20 @@ def command(
     cameras: Cameras = None,
     thermal_unit: ThermalUnit = None,
     height: Annotated[float | None, typer.Option(help="Height above ground in m.")] = None,
-    alpha: Annotated[float, typer.Option(help="Weight of distances against looks, 0 to 1.")] = 0.5,
+    alpha: Annotated[
+        float, typer.Option(help="Weight of distances against visual agreement, 0 to 1.")
+    ] = 0.5,
     lines: Annotated[
-        str, typer.Option(help="How flight lines are told apart: heading, distance.")
+        str, typer.Option(help="How flight lines are separated: heading, distance.")
     ] = "heading",
     repair: Repair = True,
-    seed: Annotated[int, typer.Option(help="Of everything random.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 0,
     jobs: Jobs = 0,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Align one survey by every method, and set the results side by side.
+    """Align one survey with every method, and compare the results.
 
     Writes compare.json, report.html, and each method's own run in a folder of its name.
     """

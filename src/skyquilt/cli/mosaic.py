@@ -61,20 +61,20 @@ def command(
     ] = None,
     surface: Annotated[
         str,
-        typer.Option(help="Heights: ties (tie points alone) or sweep (refined from the pictures)."),
+        typer.Option(help="Heights: ties (tie points alone) or sweep (refined from the images)."),
     ] = "sweep",
     blend: Annotated[
-        str, typer.Option(help="Where photos meet: auto, feather, first, average, multiband.")
+        str, typer.Option(help="Blending of photos: auto, feather, first, average, multiband.")
     ] = "auto",
     feather: Annotated[float, typer.Option(help="Width of feathered seams in map pixels.")] = 6.0,
     balance: Annotated[
-        bool, typer.Option("--balance/--no-balance", help="Bring photos to one brightness.")
+        bool, typer.Option("--balance/--no-balance", help="Adjust photos to a common brightness.")
     ] = True,
     balance_thermal: Annotated[
         bool | None,
         typer.Option(
             "--balance-thermal/--raw-thermal",
-            help="Balance the drift between thermal frames on their overlaps, or leave values as"
+            help="Balance the drift between thermal frames in their overlaps, or keep the values as"
             " recorded.",
             show_default="temperatures balanced, counts raw",
         ),
@@ -86,16 +86,15 @@ def command(
     distortion: Annotated[
         str | None,
         typer.Option(
-            help="Lens terms to calibrate, or, for methods that do not, to keep of a known"
-            " calibration: none, 2, 4,"
-            " 6 (radial order), 6t (and tangential).",
-            show_default="4 to calibrate, 6t to keep",
+            help="Lens terms to calibrate, or, for methods that do not calibrate, to use of a known"
+            " calibration: none, 2, 4, 6 (radial order), 6t (and tangential).",
+            show_default="4 to calibrate, 6t to use",
         ),
     ] = None,
     transform: Annotated[
         str | None,
         typer.Option(
-            help="How two photos may differ: translation, similarity, affine, homography.",
+            help="Transformation between two photos: translation, similarity, affine, homography.",
             show_default="similarity for image, homography for flightline",
         ),
     ] = None,
@@ -121,7 +120,10 @@ def command(
         ),
     ] = None,
     alpha: Annotated[
-        float, typer.Option(help="Weight of distances against looks, 0 to 1, for method hybrid.")
+        float,
+        typer.Option(
+            help="Weight of distances against visual agreement, 0 to 1, for method hybrid."
+        ),
     ] = 0.5,
     optimiser: Annotated[
         str,
@@ -130,36 +132,34 @@ def command(
         ),
     ] = "surfaces",
     seed: Annotated[
-        int, typer.Option(help="Of everything random; equal seeds give equal maps.")
+        int, typer.Option(help="Seed of all random numbers; equal seeds give equal maps.")
     ] = 0,
     sequence: Annotated[
         str,
         typer.Option(
-            help="Order that methods image, hybrid and flightline take photos in: time, name, or a"
+            help="Order in which methods image, hybrid and flightline add photos: time, name, or a"
             " file of names."
         ),
     ] = "time",
     lines: Annotated[
         str,
         typer.Option(
-            help="How method flightline tells lines apart: heading, or distance (as in the paper)."
+            help="How method flightline separates lines: heading, or distance (as in the paper)."
         ),
     ] = "heading",
     distances: Annotated[
         Path | None,
-        typer.Option(
-            help="Known distances (CSV: point_a, point_b, metres) by which the map is judged."
-        ),
+        typer.Option(help="Known distances (CSV: point_a, point_b, metres) to check the map with."),
     ] = None,
     height: Annotated[
         float | None,
-        typer.Option(help="Height above ground in m, for methods that do not find it."),
+        typer.Option(help="Height above ground in m, for methods that do not estimate it."),
     ] = None,
     heading: Annotated[
         float | None,
         typer.Option(
             help="Heading of all photos in degrees, for method position.",
-            show_default="the commonest reported",
+            show_default="the most common reported one",
         ),
     ] = None,
     repair: Repair = True,
@@ -167,7 +167,7 @@ def command(
     thermal: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of thermal photos: their map is laid on the visual one as thermal.tif."
+            help="Folder of thermal photos; their map (thermal.tif) is aligned with the visual map."
         ),
     ] = None,
     thermal_unit: Annotated[
@@ -177,23 +177,20 @@ def command(
     thermal_route: Annotated[
         str,
         typer.Option(
-            help="How the thermal map finds its place: rig (both cameras on one drone: on the"
-            " visual poses), maps (the"
-            " pictures of both), pairs (of photos), heights (the surfaces under them), positions"
-            " (GPS alone), auto (the"
-            " first that can be believed)."
+            help="How the thermal map is registered: rig (both cameras on one drone: from the"
+            " visual poses), maps (the images of both maps), pairs (of photos), heights (the"
+            " surfaces of both), positions (GPS alone), auto (the first that is reliable)."
         ),
     ] = "auto",
     jobs: Jobs = 0,
     memory: Annotated[
-        float | None, typer.Option(help="Memory to stay within, in GB.", show_default="1.2")
+        float | None, typer.Option(help="Memory limit in GB.", show_default="1.2")
     ] = None,
     rerun_from: Annotated[
         str | None,
         typer.Option(
-            help="Make everything anew from this stage on: features, links, align, surface,"
-            " balance, mosaic,"
-            " measure, report."
+            help="Compute everything again from this stage on: features, links, align, surface,"
+            " balance, mosaic, measure, report."
         ),
     ] = None,
     overwrite: Overwrite = False,
@@ -266,7 +263,7 @@ def command(
 
 
 def with_thermal(result: "Result") -> str:
-    """A mosaic in a few lines, and how the thermal map lies on it."""
+    """A summary of a mosaic, and how the thermal map was registered to it."""
     from skyquilt.cli.progress import mosaic_summary
 
     t = result.metrics["thermal"]
