@@ -83,7 +83,7 @@ def test_accuracy_tags_are_the_deviations(make_jpeg):
     ("gps", "words"),
     [
         (gps_exif(0, 0), "(0, 0)"),
-        (gps_exif(95, 10), "outside the globe"),
+        (gps_exif(95, 10), "outside the valid range"),
         ({1: "N", 2: ((46, 1), (0, 1), (0, 1))}, "missing"),
         ({1: "N", 2: ((46, 1), (0, 0), (0, 0)), 3: "E", 4: ((9, 0), (0, 1), (0, 1))}, "no number"),
         ({}, "no GPS position"),
@@ -167,7 +167,7 @@ def test_broken_xmp_is_searched_as_text(make_jpeg):
     xmp = dji_xmp(RelativeAltitude="+39.80").replace("/>", ">")
     photo = read_photo(make_jpeg(exif=dji_exif(), xmp=xmp))
     assert photo.position.takeoff_m == 39.8
-    assert any("broken XML" in note for note in photo.notes)
+    assert any("not valid XML" in note for note in photo.notes)
 
 
 def test_an_xml_bomb_is_not_expanded(make_jpeg):

@@ -105,7 +105,7 @@ def test_hidden_files_and_earlier_runs_are_passed_over(make_jpeg):
     (folder / "out" / "run.toml").write_text("")
     survey = read_survey(folder)
     assert len(survey.photos) == 2
-    assert any("The folder out holds an earlier run" in n for n in survey.notes)
+    assert any("The folder out contains an earlier run" in n for n in survey.notes)
 
 
 def test_a_photo_300_km_away_loses_its_position_but_stays(make_jpeg):
@@ -169,7 +169,7 @@ def test_contradictions_state_both_values(make_jpeg):
     said = " ".join(contradictions(read_survey(folder).photos))
     assert "differ by more than 30 deg in 5 photos (camera 35 to 35, aircraft 90 to 90 deg)" in said
     assert "runs from 110 to 190 m" in said
-    assert "way flown (from GPS) and the heading differ" in said
+    assert "direction of flight (from GPS) and the heading differ" in said
 
 
 def test_digest_is_of_the_content(make_jpeg, tmp_path):
