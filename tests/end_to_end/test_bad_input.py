@@ -34,7 +34,7 @@ pytestmark = pytest.mark.filterwarnings(
 
 def test_an_empty_folder(mosaic, tmp_path):
     (tmp_path / "empty").mkdir()
-    told = mosaic(tmp_path / "empty").refused(3, "no photo", "it holds nothing", "JPEG")
+    told = mosaic(tmp_path / "empty").refused(3, "no photo", "it contains nothing", "JPEG")
     assert not told.output.exists()
 
 
@@ -100,7 +100,7 @@ def renamed_text(path: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
-        (truncated, "cut off"),
+        (truncated, "truncated"),
         (garble, "damaged"),
         late(cut_but_ended, "damaged"),
         late(emptied, "0 bytes"),

@@ -85,7 +85,10 @@ def test_accuracy_tags_are_the_deviations(make_jpeg):
         (gps_exif(0, 0), "(0, 0)"),
         (gps_exif(95, 10), "outside the valid range"),
         ({1: "N", 2: ((46, 1), (0, 1), (0, 1))}, "missing"),
-        ({1: "N", 2: ((46, 1), (0, 0), (0, 0)), 3: "E", 4: ((9, 0), (0, 1), (0, 1))}, "no number"),
+        (
+            {1: "N", 2: ((46, 1), (0, 0), (0, 0)), 3: "E", 4: ((9, 0), (0, 1), (0, 1))},
+            "not a number",
+        ),
         ({}, "no GPS position"),
     ],
 )
@@ -102,7 +105,7 @@ def test_void_xmp_position_falls_back_to_exif(make_jpeg):
         make_jpeg(exif=dji_exif(), xmp=dji_xmp(GpsLatitude="0.0", GpsLongitude="0.0"))
     )
     assert photo.position.source == "exif"
-    assert any("XMP is void" in note for note in photo.notes)
+    assert any("XMP is invalid" in note for note in photo.notes)
 
 
 def test_insane_altitude_is_noted_and_ignored(make_jpeg):

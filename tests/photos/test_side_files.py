@@ -311,7 +311,7 @@ def test_deviations_of_a_calibration_are_the_adjustment_s_priors(tmp_path, photo
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("{", "no JSON"),
+        ("{", "not JSON"),
         ("[]", "cameras by name"),
         ('{"a": {"width": 3}}', "height"),
         ("{}", "by name"),

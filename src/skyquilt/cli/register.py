@@ -19,9 +19,9 @@ def command(
     method: Annotated[
         str,
         typer.Option(
-            help="auto (structure, believed only where independent patches agree), or a published"
-            " method, which"
-            " believes nine inliers: sift, surf, usurf, rfae, rfae-sift, surf+rfae; or structure."
+            help="auto (structure, accepted only where independent patches agree), or a published"
+            " method, which accepts nine inliers: sift, surf, usurf, rfae, rfae-sift, surf+rfae;"
+            " or structure."
         ),
     ] = "auto",
     metadata: Annotated[

@@ -9,7 +9,7 @@ Float = NDArray[np.float32]
 def translate(
     reference: Float, moving: Float, *, margin: int = 3, iterations: int = 4
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where the content of reference patches lies in moving ones.
+    """Shifts of the content of moving patches against reference patches.
 
     Lucas and Kanade (1981), inverse compositional, gain and offset removed by normalising both
     patches.

@@ -35,8 +35,8 @@ from shapely.prepared import prep
 from skyquilt.errors import SideFileError
 
 SEGMENTS = 100
-"""Largest number of segments per extent of an outline before it is projected, because straight
-lines become curved.
+"""An outline is divided into segments of at most its extent over this number before it is
+projected, because straight lines become curved.
 """
 
 

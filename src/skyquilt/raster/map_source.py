@@ -77,7 +77,7 @@ class TileSource:
         return found[0] + x, found[1] + y, found[2] + x, found[3] + y
 
     def part(self, bounds: Bounds, gsd: float) -> Part | None:
-        """The tiles of the coarsest level that is at least as fine as requested, joined."""
+        """The tiles of the level that is about as fine as requested, joined."""
         level = int(np.clip(np.floor(np.log2(max(gsd / self.gsd, 1e-9)) + 0.25), 0, LEVELS - 1))
         x, y = self.origin
         west, south, east, north = bounds[0] - x, bounds[1] - y, bounds[2] - x, bounds[3] - y
