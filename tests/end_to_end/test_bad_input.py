@@ -34,12 +34,12 @@ pytestmark = pytest.mark.filterwarnings(
 
 def test_an_empty_folder(mosaic, tmp_path):
     (tmp_path / "empty").mkdir()
-    told = mosaic(tmp_path / "empty").refused(3, "no photo", "it holds nothing", "JPEG")
+    told = mosaic(tmp_path / "empty").refused(3, "no photo", "it contains nothing", "JPEG")
     assert not told.output.exists()
 
 
 def test_a_folder_that_does_not_exist(mosaic, tmp_path):
-    told = mosaic(tmp_path / "nowhere").refused(2, "nowhere", "does not exist", "give a folder")
+    told = mosaic(tmp_path / "nowhere").refused(2, "nowhere", "does not exist", "choose a folder")
     assert not told.output.exists()
 
 
@@ -100,7 +100,7 @@ def renamed_text(path: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
-        (truncated, "cut off"),
+        (truncated, "truncated"),
         (garble, "damaged"),
         late(cut_but_ended, "damaged"),
         late(emptied, "0 bytes"),
@@ -327,7 +327,7 @@ def test_gps_of_one_photo_300_km_away(mosaic, photos, finished):
     told = mosaic(photos).made()
     assert told.metrics["photos_used"] == 9
     assert told.metrics["blocks"] == [9]
-    assert f"{far.name} claims to lie" in told.notes
+    assert f"{far.name} reports a position" in told.notes
     w, h = told.metrics["size_px"]
     assert max(w, h) < 1000
     assert (
@@ -350,7 +350,7 @@ def test_gps_of_one_of_two_photos_300_km_away(mosaic, photos):
     _, b = keep(photos, 0, 1)
     relabel(b, place=(49.3, 14.3))
     told = mosaic(photos).refused(2, "km wide", "positions", "--geo")
-    assert "claim to lie 301 km apart" in told.err
+    assert "report positions 301 km apart" in told.err
 
 
 @pytest.mark.slow
@@ -360,7 +360,7 @@ def test_all_positions_the_same(mosaic, photos):
     told = mosaic(photos).made()
     assert told.metrics["photos_used"] == 9
     assert told.metrics["crs"] is None
-    assert "All 9 positions are one and the same" in told.notes
+    assert "All 9 positions are identical" in told.notes
 
 
 # heights

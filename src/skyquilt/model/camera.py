@@ -1,4 +1,4 @@
-"""The interior orientation of a camera, and the orders of distortion that lens models come in."""
+"""The interior orientation of a camera, and the distortion terms that lens models use."""
 
 from dataclasses import dataclass, field
 
@@ -67,11 +67,11 @@ class Order:
     radial: int
     """Radial coefficients: terms up to r^(2 radial)."""
     tangential: bool
-    """Whether it has tangential ones."""
+    """Whether it has tangential coefficients."""
 
     @property
     def terms(self) -> tuple[bool, bool, bool, bool, bool]:
-        """Of k1, k2, k3, p1, p2 those it has."""
+        """Which of k1, k2, k3, p1, p2 the model has."""
         k1, k2, k3 = (self.radial > k for k in range(3))
         return k1, k2, k3, self.tangential, self.tangential
 
@@ -83,11 +83,11 @@ ORDERS = {
     "6": Order(radial=3, tangential=False),
     "6t": Order(radial=3, tangential=True),
 }
-"""By name: radial terms up to r^0, r^2, r^4, r^6, and r^6 with tangential ones."""
+"""By name: radial terms up to r^0, r^2, r^4, r^6, and r^6 with tangential terms."""
 
 
 def order_named(name: str) -> Order:
-    """The order of a name.
+    """The order with this name.
 
     Raises:
         ValueError: there is none.

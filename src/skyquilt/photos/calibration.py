@@ -1,4 +1,4 @@
-"""Intrinsics that a maker wrote into the metadata, as a `Camera` of this file's size."""
+"""Intrinsics that the manufacturer wrote into the metadata, as a `Camera` of this file's size."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from skyquilt.photos.tags import Exif, Xmp
 
 _SIGMA_SHARE = {"focal": 0.01, "centre": 0.003}
 _SIGMA_RADIAL, _SIGMA_TANGENTIAL = 0.01, 0.001
-"""How far a factory's coefficients are trusted."""
+"""Standard deviations assumed for a manufacturer's distortion coefficients."""
 
 
 def read_calibration(
@@ -18,7 +18,8 @@ def read_calibration(
     """The first of DJI's `DewarpData`, Pix4D's `Camera:Perspective*` and DJI's
     `CalibratedFocalLength`.
 
-    `scale` is this file's px per px as taken (`focal.native_scale`): makers calibrate the latter.
+    `scale` is this file's px per px as captured (`lens.native_scale`): the calibration refers to
+    the latter.
     """
     native = (round(width / scale), round(height / scale))
     found = (
@@ -91,7 +92,7 @@ def _px_per_mm(exif: Exif, sensor: Sensor | None, size: tuple[int, int]) -> floa
 
 
 def _calibrated_focal(xmp: Xmp, size: tuple[int, int]) -> Camera | None:
-    """DJI's value in px; its optical centre counts from the image's corner."""
+    """DJI's value in px; its optical centre is counted from the image's corner."""
     focal = xmp.number("CalibratedFocalLength")
     x, y = xmp.number("CalibratedOpticalCenterX"), xmp.number("CalibratedOpticalCenterY")
     centre = (x, y) if x and y else (size[0] / 2, size[1] / 2)
@@ -104,7 +105,9 @@ def _camera(
     centre: tuple[float, float],
     distortion: tuple[float, ...] | None,
 ) -> Camera | None:
-    """A camera from corner-counted px; None where the numbers are no lens."""
+    """A camera from px counted from the corner; None where the numbers are not plausible for a
+    lens.
+    """
     long = max(size)
     inside = all(0.25 * s < c < 0.75 * s for c, s in zip(centre, size, strict=True))
     if not (

@@ -1,4 +1,4 @@
-"""The focal length of a photo, by a camera database and by what the photo itself says."""
+"""The focal length of a photo, from a camera database and from the photo's metadata."""
 
 import csv
 import math
@@ -23,13 +23,13 @@ class Sensor:
     model: str
     """As in EXIF."""
     image_width: int | None
-    """Long side in px of the images this row is for; None = all of the model."""
+    """Long side in px of the images to which this row applies; None = all images of the model."""
     width_mm: float
     """Length of the sensor's long side in mm."""
     focal_mm: float | None
-    """Focal length of a lens that cannot be changed, in mm; used where EXIF has none."""
+    """Focal length of a fixed lens in mm; used where EXIF has none."""
     shutter: Literal["rolling", "global", ""]
-    """`global` stands for mechanical shutters too."""
+    """`global` includes mechanical shutters."""
     band: Literal["visible", "thermal"]
     """Spectrum."""
 
@@ -60,10 +60,11 @@ def _table() -> dict[str, tuple[Sensor, ...]]:
 
 
 def find_sensor(*, model: str, long_side: int) -> Sensor | None:
-    """The row for an EXIF model name and the long side in px of its images as taken; None if
+    """The row for an EXIF model name and the long side in px of its images as captured; None if
     unknown.
 
-    A model with rows for several image sizes (a visible and a thermal eye) needs the right size.
+    For a model with rows for several image sizes (a visible and a thermal camera) the size must
+    match.
     """
     rows = _table().get(_plain(model), ())
     exact = [r for r in rows if r.image_width == long_side]
@@ -74,7 +75,7 @@ def find_sensor(*, model: str, long_side: int) -> Sensor | None:
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _PLAUSIBLE = (0.2, 60.0)
-"""A focal length outside these multiples of the long side is a slip of the pen, not a lens."""
+"""A focal length outside these multiples of the long side is an error, not a lens."""
 _MOST_ZOOM = 16.0
 _APART = 1.2
 """Focal lengths that differ by more than this factor contradict each other; 35 mm values are
@@ -83,11 +84,9 @@ rounded.
 
 
 def native_scale(exif: Exif, width: int, height: int) -> tuple[float, str]:
-    """How many px of the file stand for one px as taken, and a note where the sizes disagree in
-    shape.
+    """Pixels of the file per pixel as captured, and a note where the aspect ratios differ.
 
-    EXIF keeps the size the camera wrote; a reduced copy still carries it. 1.0 where EXIF says
-    nothing.
+    EXIF keeps the size that the camera wrote, also in a reduced copy. 1.0 where EXIF has no size.
     """
     x, y = exif.number(tag.PIXELS_X), exif.number(tag.PIXELS_Y)
     if not x or not y or x < 1 or y < 1:
@@ -112,8 +111,8 @@ def find_focal(
     height: int,
     thermal: bool = False,
 ) -> Focal:
-    """The first of: calibrated, mm on the sensor, focal-plane resolution, 35 mm equivalent, a
-    guess.
+    """The first available of: calibrated, mm on the sensor, focal-plane resolution, 35 mm
+    equivalent, a guess.
     """
     candidates = (
         _calibrated(calibration),
@@ -130,16 +129,16 @@ def find_focal(
 
 
 def digital_zoom(exif: Exif) -> float:
-    """By how much the camera enlarged the middle of its image; 1.0 where EXIF says nothing."""
+    """Factor by which the camera enlarged the middle of its image; 1.0 where EXIF has none."""
     zoom = exif.number(tag.ZOOM) or 1.0
     return zoom if 1.0 < zoom <= _MOST_ZOOM else 1.0
 
 
 def focal_notes(exif: Exif, sensor: Sensor | None, width: int, height: int) -> tuple[str, ...]:
-    """Where EXIF's ways to the focal length disagree, and a digital zoom."""
+    """Notes on focal lengths in EXIF that disagree, and on a digital zoom."""
     zoom = digital_zoom(exif)
     zoomed = (
-        f"It was taken with a digital zoom of {zoom:g}; the focal length counts it in."
+        f"It was taken with a digital zoom of {zoom:g}; the focal length includes it."
         if zoom > 1
         else ""
     )
@@ -147,7 +146,7 @@ def focal_notes(exif: Exif, sensor: Sensor | None, width: int, height: int) -> t
     rounded = _from_35mm(exif, width, height)
     if direct and rounded and not 1 / _APART < direct.px / rounded.px < _APART:
         return zoomed, (
-            f"Its focal length in mm means {direct.px:.0f} px, its 35 mm equivalent"
+            f"Its focal length in mm corresponds to {direct.px:.0f} px, its 35 mm equivalent to"
             f" {rounded.px:.0f} px; "
             "one of them is wrong."
         )
