@@ -177,7 +177,7 @@ def seams(survey: Path, gsd: float) -> None:
     from skyquilt.photos.pixels import read_color
     from skyquilt.quality.seam_measurement import measure_seams
     from skyquilt.settings import MosaicSettings
-    from skyquilt.workflows.flow import REGISTRY
+    from skyquilt.workflows.artefacts import REGISTRY
     from skyquilt.workflows.methods import methods_for
     from skyquilt.workflows.mosaic import mosaic
     from skyquilt.workflows.photo_features import find_features

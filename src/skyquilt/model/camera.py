@@ -1,6 +1,6 @@
 """The interior orientation of a camera, and the distortion terms that lens models use."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +58,27 @@ class Camera:
     def ideal(cls, *, width: int, height: int, focal: float) -> "Camera":
         """A camera without distortion whose principal point is the image centre."""
         return cls(width=width, height=height, focal=focal, cx=(width - 1) / 2, cy=(height - 1) / 2)
+
+    def rescaled(self, width: int, height: int) -> "Camera":
+        """The same lens on an image of another size in px with the same field of view."""
+        s = max(width, height) / max(self.width, self.height)
+        if s == 1.0:
+            return self
+        sigmas = self.sigmas and (*(v * s for v in self.sigmas[:3]), *self.sigmas[3:])
+        return replace(
+            self,
+            width=width,
+            height=height,
+            focal=self.focal * s,
+            cx=(self.cx + 0.5) * s - 0.5,
+            cy=(self.cy + 0.5) * s - 0.5,
+            sigmas=sigmas,
+        )
+
+    def mirrored(self) -> "Camera":
+        """The calibration of the same camera's files turned by 180 degrees."""
+        cx, cy = self.width - 1 - self.cx, self.height - 1 - self.cy
+        return replace(self, cx=cx, cy=cy, p1=-self.p1, p2=-self.p2)
 
 
 @dataclass(frozen=True, kw_only=True)

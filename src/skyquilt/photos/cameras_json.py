@@ -10,7 +10,6 @@ from skyquilt.errors import SideFileError
 from skyquilt.geometry.camera_formats import camera_from_opensfm
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Focal, Photo
-from skyquilt.photos.calibration import rescaled
 
 _SIGMA_SHARE = 0.01
 
@@ -77,7 +76,7 @@ def _fitting(photo: Photo, cameras: Mapping[str, Camera]) -> Camera | None:
 def _calibrated(photo: Photo, camera: Camera | None) -> Photo:
     if camera is None:
         return photo
-    own = rescaled(camera, width=photo.width, height=photo.height)
+    own = camera.rescaled(photo.width, photo.height)
     sigma = own.sigmas[0] if own.sigmas else _SIGMA_SHARE * own.focal
     notes = tuple(n for n in photo.notes if "focal length" not in n)
     focal = Focal(px=own.focal, sigma_px=sigma, source="calibrated")

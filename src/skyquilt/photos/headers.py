@@ -20,6 +20,7 @@ SOI, EOI, SOS = 0xD8, 0xD9, 0xDA
 APP1, APP3 = 0xE1, 0xE3
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _BARE = frozenset({0x01, *range(0xD0, 0xD8)})  # markers without a length
+_FLIR = b"FLIR\x00"
 _EXIF = b"Exif\x00"
 _XMP = b"http://ns.adobe.com/xap/1.0/\x00"
 _XMP_MORE = b"http://ns.adobe.com/xmp/extension/\x00"
@@ -39,6 +40,11 @@ class JpegHeader:
     """Marker and payload of every APP segment, in the order of the file."""
     scan_offset: int
     """Byte at which the first scan begins."""
+
+    @property
+    def radiometric(self) -> bool:
+        """Whether segments of the kind that FLIR and DJI keep raw thermal data in are there."""
+        return any(m == APP3 or (m == APP1 and p.startswith(_FLIR)) for m, p in self.segments)
 
     @property
     def exif(self) -> bytes:
@@ -98,11 +104,8 @@ def read_jpeg_header(file: BinaryIO) -> JpegHeader:
             raise UnreadablePhotoError("it is a JPEG without an image in it")
         payload = _payload(file)
         if marker in _FRAMES and len(payload) >= 6:
-            frame = (
-                int.from_bytes(payload[3:5], "big"),
-                int.from_bytes(payload[1:3], "big"),
-                payload[5],
-            )
+            height, width = (int.from_bytes(payload[k : k + 2], "big") for k in (1, 3))
+            frame = width, height, payload[5]
         elif 0xE0 <= marker <= 0xEF:
             segments.append((marker, payload))
     if frame is None or 0 in frame:
@@ -178,9 +181,8 @@ def read_header(path: Path) -> Header:
     except OSError as error:
         raise UnreadablePhotoError(f"it cannot be read ({error.strerror or error})") from error
     except Exception as error:  # tifffile and Pillow raise many exceptions on broken data
-        raise UnreadablePhotoError(
-            f"its header is broken ({type(error).__name__}: {error})"
-        ) from error
+        broken = f"its header is broken ({type(error).__name__}: {error})"
+        raise UnreadablePhotoError(broken) from error
 
 
 def content_digest(path: Path) -> str:
@@ -274,9 +276,7 @@ def _stored_as(dtype: "np.dtype[np.generic]") -> Dtype:
         return "uint16"
     if dtype.kind in "iuf":
         return "float32"
-    raise UnreadablePhotoError(
-        f"its pixels are of type {dtype}; integers or real numbers are needed"
-    )
+    raise UnreadablePhotoError(f"its pixels are {dtype}; integers or real numbers are needed")
 
 
 def _png(file: BinaryIO) -> Header:

@@ -11,9 +11,15 @@ from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Stored
 from skyquilt.photos import tags as tag
-from skyquilt.photos.calibration import read_calibration
 from skyquilt.photos.headers import Header, content_digest, read_header
-from skyquilt.photos.lens import Sensor, find_focal, find_sensor, focal_notes, native_scale
+from skyquilt.photos.lens import (
+    Sensor,
+    find_focal,
+    find_sensor,
+    focal_notes,
+    native_scale,
+    read_calibration,
+)
 from skyquilt.photos.metadata import (
     find_editor,
     modified_time,
@@ -123,6 +129,8 @@ def _lens(header: Header, width: int, height: int, *, thermal: bool) -> _Lens:
 
 def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame | None:
     if header.jpeg:
+        if not header.jpeg.radiometric:
+            return None
         return thermal_frame_of_jpeg(header.jpeg, make=header.exif.text(tag.MAKE))
     if (
         header.kind != "tiff"

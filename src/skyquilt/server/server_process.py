@@ -28,7 +28,7 @@ from skyquilt.server.survey import LiveSurvey
 PATIENCE_S = 60.0
 """How long the process may take to begin."""
 NICE = 5
-"""LocalPose photos comes first."""
+"""Placing photos comes first."""
 
 
 class UploadEndpoint:

@@ -22,7 +22,6 @@ from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import SkyquiltError, UnreadablePhotoError
-from skyquilt.model import camera, features, poses, raster, surface
 from skyquilt.model.event import Event, Note
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import Alignment, MapFrame, Prior
@@ -38,7 +37,6 @@ from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import (
     FeaturedPhotos,
     GreyPictures,
-    PhotoFeatures,
     PhotoPixels,
     features_recipe,
     find_features,
@@ -48,28 +46,6 @@ from skyquilt.workflows.photo_features import (
 from skyquilt.workflows.survey_input import SurveyInput
 
 T = TypeVar("T")
-REGISTRY = {
-    c.__name__: c
-    for c in (
-        PhotoFeatures,
-        features.Features,
-        features.Link,
-        features.RejectedLink,
-        features.Matches,
-        camera.Camera,
-        poses.Alignment,
-        poses.MapFrame,
-        poses.Pose,
-        poses.TiePoints,
-        poses.ControlResidual,
-        poses.Join,
-        surface.Surface,
-        RejectedPhoto,
-        companions.BlockExtras,
-        raster.Grid,
-    )
-}
-"""Records that the store may hold."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
