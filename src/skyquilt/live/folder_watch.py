@@ -144,7 +144,7 @@ class Watch:
         if not head:
             return "it is empty (0 bytes)"
         if ending_of(head) is None:
-            return "its content is not JPEG, TIFF or PNG"
+            return "its content is neither JPEG, TIFF nor PNG"
         photo = read_photo(path)
         return photo.reason if isinstance(photo, RejectedPhoto) else ""
 

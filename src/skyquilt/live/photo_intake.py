@@ -77,7 +77,7 @@ class Intake:
             )
         arrived = self.inbox.bring(blocks)
         if arrived is None:
-            return self.refuse(name, source, "its content is not JPEG, TIFF or PNG")
+            return self.refuse(name, source, "its content is neither JPEG, TIFF nor PNG")
         return self._enter(arrived, name, source)
 
     def take_file(self, path: Path, source: str) -> Accepted | Refused:
