@@ -123,7 +123,7 @@ def _nothing_placed(method: str, photos: int, rejected: dict[int, str]) -> str:
     if "height" in reasons:
         advice = "add --height METRES"
     return (
-        f"method {method} places photos by their metadata, and none of {photos} photos has enough"
+        f"method {method} places photos by their metadata, and none of {photos} can be placed"
         f" ({reasons[:200]}); {advice}"
     )
 

@@ -105,9 +105,7 @@ class Propagate:
         """The registration of b's frame to a's, or the reason why there is none."""
         points = carried(pairs, common_H_a, common_H_b)
         if len(points.px_a) < self.minimum:
-            reason = (
-                f"{len(points.px_a)} correspondences were transferred, {self.minimum} are needed"
-            )
+            reason = f"{len(points.px_a)} correspondences were found, {self.minimum} are needed"
             return RefusedRegistration(reason=reason)
         extent = float(np.linalg.norm(np.ptp(points.px_a, axis=0)))
         balance = balanced_weights(points.px_a, self.radius * extent)
