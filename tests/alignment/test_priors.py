@@ -84,8 +84,8 @@ def test_a_crs_asked_for():
 @pytest.mark.parametrize(
     ("crs", "words"),
     [
-        ("EPSG:999999", "no coordinate system"),
-        ("nonsense", "no coordinate system"),
+        ("EPSG:999999", "not a coordinate system"),
+        ("nonsense", "not a coordinate system"),
         ("EPSG:4326", "not projected in metres"),
         ("EPSG:2263", "not projected in metres"),
         ("EPSG:4978", "not projected"),

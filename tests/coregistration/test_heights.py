@@ -104,7 +104,7 @@ def test_fields_that_hardly_meet_are_refused():
     z = ground(8)
     away = start() + np.array([[0, 0, 500.0], [0, 0, 0], [0, 0, 0]])
     found = AlignHeights()(field(z), field(moved(z)), away)
-    assert isinstance(found, RefusedRegistration) and "too little ground" in found.reason
+    assert isinstance(found, RefusedRegistration) and "too few cells" in found.reason
 
 
 @pytest.mark.parametrize("cell", [0.2, 0.37])

@@ -119,4 +119,4 @@ def test_refusals():
             a=0, b=0, px_a=rng(1).uniform(0, 500, (40, 2)), px_b=rng(2).uniform(0, 500, (40, 2))
         )
     ]
-    assert "agree on no" in Propagate()(wild, a_H, b_H).reason
+    assert "do not fit a common" in Propagate()(wild, a_H, b_H).reason

@@ -106,7 +106,7 @@ def test_a_refusal_is_written_down_and_has_its_exit_code(files, tmp_path, capsys
     assert command("register", folder / "a.jpg", folder / "other.png", "-o", output, "--quiet") == 7
     said = capsys.readouterr().err
     assert (
-        said.startswith("skyquilt: refused: the best place found is not confirmed")
+        said.startswith("skyquilt: refused: the best position found is not confirmed")
         and said.count("\n") == 1
     )
     record = json.loads((output / "registration.json").read_text())

@@ -101,7 +101,7 @@ def test_the_same_content_twice_is_one_photo(small, flight, tmp_path):
     copy = tmp_path / "other_name.jpg"
     shutil.copyfile(flight.photos[0], copy)
     before = len(small.members.by_id)
-    assert small.add(copy).text == "it was there already"
+    assert small.add(copy).text == "it was already received"
     assert len(small.members.by_id) == before
 
 
@@ -188,7 +188,7 @@ def test_a_preview_gives_way_to_the_full_picture(flight, tmp_path):
     assert [m.state for m in live.members.by_id.values()] == ["superseded", "placed"]
     assert live.canvas.tiles_of(1) == ()
     late = live.add(small)
-    assert late.text == "it was there already"
+    assert late.text == "it was already received"
     live.close()
 
 

@@ -100,5 +100,5 @@ def test_nothing_and_kinds():
     assert len(Guided()(none, some, np.zeros((0, 2)))) == 0
     with pytest.raises(ValueError, match="one kind expected, got real of 64 and binary of 32"):
         Best()(some, features(np.ones((3, 32), np.uint8), binary=True))
-    with pytest.raises(ValueError, match="a place for each of 3"):
+    with pytest.raises(ValueError, match="a position for each of 3"):
         Guided()(some, some, np.zeros((2, 2)))

@@ -1,1 +1,1 @@
-"""Stage: Links -> poses."""
+"""Processing stage from links to poses."""

@@ -1,10 +1,10 @@
-"""Bundle adjustment: Levenberg-Marquardt on the Schur complement, with priors on everything that
-has one.
+"""Bundle adjustment: Levenberg-Marquardt on the Schur complement, with priors on all unknowns for
+which one is known.
 
-Robust losses are iteratively reweighted (Cauchy). Libraries were weighed first: see
-docs/decisions.md; the wheel of pycolmap offers priors on positions only, and a strip without loops
-needs them on tilt and on every intrinsic as well. The tests hold this code against pycolmap's Ceres
-on problems that both can state.
+Robust losses are iteratively reweighted (Cauchy). Why no library is used: see docs/decisions.md.
+The wheel of pycolmap offers priors on positions only; a flight strip without loops also needs
+priors on tilt and on every intrinsic. The tests compare this code with pycolmap's Ceres on problems
+that both can express.
 """
 
 from collections.abc import Callable
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 SMALL = 500
-"""Unknowns up to which NumPy's solver does: SciPy's halves the work, but takes longer to load than
-that saves.
+"""Largest number of unknowns solved by NumPy. SciPy's solver needs half the time, but loading it
+takes longer than it saves on small problems.
 """
 DENSE_LIMIT = 4000
-"""Unknowns of the reduced system up to which dense Cholesky is used."""
+"""Largest number of unknowns of the reduced system for which dense Cholesky is used."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,7 +68,7 @@ class Normal:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Adjusted:
-    """Outcome of an adjustment."""
+    """Result of an adjustment."""
 
     state: State
     """The unknowns at the minimum."""
@@ -77,7 +77,7 @@ class Adjusted:
     iterations: int
     """Steps taken."""
     converged: bool
-    """False when the limit of iterations came first."""
+    """False if the limit of iterations was reached first."""
 
 
 def _cauchy(squared: Array, scale: float) -> tuple[Array, Array]:
@@ -87,14 +87,14 @@ def _cauchy(squared: Array, scale: float) -> tuple[Array, Array]:
 
 
 def _pseudo_huber(squared: Array, scale: float) -> tuple[Array, Array]:
-    """Weights and costs under the pseudo-Huber loss: what lies counts less, but it never stops
-    counting.
+    """Weights and costs under the pseudo-Huber loss: outliers get less weight, but never zero
+    weight.
 
-    A strip that bends away from its positions and angles does so with all of them together; a loss
-    that forgets outliers would forget them all.
+    If a strip bends away from its measured positions and angles, all of them have large residuals
+    together. A redescending loss would then ignore all of them.
     """
     root = np.sqrt(1 + squared / scale**2)
-    # the cost is 2 scale^2 (root - 1), written without its cancellation at large scales
+    # the cost is 2 scale^2 (root - 1), in a form without cancellation at large scales
     return 1 / root, 2 * squared / (root + 1)
 
 
@@ -209,9 +209,9 @@ def _zeros(size: int) -> "Array | sparse.lil_matrix":
 
 
 def _solve_positive(S: Array, rhs: Array) -> Array:
-    """S^-1 rhs; `LinAlgError` where S is not positive definite."""
+    """S^-1 rhs; `LinAlgError` if S is not positive definite."""
     if len(S) <= SMALL:
-        np.linalg.cholesky(S)  # the solver itself would take any matrix
+        np.linalg.cholesky(S)  # the solver itself accepts any matrix
         return np.asarray(np.linalg.solve(S, rhs))
     from scipy import linalg
 
@@ -337,14 +337,15 @@ def adjust(
 ) -> Adjusted:
     """Minimises the robust cost.
 
-    After each step the points settle under the moved photos before the step is judged: a strip that
-    straightens moves along a curve, and without that its long steps would all be refused.
+    After each step the points are refined under the moved photos before the step is accepted or
+    rejected. A strip that straightens moves along a curve; without this refinement all its long
+    steps would be rejected.
 
     Args:
         problem: observations and priors.
         state: where to start.
-        iterations: most steps to take.
-        tolerance: relative decrease of the cost at which it counts as converged.
+        iterations: largest number of steps.
+        tolerance: relative decrease of the cost below which the adjustment has converged.
         damping: first damping, relative to the diagonal of the normal equations.
     """
 
@@ -373,8 +374,8 @@ def adjust(
 def covariance(problem: Problem, state: State) -> Array | None:
     """Covariance ((6n+8m), (6n+8m)) of photos and cameras at the minimum, points marginalised.
 
-    In units of the whitened residuals, scaled by their robust variance factor; None beyond
-    `DENSE_LIMIT`, and where nothing holds some of them.
+    In units of the whitened residuals, scaled by their robust variance factor. None for more than
+    `DENSE_LIMIT` unknowns, and if some unknowns are not determined.
     """
     normal = normal_equations(problem, state)
     reduced = Reduced(problem, normal, 0.0)
@@ -389,5 +390,5 @@ def covariance(problem: Problem, state: State) -> Array | None:
         inverse = np.linalg.inv(S * scale) * scale
     except np.linalg.LinAlgError:
         return None
-    fixed = 8 * reduced.m if reduced.q == 0 else 0  # what is fixed does not vary
+    fixed = 8 * reduced.m if reduced.q == 0 else 0  # fixed intrinsics have no variance
     return np.pad(inverse, (0, fixed)) if np.isfinite(inverse).all() else None

@@ -18,12 +18,14 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Pose, Prior
 
 REQUESTED = "asked for"
-"""Why a method was used that a user named."""
+"""The reason recorded for a method that the user requested."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ByLinks:
-    """`bundle`: all linked photos adjusted at once; the others by their metadata."""
+    """`bundle`: all linked photos are adjusted together; the others are placed by their
+    metadata.
+    """
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
@@ -51,7 +53,9 @@ class ByLinks:
 
 @dataclass(frozen=True, kw_only=True)
 class ByReport:
-    """`pose` and `position`: photos where their metadata place them, repaired by links or not."""
+    """`pose` and `position`: photos are placed by their metadata, with or without correction by
+    links.
+    """
 
     method: ByMetadata
     """Which metadata are used."""
@@ -61,7 +65,7 @@ class ByReport:
 
     @property
     def needs_links(self) -> bool:
-        """Only to repair metadata."""
+        """Links are needed only to correct metadata."""
         return self.repair
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -76,7 +80,7 @@ class ByReport:
 
 @dataclass(frozen=True, kw_only=True)
 class Auto:
-    """Chooses by what the survey has: `bundle` where links hold photos together, else `pose`."""
+    """Chooses the method from the data: `bundle` if photos are linked, otherwise `pose`."""
 
     bundle: ByLinks
     """For linked photos."""
@@ -86,7 +90,7 @@ class Auto:
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
-        """Aligns the photos; `why` is a sentence.
+        """Aligns the photos; `why` gives the reason as a sentence.
 
         Raises:
             AlignmentError: photos without links and without positions.
@@ -98,22 +102,22 @@ class Auto:
 
 
 def choose_method(photos: int, links: int, positions: int) -> tuple[str, str]:
-    """`bundle` or `pose`, and why, one sentence.
+    """`bundle` or `pose`, and the reason as one sentence.
 
     Raises:
         AlignmentError: neither can place the photos.
     """
     if photos == 1:
-        return "pose", "one photo has nothing to be adjusted against"
+        return "pose", "a single photo cannot be adjusted"
     if links:
         where = (
             "and positions place it"
             if positions
             else "but no positions: the map is not georeferenced"
         )
-        return "bundle", f"{links} links hold the photos together, {where}"
+        return "bundle", f"{links} links connect the photos, {where}"
     if positions:
-        return "pose", "no two photos could be linked, so each lies where its metadata say"
+        return "pose", "no two photos could be linked, so each is placed by its metadata"
     raise AlignmentError(
         f"no two of {photos} photos overlap recognisably and none has a position;"
         " give positions with --geo, or photos that overlap by half or more"
@@ -126,7 +130,7 @@ def by_pose(height_m: float | None, repair: bool) -> ByReport:
 
 
 def repaired_metadata(inputs: AlignmentInputs) -> Repaired | None:
-    """Metadata, corrected where the pixels of links contradict them; None without links."""
+    """Metadata, corrected where the links contradict them; None without links."""
     if not inputs.links:
         return None
     convergence = inputs.frame.convergence_deg
@@ -136,7 +140,7 @@ def repaired_metadata(inputs: AlignmentInputs) -> Repaired | None:
 def placed_by_metadata(
     method: ByMetadata, inputs: AlignmentInputs, repaired: Repaired | None
 ) -> Alignment:
-    """Photos placed by reported or by repaired metadata."""
+    """Photos placed by reported or by corrected metadata."""
     if repaired is None:
         return method(inputs.photos, inputs.frame, inputs.priors)
     placed = method(inputs.photos, inputs.frame, repaired.priors, repaired.heights_m)
@@ -169,7 +173,7 @@ def with_loose_photos(
         camera_of[i] = photo.camera_key
         blocks.append((i,))
         notes.append(
-            f"{photo.name} could not be linked to any other photo; it lies where its metadata say."
+            f"{photo.name} could not be linked to any other photo; it is placed by its metadata."
         )
     return replace(
         alignment,
@@ -183,7 +187,7 @@ def with_loose_photos(
 
 
 def _median_offset(alignment: Alignment, priors: Sequence[Prior]) -> NDArray[np.float64]:
-    """(3,) m from reported to adjusted positions; 0 where nothing is known."""
+    """(3,) offset in m from reported to adjusted positions; 0 where it is unknown."""
     apart = np.array([p.map_C - priors[i].map_C for i, p in alignment.poses.items()])
     columns = apart.reshape(-1, 3).T
     known = [c[np.isfinite(c)] for c in columns]
@@ -191,7 +195,7 @@ def _median_offset(alignment: Alignment, priors: Sequence[Prior]) -> NDArray[np.
 
 
 def _lacking(C: NDArray[np.float64], prior: Prior) -> str:
-    """What a photo cannot be placed without; empty where nothing is missing."""
+    """The data missing for placing a photo; empty if nothing is missing."""
     if not np.isfinite(C[:2]).all():
         return "no position"
     if not np.isfinite(C[2]):

@@ -1,6 +1,4 @@
-"""`bundle`: similarity graph -> adjustment with self-calibration and priors -> points of the
-ground.
-"""
+"""`bundle`: similarity graph -> adjustment with self-calibration and priors -> ground points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -34,12 +32,15 @@ class Bundle:
     `6t` (and tangential).
     """
     per_photo: int = 400
-    """Observations per photo in the adjustment; all the others are triangulated afterwards."""
+    """Observations per photo in the adjustment; all other tie points are triangulated
+    afterwards.
+    """
     repair: bool = True
-    """Treat metadata as measurements that may lie; False believes them to their stated deviations.
+    """Whether metadata may contain gross errors. False = they are weighted by their stated
+    deviations.
     """
     match_observations: LeastSquaresMatching | None = field(default_factory=LeastSquaresMatching)
-    """Registration of observations in larger pictures; None leaves keypoints as they were found."""
+    """Refinement of observations in larger images; None leaves keypoints unchanged."""
     version: ClassVar[int] = 4
 
     def __call__(
@@ -52,8 +53,8 @@ class Bundle:
         control: Sequence[Control] = (),
         grey: GreyPicture | None = None,
     ) -> Alignment:
-        """Aligns the photos that hang together by links; `grey` gives pictures to match
-        observations in.
+        """Aligns the photos that are connected by links; `grey` gives images for the refinement of
+        observations.
 
         Raises:
             AlignmentError: no two photos are linked.
@@ -87,7 +88,7 @@ def _sharpened(
     match_observations: LeastSquaresMatching,
     grey: GreyPicture,
 ) -> Tracks:
-    """Tracks (sensor pixels) with observations registered in larger pictures."""
+    """Tracks (sensor pixels) with observations refined in larger images."""
     everything, _ = setup.problem(tracks)
     xyz = triangulated(everything, state).X
     cameras, camera_of = camera_records(photos, setup, state, None)
@@ -100,7 +101,9 @@ def _sharpened(
 
 
 def _rough(problem: Problem, state: State) -> tuple[Problem, State]:
-    """Intrinsics fixed under a wide loss, then all free under a narrower one, pruning between."""
+    """First stage: intrinsics fixed under a wide loss, then all free under a narrower one; outliers
+    are removed in between.
+    """
     fixed = replace(problem, free=np.zeros_like(problem.free), loss_px=20.0)
     state = adjust(fixed, state, iterations=10, tolerance=3e-2).state
     problem, state = prune(problem, state, 40.0)
@@ -109,7 +112,9 @@ def _rough(problem: Problem, state: State) -> tuple[Problem, State]:
 
 
 def _fine(problem: Problem, state: State) -> tuple[Problem, State]:
-    """All free under ever narrower losses, pruning between."""
+    """Second stage: all unknowns free under ever narrower losses; outliers are removed in
+    between.
+    """
     problem, state = prune(problem, state, 20.0)
     state = adjust(problem.with_loss(2.5), state, iterations=20, tolerance=2e-3, damping=1e-6).state
     problem, state = prune(problem, state, 5.0)
@@ -119,8 +124,8 @@ def _fine(problem: Problem, state: State) -> tuple[Problem, State]:
 
 
 def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]:
-    """Without the observations off by more than `limit` deviations, and points then seen once;
-    control stays.
+    """Removes observations with residuals above `limit` deviations and points left with one
+    observation; control points are kept.
     """
     error = np.linalg.norm(residuals_px(problem, state), axis=1) / problem.sigma_px
     pinned = np.asarray(np.isfinite(problem.X0).any(1))
@@ -141,11 +146,12 @@ def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]
 
 
 def _believe_positions_less(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
-    """Where neighbours contradict the stated horizontal accuracy, their scatter takes its place.
+    """Replaces the stated horizontal accuracy of positions by their scatter between neighbours
+    where that is larger.
 
-    Only what changes from photo to photo counts: a smooth misfit may as well be the block's own
-    bending, and believing positions less would let it bend. (Heights are judged by image scale,
-    before the adjustment.)
+    Only differences from photo to photo count. A smooth misfit may be a deformation of the block,
+    and positions with less weight would permit it. (Heights are checked by image scale before the
+    adjustment.)
     """
     for _ in range(2):
         error = state.C - problem.C0
@@ -174,11 +180,11 @@ def position_noise(error: Array) -> float:
 def leave_one_out(
     problem: Problem, state: State, C_covariance: Array | None
 ) -> tuple[float, float, float] | None:
-    """RMS per axis in m of each measured position against the position that everything else
-    predicts.
+    """RMS per axis in m of the difference between each measured position and its prediction from
+    all other observations.
 
-    From the covariance of the full solution (the usual identity for linear least squares), not by n
-    solutions.
+    Computed from the covariance of the full solution (the usual identity of linear least squares)
+    instead of n adjustments.
     """
     known = np.flatnonzero(np.isfinite(problem.C0[:, :2]).all(1))
     if C_covariance is None or len(known) < 3:
@@ -200,9 +206,7 @@ def leave_one_out(
 
 
 def ground_points(tracks: Tracks, setup: Setup, problem: Problem, state: State) -> TiePoints:
-    """All tracks triangulated with the final poses; bad observations and unstable points
-    dropped.
-    """
+    """All tracks triangulated with the final poses; outliers and unstable points are removed."""
     everything, _ = setup.problem(tracks)
     everything = replace(everything, loss_px=2.0)
     whole = triangulated(everything, state)
@@ -234,7 +238,7 @@ def _outcome(
 ) -> Alignment:
     ties = ground_points(tracks, setup, problem, state)
     seen = np.bincount(ties.photo, minlength=len(photos))
-    weak = {int(i): f"only {seen[i]} tie points hold it" for i in setup.members if seen[i] < 8}
+    weak = {int(i): f"it has only {seen[i]} tie points" for i in setup.members if seen[i] < 8}
     full = covariance(problem, state)
     variance = _variance_factor(problem, state)
     cameras, camera_of = camera_records(

@@ -1,4 +1,4 @@
-"""Where metadata and pixels disagree."""
+"""Contradictions between metadata and image content."""
 
 from collections.abc import Sequence
 
@@ -10,13 +10,13 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Prior
 
 YAW_DEG = 15.0
-"""Yaws further apart than this contradict each other."""
+"""Yaw angles in degrees that differ by more than this contradict each other."""
 
 
 def conflicts(
     photos: Sequence[Photo], priors: Sequence[Prior], alignment: Alignment
 ) -> list[MetadataConflict]:
-    """All contradictions of photos that pixels hold to others, in order of capture."""
+    """All contradictions of photos that are connected by tie points, in order of capture."""
     held = alignment.held or (tuple(sorted(alignment.poses)) if alignment.method == "pose" else ())
     found = [c for i in held for c in _yaw(photos[i], priors[i], alignment, i)]
     if alignment.frame.crs is not None:
@@ -34,9 +34,9 @@ def _yaw(photo: Photo, prior: Prior, alignment: Alignment, i: int) -> list[Metad
     if abs(off) < max(YAW_DEG, 3 * prior.sigma_yaw_deg):
         return []
     convergence = alignment.frame.convergence_deg
-    why = f"the heading reported ({prior.yaw_source}) is off by {off:+.0f} degrees"
+    why = f"the reported heading ({prior.yaw_source}) is wrong by {off:+.0f} degrees"
     if abs(abs(off) - 180) < 20 and photo.editor:
-        why = "the file was turned upside down by another program"
+        why = "another program has turned the file upside down"
     return [
         MetadataConflict(
             photo=photo.name,
@@ -54,7 +54,7 @@ def _altitudes(
     """Altitudes that differ from the solution by more than three deviations and 5 % of the flying
     height.
 
-    The common offset of a survey is its datum's, not a contradiction.
+    An offset common to all photos comes from the height datum and is not a contradiction.
     """
     z = np.array([alignment.poses[i].map_C[2] for i in held])
     off = np.array([priors[i].map_C[2] for i in held]) - z
@@ -73,7 +73,7 @@ def _altitudes(
                     field="altitude",
                     reported=round(reported, 1),
                     estimated=round(reported - float(e), 1),
-                    meaning=f"image scale and neighbours put it {abs(e):.0f} m {where}",
+                    meaning=f"by image scale and neighbours it is {abs(e):.0f} m {where}",
                 )
             )
     return out
@@ -92,7 +92,7 @@ def _positions(
                     field="position",
                     reported=round(off, 1),
                     estimated=0.0,
-                    meaning=f"the reported position lies {off:.1f} m from where the photo fits",
+                    meaning=f"the reported position is {off:.1f} m from the adjusted one",
                 )
             )
     return out
@@ -115,7 +115,7 @@ def _focals(
                     field="focal",
                     reported=round(photo.focal.px, 1),
                     estimated=round(camera.focal, 1),
-                    meaning=f"self-calibration of {photo.camera_key} finds another focal length (in"
+                    meaning=f"self-calibration of {photo.camera_key} gives another focal length (in"
                     " px)",
                 )
             )

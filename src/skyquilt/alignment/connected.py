@@ -1,5 +1,5 @@
-"""Connected components and spanning trees of small and of large graphs, without the half second
-SciPy takes to load.
+"""Connected components and spanning trees of small and of large graphs, without SciPy, which takes
+half a second to load.
 """
 
 from collections import deque
@@ -16,8 +16,8 @@ def connected(count: int, a: NDArray[Any], b: NDArray[Any]) -> Index:
     """Component (count,) of each node of a graph with edges a-b, numbered in order of their first
     nodes.
 
-    Labels sink to the least one in reach, and each round follows them to their ends (Shiloach and
-    Vishkin 1982).
+    Each node takes the smallest label among its neighbours; each round then follows the labels to
+    their roots (Shiloach and Vishkin 1982).
     """
     label = np.arange(count)
     while (label[a] != label[b]).any():

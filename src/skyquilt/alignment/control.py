@@ -1,5 +1,5 @@
-"""Control points: observations that hold the block to the ground; check points: the judges kept
-out.
+"""Control points are observations in the adjustment and tie the block to the ground. Check points
+are not adjusted; they measure its accuracy.
 """
 
 from collections.abc import Sequence
@@ -33,16 +33,16 @@ class Control:
     sigma_m: float
     """Deviation of each coordinate in m."""
     photo: NDArray[np.int64]
-    """(k,) photos that show it."""
+    """(k,) photos in which it is visible."""
     px: Array
-    """(k, 2) where, in file pixels."""
+    """(k, 2) image coordinates in file pixels."""
 
 
 def control_in_frame(
     points: Sequence[ControlPoint], photos: Sequence[Photo], frame: MapFrame
 ) -> tuple[Control, ...]:
-    """Control points in map coordinates; observations in unknown photos are left out, points never
-    seen too.
+    """Control points in map coordinates; observations in unknown photos and points without
+    observations are left out.
     """
     index = {p.name: i for i, p in enumerate(photos)} | {
         p.path.name: i for i, p in enumerate(photos)
@@ -92,7 +92,9 @@ def _observations(
 def _alone(
     control: Sequence[Control], setup: Setup, problem: Problem, state: State
 ) -> tuple[Problem, State]:
-    """The control points alone, seen by the poses as they are, intersected from their rays."""
+    """A problem with the control points alone, intersected from their rays with the current
+    poses.
+    """
     point, row, px = _observations(control, setup)
     empty = np.full((len(control), 3), np.nan)
     own_problem = replace(
@@ -110,7 +112,9 @@ def _alone(
 def intersected(
     control: Sequence[Control], setup: Setup, problem: Problem, state: State
 ) -> tuple[Array, Array]:
-    """Where the poses see the points (k, 3) in m, and the RMS reprojection error of each in px."""
+    """The points intersected with the current poses, (k, 3) in m, and the RMS reprojection error of
+    each in px.
+    """
     own, solved = _alone(control, setup, problem, state)
     error = (residuals_px(own, solved) ** 2).sum(1)
     count = np.maximum(np.bincount(own.point, minlength=len(control)), 1)
@@ -139,10 +143,10 @@ def _moved(problem: Problem, state: State, s: float, R: Array, t: Array) -> tupl
 def hold_to_control(
     problem: Problem, state: State, frame: MapFrame, setup: Setup, control: Sequence[Control]
 ) -> tuple[Problem, State, MapFrame, Sequence[Control]]:
-    """The adjustment once more with control points as observations.
+    """Repeats the adjustment with control points as observations.
 
-    GPS positions share an offset (datum of heights, base station); the control points take it out
-    first.
+    GPS positions share an offset (height datum, base station). It is estimated from the control
+    points and removed first.
 
     Raises:
         AlignmentError: no position and fewer than three usable control points.
@@ -172,8 +176,8 @@ def hold_to_control(
         problem = replace(problem, sigma_C=np.full_like(problem.sigma_C, 1e4))
     state = adjust(problem, state, iterations=25, tolerance=1e-5).state
     if setup.georeferenced and len(fit) >= 3:
-        # the positions' common offset was taken from a solution that they still held: control knows
-        # it better
+        # the common offset of the positions came from a solution that still depended on them;
+        # estimate it again from control points
         for _ in range(3):
             offset = np.nan_to_num(np.nanmedian(state.C - problem.C0, axis=0))
             problem = replace(problem, C0=problem.C0 + offset)
@@ -190,7 +194,7 @@ def hold_to_control(
 def _with_points(
     problem: Problem, state: State, setup: Setup, fit: Sequence[Control]
 ) -> tuple[Problem, State]:
-    """Tie points and control points together."""
+    """The problem with tie points and control points."""
     point, row, px = _observations(fit, setup)
     P = len(state.X)
     surveyed = np.array([c.xyz for c in fit])

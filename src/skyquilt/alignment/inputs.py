@@ -1,4 +1,4 @@
-"""What a method of alignment may use, and what it is."""
+"""Inputs and interface of the alignment methods."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ from skyquilt.model.photo import ControlPoint, Photo
 from skyquilt.model.poses import Alignment, MapFrame, Prior
 
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
-"""Grey picture of a photo (index), its longest side at most the px given."""
+"""Gives the grey image of a photo (index), with at most the given px on its longest side."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AlignmentInputs:
-    """Everything that is known of a survey's photos before they are aligned."""
+    """All data of a survey's photos before they are aligned."""
 
     photos: Sequence[Photo]
     """Photos; all indices below refer to them."""
@@ -26,26 +26,27 @@ class AlignmentInputs:
     frame: MapFrame
     """The map's frame."""
     priors: Sequence[Prior]
-    """What the metadata say, one per photo."""
+    """Priors from the metadata, one per photo."""
     links: Sequence[Link]
-    """Verified links; none for a method that needs none."""
+    """Verified links; empty for a method that does not need them."""
     control: Sequence[ControlPoint]
     """Control and check points."""
     order: Sequence[int]
-    """Photos in the order they are joined in; photos that the sequence does not name are left out.
-    """
+    """Photos in the order in which they are joined; photos not listed are left out."""
     grey: GreyPicture
-    """Grey pictures."""
+    """Gives grey images."""
 
 
 class Aligner(Protocol):
-    """A method of alignment: a frozen dataclass, whose value is part of the store's keys."""
+    """Interface of an alignment method: a frozen dataclass whose value is part of the
+    store's keys.
+    """
 
     @property
     def needs_links(self) -> bool:
-        """Whether photos are linked first."""
+        """Whether the photos must be linked before."""
         ...
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
-        """Poses and calibration; `why` says why this method was used."""
+        """Poses and calibration; `why` gives the reason for the method."""
         ...

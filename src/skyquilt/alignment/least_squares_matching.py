@@ -1,9 +1,9 @@
-"""Observations made sharper: keypoints found in small pictures, moved to where larger pictures
-agree.
+"""Refinement of observations: keypoints found in reduced images are moved to the best agreement of
+larger images.
 
-With poses nearly right, every observation of a point is a patch of the same ground: rectified to
-the ground, the patches differ by a translation, which is what the observations' errors are. One
-observation stays and the others follow it.
+With approximately correct poses, the patches around all observations of a point show the same
+ground. Rectified to the ground they differ by a translation only, and this translation is the error
+of the observation. One observation per point is kept and the others are registered to it.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,11 +22,11 @@ from skyquilt.model.poses import Pose
 
 Array = NDArray[np.float64]
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
-"""Grey picture (h, w) of a photo (index), its longest side at most the px given."""
+"""Gives the grey image (h, w) of a photo (index), with at most the given px on its longest side."""
 MARGIN = 3
-"""Pixels by which a observation may move."""
+"""Largest shift of an observation in patch px."""
 BATCH = 4000
-"""Observations registered at a time: bounds the memory."""
+"""Number of observations registered at a time, to bound memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,15 +34,15 @@ class LeastSquaresMatching:
     """Registration of all observations of a point to the most central one."""
 
     side: int = 15
-    """Pixels of a patch's side, in the picture it is cut from."""
+    """Side of a patch in px of the image."""
     longest: int = 1000
-    """Longest side in px of the pictures."""
+    """Longest side of the images in px."""
     agree: float = 0.75
-    """Least correlation of two observations; others stay as they were found, with their
+    """Least correlation of two patches. Observations below it keep their place and standard
     deviation.
     """
     sigma: float = 0.12
-    """Standard deviation of a sharpened observation in px of the picture."""
+    """Standard deviation of a refined observation in px of the image."""
     version: ClassVar[int] = 1
 
     def __call__(
@@ -53,7 +53,7 @@ class LeastSquaresMatching:
         cameras: Mapping[int, Camera],
         grey: GreyPicture,
     ) -> Tracks:
-        """Tracks (file pixels) with sharper observations; `xyz` (count, 3): their points in the map
+        """Tracks (file pixels) with refined observations; `xyz` (count, 3): their points in the map
         frame.
         """
         anchor = self._anchors(tracks, cameras)
@@ -73,7 +73,9 @@ class LeastSquaresMatching:
     def _registered(
         self, patches: NDArray[np.uint8], first: NDArray[np.int64], others: NDArray[np.int64]
     ) -> tuple[Array, Array]:
-        """Shifts (m, 2) in patch px and correlations (m,), some thousand pairs at a time."""
+        """Shifts (m, 2) in patch px and correlations (m,), computed for some thousand pairs at a
+        time.
+        """
         inner = slice(MARGIN, -MARGIN)
         parts = []
         for k in range(0, len(others), BATCH):
@@ -104,7 +106,7 @@ class LeastSquaresMatching:
         grey: GreyPicture,
     ) -> tuple[NDArray[np.uint8], Array]:
         """Patches (N, s + 2 margin, ...) of all observations rectified to the level ground of their
-        point, centred where each was seen, and the pictures' scales (N,): sensor px per px.
+        point, centred at each observation, and the image scales (N,): sensor px per image px.
         """
         full = self.side + 2 * MARGIN
         out = np.zeros((len(tracks.point), full, full), np.uint8)
@@ -115,7 +117,7 @@ class LeastSquaresMatching:
             picture, camera = grey(photo, self.longest), cameras[photo]
             scale[own] = camera.width / picture.shape[1]
             gx, gy = ground_axes(xyz[tracks.point[own]], poses[photo], camera, scale[own[0]])
-            # the ground around a point is nearly affine in the picture over a few pixels
+            # the mapping from ground to image is nearly affine over a few pixels
             centre = (tracks.px[own] + 0.5) / scale[own[0]] - 0.5
             u = (
                 centre[:, 0, None, None]
@@ -161,8 +163,8 @@ class LeastSquaresMatching:
 
 
 def ground_axes(X: Array, pose: Pose, camera: Camera, scale: float) -> tuple[Array, Array]:
-    """How far a picture moves, in its px (n, 2), per patch px eastwards and southwards on
-    level ground at X (n, 3).
+    """Shift in image px (n, 2) per patch px eastwards and southwards on level ground at X
+    (n, 3).
     """
     size = np.abs(pose.map_C[2] - X[:, 2]) / camera.focal * scale
     px = [_pixel(camera, pose, p) / scale for p in (X, X + _along(size, 0), X - _along(size, 1))]

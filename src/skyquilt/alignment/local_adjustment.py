@@ -1,9 +1,8 @@
-"""One photo more: placed by its links to photos that are placed already, its neighbourhood settling
-around it.
+"""Local adjustment: places a new photo by its links to placed photos and refines its neighbourhood.
 
-The work is bounded whatever the size of the map (part D of the methods): a window of the new photo,
-the photos it is linked to, and a ring of others that are held where they are. Calibrations stay; a
-bundle of the whole block, in the background, changes those.
+The work is bounded whatever the size of the map (part D of the methods): a window with the new
+photo, the photos linked to it, and a ring of other photos that are held fixed. Calibrations are not
+changed; the adjustment of the whole block in the background does that.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,13 +26,13 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Pose, Prior
 
 HELD_M, HELD_RAD = 1e-3, 1e-5
-"""Deviations of photos that are held."""
+"""Standard deviations of the poses of held photos."""
 STAGES = ((2.0, 20.0, 40.0, 3e-2), (0.8, 6.0, 12.0, 1e-2), (0.0, 2.5, 5.0, 1e-2))
-"""Rounds of an adjustment: from which median misfit in px of the new photo on, width of the loss in
-px, residual in px beyond which observations go, and tolerance.
+"""Rounds of an adjustment: the median residual in px of the new photo from which the round is
+needed, width of the loss in px, residual in px above which observations are removed, and tolerance.
 """
 TURNED = "/turned"
-"""End of the names of calibrations of files that were rewritten upside down."""
+"""Suffix of the names of calibrations for files that were saved upside down."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,25 +42,25 @@ class Window:
     photos: Sequence[Photo]
     """The photos; the new one is `new`."""
     priors: Sequence[Prior]
-    """What their metadata say."""
+    """Priors from their metadata."""
     features: Sequence[Features]
     """Their keypoints."""
     links: Sequence[Link]
     """Links between them."""
     poses: Mapping[int, Pose]
-    """Where those are that are placed."""
+    """Poses of the placed photos."""
     cameras: Mapping[str, Camera]
     """Calibrations known so far, by name."""
     camera_of: Mapping[int, str]
-    """Names of the calibrations of placed photos."""
+    """Name of the calibration of each placed photo."""
     new: int
-    """The photo to place; where it is placed already, the window only settles."""
+    """The photo to place; if it is already placed, the window is only refined."""
     held: frozenset[int]
     """Placed photos that must not move."""
     ground: float
-    """Height of the ground around in m."""
+    """Height of the surrounding ground in m."""
     sigma_xy: float
-    """Deviation of positions in m that the map has shown, where worse than stated."""
+    """Standard deviation of positions in m as estimated by the map, where larger than stated."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,19 +72,19 @@ class AdjustedWindow:
     camera: str
     """Name of the new photo's calibration."""
     observations: int
-    """Observations that hold the new photo."""
+    """Number of observations of the new photo."""
     xyz: NDArray[np.float64]
-    """(P, 3) points of the ground in m."""
+    """(P, 3) ground points in m."""
     dropped: tuple[tuple[int, int], ...]
     """Links (a, b) that contradict the others."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NotAdjusted:
-    """Why the links do not place a photo: false in `if`."""
+    """Why the links do not determine a photo's pose. Its truth value is False."""
 
     reason: str
-    """A phrase."""
+    """The reason as a phrase."""
 
     def __bool__(self) -> bool:
         return False
@@ -93,12 +92,12 @@ class NotAdjusted:
 
 @dataclass(frozen=True, kw_only=True)
 class LocalAdjustment:
-    """Similarity from the links, then a bundle adjustment of the window."""
+    """A similarity from the links, followed by a bundle adjustment of the window."""
 
     per_photo: int = 120
     """Observations per photo in the adjustment."""
     least: int = 12
-    """Fewest observations that hold a photo."""
+    """Fewest observations that determine a photo."""
     disagree: float = 0.12
     """Links that put a photo further apart than this share of the flying height contradict each
     other.
@@ -106,7 +105,7 @@ class LocalAdjustment:
     version: ClassVar[int] = 1
 
     def __call__(self, window: Window) -> AdjustedWindow | NotAdjusted:
-        """Places the new photo and settles the free ones."""
+        """Places the new photo and refines the free ones."""
         plane = {i: _similarity(window, i) for i in window.poses}
         dropped: tuple[tuple[int, int], ...] = ()
         if window.new not in window.poses:
@@ -127,7 +126,7 @@ class LocalAdjustment:
         problem, state = _adjusted(problem, triangulated(problem, state), row)
         observations = int((problem.photo == row).sum())
         if observations < self.least:
-            return NotAdjusted(reason=f"only {observations} tie points hold it")
+            return NotAdjusted(reason=f"it has only {observations} tie points")
         moved = {i: p for i, p in pose_records(setup, state).items() if i not in window.held}
         key = window.photos[window.new].camera_key
         return AdjustedWindow(
@@ -140,15 +139,17 @@ class LocalAdjustment:
 
 
 def _useful(tracks: Tracks, window: Window) -> Tracks:
-    """Tracks that a photo which may move sees; what only held ones see moves nothing."""
+    """Tracks with an observation in a photo that may move; tracks in held photos only have no
+    effect.
+    """
     free = np.array([i not in window.held for i in range(len(window.photos))])
     seen = np.bincount(tracks.point, weights=free[tracks.photo], minlength=tracks.count) > 0
     return tracks.only(seen[tracks.point])
 
 
 def _adjusted(problem: Problem, state: State, new: int) -> tuple[Problem, State]:
-    """Ever narrower losses, pruning between; the wide ones only where the new photo, of that row,
-    starts far off.
+    """Adjusts with ever narrower losses and removes outliers in between. The wide losses are used
+    only if the new photo (row `new`) starts far off.
     """
     off = np.hypot(*residuals_px(problem, state)[problem.photo == new].T)
     start = float(np.nanmedian(off)) if np.isfinite(off).any() else np.inf
@@ -164,7 +165,9 @@ def _adjusted(problem: Problem, state: State, new: int) -> tuple[Problem, State]
 
 
 def _similarity(window: Window, i: int) -> tuple[complex, complex]:
-    """a and t of x + iy = a p + t that a placed photo is, near its centre (`similarity_graph`)."""
+    """a and t of the similarity x + iy = a p + t that approximates a placed photo near its centre
+    (see `similarity_graph`).
+    """
     pose, photo = window.poses[i], window.photos[i]
     centre = np.array([[(photo.width - 1) / 2, (photo.height - 1) / 2]])
     step = np.array([[photo.focal.px / 4, 0.0]])
@@ -177,7 +180,7 @@ def _similarity(window: Window, i: int) -> tuple[complex, complex]:
     xy = pose.map_C[:2] + direction[:, :2] * reach[:, None]
     z = xy[:, 0] + 1j * xy[:, 1]
     a = (z[1] - z[2]) / 0.5
-    # the centre's image in photo coordinates is 0 where the lens is ideal
+    # for an ideal lens the centre has photo coordinates 0
     return complex(a), complex(z[0])
 
 
@@ -227,7 +230,9 @@ def _guess(
 def _setup(
     window: Window, plane: Mapping[int, tuple[complex, complex]], links: Sequence[Link]
 ) -> Setup:
-    """The adjustment's arrays: placed photos start where they are, held ones stay there."""
+    """The arrays of the adjustment: placed photos start at their poses, held ones are fixed
+    there.
+    """
     members = tuple(sorted(plane))
     start = Start(
         placed=dict(plane),
@@ -239,7 +244,7 @@ def _setup(
     )
     setup = set_up(window.photos, window.priors, start, distortion="none", repair=True)
     turned = setup.turned.copy()
-    for i in window.poses:  # what a photo was found to be, it stays
+    for i in window.poses:  # a placed photo keeps its detected orientation
         turned[i] = window.camera_of.get(i, "").endswith(TURNED)
     base = setup.base
     R, C = setup.start_R.copy(), setup.start_C.copy()

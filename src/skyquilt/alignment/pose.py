@@ -1,4 +1,4 @@
-"""`position` and `pose`: every photo where its metadata say (Y 4.1.2)."""
+"""`position` and `pose`: every photo is placed by its metadata (Y 4.1.2)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,8 +15,8 @@ from skyquilt.model.poses import Alignment, MapFrame, Pose, Prior, no_ties
 
 
 def reported_camera(photo: Photo) -> Camera:
-    """The calibration that metadata or a side file give, else an ideal camera of the
-    reported focal length.
+    """The calibration from metadata or a side file, otherwise an ideal camera with the reported
+    focal length.
     """
     if photo.calibration is not None:
         return photo.calibration
@@ -25,10 +25,10 @@ def reported_camera(photo: Photo) -> Camera:
 
 @dataclass(frozen=True, kw_only=True)
 class ByMetadata:
-    """Photos placed by metadata alone; subclasses differ in what they believe."""
+    """Places photos by metadata alone; subclasses differ in the data that they use."""
 
     height_m: float | None = None
-    """Height above ground in m where altitudes do not tell it; None = heights above take-off."""
+    """Height above ground in m if the altitudes do not give it; None = heights above take-off."""
     version: ClassVar[int] = 2
     name: ClassVar[str] = "pose"
 
@@ -39,11 +39,11 @@ class ByMetadata:
         priors: Sequence[Prior],
         heights_m: NDArray[np.float64] | None = None,
     ) -> Alignment:
-        """Places all photos that have a position; one without any survives alone in a frame of its
-        own.
+        """Places all photos that have a position. A single photo without position is placed in a
+        local frame.
 
-        `heights_m` (n,): heights above ground known better than from metadata, NaN where they are
-        not.
+        `heights_m` (n,): heights above ground that replace those of the metadata; NaN = use the
+        metadata.
 
         Raises:
             AlignmentError: positions or the height above ground are missing.
@@ -91,7 +91,7 @@ class ByMetadata:
                 f"heights above {frame.vertical_datum.replace('_', ' ')}" if told else "no heights"
             )
             raise AlignmentError(
-                f"method {self.name} needs heights above ground, and the photos give {given};"
+                f"method {self.name} needs heights above ground, and the photos contain {given};"
                 " add --height METRES"
             )
         return np.where(np.isfinite(z), z, np.nanmedian(z) if np.isfinite(z).any() else np.nan)
@@ -117,7 +117,7 @@ class ByMetadata:
 
 
 def _nothing_placed(method: str, photos: int, rejected: dict[int, str]) -> str:
-    """Why no photo could be placed, and what to do."""
+    """Message: why no photo could be placed, and what to do."""
     reasons = "; ".join(dict.fromkeys(rejected.values()))
     advice = "give positions and headings with --geo, or use --method bundle"
     if "height" in reasons:
@@ -140,8 +140,8 @@ class ByPosition(ByMetadata):
     """`position`: translations only, one common scale and one survey heading (Y 4.2)."""
 
     heading_deg: float | None = None
-    """Grid heading of every photo's image top in degrees clockwise from north; None = the commonest
-    reported one, north where none is reported.
+    """Grid heading of the image top, common to all photos, in degrees clockwise from north. None =
+    the most frequent reported heading, or north if none is reported.
     """
     name: ClassVar[str] = "position"
 
@@ -158,8 +158,8 @@ class ByPosition(ByMetadata):
         return poses, {i: "it has no position" for i in range(len(photos)) if i not in poses}
 
     def _heading(self, priors: Sequence[Prior]) -> float:
-        """The survey's heading in degrees: the reported one that most others agree with, and their
-        mean.
+        """The survey's heading in degrees: the mean of the reported headings around the most
+        frequent one.
         """
         if self.heading_deg is not None:
             return self.heading_deg

@@ -1,4 +1,4 @@
-"""From what photos report to a map frame and priors in it."""
+"""Chooses the map frame and converts the metadata of photos to priors in it."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -22,9 +22,10 @@ def utm_epsg(latitude_deg: float, longitude_deg: float) -> str:
 def choose_frame(
     photos: Sequence[Photo], crs: str | None, control: Sequence[ControlPoint] = ()
 ) -> MapFrame:
-    """The frame of a survey: `crs` if asked for, else the UTM zone of the median position.
+    """The frame of a survey: `crs` if given, otherwise the UTM zone of the median position.
 
-    Without any position it is that of the control points; without those it stays ungeoreferenced.
+    Without photo positions, the UTM zone of the control points; without these, the survey is not
+    georeferenced.
 
     Raises:
         UsageError: `crs` is unknown, or not projected in metres.
@@ -53,7 +54,7 @@ def _checked_crs(crs: str) -> str:
         parsed = CRS.from_user_input(crs)
     except CRSError as error:
         raise UsageError(
-            f"--crs {crs!r} is no coordinate system that PROJ knows; try e.g. EPSG:32633"
+            f"--crs {crs!r} is not a coordinate system known to PROJ; try e.g. EPSG:32633"
         ) from error
     if not parsed.is_projected or any(
         axis.unit_name not in ("metre", "meter") for axis in parsed.axis_info[:2]
@@ -65,7 +66,7 @@ def _checked_crs(crs: str) -> str:
 
 
 def _datum(photos: Sequence[Photo]) -> Datum:
-    """The most trustworthy datum that most positions state."""
+    """The height datum that most positions state."""
     count = Counter(
         p.position.datum for p in photos if p.position and p.position.altitude_m is not None
     )
@@ -73,7 +74,7 @@ def _datum(photos: Sequence[Photo]) -> Datum:
 
 
 def _altitude(photo: Photo, datum: Datum) -> float:
-    """The photo's height above the frame's datum in m; NaN where it gives none."""
+    """The photo's height above the frame's datum in m; NaN if it contains none."""
     position = photo.position
     if position is None:
         return np.nan
@@ -87,7 +88,7 @@ def _altitude(photo: Photo, datum: Datum) -> float:
 
 
 def empty_prior() -> Prior:
-    """What a photo says about its pose that has neither position nor attitude."""
+    """The prior of a photo without position and attitude."""
     return Prior(
         map_C=np.full(3, np.nan),
         sigma_C=np.full(3, np.inf),
@@ -100,7 +101,7 @@ def empty_prior() -> Prior:
 
 
 def photo_prior(photo: Photo, frame: MapFrame, to_map: Transformer | None) -> Prior:
-    """What one photo says about its pose, in the map frame."""
+    """The pose prior of one photo in the map frame."""
     C, sigma = np.full(3, np.nan), np.array([np.inf, np.inf, np.inf])
     if photo.position and to_map is not None:
         x, y = to_map.transform(photo.position.longitude_deg, photo.position.latitude_deg)

@@ -26,8 +26,8 @@ class State:
     """(P, 3) points in m."""
 
     def moved(self, photo_step: Array, camera_step: Array, point_step: Array) -> "State":
-        """The state after a step: photos (n, 6) = rotation vector then centre, cameras
-        (m, 8), points (P, 3).
+        """The state after a step of the solver: photos (n, 6) = rotation vector then centre,
+        cameras (m, 8), points (P, 3).
         """
         return State(
             R=rotation_from_vector(photo_step[:, :3]) @ self.R,
@@ -39,7 +39,7 @@ class State:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Problem:
-    """What was measured. Observations are sorted by point."""
+    """Observations and priors. Observations are sorted by point."""
 
     point: Index
     """(N,) point of each observation, ascending."""
@@ -52,7 +52,7 @@ class Problem:
     camera: Index
     """(n,) camera of each photo."""
     free: NDArray[np.bool_]
-    """(m, 8) which intrinsics may move."""
+    """(m, 8) which intrinsics are estimated."""
     K0: Array
     """(m, 8) prior of the intrinsics."""
     sigma_K: Array
@@ -72,13 +72,15 @@ class Problem:
     loss_px: float
     """Scale of the Cauchy loss on observations, in units of their deviation."""
     loss_C: float = 3.0
-    """Scale of the pseudo-Huber loss on positions, in units of their deviation: a GPS may lie."""
+    """Scale of the pseudo-Huber loss on positions, in units of their deviation, since GPS positions
+    may contain gross errors.
+    """
     loss_R: float = 2.0
-    """Scale of the pseudo-Huber loss on attitudes: a gimbal may lie."""
+    """Scale of the pseudo-Huber loss on attitudes, since gimbal angles may contain gross errors."""
     trust: float = 1.0
     """Factor on the cost of observations. Errors of neighbouring observations are correlated (lens
-    model, rolling shutter, features of one kind); a photo's hundreds of observations weigh like
-    some dozens of independent ones.
+    model, rolling shutter, features of one kind); the hundreds of observations of a photo contain
+    as much information as some dozens of independent ones.
     """
 
     def with_loss(self, loss_px: float) -> "Problem":
@@ -91,7 +93,7 @@ class Linearised:
     """Whitened residuals and Jacobians of the observations."""
 
     residual: Array
-    """(N, 2) in deviations."""
+    """(N, 2) in units of the standard deviation."""
     J_photo: Array
     """(N, 2, 6)."""
     J_camera: Array
@@ -145,7 +147,9 @@ def linearised_points(problem: Problem, state: State) -> tuple[Array, Array]:
 
 
 def residuals_px(problem: Problem, state: State) -> Array:
-    """Projected minus seen (N, 2) in px; NaN for points behind their camera."""
+    """Image residuals (N, 2) in px, projected minus observed; NaN for points behind their
+    camera.
+    """
     local, behind = _local(problem, state)
     k = state.K[problem.camera[problem.photo]]
     px = distort(local[:, :2] / local[:, 2:], k) * k[:, :1] + k[:, 1:3]

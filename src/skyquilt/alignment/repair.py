@@ -1,4 +1,4 @@
-"""Metadata repaired by the pixels, for methods that place photos by metadata."""
+"""Correction of metadata from links, for methods that place photos by metadata."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -14,23 +14,25 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Prior
 
 SIGMA_YAW_DEG = 3.0
-"""Deviation of a heading found from links: tilts and relief bend similarities a little."""
+"""Standard deviation in degrees of a heading from links. Tilts and relief disturb the similarities
+a little.
+"""
 SIGMA_HEIGHT = 0.05
-"""Relative deviation of a height found from image scale."""
+"""Relative standard deviation of a height from image scale."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Repaired:
-    """What photos report, corrected where the pixels of their links say otherwise."""
+    """Metadata, corrected where the links contradict them."""
 
     priors: tuple[Prior, ...]
     """One per photo."""
     heights_m: NDArray[np.float64]
-    """(n,) heights above ground from image scale; NaN for photos without links, or where no
-    position gives metres.
+    """(n,) heights above ground in m from image scale; NaN for photos without links, or if no
+    positions determine the scale.
     """
     notes: tuple[str, ...]
-    """What was corrected, by photo, both values."""
+    """Messages about each correction, with both values."""
 
 
 def repair(
@@ -40,10 +42,11 @@ def repair(
     links: Sequence[Link],
     convergence_deg: float = 0.0,
 ) -> Repaired:
-    """Headings that contradict the links replaced, missing ones filled, heights above ground from
-    image scale.
+    """Replaces headings that contradict the links, fills in missing ones, and computes heights
+    above ground from image scale.
 
-    Positions stay, with the scatter that their block shows where it is worse than stated.
+    Positions are not changed; their deviation is set to their scatter in the block where that is
+    larger than stated.
     """
     start = find_start(photos, priors, features, links)
     repaired, notes = list(priors), []
@@ -65,7 +68,7 @@ def repair(
 def _heading(
     photo: Photo, prior: Prior, found_deg: float, convergence_deg: float
 ) -> tuple[Prior, list[str]]:
-    """The prior with the heading that the pixels show, where the reported one is missing or
+    """The prior with the heading from the links if the reported one is missing or
     contradicts it.
     """
     known = np.isfinite(prior.yaw_deg)
@@ -77,7 +80,7 @@ def _heading(
         return better, []
     if (
         abs(abs(off) - 180) < 20 and photo.editor
-    ):  # the file was turned upside down, and its axes with it
+    ):  # the file was saved upside down, so its axes are turned too
         better = replace(better, pitch_deg=-prior.pitch_deg, roll_deg=-prior.roll_deg)
     said, shows = (
         angle_difference_deg(y + convergence_deg, 0.0) for y in (prior.yaw_deg, found_deg)

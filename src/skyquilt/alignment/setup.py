@@ -1,4 +1,6 @@
-"""From photos, priors and a start to the arrays of an adjustment, and back to records."""
+"""Converts photos, priors and a start to the arrays of an adjustment, and its results to
+records.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,14 +20,18 @@ from skyquilt.model.poses import Pose, Prior
 Array = NDArray[np.float64]
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 INDEPENDENT = 40
-"""Independent observations that a photo's many correlated ones are worth."""
+"""Number of independent observations that carry the same information as a photo's many correlated
+ones.
+"""
 YAW_LIE_DEG = 20.0
-"""A reported yaw further than this from the pixels' is no measurement of it."""
+"""A reported yaw that differs by more than this, in degrees, from the yaw of the links counts as a
+gross error.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Setup:
-    """Rows of the adjustment's arrays and what they mean."""
+    """Meaning of the rows of the adjustment's arrays."""
 
     members: NDArray[np.int64]
     """(n,) photo of each row."""
@@ -34,7 +40,9 @@ class Setup:
     camera_keys: tuple[str, ...]
     """Name of each camera row."""
     turned: NDArray[np.bool_]
-    """(photos,) files rewritten upside down: their sensor is the file turned by 180 degrees."""
+    """(photos,) files that were saved upside down: their sensor image is the file turned by 180
+    degrees.
+    """
     size: Array
     """(photos, 2) width and height in px."""
     stated_sigma_C: Array
@@ -44,7 +52,7 @@ class Setup:
     georeferenced: bool
     """Whether any block was placed by positions."""
     z_ground: float
-    """Height of the ground plane of the start."""
+    """Height of the ground plane of the start in m."""
     base: Problem
     """The problem without observations."""
     start_R: Array
@@ -52,13 +60,13 @@ class Setup:
     start_C: Array
     """(n, 3)."""
     plane_a: NDArray[np.complex128]
-    """(n,) similarity factors of the start, for first points on the ground plane."""
+    """(n,) similarity factors of the start; they give the first points on the ground plane."""
     plane_t: NDArray[np.complex128]
     """(n,) translations of the start."""
 
     def file_px(self, photo: NDArray[np.int64], px: Array) -> Array:
-        """Sensor pixels to file pixels, and back: the two differ by a half turn for turned
-        files.
+        """Converts sensor pixels to file pixels, or back. For turned files the two differ by a
+        rotation of 180 degrees.
         """
         return np.where(self.turned[photo][:, None], self.size[photo] - 1 - px, px)
 
@@ -73,7 +81,7 @@ class Setup:
         return replace(own, px=self.file_px(own.photo, own.px))
 
     def problem(self, tracks: Tracks) -> tuple[Problem, State]:
-        """The problem of these tracks (sensor pixels), and where to start: points on the ground
+        """The problem with these tracks (sensor pixels), and its start: points on the ground
         plane.
         """
         row = np.searchsorted(self.members, tracks.photo)
@@ -101,7 +109,7 @@ class Setup:
 def set_up(
     photos: Sequence[Photo], priors: Sequence[Prior], start: Start, *, distortion: str, repair: bool
 ) -> Setup:
-    """Arrays for all photos that the start placed."""
+    """Builds the arrays for all photos that the start placed."""
     members = np.array(sorted(start.placed), np.int64)
     a = np.array([start.placed[m][0] for m in members.tolist()])
     t = np.array([start.placed[m][1] for m in members.tolist()])
@@ -161,12 +169,12 @@ def set_up(
 
 
 def _yaw_lie(prior: Prior, yaw_deg: float) -> float:
-    """Reported less found yaw in degrees; 0 where none was reported."""
+    """Reported minus estimated yaw in degrees; 0 if none was reported."""
     return angle_difference_deg(prior.yaw_deg, yaw_deg) if np.isfinite(prior.yaw_deg) else 0.0
 
 
 def _start_R(prior: Prior, yaw_deg: float, turned: bool) -> Array:
-    """Nadir with the yaw that links found; of the sensor, for a turned file."""
+    """A vertical camera with the yaw from the links; for a turned file, that of the sensor."""
     R = cam_R_map_from_angles(yaw_deg)
     return HALF_TURN @ R if turned else R
 
@@ -188,13 +196,13 @@ def _positions(
             sigma[:, :2], [[start.sigma_xy.get(int(m), 0.0)] for m in members]
         )
     free = ~np.isfinite(C0[:, 0])
-    if free.all():  # nothing holds the block: its own start does, softly
+    if free.all():  # no positions: weak priors at the start keep the block in place
         a_t = np.array(
             [[start.placed[int(m)][1].real, start.placed[int(m)][1].imag] for m in members]
         )
         C0 = np.column_stack([a_t, z_ground + height])
         sigma = stated = np.full(C0.shape, 0.1 * float(np.median(height)))
-    elif not known.any():  # nor does anything hold its height
+    elif not known.any():  # no heights: the same for the height
         C0[:, 2] = z_ground + height
         sigma[:, 2] = stated[:, 2] = 0.1 * float(np.median(height))
     return (
@@ -213,7 +221,9 @@ def _attitudes(
     repair: bool,
     turned: NDArray[Any],
 ) -> tuple[Array, Array]:
-    """Prior attitudes and deviations in rad; a yaw that lies takes its tilt's direction with it."""
+    """Prior attitudes and deviations in rad. A yaw with a gross error makes the direction of the
+    tilt unusable too.
+    """
     R0, sigma = [], []
     for m, y, lie in zip(members.tolist(), yaw, lies, strict=True):
         prior = priors[m]
@@ -233,7 +243,7 @@ def _attitudes(
 def intrinsic_priors(
     photos: Sequence[Photo], distortion: str
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Priors, deviations and freedom of each camera's intrinsics."""
+    """Prior values and deviations of each camera's intrinsics, and which of them are estimated."""
     K0: list[Array] = []
     sigma: list[Array | list[float]] = []
     for photo in photos:
@@ -252,8 +262,8 @@ def intrinsic_priors(
 
 
 def _calibrated_sigma(camera: Camera, sigma_focal: float) -> Array:
-    """Deviations of a known calibration: its own where it states them, never less than flying
-    changes a lens.
+    """Standard deviations of a known calibration: those stated by it, but at least the amount by
+    which a lens changes in flight.
     """
     wide = max(camera.width, camera.height)
     usual = [sigma_focal, 0.003 * wide, 0.003 * wide, 0.01, 0.01, 0.01, 1e-3, 1e-3]
@@ -262,7 +272,7 @@ def _calibrated_sigma(camera: Camera, sigma_focal: float) -> Array:
 
 
 def pose_records(setup: Setup, state: State) -> dict[int, Pose]:
-    """Poses of the files (a turned file's camera is its sensor's, turned)."""
+    """Poses of the files (for a turned file, the pose of the sensor turned by 180 degrees)."""
     return {
         m: Pose(cam_R_map=HALF_TURN @ R if setup.turned[m] else R, map_C=C)
         for m, R, C in zip(setup.members.tolist(), state.R, state.C, strict=True)
@@ -272,7 +282,7 @@ def pose_records(setup: Setup, state: State) -> dict[int, Pose]:
 def camera_records(
     photos: Sequence[Photo], setup: Setup, state: State, covariance: Array | None
 ) -> tuple[dict[str, Camera], dict[int, str]]:
-    """Calibrations with deviations, and the name of each photo's."""
+    """Calibrations with deviations, and the name of each photo's calibration."""
     n = len(setup.members)
     cameras: dict[str, Camera] = {}
     for row, key in enumerate(setup.camera_keys):

@@ -1,9 +1,10 @@
-"""A first solution for all photos: every photo a similarity x = a p + t of the plane, from links
-alone.
+"""A first solution for all photos from links alone: every photo is a similarity x = a p + t of the
+plane.
 
 p = (x - cx) - i (y - cy) over the focal length (y up), a = height * exp(-i yaw). A linear
-least-squares fit of points shrinks the map to lower its cost; therefore scales and angles are
-averaged first and translations come after (B/C of the methods). Positions join last, robustly.
+least-squares fit of points would reduce its cost by shrinking the map. Therefore scales and angles
+are averaged first, and translations are estimated afterwards (B/C of the methods). Positions are
+added last, with a robust fit.
 """
 
 from collections.abc import Sequence
@@ -16,9 +17,9 @@ from numpy.typing import NDArray
 from skyquilt.alignment.connected import connected, outwards, spanning_tree
 
 DENSE = 300
-"""Photos up to which the normal equations are solved as a full matrix."""
+"""Largest number of photos for which the normal equations are solved as a full matrix."""
 MOST_PAIRS = 600
-"""Pairs of positions tried as a start."""
+"""Largest number of pairs of positions tried as a start."""
 Complex = NDArray[np.complex128]
 Array = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ class PlaneLink:
     p_b: complex
     """Mean of the matched points in b."""
     weight: float
-    """Trust, e.g. the square root of the number of inliers."""
+    """Weight, e.g. the square root of the number of inliers."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,8 +107,8 @@ def _solve_differences(
 def _solve_small(
     i: Array, j: Array, d: Complex, w: Array, count: int, anchor: Complex, wa: Array
 ) -> Complex:
-    """The same by a full matrix: for few photos the book-keeping of sparse ones costs fifty times
-    as much.
+    """The same with a full matrix: for few photos the overhead of sparse matrices takes fifty times
+    as long.
     """
     normal, rhs = np.diag(wa**2), (wa**2 * anchor).astype(complex)
     np.add.at(normal, (np.r_[i, j, i, j], np.r_[i, j, j, i]), np.r_[w**2, w**2, -(w**2), -(w**2)])
@@ -127,7 +128,9 @@ def _robust_differences(
     *,
     angular: bool = False,
 ) -> Complex:
-    """Iteratively reweighted solution; `unit` is the misfit at which a link counts half."""
+    """Iteratively reweighted solution; `unit` is the residual at which a link gets half its
+    weight.
+    """
     x = start
     for _ in range(15):
         misfit = d - (x[j] - x[i])
@@ -170,10 +173,11 @@ def solve_block(members: NDArray[np.int64], links: Sequence[PlaneLink]) -> Plane
 def fit_similarity(
     x: Complex, y: Complex, sigma: Array, *, turn: complex | None = None
 ) -> tuple[complex, complex, float]:
-    """g, c and the robust misfit of y = g x + c; `turn` fixes g's direction when points cannot.
+    """g, c and the robust misfit of y = g x + c; `turn` gives the direction of g if the points do
+    not determine it.
 
-    Started from the two points whose similarity fits the better half of all best (least median of
-    squares), so somewhat less than half of the positions may lie.
+    Starts from the two points whose similarity has the least median of squares, so that nearly half
+    of the positions may be gross errors.
     """
     g, c = _least_median(x, y)
     if turn is not None:
@@ -194,12 +198,12 @@ def _median(z: Complex) -> complex:
 
 
 def _least_median(x: Complex, y: Complex) -> tuple[complex, complex]:
-    """g and c through two of the points, of several hundred pairs the one that most points agree
-    with.
+    """g and c through two of the points, of several hundred pairs the one with the least median of
+    squares.
     """
     k, m = np.triu_indices(len(x), 1)
     reach = np.abs(x[k] - x[m])
-    if len(k) > MOST_PAIRS:  # pairs far apart tell most
+    if len(k) > MOST_PAIRS:  # pairs far apart are the most informative
         far = np.flatnonzero(reach >= np.median(reach))
         chosen = np.random.default_rng(0).choice(far, min(MOST_PAIRS, len(far)), replace=False)
         k, m, reach = k[chosen], m[chosen], reach[chosen]
@@ -218,10 +222,11 @@ def _least_median(x: Complex, y: Complex) -> tuple[complex, complex]:
 def tie_to_positions(
     solution: PlaneSolution, links: Sequence[PlaneLink], position: Complex, sigma: Array
 ) -> PlaneSolution:
-    """Moves a georeferenced solution so that links and positions agree: strips stop bending away.
+    """Adjusts a georeferenced solution to links and positions together, which removes the bending
+    of strips.
 
-    `position` (k,) in m, NaN where unknown; `sigma` (k,) in m. Links count to about 2 % of the
-    height.
+    `position` (k,) in m, NaN where unknown; `sigma` (k,) in m. The standard deviation of links is
+    about 2 % of the height.
     """
     index = {int(m): k for k, m in enumerate(solution.members)}
     i = np.array([index[link.a] for link in links], int)

@@ -1,5 +1,5 @@
-"""The start of an adjustment: every linked photo a similarity of the ground plane, in metres of the
-map.
+"""The start of an adjustment: every linked photo is a similarity of the ground plane, in m of the
+map frame.
 """
 
 from collections.abc import Sequence
@@ -22,13 +22,14 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Prior
 
 NOMINAL_HEIGHT_M = 50.0
-"""Height above ground assumed where nothing gives a scale; the result is then marked as not metric.
+"""Height above ground in m assumed if no data determine the scale; the result is then marked as not
+metric.
 """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Start:
-    """Where the adjustment starts."""
+    """Approximate values for the adjustment."""
 
     placed: dict[int, tuple[complex, complex]]
     """Photo -> (a, t) of x + iy = a p + t, in m."""
@@ -37,13 +38,13 @@ class Start:
     links: tuple[Link, ...]
     """Links that agree with the blocks."""
     sigma_xy: dict[int, float]
-    """Photo -> deviation of its measured position in m as its block sees it, where worse than
-    stated.
+    """Photo -> standard deviation of its measured position in m as estimated from its block, where
+    larger than stated.
     """
     georeferenced: frozenset[int]
     """Photos of blocks that positions placed."""
     metric: bool
-    """False where even the scale had to be assumed."""
+    """False if the scale had to be assumed."""
 
 
 def plane_link(link: Link, photos: Sequence[Photo], features: Sequence[Features]) -> PlaneLink:
@@ -70,7 +71,9 @@ def find_start(
     features: Sequence[Features],
     links: Sequence[Link],
 ) -> Start:
-    """Solves every block, drops links that contradict it, and places it by its own positions."""
+    """Solves every block, removes links that contradict it, and georeferences it by its
+    positions.
+    """
     plane = {(k.a, k.b): plane_link(k, photos, features) for k in links}
     solutions, kept = _consistent_blocks(len(photos), plane)
     placed: dict[int, tuple[complex, complex]] = {}
@@ -126,7 +129,7 @@ def _consistent_blocks(
 def georeference(
     solution: PlaneSolution, links: Sequence[PlaneLink], priors: Sequence[Prior]
 ) -> tuple[PlaneSolution, float, bool]:
-    """The block in map metres, the scatter of its positions in m (NaN without), and
+    """The block in map metres, the scatter of its positions in m (NaN without positions), and
     whether its scale is known.
     """
     position = np.array([complex(p.map_C[0], p.map_C[1]) for p in priors])
@@ -152,8 +155,8 @@ def georeference(
 
 
 def _turn(a: NDArray[np.complex128], priors: Sequence[Prior]) -> complex:
-    """The direction that brings the block's yaws to the reported ones, by majority; 1
-    where none is reported.
+    """The rotation from the block's yaws to the reported ones, by majority; 1 if none is
+    reported.
     """
     yaw = np.radians([p.yaw_deg for p in priors])
     known = np.isfinite(yaw)
@@ -166,8 +169,8 @@ def _turn(a: NDArray[np.complex128], priors: Sequence[Prior]) -> complex:
 
 
 def _scale_by_height(a: NDArray[np.complex128], priors: Sequence[Prior]) -> tuple[float, bool]:
-    """Metres per block unit from heights above take-off, taken as heights above ground;
-    else a nominal height.
+    """Metres per block unit from heights above take-off, taken as heights above ground; otherwise
+    from a nominal height.
     """
     height = np.array([p.map_C[2] for p in priors])
     ratio = (height / np.abs(a))[np.isfinite(height) & (height > 1)]

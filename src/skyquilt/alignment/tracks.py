@@ -1,4 +1,4 @@
-"""Tracks: one point on the ground, seen in several photos."""
+"""Tracks: the observations of one ground point in several photos."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Tracks:
         return int(self.point[-1]) + 1 if len(self.point) else 0
 
     def only(self, observation: NDArray[np.bool_]) -> "Tracks":
-        """The observations marked, less tracks left with one; renumbered."""
+        """The selected observations, without tracks left with one observation; renumbered."""
         point = self.point[observation]
         keep = np.flatnonzero(observation)[np.bincount(point, minlength=self.count)[point] >= 2]
         _, renumbered = np.unique(self.point[keep], return_inverse=True)
@@ -46,7 +46,8 @@ class Tracks:
 def build_tracks(
     features: Sequence[Features], links: Sequence[Link], *, sigma: float = 0.25
 ) -> Tracks:
-    """Chains of matches; one that visits a photo twice is wrong somewhere and dropped.
+    """Joins matches to tracks. A track with two observations in one photo contains a wrong match
+    and is removed.
 
     `sigma`: standard deviation of a keypoint in px of the image it was found in.
     """
@@ -81,8 +82,8 @@ def build_tracks(
 def thin(
     tracks: Tracks, sizes: Sequence[tuple[int, int]], *, per_photo: int, cells: int = 8
 ) -> Tracks:
-    """The tracks an adjustment needs: long ones first, until every photo has `per_photo` spread
-    over its area.
+    """Selects tracks for an adjustment: long ones first, until every photo has `per_photo`
+    observations spread over its area.
 
     `sizes`: (width, height) of each photo.
     """

@@ -26,7 +26,7 @@ def intersect(point: NDArray[np.int64], origin: Array, direction: Array, count: 
 
 
 def triangulated(problem: Problem, state: State) -> State:
-    """The state with the problem's points (as many as `X0` has) where their rays meet best."""
+    """The state with all points of the problem (as many as in `X0`) intersected from their rays."""
     xy = np.empty((len(problem.px), 2))
     for row, k in enumerate(state.K):
         own = problem.camera[problem.photo] == row
@@ -39,8 +39,8 @@ def triangulated(problem: Problem, state: State) -> State:
 
 
 def polish(problem: Problem, state: State, *, iterations: int = 5) -> tuple[State, Array]:
-    """Gauss-Newton on the points alone; returns the state and each point's height deviation (P,) in
-    m.
+    """Gauss-Newton on the points alone; returns the state and the standard deviation (P,) of each
+    point's height in m.
     """
     sigma_z = np.full(len(state.X), np.inf)
     for _ in range(iterations):

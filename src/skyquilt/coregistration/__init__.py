@@ -1,1 +1,1 @@
-"""Pictures of different spectra laid on one another."""
+"""Registration of images of different spectral bands."""

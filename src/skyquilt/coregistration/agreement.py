@@ -1,11 +1,11 @@
-"""Whether a registration is to be believed: do patches that know nothing of it find the same place?
+"""Test of a registration: do patches that are matched independently confirm it?
 
-The overlap is cut into patches. Each is correlated alone with the other picture over small shifts;
-the rank of the registered place among all of them is a p-value that needs no model of noise: for
-pictures that have nothing in common, the place is as good as any other, and ranks are uniform.
-Fisher's method makes one number of all ranks. It is not a probability any more once the place was
-chosen as the best of thousands; what chance reaches then is measured on pictures that show
-different things (docs/methods.md).
+The overlap is cut into patches. Each patch is correlated on its own with the other image over small
+shifts. The rank of the registered position among all shifts is a p-value that needs no noise model:
+for unrelated images the registered position is as good as any other, and ranks are uniform.
+Fisher's method combines all ranks to one number. If the position was chosen as the best of
+thousands, this number is no longer a probability; the values that occur by chance were therefore
+measured on unrelated images (docs/methods.md).
 """
 
 from collections.abc import Iterator
@@ -23,16 +23,16 @@ from skyquilt.model.registration import Matrix
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Agreement:
-    """What the patches say."""
+    """Result of the test."""
 
     surprise: float
-    """-log10 of Fisher's p-value, the mean over all patch sizes."""
+    """-log10 of Fisher's p-value, averaged over all patch sizes."""
     patches: int
-    """Patches of the smaller size asked for."""
+    """Number of patches of the smaller size that were tested."""
     px: NDArray[np.float64]
-    """(n, 2) middles of the patches that agree, in px of b's resolution as registered."""
+    """(n, 2) centres of the patches that agree, in px of b at the resolution of the test."""
     shift: NDArray[np.float64]
-    """(n, 2) px by which each would rather lie: b's content lies at px + shift."""
+    """(n, 2) shift in px at which each patch matches best: b's content is at px + shift."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,15 +42,15 @@ class Agree:
     across: tuple[int, ...] = (6, 8)
     """Patches along the side of a square of b's area, one test each."""
     reach: int = 12
-    """Px of shift along each axis that compete with the registered place."""
+    """Largest shift in px along each axis that is compared with the registered position."""
     near: int = 2
-    """Px within which a patch agrees."""
+    """Largest distance in px from the registered position at which a patch agrees."""
     filled: float = 0.6
-    """Least share of a patch that both pictures cover."""
+    """Least share of a patch that both images must cover."""
     version: ClassVar[int] = 1
 
     def __call__(self, a: Orientation, b: Orientation, b_H_a: Matrix) -> Agreement:
-        """Agreement on a transform in px of this resolution."""
+        """Tests a transform in px of this resolution."""
         fields, valid = warped(a, b_H_a, b.shape)
         both = valid * b.valid
         surprises, rows, count = [], [], 0
@@ -69,7 +69,7 @@ class Agree:
     def _patches(
         self, fields: Fields, target: Fields, both: NDArray[Any], across: int
     ) -> Iterator[tuple[float, float, float, float, float]]:
-        """Rank, middle and shift of each patch."""
+        """Rank, centre and shift of each patch."""
         height, width = both.shape
         side = int(np.sqrt(height * width) / across)
         reach = self.reach
@@ -93,7 +93,9 @@ class Agree:
                 )
 
     def _rank(self, score: NDArray[Any]) -> float:
-        """Share of places at least as good as the registered one, each with its neighbourhood."""
+        """Share of positions at least as good as the registered one, each with its
+        neighbourhood.
+        """
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * self.near + 1, 2 * self.near + 1))
         best = np.asarray(cv2.dilate(score, disc))
         rivals = best[self.near : -self.near, self.near : -self.near]
@@ -102,7 +104,7 @@ class Agree:
 
 
 def _scores(around: Fields, patch: Fields) -> NDArray[np.float32]:
-    """Normalised correlation of a patch (s, s, 4) at every place of its surroundings."""
+    """Normalised correlation of a patch (s, s, 4) at every position in its surroundings."""
     side = patch.shape[0]
     energy = cv2.boxFilter(
         np.einsum("ijk,ijk->ij", around, around),
@@ -124,7 +126,7 @@ def _scores(around: Fields, patch: Fields) -> NDArray[np.float32]:
 
 
 def _summit(score: NDArray[np.float32]) -> tuple[float, float]:
-    """Column and row of the highest place, between pixels by a parabola along each axis."""
+    """Column and row of the maximum, with subpixel interpolation by a parabola along each axis."""
     row, column = divmod(int(score.argmax()), score.shape[1])
     return (
         column + _between(score[row, max(column - 1, 0) : column + 2]),
@@ -133,7 +135,9 @@ def _summit(score: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def _between(three: NDArray[np.float32]) -> float:
-    """Where a parabola through three values is highest, from the middle one; 0 at the border."""
+    """Position of the maximum of a parabola through three values, relative to the middle one; 0 at
+    the border.
+    """
     if len(three) < 3:
         return 0.0
     bend = float(three[0] - 2 * three[1] + three[2])
@@ -141,10 +145,11 @@ def _between(three: NDArray[np.float32]) -> float:
 
 
 def _fisher(ranks: NDArray[np.float64]) -> float:
-    """-log10 of the p-value of independent uniform ranks being this small together; 0 without any.
+    """-log10 of the p-value for independent uniform ranks to be this small together; 0 without
+    ranks.
 
-    -2 sum of logs is chi-squared with 2 n degrees of freedom, whose tail is a sum of n terms of
-    Poisson's.
+    -2 times the sum of logs is chi-squared with 2 n degrees of freedom; its tail is a sum of n
+    Poisson terms.
     """
     if not len(ranks):
         return 0.0

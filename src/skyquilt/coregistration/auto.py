@@ -1,4 +1,4 @@
-"""Registration by structure, coarse to fine, believed only where independent patches agree."""
+"""Registration by image structure, coarse to fine; accepted only if independent patches agree."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -19,34 +19,36 @@ _SEARCH, _NEARBY, _SELECT, _DECIDE = range(4)
 
 @dataclass(frozen=True, kw_only=True)
 class Auto:
-    """The default. Structure matches are quick and bear distortion; where patches do not confirm
-    them beyond doubt, every rotation and a range of scales are searched, and the neighbourhood of a
-    guess.
+    """The default method. Structure matches are fast and tolerate distortion. If patches do not
+    clearly confirm them, the neighbourhood of a guess and then all rotations and a range of scales
+    are searched.
     """
 
     propose: StructureMatches
     """Structure matches."""
     everywhere: Everywhere = field(default_factory=Everywhere)
-    """Search without knowledge."""
+    """Search without prior knowledge."""
     nearby: Nearby = field(default_factory=Nearby)
-    """Search about the guess (without one: two cameras side by side with equal fields of view)."""
+    """Search around the guess (without a guess: two cameras side by side with equal fields of
+    view).
+    """
     decide: Decide = field(default_factory=Decide)
-    """The verdict."""
+    """The decision."""
     sides: tuple[float, float, float, float] = (80.0, 128.0, 160.0, 256.0)
-    """Px of the squares whose areas the pictures are shrunken to: search, search nearby, selection,
-    verdict.
+    """Sides in px of the squares to whose areas the images are reduced: for search, search near the
+    guess, selection, decision.
     """
     sure: float = 6.0
-    """Agreement beyond which nothing else is tried."""
+    """Agreement above which nothing else is tried."""
     version: ClassVar[int] = 1
 
     def __call__(
         self, a: Picture, b: Picture, guess: Guess | None = None
     ) -> Registration | RefusedRegistration:
-        """The registration of b to a, or why there is none.
+        """The registration of b to a, or the reason why there is none.
 
-        A guess is tried first; where it is not confirmed the search goes on everywhere: metadata
-        may lie.
+        A guess is tried first. If it is not confirmed, everything is searched, since metadata may
+        be wrong.
         """
         if guess is not None and (found := self._guided(a, b, guess)):
             return found
@@ -63,7 +65,7 @@ class Auto:
         return self.decide(pyramid, first + self._best(pyramid, places))
 
     def _guided(self, a: Picture, b: Picture, guess: Guess) -> Registration | RefusedRegistration:
-        """The verdict on the neighbourhood of a guess, within what both pictures then share."""
+        """The decision in the neighbourhood of a guess, on the part that both images then share."""
         part = common_part(a, b, guess)
         pictures = both_usable(part.a, part.b)
         if isinstance(pictures, RefusedRegistration):
@@ -73,13 +75,13 @@ class Auto:
         return part.whole(self.decide(pyramid, fits))
 
     def _near(self, pyramid: Pyramid, guess: Guess) -> list[Matrix]:
-        """Places near a guess, in px of the level that selects."""
+        """Candidate transforms near a guess, in px of the selection level."""
         a, b = pyramid.at(_NEARBY)
         found = distinct(self.nearby(a, b, guess), a.shape, 3, 8)
         return [pyramid.moved(c.b_H_a, _NEARBY, _SELECT) for c in found]
 
     def _anywhere(self, pyramid: Pyramid) -> list[Matrix]:
-        """Places of all rotations and scales, in px of the level that selects."""
+        """Candidate transforms of all rotations and scales, in px of the selection level."""
         a, b = pyramid.at(_SEARCH)
         rough = distinct(self.everywhere(a, b), a.shape, 3, 40)
         better = distinct(_sharpened(a, b, [c.b_H_a for c in rough], 2), a.shape, 1.5, 16)
@@ -87,7 +89,7 @@ class Auto:
         return [pyramid.moved(c.b_H_a, _SEARCH, _SELECT) for c in found]
 
     def _best(self, pyramid: Pyramid, places: Sequence[Matrix]) -> list[Fit]:
-        """The few that stand out most, sharpened at the level of the verdict."""
+        """The few most distinct ones, refined at the decision level."""
         a, b = pyramid.at(_SELECT)
         found = distinct(_sharpened(a, b, places, 5), a.shape, 2, 8)
         found.sort(key=lambda c: -distinctness(a, b, c.b_H_a))

@@ -1,4 +1,4 @@
-"""Places where two pictures may fit, best first: over all shifts, or near a guess."""
+"""Candidate transforms between two images, best first: over all shifts, or near a guess."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -13,23 +13,24 @@ from skyquilt.coregistration.orientation import Orientation, between, spectra, t
 from skyquilt.model.registration import Guess, Matrix
 
 _SUPPRESS = 4
-"""Px about a peak in which no other is looked for."""
+"""Radius in px around a peak in which no other peak is searched."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Candidate:
-    """A transform and what speaks for it."""
+    """A transform and its score."""
 
     b_H_a: Matrix
-    """(3, 3) in px of the resolution it was found in."""
+    """(3, 3) in px of the resolution in which it was found."""
     score: float
-    """The higher the better; comparable among candidates of one search only."""
+    """Higher is better; comparable only among candidates of one search."""
 
 
 def distinct(
     candidates: Sequence[Candidate], shape: tuple[int, int], apart: float, most: int
 ) -> list[Candidate]:
-    """The best ones, no two of which carry a's corners to within `apart` px (RMS) of each other.
+    """The best candidates that differ from each other: any two move a's corners to positions at
+    least `apart` px (RMS) apart.
 
     `shape` is a's height and width; candidates need not be in order.
     """
@@ -48,7 +49,7 @@ def distinct(
 
 
 def corners(b_H_a: Matrix, shape: tuple[int, int]) -> np.ndarray:
-    """Where a transform carries the corners of a picture of `shape`: (4, 2) in px of b."""
+    """The transformed corners of an image of `shape`: (4, 2) in px of b."""
     height, width = shape
     ends = np.array(
         [[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1.0]]
@@ -58,7 +59,9 @@ def corners(b_H_a: Matrix, shape: tuple[int, int]) -> np.ndarray:
 
 
 def similarity(scale: float, angle: float, from_px: np.ndarray, to_px: np.ndarray) -> Matrix:
-    """Scales and turns (radians, x towards y) so that one point falls on another."""
+    """Similarity with a scale and rotation (radians, x towards y) that maps one point to
+    another.
+    """
     c, s = scale * np.cos(angle), scale * np.sin(angle)
     turn = np.array([[c, -s], [s, c]])
     shift = np.asarray(to_px) - turn @ np.asarray(from_px)
@@ -71,7 +74,7 @@ def middle(shape: tuple[int, int]) -> np.ndarray:
 
 
 def peaks(z: NDArray[np.float32], most: int) -> Iterator[tuple[float, int, int]]:
-    """The highest places (score, x, y) of a field that wraps around; the field is spoilt."""
+    """The highest peaks (score, x, y) of a field that wraps around; the field is modified."""
     height, width = z.shape
     near = np.arange(-_SUPPRESS, _SUPPRESS + 1)
     for _ in range(most):
@@ -83,9 +86,7 @@ def peaks(z: NDArray[np.float32], most: int) -> Iterator[tuple[float, int, int]]
 
 
 def same_view(a: tuple[int, int], b: tuple[int, int]) -> Guess:
-    """The guess for two cameras side by side: equal fields of view, of pictures of shapes (H,
-    W).
-    """
+    """The guess for two cameras side by side: equal fields of view, for images of shapes (H, W)."""
     scale = float(np.sqrt(b[0] * b[1] / (a[0] * a[1])))
     return Guess(b_H_a=similarity(scale, 0.0, middle(a), middle(b)), source="equal fields of view")
 
@@ -95,11 +96,11 @@ class Nearby:
     """Correlation of orientation fields over small rotations, scales and shifts from a guess."""
 
     step_deg: float = 2.0
-    """Between rotations."""
+    """Step between rotations in degrees."""
     step_scale: float = 1.0355
     """Factor between scales."""
     per_turn: int = 2
-    """Peaks kept of each rotation and scale."""
+    """Number of peaks kept for each rotation and scale."""
     version: ClassVar[int] = 1
 
     def __call__(self, a: Orientation, b: Orientation, guess: Guess) -> list[Candidate]:
@@ -115,7 +116,7 @@ class Nearby:
         return found
 
     def _steps(self, guess: Guess, shape: tuple[int, int]) -> list[Matrix]:
-        """Small turns and scalings about b's middle."""
+        """Small rotations and scalings about b's middle."""
         turns = int(guess.rotation_deg / self.step_deg)
         factors = int(np.log(guess.scale) / np.log(self.step_scale))
         return [

@@ -1,8 +1,7 @@
-"""The parts of two pictures that a guess says they share.
+"""The parts that two images share according to a guess.
 
-A thermal camera that sees the middle of a visible photo, or two maps of different extent, would
-otherwise be compared at different ground resolutions, as resolutions are chosen by the pictures'
-areas.
+Resolutions are chosen by image area. Without this step, a thermal image of the middle of a visible
+photo, or two maps of different extent, would be compared at different ground resolutions.
 """
 
 from dataclasses import dataclass, replace
@@ -14,14 +13,14 @@ from numpy.typing import NDArray
 from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistration, Registration
 
 _WHOLE = 0.7
-"""Share of a picture above which it is left as it is."""
+"""If the shared part is more than this share of an image, the whole image is used."""
 _LEAST_PX = 96
-"""Px of the shorter side below which a part is not worth its loss."""
+"""If the shorter side of a part has fewer px, the whole images are used."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CommonPart:
-    """Parts of both pictures, and where they lie."""
+    """Parts of both images, and their positions."""
 
     a: Picture
     """Part of a."""
@@ -37,7 +36,7 @@ class CommonPart:
     def whole(
         self, outcome: Registration | RefusedRegistration
     ) -> Registration | RefusedRegistration:
-        """A registration of the parts as one of the pictures."""
+        """Converts a registration of the parts to one of the whole images."""
         if isinstance(outcome, RefusedRegistration):
             return outcome
         matrix = _moved(self.shift_b) @ outcome.b_H_a @ _moved(-self.shift_a)
@@ -50,7 +49,7 @@ class CommonPart:
 
 
 def common_part(a: Picture, b: Picture, guess: Guess) -> CommonPart:
-    """What both pictures show if the guess is right to within its own reach."""
+    """The parts shared by both images if the guess is right within its stated uncertainty."""
     margin = guess.reach * max(b.shape)
     scale = float(np.sqrt(abs(np.linalg.det(guess.b_H_a[:2, :2])))) or 1.0
     in_a = _window(np.linalg.inv(guess.b_H_a), b.shape, margin / scale, a.shape)
@@ -70,8 +69,8 @@ def common_part(a: Picture, b: Picture, guess: Guess) -> CommonPart:
 def _window(
     to_H_from: NDArray[Any], source: tuple[int, int], margin: float, target: tuple[int, int]
 ) -> tuple[slice, slice]:
-    """Rows and columns of `target` that the picture `source` covers, widened by a margin; all where
-    that is most.
+    """Rows and columns of `target` that the image `source` covers, widened by a margin; all of them
+    if that is most of the image.
     """
     height, width = source
     ends = np.array([[0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1.0]]) @ to_H_from.T

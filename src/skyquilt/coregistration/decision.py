@@ -1,4 +1,4 @@
-"""Which of several places is believed, with which model, or why none is; ambiguity counts."""
+"""Decides which candidate transform is accepted and with which model, or why none is accepted."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -25,26 +25,28 @@ Outcome = Registration | RefusedRegistration
 
 @dataclass(frozen=True, kw_only=True)
 class Decide:
-    """Believes the place that independent patches confirm, and frees the model as far as pictures
-    support it.
+    """Accepts the transform that independent patches confirm, and uses a model with more parameters
+    if the images support it.
     """
 
     agree: Agree = field(default_factory=Agree)
     """The test."""
     least_surprise: float = 5.0
-    """Agreement below which a registration is refused; docs/methods.md says what chance reaches."""
+    """Agreement below which a registration is refused; docs/methods.md gives the values that occur
+    by chance.
+    """
     gain: float = 0.02
-    """Relative gain in correlation that a freer model must bring to be preferred."""
+    """Relative gain in correlation required for a model with more parameters."""
     finest: float = 640.0
-    """Px of the square whose area larger pictures are sharpened at in the end."""
+    """Side in px of the square to whose area larger images are reduced for the final refinement."""
     version: ClassVar[int] = 1
 
     def __call__(self, pyramid: Pyramid, fits: Sequence[Fit]) -> Outcome:
-        """The verdict on places in px of the finest level."""
+        """The decision on transforms in px of the finest level."""
         judged = [(self.agree(*pyramid.at(pyramid.last), fit.b_H_a), fit) for fit in fits]
         if not judged:
             return RefusedRegistration(
-                reason="no place was found where enough of both pictures overlaps"
+                reason="no position was found with enough overlap of both images"
             )
         agreement, fit = max(judged, key=lambda j: j[0].surprise)
         if agreement.surprise < self.least_surprise:
@@ -56,7 +58,7 @@ class Decide:
         return self._finished(pyramid, fit, agreement)
 
     def _finished(self, pyramid: Pyramid, fit: Fit, agreement: Agreement) -> Registration:
-        """The model that the pictures support, in px of the pictures."""
+        """The registration with the model that the images support, in px of the images."""
         a, b = pyramid.at(pyramid.last)
         freedoms: tuple[Freedom, ...] = ("affine", "homography")
         model: Freedom = "similarity"
@@ -75,8 +77,8 @@ class Decide:
         )
 
     def _finest(self, pyramid: Pyramid, full: Matrix, model: Freedom) -> Matrix:
-        """The transform sharpened once more where pictures are so large that a pixel of the verdict
-        is many.
+        """The transform refined again at a finer level if the images are much larger than the
+        decision level.
         """
         larger = pyramid.finest(self.finest)
         if larger is None:
@@ -101,25 +103,25 @@ def _evidence(agreement: Agreement, fit: Fit) -> dict[str, float]:
 
 def _doubt(agreement: Agreement, least: float) -> str:
     return (
-        f"the best place found is not confirmed: {len(agreement.px)} of {agreement.patches} patches"
-        " find it by"
-        f" themselves, which is worth 10^-{agreement.surprise:.1f} where 10^-{least:g} is asked for"
+        f"the best position found is not confirmed: {len(agreement.px)} of {agreement.patches}"
+        " patches agree with"
+        f" it, significance 10^-{agreement.surprise:.1f}; 10^-{least:g} is required"
     )
 
 
 _NEAR = 2
-"""Px about the registered place in which its peak is looked for."""
+"""Radius in px around the registered position in which its peak is searched."""
 _OWN = 0.03
-"""Share of the picture about the registered place that belongs to its peak."""
+"""Share of the image around the registered position that belongs to its peak."""
 _LEAST = 0.3
-"""Share of the overlap below which a shift does not count."""
+"""Shifts with a smaller share of the overlap are ignored."""
 
 
 def distinctness(a: Orientation, b: Orientation, b_H_a: Matrix) -> float:
-    """The peak at a registration over the RMS of all far shifts.
+    """The correlation peak at a registration divided by the RMS over all distant shifts.
 
-    Unlike the correlation it can be compared between pictures: smooth ones correlate by chance,
-    too.
+    Unlike the correlation it can be compared between images, since smooth images also correlate by
+    chance.
     """
     fields, valid = warped(a, b_H_a, b.shape)
     shape = (scipy.fft.next_fast_len(2 * b.shape[0]), scipy.fft.next_fast_len(2 * b.shape[1]))

@@ -1,4 +1,4 @@
-"""Search without any knowledge: every rotation, a range of scales, every shift."""
+"""Search without prior knowledge: all rotations, a range of scales, all shifts."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,30 +13,30 @@ from skyquilt.coregistration.candidates import Candidate, middle, peaks, similar
 from skyquilt.coregistration.orientation import Orientation, spectra, turned
 
 _COARSE = 4
-"""Px per px of the grid that overlaps are counted on."""
+"""Px per px of the coarse grid on which overlaps are computed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Everywhere:
     """Correlation of orientation fields by FFT over a grid of rotations and scales.
 
-    The score is the correlation's sum over the root of the overlap: what chance reaches is then the
-    same for large overlaps and small ones. Scales are relative to equal areas, so pictures of one
-    field of view have 1, whatever their sizes.
+    The score is the sum of the correlation divided by the root of the overlap, so that scores by
+    chance are equal for large and small overlaps. Scales are relative to equal areas: images with
+    the same field of view have scale 1, whatever their sizes.
     """
 
     step_deg: float = 4.0
-    """Between rotations."""
+    """Step between rotations in degrees."""
     step_scale: float = 1.0725
     """Factor between scales."""
     smallest: float = 0.7
     """Smallest scale from a to b, relative to equal areas."""
     largest: float = 1.45
-    """Largest one."""
+    """Largest scale."""
     overlap: float = 0.4
     """Least overlap as a share of the smaller picture's valid area."""
     per_turn: int = 2
-    """Peaks kept of each rotation and scale."""
+    """Number of peaks kept for each rotation and scale."""
     version: ClassVar[int] = 1
 
     def __call__(self, a: Orientation, b: Orientation) -> list[Candidate]:
@@ -62,12 +62,14 @@ class Everywhere:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Plane:
-    """The square of `side` px on which a is turned about the middle and b is laid in the corner."""
+    """Square of `side` px for the correlation: a is rotated about its middle, b is placed in the
+    corner.
+    """
 
     side: int
     """A multiple of 2 * _COARSE."""
     b: tuple[NDArray[np.complex64], NDArray[np.complex64]]
-    """Conjugate spectra (2, side, side) of b, and of b turned by 180 degrees about the origin."""
+    """Conjugate spectra (2, side, side) of b, and of b rotated by 180 degrees about the origin."""
     b_valid: tuple[NDArray[np.complex64], NDArray[np.complex64]]
     """The same of b's validity, on the coarse grid."""
     b_middle: NDArray[np.float64]
@@ -93,8 +95,8 @@ class _Plane:
     ) -> Iterator[tuple[float, NDArray[np.float32], NDArray[np.float32]]]:
         """Angle, correlation and overlap (side, side) for `angle` and for `angle` + 180 degrees.
 
-        Turning by 180 degrees leaves orientations as they are and mirrors positions, so both share
-        their transforms: the second one is the first against a b that is turned instead.
+        A rotation by 180 degrees leaves orientations unchanged and mirrors positions. So both
+        angles share the transform of a: for the second angle it is correlated with the rotated b.
         """
         half = np.array([self.side / 2, self.side / 2])
         turn = similarity(scale, angle, middle(a.shape), half)[:2]
@@ -109,7 +111,7 @@ class _Plane:
             yield angle + extra, field, overlap.repeat(_COARSE, 0).repeat(_COARSE, 1)
 
     def place(self, x: int, y: int, *, flipped: bool) -> NDArray[np.float64]:
-        """Where a's middle falls in b, px, for a peak of the correlation at (x, y)."""
+        """Position of a's middle in b in px, for a peak of the correlation at (x, y)."""
         shift = np.array([x, y], np.float64)
         at = self.side / 2 + shift if flipped else self.side / 2 - shift
         low = self.b_middle - self.side / 2
@@ -117,5 +119,5 @@ class _Plane:
 
 
 def _reversed(spectrum: NDArray[np.complex64]) -> NDArray[np.complex64]:
-    """The spectrum of the same picture turned by 180 degrees about pixel (0, 0)."""
+    """The spectrum of the same image rotated by 180 degrees about pixel (0, 0)."""
     return np.roll(spectrum[..., ::-1, ::-1], 1, (-2, -1)).copy()

@@ -1,4 +1,4 @@
-"""What a registration leaves behind: B on A's grid, pictures for people, a page."""
+"""Output files of a registration: B on A's grid, images for display, a report page."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,14 +21,16 @@ from skyquilt.raster.vrt import vrt
 
 OVERLAYS = ("side_by_side.png", "checkerboard.png", "false_colour.png", "alpha.png")
 CONTRACT = ("registration.json", "report.html", "b_on_a.tif", "b.vrt", *OVERLAYS)
-"""Files of an accepted registration; a refused one leaves the first two."""
+"""Files of an accepted registration; a refused one writes only the first two."""
 LONGEST_SHOWN = 1600
-"""Px of the longer side of the pictures for people."""
+"""Longer side in px of the images for display."""
 _MARGIN = 2
 
 
 def draw(output: Path, a: Source, b: Source, outcome: Registration) -> None:
-    """Writes B on A's grid at full size, B's own pixels with their place, and the pictures."""
+    """Writes B on A's grid at full size, a virtual raster of B's own pixels with ground control
+    points, and the images for display.
+    """
     resample_onto(output / "b_on_a.tif", a, b, outcome.b_H_a)
     if not (b.photo and b.photo.unit):  # a virtual raster would show a radiometric photo's palette
         write_text(output / "b.vrt", _vrt(a, b, outcome.b_H_a))
@@ -40,7 +42,7 @@ def draw(output: Path, a: Source, b: Source, outcome: Registration) -> None:
 
 
 def overlays(a: Source, b: Source, outcome: Registration) -> list[NDArray[np.uint8]]:
-    """RGB pictures in the order of `OVERLAYS`, reduced to `LONGEST_SHOWN`."""
+    """RGB images in the order of `OVERLAYS`, reduced to `LONGEST_SHOWN`."""
     small_a, a_S = _reduced(a)
     small_b, b_S = _reduced(b)
     there = b_S @ outcome.b_H_a @ np.linalg.inv(a_S)
@@ -62,7 +64,7 @@ def page(
     opened: tuple[Source | RejectedPhoto, Source | RejectedPhoto],
     outcome: Registration | RefusedRegistration,
 ) -> str:
-    """The report page, whole in itself."""
+    """The report page as one self-contained file."""
     a, b = opened
     pictures: list[NDArray[np.uint8]] = []
     if isinstance(a, Source) and isinstance(b, Source):
@@ -75,7 +77,7 @@ def page(
 
 
 def _reduced(source: Source) -> tuple[NDArray[np.uint8], Matrix]:
-    """Grey levels for people, and what takes the file's pixels to theirs."""
+    """Grey image for display, and the transform from the file's pixels to its pixels."""
     values = source.picture.values
     valid = source.picture.valid
     if valid is None:
@@ -97,8 +99,8 @@ def _apply(matrix: NDArray[Any], px: NDArray[Any]) -> NDArray[Any]:
 def resample_onto(
     path: Path, a: Source, b: Source, b_H_a: Matrix, tags: Mapping[str, str] | None = None
 ) -> None:
-    """B's values on A's pixels, bilinear, in pieces; A's place where it has one, else A's
-    pixels.
+    """Writes B's values on A's pixels, with bilinear interpolation, block by block. The raster has
+    A's georeference, or pixel coordinates if A has none.
     """
     sample = b.picture.values
     kind = sample.dtype.name if sample.dtype.name in ("uint8", "uint16") else "float32"
@@ -158,9 +160,7 @@ def _wide(mask: NDArray[np.bool_], values: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def _part(b: Source, there: Matrix, block: Block) -> tuple[int, int, int, int] | None:
-    """Row, column, height and width of the part of B that a block shows; None where it shows
-    none.
-    """
+    """Row, column, height and width of the part of B within a block; None if there is none."""
     edge = np.linspace(0, 1, 9)
     x, y = np.meshgrid(edge * (block.width - 1), edge * (block.height - 1))
     px = _apply(there, np.c_[x.ravel(), y.ravel()])
@@ -172,14 +172,14 @@ def _part(b: Source, there: Matrix, block: Block) -> tuple[int, int, int, int] |
 
 
 def _shrinking(there: Matrix, block: Block) -> int:
-    """How many of B's pixels one of A's covers, per axis: they are averaged, not skipped."""
+    """Number of B's pixels within one of A's, per axis; they are averaged to avoid aliasing."""
     middle = np.array([block.width / 2, block.height / 2])
     ends = _apply(there, middle + np.array([[0, 0], [1, 0], [0, 1]]))
     return max(1, int(min(np.linalg.norm(ends[1:] - ends[0], axis=1))))
 
 
 def _vrt(a: Source, b: Source, b_H_a: Matrix) -> str:
-    """B's own file, placed by a grid of ground points on A."""
+    """A virtual raster of B's own file, with a grid of ground control points on A."""
     ends = np.linspace(0, 1, 6)
     x, y = np.meshgrid(ends * (b.width - 1), ends * (b.height - 1))
     px_b = np.c_[x.ravel(), y.ravel()]

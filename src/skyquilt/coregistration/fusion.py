@@ -1,6 +1,6 @@
-"""Two registered pictures shown as one: pictures for people, 8-bit RGB on a's grid.
+"""Fusion of two registered images for display: 8-bit RGB on a's grid.
 
-All take a and b on the same grid, grey (H, W) uint8, and `seen` (H, W), where b has a picture.
+All take a and b on the same grid, grey (H, W) uint8, and `seen` (H, W), where b has valid pixels.
 """
 
 from typing import Any
@@ -18,9 +18,7 @@ _LINE = (64, 200, 255)
 
 
 def shown(values: NDArray[Any], valid: Mask) -> Grey:
-    """Grey levels of any picture: stretched between its 1st and 99th percentile; 0 where
-    invalid.
-    """
+    """Grey levels of any image: stretched between its 1st and 99th percentile; 0 where invalid."""
     band = (
         values if values.ndim == 2 else cv2.cvtColor(values.astype(np.float32), cv2.COLOR_RGB2GRAY)
     )
@@ -37,8 +35,8 @@ def shown(values: NDArray[Any], valid: Mask) -> Grey:
 
 
 def false_colour(a: Grey, b: Grey, seen: Mask) -> Rgb:
-    """a in green, b in red and blue: grey where both are alike, coloured fringes where edges
-    part.
+    """a in green, b in red and blue: grey where both are equal, coloured fringes where edges do not
+    coincide.
     """
     other = np.where(seen, b, 0).astype(np.uint8)
     return np.dstack([other, a, other])
@@ -53,8 +51,8 @@ def alpha(a: Grey, b: Grey, seen: Mask, weight: float = 0.5) -> Rgb:
 
 
 def checkerboard(a: Grey, b: Grey, seen: Mask, squares: int = 8) -> Rgb:
-    """a and b by turns in squares, so many along the longer side; what runs on across them is
-    registered.
+    """a and b in alternating squares; `squares`: their number along the longer side. Structures
+    continue across the squares if the registration is right.
     """
     side = max(1, -(-max(a.shape) // squares))
     rows, columns = np.indices(a.shape)
@@ -63,7 +61,9 @@ def checkerboard(a: Grey, b: Grey, seen: Mask, squares: int = 8) -> Rgb:
 
 
 def side_by_side(a: Grey, b: Grey, px_a: NDArray[Any], px_b: NDArray[Any], most: int = 60) -> Rgb:
-    """Both pictures as they are, inliers (n, 2) joined by lines; at most `most`, evenly chosen."""
+    """Both images unchanged, with inliers (n, 2) joined by lines; at most `most` of them, evenly
+    chosen.
+    """
     canvas = np.full(
         (max(a.shape[0], b.shape[0]), a.shape[1] + _GAP + b.shape[1], 3), 255, np.uint8
     )

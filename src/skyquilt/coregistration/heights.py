@@ -1,10 +1,10 @@
-"""Two fields of heights laid on one another to a fraction of a cell.
+"""Registration of two height fields with an accuracy of a fraction of a cell.
 
-Heights look alike in every spectrum, at any hour and in every season, but for leaves: no shadow and
-no shading draws the fit aside, as it does with pictures. Two adjusted blocks differ by a
-similarity, heights included; slopes tell how far the one must move for its heights to equal the
-other's (least squares matching; for elevation models Rosenholm and Torlegard 1988). Walls do not
-count, nor does what only one field has.
+Heights are independent of the spectral band, the time of day and, except for leaves, the season.
+Shadows and shading do not bias the fit, as they do with images. Two adjusted blocks differ by a 3D
+similarity. The slopes determine the shift that makes the heights of one field equal to those of the
+other (least squares matching; for elevation models Rosenholm and Torlegard 1988). Steep walls and
+objects that only one field contains are excluded.
 """
 
 from dataclasses import dataclass, field, replace
@@ -19,55 +19,54 @@ from skyquilt.model.surface import HeightField
 
 Doubles = NDArray[np.float64]
 _TILES = 4
-"""Per side of the chess-board that parts the ground into halves."""
+"""Number of squares per side of the chess-board that divides the ground into two halves."""
 _LEAST = 400
-"""Cells that both fields must know."""
-_TOO_LITTLE = RefusedRegistration(
-    reason="too little ground has heights in both maps to compare them"
-)
+"""Fewest cells with heights in both fields."""
+_TOO_LITTLE = RefusedRegistration(reason="too few cells have heights in both maps")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeightFit:
-    """How one field lies on the other."""
+    """Result of the registration of two height fields."""
 
     b_H_a: Matrix
-    """(3, 3) similarity, takes a's ground coordinates in m to b's."""
+    """(3, 3) similarity from a's ground coordinates in m to b's."""
     cells: int
-    """Cells compared."""
+    """Number of cells compared."""
     residual_m: float
-    """Robust deviation of the heights' differences."""
+    """Robust standard deviation of the height differences in m."""
     apart_m: float
-    """RMS distance over the ground between the places that the two halves of it find by themselves.
-    """
+    """RMS distance over the ground, in m, between the independent solutions of its two halves."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AlignHeights:
-    """Gauss-Newton, coarse to fine: a similarity of the plane, and of the heights a factor and a
-    bent plane.
+    """Gauss-Newton, coarse to fine. The unknowns are a similarity of the plane, and for the heights
+    a factor and a curved surface of low order.
     """
 
     sigmas: tuple[float, ...] = (5.0, 2.5, 1.25, 0.75)
     """Standard deviations of the smoothing, in cells."""
     steepest: float = 2.5
-    """Slope above which heights are walls."""
+    """Slope above which cells are excluded as walls."""
     scale: float = 1.0
-    """Difference in cells beyond which a height counts ever less."""
+    """Height difference in cells above which the weight of a cell decreases."""
     steps: int = 20
-    """Most steps at each smoothing."""
+    """Largest number of steps at each smoothing."""
     furthest_apart: float = 2.0
-    """Cells by which the places that two halves of the ground find may differ."""
+    """Largest distance in cells between the solutions of the two halves of the ground."""
     likeness: float = 1.25
-    """Factor, either way, by which what stands out of the ground may be higher in one map than in
-    the other: noise and other ground come out at nearly none.
+    """Largest ratio, in either direction, of the heights of relief between the two maps. For noise
+    or unrelated ground the fitted factor is close to zero.
     """
     version: ClassVar[int] = 1
 
     def __call__(
         self, a: HeightField, b: HeightField, start: Matrix
     ) -> HeightFit | RefusedRegistration:
-        """b on a near a start (3, 3), ground coordinates in m, or why heights do not tell it."""
+        """The registration of b to a near a start (3, 3), in ground coordinates in m, or why
+        heights do not determine it.
+        """
         cell = 2 * max(a.cell, b.cell)
         a, b = a.coarser(cell), b.coarser(cell)
         everything = np.ones(a.z.shape, bool)
@@ -76,8 +75,8 @@ class AlignHeights:
             return _TOO_LITTLE
         if abs(np.log(max(fit.factor, 1e-3))) > np.log(self.likeness):
             return RefusedRegistration(
-                reason=f"heights of the one map stand {fit.factor:.2f} times as high in the other:"
-                " no likeness"
+                reason=f"heights of one map are {fit.factor:.2f} times as high in the other:"
+                " they are unrelated"
             )
         parts = [self._fitted(a, b, fit, half, self.sigmas[-2:]) for half in _halves(a.z.shape)]
         if parts[0] is None or parts[1] is None:
@@ -85,8 +84,8 @@ class AlignHeights:
         apart = float(np.sqrt((((parts[0].p - parts[1].p) @ fit.spread) ** 2).sum()))
         if apart > self.furthest_apart * cell:
             return RefusedRegistration(
-                reason=f"two halves of the ground find places {apart:.1f} m apart: its relief does"
-                " not tell the place"
+                reason=f"solutions of two halves of the ground are {apart:.1f} m apart: its relief"
+                " does not determine the position"
             )
         return HeightFit(b_H_a=fit.matrix, cells=fit.cells, residual_m=fit.residual, apart_m=apart)
 
@@ -98,7 +97,7 @@ class AlignHeights:
         part: NDArray[np.bool_],
         sigmas: tuple[float, ...],
     ) -> "_Fit | None":
-        """The best place by the cells of a in `part`; None where too few can be compared."""
+        """The best fit from the cells of a in `part`; None if too few can be compared."""
         for sigma in sigmas:
             one, other = _smooth(a, sigma), _Slopes.of(_smooth(b, sigma), b, self.steepest)
             known = a.known & part
@@ -119,7 +118,7 @@ class AlignHeights:
         fit: "_Fit",
         cell: float,
     ) -> "tuple[_Fit, float] | None":
-        """A step, and by how many m it moves the ground's border."""
+        """One step, and the distance in m by which it moves the border of the ground."""
         z, gx, gy, both = other.at(*fit.there(one - np.median(one[known])))
         both &= known
         if both.sum() < _LEAST:
@@ -144,21 +143,23 @@ class AlignHeights:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Fit:
-    """A similarity by its movement in m of the ground's middle and border: x = x0 + p0 + p2 u - p3
-    v and so on.
+    """A similarity, parametrised by the shift in m of the ground's middle and border: x = x0 + p0 +
+    p2 u - p3 v, and y accordingly.
     """
 
     u: Doubles
     v: Doubles
-    """(rows, cols) places of a from its middle, in units of half its longer side."""
+    """(rows, cols) positions of a's cells relative to its middle, in units of half its
+    longer side.
+    """
     middle: Doubles
     unit: float
     p: Doubles
-    """(4,) place of the middle, and the unit's image along x and y, all in m."""
+    """(4,) position of the middle, and the image of the unit vector along x and y, all in m."""
     tilt: Doubles = field(default_factory=lambda: np.zeros(2))
-    """(2,) slopes along x and y of a's heights less b's: one block leans against the other."""
+    """(2,) slopes along x and y of a's heights minus b's: the tilt between the blocks."""
     factor: float = 1.0
-    """Of b's heights that fits a's, general slope and bend apart."""
+    """Factor from b's heights to a's, apart from the general slope and curvature."""
     cells: int = 0
     residual: float = 0.0
 
@@ -179,10 +180,10 @@ class _Fit:
         )
 
     def there(self, lift: NDArray[Any]) -> tuple[Doubles, Doubles]:
-        """(rows, cols) where the cells of a lie in b, `lift` m above the level that the similarity
-        is true for.
+        """(rows, cols) positions in b of the cells of a, `lift` m above the level for which the
+        similarity holds.
 
-        A block that leans by a slope has roofs and crowns aside by the slope times their height.
+        In a tilted block, roofs and tree crowns are displaced by the slope times their height.
         """
         x, y, c, s = self.p
         along, across = self.tilt
@@ -200,17 +201,19 @@ class _Fit:
 
     @property
     def spread(self) -> Doubles:
-        """(4, 4) that turns a difference of parameters into RMS distances over the ground."""
+        """(4, 4) matrix from a difference of parameters to RMS distances over the ground."""
         r2 = float((self.u**2 + self.v**2).mean())
         return np.diag(np.sqrt([1, 1, r2, r2]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Slopes:
-    """Heights of b and how they change, to be looked up."""
+    """Heights and slopes of b for interpolation."""
 
     layers: NDArray[np.float32]
-    """(rows, cols, 4): height, slope along x and y, 1 where all three are known and no wall."""
+    """(rows, cols, 4): height, slope along x and y, 1 where all three are known and the cell is not
+    a wall.
+    """
     field: HeightField
 
     @classmethod
@@ -235,14 +238,14 @@ class _Slopes:
 
 
 def _smooth(one: HeightField, sigma: float) -> NDArray[np.float32]:
-    """Heights smoothed over what is known."""
+    """Heights smoothed over the known cells."""
     weight = one.known.astype(np.float32)
     total = np.asarray(cv2.GaussianBlur(np.where(one.known, one.z, np.float32(0)), (0, 0), sigma))
     return np.asarray(total / np.maximum(cv2.GaussianBlur(weight, (0, 0), sigma), 1e-3), np.float32)
 
 
 def _robust(A: Doubles, wanted: NDArray[Any], scale: float) -> tuple[Doubles, Doubles]:
-    """Least squares reweighted (Geman and McClure), and what it leaves."""
+    """Reweighted least squares (Geman and McClure): the solution and its residuals."""
     weight = np.ones(len(A))
     for _ in range(6):
         W = A * weight[:, None]

@@ -3,9 +3,9 @@ manner.
 
 RIFT (Li, Hu and Ai 2020) makes its descriptor independent of rotation by a ring of filter
 sequences, RIFT2 (2023) by the patch's dominant index; here the dominant direction is found to a
-fraction of an index, the patch is sampled along it and its indices are counted from it. A direction
-is one of 180 degrees: the other half is tried when descriptors are compared, where it is the same
-descriptor with its cells in reverse.
+fraction of an index, the patch is sampled along it and its indices are counted from it. Directions
+are known modulo 180 degrees. The opposite direction is tried when descriptors are compared; it
+gives the same descriptor with its cells in reverse order.
 """
 
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ from skyquilt.coregistration.log_gabor import ORIENTATIONS, Phase
 CELLS = 6
 """Cells along each side of a patch."""
 _FAST = 4
-"""Levels of 255 by which a FAST corner's ring differs."""
+"""Threshold of FAST corners in levels of 255."""
 _BORDER = 6
-"""Px at the border of what is valid where no keypoint is taken."""
+"""Width in px of the border of the valid area in which no keypoint is taken."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,9 +30,9 @@ class IndexFeatures:
     """Keypoints and descriptors."""
 
     px: NDArray[np.float64]
-    """(n, 2) px of the resolution they were found in."""
+    """(n, 2) px of the resolution in which they were found."""
     vectors: NDArray[np.float32]
-    """(n, CELLS**2, ORIENTATIONS) of unit length."""
+    """(n, CELLS**2, ORIENTATIONS) descriptors of unit length."""
 
     def __len__(self) -> int:
         return len(self.px)
@@ -53,14 +53,14 @@ def index_features(phase: Phase, valid: NDArray[Any], *, count: int, patch: int)
 
 
 def similarities(a: IndexFeatures, b: IndexFeatures) -> NDArray[np.float32]:
-    """(len(a), len(b)) dot products, the better of both halves of the turn."""
+    """(len(a), len(b)) dot products, the better of both opposite directions."""
     fa, fb = a.vectors.reshape(len(a), -1), b.vectors.reshape(len(b), -1)
     turned = b.vectors[:, ::-1].reshape(len(b), -1)
     return np.asarray(np.maximum(fa @ fb.T, fa @ turned.T))
 
 
 def mutual(a: IndexFeatures, b: IndexFeatures) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Indices into a and b of each other's nearest."""
+    """Indices into a and b of mutual nearest neighbours."""
     if not len(a) or not len(b):
         return np.zeros(0, int), np.zeros(0, int)
     likeness = similarities(a, b)

@@ -1,8 +1,8 @@
 """Log-Gabor responses, phase congruency and the maximum index map.
 
 Kovesi (1999), "Image features from phase congruency", and (2003) for the moments; Li, Hu and Ai
-(2020), RIFT, for the map of the orientation that responds most, which hardly depends on how bright
-either side of an edge is.
+(2020), RIFT, for the map of the orientation with the strongest response, which hardly depends on
+the brightness on either side of an edge.
 """
 
 from dataclasses import dataclass
@@ -13,32 +13,36 @@ import scipy.fft
 from numpy.typing import NDArray
 
 SCALES = 4
-"""Wavelengths."""
+"""Number of wavelengths."""
 ORIENTATIONS = 6
-"""Directions, 30 degrees apart."""
+"""Number of directions, 30 degrees apart."""
 _SHORTEST = 3.0
 _FACTOR = 1.6
 _BANDWIDTH = 0.75
 _NOISE = 2.0
-"""Standard deviations of the noise's energy that are taken off."""
+"""Number of standard deviations of the noise energy that are subtracted."""
 _CUTOFF, _SHARP = 0.45, 15
-"""Low-pass that keeps the corners of the spectrum out: share of the sampling rate, order."""
+"""Low-pass filter that excludes the corners of the spectrum: cut-off as a share of the sampling
+rate, and order.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Phase:
-    """What the filters say of a picture."""
+    """Filter responses of an image."""
 
     index: NDArray[np.uint8]
-    """(h, w) which of the `ORIENTATIONS` responds most over all scales: the maximum index map."""
+    """(h, w) index of the strongest of the `ORIENTATIONS` over all scales: the maximum index
+    map.
+    """
     edges: NDArray[np.float32]
-    """(h, w) maximum moment of phase congruency: edges and corners, in [0, 1] or so."""
+    """(h, w) maximum moment of phase congruency: edges and corners, about in [0, 1]."""
     corners: NDArray[np.float32]
     """(h, w) minimum moment: corners alone."""
 
 
 def phase(grey: NDArray[np.float32]) -> Phase:
-    """Filters a picture (h, w)."""
+    """Filters an image (h, w)."""
     spectrum = scipy.fft.fft2(grey.astype(np.float32))
     radius, angle = _polar(grey.shape)
     bands = _bands(radius)
@@ -83,7 +87,7 @@ def _oriented(
         size = np.abs(response)
         amplitude += size
         total = total + response
-        if s == 0:  # the finest scale is mostly noise; its Rayleigh parameter tells that of all
+        if s == 0:  # mostly noise: its Rayleigh parameter gives the noise of all scales
             tau = float(np.median(size)) / np.sqrt(np.log(4))
             sums = tau * (1 - _FACTOR**-SCALES) / (1 - 1 / _FACTOR)
             noise = sums * (np.sqrt(np.pi / 2) + _NOISE * np.sqrt((4 - np.pi) / 2))

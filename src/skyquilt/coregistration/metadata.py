@@ -1,4 +1,4 @@
-"""What two photos' metadata say of how one lies on the other."""
+"""Guess of the registration of two photos from their metadata."""
 
 from math import cos, hypot, radians, sin
 
@@ -10,18 +10,18 @@ from skyquilt.model.registration import Guess
 
 _EARTH_M = 6378137.0
 _REACH = 0.3
-"""Share of b's longer side by which tilt, lever arms and positions may be wrong."""
+"""Largest error from tilt, lever arms and positions, as a share of b's longer side."""
 _TURN_DEG = 12.0
-"""Degrees by which the difference of two yaws may be wrong."""
+"""Largest error of the difference of two yaws in degrees."""
 _SCALE = 1.3
-"""Factor by which focal lengths and heights may be wrong together."""
+"""Largest error of the scale from focal lengths and heights, as a factor."""
 
 
 def from_metadata(a: Photo, b: Photo) -> Guess | None:
-    """The guess for two photos that look straight down, or None where they do not say enough.
+    """The guess for two vertical photos, or None if their metadata are not sufficient.
 
     Scale from focal lengths and heights above take-off, rotation from yaws, shift from positions;
-    what both do not state is taken as equal. Focal lengths that are guesses say nothing.
+    data that are not given by both are assumed to be equal. Assumed focal lengths are not used.
     """
     if "guess" in (a.focal.source, b.focal.source):
         return None
@@ -53,7 +53,7 @@ def from_metadata(a: Photo, b: Photo) -> Guess | None:
 
 
 def _heights(a: Photo, b: Photo) -> tuple[float, float] | None:
-    """Heights in m above take-off, where both state them and they are flown at."""
+    """Heights in m above take-off, if both photos give them and both were taken in flight."""
     found = [p.position.takeoff_m if p.position else None for p in (a, b)]
     if found[0] is None or found[1] is None or min(found[0], found[1]) < 5:
         return None

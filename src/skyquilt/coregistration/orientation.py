@@ -1,9 +1,11 @@
-"""What spectra have in common: where edges run, whichever side of them is brighter.
+"""Edge orientation fields: what different spectral bands have in common is the direction of edges,
+whichever side is brighter.
 
-A picture becomes fields of unit-contrast orientation. With g = |g| exp(i t) the gradient, the
-fields are w exp(2 i t) and w exp(4 i t): both are the same for t and t + pi, so a reversed contrast
-changes nothing; the second tells orientations apart more sharply than the first alone. w is the
-gradient's length over its surroundings' RMS, so that faint and strong structure weigh alike.
+An image is converted to fields of orientation with normalised contrast. With g = |g| exp(i t) the
+gradient, the fields are w exp(2 i t) and w exp(4 i t): both are equal for t and t + pi, so reversed
+contrast has no effect. The second field distinguishes orientations more sharply than the first
+alone. w is the gradient's length divided by the RMS of its surroundings, so that faint and strong
+structure have equal weight.
 """
 
 from collections.abc import Sequence
@@ -19,30 +21,31 @@ from skyquilt.coregistration.usable import Usable
 from skyquilt.model.registration import Matrix
 
 Fields = NDArray[Any]
-"""(h, w, 4) of 32-bit numbers, see above."""
+"""(h, w, 4) 32-bit floats, see above."""
 BLUR = 1.0
 """Standard deviation in px of the smoothing before gradients are taken."""
 SURROUNDINGS = 1 / 16
-"""Standard deviation of the surroundings that contrast is measured against, as a share of the side.
+"""Standard deviation of the window in which contrast is normalised, as a share of the image
+side.
 """
 FLOOR = 0.3
-"""Share of the median contrast that is added to every contrast: flat areas stay weak."""
+"""Share of the median contrast that is added to every contrast, so that flat areas stay weak."""
 STRONGEST = 2.0
-"""Largest weight: one glaring lamp must not decide."""
+"""Largest weight, so that a single bright object does not dominate."""
 MARGIN = 5
-"""Px: width of the neighbourhood whose pixels must all be picture for a gradient to count."""
+"""Width in px of the neighbourhood that must be valid for a gradient to be used."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Orientation:
-    """The fields of one picture at one resolution."""
+    """The fields of one image at one resolution."""
 
     fields: Fields
     """(h, w, 4): real and imaginary parts of w exp(2 i t), then of w exp(4 i t)."""
     valid: NDArray[Any]
-    """(h, w) 1 where a gradient could be taken, else 0."""
+    """(h, w) 1 where a gradient could be computed, else 0."""
     small_S_full: Matrix
-    """(3, 3) takes full-size pixels to pixels of this resolution."""
+    """(3, 3) from full-size pixels to pixels of this resolution."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -51,14 +54,14 @@ class Orientation:
 
 
 def orientation(grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float) -> Orientation:
-    """Fields of a picture (H, W) shrunken to the area of a square of `side` px (never enlarged)."""
+    """Fields of an image (H, W) reduced to the area of a square of `side` px (never enlarged)."""
     small, whole, small_S_full = shrunken(grey, valid, side)
     return of_bands(small, whole, small_S_full)
 
 
 def of_bands(small: NDArray[Any], whole: NDArray[np.bool_], small_S_full: Matrix) -> Orientation:
-    """Fields of a picture (h, w) or (h, w, bands) at its own resolution; `whole` (h, w) where it is
-    known.
+    """Fields of an image (h, w) or (h, w, bands) at its own resolution; `whole` (h, w): its valid
+    pixels.
 
     Gradients g of several bands add up as g^2: the direction along which all of them together
     change most (Di Zenzo 1986), whichever way each of them changes.
@@ -89,7 +92,7 @@ def _fields(small: NDArray[Any], valid: NDArray[Any]) -> Fields:
 
 
 def _surroundings(length: NDArray[Any], valid: NDArray[Any]) -> NDArray[np.float32]:
-    """RMS gradient about each pixel, over valid ones, and the floor."""
+    """RMS gradient around each pixel, over valid ones, plus the floor."""
     sigma = np.sqrt(length.size) * SURROUNDINGS
     share = cv2.GaussianBlur(valid, (0, 0), sigma) + 1e-3
     rms = np.sqrt(cv2.GaussianBlur(length * length * valid, (0, 0), sigma) / share)
@@ -102,9 +105,9 @@ def _surroundings(length: NDArray[Any], valid: NDArray[Any]) -> NDArray[np.float
 def shrunken(
     grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float
 ) -> tuple[NDArray[Any], NDArray[np.bool_], Matrix]:
-    """A picture (H, W) or (H, W, bands) and its validity (H, W) averaged down to the area of a
-    square of `side` px (never enlarged), and the (3, 3) that takes its pixels there. Both axes
-    shrink alike, so a similarity stays one.
+    """An image (H, W) or (H, W, bands) and its validity (H, W) averaged to the area of a square of
+    `side` px (never enlarged), and the (3, 3) transform to its pixels. Both axes are scaled
+    equally, so that a similarity remains one.
     """
     factor = min(1.0, side / float(np.sqrt(valid.size)))
     small, share = (
@@ -116,20 +119,20 @@ def shrunken(
 
 
 def between(a: Orientation, b: Orientation, b_H_a: Matrix) -> Matrix:
-    """A transform of full-size pixels as one of these two resolutions' pixels."""
+    """Converts a transform of full-size pixels to pixels of these two resolutions."""
     m = b.small_S_full @ b_H_a @ np.linalg.inv(a.small_S_full)
     return np.asarray(m / m[2, 2])
 
 
 def full_size(a: Orientation, b: Orientation, small: Matrix) -> Matrix:
-    """The reverse of `between`."""
+    """The inverse of `between`."""
     m = np.linalg.inv(b.small_S_full) @ small @ a.small_S_full
     return np.asarray(m / m[2, 2])
 
 
 def warped(a: Orientation, b_H_a: Matrix, shape: tuple[int, int]) -> tuple[Fields, NDArray[Any]]:
-    """a's fields and validity as they would be in b's frame, (h, w, 4) and (h, w); orientations
-    turn along.
+    """a's fields (h, w, 4) and validity (h, w) resampled to b's frame; orientations are rotated
+    accordingly.
     """
     size = (shape[1], shape[0])
     fields = cv2.warpPerspective(a.fields, b_H_a, size)
@@ -139,7 +142,9 @@ def warped(a: Orientation, b_H_a: Matrix, shape: tuple[int, int]) -> tuple[Field
 
 
 def turned(fields: Fields, angle: float) -> Fields:
-    """Fields whose orientations are turned by an angle in radians (x towards y); pixels stay."""
+    """Fields with orientations rotated by an angle in radians (x towards y); pixels are not
+    moved.
+    """
     turn = np.exp(np.array([2j, 4j]) * angle).astype(np.complex64)
     out = np.ascontiguousarray(fields).view(np.complex64) * turn
     return out.view(np.float32)
@@ -152,15 +157,17 @@ def spectra(fields: Fields, shape: tuple[int, int]) -> NDArray[np.complex64]:
 
 
 class Pyramid:
-    """Orientation fields of two pictures, each resolution made when first asked for."""
+    """Orientation fields of two images; each resolution is computed when first needed."""
 
     def __init__(self, *, a: Usable, b: Usable, sides: Sequence[float]) -> None:
-        """`sides`: px of the squares whose areas the pictures are shrunken to."""
+        """`sides`: sides in px of the squares to whose areas the images are reduced."""
         self._pictures, self._sides = (a, b), tuple(sides)
         self._levels: dict[int, tuple[Orientation, Orientation]] = {}
 
     def finest(self, side: float) -> tuple[Orientation, Orientation] | None:
-        """a and b at a side beyond the last level; None where one of them is not that large."""
+        """a and b at a finer resolution than the last level; None if one of them is not large
+        enough.
+        """
         if any(one.grey.size < side**2 for one in self._pictures):
             return None
         a, b = (orientation(p.grey, p.valid, side) for p in self._pictures)
@@ -179,13 +186,13 @@ class Pyramid:
         return self._levels[level]
 
     def moved(self, small: Matrix, source: int, target: int) -> Matrix:
-        """A transform in px of one level in those of another."""
+        """Converts a transform in px of one level to px of another."""
         return self.small(self.full(small, source), target)
 
     def small(self, full: Matrix, level: int) -> Matrix:
-        """A transform in px of the pictures in those of a level."""
+        """Converts a transform in px of the images to px of a level."""
         return between(*self.at(level), full)
 
     def full(self, small: Matrix, level: int) -> Matrix:
-        """A transform in px of a level in those of the pictures."""
+        """Converts a transform in px of a level to px of the images."""
         return full_size(*self.at(level), small)

@@ -1,4 +1,4 @@
-"""The page of one registration."""
+"""The report page of one registration."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,26 +13,26 @@ from skyquilt.report.page import plain_page
 from skyquilt.report.parts import Figure, Section, Sentences, Table, Tile
 
 _CAPTIONS = (
+    ("Side by side", "Both images unchanged; lines join places that were matched independently."),
     (
-        "Side by side",
-        "Both pictures as they are; lines join places that were found in both by themselves.",
+        "Checkerboard",
+        "A and B alternate: in a right registration, structures continue across the edges.",
     ),
-    ("Checkerboard", "A and B by turns: what runs on across the squares' edges is registered."),
-    ("False colour", "A in green, B in magenta: fringes show where edges part."),
+    ("False colour", "A in green, B in magenta: fringes show where edges do not coincide."),
     ("B over A", "B in warm colours, half transparent."),
 )
 _EVIDENCE = {
-    "surprise": "agreement of independent patches, -log10 of what chance would give",
-    "patches": "patches that could be asked",
-    "patches_agreeing": "of them, those that find the same place by themselves",
+    "surprise": "agreement of independent patches, -log10 of its probability by chance",
+    "patches": "patches that could be tested",
+    "patches_agreeing": "of these, patches that independently find the same position",
     "correlation": "correlation of edge orientations over the overlap",
     "matches": "matches",
 }
 
 
 def registration_page(record: Mapping[str, Any], pictures: Sequence[NDArray[np.uint8]]) -> str:
-    """The page from what registration.json says and RGB pictures: four of an accepted one, one of a
-    refused.
+    """The page from the record in registration.json and RGB images: four for an accepted
+    registration, one for a refused one.
     """
     sections = (
         [Section(id="pictures", title="Pictures", blocks=tuple(_figures(pictures)))]
@@ -52,7 +52,7 @@ def registration_page(record: Mapping[str, Any], pictures: Sequence[NDArray[np.u
 
 
 def picture(rgb: NDArray[np.uint8], title: str, caption: str) -> Figure:
-    """A picture (H, W, 3) as a figure, inside the page."""
+    """An image (H, W, 3) as a figure embedded in the page."""
     opaque = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
     image = Markup('<img src="{}" alt="{}">').format(Markup(jpeg_uri(opaque)), title)
     return Figure(svg=image, title=title, caption=caption, wide=True)
@@ -61,11 +61,7 @@ def picture(rgb: NDArray[np.uint8], title: str, caption: str) -> Figure:
 def _figures(pictures: Sequence[NDArray[np.uint8]]) -> list[Figure]:
     if len(pictures) == 1:
         return [
-            picture(
-                pictures[0],
-                "Side by side",
-                "Both pictures as they are; nothing was laid on anything.",
-            )
+            picture(pictures[0], "Side by side", "Both images unchanged; there is no registration.")
         ]
     return [picture(p, *words) for p, words in zip(pictures, _CAPTIONS, strict=True)]
 
@@ -84,7 +80,7 @@ def _tiles(record: Mapping[str, Any]) -> tuple[Tile, ...]:
             label="Verdict",
             value="accepted" if accepted else "refused",
             verdict="good" if accepted else "poor",
-            says="Whether the registration is believed; the evidence below says why.",
+            says="Whether the registration is accepted; the evidence below gives the reasons.",
         ),
         Tile(
             label="Inliers", value=plain(record["inliers"]), says="Features or patches that agree."
@@ -98,7 +94,7 @@ def _tiles(record: Mapping[str, Any]) -> tuple[Tile, ...]:
             label="Residual",
             value=fixed(record["residual_px"], 2),
             unit="px",
-            says="RMS distance in B between inliers and the transform.",
+            says="RMS distance in B between inliers and their transformed positions.",
         ),
         Tile(
             label="Time", value=seconds(record["cpu_seconds"]), says="CPU time of the registration."
@@ -108,18 +104,16 @@ def _tiles(record: Mapping[str, Any]) -> tuple[Tile, ...]:
 
 def _transform(record: Mapping[str, Any]) -> tuple[Table | Sentences, ...]:
     if record["b_H_a"] is None:
-        return (Sentences(items=("There is none: a wrong one would be worse.",)),)
+        return (Sentences(items=("There is none, since the registration was refused.",)),)
     m = np.array(record["b_H_a"])
     rows = tuple(tuple(f"{value:.9g}" for value in row) for row in m)
     scale = float(np.sqrt(abs(np.linalg.det(m[:2, :2]))))
     turn = float(np.degrees(np.arctan2(m[1, 0] - m[0, 1], m[0, 0] + m[1, 1])))
     said = (
-        "Takes pixels of A (x right, y down, centres at integers) to pixels of B; a"
+        "From pixels of A (x right, y down, centres at integers) to pixels of B; a"
         f" {record['model']}.",
         f"Scale {fixed(scale, 4)}, rotation {fixed(turn, 2)} degrees clockwise.",
-        f"Known beforehand from {record['guess']}."
-        if record["guess"]
-        else "Nothing was known beforehand.",
+        f"Guess from {record['guess']}." if record["guess"] else "There was no guess.",
     )
     return Sentences(items=said), Table(
         title="b_H_a", head=("", "", ""), rows=rows, numeric="nnn", wide=False
@@ -131,7 +125,9 @@ def _evidence(record: Mapping[str, Any]) -> Table | Sentences:
     if not found:
         return Sentences(items=(record["reason"] or DASH,))
     rows = tuple((_EVIDENCE.get(k, k.replace("_", " ")), plain(v)) for k, v in found.items())
-    return Table(title="What acceptance rests on", head=("what", "figure"), rows=rows, numeric="tn")
+    return Table(
+        title="Evidence for the decision", head=("what", "figure"), rows=rows, numeric="tn"
+    )
 
 
 def _name(path: str) -> str:

@@ -1,4 +1,4 @@
-"""A file to register, whatever it is: a photo, a radiometric frame or a map with its place."""
+"""A file to register: a photo, a radiometric frame or a georeferenced map."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ from skyquilt.photos.read import read_photo
 from skyquilt.raster.read_map import MapFile, open_map, read_reduced, read_window
 
 LONGEST = 2048
-"""Px of the longer side at which a photo or map is registered at most; it is resampled at its full
-size.
+"""Largest size in px of the longer side at which a photo or map is registered; the output is
+resampled at full size.
 """
 Window = Callable[[int, int, int, int], tuple[NDArray[Any], NDArray[np.bool_]]]
 
@@ -35,36 +35,36 @@ class Source:
     width: int
     """Columns at full size."""
     picture: Picture
-    """What is registered; smaller than the file where that is large."""
+    """The image that is registered; reduced if the file is large."""
     reduction: tuple[float, float]
-    """Px of the file per px of the picture, along x and y."""
+    """Px of the file per px of the image, along x and y."""
     window: Window
     """(row, column, height, width) -> pixels and validity at full size."""
     photo: Photo | None = None
     """Its metadata, if it is a photo."""
     place: MapFile | None = None
-    """Its place, if it has one."""
+    """Its georeference, if it has one."""
 
     @property
     def full_S_picture(self) -> Matrix:
-        """(3, 3) takes the picture's pixels to those of the file."""
+        """(3, 3) from the image's pixels to those of the file."""
         x, y = self.reduction
         return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
 
     @property
     def unit(self) -> str:
-        """Unit of the values; empty for pictures."""
+        """Unit of the values; empty for colour images."""
         return self.photo.unit if self.photo else self.place.unit if self.place else ""
 
 
 def open_picture(path: Path) -> Source | RejectedPhoto:
-    """Opens a file and reads the picture, or says why it cannot be used.
+    """Opens a file and reads the image, or gives the reason why it cannot be used.
 
     Raises:
         UsageError: there is no such file.
     """
     if not path.is_file():
-        raise UsageError(f"{path} is no file; two photos or two GeoTIFFs are registered")
+        raise UsageError(f"{path} is not a file; give two photos or two GeoTIFFs")
     if path.suffix.lower() in (".tif", ".tiff", ".vrt") and (place := open_map(path)) is not None:
         try:
             return _of_map(place)
@@ -87,7 +87,7 @@ def _of_photo(photo: Photo) -> Source:
     valid = np.isfinite(values if values.ndim == 2 else values.sum(2, dtype=np.float32))
     factor = min(1.0, LONGEST / max(values.shape[:2]))
     small = values
-    if factor < 1:  # both axes alike, so that a similarity stays one
+    if factor < 1:  # scale both axes equally, so that a similarity remains one
         small = np.asarray(
             cv2.resize(values, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
         )
@@ -123,9 +123,7 @@ def _of_map(place: MapFile) -> Source:
 
 
 def guess_of(a: Source, b: Source) -> Guess | None:
-    """What metadata or places say beforehand, in px of the pictures; None where they say
-    nothing.
-    """
+    """The guess from metadata or georeferences, in px of the images; None if they give none."""
     if a.place and b.place and a.place.crs and b.place.crs:
         guess = _from_places(a, b)
     elif a.photo and b.photo:
@@ -145,7 +143,7 @@ def guess_of(a: Source, b: Source) -> Guess | None:
 
 
 def _from_places(a: Source, b: Source) -> Guess | None:
-    """The transform that two georeferences imply, an affine one through the overlap's corners."""
+    """The transform between two georeferences: an affine one through the overlap's corners."""
     from pyproj import Transformer
 
     assert a.place is not None and b.place is not None

@@ -1,8 +1,9 @@
-"""Registration of two blocks by the pairs that could be registered [Yahyanejad 2013, 5.2.3, (5.7)].
+"""Registration of two blocks from those pairs of photos that could be registered [Yahyanejad 2013,
+5.2.3, (5.7)].
 
-Photos of one spectrum are tied to one another by homographies, which hold even with little overlap.
-So correspondences of one pair between spectra are correspondences of every other pair, and of both
-mosaics: one pair that registers is enough, and all of them together are better.
+Photos of one spectral band are connected by homographies, which are reliable even with little
+overlap. So correspondences between the bands found in one pair can be transferred to every other
+pair and to both mosaics. One registered pair is enough; all pairs together are more accurate.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +23,7 @@ class PairPoints:
     """Correspondences of one photo of a with one of b."""
 
     a: int
-    """Index of the photo of the first spectrum."""
+    """Index of the photo of the first band."""
     b: int
     """Index of the photo of the second."""
     px_a: NDArray[np.float64]
@@ -36,11 +37,11 @@ class Carried:
     """Correspondences of all pairs in two common frames."""
 
     px_a: NDArray[np.float64]
-    """(n, 2) in the frame of the first spectrum."""
+    """(n, 2) in the frame of the first band."""
     px_b: NDArray[np.float64]
-    """(n, 2) in that of the second."""
+    """(n, 2) in the frame of the second band."""
     pair: NDArray[np.int64]
-    """(n,) index of the pair that each comes from."""
+    """(n,) index of the pair of each correspondence."""
 
 
 def carried(
@@ -48,8 +49,8 @@ def carried(
 ) -> Carried:
     """(5.7): R(x_V2, x_T2) = R(H_V1V2 x_V1, H_T1T2 x_T1), for all pairs whose photos are placed.
 
-    The homographies take pixels of each photo of a spectrum to one frame: another photo of it, or
-    its mosaic.
+    The homographies map the pixels of each photo of a band to one frame: another photo of the band,
+    or its mosaic.
     """
     known = [
         (k, p)
@@ -68,8 +69,8 @@ def carried(
 def balanced_weights(px: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
     """(n,) one over the number of points within `radius` px, itself included.
 
-    A place that many pairs see, or that one pair sees many times, then weighs about as much as any
-    other: the thesis names the double counting as the flaw of fitting all points alike.
+    So a place covered by many pairs, or by many points of one pair, gets about the same weight as
+    any other. The thesis names this double counting as the weakness of equal weights.
     """
     if not len(px):
         return np.zeros(0)
@@ -82,17 +83,17 @@ class Propagate:
     """One transform between two blocks from all of their registered pairs."""
 
     model: Model = "homography"
-    """What is fitted."""
+    """Type of the transform."""
     radius: float = 0.05
-    """Radius of balancing, as a share of the extent of the points."""
+    """Radius for the balanced weights, as a share of the extent of the points."""
     scale_px: float = 3.0
-    """Error in px of b's frame beyond which a correspondence counts ever less (Cauchy)."""
+    """Error in px of b's frame above which the weight of a correspondence decreases (Cauchy)."""
     inlier_px: float = 9.0
-    """Error below which it is an inlier."""
+    """Error in px below which it is an inlier."""
     minimum: int = 9
     """Fewest inliers."""
     steps: int = 20
-    """Of reweighting."""
+    """Steps of reweighting."""
     version: ClassVar[int] = 1
 
     def __call__(
@@ -101,12 +102,10 @@ class Propagate:
         common_H_a: Mapping[int, Matrix],
         common_H_b: Mapping[int, Matrix],
     ) -> Registration | RefusedRegistration:
-        """b's frame on a's, or why there is no such transform."""
+        """The registration of b's frame to a's, or the reason why there is none."""
         points = carried(pairs, common_H_a, common_H_b)
         if len(points.px_a) < self.minimum:
-            reason = (
-                f"{len(points.px_a)} correspondences were carried, and {self.minimum} are needed"
-            )
+            reason = f"{len(points.px_a)} correspondences were found, {self.minimum} are needed"
             return RefusedRegistration(reason=reason)
         extent = float(np.linalg.norm(np.ptp(points.px_a, axis=0)))
         balance = balanced_weights(points.px_a, self.radius * extent)
@@ -118,7 +117,7 @@ class Propagate:
         )
         if matrix is None or error is None or (error < self.inlier_px).sum() < self.minimum:
             return RefusedRegistration(
-                reason="the pairs' correspondences agree on no common transform"
+                reason="the correspondences of the pairs do not fit a common transform"
             )
         inside = error < self.inlier_px
         return Registration(
@@ -134,9 +133,7 @@ class Propagate:
         )
 
     def _fitted(self, points: Carried, balance: NDArray[np.float64]) -> Matrix | None:
-        """Least squares reweighted by Cauchy's function, its scale narrowing from the median
-        error.
-        """
+        """Least squares with Cauchy weights; their scale decreases from the median error."""
         matrix = fit(self.model, points.px_a, points.px_b, balance)
         for k in range(self.steps):
             if matrix is None:

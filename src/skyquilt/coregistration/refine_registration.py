@@ -1,10 +1,11 @@
-"""The last pixels of a believed registration: found by colour where colour is reliable, else by
+"""Final refinement of an accepted registration: by colour where colour is reliable, otherwise by
 brightness.
 
-A registration is known to a few pixels by then. Shading and shadows pull brightness aside where the
-sun stands differently in the two pictures. Log-chromaticity hardly changes with the light, so it
-decides wherever the patch test (the one that registrations are accepted by) confirms it. Pictures
-without colour (a grey lens, snow, asphalt, haze) are refined by brightness.
+The registration is known to a few pixels before this step. If the sun has different directions in
+the two images, shading and shadows bias a refinement by brightness. Log-chromaticity hardly depends
+on illumination, so it is used wherever the patch test (by which registrations are accepted)
+confirms its result. Images without colour (a grey camera, snow, asphalt, haze) are refined by
+brightness.
 """
 
 from dataclasses import dataclass, field, replace
@@ -28,37 +29,37 @@ from skyquilt.geometry.transforms import fit, transfer
 from skyquilt.model.registration import Matrix, Picture, RefusedRegistration, Registration
 
 _JUDGED = 256.0
-"""Px of the square whose area pictures have where patches judge, as in `auto`."""
+"""Side in px of the square to whose area images are reduced for the patch test, as in `auto`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RefineRegistration:
-    """Sharpens by colours, or by brightness, as stiffly as two adjusted blocks differ."""
+    """Refines by colour or by brightness. The model is as rigid as the difference between two
+    adjusted blocks.
+    """
 
     side: float = 1000.0
-    """Px of the square whose area the pictures are shrunken to."""
+    """Side in px of the square to whose area the images are reduced."""
     rigid: SubpixelRefinement = field(
         default_factory=lambda: SubpixelRefinement(freedom="similarity", steps=25)
     )
-    """How they are sharpened."""
+    """The refinement."""
     free: SubpixelRefinement | None = None
-    """A freer way, taken where it pays; None where there is none."""
+    """A refinement with more parameters, used if it gains enough; None = none."""
     gain: float = 0.02
-    """Relative gain in correlation that the freer way must bring."""
+    """Relative gain in correlation required for it."""
     agree: Agree = field(default_factory=Agree)
-    """What colours must pass."""
+    """The patch test that the result by colour must pass."""
     least_surprise: float = 5.0
-    """Agreement below which colours tell nothing."""
+    """Agreement below which the result by colour is not used."""
     reach: float = 0.02
-    """Share of the longer side by which the place may move (RMS): what was believed is right to
-    half of that.
+    """Largest shift (RMS) as a share of the longer side. The accepted registration is right to half
+    of that.
     """
     version: ClassVar[int] = 1
 
     def __call__(self, a: Picture, b: Picture, outcome: Registration) -> Registration:
-        """The registration at its exact place; as it was where the pictures show nothing near
-        it.
-        """
+        """The refined registration; unchanged if no better fit is found near it."""
         pair = both_usable(a, b)
         if isinstance(pair, RefusedRegistration):
             return outcome
@@ -80,8 +81,8 @@ class RefineRegistration:
     def _confirmed(
         self, colours: Orientation | None, other: Usable, start: Matrix
     ) -> tuple[Matrix, float] | None:
-        """Where colours alone put the picture at the resolution of the verdict, and how clearly
-        patches agree on it.
+        """The transform from colours alone at the decision level, and the agreement of the patches
+        with it.
         """
         if colours is None:
             return None
@@ -97,8 +98,8 @@ class RefineRegistration:
     def _fitted(
         self, fields: Orientation, target: Orientation, begin: Matrix, start: Matrix
     ) -> tuple[Fit, SubpixelRefinement] | None:
-        """The place found from `begin`, in px of the target, and the way; None where it lies far
-        from the start.
+        """The transform refined from `begin`, in px of the target, and the refinement used; None if
+        it is far from the start.
         """
         begun = between(fields, target, start)
         found, way = self.rigid(fields, target, between(fields, target, begin)), self.rigid
@@ -129,25 +130,25 @@ def _placed(
 
 
 def stiff(b_H_a: Matrix, shape: tuple[int, int]) -> Matrix:
-    """The similarity (3, 3) nearest to a transform over a picture (H, W)."""
+    """The similarity (3, 3) nearest to a transform over an image (H, W)."""
     px = _grid(shape)
     found = fit("similarity", px, transfer(b_H_a, px))
     return b_H_a if found is None else found
 
 
 def _grid(shape: tuple[int, int]) -> np.ndarray:
-    """(25, 2) px spread over a picture (H, W)."""
+    """(25, 2) px distributed over an image (H, W)."""
     x, y = (np.linspace(0, n - 1, 5) for n in (shape[1], shape[0]))
     return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
 
 
 DARK = 1 / 64
-"""Share of the largest value that is added to all: the ratios of black are noise."""
+"""Share of the largest value that is added to all values, since ratios of dark values are noise."""
 
 
 def chromaticity(rgb: NDArray[Any]) -> NDArray[np.float32]:
-    """Logarithms (h, w, 3) of an RGB picture's values, less their mean over the bands: the same for
-    any brightness.
+    """Logarithms (h, w, 3) of an RGB image's values minus their mean over the bands; independent of
+    brightness.
     """
     largest = float(np.iinfo(rgb.dtype).max) if rgb.dtype.kind == "u" else float(np.nanmax(rgb))
     logarithm = np.log(
@@ -157,9 +158,7 @@ def chromaticity(rgb: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def chromatic(picture: Picture, valid: NDArray[np.bool_], side: float) -> Orientation | None:
-    """Fields of a picture's colours, shrunken as `orientation` does; None where it has no
-    colours.
-    """
+    """Fields of an image's colours, reduced as in `orientation`; None if it has no colours."""
     values = picture.values
     if values.ndim != 3 or values.shape[2] != 3:
         return None

@@ -1,8 +1,8 @@
-"""Two cameras on one drone: how one is turned against the other, from pairs taken together.
+"""Relative rotation of two cameras on one drone, from pairs of photos taken at the same time.
 
-Both look from almost the same place, so that a pair's pixels correspond by a rotation alone,
-whatever the ground looks like. Each pair gives one; the rig has one, and pairs that disagree with
-it are wrong.
+Both cameras have almost the same position, so the pixels of a pair correspond by a rotation alone,
+whatever the relief of the ground. Each pair gives a rotation. The rig has a single one, so pairs
+that disagree with it are outliers.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RigPair:
-    """Correspondences of two photos taken together."""
+    """Correspondences of two photos taken at the same time."""
 
     px_a: Array
     """(n, 2) px of the first camera's photo."""
@@ -40,29 +40,29 @@ class Rig:
     b_R_a: Array
     """(3, 3) takes camera coordinates of a to those of b."""
     camera_b: Camera
-    """The second camera, with the focal length that fits best where it was free."""
+    """The second camera, with the estimated focal length if it was free."""
     spread_deg: float
-    """Median angle of the pairs' own rotations from it."""
+    """Median angle between the pairs' own rotations and the common one."""
     agreeing: int
-    """Pairs it rests on."""
+    """Number of pairs used."""
     pairs: int
-    """Pairs that were registered."""
+    """Number of pairs registered."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FindRig:
-    """The rotation most pairs agree on, then one fit to all of those."""
+    """Finds the rotation on which most pairs agree, then fits one to all of these pairs."""
 
     free: float = 0.15
     """Share by which the second focal length may change; 0 = it is known."""
     agree_deg: float = 1.0
-    """Angle from the common rotation up to which a pair agrees."""
+    """Largest angle to the common rotation for a pair to agree."""
     minimum: int = 3
-    """Fewest pairs that must."""
+    """Fewest pairs that must agree."""
     version: ClassVar[int] = 1
 
     def __call__(self, pairs: Sequence[RigPair], camera_b: Camera) -> Rig | RefusedRegistration:
-        """The rig, or why there is none."""
+        """The rig, or the reason why there is none."""
         if len(pairs) < self.minimum:
             return RefusedRegistration(
                 reason=f"{len(pairs)} pairs taken together could be registered, and {self.minimum}"
@@ -89,7 +89,7 @@ class FindRig:
         )
 
     def _focal(self, pairs: Sequence[RigPair], camera_b: Camera) -> Camera:
-        """The camera whose focal length makes the pairs' directions congruent, in the median over
+        """The camera with the focal length that minimises the median misfit of directions over the
         pairs.
         """
 
@@ -116,6 +116,6 @@ def _rotation(pairs: Sequence[RigPair], camera_b: Camera) -> Array:
 
 
 def _misfit(pair: RigPair, camera_b: Camera) -> float:
-    """RMS angle in radians between turned and seen directions of one pair."""
+    """RMS angle in radians between rotated and observed directions of one pair."""
     a, b = _unit(pair.camera_a, pair.px_a), _unit(camera_b, pair.px_b)
     return float(np.sqrt(((a @ turning(a, b).T - b) ** 2).sum(1).mean()))

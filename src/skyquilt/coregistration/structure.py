@@ -1,4 +1,4 @@
-"""Registration by a structure descriptor, verified like everything else by agreement of patches."""
+"""Registration by a structure descriptor, verified by the agreement of patches."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -21,12 +21,12 @@ Estimator = Callable[[NDArray[Any], NDArray[Any]], Estimate | NoEstimate]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Proposal:
-    """What matches say, not yet verified."""
+    """A transform from matches, not verified yet."""
 
     b_H_a: Matrix | None
-    """(3, 3) in px of the pictures; None where matches agree on nothing."""
+    """(3, 3) in px of the images; None if the matches do not fit a common transform."""
     matches: int
-    """How many there were."""
+    """Number of matches."""
     reason: str = ""
     """Why there is no transform."""
 
@@ -36,17 +36,17 @@ class StructureMatches:
     """Phase congruency, maximum index map, mutual matches, one similarity."""
 
     estimate: Estimator
-    """A similarity from matches (n, 2), or none."""
+    """Estimator of a similarity from matches (n, 2)."""
     count: int = 1500
-    """Most keypoints of a picture."""
+    """Largest number of keypoints per image."""
     patch: int = 72
-    """Px of a descriptor's patch, a multiple of 6."""
+    """Side in px of a descriptor's patch, a multiple of 6."""
     side: float = 320.0
-    """Px of the square whose area the pictures are shrunken to."""
+    """Side in px of the square to whose area the images are reduced."""
     version: ClassVar[int] = 1
 
     def __call__(self, a: Usable, b: Usable) -> Proposal:
-        """The transform that most matches agree on."""
+        """The transform on which most matches agree."""
         (fa, full_a), (fb, full_b) = self._features(a), self._features(b)
         in_a, in_b = mutual(fa, fb)
         found = self.estimate(fa.px[in_a], fb.px[in_b])
@@ -56,9 +56,9 @@ class StructureMatches:
         return Proposal(b_H_a=full / full[2, 2], matches=len(in_a))
 
     def _features(self, picture: Usable) -> tuple[IndexFeatures, Matrix]:
-        """Features, and what takes full-size pixels to theirs."""
+        """Features, and the transform from full-size pixels to theirs."""
         grey, valid, small_S_full = shrunken(picture.grey, picture.valid, self.side)
-        # what is no picture gets the mean, whose edge is weaker than that of black or white
+        # invalid pixels get the mean, whose edges are weaker than those of black or white
         filled = np.where(valid, grey, grey[valid].mean() if valid.any() else 0).astype(np.float32)
         return index_features(
             phase(filled), valid, count=self.count, patch=self.patch
@@ -67,20 +67,22 @@ class StructureMatches:
 
 @dataclass(frozen=True, kw_only=True)
 class Structure:
-    """Structure matches, sharpened and verified."""
+    """Structure matches, refined and verified."""
 
     propose: StructureMatches
     """The matches."""
     decide: Decide = field(default_factory=Decide)
-    """The verdict."""
+    """The decision."""
     sides: tuple[float, float] = (160.0, 256.0)
-    """Px of the squares whose areas the pictures are shrunken to: sharpening, verdict."""
+    """Sides in px of the squares to whose areas the images are reduced: for refinement,
+    decision.
+    """
     version: ClassVar[int] = 1
 
     def __call__(
         self, a: Picture, b: Picture, guess: Guess | None = None
     ) -> Registration | RefusedRegistration:
-        """The registration of b to a, or why there is none; a guess is not used."""
+        """The registration of b to a, or the reason why there is none; a guess is not used."""
         pictures = both_usable(a, b)
         if isinstance(pictures, RefusedRegistration):
             return pictures
@@ -94,8 +96,8 @@ class Structure:
 
 
 def sharpened(pyramid: Pyramid, b_H_a: Matrix, level: int) -> Fit:
-    """A transform of the pictures' pixels sharpened at a level, then at the last one, in whose px
-    it is.
+    """Refines a transform of the images' pixels at a level, then at the last level; the result is
+    in px of the last level.
     """
     rough = SubpixelRefinement()(*pyramid.at(level), pyramid.small(b_H_a, level))
     return SubpixelRefinement()(

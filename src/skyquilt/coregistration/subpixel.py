@@ -1,9 +1,8 @@
-"""From a rough place to the exact one: the correlation coefficient of orientation fields,
-maximised.
+"""Subpixel refinement of a transform: maximises the correlation coefficient of orientation fields.
 
-Evangelidis and Psarakis (2008), ECC, forward compositional: the coefficient's own Gauss-Newton
-step, which stays right where the pictures correlate by a tenth only. Fields turn along with the
-picture, so a rotation's derivative has a term of its own.
+Evangelidis and Psarakis (2008), ECC, forward compositional: a Gauss-Newton step derived from the
+coefficient itself, which remains valid even if the correlation of the images is only 0.1.
+Orientations rotate with the image, so the derivative of a rotation has an additional term.
 """
 
 from dataclasses import dataclass
@@ -18,12 +17,14 @@ from skyquilt.model.registration import Matrix
 Freedom = Literal["similarity", "affine", "homography"]
 _TINY = 1e-9
 _LARGEST_GAIN = 20.0
-"""Of the step's own scaling, which is unbounded where there is no correlation."""
+"""Largest scaling of a step; without a limit it would be unbounded where there is no
+correlation.
+"""
 _STILL = 0.02
-"""Px below which a step ends the search."""
+"""The search ends when a step is smaller than this, in px."""
 _PARAMETERS = {"similarity": 4, "affine": 6, "homography": 8}
 _LEAST = 50
-"""Px of overlap below which there is nothing to fit."""
+"""Least overlap in px for a fit."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,30 +32,30 @@ class Fit:
     """A transform and how well it fits."""
 
     b_H_a: Matrix
-    """(3, 3) in px of the resolution."""
+    """(3, 3) in px of the resolution of the fields."""
     correlation: float
     """Coefficient over the overlap, in [-1, 1]."""
     overlap: float
-    """Px of b."""
+    """Overlap in px of b."""
 
     @property
     def score(self) -> float:
-        """Correlation times the root of the overlap: comparable between overlaps."""
+        """Correlation times the root of the overlap: comparable between different overlaps."""
         return self.correlation * float(np.sqrt(self.overlap))
 
 
 @dataclass(frozen=True, kw_only=True)
 class SubpixelRefinement:
-    """Gauss-Newton steps, each accepted only where it raises the correlation."""
+    """Gauss-Newton steps, each accepted only if it increases the correlation."""
 
     freedom: Freedom = "similarity"
-    """What may change."""
+    """Type of the transform."""
     steps: int = 6
-    """Most steps."""
+    """Largest number of steps."""
     version: ClassVar[int] = 1
 
     def __call__(self, a: Orientation, b: Orientation, b_H_a: Matrix) -> Fit:
-        """The best transform near a given one; at worst the given one itself."""
+        """The best transform near a given one; the given one itself if none is better."""
         frame = _Frame.of(b.shape)
         best, fields, valid = _tried(a, b, b_H_a)
         for _ in range(self.steps):
@@ -93,8 +94,8 @@ def _tried(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Frame:
-    """b's pixels counted from its middle in units of half its longer side: parameters of like
-    size.
+    """b's pixels relative to its middle in units of half its longer side, so that parameters have
+    similar magnitudes.
     """
 
     x: NDArray[np.float32]
@@ -115,8 +116,8 @@ class _Frame:
         )
 
     def applied(self, p: NDArray[np.float64], freedom: Freedom) -> Matrix:
-        """A small transform of b's frame from its parameters: px of movement, at the middle or at
-        the unit.
+        """A small transform of b's frame from its parameters: shifts in px, at the middle or at
+        unit distance.
         """
         q = np.zeros(6)
         if freedom == "similarity":
@@ -132,7 +133,7 @@ class _Frame:
 def _change(
     fields: Fields, valid: NDArray[np.float32], b: Orientation, frame: _Frame, freedom: Freedom
 ) -> NDArray[np.float64] | None:
-    """The step's parameters; None where the overlap is lost or nothing correlates."""
+    """The step's parameters; None if the overlap is too small or there is no correlation."""
     inside = (valid * b.valid) > 0.5
     if inside.sum() < _LEAST:
         return None
@@ -145,7 +146,7 @@ def _change(
     own, cross = float(w @ w) - Jw @ projected, float(target @ w) - Jb @ projected
     if (
         cross <= 0
-    ):  # the shift alone explains all: Evangelidis and Psarakis's second case, simplified
+    ):  # only the shift explains it: second case of Evangelidis and Psarakis, simplified
         cross = float(target @ w)
     if cross <= 0:
         return None
@@ -161,8 +162,7 @@ def _derivatives(
     np.subtract(fields[2:], fields[:-2], out=gy[1:-1])
     gx, gy, w = gx[inside] / 2, gy[inside] / 2, fields[inside]
     x, y = frame.x[inside][:, None], frame.y[inside][:, None]
-    # by what an orientation's own turning changes the fields, per px of movement at the unit's
-    # distance
+    # change of the fields by the rotation of orientations, per px of shift at unit distance
     turn = np.stack([-w[:, 1], w[:, 0], -2 * w[:, 3], 2 * w[:, 2]], -1) / np.float32(frame.unit)
     J = np.empty((_PARAMETERS[freedom], *w.shape), np.float32)
     np.negative(gx, out=J[0])

@@ -1,4 +1,4 @@
-"""What of a picture can be registered, and whether that is enough."""
+"""The part of an image that can be registered, and whether it is sufficient."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -10,38 +10,41 @@ from numpy.typing import NDArray
 from skyquilt.model.registration import Picture, RefusedRegistration
 
 SHORTEST = 48
-"""Px of the shorter side below which no patch of a picture could confirm its place."""
+"""Least size in px of the shorter side; in smaller images no patch could confirm a registration."""
 NEAR_END = 4
-"""8-bit levels from black or white within which JPEG leaves a frame's colour."""
+"""Largest deviation of a black or white frame from its colour after JPEG compression, in 8-bit
+levels.
+"""
 LEAST_FRAME = 0.002
-"""Share of the picture that a frame takes at least; smaller dark spots at the border are picture.
+"""Least share of the image covered by a frame; smaller dark spots at the border belong to the
+image.
 """
 LEAST_VALID = 0.1
-"""Share of the picture that must be left."""
+"""Least share of the image that must be valid."""
 LEAST_RANGE = 3.0
-"""Levels between the 1st and 99th percentile (8 bits; counts of 16) below which there is no
-contrast.
+"""Least range between the 1st and 99th percentile for an image to have contrast (8-bit levels;
+counts for 16 bits).
 """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Usable:
-    """A picture as one band of real numbers."""
+    """An image as one band of real numbers."""
 
     grey: NDArray[np.float32]
     """(H, W), no gaps: 0 where invalid."""
     valid: NDArray[np.bool_]
-    """(H, W) where there is a picture."""
+    """(H, W) valid pixels."""
     reason: str = ""
-    """Why nothing can be registered with it; empty if something can."""
+    """Why it cannot be registered; empty if it can."""
 
     def __bool__(self) -> bool:
         return not self.reason
 
 
 def usable(picture: Picture) -> Usable:
-    """Brightness and valid part of a picture. A black or white frame, as rotated pictures have, is
-    no picture: its edges would be taken for structure and its shape would betray the rotation.
+    """Brightness and valid part of an image. A black or white frame, as in rotated images, is
+    excluded: its edges would be matched as structure, and its shape would reveal the rotation.
     """
     band = _one_band(picture.values)
     finite = np.isfinite(band)
@@ -60,7 +63,7 @@ def _one_band(values: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def _frame(grey: NDArray[np.float32], given: NDArray[np.bool_], slack: float) -> NDArray[np.bool_]:
-    """Regions at the darkest or brightest value that touch the border of what is given."""
+    """Regions with the darkest or brightest value that touch the border of the given pixels."""
     frame = np.zeros(grey.shape, bool)
     if not given.any():
         return frame
@@ -78,12 +81,12 @@ def _frame(grey: NDArray[np.float32], given: NDArray[np.bool_], slack: float) ->
 def _reason(grey: NDArray[np.float32], valid: NDArray[np.bool_]) -> str:
     height, width = grey.shape
     if min(height, width) < SHORTEST:
-        return f"has only {width} x {height} px, and {SHORTEST} a side are needed"
+        return f"has only {width} x {height} px, and {SHORTEST} per side are needed"
     share = float(valid.mean())
     if share < LEAST_VALID:
         return (
-            f"is blank or saturated: {1 - share:.0%} of it is black, white or without measurement,"
-            f" and {LEAST_VALID:.0%} must be picture"
+            f"is blank or saturated: {1 - share:.0%} of it is black, white or without data,"
+            f" and {LEAST_VALID:.0%} must be valid"
         )
     low, high = np.percentile(grey[valid], [1, 99])
     if high - low < LEAST_RANGE * _unit(grey):
@@ -92,12 +95,12 @@ def _reason(grey: NDArray[np.float32], valid: NDArray[np.bool_]) -> str:
 
 
 def _unit(grey: NDArray[np.float32]) -> float:
-    """1 for levels and counts; a twentieth for measured values of finer steps, such as degrees."""
+    """1 for levels and counts; 0.05 for measured values with finer steps, such as degrees."""
     return 1.0 if np.array_equal(grey[::7, ::7], np.rint(grey[::7, ::7])) else 0.05
 
 
 def both_usable(a: Picture, b: Picture) -> tuple[Usable, Usable] | RefusedRegistration:
-    """Both pictures, or the refusal of the first that shows nothing."""
+    """Both images, or the refusal of the first that cannot be used."""
     pair = usable(a), usable(b)
     for name, one in zip("AB", pair, strict=True):
         if not one:

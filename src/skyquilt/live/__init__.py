@@ -1,10 +1,11 @@
-"""The live story: a map that grows photo by photo (part D of the methods).
+"""The live workflow: a map that grows photo by photo (part D of the methods).
 
-    accept (durable) -> place (metadata) -> draw -> link -> settle -> draw -> close loops in the
+    accept (durable) -> place (metadata) -> draw -> link -> refine -> draw -> adjust blocks in the
     background
 
-`story.LiveMap` is the file to read first. `intake` and `watch` bring photos in; `arriving` and
-`metadata` place them, `refining`, `neighbours`, `linking` and `placing` settle them; `showing` and
-`drawing` keep the tiles; `schedule`, `closing` and `adopting` bundle whole blocks behind the
-scenes; `finish` runs the batch story at the end.
+Start reading at `live_map.LiveMap`. `photo_intake` and `folder_watch` accept photos. `initial_pose`
+and `drone_metadata` place them from their metadata. `neighbours`, `links`, `local_pose` and
+`refinement` refine their poses from tie points. `redraw_queue` and `tile_drawing` keep the tiles up
+to date. `adjustment_schedule`, `background_adjustment` and `apply_adjustment` adjust whole blocks
+in the background. `final_map` runs the batch workflow at the end.
 """

@@ -1,4 +1,4 @@
-"""When a block, or a large part of one, is adjusted as a whole."""
+"""Decides when a block of photos, or a large part of one, is adjusted as a whole."""
 
 import time
 from collections import deque
@@ -14,33 +14,34 @@ from skyquilt.model.camera import Camera
 from skyquilt.workflows.methods import Methods
 
 QUIET_S = 2.0
-"""Without a new photo for so long, a block is bundled however little it has grown."""
+"""If no photo has arrived for this long, a block is adjusted even if it has grown little."""
 KEY = "schedule"
 
 
 @dataclass(kw_only=True)
 class Schedule:
-    """What it is decided by: written down with whatever changes it, so that a restart decides the
-    same.
+    """The state on which the decision depends. It is stored in the same transaction as each change
+    to it, so that a restart decides the same.
     """
 
     closed_at: dict[int, int] = field(default_factory=dict)
-    """Photos that a block had when it was last adjusted as a whole, by its name."""
+    """Number of photos that each block had when it was last adjusted as a whole, by block name."""
     since: int = 0
-    """Photos refined since."""
+    """Number of photos refined since then."""
     loop: int | None = None
-    """A photo that closed a loop which nothing has adjusted yet."""
+    """A photo that closed a loop which has not been adjusted yet."""
     checked: bool = True
-    """Whether it has been decided on since the last photo was refined; where work is deterministic.
+    """Whether a decision was made since the last photo was refined. Used in deterministic mode
+    only.
     """
     under_way: dict[str, Any] | None = None
-    """What this was when the job in the background began: it counts as not done until its outcome
-    is taken over.
+    """Copy of this state from the start of the background job. After a restart it is used again,
+    since the job counts as not done until its result is applied.
     """
 
     @classmethod
     def read(cls, ledger: Ledger) -> "Schedule":
-        """As it was written last."""
+        """Reads the state that was last stored."""
         found = ledger.meta(KEY) or {}
         closed = {int(k): int(v) for k, v in found.get("closed_at", {}).items()}
         return cls(
@@ -51,7 +52,7 @@ class Schedule:
         )
 
     def write(self, ledger: Ledger) -> None:
-        """Writes it down (inside a transaction)."""
+        """Stores the state (inside a transaction)."""
         record = asdict(self)
         began = record.pop("under_way")
         if began is not None:
@@ -61,23 +62,23 @@ class Schedule:
         ledger.put_meta(KEY, record)
 
     def refined(self, photo: int, *, loop: bool) -> None:
-        """A photo was refined; `loop`: its links close one."""
+        """Notes that a photo was refined; `loop`: whether its links close a loop."""
         self.since, self.checked = self.since + 1, False
         if loop:
             self.loop = photo
 
     def begun(self, block: int, size: int) -> None:
-        """A job over a block of so many photos begins."""
+        """Notes that a job begins on a block of `size` photos."""
         self.under_way = {"since": self.since, "loop": self.loop, "closed_at": dict(self.closed_at)}
         self.closed_at[block], self.since, self.loop = size, 0, None
 
     def ended(self) -> None:
-        """Its outcome is about to be written."""
+        """Notes that the result of the job is about to be stored."""
         self.under_way, self.checked = None, True
 
 
 class Blocks:
-    """Chooses the next job."""
+    """Chooses the next adjustment job."""
 
     def __init__(
         self,
@@ -93,8 +94,8 @@ class Blocks:
         self.last_arrival = time.monotonic()
 
     def due(self, ground: float, *, idle: bool) -> AdjustmentJob | None:
-        """The block, or part of one, that should be adjusted as a whole now; `ground`: its height
-        in m.
+        """The block, or part of a block, that should be adjusted as a whole now; None where none is
+        due. `ground`: height of the ground in m.
         """
         if not self.settings.reposition or self.schedule.since == 0:
             return None
@@ -116,8 +117,8 @@ class Blocks:
         return job
 
     def _root(self) -> int:
-        """A photo of the block: the one that closed a loop, else the newest of the block that has
-        grown most.
+        """A photo of the block to adjust: the one that closed a loop, otherwise the newest photo of
+        the block that has grown most.
         """
         if self.schedule.loop is not None:
             return self.schedule.loop
@@ -130,7 +131,9 @@ class Blocks:
         return max(grown[1])
 
     def _around(self, root: int) -> tuple[list[int], frozenset[int]]:
-        """The photos nearest along links, and the ring of those beyond, which are held."""
+        """The photos that can be reached by the fewest links, and the ring of photos around them,
+        which are held fixed.
+        """
         reached: dict[int, None] = {root: None}
         queue = deque([root])
         while queue and len(reached) < 2 * PART:

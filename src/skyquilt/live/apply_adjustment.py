@@ -1,4 +1,4 @@
-"""The outcome of work on a whole block becomes the map's."""
+"""Applies the result of a block adjustment to the map."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,8 @@ from skyquilt.model.poses import Pose
 
 
 class ApplyAdjustment:
-    """New poses of a block; what was placed meanwhile follows its neighbours and is settled
-    again.
+    """Stores the new poses of a block. Photos that were placed during the job move with their
+    neighbours and are refined again.
     """
 
     def __init__(self, refinement: Refinement) -> None:
@@ -30,7 +30,7 @@ class ApplyAdjustment:
         )
 
     def apply(self, done: BlockAdjustment) -> Update:
-        """Takes it over, in one transaction."""
+        """Applies the result in one transaction."""
         if not done.poses:
             return self._failed(done.problem)
         before = {i: self.members.by_id[i].pose for i in done.poses}
@@ -49,7 +49,7 @@ class ApplyAdjustment:
             self.schedule.write(self.ledger)
             self.ledger.tell("note", {"text": text})
         hit("block closed")
-        if done.cameras:  # heights and calibrations changed: all of the block looks different
+        if done.cameras:  # heights and calibrations changed: redraw the whole block
             self._show(done)
         return Update(what="closed", moved=tuple(done.poses), text=text)
 
@@ -60,7 +60,7 @@ class ApplyAdjustment:
         return Update(what="noted", text=f"a block could not be adjusted as a whole: {problem}")
 
     def _since(self, done: BlockAdjustment) -> list[Member]:
-        """Photos that have joined the block since the job began; of large blocks, none."""
+        """Photos that have joined the block since the job began; empty for large blocks."""
         block = self.members.block(next(iter(done.poses)))
         if len(block) > CLOSING:
             return []

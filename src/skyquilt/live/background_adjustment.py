@@ -1,8 +1,8 @@
-"""Loops closed behind the scenes: a whole block bundled, or a large part of it settled, in a
-process of its own.
+"""Block adjustment in the background: a whole block, or a large part of it, is adjusted in a
+separate process.
 
-The foreground goes on meanwhile; what it has placed since follows its neighbours when the outcome
-is taken over.
+The main process continues in the meantime. Photos that it places during the job move with their
+neighbours when the result is applied.
 """
 
 from collections.abc import Sequence
@@ -40,12 +40,13 @@ from skyquilt.workflows.photo_features import (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AdjustmentJob:
-    """What to bundle."""
+    """Input of one block adjustment."""
 
     ids: tuple[int, ...]
-    """Photos, ascending."""
+    """Numbers of the photos, ascending."""
     held: frozenset[int]
-    """Of these, the ones that stay; empty = the block is bundled as a whole, calibration included.
+    """Those of `ids` whose poses are held fixed; empty = the whole block is adjusted, including the
+    camera calibration.
     """
     photos: tuple[Photo, ...]
     """Their files."""
@@ -54,43 +55,45 @@ class AdjustmentJob:
     frame: MapFrame
     """The map's frame."""
     poses: dict[int, Pose]
-    """Where they are."""
+    """Current poses."""
     cameras: dict[str, Camera]
-    """Calibrations."""
+    """Camera calibrations, by name."""
     camera_of: dict[int, str]
-    """Names of them."""
+    """Name of each photo's calibration."""
     ground: float
     """Height of the ground in m."""
     folder: Path
-    """The survey's folder: links and features are read from there."""
+    """The survey's folder; links and features are read from it."""
     store: Path
     """The store's folder."""
     methods: Methods
-    """How features were found."""
+    """The methods with which features were found."""
     sweep: bool
-    """Whether heights are swept from the pictures too, as the batch story does it."""
+    """Whether ground heights are also computed from the images by plane sweep, as in the batch
+    workflow.
+    """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BlockAdjustment:
-    """The outcome."""
+    """Result of one block adjustment."""
 
     ids: tuple[int, ...]
     """The photos of the job."""
     poses: dict[int, Pose]
     """New poses."""
     cameras: dict[str, Camera]
-    """New calibrations; none of a part."""
+    """New calibrations; empty if only part of a block was adjusted."""
     camera_of: dict[int, str]
-    """Names of the calibrations of the photos moved."""
+    """Name of the calibration of each moved photo."""
     xyz: NDArray[np.float64]
     """(P, 3) ground points in m."""
     problem: str = ""
-    """Why there is no outcome, where there is none."""
+    """Why there is no result; empty where there is one."""
 
 
 def adjust_block(job: AdjustmentJob) -> BlockAdjustment:
-    """Does the work."""
+    """Runs the adjustment."""
     try:
         ledger = Ledger(job.folder, write=False)
         try:
@@ -115,7 +118,7 @@ def _nothing(ids: tuple[int, ...], problem: str) -> BlockAdjustment:
 def _features(photo: Photo, store: Store, methods: Methods) -> Features:
     looked = store.get("features", features_key(photo, methods.detector))
     if looked is None:
-        raise AlignmentError(f"the features of {photo.name} are gone from the store")
+        raise AlignmentError(f"the features of {photo.name} are missing from the store")
     found: Features = looked.features
     return found
 
@@ -150,7 +153,9 @@ def _whole(
 def _swept(
     done: Alignment, pictures: GreyPictures, job: AdjustmentJob, store: Store
 ) -> NDArray[np.float64]:
-    """(P, 3) the ground as the batch story finds it, at the nodes of its grid below the photos."""
+    """(P, 3) ground points in m: the surface of the batch workflow at the nodes of its grid below
+    the photos.
+    """
     methods = job.methods
     ground = result_of(
         find_ground(
@@ -211,22 +216,24 @@ def _part(
 
 
 class BackgroundAdjustment:
-    """At most one job at a time behind the scenes."""
+    """Runs at most one adjustment job at a time in the background."""
 
     def __init__(self) -> None:
         self._work: Background[BlockAdjustment] | None = None
 
     @property
     def busy(self) -> bool:
-        """Whether a job is under way, or its outcome has not been fetched."""
+        """Whether a job is running, or its result has not been fetched yet."""
         return self._work is not None
 
     def start(self, job: AdjustmentJob) -> None:
-        """Begins a job."""
+        """Starts a job."""
         self._work = Background(adjust_block, job)
 
     def outcome(self) -> BlockAdjustment | None:
-        """The outcome, once there is one; then another job may begin."""
+        """The result of the job; None while it runs. After this returns a result, another job may
+        start.
+        """
         if self._work is None or self._work.busy:
             return None
         done = self._work.outcome()

@@ -1,5 +1,5 @@
-"""Files that were closed after writing, or moved into a folder, as Linux tells it (inotify);
-elsewhere nobody tells.
+"""Reports files that were closed after writing or moved into a folder. Uses inotify, so it works on
+Linux only; on other systems nothing is reported.
 """
 
 import ctypes
@@ -14,12 +14,12 @@ _HEAD = struct.Struct("iIII")
 
 @dataclass(kw_only=True)
 class ClosedFiles:
-    """Of a folder and all below it."""
+    """Watches a folder and all its subfolders for completed files."""
 
     folder: Path
-    """The folder."""
+    """The folder that is watched."""
     told: bool = False
-    """Whether this system tells of closed files at all."""
+    """Whether this system reports closed files."""
     _handle: int = -1
     _folders: dict[int, str] = field(default_factory=dict)
 
@@ -32,7 +32,7 @@ class ClosedFiles:
         self.told = self._handle >= 0 and self._watch(str(self.folder))
 
     def _watch(self, folder: str) -> bool:
-        """Adds a folder and those below it; False where the system takes no more."""
+        """Watches a folder and its subfolders; False if the system refuses more watches."""
         number = self._libc.inotify_add_watch(
             self._handle, os.fsencode(folder), CLOSE_WRITE | MOVED_TO | CREATE
         )
@@ -49,11 +49,10 @@ class ClosedFiles:
         return all(watched)
 
     def look(self) -> tuple[set[str], bool]:
-        """Paths closed since the last look, and whether the whole folder should be looked at
-        besides.
+        """Paths closed since the last call, and whether the whole folder must be scanned as well.
 
-        That is so where a folder has come, whose files may have come before it was watched, and
-        after a flood.
+        A scan is needed after a new subfolder appeared, since files may have arrived before it was
+        watched, and after the queue of events overflowed.
         """
         closed: set[str] = set()
         everything = False
@@ -78,7 +77,7 @@ class ClosedFiles:
             return b""
 
     def close(self) -> None:
-        """No more is told."""
+        """Stops watching."""
         if self._handle >= 0:
             os.close(self._handle)
             self._handle, self.told = -1, False

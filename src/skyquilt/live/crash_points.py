@@ -1,5 +1,5 @@
-"""Names for the moments at which something has just become durable: what crash tests are aimed
-at.
+"""Names for the moments at which data has just become durable. Crash tests end the process at these
+points.
 """
 
 from collections.abc import Callable
@@ -16,17 +16,17 @@ POINTS = (
     "folder seen",
     "published",
 )
-"""All of them, in the order that a photo passes them."""
+"""All crash points, in the order in which a photo passes them."""
 
 
 def _nothing(name: str) -> None:
-    """Nobody is waiting."""
+    """Does nothing: the default outside tests."""
 
 
 watcher: Callable[[str], None] = _nothing
-"""Called with the name of each point that is reached; a test puts its own here."""
+"""Called with the name of each point that is reached. Tests replace it."""
 
 
 def hit(name: str) -> None:
-    """Says that a point is passed."""
+    """Reports that a point was reached."""
     watcher(name)

@@ -1,4 +1,6 @@
-"""Where a photo is by its metadata, corrected by what earlier photos of its source have shown."""
+"""First pose of a photo from its metadata, corrected by the errors found in earlier photos of the
+same source.
+"""
 
 from collections import defaultdict, deque
 from typing import Any
@@ -18,16 +20,16 @@ from skyquilt.model.poses import Pose
 from skyquilt.ortho.height_cells import HeightCells
 
 NOMINAL_M = 50.0
-"""Height above ground where nothing tells it."""
+"""Assumed height above ground in m where the metadata do not contain one."""
 RECENT = 15
-"""Photos of one source by which the next one's metadata are corrected."""
+"""Number of recent photos of one source from which the correction of the next photo is computed."""
 
 
 class Metadata:
-    """First poses, and what settled photos teach about those to come."""
+    """Computes first poses and learns corrections from photos whose poses were refined."""
 
     def __init__(self, members: Members, heights: HeightCells, settings: LiveSettings) -> None:
-        """What was learned before a restart is learned again, in the same order."""
+        """Reads what was learned before a restart, in the same order."""
         self.members, self.heights, self.settings = members, heights, settings
         self._recent: dict[str, deque[tuple[float, float]]] = defaultdict(
             lambda: deque(maxlen=RECENT)
@@ -37,14 +39,14 @@ class Metadata:
             self._remember(member)
 
     def frame_from(self, member: Member) -> bool:
-        """Makes the map's frame from the first photo that knows where it is."""
+        """Defines the map's frame from the first photo that has a position."""
         if self.members.frame is None and member.photo.position is not None:
             self.members.set_frame(choose_frame([member.photo], self.settings.crs))
         return self.members.frame is not None
 
     def first(self, member: Member) -> Pose | None:
-        """A pose from metadata, corrected by what earlier photos of the same source have shown;
-        None without place.
+        """A pose from metadata, corrected by the errors found in earlier photos of the same source;
+        None if the photo has no position.
         """
         prior = member.prior
         if not np.isfinite(prior.map_C[:2]).all():
@@ -65,7 +67,7 @@ class Metadata:
         return Pose(cam_R_map=R, map_C=np.array([prior.map_C[0], prior.map_C[1], z]))
 
     def _corrections(self, member: Member) -> tuple[float, float]:
-        """How far recent photos of the source reported headings (deg) and heights (m) wrongly."""
+        """Error of the headings (deg) and heights (m) that recent photos of the source reported."""
         found = self._recent.get(f"{member.source}|{member.photo.camera_key}")
         if not found:
             return 0.0, np.nan
@@ -79,8 +81,8 @@ class Metadata:
         return (turn if abs(turn) > 10 else 0.0), lift
 
     def learn(self, member: Member) -> None:
-        """Compares what a photo that has just settled reported with where it is; `member.learned`
-        keeps it.
+        """Compares the metadata of a photo with its refined pose; stores the differences in
+        `member.learned`.
         """
         assert member.pose is not None
         yaw, _, _ = angles_from_cam_R_map(member.pose.cam_R_map)
@@ -114,5 +116,7 @@ class Metadata:
         return near if near is not None else float(self.members.ledger.meta("ground", 0.0))
 
     def scatter(self) -> float:
-        """Deviation per axis in m of reported positions as the map has shown it."""
+        """Standard deviation per axis, in m, of reported positions, estimated from the refined
+        photos.
+        """
         return float(np.median(self._misfit)) / 1.18 if len(self._misfit) >= 5 else 0.0

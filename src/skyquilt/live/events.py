@@ -1,5 +1,5 @@
-"""What those who look on are told: each sentence is a row of the ledger, in the transaction of what
-it tells.
+"""Events for viewers. Each event is a row of the ledger, written in the same transaction as the
+change that it reports.
 """
 
 from collections.abc import Iterable
@@ -12,17 +12,17 @@ from skyquilt.live.tile_drawing import Canvas
 from skyquilt.raster.tile_store import Address
 
 MOST_BOXES = 24
-"""Parts that a change of the map is told by."""
+"""Largest number of boxes with which a change of the map is reported."""
 
 
 class MapEvents:
-    """Of photos and of tiles."""
+    """Reports changes of photos and of tiles."""
 
     def __init__(self, members: Members, canvas: Canvas) -> None:
         self.members, self.ledger, self.canvas = members, members.ledger, canvas
 
     def photo(self, member: Member, **more: Any) -> None:
-        """The state of a photo, and `more` of it."""
+        """Reports the state of a photo; `more`: further fields."""
         photo = member.photo
         said = {
             "id": member.id,
@@ -34,7 +34,7 @@ class MapEvents:
         self.ledger.tell("photo", {**said, **more})
 
     def superseded(self, member: Member) -> None:
-        """A preview that has given way."""
+        """Reports that a preview was replaced by the full photo."""
         self.ledger.tell(
             "photo", {"id": member.id, "name": member.photo.name, "state": "superseded"}
         )
@@ -47,8 +47,8 @@ class MapEvents:
         return ring, self.members.lonlat(member.pose.map_C[None, :2])[0]
 
     def tiles(self, addresses: Iterable[Address]) -> None:
-        """Where the map has changed, by layer: as a whole, and by parts, so that the rest need not
-        be fetched again.
+        """Reports where the map has changed, per layer: the overall bounding box, and smaller
+        boxes, so that viewers need not fetch unchanged tiles again.
         """
         by_layer: dict[str, set[Address]] = {}
         for a in addresses:
@@ -70,7 +70,7 @@ class MapEvents:
 
 
 def _gathered(changed: set[Address]) -> set[Address]:
-    """The same ground in few tiles: coarser ones where there are many."""
+    """Covers the same area with few tiles: coarser ones if there are many."""
     while len(changed) > MOST_BOXES:
         changed = {a.parent for a in changed}
     return changed

@@ -1,5 +1,5 @@
-"""The end of a flight: the batch story on the photos that were accepted, from features that are
-there already.
+"""The end of a flight: the batch workflow runs on the accepted photos and reuses the features that
+were already computed.
 """
 
 import os
@@ -17,14 +17,14 @@ from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.mosaic import iter_mosaic
 
 NAMED = "named"
-"""Photos under names that people know, for the final map's files."""
+"""Folder with links to the photos under readable names, for the files of the final map."""
 
 
 def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
-    """Makes `folder/finished`, the batch mosaic; the live map stays as it is.
+    """Makes the batch mosaic in `folder/finished`; the live map is not changed.
 
     Raises:
-        SkyquiltError: as `iter_mosaic`; NoPhotosError where no photo was accepted.
+        SkyquiltError: as `iter_mosaic`; NoPhotosError if no photo was accepted.
     """
     ledger = Ledger(folder, write=False)
     try:
@@ -40,14 +40,14 @@ def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
     wanted = MosaicSettings(
         features=settings.features, crs=settings.crs, thermal_unit=settings.thermal_unit
     )
-    # asked for again after more photos have come, the final map is made anew; what was computed
-    # before is found
+    # if the final map is requested again after more photos have arrived, it is made anew; results
+    # computed before are reused from the store
     yield from iter_mosaic(paths, folder / FINISHED, wanted, overwrite=True)
 
 
 def named(folder: Path, photos: list[tuple[int, str, str]]) -> list[Path]:
-    """Links to accepted photos (number, name, file) whose names are harmless and tell what was
-    sent.
+    """Makes links to accepted photos (number, name, file). The link names are safe as file names
+    and contain the names under which the photos were sent.
     """
     home = folder / NAMED
     shutil.rmtree(home, ignore_errors=True)

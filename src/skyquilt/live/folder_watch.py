@@ -1,4 +1,4 @@
-"""A folder that photos are copied into: each is taken when it is complete."""
+"""Watches a folder into which photos are copied, and accepts each photo when it is complete."""
 
 import os
 import time
@@ -17,20 +17,23 @@ from skyquilt.photos.read import read_photo
 ENDINGS = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
 PARTIAL = (".part", ".partial", ".tmp", ".crdownload", ".filepart")
 QUIET_S = 0.04
-"""A file whose end was not told is taken when it has not grown for so long."""
+"""If the system does not report that a file was closed, the file is taken when it has not grown for
+this time, in s.
+"""
 SCAN_S = 0.05
-"""Between looks at the whole folder where the system does not tell of files that are complete."""
+"""Time in s between scans of the whole folder if the system does not report closed files."""
 SCAN_TOLD_S = 1.0
-"""The same where it does: it does not tell of files that other machines write into a shared folder.
+"""The same if it does. Scans are still needed, since files that other machines write into a shared
+folder are not reported.
 """
 SHARE = 0.02
-"""Of the time that looking may take, however many files there are."""
+"""Largest share of the time that may be spent on scans, however many files there are."""
 PATIENCE_S = 4.0
-"""A file that is cut off is refused when it has not grown for so long; it is looked at again when
+"""A truncated file is refused when it has not grown for this time, in s. It is checked again when
 it changes.
 """
 Stamp = tuple[int, int]
-"""Size and time of change of a file."""
+"""Size and modification time of a file."""
 
 
 @dataclass(kw_only=True)
@@ -38,21 +41,23 @@ class Growing:
     """A file that is not taken yet."""
 
     stamp: Stamp
-    """How it is."""
+    """Its size and modification time."""
     since: float
-    """When it was first seen so, monotonic seconds."""
+    """When it was first seen with this stamp, in monotonic seconds."""
     closed: bool = False
-    """Whether its writer has closed it since."""
+    """Whether it was closed after writing since then."""
 
 
 @dataclass(kw_only=True)
 class Watch:
-    """Looks into a folder and all below it; survives restarts by what the ledger has seen."""
+    """Watches a folder and its subfolders. The ledger stores which files were seen, so that a
+    restart continues.
+    """
 
     folder: Path
     """The folder."""
     intake: Intake
-    """Where photos go."""
+    """Accepts the photos."""
     growing: dict[str, Growing] = field(default_factory=dict)
     """Files that are not taken yet, by path."""
     _due: float = 0.0
@@ -60,21 +65,21 @@ class Watch:
     def __post_init__(self) -> None:
         if not self.folder.is_dir():
             raise UsageError(
-                f"{self.folder} is no folder; make it, or name the one that photos are copied into"
+                f"{self.folder} is not a folder; make it, or name the folder for the photos"
             )
         known = self.intake.ledger.rows("select path, size, mtime from seen")
         self._seen = {str(p): (int(s), int(m)) for p, s, m in known}
         self._closed = ClosedFiles(folder=self.folder)
 
     def look(self) -> Iterator[Accepted | Refused]:
-        """Takes every file that is complete now, in order of names.
+        """Takes every file that is complete now, ordered by name.
 
         Raises:
             OutputError: the disk is full; the file stays and is taken later.
         """
         now = (
             time.monotonic()
-        )  # one moment for all, so that files that came together are taken in order
+        )  # one time for all, so that files that arrived together are taken in order
         self._note(now)
         for key in sorted(self.growing, key=Path):
             known = self.growing[key]
@@ -86,7 +91,7 @@ class Watch:
             yield self._take(Path(key), key, known, reason)
 
     def _note(self, now: float) -> None:
-        """Files that are new or have grown, and those whose writers have closed them."""
+        """Records files that are new or have grown, and files that were closed after writing."""
         closed, everything = self._closed.look()
         for path, stamp in self._candidates(closed, everything=everything, now=now):
             key = str(path)
@@ -115,7 +120,7 @@ class Watch:
     def _candidates(
         self, closed: set[str], *, everything: bool, now: float
     ) -> list[tuple[Path, Stamp | None]]:
-        """Files to look at, with what tells that they have changed; None where they are gone."""
+        """Files to check, with their stamp; None if the file no longer exists."""
         known = {p for p in map(Path, closed | self.growing.keys()) if _photo_name(p.name)}
         if everything or now >= self._due:
             known.update(self._files())
@@ -139,7 +144,7 @@ class Watch:
         if not head:
             return "it is empty (0 bytes)"
         if ending_of(head) is None:
-            return "it is neither JPEG, TIFF nor PNG inside, whatever its name says"
+            return "its content is neither JPEG, TIFF nor PNG"
         photo = read_photo(path)
         return photo.reason if isinstance(photo, RejectedPhoto) else ""
 
@@ -150,7 +155,7 @@ def _photo_name(name: str) -> bool:
 
 
 def _stamp(path: Path) -> Stamp | None:
-    """Size and time of change; None where the file is gone."""
+    """Size and modification time; None if the file no longer exists."""
     try:
         status = path.stat()
     except OSError:

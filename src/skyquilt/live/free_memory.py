@@ -1,7 +1,7 @@
-"""Memory that was freed, given back to the system.
+"""Returns freed memory to the operating system.
 
-A process that lives for hours and makes and drops pictures of all sizes keeps holes between those
-that stay: on the scale of a thousand photos, as much again as it holds.
+A process that runs for hours and allocates and frees images of many sizes fragments its memory:
+after about a thousand photos the unused gaps are as large as the memory in use.
 """
 
 import ctypes
@@ -9,8 +9,8 @@ from contextlib import suppress
 
 
 def give_back() -> None:
-    """Asks the C library to return what it has free (glibc's malloc_trim); other libraries do that
-    by themselves.
+    """Asks the C library to return free memory (malloc_trim of glibc). Other C libraries do that by
+    themselves.
     """
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(ctypes.c_size_t(0))

@@ -1,7 +1,8 @@
-"""Photos accepted for good: a file lies durably in the survey's folder before a row says that it
-was received.
+"""Folder of accepted photos. A file is stored durably in the survey's folder before a row of the
+ledger says that it was received.
 
-Contents name the files; names that senders give are only ever text.
+Files are named by a hash of their content. Names that senders give are kept as text only and never
+used as paths.
 """
 
 import errno
@@ -25,24 +26,24 @@ ENDINGS = {
     b"II+\x00": ".tif",
     b"\x89PNG": ".png",
 }
-"""First bytes of files that may be photos."""
+"""First bytes of the supported file formats, with the file extension."""
 BLOCK = 1 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
 class Arrived:
-    """A file that lies in the survey's folder, not accepted yet."""
+    """A file that was stored in the survey's folder but is not accepted yet."""
 
     path: Path
-    """Where."""
+    """Its path."""
     digest: str
-    """BLAKE2b of its content (hex)."""
+    """BLAKE2b hash of its content (hex)."""
     size: int
-    """Bytes."""
+    """Size in bytes."""
 
 
 def ending_of(head: bytes) -> str | None:
-    """The ending that a file's first bytes deserve; None where it is no photo."""
+    """The file extension that matches a file's first bytes; None if it is not a photo."""
     return next((end for magic, end in ENDINGS.items() if head.startswith(magic)), None)
 
 
@@ -52,8 +53,8 @@ class Inbox:
     def __init__(
         self, ledger: Ledger, folder: Path, *, most_bytes: int = 500_000_000, tidy: bool = True
     ) -> None:
-        """Photos go to `folder`; one file may have at most `most_bytes`. `tidy`: removes what a
-        crash left of some.
+        """Photos are stored in `folder`; one file may have at most `most_bytes`. `tidy`: removes
+        partly written files that a crash left behind.
         """
         self.ledger, self.folder, self.most_bytes = ledger, folder, most_bytes
         try:
@@ -64,8 +65,7 @@ class Inbox:
             raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
 
     def bring(self, blocks: Iterable[bytes]) -> Arrived | None:
-        """Writes a file's bytes durably under the name of their content; None where they are no
-        photo.
+        """Writes a file's bytes durably under the hash of its content; None if it is not a photo.
 
         Raises:
             OutputError: the disk is full, or the file is larger than allowed.
@@ -116,7 +116,7 @@ def _blocks(first: bytes, file: object) -> Iterable[bytes]:
 
 
 def synced(folder: Path) -> None:
-    """Makes names in a folder durable; systems without that promise nothing."""
+    """Makes the names in a folder durable (fsync of the folder), on systems that support it."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

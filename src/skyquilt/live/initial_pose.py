@@ -1,4 +1,4 @@
-"""The first look at a photo: it is on the map by its metadata at once."""
+"""The first step for a photo: its metadata place it on the map at once."""
 
 import json
 from dataclasses import asdict
@@ -16,11 +16,11 @@ from skyquilt.live.update import Update
 from skyquilt.ortho.ground import round_gsd
 
 ABOVE_M = 50.0
-"""Flying height where nothing tells it."""
+"""Assumed flying height in m where the metadata do not contain one."""
 
 
 class InitialPose:
-    """Photos received become photos placed, or photos that wait for a place."""
+    """Places received photos from their metadata; photos without a position wait."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class InitialPose:
         self.ledger = metadata.members.ledger
 
     def place(self, member: Member) -> Update:
-        """Places the photo, which heads the queue of those received."""
+        """Places the photo, which is the first in the queue of received photos."""
         if self.metadata.frame_from(member) and self.canvas.gsd == 0:
             self._begin(member)
         preview = self._preview(member)
@@ -64,14 +64,14 @@ class InitialPose:
         return Update(what=member.state, photo=member.id)
 
     def _preview(self, member: Member) -> Member | None:
-        """The smaller picture of the same shot that came first."""
+        """The preview of the same shot that arrived before this photo; None if there is none."""
         row = self.ledger.row("select about from photo where id = ?", member.id)
         about = json.loads(row[0]) if row is not None and row[0] else {}
         known = (self.members.by_id[i] for i in about.get("preview", ()) if i in self.members.by_id)
         return next(known, None)
 
     def _begin(self, member: Member) -> None:
-        """The map's frame and pixels, for good."""
+        """Fixes the map's frame and pixel size for the whole survey."""
         prior, photo, frame = member.prior, member.photo, self.members.frame
         assert frame is not None
         takeoff = frame.vertical_datum == "takeoff"

@@ -1,9 +1,9 @@
-"""What a live survey knows, in one transactional file: photos, links, cameras, heights, events,
+"""The ledger: the database of a live survey, with photos, links, cameras, heights, events and
 layers.
 
-SQLite in WAL mode with `synchronous=FULL`: what is committed survives a kill and a power cut, what
-is not is not there at all. One writer (the mapping) and any number of readers, in this process or
-in others.
+SQLite in WAL mode with `synchronous=FULL`: committed data survive a kill and a power cut; an
+uncommitted transaction leaves nothing behind. There is one writer (the mapping) and any number of
+readers, in this process or in others.
 """
 
 import json
@@ -18,9 +18,9 @@ from typing import Any
 from skyquilt.errors import OutputError
 
 NAME = "live.db"
-"""The file in the survey's folder."""
+"""Name of the file in the survey's folder."""
 FORMAT = 1
-"""Of the tables below."""
+"""Version of the tables below."""
 TABLES = """
 create table if not exists meta(key text primary key, value text not null);
 create table if not exists photo(
@@ -48,7 +48,7 @@ create index if not exists link_b on link(b);
 
 
 def connected(path: Path, *, write: bool) -> sqlite3.Connection:
-    """A connection to a database that other threads and processes read while one writes.
+    """A connection to a database that other threads and processes can read while one writes.
 
     Raises:
         OutputError: it cannot be opened.
@@ -72,7 +72,7 @@ def connected(path: Path, *, write: bool) -> sqlite3.Connection:
 
 @contextmanager
 def transaction(db: sqlite3.Connection, path: Path) -> Iterator[None]:
-    """All or nothing.
+    """A transaction: all changes are stored, or none.
 
     Raises:
         OutputError: the disk is full, or the file cannot be written.
@@ -85,8 +85,8 @@ def transaction(db: sqlite3.Connection, path: Path) -> Iterator[None]:
         _rolled_back(db)
         if "full" in str(error) or "disk I/O" in str(error):
             raise OutputError(
-                f"the disk is full: {path} cannot grow. Make room; what was accepted is safe and"
-                " mapping goes on"
+                f"the disk is full: {path} cannot grow. Free some space; accepted photos are"
+                " safe and mapping continues"
             ) from error
         raise OutputError(f"{path} cannot be written: {error}") from error
     except BaseException:
@@ -100,10 +100,10 @@ def _rolled_back(db: sqlite3.Connection) -> None:
 
 
 class Ledger:
-    """The database of one live survey; safe to share between threads."""
+    """The database of one live survey. Can be shared between threads."""
 
     def __init__(self, folder: Path, *, write: bool) -> None:
-        """Opens `folder/live.db`; `write` makes it where it is missing.
+        """Opens `folder/live.db`; with `write` it is created if it is missing.
 
         Raises:
             OutputError: it cannot be opened, or is of another format.
@@ -126,7 +126,7 @@ class Ledger:
 
     @contextmanager
     def change(self) -> Iterator[sqlite3.Connection]:
-        """A transaction; several changes in it become true together or not at all."""
+        """A transaction: the changes inside it are stored together or not at all."""
         with self.lock:
             if self.db.in_transaction:
                 yield self.db
@@ -136,8 +136,8 @@ class Ledger:
 
     @contextmanager
     def lightly(self) -> Iterator[None]:
-        """Changes that a power cut, though no kill, may undo: nothing is promised, so nobody waits
-        for them.
+        """Transactions without waiting for the disk. A power cut may undo them, a kill may not;
+        used for changes that need not be durable.
         """
         with self.lock:
             light = not self.db.in_transaction
@@ -171,7 +171,7 @@ class Ledger:
             db.execute("insert or replace into meta values (?, ?)", (key, json.dumps(value)))
 
     def tell(self, kind: str, body: dict[str, Any]) -> None:
-        """Appends to what viewers follow."""
+        """Appends an event for viewers."""
         with self.change() as db:
             db.execute(
                 "insert into event(at, kind, body) values (?, ?, ?)",
@@ -186,19 +186,19 @@ class Ledger:
         return [(int(n), str(k), str(b)) for n, k, b in found]
 
     def stamp(self) -> int:
-        """A number that changes when another connection has written: far cheaper to ask for than
-        news.
+        """A number that changes when another connection has written. Reading it is much faster than
+        a query for new events.
         """
         with self.lock:
             return int(self.db.execute("pragma data_version").fetchone()[0])
 
     def last_event(self) -> int:
-        """Number of the newest event; 0 where there is none."""
+        """Number of the newest event; 0 if there is none."""
         found = self.row("select max(seq) from event")
         return int(found[0] or 0) if found else 0
 
     def refuse(self, name: str, source: str, reason: str) -> None:
-        """Writes down a file that takes no part, and tells it."""
+        """Records a refused file and reports it as an event."""
         with self.lightly(), self.change() as db:
             db.execute(
                 "insert into refused(name, source, reason, at) values (?, ?, ?, ?)",
@@ -214,7 +214,7 @@ class Ledger:
             db.execute(f"update photo set {names} where id = ?", (*values, photo))
 
     def counts(self) -> dict[str, int]:
-        """Number of photos by state, `refused` among them."""
+        """Number of photos by state, including `refused`."""
         found = {
             str(s): int(n) for s, n in self.rows("select state, count(*) from photo group by state")
         }
@@ -222,7 +222,7 @@ class Ledger:
         return {**found, "refused": int(refused[0]) if refused else 0}
 
     def put_links(self, links: Sequence[tuple[int, int, bytes | None]]) -> None:
-        """Stores links (a < b); None = the pair was tried and does not match."""
+        """Stores links (a < b); None = the pair was compared and does not match."""
         with self.change() as db:
             db.executemany("insert or replace into link values (?, ?, ?)", links)
 

@@ -1,4 +1,4 @@
-"""Features of photos and links between them, as they are found and as they are written down."""
+"""Features of photos and links between photos: computed, stored and read."""
 
 from collections import OrderedDict
 from collections.abc import Collection, Iterable, Sequence
@@ -16,15 +16,15 @@ from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import photo_features
 
 FEATURES_KEPT = 48
-"""Photos whose features stay at hand."""
+"""Number of photos whose features are kept in memory."""
 ENOUGH = 5
-"""Links that hold a new photo; further neighbours are not compared."""
+"""Number of links that are enough for a new photo; further neighbours are not compared."""
 LINKS_KEPT = 1500
-"""Links decoded and at hand, of some kilobytes each."""
+"""Number of decoded links kept in memory, of a few kilobytes each."""
 
 
 class LiveLinks:
-    """Compares photos."""
+    """Finds features and matches pairs of photos."""
 
     def __init__(
         self, members: Members, methods: Methods, store: Store, pixels: PixelCache
@@ -33,11 +33,11 @@ class LiveLinks:
         self._features: OrderedDict[int, Features] = OrderedDict()
 
     def has_features(self, number: int) -> bool:
-        """Whether a photo's features are at hand."""
+        """Whether a photo's features are in memory."""
         return number in self._features
 
     def features(self, number: int) -> Features:
-        """Features of a photo: at hand, from the store, or found now."""
+        """Features of a photo: from memory, from the store, or computed now."""
         if number in self._features:
             self._features.move_to_end(number)
             return self._features[number]
@@ -49,8 +49,8 @@ class LiveLinks:
         return look.features
 
     def compared(self, member: Member, others: Sequence[int]) -> dict[tuple[int, int], Link | None]:
-        """Links to others, one after the other until enough hold; None where a pair does not
-        match.
+        """Links to other photos, compared one after the other until there are enough links; None
+        where a pair does not match.
         """
         own = self.features(member.id)
         found: dict[tuple[int, int], Link | None] = {}
@@ -65,7 +65,9 @@ class LiveLinks:
     def links_among(
         self, ids: Iterable[int], touching: Collection[int] | None = None
     ) -> list[Link]:
-        """Known links between these photos, or only those that hold one of `touching`."""
+        """Stored links between these photos, or only those with at least one photo of
+        `touching`.
+        """
         inside = set(ids)
         ends = inside if touching is None else touching
         pairs = sorted(
@@ -74,7 +76,7 @@ class LiveLinks:
         return [k for a, b in pairs if (k := self.link(a, b)) is not None]
 
     def link(self, a: int, b: int) -> Link | None:
-        """A known link; None where there is none."""
+        """A stored link; None if there is none."""
         for i, j in ((a, b), (b, a)):
             row = self.members.ledger.row("select body from link where a = ? and b = ?", i, j)
             if row is not None and row[0] is not None:
@@ -83,7 +85,7 @@ class LiveLinks:
 
 
 def link_bytes(link: Link) -> bytes:
-    """A link for the ledger."""
+    """A link encoded for the ledger."""
     return encode(
         {
             "a": link.a,
@@ -97,7 +99,7 @@ def link_bytes(link: Link) -> bytes:
 
 @lru_cache(maxsize=LINKS_KEPT)
 def link_from(body: bytes) -> Link:
-    """The link of such bytes; every photo asks for the same links of its surroundings."""
+    """Decodes a link. Cached, since each new photo needs the same links of its surroundings."""
     d = decode(body, {})
     return Link(
         a=d["a"],

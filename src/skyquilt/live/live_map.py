@@ -1,8 +1,8 @@
-"""The live map: photos in any order become a map that is always there, photo by photo.
+"""The live map: photos arrive in any order, and the map is updated with each photo.
 
-Read `LiveMap.work`: one unit of work at a time, the most urgent first. Everything that must survive
-is in the ledger, the tile store and the folder of photos before the next unit begins; a restart
-reads them and goes on.
+Start reading at `LiveMap.work`: it does one unit of work at a time, the most urgent first. Before
+the next unit begins, everything that must survive is in the ledger, the tile store and the folder
+of photos. A restart reads these and continues.
 """
 
 import time
@@ -45,24 +45,28 @@ from skyquilt.workflows.methods import methods_for
 from skyquilt.workflows.photo_features import PhotoFeatures
 
 PHOTOS, TILES, FINISHED = "photos", "tiles.db", "finished"
-"""Where accepted photos, the map's tiles and the final map lie in the survey's folder."""
+"""Names of the accepted photos, the map's tiles and the final map in the survey's folder."""
 STORE = Path(FINISHED) / ".skyquilt" / "store"
 FULL_BYTES = 120_000_000
-"""Full-size photos at hand."""
+"""Bytes of full-size photos kept in memory."""
 TOGETHER = 4
-"""Photos placed before they are drawn, where several wait: they share tiles."""
+"""Number of waiting photos that are placed before they are drawn. Drawing them together is faster,
+since they share tiles.
+"""
 TIDY = 4
-"""Photos after which free memory is given back."""
+"""Freed memory is returned to the system after this number of photos."""
 
 
 class LiveMap:
-    """A survey's folder while it is written; one at a time."""
+    """A live survey, open for writing. Only one process may write to a survey's folder at a
+    time.
+    """
 
     def __init__(self, folder: Path, settings: LiveSettings | None = None) -> None:
-        """Opens the folder, or takes up what an earlier run left.
+        """Opens the folder, or continues an earlier run.
 
         Raises:
-            OutputError: it cannot be written. UsageError: it was begun with other settings.
+            OutputError: it cannot be written. UsageError: it was started with other settings.
         """
         cv2.setNumThreads(1)
         self.folder, self.settings = Path(folder), settings or LiveSettings()
@@ -88,13 +92,13 @@ class LiveMap:
             self.ledger.put_meta("settings", asked)
         elif differing := ", ".join(k for k in asked if known.get(k) != asked[k]):
             raise UsageError(
-                f"{self.folder} was begun with other settings ({differing}); use the same, or"
+                f"{self.folder} was started with other settings ({differing}); use the same, or"
                 " another folder"
             )
 
     def _load(self) -> None:
-        """Everything in memory, from what is durable: after a start, and after a write that
-        failed.
+        """Rebuilds the state in memory from the durable files, at start and after a failed
+        write.
         """
         self.members = Members(self.ledger, self.inbox, self.settings.thermal_unit)
         self.queues = Queues(self.members.by_id.values())
@@ -133,7 +137,7 @@ class LiveMap:
         if isinstance(done, Refused):
             return Update(what="refused", text=f"{done.name}: {done.reason}")
         last = Update(
-            what="noted", photo=done.id, text="it was there already" if done.duplicate else ""
+            what="noted", photo=done.id, text="it was already received" if done.duplicate else ""
         )
         for update in self.drain():
             if update.photo == done.id and update.what != "drawn":
@@ -141,12 +145,12 @@ class LiveMap:
         return last
 
     def drain(self) -> Iterator[Update]:
-        """Works until nothing is left but what background work may bring."""
+        """Works until only the result of background work is outstanding."""
         while (update := self.work()) is not None:
             yield update
 
     def settle(self) -> Iterator[Update]:
-        """Works until nothing is left, loops closed and all."""
+        """Works until nothing is left, including background adjustments."""
         while True:
             yield from self.drain()
             if not self.background.busy:
@@ -156,11 +160,11 @@ class LiveMap:
     # -- working
 
     def work(self) -> Update | None:
-        """The most urgent unit of work; None when there is none.
+        """Does the most urgent unit of work; None if there is none.
 
         Raises:
-            OutputError: the disk is full; nothing accepted is lost, and the same unit is done when
-                there is room.
+            OutputError: the disk is full. No accepted photo is lost, and the same unit is repeated
+                when there is space.
         """
         began = time.perf_counter()
         try:
@@ -187,9 +191,9 @@ class LiveMap:
         )
 
     def _one_by_one(self) -> Update | None:
-        """Each photo is placed, refined, and its block adjusted before the next one is looked at.
+        """Places and refines each photo and adjusts its block before the next photo is processed.
 
-        Poses then follow from the photos and their order alone, whatever happened between them.
+        Poses then depend only on the photos and their order, not on timing.
         """
         if not self.schedule.checked:
             job = self.blocks.due(self.canvas.ground, idle=False)
@@ -209,7 +213,9 @@ class LiveMap:
         return self.initial_pose.place(first)
 
     def _refined(self) -> Update | None:
-        """In two units, so that a photo that comes meanwhile need not wait for both."""
+        """Refines a photo in two units of work, so that a photo that arrives in between need not
+        wait for both.
+        """
         if not self.queues.untried or self.members.frame is None:
             return None
         member = self.queues.untried[0]
@@ -219,8 +225,8 @@ class LiveMap:
         return self.refinement.refine(member)
 
     def _drawn_first(self) -> Update | None:
-        """Who came first is seen first: photos that come while others are drawn are placed after
-        them.
+        """Draws photos in order of arrival: a photo that arrives while others wait to be drawn is
+        placed after them.
         """
         update = self.redraw.draw(self.redraw.urgent) if self.redraw.urgent else None
         self._room = 0 if self.redraw.urgent else TOGETHER
@@ -238,7 +244,7 @@ class LiveMap:
         return None if done is None else self.apply_adjustment.apply(done)
 
     def _behind(self) -> Update | None:
-        """Loops closed and blocks bundled in a process of their own."""
+        """Starts the adjustment of a block in a separate process."""
         if self.background.busy:
             return None
         job = self.blocks.due(self.canvas.ground, idle=True)
@@ -250,7 +256,7 @@ class LiveMap:
         )
 
     def close(self) -> None:
-        """Ends; what is written stays."""
+        """Ends the work; everything written is kept."""
         self.background.stop()
         self.tiles.close()
         self.ledger.close()

@@ -1,4 +1,4 @@
-"""Where a photo is by its links: settled among a bounded number of neighbours."""
+"""The pose of a photo from its links: an adjustment with a bounded number of neighbours."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,31 +19,31 @@ from skyquilt.model.features import Link
 from skyquilt.model.poses import Alignment, Pose
 
 RING = 8
-"""Held photos around those that may move."""
+"""Number of photos held fixed around those that may move."""
 MOVING = 2
-"""Linked photos that settle together with a new one."""
+"""Number of linked photos that are adjusted together with a new one."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Change:
-    """What placing one photo did."""
+    """Result of refining one photo."""
 
     moved: dict[int, Pose]
     """New poses, by photo."""
     cameras: dict[str, Camera]
     """New calibrations."""
     camera_of: dict[int, str]
-    """Calibrations of the photos moved."""
+    """Name of the calibration of each moved photo."""
     links: dict[tuple[int, int], Link | None]
     """Pairs compared; None = they do not match."""
     xyz: NDArray[np.float64]
     """(P, 3) ground points in m."""
     reason: str = ""
-    """Why the photo is not held by links, where it is not."""
+    """Why the links do not determine the photo's pose; empty if they do."""
 
 
 class LocalPose:
-    """Settles single photos; nothing is written."""
+    """Refines the poses of single photos; writes nothing."""
 
     def __init__(
         self,
@@ -59,15 +59,13 @@ class LocalPose:
         self.young = Bundle(per_photo=150, match_observations=None)
 
     def refine(self, member: Member) -> Change:
-        """Compares a photo with its neighbours and settles it among them; nothing is written."""
+        """Compares a photo with its neighbours and adjusts it together with them; writes
+        nothing.
+        """
         links = self.live_links.compared(member, self.neighbours.of(member, member.pose))
         good = {key: k for key, k in links.items() if k is not None}
         if not good:
-            why = (
-                "no neighbour shows the same ground recognisably"
-                if links
-                else "nothing is near it yet"
-            )
+            why = "it matches none of its neighbours" if links else "there is no photo near it yet"
             return Change(
                 moved={}, cameras={}, camera_of={}, links=links, xyz=np.zeros((0, 3)), reason=why
             )
@@ -97,7 +95,7 @@ class LocalPose:
         return self._adjusted_locally(member, links, good)
 
     def _bundled(self, ids: Sequence[int], good: dict[tuple[int, int], Link]) -> Alignment | None:
-        """A small block bundled as a whole."""
+        """Adjusts a small block as a whole."""
         where = {i: k for k, i in enumerate(ids)}
         links = [_renumbered(k, where) for k in [*self.live_links.links_among(ids), *good.values()]]
         members = [self.members.by_id[i] for i in ids]
@@ -119,7 +117,9 @@ class LocalPose:
         links: dict[tuple[int, int], Link | None],
         good: dict[tuple[int, int], Link],
     ) -> Change:
-        """A photo that joins a larger block: its window adjusted, everything around it held."""
+        """Adjusts a photo that joins a larger block together with its neighbours; all photos around
+        them are held fixed.
+        """
         direct = sorted({a for a, _ in good if self.members.by_id[a].pose is not None})
         by_strength = sorted(direct, key=lambda a: (-len(good[a, member.id]), a))
         moving = set(by_strength[:MOVING]) if self.settings.reposition else set()
@@ -152,11 +152,11 @@ class LocalPose:
     def window(
         self, member: Member, ids: Sequence[int], held: frozenset[int], more: Sequence[Link]
     ) -> Window:
-        """A window of these photos; `more` links than those written down."""
+        """The local adjustment of these photos; `more`: links that are not stored yet."""
         where = {i: k for k, i in enumerate(ids)}
         members = [self.members.by_id[i] for i in ids]
         known = {(k.a, k.b) for k in more}
-        free = set(ids) - held  # what links held photos to each other moves nothing
+        free = set(ids) - held  # links between two held photos have no effect
         links = [
             *(k for k in self.live_links.links_among(ids, free) if (k.a, k.b) not in known),
             *more,

@@ -1,4 +1,4 @@
-"""What the mapping holds in memory of each photo, and how that is written down and read again."""
+"""State of each photo in memory, and how it is stored and read."""
 
 import json
 from collections import deque
@@ -28,36 +28,38 @@ class Member:
     id: int
     """Number, in order of acceptance."""
     photo: Photo
-    """What its file says."""
+    """Data read from its file."""
     prior: Prior = field(default_factory=empty_prior)
-    """What its metadata say in the map's frame; nothing until there is a frame."""
+    """Pose priors from its metadata in the map's frame; empty until there is a frame."""
     source: str
-    """Who sent it: a folder, a drone."""
+    """The folder or drone that it came from."""
     state: str
     """received, waiting, placed, refined, superseded or refused."""
     pose: Pose | None = None
-    """Where it is."""
+    """Its pose."""
     camera: str = ""
-    """Name of its calibration."""
+    """Name of its camera calibration."""
     tried: int = 0
-    """Which one it was to be compared with its neighbours, counted from 1; 0 = it has yet to be."""
+    """Position in the order in which photos were compared with their neighbours, counted from 1; 0
+    = not compared yet.
+    """
     again: int = 0
-    """Counts from 1 when a photo without place has met one that it links to and is to be tried
+    """Set to a count from 1 when an unplaced photo links to a new photo and must be compared
     again.
     """
     learned: tuple[float, float, float] | None = None
-    """By how much its metadata were found wrong: heading in degrees, height in m, place in m; NaN =
-    not known.
+    """Errors found in its metadata: heading in degrees, height in m, position in m; NaN = not
+    known.
     """
     links: set[int] = field(default_factory=set)
     """Photos it is linked to."""
 
 
 class Queues:
-    """Photos that are waiting for something."""
+    """Photos that wait for a processing step."""
 
     def __init__(self, members: Iterable[Member]) -> None:
-        """As they would be without a restart in between."""
+        """Restores the queues as they were before a restart."""
         known = list(members)
         self.received = deque(m for m in known if m.state == "received")
         """To be placed by their metadata, in order of acceptance."""
@@ -66,16 +68,16 @@ class Queues:
         """To be compared with their neighbours."""
         lost = [m for m in known if m.state == "waiting" and m.tried]
         self.lost = sorted(lost, key=lambda m: m.tried)
-        """Compared, and without a place still."""
+        """Compared, but still without a pose."""
 
 
 class Members:
-    """All accepted photos, blocks of linked ones, the frame and the cameras; what changes is
-    written by `save`.
+    """All accepted photos, the blocks of linked photos, the frame and the cameras. `save` stores
+    changes.
     """
 
     def __init__(self, ledger: Ledger, inbox: Inbox, thermal_unit: str | None = None) -> None:
-        """Reads what the ledger holds; `thermal_unit` as photos were accepted with."""
+        """Reads the ledger; `thermal_unit`: the unit with which the photos were accepted."""
         self.ledger, self.inbox, self.thermal_unit = ledger, inbox, thermal_unit
         self.by_id: dict[int, Member] = {}
         self.block_of: dict[int, int] = {}
@@ -94,7 +96,7 @@ class Members:
             self.joined(int(a), int(b))
 
     def set_frame(self, frame: MapFrame) -> None:
-        """The map's frame, once and for all."""
+        """Sets the map's frame; it does not change afterwards."""
         self.frame = frame
         self._to_map = Transformer.from_crs(4326, frame.crs, always_xy=True)
         self._to_wgs = Transformer.from_crs(frame.crs, 4326, always_xy=True)
@@ -102,7 +104,7 @@ class Members:
             member.prior = photo_prior(member.photo, frame, self._to_map)
 
     def take_up(self) -> list[Member]:
-        """Photos that were accepted since the last look, in order."""
+        """Photos that were accepted since the last call, in order."""
         query = (
             "select id, name, source, file, state, pose, camera, about from photo where id > ?"
             " order by id"
@@ -134,8 +136,8 @@ class Members:
         return new
 
     def joined(self, a: int, b: int) -> None:
-        """Notes a link; a block is named by its first photo, in whatever order its links were
-        found.
+        """Records a link. A block is named by its first photo, whatever the order in which its
+        links were found.
         """
         if a not in self.by_id or b not in self.by_id:
             return
@@ -149,11 +151,13 @@ class Members:
             self.block_of[i] = one
 
     def block(self, photo: int) -> set[int]:
-        """Photos that hang together with this one."""
+        """All photos that are connected with this one by links."""
         return self.blocks[self.block_of[photo]]
 
     def camera(self, member: Member) -> Camera:
-        """The calibration of a photo: what the map has found, else what the photo says."""
+        """The calibration of a photo: as estimated by the map, otherwise from the photo's
+        metadata.
+        """
         known = self.cameras.get(member.camera) or self.cameras.get(member.photo.camera_key)
         photo = member.photo
         if known is not None:
@@ -167,7 +171,7 @@ class Members:
         return (m for m in self.by_id.values() if m.state in ON_MAP and m.pose is not None)
 
     def save(self, member: Member, **more: Any) -> None:
-        """Writes down where a photo is (inside a transaction of the ledger)."""
+        """Stores the state of a photo (inside a transaction of the ledger)."""
         self.ledger.set_photo(
             member.id,
             state=member.state,
@@ -177,7 +181,7 @@ class Members:
         )
 
     def save_cameras(self, cameras: dict[str, Camera]) -> None:
-        """Keeps calibrations (inside a transaction of the ledger)."""
+        """Stores calibrations (inside a transaction of the ledger)."""
         self.cameras.update(cameras)
         with self.ledger.change() as db:
             for key, camera in cameras.items():
@@ -195,7 +199,7 @@ class Members:
 
 
 def _about(said: dict[str, Any]) -> dict[str, Any]:
-    """The fields of a member that its row holds as JSON."""
+    """The fields of a member that are stored as JSON in its row."""
     learned = said.get("learned")
     return {
         "tried": int(said.get("tried", 0)),
@@ -207,7 +211,7 @@ def _about(said: dict[str, Any]) -> dict[str, Any]:
 
 
 def about_record(member: Member, why: str) -> dict[str, Any]:
-    """What a row holds as JSON of a photo that was compared with its neighbours."""
+    """The JSON record stored in the row of a photo that was compared with its neighbours."""
     learned = None
     if member.learned is not None:
         learned = [v if np.isfinite(v) else None for v in member.learned]
@@ -215,10 +219,10 @@ def about_record(member: Member, why: str) -> dict[str, Any]:
 
 
 def pose_record(pose: Pose) -> dict[str, list[float]]:
-    """A pose for JSON; floats come back bit for bit."""
+    """A pose as JSON record; floats are preserved exactly."""
     return {"R": pose.cam_R_map.ravel().tolist(), "C": pose.map_C.tolist()}
 
 
 def pose_from(record: dict[str, list[float]]) -> Pose:
-    """The pose of such a record."""
+    """Reads a pose from its JSON record."""
     return Pose(cam_R_map=np.array(record["R"]).reshape(3, 3), map_C=np.array(record["C"]))

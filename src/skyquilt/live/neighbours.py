@@ -1,4 +1,4 @@
-"""Which photos a new one is compared with: an index of where they were taken from."""
+"""Chooses the photos with which a new one is compared, by a spatial index of camera positions."""
 
 from collections import defaultdict
 from typing import Any
@@ -12,11 +12,11 @@ from skyquilt.live.settings import NEIGHBOURS
 from skyquilt.model.poses import Pose
 
 CELL_M = 30.0
-"""Side of the cells of the index."""
+"""Side of the cells of the index in m."""
 
 
 class Neighbours:
-    """Photos that have been compared before, by place."""
+    """Spatial index of the photos that were compared before."""
 
     def __init__(self, members: Members, metadata: Metadata) -> None:
         self.members, self.metadata = members, metadata
@@ -27,7 +27,7 @@ class Neighbours:
                 self.indexed(member)
 
     def indexed(self, member: Member) -> None:
-        """Enters a photo that others may be compared with, or moves it."""
+        """Adds a photo to the index, or updates its position."""
         if member.pose is None:
             return
         c, r = np.floor(member.pose.map_C[:2] / CELL_M).astype(int).tolist()
@@ -39,14 +39,14 @@ class Neighbours:
 
     @staticmethod
     def aim(pose: Pose, ground: float) -> NDArray[np.float64]:
-        """Where the middle of a photo lies (2,) in m on a ground of that height."""
+        """Ground point (2,) in m of the centre of a photo, on flat ground of that height."""
         ray = pose.cam_R_map[2]
         drop = (ground - pose.map_C[2]) / min(float(ray[2]), -0.3)
         return np.asarray(pose.map_C[:2] + ray[:2] * drop)
 
     def of(self, member: Member, pose: Pose | None, most: int = NEIGHBOURS) -> list[int]:
-        """Photos of the same spectrum, compared before, nearest first; the latest where nothing
-        tells the place.
+        """Photos of the same spectral band that were compared before, nearest first. If the
+        position is unknown: the latest ones.
         """
         if pose is None:
             return self._latest(member, most)
@@ -72,8 +72,8 @@ class Neighbours:
         return [i for _, i in sorted(found)[:most]]
 
     def _near(self, at: NDArray[Any], reach: float) -> list[int]:
-        """Photos taken from above a square around a place; cameras that look aslant stand beside
-        what they see.
+        """Photos taken from above a square around a ground point. The search reaches beyond the
+        photo's footprint, since oblique cameras are not above the ground that they see.
         """
         rings = int(np.ceil(reach / CELL_M))
         c, r = np.floor(at / CELL_M).astype(int).tolist()

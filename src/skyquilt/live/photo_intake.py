@@ -1,4 +1,4 @@
-"""Photos accepted: checked, durable, told apart from what is there already."""
+"""Accepts photos: checks them, stores them durably and detects duplicates."""
 
 import json
 import re
@@ -18,39 +18,39 @@ from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.photos.read import read_photo
 
 MOST_PIXELS = 400_000_000
-"""Larger pictures are refused before they are decoded."""
+"""Images with more pixels are refused before they are decoded."""
 NAME = 200
-"""Most characters of a name that are kept."""
+"""Largest number of characters of a name that are kept."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Accepted:
-    """A photo that is safe."""
+    """A photo that is stored durably."""
 
     id: int
     """Its number."""
     name: str
     """Its name."""
     duplicate: bool = False
-    """True where its very content was there already."""
+    """True if the same file was received before."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Refused:
-    """A file that is no photo for the map: false in `if`."""
+    """A file that was not accepted. Its truth value is False."""
 
     name: str
     """Its name."""
     reason: str
-    """Why, a phrase."""
+    """The reason, as a phrase."""
 
     def __bool__(self) -> bool:
         return False
 
 
 def shown_name(name: str) -> str:
-    """A name as text to show: last part of any path, no control characters, bounded; never used as
-    a path.
+    """A name for display: the last part of a path, without control characters, of limited length.
+    It is never used as a path.
     """
     last = re.split(r"[\\/]", name)[-1] or "photo"
     text = "".join(c if unicodedata.category(c)[0] != "C" else "?" for c in last)
@@ -58,7 +58,7 @@ def shown_name(name: str) -> str:
 
 
 class Intake:
-    """The one door for photos; safe to use from several threads."""
+    """Accepts all photos, whatever their source. Can be used from several threads."""
 
     def __init__(self, ledger: Ledger, inbox: Inbox, settings: LiveSettings) -> None:
         self.ledger, self.inbox, self.settings = ledger, inbox, settings
@@ -67,7 +67,8 @@ class Intake:
         """Accepts a file's bytes; when this returns `Accepted`, no crash can lose the photo.
 
         Raises:
-            OutputError: the disk is full; nothing was accepted and nothing is lost.
+            OutputError: the disk is full; this photo was not accepted, and no accepted photo is
+            lost.
         """
         name, source = shown_name(name), shown_name(source)
         if self._full():
@@ -76,9 +77,7 @@ class Intake:
             )
         arrived = self.inbox.bring(blocks)
         if arrived is None:
-            return self.refuse(
-                name, source, "it is neither JPEG, TIFF nor PNG inside, whatever its name says"
-            )
+            return self.refuse(name, source, "its content is neither JPEG, TIFF nor PNG")
         return self._enter(arrived, name, source)
 
     def take_file(self, path: Path, source: str) -> Accepted | Refused:
@@ -91,7 +90,7 @@ class Intake:
         return found is not None and found[0] >= self.settings.most_photos
 
     def refuse(self, name: str, source: str, reason: str) -> Refused:
-        """Writes down and tells that a file takes no part."""
+        """Records a refused file and reports it."""
         self.ledger.refuse(name, source, reason)
         return Refused(name=name, reason=reason)
 
@@ -127,7 +126,7 @@ class Intake:
             if larger is not None:
                 _gone(arrived.path)
                 return self.refuse(
-                    name, source, f"it is a smaller copy of {larger}, which is there already"
+                    name, source, f"it is a smaller copy of {larger}, which was already received"
                 )
             cursor = db.execute(
                 "insert into photo(digest, name, source, file, bytes, received, shot, width, state,"
@@ -153,8 +152,8 @@ class Intake:
 
 
 def shot_of(photo: Photo) -> str:
-    """What a preview and the full picture of one shot have in common; of photos without a time,
-    nothing.
+    """A key that a preview and the full photo of one shot share; empty for photos without capture
+    time.
     """
     if photo.time is None or photo.position is None:
         return photo.digest
@@ -169,7 +168,7 @@ def _too_large(photo: Photo) -> str:
     if photo.width * photo.height <= MOST_PIXELS:
         return ""
     return (
-        f"it claims {photo.width} x {photo.height} px, and {MOST_PIXELS // 10**6} megapixels are"
+        f"it has {photo.width} x {photo.height} px, and {MOST_PIXELS // 10**6} megapixels are"
         " the most"
     )
 

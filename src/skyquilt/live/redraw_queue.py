@@ -1,4 +1,4 @@
-"""Which tiles are to be drawn, the most urgent first, and when what was drawn is told."""
+"""Decides which tiles are drawn next, the most urgent first, and when drawn tiles are reported."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -15,18 +15,18 @@ from skyquilt.model.poses import Pose
 from skyquilt.raster.tile_store import Address
 
 DRAWN_AT_ONCE = 12
-"""Tiles drawn in one unit of work; of those of a new photo, twice as many."""
+"""Number of tiles drawn in one unit of work; twice as many for a new photo."""
 NOTED_AT_ONCE = 8
-"""Photos whose places are taken note of in one unit of work."""
+"""Number of moved photos whose tiles are determined in one unit of work."""
 Queue = dict[Address, set[int]]
-"""Tiles to draw, in order, and the photos that have changed on each."""
+"""Tiles to draw, in order, with the photos that have changed on each."""
 
 
 class RedrawQueue:
-    """The map as it should look, against what the tiles show."""
+    """Queues of tiles that differ from the current poses and must be redrawn."""
 
     def __init__(self, members: Members, canvas: Canvas, map_events: MapEvents) -> None:
-        """What is drawn stays, what moved since is drawn."""
+        """Keeps tiles that were drawn before; queues the tiles of photos that have moved since."""
         self.members, self.ledger, self.canvas, self.map_events = (
             members,
             members.ledger,
@@ -57,23 +57,23 @@ class RedrawQueue:
                 _add(self.dirty, addresses, member.id)
 
     def show(self, member: Member) -> None:
-        """A photo has come and is to be seen at once."""
+        """Queues the tiles of a new photo as urgent."""
         self._to_draw.add(member.id)
         _add(self.urgent, self.canvas.place(member, self.members.camera(member)), member.id)
 
     def changed(self, member: Member) -> None:
-        """A photo looks different now, which will be taken note of when there is time."""
+        """Notes that a photo looks different; its tiles are determined later."""
         self._to_draw.add(member.id)
         self.pending[member.id] = None
 
     def moved(self, member: Member) -> None:
-        """A photo has moved; it is drawn again where that shows."""
+        """Notes that a photo has moved; it is drawn again if the change is visible."""
         drawn = self._drawn.get(member.id)
         if drawn is None or self.canvas.moved(member, drawn):
             self.changed(member)
 
     def take_note(self) -> Update:
-        """Finds the tiles that some of the changed photos lie on."""
+        """Finds the tiles of some of the changed photos."""
         some = list(self.pending)[:NOTED_AT_ONCE]
         for number in some:
             member = self.members.by_id[number]
@@ -89,8 +89,8 @@ class RedrawQueue:
         return Update(what="noted")
 
     def _looks_as_drawn(self, number: int) -> bool:
-        """Whether a photo's rim, where poses, lenses and heights show most, lies where it was
-        drawn.
+        """Whether a photo's outline still lies where it was drawn. Changes of pose, lens and
+        heights are largest at the image border.
         """
         rim, drawn = self.canvas.outline(number), self._rims.get(number)
         if rim is None or drawn is None or rim.shape != drawn.shape:
@@ -98,17 +98,19 @@ class RedrawQueue:
         return bool(np.abs(rim - drawn).max() < LEAST_MOVE * self.canvas.gsd)
 
     def gone(self, number: int) -> None:
-        """A photo takes no part any more."""
+        """Removes a photo."""
         _add(self.dirty, self.canvas.remove(number), number)
 
     def draw(self, queue: Queue, rule: str = "") -> Update:
-        """Some of the dirty tiles; when no more are, what was drawn is written down and told."""
+        """Draws some of the queued tiles. When the queue is empty, what was drawn is stored and
+        reported.
+        """
         some = list(queue)[: DRAWN_AT_ONCE * (2 if queue is self.urgent else 1)]
         return self._drawn_some(queue, some, rule)
 
     def draw_moved(self) -> Update:
-        """The same for photos that moved, and soon after, their pictures still at hand, for the
-        other layers.
+        """The same for photos that moved, followed by the newest-on-top layers while their images
+        are still in memory.
         """
         ready = self._newest()
         if len(ready) >= DRAWN_AT_ONCE:
@@ -137,7 +139,7 @@ class RedrawQueue:
         return Update(what="drawn", tiles=tiles)
 
     def _told(self, rule: str) -> int:
-        """The coarser levels, and the news for those who look on."""
+        """Draws the coarser levels and reports the changes to viewers."""
         raised = self.canvas.finish(rule)
         shown = [] if rule else [i for i in self._to_draw if not self._waits(i)]
         with self.ledger.change():
@@ -149,7 +151,7 @@ class RedrawQueue:
         return raised
 
     def _waits(self, number: int) -> bool:
-        """Whether tiles of a photo are still to be drawn."""
+        """Whether tiles of a photo still wait to be drawn."""
         return number in self.pending or any(
             a in self.dirty or a in self.urgent for a in self.canvas.tiles_of(number)
         )

@@ -1,4 +1,4 @@
-"""Photos as small as the growing map needs them."""
+"""Photos reduced to the resolution that the growing map needs."""
 
 from typing import Any
 
@@ -15,23 +15,25 @@ from skyquilt.photos.pixels import Reduction, read_color
 SHARPNESS = 1.2
 """Photo pixels per map pixel, along a side."""
 QUALITY = 95
-"""Of the pictures' files."""
+"""Quality of the stored reduced images."""
 PICTURES_BYTES = 150_000_000
-"""Pictures at hand."""
+"""Bytes of reduced images kept in memory."""
 STAGE = "small"
-"""Where they lie in the store."""
+"""Their kind in the store."""
 
 
 def measured(member: Member) -> bool:
-    """Whether a photo holds measured values, of one band, not a picture."""
+    """Whether a photo contains measured values of one band (such as temperatures) instead of
+    colours.
+    """
     return member.photo.band == "thermal" and bool(member.photo.unit)
 
 
 class SmallPictures:
-    """Pixels by photo, one band or three; they are made once.
+    """Reduced images by photo, with one band or three; each is made once.
 
-    Pictures go through the store: on a large map each is needed again and again, and a small file
-    is read in a quarter of the time of the photo.
+    They are kept in the store: on a large map each is needed many times, and reading a small file
+    takes a quarter of the time of the photo.
     """
 
     def __init__(self, full: PixelCache, members: dict[int, Member], store: Store) -> None:
@@ -40,17 +42,19 @@ class SmallPictures:
         self._at_hand = PixelCache(read=self._read, budget_bytes=PICTURES_BYTES)
 
     def __call__(self, number: int) -> NDArray[Any]:
-        """Pixels (h, w, bands) of a photo whose size was asked for before, read-only."""
+        """Pixels (h, w, bands) of a photo, read-only; `longest` must have been called for it
+        before.
+        """
         return self._at_hand(number)
 
     @property
     def decoded(self) -> int:
-        """How many times a picture was read."""
+        """How many times an image was read."""
         return self._at_hand.decoded
 
     def longest(self, member: Member, gsd: float, ground: float) -> int:
-        """Longest side in px of a photo on a map of that pixel size in m over the ground; the same
-        ever after.
+        """Longest side in px that a photo needs on a map of this pixel size in m over the ground.
+        The first result is kept for later calls.
         """
         if member.id not in self._longest:
             photo, pose = member.photo, member.pose

@@ -1,4 +1,4 @@
-"""The second look at a photo: linked to its neighbours and settled among them."""
+"""The second step for a photo: it is linked to its neighbours and its pose is refined."""
 
 from collections.abc import Iterable
 
@@ -16,14 +16,14 @@ from skyquilt.live.update import Update
 from skyquilt.model.poses import Pose
 
 LOOP = 12
-"""Steps along links beyond which a new link closes a loop."""
+"""A new link closes a loop if its photos were more than this number of links apart."""
 LOST = 2
-"""Photos waiting for links that a photo which settles is compared with."""
+"""Number of photos without links with which a refined photo is compared."""
 
 
 class Refinement:
-    """All that one photo changes becomes true at once: links, poses, heights, what was learned,
-    what is due next.
+    """Refines a photo and stores all its changes in one transaction: links, poses, heights, learned
+    corrections and the adjustment schedule.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class Refinement:
         self._tried = max((m.tried for m in self.members.by_id.values()), default=0)
 
     def refine(self, member: Member) -> Update:
-        """Settles the photo, which heads the queue of those not tried."""
+        """Refines the photo, which is the first in the queue of photos not compared yet."""
         if member.state == "superseded":
             self.queues.untried.popleft()
             return Update(what="noted", photo=member.id)
@@ -85,7 +85,7 @@ class Refinement:
         self.local_pose.neighbours.indexed(member)
 
     def move(self, moved: dict[int, Pose], camera_of: dict[int, str]) -> None:
-        """New poses of photos (inside a transaction of the ledger)."""
+        """Stores new poses of photos (inside a transaction of the ledger)."""
         for i, pose in moved.items():
             member = self.members.by_id[i]
             member.pose, member.camera = pose, camera_of.get(i, member.camera)
@@ -97,8 +97,8 @@ class Refinement:
                 self.redraw.moved(member)
 
     def heights(self, xyz: NDArray[np.float64], *, known: bool, anew: bool = False) -> None:
-        """Takes in ground points (P, 3) (inside a transaction); `known`: they come from calibrated
-        cameras.
+        """Adds ground points (P, 3) in m to the height cells (inside a transaction); `known`: they
+        come from calibrated cameras.
         """
         cells = self.local_pose.metadata.heights
         touched, z = cells.add(xyz, anew=anew)
@@ -113,8 +113,8 @@ class Refinement:
                 self.redraw.canvas.ground = ground
 
     def _distance(self, member: Member, change: Change) -> int:
-        """Steps along known links between the photos that this one links; more than LOOP = it
-        closes a loop.
+        """Number of stored links on the shortest path between the photos that this one is linked
+        to; more than LOOP = it closes a loop.
         """
         ends = [
             i for key, k in change.links.items() if k is not None for i in key if i != member.id
@@ -130,7 +130,7 @@ class Refinement:
         return LOOP + 1
 
     def _found(self, member: Member, change: Change) -> list[Member]:
-        """Photos that wait for links and link to this one, now that it settles."""
+        """Photos without links so far that match this one."""
         if member.id not in change.moved:
             return []
         lost = [m for m in self.queues.lost if m.photo.band == member.photo.band][-LOST:]

@@ -1,5 +1,5 @@
-"""A flight replayed: photos of a simulated or real flight arrive as they would from drones in the
-air.
+"""Replays a flight: photos of a simulated or real flight arrive as they would from flying
+drones.
 """
 
 import time
@@ -23,27 +23,27 @@ from skyquilt.photos.survey import capture_order, read_survey
 PREVIEW = 800
 """Longest side in px of previews."""
 BURST_S = 30.0
-"""How long a burst lasts."""
+"""Duration of a burst in s."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FlySettings:
-    """How photos arrive."""
+    """Settings of a replayed flight."""
 
     rate: float = 1.0
-    """Photos per second, all drones together."""
+    """Photos per second of all drones together."""
     drones: int = 1
-    """Drones among which the flight is shared; each flies its share at the same time."""
+    """Number of drones among which the flight is divided; they fly at the same time."""
     loss: float = 0.0
     """Share of photos that never arrive."""
     reorder: float = 0.0
-    """Share of photos that arrive a few places late."""
+    """Share of photos that arrive a few positions late."""
     previews: bool = False
-    """Whether a small picture of each photo arrives first, the full one some photos later."""
+    """Whether a preview of each photo arrives first, and the full photo some photos later."""
     burst: float | None = None
-    """Photos per second during half a minute in the middle."""
+    """Photos per second during half a minute in the middle of the flight; None = no burst."""
     seed: int = 0
-    """Of losses and order."""
+    """Seed of the random losses and order."""
 
     def __post_init__(self) -> None:
         for name, value, low, high in (
@@ -64,13 +64,13 @@ class Sent:
     name: str
     """Its name."""
     drone: int
-    """Who sent it, from 1."""
+    """Number of the drone that sent it, from 1."""
     preview: bool
-    """Whether it was a small one."""
+    """Whether it was a preview."""
     at_s: float
     """Seconds since take-off."""
     answer: str
-    """What the receiver said."""
+    """Response of the receiver."""
 
 
 def order_of(photos: Sequence[Photo], settings: FlySettings) -> list[tuple[int, Photo, bool]]:
@@ -99,8 +99,8 @@ def fly(folder: Path, to: str, settings: FlySettings, token: str | None = None) 
     """Sends the photos of a folder (or of a simulated flight's `photos` below it) in real time.
 
     Raises:
-        NoPhotosError: there are none. UsageError, OutputError: the receiver is not there, or
-            refuses to write.
+        NoPhotosError: there are none. UsageError, OutputError: the receiver is missing, or cannot
+            write.
     """
     below = folder / "photos"
     survey = read_survey(below if below.is_dir() else folder)
@@ -110,7 +110,7 @@ def fly(folder: Path, to: str, settings: FlySettings, token: str | None = None) 
     web = to.startswith(("http://", "https://"))
     if not web and not Path(to).is_dir():
         raise UsageError(
-            f"{to} is neither a folder nor an address; make the folder that 'skyquilt live' watches"
+            f"{to} is neither a folder nor a URL; make the folder that 'skyquilt live' watches"
         )
     began, due = time.monotonic(), 0.0
     middle = len(arrivals) / settings.rate / 2
@@ -132,7 +132,7 @@ def fly(folder: Path, to: str, settings: FlySettings, token: str | None = None) 
 
 
 def preview_of(path: Path) -> bytes:
-    """A small JPEG of a photo with all its metadata; other formats as they are."""
+    """A small JPEG of a photo with all its metadata; other formats are returned unchanged."""
     data = path.read_bytes()
     if data[:2] != b"\xff\xd8":
         return data
@@ -149,7 +149,7 @@ def preview_of(path: Path) -> bytes:
 
 
 def _copied(folder: Path, name: str, drone: int, data: bytes) -> str:
-    """Written as a camera's card reader does it: the file is there before it is whole."""
+    """Writes the file as a card reader does: it appears under its name before it is complete."""
     target = folder / f"drone-{drone}" / name
     try:
         target.parent.mkdir(exist_ok=True)
@@ -173,7 +173,7 @@ def _posted(url: str, name: str, drone: int, data: bytes, token: str | None) -> 
     except urllib.error.HTTPError as error:
         if error.code in (401, 403, 405):
             raise UsageError(
-                f"{url} takes no photos from here ({error.read().decode(errors='replace')[:200]})"
+                f"{url} accepts no photos from here ({error.read().decode(errors='replace')[:200]})"
             ) from error
         return f"{error.code}"
     except OSError as error:

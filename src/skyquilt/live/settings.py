@@ -1,4 +1,4 @@
-"""What a live map can be asked for."""
+"""Settings of a live map."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,24 +7,28 @@ from skyquilt.errors import UsageError
 from skyquilt.settings import THERMAL_UNITS, one_of
 
 NEIGHBOURS = 8
-"""Most placed photos that a new one is compared with."""
+"""Largest number of placed photos with which a new one is compared."""
 YOUNG = 10
-"""Blocks of at most so many photos are bundled as a whole with every photo that joins."""
+"""Blocks of at most this number of photos are adjusted as a whole with every photo that joins."""
 CLOSING = 150
-"""Blocks of at most so many photos are bundled as a whole in the background; of larger ones a part
-is.
+"""Blocks of at most this number of photos are adjusted as a whole in the background; of larger
+blocks only a part is adjusted.
 """
 PART = 120
-"""Photos that move in such a part."""
+"""Number of photos that may move in such a part."""
 SWEEPING = 60
-"""Blocks of at most so many photos get their heights swept from the pictures when it is quiet."""
+"""For blocks of at most this number of photos, ground heights are computed by plane sweep when no
+photos arrive.
+"""
 GROWTH = 1.3
-"""A block is bundled in the background when it has grown by this factor since."""
+"""A block is adjusted in the background when it has grown by this factor since its last
+adjustment.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LiveSettings:
-    """The defaults are meant to be right."""
+    """Options of a live map. The defaults suit most surveys."""
 
     gsd_cm: float | None = None
     """Ground size of a pixel of the growing map in cm; None = about three times the photos' own."""
@@ -35,19 +39,19 @@ class LiveSettings:
     4.1).
     """
     deterministic: bool = False
-    """Background work at fixed counts of photos and in line, so that equal photos in equal order
-    give equal poses.
+    """Whether background work runs in sequence and after fixed numbers of photos, so that the same
+    photos in the same order give the same poses.
     """
     thermal_unit: str | None = None
-    """One of `THERMAL_UNITS`: what values of single-band TIFFs mean; None = found out, as is
-    whether they are thermal.
+    """One of `THERMAL_UNITS`: the unit of values in single-band TIFFs. None = detected, together
+    with whether they are thermal.
     """
     features: int = 1200
-    """Features per photo, as the batch story takes them."""
+    """Features per photo, as in the batch workflow."""
     most_bytes: int = 500_000_000
     """Largest photo file in bytes."""
     most_photos: int = 100_000
-    """Most photos accepted."""
+    """Largest number of photos accepted."""
 
     def __post_init__(self) -> None:
         if self.thermal_unit is not None:
@@ -62,7 +66,7 @@ class LiveSettings:
                 raise UsageError(f"{name} {value} lies outside {low} to {high}")
 
     def shaping(self) -> dict[str, Any]:
-        """What must stay the same when a survey goes on after a restart."""
+        """The settings that must stay the same when a survey continues after a restart."""
         return {
             "reposition": self.reposition,
             "features": self.features,

@@ -1,5 +1,5 @@
-"""The growing map drawn: a tile is a function of the photos that see it, drawn anew where those
-look different.
+"""Draws the tiles of the growing map. A tile depends only on the photos that cover it, and is
+redrawn where those have changed.
 """
 
 import os
@@ -29,16 +29,17 @@ from skyquilt.ortho.plan import Plan
 from skyquilt.raster.tile_store import SIDE, Address, Tile, TileStore, covering
 
 NEWEST = "-newest"
-"""End of the names of layers that show the newest photo instead of the most vertical view."""
+"""Suffix of the names of layers that show the newest photo instead of the most vertical view."""
 MOST_VIEWS = 24
-"""Photos that a tile is composed from."""
+"""Largest number of photos from which a tile is composed."""
 LEAST_MOVE = 0.6
-"""Map pixels by which a photo must have moved to be drawn again."""
+"""A photo is drawn again if it has moved by more than this number of map pixels."""
 DRAWINGS = 96
-"""Tiles at hand with what they were composed from: where photos change, only their parts are drawn.
+"""Number of tiles kept in memory with their composition, so that only the parts of changed photos
+are redrawn.
 """
 THREADS = min(2, os.cpu_count() or 1)
-"""Tiles drawn side by side."""
+"""Number of tiles drawn in parallel."""
 WHOLE = Window(row=0, column=0, height=SIDE, width=SIDE)
 RULES: dict[str, Blend] = {"": Feather(width_px=2.0), NEWEST: Newest()}
 
@@ -50,16 +51,16 @@ class Drawing:
     plan: Plan
     """Which photos show where on it."""
     composed: Composed
-    """How it looks."""
+    """The composed pixels."""
 
 
 def layer_of(member: Member) -> str:
-    """The layer that shows a photo: one per spectrum."""
+    """The layer that shows a photo: one per spectral band."""
     return member.photo.band
 
 
 class Canvas:
-    """Which photos see which tile, and the tiles themselves."""
+    """The tiles of the map, and which photos cover which tile."""
 
     def __init__(
         self,
@@ -82,7 +83,7 @@ class Canvas:
         self._pictures = SmallPictures(full, members, store)
 
     def place(self, member: Member, camera: Camera) -> set[Address]:
-        """Takes note of where a photo is now; the tiles that may look different."""
+        """Records the pose of a photo; returns the tiles that may look different."""
         assert member.pose is not None
         old = self._seen.get(member.id, ())
         view = self._view(member, camera, member.pose)
@@ -90,7 +91,7 @@ class Canvas:
             return self.remove(member.id)
         low, high = view.footprint.min(0), view.footprint.max(0)
         now = tuple(covering(layer_of(member), 0, self.gsd, (low[0], low[1], high[0], high[1])))
-        if len(now) > 4000:  # a photo that sees the horizon
+        if len(now) > 4000:  # the photo contains the horizon
             return self.remove(member.id)
         for address in old:
             self._by_tile[address].discard(member.id)
@@ -100,7 +101,7 @@ class Canvas:
         return set(old) | set(now)
 
     def remove(self, number: int) -> set[Address]:
-        """Forgets a photo; the tiles that may look different."""
+        """Removes a photo; returns the tiles that may look different."""
         old = self._seen.pop(number, ())
         for address in old:
             self._by_tile[address].discard(number)
@@ -134,7 +135,7 @@ class Canvas:
         )
 
     def surface(self, bounds: Iterable[float]) -> Surface:
-        """Heights over bounds in m."""
+        """Ground heights in m within bounds (m, map frame)."""
         return self.heights.surface(bounds, self.ground)
 
     def tiles_of(self, number: int) -> tuple[Address, ...]:
@@ -147,7 +148,7 @@ class Canvas:
         return None if view is None else view.footprint
 
     def moved(self, member: Member, drawn: Pose) -> bool:
-        """Whether a photo lies so far from where it was drawn that it shows."""
+        """Whether a photo has moved visibly since it was drawn."""
         assert member.pose is not None
         camera = member.photo
         above = max(float(drawn.map_C[2]) - self.ground, 1.0)
@@ -160,7 +161,7 @@ class Canvas:
         return bool(max(shift, turn) > LEAST_MOVE * self.gsd)
 
     def covering(self, x: float, y: float) -> list[int]:
-        """Photos whose footprint holds a point (m, map frame), the most vertical view first."""
+        """Photos whose footprint contains a point (m, map frame), the most vertical view first."""
         found = []
         for layer in {a.layer for a in self._by_tile}:
             for address in covering(layer, 0, self.gsd, (x, y, x, y)):
@@ -170,8 +171,8 @@ class Canvas:
     def draw(self, dirty: Mapping[Address, Collection[int]], rule: str = "") -> list[Address]:
         """Draws tiles of level 0 (addresses of the plain layer) on which these photos have changed.
 
-        A tile stays as it is where none of them shows, before or now. Returns those written;
-        `finish` does the coarser ones.
+        A tile is not changed if none of them was or is visible on it. Returns the tiles written;
+        `finish` draws the coarser levels.
         """
         drawn = list(in_order(lambda a: self._drawn(a, dirty[a], rule), list(dirty), jobs=THREADS))
         for at, drawing, _ in drawn:
@@ -191,9 +192,7 @@ class Canvas:
     def _drawn(
         self, address: Address, changed: Collection[int], rule: str
     ) -> tuple[Address, "Drawing | None", Tile | None]:
-        """The tile's address in its own layer, what it was made from, and how it looks; None = as
-        before.
-        """
+        """The tile's address in its own layer, its composition and its pixels; None = unchanged."""
         at = replace(address, layer=address.layer + rule)
         compose, kept = self._composer(address, RULES[rule]), self._kept.get(at)
         plan = compose.plan(WHOLE, earlier=kept.plan if kept else None) if compose else None
@@ -217,7 +216,7 @@ class Canvas:
             self._kept.popitem(last=False)
 
     def finish(self, rule: str = "") -> int:
-        """Makes the coarser tiles above all that was drawn since; returns how many."""
+        """Draws the coarser tiles above all tiles drawn since the last call; returns how many."""
         changed = {a for a in self._raised if a.layer.endswith(NEWEST) == bool(rule)}
         met = self._met if rule else set[Address]()
         self._raised -= changed
@@ -226,13 +225,13 @@ class Canvas:
         return raised
 
     def owed(self) -> list[Address]:
-        """Tiles (addresses of the plain layer) whose newest-on-top fellows show less than they
-        do.
+        """Tiles (addresses of the plain layer) whose counterparts in the newest-on-top layer are
+        out of date.
         """
         return [replace(a, layer=a.layer.removesuffix(NEWEST)) for a in self.tiles.owed()]
 
     def _composer(self, address: Address, blend: Blend) -> Composer | None:
-        """What a tile is drawn with; None where no photo sees it."""
+        """The composer of a tile; None if no photo covers it."""
         grid = address.grid(self.gsd)
         inside = [
             v

@@ -1,21 +1,21 @@
-"""What one unit of work did."""
+"""Result of one unit of work."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, kw_only=True)
 class Update:
-    """One unit of work done."""
+    """Describes one unit of work that was done."""
 
     what: str
     """placed, waiting, refined, loose, refused, drawn, closed or noted."""
     photo: int | None = None
-    """The photo it was about."""
+    """The photo concerned."""
     moved: tuple[int, ...] = ()
-    """Photos that lie elsewhere now."""
+    """Photos that have moved."""
     tiles: int = 0
     """Tiles written."""
     text: str = ""
-    """A sentence, where there is something to say."""
+    """A message for the user; may be empty."""
     seconds: float = 0.0
-    """Time it took."""
+    """Duration in s."""

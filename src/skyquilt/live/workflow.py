@@ -1,5 +1,5 @@
-"""The live story as events: folders watched, photos mapped, the final map made when it is asked
-for.
+"""The live workflow as events: folders are watched, photos mapped, and the final map made on
+request.
 """
 
 import threading
@@ -17,11 +17,11 @@ from skyquilt.live.update import Update
 from skyquilt.model.event import Event, Note, Result
 
 IDLE_S = 0.01
-"""Between looks when nothing is to be done."""
+"""Pause in s between checks when there is nothing to do."""
 FULL_S = 2.0
-"""Pause when the disk is full."""
+"""Pause in s when the disk is full."""
 STEADY_S = 5.0
-"""With `finish`: no new photo for so long means that the flight is over."""
+"""With `finish`: if no photo arrives for this time in s, the flight is over."""
 
 
 def iter_live(
@@ -31,10 +31,10 @@ def iter_live(
     finish: bool = False,
     stop: threading.Event | None = None,
 ) -> Iterator[Event | Update]:
-    """Maps photos as they come into folders or by other ways into `live`, until `stop`.
+    """Maps photos as they arrive in folders or otherwise in `live`, until `stop`.
 
-    `finish`: ends when no photo has come for some seconds, with the final map. Every pause and
-    refusal is told.
+    `finish`: makes the final map and ends when no photo has arrived for some seconds. Every pause
+    and refusal is reported.
 
     Raises:
         UsageError: a folder is missing.
@@ -71,7 +71,7 @@ def _taken(watches: Sequence[Watch]) -> Iterator[Event]:
 
 
 def _finished(live: LiveMap, settings: LiveSettings) -> Iterator[Event]:
-    """The final map; a failure is told and the live map goes on."""
+    """Makes the final map; a failure is reported and the live map continues."""
     live.ledger.put_meta("finish", "running")
     live.ledger.tell("finish", {"state": "running", "text": "the final map is being made"})
     try:
@@ -81,7 +81,7 @@ def _finished(live: LiveMap, settings: LiveSettings) -> Iterator[Event]:
                 live.ledger.put_meta("finish", "done")
                 live.ledger.tell(
                     "finish",
-                    {"state": "done", "text": "the final map is there, beside the live one"},
+                    {"state": "done", "text": "the final map is ready, beside the live one"},
                 )
     except SkyquiltError as error:
         live.ledger.put_meta("finish", "failed")

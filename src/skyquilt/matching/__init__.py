@@ -1,1 +1,1 @@
-"""What photos have in common: features, candidate pairs, matches, verified links."""
+"""Image matching: features, candidate pairs, matches, verified links."""

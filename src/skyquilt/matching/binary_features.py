@@ -1,4 +1,4 @@
-"""Binary features: ORB and AKAZE as OpenCV has them, spread over the image."""
+"""Binary features: ORB and AKAZE of OpenCV, distributed over the image."""
 
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -15,7 +15,7 @@ from skyquilt.model.features import Features
 def binary_features(
     detector: Any, grey: NDArray[np.uint8], full: tuple[int, int], *, count: int, cells: int
 ) -> Features:
-    """At most `count` keypoints of an OpenCV detector with binary descriptors, spread over the
+    """At most `count` keypoints of an OpenCV detector with binary descriptors, distributed over the
     image (H, W).
     """
     points, found = detector.detectAndCompute(grey, None)
@@ -34,20 +34,20 @@ def binary_features(
 
 @dataclass(frozen=True, kw_only=True)
 class Orb:
-    """Turned corners with 256 compared pairs of pixels."""
+    """ORB: oriented FAST corners, described by 256 comparisons of pixel pairs."""
 
     count: int = 1500
     """Most keypoints kept per photo."""
     longest: int = 1000
     """Longest side in px of the image searched; smaller photos are searched as they are."""
     factor: float = 1.2
-    """From one level of the pyramid to the next."""
+    """Scale factor between levels of the pyramid."""
     levels: int = 8
-    """Of the pyramid."""
+    """Levels of the pyramid."""
     corner: int = 10
-    """FAST's threshold, grey levels of 255."""
+    """Threshold of FAST in grey levels of 255."""
     cells: int = 10
-    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare.
+    """The image is divided into cells x cells; each keeps its strongest keypoints.
     """
     version: ClassVar[int] = 1
 
@@ -71,20 +71,20 @@ class Orb:
 
 @dataclass(frozen=True, kw_only=True)
 class Akaze:
-    """The M-LDB descriptor of 486 bits."""
+    """AKAZE keypoints with the M-LDB descriptor of 486 bits."""
 
     count: int = 1500
     """Most keypoints kept per photo."""
     longest: int = 1000
     """Longest side in px of the image searched; smaller photos are searched as they are."""
     threshold: float = 0.0003
-    """Of the detector's response."""
+    """Threshold of the detector's response."""
     octaves: int = 4
     """Octaves of scale."""
     upright: bool = False
-    """No orientation."""
+    """Whether keypoints have no orientation."""
     cells: int = 10
-    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare.
+    """The image is divided into cells x cells; each keeps its strongest keypoints.
     """
     version: ClassVar[int] = 1
 

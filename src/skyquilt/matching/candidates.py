@@ -1,4 +1,4 @@
-"""Candidate pairs: near neighbours by position, neighbours in time, and look-alikes."""
+"""Candidate pairs: neighbours by position, neighbours in time, and photos of similar content."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -16,13 +16,13 @@ Pair = tuple[int, int]
 class Nearest:
     """Photos whose footprints can overlap by the measured positions.
 
-    Altitudes lie (A2 of the methods), so the footprint is not computed from them here: the caller
-    gives the ground distance within which photos overlap, learnt from links already found, or None
-    to take neighbours only.
+    Altitudes are unreliable (A2 of the methods), so footprints are not computed from them. The
+    caller gives the ground distance within which photos overlap, estimated from links already
+    found, or None to use the number of neighbours only.
     """
 
     neighbours: int = 12
-    """Most neighbours by distance per photo."""
+    """Largest number of nearest photos paired with each photo."""
     version: ClassVar[int] = 1
 
     def __call__(self, map_xy: NDArray[Any], reach_m: float | None = None) -> list[Pair]:
@@ -54,9 +54,11 @@ class Retrieval:
     words: int = 64
     """Size of the vocabulary."""
     neighbours: int = 12
-    """Most similar photos paired with each photo asked about."""
+    """Number of most similar photos paired with each requested photo."""
     exhaustive_below: int = 25
-    """Surveys of fewer photos are paired completely: retrieval could only lose."""
+    """In surveys of fewer photos all pairs are candidates, since retrieval could only lose
+    pairs.
+    """
     sample: int = 400
     """Descriptors per photo, the largest keypoints first."""
     seed: int = 0
@@ -64,7 +66,7 @@ class Retrieval:
     version: ClassVar[int] = 1
 
     def __call__(self, features: list[Features], asked: list[int] | None = None) -> list[Pair]:
-        """Pairs i < j for the photos asked about (all by default)."""
+        """Pairs i < j for the requested photos (all by default)."""
         n = len(features)
         rows = list(range(n)) if asked is None else asked
         if n < self.exhaustive_below:

@@ -1,5 +1,5 @@
-"""What all estimators share: checked points, and the record of a transformation with its
-inliers.
+"""Functions shared by all estimators: checks of the points, and the record of a transformation with
+its inliers.
 """
 
 from typing import Protocol
@@ -15,17 +15,17 @@ Doubles = NDArray[np.float64]
 
 
 class Estimator(Protocol):
-    """What finds a transformation from matches a, b (N, 2) px: `Ransac`, `Lmeds`, `Magsac`,
-    `RansacSte`.
+    """Interface of the estimators of a transformation from matches a, b (N, 2) px: `Ransac`,
+    `Lmeds`, `Magsac`, `RansacSte`.
     """
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> Estimate | NoEstimate:
-        """b_H_a with its inliers, or why there is none."""
+        """b_H_a with its inliers, or the reason why there is none."""
         ...
 
 
 def matched(a: ArrayLike, b: ArrayLike) -> tuple[Doubles, Doubles]:
-    """Both as (N, 2) float; ValueError where they are no matches."""
+    """Both as (N, 2) float; ValueError if they are not matches."""
     pa, pb = np.asarray(a, np.float64), np.asarray(b, np.float64)
     if pa.ndim != 2 or pa.shape[1] != 2 or pa.shape != pb.shape:
         raise ValueError(f"two equal (N, 2) expected, got {pa.shape} and {pb.shape}")
@@ -35,15 +35,15 @@ def matched(a: ArrayLike, b: ArrayLike) -> tuple[Doubles, Doubles]:
 
 
 def too_few(model: str, count: int, minimum: int) -> NoEstimate | None:
-    """Why `count` matches are not enough; None when they are. One more than a model needs can agree
-    at the least.
+    """Why `count` matches are not enough; None if they are. At least one match more than the
+    minimal sample is needed, since the sample itself always agrees.
     """
     least = max(minimum, MINIMAL[model] + 1)
     return NoEstimate(reason=f"too few matches ({count} of {least})") if count < least else None
 
 
 def weak(model: str, count: int, total: int, minimum: int) -> NoEstimate | None:
-    """Why `count` inliers of `total` matches are not enough; None when they are."""
+    """Why `count` inliers of `total` matches are not enough; None if they are."""
     if count >= max(minimum, MINIMAL[model] + 1):
         return None
     return NoEstimate(reason=f"weak inliers ({count} of {total} matches)")
@@ -52,8 +52,8 @@ def weak(model: str, count: int, total: int, minimum: int) -> NoEstimate | None:
 def polished(
     model: str, H: Doubles, a: Doubles, b: Doubles, limit: float, *, rounds: int = 5
 ) -> tuple[Doubles, NDArray[np.bool_]]:
-    """The model fitted to those with a symmetric transfer error below `limit` px^2, again until
-    they stay; and they.
+    """The model fitted to the matches with a symmetric transfer error below `limit` px^2, repeated
+    until these no longer change; and these matches.
     """
     inliers = symmetric_transfer_errors(H, a, b) < limit
     for _ in range(rounds):

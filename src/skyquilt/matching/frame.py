@@ -1,5 +1,5 @@
-"""What estimators that search, then polish, have in common: checks, the search, refusals, the
-record.
+"""Common frame of estimators that search by random samples and then refine: checks, search,
+refusals, record.
 """
 
 from collections.abc import Callable
@@ -20,11 +20,11 @@ from skyquilt.matching.estimate import (
 from skyquilt.matching.search import Found
 
 Search = Callable[[Doubles, Doubles], Found | None]
-"""The best model through random samples of matches a, b (N, 2) px; None when no sample determines
+"""Finds the best model from random samples of matches a, b (N, 2) px; None if no sample determines
 one.
 """
 Finalise = Callable[[NDArray[Any], Doubles, Doubles], tuple[Doubles, float] | NoEstimate]
-"""b_H_a of a search -> the one to polish, and the largest symmetric transfer error of an inlier in
+"""b_H_a of a search -> the one to refine, and the largest symmetric transfer error of an inlier in
 px^2.
 """
 
@@ -39,15 +39,15 @@ def estimated(
     find: Search,
     finalise: Finalise,
 ) -> Estimate | NoEstimate:
-    """b_H_a from matches a, b (N, 2) px by a loss that `find` and `finalise` know, or why there is
-    none.
+    """b_H_a from matches a, b (N, 2) px by the loss of `find` and `finalise`, or the reason why
+    there is none.
     """
     a, b = matched(a, b)
     if (few := too_few(model, len(a), minimum)) is not None:
         return few
     found = find(a, b)
     if found is None:
-        return NoEstimate(reason=f"no {model} passes through the matches")
+        return NoEstimate(reason=f"no {model} fits the matches")
     final = finalise(found.b_H_a, a, b)
     if isinstance(final, NoEstimate):
         return final

@@ -1,4 +1,4 @@
-"""Keypoints spread over the image, so that no corner stays bare."""
+"""Selection of keypoints distributed over the whole image."""
 
 from typing import Any
 
@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 def spread(
     xy: NDArray[Any], response: NDArray[Any], shape: tuple[int, ...], count: int, cells: int
 ) -> NDArray[np.int64]:
-    """Indices of `count` points: round after round the strongest left in every cell of the
-    image.
+    """Indices of `count` points: in each round, the strongest remaining point of every cell of the
+    image is taken.
     """
     if len(xy) <= count:
         return np.arange(len(xy))

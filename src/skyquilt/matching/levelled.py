@@ -1,4 +1,4 @@
-"""Levelled features: those of the dominant plane (Yahyanejad 2013, 4.2.2)."""
+"""Levelled features: the features on the dominant plane (Yahyanejad 2013, 4.2.2)."""
 
 import math
 from dataclasses import dataclass, replace
@@ -15,9 +15,9 @@ from skyquilt.model.estimate import Estimate
 Doubles = NDArray[np.float64]
 
 WORKING_WIDTH = 1500
-"""Image width in px that (4.9) is meant for."""
+"""Image width in px for which (4.9) is defined."""
 SHARE = 0.1
-"""Height variation over flight altitude where nothing is known of either."""
+"""Height variation over flight altitude if either is unknown."""
 _NODES = 200
 """Nodes along the longer side at which a depth map is interpolated."""
 
@@ -27,7 +27,7 @@ def threshold_px(relief_m: float | None, height_m: float | None) -> int:
     least altitude.
     """
     share = SHARE if relief_m is None or height_m is None else relief_m / height_m
-    # 50 * 0.1 is a little more than 5 in binary: it is not to become 6
+    # 50 * 0.1 is slightly more than 5 in binary; the result must not become 6
     return max(1, math.ceil(round(50 * share, 9)))
 
 
@@ -36,38 +36,37 @@ class LevelledFeatures:
     """A transformation from the features of the dominant plane."""
 
     estimate: Estimate
-    """With the level features as its inliers; the former one where too few are level."""
+    """Estimate with the levelled features as its inliers; the former one if there are too few."""
     d_px: Doubles
     """(M, 2) disparity vectors of the former inliers before the removal [(4.8)]."""
     level: NDArray[np.bool_]
-    """(M,) which of them are level."""
+    """(M,) which of them are levelled."""
     eps_px: float
-    """Largest disparity of a level feature, px [(4.9)]."""
+    """Largest disparity of a levelled feature, px [(4.9)]."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
-    """Removes inliers whose disparity after the transformation exceeds eps_d, and fits anew.
+    """Removes inliers whose disparity after the transformation exceeds eps_d, and fits again.
 
-    A fit to all inliers lies between the ground and what stands on it, so that much of the ground
-    would be removed. Disparities are therefore counted from the dominant plane, as the thesis means
-    them: from a fit whose weights fall with the disparity, the faster the closer it gets.
+    A fit to all inliers lies between the ground and the objects on it, so that much of the ground
+    would be removed. Disparities are therefore measured from the dominant plane, as intended in the
+    thesis: from a robust fit whose weights decrease with the disparity, more steeply in each
+    iteration.
     """
 
     relief_m: float | None = None
     """Largest height variation on the ground, m."""
     height_m: float | None = None
-    """Least flight altitude above it, m; where either is None, their quotient is taken as 0.1."""
+    """Least flight altitude above it, m; if either is None, their quotient is taken as 0.1."""
     width: int = WORKING_WIDTH
-    """Width in px of the images that points are given in; eps_d is for 1500 and shrinks with
-    smaller ones.
+    """Width in px of the images in which points are given; eps_d holds for 1500 and is scaled with
+    the width.
     """
     version: ClassVar[int] = 1
 
     def __call__(self, a: Doubles, b: Doubles, estimate: Estimate) -> LevelledFeatures:
-        """From the matches a, b (N, 2) px and the estimate from them, whose inliers are looked
-        at.
-        """
+        """From the matches a, b (N, 2) px and the estimate from them; only its inliers are used."""
         a, b = a[estimate.inliers], b[estimate.inliers]
         eps = max(1.0, threshold_px(self.relief_m, self.height_m) * self.width / WORKING_WIDTH)
         d = disparities(_dominant(estimate, a, b, eps), a, b)
@@ -87,8 +86,8 @@ class Level:
 
 
 def _dominant(estimate: Estimate, a: Doubles, b: Doubles, eps: float) -> Doubles:
-    """b_H_a of the plane that most points lie on: graduated reweighting (Geman and McClure's) down
-    to half of eps.
+    """b_H_a of the plane on which most points lie, by reweighting with a narrowing Geman-McClure
+    loss, down to half of eps.
     """
     H = estimate.b_H_a
     d2 = (disparities(H, a, b) ** 2).sum(1)
@@ -104,9 +103,7 @@ def _dominant(estimate: Estimate, a: Doubles, b: Doubles, eps: float) -> Doubles
 
 
 def disparities(b_H_a: Doubles, a: Doubles, b: Doubles) -> Doubles:
-    """(N, 2) px: from where the transformation expects each point of a to where b has it
-    [(4.8)].
-    """
+    """(N, 2) px: from the transformed position of each point of a to its match in b [(4.8)]."""
     return np.asarray(b - transfer(b_H_a, a))
 
 
@@ -114,10 +111,11 @@ def depth_map(px: Doubles, d_px: Doubles, shape: tuple[int, int]) -> NDArray[np.
     """DM (H, W, 3) in [0, 1] of disparities d_px (M, 2) at px (M, 2): red d_x, green |d|, blue d_y
     [(4.8)].
 
-    Each is scaled from its least to its largest value, 0.5 where all are alike; between points
-    linearly, outside of them as the nearest. All 0.5 where there is no point.
+    Each channel is scaled from its smallest to its largest value; 0.5 if all are equal. Values are
+    interpolated linearly between points and taken from the nearest point outside of them. All 0.5
+    if there are no points.
     """
-    from scipy.interpolate import (  # a tenth of a second that few need
+    from scipy.interpolate import (  # imported here: it takes 0.1 s and is rarely needed
         LinearNDInterpolator,
         NearestNDInterpolator,
     )
@@ -129,7 +127,7 @@ def depth_map(px: Doubles, d_px: Doubles, shape: tuple[int, int]) -> NDArray[np.
     scaled = np.where(span > 0, (values - low) / np.where(span > 0, span, 1), 0.5)
     step = max(1.0, max(shape) / _NODES)
     x, y = (np.arange(int(np.ceil(n / step))) for n in (shape[1], shape[0]))
-    # nodes at the centres of the cells that the enlargement below makes of them
+    # nodes at the centres of the cells that result from the enlargement below
     nodes = np.meshgrid((x + 0.5) * shape[1] / len(x) - 0.5, (y + 0.5) * shape[0] / len(y) - 0.5)
     field = NearestNDInterpolator(px, scaled)(*nodes)
     if len(px) > 3 and np.linalg.matrix_rank(px - px.mean(0), tol=1e-6) == 2:

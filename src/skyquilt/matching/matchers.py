@@ -1,5 +1,5 @@
-"""Putative matches of two photos by their descriptors: mutual nearest neighbours, nearest one way,
-and nearest within a radius of an expected place.
+"""Putative matches of two photos by their descriptors: mutual nearest neighbours, one-way nearest
+neighbours, and nearest neighbours within a radius of a predicted position.
 """
 
 from dataclasses import dataclass, replace
@@ -24,17 +24,17 @@ def similarities(a: Features, b: Features) -> NDArray[np.float32]:
 
 
 def no_matches() -> Matches:
-    """None at all."""
+    """An empty set of matches."""
     return Matches(index_a=np.zeros(0, np.int64), index_b=np.zeros(0, np.int64))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mutual:
-    """Each other's nearest, and clearly nearer than the second nearest."""
+    """Mutual nearest neighbours that are clearly nearer than the second nearest."""
 
     ratio: float = 0.85
-    """Largest distance to the nearest over distance to the second nearest; Hamming's of binary
-    descriptors.
+    """Largest ratio of the distances to the nearest and the second nearest; Hamming distances for
+    binary descriptors.
     """
     version: ClassVar[int] = 3
 
@@ -49,10 +49,10 @@ class Mutual:
         similarity[rows, best] = -1.0
         second = similarity.max(1)
         similarity[rows, best] = first
-        # 1 - s is d^2 / 2 of unit vectors, but twice the distance itself of bits
+        # 1 - s is d^2 / 2 for unit vectors, but proportional to the distance itself for bits
         ratio = self.ratio if a.binary else self.ratio**2
         clear = np.flatnonzero((1 - first) < ratio * (1 - second))
-        # who is nearest the other way round matters for the clear ones only
+        # the nearest in the other direction is needed only for matches that pass the ratio test
         mutual = similarity[:, best[clear]].max(0) <= first[clear]
         kept = clear[mutual]
         return Matches(index_a=kept, index_b=best[kept])
@@ -60,20 +60,21 @@ class Mutual:
 
 @dataclass(frozen=True, kw_only=True)
 class OneWay:
-    """Each feature of a with its nearest in b, where the second nearest is clearly farther [Y
+    """Matches each feature of a with its nearest in b if the second nearest is clearly farther [Y
     5.2.1].
     """
 
     threshold: float = 1.2
-    """A match is kept when this times its squared distance is less than that of the second nearest.
+    """A match is kept if its squared distance times this factor is less than that of the second
+    nearest.
     """
     version: ClassVar[int] = 1
 
     def __call__(self, a: Features, b: Features) -> Matches:
-        """Putative matches of two pictures; several of a may share one of b."""
+        """Putative matches of two images; several features of a may share one of b."""
         if not len(a) or len(b) < 2:
             return no_matches()
-        # of unit vectors, d^2 = 2 (1 - s); of bits, half of that is the share of those that differ
+        # for unit vectors, d^2 = 2 (1 - s); for bits, half of that is the share that differs
         distance = 1 - similarities(a, b)
         best = distance.argmin(1)
         rows = np.arange(len(a))
@@ -85,35 +86,36 @@ class OneWay:
 
 @dataclass(frozen=True, kw_only=True)
 class Guided:
-    """Each other's nearest among those within a radius of the expected place."""
+    """Mutual nearest neighbours among the features within a radius of the predicted position."""
 
     radius_px: float = 100.0
-    """Farthest that a match lies from where it is expected, px of the full photo b."""
+    """Largest distance of a match from its predicted position, in px of the full photo b."""
     share: float = 0.15
-    """The same as a share of a photo's width, see `for_width`: positions err by metres and headings
-    by degrees.
+    """The same as a share of a photo's width, see `for_width`. It allows for errors of metres in
+    positions and of degrees in headings.
     """
     height_m: float | None = None
-    """Height above ground in m by which places are predicted; None = heights above take-off."""
+    """Height above ground in m used for the prediction; None = heights above take-off."""
     ratio: float = 0.9
-    """Largest distance to the nearest over distance to the second nearest within the radius."""
+    """Largest ratio of the distances to the nearest and the second nearest within the radius."""
     distance: float = 0.8
-    """Largest distance of two unit descriptors (0 equal, sqrt 2 unrelated): a circle may hold no
-    second to compare with. Of binary ones, half of it is the largest share of bits that differ.
+    """Largest distance of two unit descriptors (0 equal, sqrt 2 unrelated): needed since the circle
+    may contain no second feature for the ratio test. For binary descriptors, half of it is the
+    largest share of bits that differ.
     """
     version: ClassVar[int] = 2
 
     def for_width(self, width: int) -> "Guided":
-        """The same with a radius that suits photos of this width in px."""
+        """The same with a radius for photos of this width in px."""
         return replace(self, radius_px=self.share * width)
 
     def __call__(self, a: Features, b: Features, predicted: NDArray[np.float64]) -> Matches:
-        """Putative matches; `predicted` (len(a), 2) px of b, NaN where nothing is known, which
-        matches nothing.
+        """Putative matches; `predicted` (len(a), 2) px of b, NaN where it is unknown; such features
+        get no match.
         """
         if predicted.shape != (len(a), 2):
             raise ValueError(
-                f"a place for each of {len(a)} keypoints expected, got {predicted.shape}"
+                f"a position for each of {len(a)} keypoints expected, got {predicted.shape}"
             )
         if not len(a) or not len(b):
             return no_matches()

@@ -16,24 +16,26 @@ from skyquilt.matching.search import search
 
 @dataclass(frozen=True, kw_only=True)
 class Ransac:
-    """The model that most matches agree on; ties and near-ties go to the smaller errors."""
+    """The model with the lowest MSAC cost: the number of inliers decides, then their errors."""
 
     model: Model = "homography"
-    """What is estimated."""
+    """Type of the transformation."""
     threshold_px: float = 3.0
-    """Largest transfer error of an inlier: root mean square of both ways."""
+    """Largest transfer error of an inlier in px: root mean square of both directions."""
     confidence: float = 0.99
-    """That one sample was free of outliers, before the search ends."""
+    """Probability that at least one sample was free of outliers; the search ends when it is
+    reached.
+    """
     max_iterations: int = 5000
-    """Cap of the samples."""
+    """Largest number of samples."""
     minimum: int = 8
     """Fewest inliers of an estimate."""
     seed: int = 0
-    """Of the samples: equal seeds give equal results."""
+    """Seed of the samples; equal seeds give equal results."""
     version: ClassVar[int] = 1
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> Estimate | NoEstimate:
-        """b_H_a from matches a, b (N, 2) px, or why there is none."""
+        """b_H_a from matches a, b (N, 2) px, or the reason why there is none."""
         limit = 2 * self.threshold_px**2
         return estimated(
             "RANSAC",

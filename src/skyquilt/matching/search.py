@@ -1,4 +1,6 @@
-"""The random search that robust estimators share: samples, models, costs, hundreds at a time."""
+"""Random search shared by the robust estimators: samples, models and costs, computed in batches of
+hundreds.
+"""
 
 import math
 from collections.abc import Callable
@@ -16,14 +18,14 @@ _FIRST, _LARGEST = 16, 256
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Found:
-    """The best of a search."""
+    """The best model of a search."""
 
     b_H_a: Doubles
-    """(3, 3)."""
+    """(3, 3) transformation."""
     iterations: int
     """Samples tried."""
     capped: bool
-    """True when more would have been needed."""
+    """True if more samples would have been needed."""
 
 
 def samples(rng: np.random.Generator, total: int, size: int, count: int) -> NDArray[np.int64]:
@@ -31,15 +33,15 @@ def samples(rng: np.random.Generator, total: int, size: int, count: int) -> NDAr
     drawn = np.empty((count, size), np.int64)
     for k in range(size):
         new = rng.integers(total - k, size=count)
-        for earlier in np.sort(drawn[:, :k], axis=1).T:  # the new counts only those not drawn yet
+        for earlier in np.sort(drawn[:, :k], axis=1).T:  # skip indices already drawn
             new += new >= earlier
         drawn[:, k] = new
     return drawn
 
 
 def needed(confidence: float, share: float, size: int, cap: int) -> int:
-    """Samples until one is free of outliers with that confidence, at most cap + 1 [A (10), its
-    exponent S read as (1 - eps)^s].
+    """Number of samples until one is free of outliers with that confidence, at most cap + 1 [A
+    (10), with its exponent S read as (1 - eps)^s].
     """
     clean = share**size
     if clean >= 1:
@@ -60,11 +62,12 @@ def search(
     cap: int,
     seed: int,
 ) -> Found | None:
-    """The model through a random minimal sample with the least cost; None when no sample determines
-    one.
+    """The model with the lowest cost among those from random minimal samples; None if no sample
+    determines one.
 
-    `cost` takes symmetric transfer errors (M, N) px^2 to (M,); `support` those of one model (N,) to
-    its number of inliers, which says how many samples are enough. Equal seeds give equal results.
+    `cost` maps symmetric transfer errors (M, N) px^2 to costs (M,). `support` maps those of one
+    model (N,) to its number of inliers, which determines how many samples are enough. Equal seeds
+    give equal results.
     """
     rng, size = np.random.default_rng(seed), MINIMAL[model]
     best, least, done, wanted, batch = None, np.inf, 0, cap + 1, _FIRST

@@ -1,4 +1,4 @@
-"""SIFT with RootSIFT descriptors, spread over the image."""
+"""SIFT keypoints with RootSIFT descriptors, distributed over the image."""
 
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -14,7 +14,7 @@ from skyquilt.model.features import DESCRIPTOR_UNIT, Features
 
 @dataclass(frozen=True, kw_only=True)
 class Sift:
-    """SIFT (Lowe 2004) on a shrunken image, descriptors as RootSIFT (Arandjelovic and Zisserman
+    """SIFT (Lowe 2004) on a reduced image, with descriptors as RootSIFT (Arandjelovic and Zisserman
     2012).
     """
 
@@ -25,14 +25,15 @@ class Sift:
     contrast: float = 0.015
     """OpenCV's contrast threshold."""
     levels: int = 3
-    """Scale levels per octave; the thesis takes 43 between spectra [Y 5.2.1]."""
+    """Scale levels per octave; the thesis uses 43 for pairs of different spectra [Y 5.2.1]."""
     root: bool = True
     """RootSIFT; False keeps Lowe's descriptors, as the thesis used them."""
     cells: int = 10
-    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare.
+    """The image is divided into cells x cells; each keeps its strongest keypoints, so that they are
+    distributed over the whole image.
     """
     spare: float = 1.2
-    """Keypoints described per keypoint kept: the choice that `spread` has."""
+    """Number of keypoints described per keypoint kept; `spread` selects from them."""
     version: ClassVar[int] = 5
 
     def __call__(self, image: NDArray[Any]) -> Features:
@@ -48,7 +49,7 @@ class Sift:
         to.
         """
         grey = to_grey8(small)
-        # without precise upscaling OpenCV reports every keypoint a quarter pixel down and to the
+        # without precise upscaling, OpenCV reports keypoints a quarter of a pixel too far down and
         # right
         detector = cv2.SIFT.create(
             int(self.spare * self.count),
@@ -72,8 +73,8 @@ class Sift:
 
 
 def _root(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """RootSIFT: L1-normalised, then the square root, which has unit length; 8 bits hold it (see
-    Features).
+    """RootSIFT: L1 normalisation, then the square root, which has unit length. Stored in 8 bits
+    (see Features).
     """
     total = np.maximum(descriptors.sum(1, keepdims=True), 1e-9)
     return np.asarray(

@@ -1,4 +1,6 @@
-"""Verification of a pair: one similarity, loosely, then one epipolar geometry, tightly."""
+"""Verification of a pair: first a similarity with a wide tolerance, then epipolar geometry with a
+narrow one.
+"""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -14,12 +16,12 @@ EPIPOLAR = {"magsac": cv2.USAC_MAGSAC, "ransac": cv2.FM_RANSAC, "lmeds": cv2.FM_
 
 @dataclass(frozen=True, kw_only=True)
 class Verify:
-    """Near-nadir photos of one ground differ by a similarity up to relief and tilt; relief
-    obeys epipolar geometry.
+    """Near-vertical photos of the same ground differ by a similarity, except for relief and tilt;
+    displacements by relief fulfil the epipolar geometry.
     """
 
     similarity_share: float = 0.03
-    """Tolerance of the similarity as a share of the image width: room for relief and tilt."""
+    """Tolerance of the similarity as a share of the image width: it allows for relief and tilt."""
     epipolar: str = "magsac"
     """One of `EPIPOLAR`: the estimator of the epipolar geometry."""
     epipolar_px: float = 1.0
@@ -39,8 +41,8 @@ class Verify:
         matches: Matches,
         width: int,
     ) -> Link | RejectedLink:
-        """The link of photos a and b (indices), or why there is none. `width`: image width in
-        px.
+        """The link of photos a and b (indices), or the reason why there is none. `width`: image
+        width in px.
         """
         if len(matches) < self.minimum:
             return RejectedLink(
@@ -65,7 +67,7 @@ class Verify:
         keep = self._epipolar(pa, pb, keep, max(features_a.scale, features_b.scale))
         if len(keep) < self.minimum:
             return RejectedLink(a=a, b=b, reason=f"weak inliers after epipolar check ({len(keep)})")
-        # image y runs down: conjugate to get the y-up similarity
+        # image y points down: conjugate to get the similarity with y up
         return Link(
             a=a,
             b=b,
@@ -77,7 +79,7 @@ class Verify:
     def _epipolar(
         self, pa: np.ndarray, pb: np.ndarray, keep: np.ndarray, scale: float
     ) -> np.ndarray:
-        """Indices of those in `keep` that agree with one epipolar geometry."""
+        """Indices of the matches in `keep` that agree with one epipolar geometry."""
         try:
             _, inliers = cv2.findFundamentalMat(
                 pa[keep], pb[keep], EPIPOLAR[self.epipolar], self.epipolar_px * scale, 0.999, 1000

@@ -1,1 +1,1 @@
-"""Heights of the ground, and photos drawn on them: the orthomosaic."""
+"""Ground heights and the orthomosaic that is drawn on them."""

@@ -1,5 +1,5 @@
-"""Merge rules: what a map pixel shows where several photos see it. No ghost removal: every
-pixel is some photo's.
+"""Blending methods: how a map pixel is computed where several photos cover it. There is no removal
+of moving objects (ghosts).
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,8 @@ class Layer:
     pixels: NDArray[Any]
     """(h, w, bands)."""
     score: Float
-    """(h, w) squared tangent of the angle off the vertical; infinite where the photo sees nothing.
+    """(h, w) squared tangent of the angle off the vertical; infinite where the photo does not cover
+    the ground.
     """
     centre: tuple[float, float]
     """Camera's plan position in m."""
@@ -33,26 +34,28 @@ class Layer:
 
 
 class Blend(Protocol):
-    """A merge rule."""
+    """Interface of a blending method."""
 
     @property
     def margin(self) -> int:
-        """Pixels beyond the window that the rule must see."""
+        """Pixels beyond the window that the method needs."""
 
     def rank(self, order: Order, score: Float) -> Float:
-        """What decides between photos: the lowest wins. `order`: position in order of capture, of
-        one photo or of each score's.
+        """The rank of photos: the photo with the lowest rank is shown. `order`: position in order
+        of capture, of one photo or for each score.
         """
 
     def reach(self, gsd: float) -> float:
-        """How far, in rank, a photo behind the winner still matters; infinite = all photos do."""
+        """Largest difference in rank from the leading photo with which a photo still contributes;
+        infinite = all photos contribute.
+        """
 
     def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray[Any], NDArray[np.int32]]:
-        """Pixels (h, w, bands) and which photo leads each (h, w), -1 = none."""
+        """Pixels (h, w, bands) and the leading photo of each (h, w), -1 = none."""
 
 
 def leader(layers: Sequence[Layer], ranks: Sequence[Float]) -> NDArray[np.int32]:
-    """Position in `layers` of the lowest finite rank per pixel, -1 where none is."""
+    """Position in `layers` of the lowest finite rank per pixel, -1 = none."""
     best, lead = ranks[0], np.isfinite(ranks[0]).astype(np.int32) - 1
     for position, rank in enumerate(ranks[1:], 1):
         np.copyto(lead, np.int32(position), where=rank < best)
@@ -66,7 +69,7 @@ def _photos(lead: NDArray[np.int32], layers: Sequence[Layer]) -> NDArray[np.int3
 
 
 def _weighted(layers: Sequence[Layer], weights: Sequence[Float]) -> NDArray[Any]:
-    """Sum of pixels by weights that add up to one (zero where no photo sees)."""
+    """Weighted sum of pixels; weights add up to one (zero where there is no photo)."""
     kind = layers[0].pixels.dtype
     total = np.zeros(layers[0].pixels.shape, np.float32)
     for layer, weight in zip(layers, weights, strict=True):
@@ -83,7 +86,7 @@ def _weighted(layers: Sequence[Layer], weights: Sequence[Float]) -> NDArray[Any]
 
 @dataclass(frozen=True, kw_only=True)
 class Feather:
-    """The most vertical view wins; seams are blended over a few pixels."""
+    """Shows the most vertical view; seams are blended over a few pixels."""
 
     width_px: float = 6.0
     """Width of the blend in map pixels; 0 = hard seams."""
@@ -95,12 +98,14 @@ class Feather:
         return score
 
     def reach(self, gsd: float) -> float:
-        """Half the blend's width from the seam of two cameras a height apart."""
+        """The rank difference at half the blend's width from the seam of two cameras one flying
+        height apart.
+        """
         return self.width_px * gsd
 
     def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray[Any], NDArray[np.int32]]:
-        """Ramps across seams, whose distance follows from the ranks: they differ linearly in the
-        plane.
+        """Linear ramps across seams. The distance to a seam follows from the ranks, whose
+        difference is linear in the plane.
         """
         lead = leader(layers, [layer.score for layer in layers])
         hard = _picked(layers, lead)
@@ -111,7 +116,7 @@ class Feather:
     def _soften(
         self, hard: NDArray[Any], layers: Sequence[Layer], lead: NDArray[np.int32], gsd: float
     ) -> None:
-        """Blends, in place, the few pixels that lie within half a width of a seam."""
+        """Blends, in place, the pixels within half a width of a seam."""
         slopes = _slopes(layers, gsd)
         steepest = slopes.max()
         best, second = layers[0].score, np.full_like(layers[0].score, np.inf)
@@ -122,13 +127,13 @@ class Feather:
         if not len(near):
             return
         s = np.stack([layer.score.ravel()[near] for layer in layers])
-        # no ramp reaches further from the winner than half a width of the seam with it
+        # no ramp reaches further than half a width from the seam with the leading photo
         within = (s < s.min(0) + slopes[:, s.argmin(0)] * np.float32(self.width_px / 2)).sum(0) > 1
         near, s = near[within], s[:, within]
         ramps = np.empty(s.shape, np.float32)
         with np.errstate(invalid="ignore"):
             for k in range(len(layers)):
-                # signed distance in px to the nearest seam: positive where this layer wins
+                # signed distance in px to the nearest seam: positive where this layer leads
                 rows = [(s[j] - s[k]) / slopes[k, j] for j in range(len(layers)) if j != k]
                 ramps[k] = np.clip(0.5 + np.min(rows, axis=0) / self.width_px, 0, 1)
         ramps = np.where(np.isfinite(s), np.nan_to_num(ramps), 0)
@@ -145,7 +150,7 @@ class Feather:
 
 
 def _slopes(layers: Sequence[Layer], gsd: float) -> Float:
-    """(k, k) change of the ranks' difference per px across the seam of two photos."""
+    """(k, k) change of the rank difference per px across the seam of two photos."""
     centre = np.array([layer.centre for layer in layers])
     height = np.array([layer.height for layer in layers])
     apart = np.hypot(*(centre[:, None] - centre).transpose(2, 0, 1))
@@ -157,7 +162,7 @@ def _slopes(layers: Sequence[Layer], gsd: float) -> Float:
 
 
 def _picked(layers: Sequence[Layer], lead: NDArray[np.int32]) -> NDArray[Any]:
-    """Each pixel from its leading layer; zero or NaN where there is none."""
+    """Takes each pixel from its leading layer; zero or NaN where there is none."""
     kind = layers[0].pixels.dtype
     out = np.full(layers[0].pixels.shape, np.nan if kind.kind == "f" else 0, kind)
     for position, layer in enumerate(layers):
@@ -169,7 +174,9 @@ def _picked(layers: Sequence[Layer], lead: NDArray[np.int32]) -> NDArray[Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class First:
-    """The photo taken first wins, hard seams: earlier photos stay, as in the thesis."""
+    """Shows the photo taken first, with hard seams: earlier photos stay on top, as in the
+    thesis.
+    """
 
     margin: ClassVar[int] = 0
     version: ClassVar[int] = 1
@@ -179,11 +186,11 @@ class First:
         return np.where(np.isfinite(score), np.float32(order), np.float32(np.inf))
 
     def reach(self, gsd: float) -> float:
-        """Only the winner matters."""
+        """Zero, since only the leading photo contributes."""
         return 0.0
 
     def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray[Any], NDArray[np.int32]]:
-        """The first layer that sees the pixel; layers come in order of capture."""
+        """Takes each pixel from the first layer that covers it; layers are in order of capture."""
         ranks = [self.rank(k, layer.score) for k, layer in enumerate(layers)]
         lead = leader(layers, ranks)
         return _picked(layers, lead), _photos(lead, layers)
@@ -191,21 +198,21 @@ class First:
 
 @dataclass(frozen=True, kw_only=True)
 class Average:
-    """The mean of all photos that see the pixel, as in Arteaga et al. 2019."""
+    """The mean of all photos that cover the pixel, as in Arteaga et al. 2019."""
 
     margin: ClassVar[int] = 0
     version: ClassVar[int] = 1
 
     def rank(self, order: Order, score: Float) -> Float:
-        """The angle off the vertical decides which photo is named as the source."""
+        """The angle off the vertical; it determines which photo is recorded as the source."""
         return score
 
     def reach(self, gsd: float) -> float:
-        """All photos matter."""
+        """Infinite, since all photos contribute."""
         return float(np.inf)
 
     def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray[Any], NDArray[np.int32]]:
-        """Equal weights."""
+        """Averages with equal weights."""
         seen = [np.isfinite(layer.score).astype(np.float32) for layer in layers]
         number = np.maximum(np.sum(seen, axis=0, dtype=np.float32), 1e-6)
         lead = leader(layers, [layer.score for layer in layers])
@@ -217,17 +224,17 @@ class Average:
 
 @dataclass(frozen=True, kw_only=True)
 class Multiband:
-    """The most vertical view wins; each band of detail is blended over its own width
-    (Burt and Adelson 1983).
+    """Shows the most vertical view; each spatial frequency band is blended over its own width (Burt
+    and Adelson 1983).
     """
 
     levels: int = 5
-    """Halvings of the Laplacian pyramid; the widest blend is about 2 ** levels px."""
+    """Levels of the Laplacian pyramid; the widest blend is about 2 ** levels px."""
     version: ClassVar[int] = 1
 
     @property
     def margin(self) -> int:
-        """Tiles see each other's rim, so that they meet without a step."""
+        """Neighbouring tiles overlap by the widest blend, so that there is no step between them."""
         return int(4 * 2**self.levels)
 
     def rank(self, order: Order, score: Float) -> Float:
@@ -235,11 +242,13 @@ class Multiband:
         return score
 
     def reach(self, gsd: float) -> float:
-        """As wide as the coarsest blend."""
+        """The rank difference over the width of the coarsest blend."""
         return 4.0 * self.margin * gsd
 
     def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray[Any], NDArray[np.int32]]:
-        """Laplacian pyramids of the layers, weighted by Gaussian pyramids of their territories."""
+        """Sums the Laplacian pyramids of the layers, weighted by Gaussian pyramids of the masks
+        where each layer leads.
+        """
         lead = leader(layers, [layer.score for layer in layers])
         hard = _picked(layers, lead)
         if len(layers) == 1:
@@ -267,8 +276,8 @@ class Multiband:
 
 
 def _filled(layer: Layer, hard: NDArray[Any]) -> Float:
-    """The layer, continued by the hard composite where it sees nothing, so that no black bleeds
-    in.
+    """The layer, filled with the unblended mosaic where it has no pixels, so that black does not
+    bleed in.
     """
     seen = np.isfinite(layer.score)[..., None]
     return np.nan_to_num(np.where(seen, layer.pixels, hard).astype(np.float32))

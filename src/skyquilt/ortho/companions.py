@@ -1,4 +1,6 @@
-"""What lies beside a map: which photo each place shows, how many photos see it, and a preview."""
+"""Additional rasters of a map: the source photo of each place, the number of photos that cover it,
+and a preview.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -19,12 +21,12 @@ PROVENANCE = 4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BlockExtras:
-    """What a block of the map leaves beside its pixels."""
+    """Data of a map block for the additional rasters."""
 
     provenance: NDArray[np.uint32]
     """Shot numbers from 1, 0 = none, every PROVENANCE-th pixel."""
     views: NDArray[np.uint16]
-    """Photos that see each STEP-pixel cell."""
+    """Number of photos that cover each STEP-pixel cell."""
     preview: NDArray[Any]
     """(h, w, bands) the block, area-averaged to every `preview_factor`-th pixel."""
     shown: NDArray[np.uint8]
@@ -33,7 +35,7 @@ class BlockExtras:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Drawn:
-    """The finished rasters' small companions."""
+    """The additional rasters of a finished map."""
 
     provenance: NDArray[np.uint32]
     """As in provenance.tif."""
@@ -50,8 +52,8 @@ class Drawn:
 
 
 def shot_numbers(compose: Composer) -> NDArray[np.uint32]:
-    """Number in shots.geojson of each photo; the last entry, which index -1 (no photo) finds,
-    is 0.
+    """Number of each photo in shots.geojson. The last entry is 0, so that index -1 (no photo) gives
+    0.
     """
     number = {v.photo: k + 1 for k, v in enumerate(sorted(compose.views, key=lambda v: v.photo))}
     table = np.zeros(max(number) + 2, np.uint32)
@@ -62,8 +64,8 @@ def shot_numbers(compose: Composer) -> NDArray[np.uint32]:
 def extras_of(
     composed: Composed, valid: NDArray[np.bool_], table: NDArray[np.uint32], factor: int
 ) -> BlockExtras:
-    """What a composed block leaves; `table` gives shot numbers by photo, `factor` the preview's
-    reduction.
+    """The additional data of a composed block; `table`: shot numbers by photo, `factor`: reduction
+    of the preview.
     """
     preview, shown = _reduced(composed.pixels, valid, factor)
     numbers = table[np.where(_thinned(valid), _thinned(composed.photo), -1)]
@@ -71,7 +73,7 @@ def extras_of(
 
 
 def _thinned(numbers: NDArray[Any]) -> NDArray[Any]:
-    """Every PROVENANCE-th pixel in both directions, from the middle of its cell."""
+    """Every PROVENANCE-th pixel in both directions, taken at the middle of its cell."""
     rows, columns = (
         np.minimum(np.arange(PROVENANCE // 2, size + PROVENANCE // 2, PROVENANCE), size - 1)
         for size in numbers.shape
@@ -100,16 +102,14 @@ def _reduced(
     share = np.asarray(averaged(opaque, size), np.uint8)
     solid = np.nan_to_num(pixels) if pixels.dtype.kind == "f" else pixels
     mean = averaged(solid, size).reshape(*share.shape, -1)
-    if share.min() < 255:  # pixels that are not valid are zero: divide by what was
+    if share.min() < 255:  # invalid pixels are zero: divide by the valid share
         whole = mean.astype(np.float32) * (255.0 / np.maximum(share, 1))[..., None]
         mean = (np.minimum(whole, 255) if pixels.dtype == np.uint8 else whole).astype(pixels.dtype)
     return mean, share
 
 
 def coloured(preview: NDArray[Any], shown: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """RGBA (h, w, 4) of a preview: pictures as they are, measured values from dark to bright
-    (inferno).
-    """
+    """RGBA (h, w, 4) of a preview: photos unchanged, measured values in the colour map inferno."""
     if preview.dtype == np.uint8 and preview.shape[2] == 3:
         return np.dstack([preview, shown])
     value = preview[..., 0].astype(np.float32)
@@ -137,7 +137,7 @@ class Companions:
         self.shown = np.zeros((small.height, small.width), np.uint8)
 
     def add(self, row: int, column: int, extras: BlockExtras) -> None:
-        """Puts a block's extras in their place; its first pixel is at (row, column) of the map."""
+        """Inserts the data of a block whose first pixel is at (row, column) of the map."""
         for target, part, step in (
             (self.provenance, extras.provenance, PROVENANCE),
             (self.views, extras.views, STEP),

@@ -1,4 +1,4 @@
-"""Composition of a window of the map from the photos that see it."""
+"""Composition of a window of the map from the photos that cover it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,9 @@ PhotoPixels = Callable[[int], NDArray[Any]]
 PIECE = 256
 """Pixels of a piece composed at a time."""
 MOST_PADDED = 12
-"""Values of a photo's cut-out per map pixel up to which a fourth band pays."""
+"""Largest number of values in a photo's cut-out per map pixel for which adding a fourth band saves
+time.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,23 +32,23 @@ class Composed:
     pixels: NDArray[Any]
     """(h, w, bands)."""
     photo: NDArray[np.int32]
-    """(h, w) index of the photo that leads each pixel, -1 = none."""
+    """(h, w) index of the leading photo of each pixel, -1 = none."""
     views: NDArray[np.uint16]
-    """(r, c) number of photos, of those planned with, that see each STEP x STEP cell."""
+    """(r, c) number of planned photos that cover each STEP x STEP cell."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Composer:
-    """Everything that composition needs, but the window."""
+    """Composes windows of a map."""
 
     grid: Grid
     """The map's grid."""
     views: Sequence[View]
     """Placed photos."""
     surface: Surface
-    """Heights."""
+    """Ground heights."""
     blend: Blend
-    """Merge rule."""
+    """Blending method."""
     pixels: PhotoPixels
     """Source of photo pixels."""
     bands: int
@@ -54,18 +56,18 @@ class Composer:
     dtype: np.dtype
     """Type of the map's pixels."""
     exposure: Exposure = NEUTRAL
-    """Gains."""
+    """Brightness corrections of the photos."""
 
     def __call__(self, window: Window) -> Composed:
-        """The window."""
+        """Plans and composes a window."""
         return self.drawn(self.plan(window, counted=True))
 
     def plan(self, window: Window, *, counted: bool = False, earlier: Plan | None = None) -> Plan:
-        """Which photos can show where; costs little, and no photo is read.
+        """Determines which photos can be visible where. This is fast and reads no photo.
 
-        `counted`: all photos that see the window are in the plan, not only those that others do not
-        surely hide. `earlier`: a plan of the same window; photos that have not changed since are
-        not projected again, and heights stay where their change does not show.
+        `counted`: the plan contains all photos that cover the window, also those that are certainly
+        hidden by others. `earlier`: a plan of the same window; unchanged photos are not projected
+        again, and heights are kept where their change is not visible.
         """
         return planned(
             window,
@@ -78,7 +80,7 @@ class Composer:
         )
 
     def drawn(self, plan: Plan) -> Composed:
-        """A window as planned, piece by piece."""
+        """Composes a planned window piece by piece."""
         window, margin = plan.window, plan.margin
         out = np.full(
             (window.height, window.width, self.bands),
@@ -97,10 +99,10 @@ class Composer:
         return Composed(pixels=out, photo=photo, views=self._counted(plan.nodes, margin, window))
 
     def redrawn(self, plan: Plan, earlier: Plan, before: Composed) -> Composed:
-        """What `drawn(plan)` gives, from what an earlier plan gave: only cells that look different
-        are touched.
+        """The same result as `drawn(plan)`, from the result of an earlier plan: only changed cells
+        are composed again.
 
-        For merge rules that look at nothing beyond a pixel (margin 0).
+        Only for blending methods that work on single pixels (margin 0).
         """
         window = plan.window
         changed = stale(plan, earlier)[1:-1, 1:-1]
@@ -138,10 +140,10 @@ class Composer:
         w: int,
         wanted: NDArray[np.bool_] | None = None,
     ) -> tuple[NDArray[Any], NDArray[np.int32]] | None:
-        """Pixels (h, w, bands) and leading photo (h, w) from a row and column of the window of the
-        nodes.
+        """Pixels (h, w, bands) and leading photo (h, w) of a piece that starts at a row and column
+        of the nodes' window.
 
-        `wanted`: (r, c) cells of the window that matter; None = all do.
+        `wanted`: (r, c) cells of the window that are needed; None = all.
         """
         cells = (
             slice(row // STEP + 1, (row + h - 1) // STEP + 2),
@@ -158,7 +160,7 @@ class Composer:
             return None
         alone = len(chosen) == 1
         cuts = [cut(n, row, column, h, w) for n, _ in chosen]
-        if alone and cuts[0].seen.all():  # nothing to merge, whatever the rule
+        if alone and cuts[0].seen.all():  # nothing to blend, whatever the method
             pixels, _ = self._warped(cuts[0], h, w, alone=True)
             return pixels, np.full((h, w), cuts[0].view.photo, np.int32)
         layers = [
@@ -168,7 +170,9 @@ class Composer:
         return self.blend.merge(layers, self.grid.gsd)
 
     def _layer(self, n: Nodes, near: NDArray[np.bool_], h: int, w: int, *, alone: bool) -> Layer:
-        """One photo over a piece; only the box of the cells where it can show is filled."""
+        """One photo over a piece; filled only within the bounding box of the cells where it can be
+        visible.
+        """
         rows, columns = _extent(np.asarray(near.any(1)), h), _extent(np.asarray(near.any(0)), w)
         size = rows.stop - rows.start, columns.stop - columns.start
         pixels, score = self._warped(cut(n, rows.start, columns.start, *size), *size, alone=alone)
@@ -186,9 +190,9 @@ class Composer:
     def _warped(
         self, n: Nodes, h: int, w: int, *, alone: bool
     ) -> tuple[NDArray[Any], NDArray[np.float32]]:
-        """Pixels (h, w, bands) and scores (h, w) of a photo where these nodes are."""
+        """Pixels (h, w, bands) and scores (h, w) of a photo over the area of these nodes."""
         image = self.pixels(n.view.photo)
-        # remap works in 16 bits: a cut-out keeps its coordinates small
+        # cv2.remap uses 16-bit coordinates: a cut-out keeps them small
         x, y = _reach(n.u, image.shape[1]), _reach(n.v, image.shape[0])
         u, v = densify(n.u - np.float32(x.start), h, w), densify(n.v - np.float32(y.start), h, w)
         warped = _remapped(image[y, x], u, v)
@@ -214,7 +218,7 @@ class Composer:
 def _remapped(image: NDArray[Any], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[Any]:
     """Pixels (h, w, bands) of an image at columns u and rows v (h, w)."""
     if image.dtype == np.uint8 and image.shape[2:] == (3,) and image.size <= MOST_PADDED * u.size:
-        # OpenCV warps four bands in half the time of three, the way there and back included
+        # OpenCV warps four bands in half the time of three, including the conversion
         four = cv2.cvtColor(image, cv2.COLOR_RGB2RGBA)
         warped = cv2.remap(four, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(cv2.cvtColor(warped, cv2.COLOR_RGBA2RGB))
@@ -229,7 +233,7 @@ def _extent(needed: NDArray[np.bool_], size: int) -> slice:
 
 
 def _reach(places: NDArray[np.float32], size: int) -> slice:
-    """The pixels, of `size`, that lie within a photo's node coordinates; one at least."""
+    """The range of pixels, of `size`, covered by a photo's node coordinates; at least one pixel."""
     start = min(max(int(places.min()) - 2, 0), size - 1)
     return slice(start, max(min(int(np.ceil(places.max())) + 3, size), start + 1))
 
@@ -237,7 +241,7 @@ def _reach(places: NDArray[np.float32], size: int) -> slice:
 def _embedded(
     part: NDArray[Any], empty: float, rows: slice, columns: slice, h: int, w: int
 ) -> NDArray[Any]:
-    """A part (rows, columns[, bands]) in its place of a piece (h, w[, bands])."""
+    """Inserts a part (rows, columns[, bands]) in an empty piece (h, w[, bands])."""
     out = np.full((h, w, *part.shape[2:]), empty, part.dtype)
     out[rows, columns] = part
     return out

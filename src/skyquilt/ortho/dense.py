@@ -1,9 +1,8 @@
-"""Heights at nearly every pixel, with gaps where pictures disagree: what tells one survey's place
-on another's.
+"""Dense heights with gaps where images disagree, for the registration of one survey to another.
 
-A surface for drawing fills its gaps and is smoothed, which moves the outlines of what stands up.
-Here only what two pictures agree on counts, first coarsely over everything that may stand on the
-ground, then at full sharpness.
+A surface for the orthomosaic is smoothed and has no gaps, which moves the outlines of buildings and
+trees. Here only heights on which two images agree are used: first from a coarse search over a large
+height range, then from a fine one.
 """
 
 from collections.abc import Sequence
@@ -20,26 +19,26 @@ from skyquilt.ortho.sweep import GreyPicture, Sweep
 
 @dataclass(frozen=True, kw_only=True)
 class Dense:
-    """A coarse sweep that finds roofs and crowns, then a fine one about it, its heights left as
-    they are.
+    """A coarse sweep that finds roofs and tree crowns, then a fine one around it whose heights are
+    not smoothed.
     """
 
     coarse: Sweep = field(
         default_factory=lambda: Sweep(sides=(400,), above=0.2, smoothing_cells=0.7)
     )
-    """Finds what stands up, to a fifth of the flying height."""
+    """Finds objects up to a fifth of the flying height."""
     fine: Sweep = field(default_factory=lambda: Sweep(window=7, agree=0.5))
-    """Measures it."""
+    """Refines the heights."""
     longest: int = 1000
-    """Longest side in px of the pictures that are measured in."""
+    """Longest side in px of the images used for the fine sweep."""
     reach: float = 4.0
-    """Px of disparity about the coarse surface."""
+    """Search range around the coarse surface in px of disparity."""
     version: ClassVar[int] = 1
 
     def __call__(
         self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture
     ) -> HeightField | None:
-        """The heights over a map's grid; None where fewer than two photos look down."""
+        """The heights on a map's grid; None if fewer than two photos look down."""
         height = float(np.median([v.pose.map_C[2] for v in views] or [0.0]) - np.median(surface.z))
         if len(views) < 2 or height <= 0:
             return None

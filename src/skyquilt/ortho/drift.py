@@ -1,8 +1,8 @@
-"""Drift: what a thermal camera's frames differ by though they show the same ground.
+"""Drift of thermal cameras: differences between frames that show the same ground.
 
-An uncooled sensor warms and cools, so a frame's values are off by an amount of its own. Where
-frames overlap they show the same ground, and one number per frame makes them agree. That is a
-correction and no measurement: values as recorded are an option away.
+The temperature of an uncooled sensor changes, so each frame has its own offset. Overlapping frames
+show the same ground, so the offsets can be estimated from the overlaps, one per frame. This is a
+correction, not a measurement; an option keeps the recorded values.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,13 +18,15 @@ from skyquilt.model.surface import Surface
 Doubles = NDArray[np.float64]
 Ints = NDArray[np.int64]
 CORRELATED = 30.0
-"""Neighbouring samples err alike: so many count as one."""
+"""Errors of neighbouring samples are correlated: this number of samples counts as one independent
+sample.
+"""
 _TINY = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Overlaps:
-    """By how much frames differ where they overlap: the edges of a graph of frames."""
+    """Differences between overlapping frames: the edges of a graph of frames."""
 
     first: Ints
     """(E,) row of the one frame."""
@@ -41,16 +43,16 @@ class Drift:
     """One offset per frame from the medians of all overlaps, outlying overlaps down-weighted
     (Cauchy).
 
-    Overlaps leave a common offset open. It is fixed so that the median offset of frames that hang
-    together is zero: the map keeps the level that most of its frames have.
+    Overlaps do not determine a common offset. It is chosen so that the median offset of each
+    connected group of frames is zero: the map keeps the level of most of its frames.
     """
 
     points: int = 4000
-    """Ground points looked at; more on surveys of many frames."""
+    """Number of ground points sampled; more for surveys of many frames."""
     least: int = 8
     """Fewest points that two frames must share."""
     rounds: int = 12
-    """Of reweighting."""
+    """Rounds of reweighting."""
     version: ClassVar[int] = 1
 
     def __call__(
@@ -60,7 +62,7 @@ class Drift:
         surface: Surface,
         bounds: tuple[float, float, float, float],
     ) -> dict[int, float]:
-        """Photo -> what is to be added to its values, from thumbnails (h, w) of the photos in their
+        """Photo -> the offset to add to its values, from thumbnails (h, w) of the photos in their
         unit.
         """
         usable = [v for v in views if v.photo in thumbnails]
@@ -80,7 +82,7 @@ class Drift:
         surface: Surface,
         bounds: tuple[float, float, float, float],
     ) -> tuple[Ints, Ints, Doubles]:
-        """Ground point, view and value (N,) of everything seen."""
+        """Ground point, view and value (N,) of all samples."""
         west, south, east, north = bounds
         step = np.sqrt((east - west) * (north - south) / max(self.points, 40 * len(views)))
         x, y = np.meshgrid(np.arange(west, east, step), np.arange(south, north, step))
@@ -146,10 +148,10 @@ def solved(edges: Overlaps, count: int, rounds: int) -> Doubles:
     """Offsets (count,) that make frames agree: second + o[second] = first + o[first], median zero
     per component.
 
-    A weak pull to zero, its width what frames differ by as a rule, keeps a long line of frames from
-    drifting off by the sum of many small errors.
+    A weak prior of zero, with the typical difference of frames as its deviation, prevents the
+    errors from adding up along a long line of frames.
     """
-    from scipy import sparse  # few runs are thermal, and all would wait for it
+    from scipy import sparse  # imported here, since only thermal runs need it
     from scipy.sparse import linalg as sparse_linalg
     from scipy.sparse.csgraph import connected_components
 

@@ -1,4 +1,4 @@
-"""Exposure: what brings overlapping photos to one brightness, from the ground they both show.
+"""Exposure: brings overlapping photos to a common brightness, from the ground that they share.
 
 Per photo a gain for each band and a smooth field over the image (vignetting, a cloud's shadow, the
 sun's glare). Gains act on the odds x / (1 - x) of a pixel value x in (0, 1), not on the value:
@@ -20,19 +20,23 @@ from skyquilt.model.surface import Surface
 Float = NDArray[np.float32]
 
 SETTLED = 1e-3
-"""Change of log odds that no 8-bit level can show."""
+"""A change of log odds that is not visible in 8-bit values; ends the iteration."""
 SIGMA_LEVEL = 0.15
-"""Deviation in log odds of two photos' brightness of one ground point, all else equal."""
+"""Standard deviation in log odds of the difference in brightness of one ground point between two
+photos with the same exposure.
+"""
 CORRELATED = 30.0
-"""Neighbouring samples err alike: so many count as one."""
+"""Errors of neighbouring samples are correlated: this number of samples counts as one independent
+sample.
+"""
 DENSE = 1000
-"""Unknowns up to which the normal equations are solved as a full matrix."""
+"""Largest number of unknowns for which the normal equations are solved as a full matrix."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Exposure:
-    """What brings photos to one brightness: log odds + gain[band] + field . (x, y, x^2, y^2, x
-    y).
+    """Correction of each photo to a common brightness: log odds + gain[band] + field . (x, y, x^2,
+    y^2, x y).
     """
 
     gains: Mapping[int, Float]
@@ -40,19 +44,19 @@ class Exposure:
     fields: Mapping[int, Float]
     """Photo -> (5,) in log odds, for x and y from -1 to 1 over the image."""
     offsets: Mapping[int, float] = field(default_factory=dict)
-    """Photo -> what is added to measured values, in their unit."""
+    """Photo -> offset added to measured values, in their unit."""
 
     def uneven(self, photo: int) -> bool:
         """Whether the photo needs more than one gain per band."""
         return bool(np.abs(self.fields[photo]).max() > 0)
 
     def odds(self, photo: int, x: Float, y: Float) -> Float:
-        """Factors (h, w, bands) on the odds at places x, y (h, w) in the image, -1 to 1."""
+        """Factors (h, w, bands) on the odds at image positions x, y (h, w), -1 to 1."""
         field = np.exp(_basis(x, y) @ self.fields[photo])
         return (field[..., None] * np.exp(self.gains[photo])).astype(np.float32)
 
     def table(self, photo: int) -> NDArray[np.uint8] | None:
-        """Lookup table (1, 256, bands) of an even photo; None where nothing changes."""
+        """Lookup table (1, 256, bands) of a photo with gains only; None if nothing changes."""
         gains = self.gains[photo]
         return odds_table(gains) if float(np.abs(gains).max()) >= 0.005 else None
 
@@ -60,7 +64,7 @@ class Exposure:
 def with_odds(pixels: NDArray[np.uint8], odds: Float) -> NDArray[np.uint8]:
     """Pixels (h, w, bands) with their odds multiplied by odds (h, w, bands)."""
     brighter = cv2.multiply(pixels, odds, dtype=cv2.CV_32F).reshape(pixels.shape)
-    level: Any = (255.0,) * 4  # a scalar for each band: OpenCV's stubs know arrays only
+    level: Any = (255.0,) * 4  # a scalar for each band: OpenCV's type stubs accept arrays only
     white = cv2.add(cv2.subtract(brighter, pixels, dtype=cv2.CV_32F), level).reshape(pixels.shape)
     return np.asarray(cv2.divide(brighter, white, scale=255, dtype=cv2.CV_8U), np.uint8).reshape(
         pixels.shape
@@ -88,14 +92,14 @@ class Balance:
     """Robust least squares of log-odds differences at ground points seen by several photos."""
 
     points: int = 2500
-    """Ground points looked at; more on surveys of many photos."""
+    """Number of ground points sampled; more for surveys of many photos."""
     sigma_gain: float = 0.5
     """Prior deviation of a gain in log odds."""
     sigma_field: float = 0.15
     """Prior deviation of a term of the field in log odds."""
     even: float = 0.1
-    """Fields smaller than this in log odds everywhere (6 of 255 on a middle grey) are left alone:
-    it saves time.
+    """Fields smaller than this everywhere, in log odds (6 of 255 levels on middle grey), are not
+    applied, to save time.
     """
     version: ClassVar[int] = 2
 
@@ -116,8 +120,8 @@ class Balance:
         return self._solve(samples, [v.photo for v in usable])
 
     def _solve(self, s: "Samples", photos: Sequence[int]) -> Exposure:
-        """log odds + gain + field is the same for all photos of a point: differences to the
-        point's mean vanish.
+        """Condition: log odds + gain + field is the same in all photos of a ground point, so
+        differences from the point's mean are zero.
         """
         n, N = len(photos), len(s.point)
         _, point = np.unique(s.point, return_inverse=True)
@@ -215,8 +219,8 @@ def _robust_differences(
     count: int,
 ) -> NDArray[np.float64]:
     """x (count, k, bands) that makes y + terms . x[row] equal within each point, y (N, bands) and
-    terms (N, k), reweighted against moving things and shadows, which all bands see. `ridge` (k,)
-    pulls x to zero.
+    terms (N, k), with robust weights common to all bands, against moving objects and shadows.
+    `ridge` (k,): weight of the prior of zero for x.
     """
     pairs = _Pairs.of(row, point)
     w = np.ones(len(y))
@@ -257,7 +261,7 @@ class _Pairs:
     b: NDArray[np.int64]
     """(M,) second sample; its photo is not before the first's."""
     cuts: NDArray[np.int64]
-    """(G + 1,) where the pairs of another two photos begin."""
+    """(G + 1,) start of the pairs of each two photos."""
     row_a: NDArray[np.int64]
     """(G,) first photo."""
     row_b: NDArray[np.int64]
@@ -291,8 +295,8 @@ class _Pairs:
 def _solved(
     own: NDArray[Any], pairs: _Pairs, blocks: NDArray[Any], pull: NDArray[Any], rhs: NDArray[Any]
 ) -> NDArray[Any]:
-    """Solution (n k, bands) of the normal equations: own blocks (n, k, k) less those of pairs, and
-    a pull to zero.
+    """Solution (n k, bands) of the normal equations: own blocks (n, k, k) minus those of pairs,
+    with a prior of zero.
     """
     n, k, _ = own.shape
     i, j = (
@@ -307,7 +311,7 @@ def _solved(
         return np.asarray(
             np.linalg.solve(normal.swapaxes(1, 2).reshape(n * k, n * k) + np.diag(pull), rhs)
         )
-    from scipy import sparse  # where it saves more time than it takes to load
+    from scipy import sparse  # imported only where it saves more time than it takes to load
     from scipy.sparse import linalg
 
     at = np.arange(k)

@@ -1,4 +1,4 @@
-"""The ground of a map: heights, what each photo sees of them, and the map's grid."""
+"""The ground of a map: heights, the view of each photo, and the map's grid."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ from skyquilt.ortho.tie_surface import level
 from skyquilt.settings import PictureSettings
 
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
-"""Grey picture of a photo (index), its longest side at most the px given."""
+"""Gives the grey image of a photo (index), with at most the given px on its longest side."""
 
 FINEST = 20
-"""Map pixels per photo pixel, along a side, that may be asked for."""
+"""Largest number of map pixels per photo pixel, along a side."""
 MOST_PIXELS = 4e11
-"""Largest map."""
+"""Largest map in pixels."""
 WIDEST_M = 200_000.0
-"""Widest map: no drone flies further."""
+"""Largest width of a map in m: more than any drone flies."""
 
 
 class SurfaceFromTies(Protocol):
@@ -37,23 +37,23 @@ class SurfaceFromTies(Protocol):
 
 
 class SurfaceFromPictures(Protocol):
-    """Heights refined by comparing pictures."""
+    """Heights refined by image matching."""
 
     def __call__(
         self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, /
     ) -> Surface:
-        """The surface with better heights where pictures determine them."""
+        """The surface with refined heights where images determine them."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ground:
-    """What the map is drawn on."""
+    """Heights, views and grid of a map."""
 
     surface: Surface
     """Heights."""
     views: tuple[View, ...]
-    """What each photo sees."""
+    """The view of each placed photo."""
     grid: Grid
     """The map's pixels."""
     native_gsd: float
@@ -70,19 +70,19 @@ def find_ground(
     *,
     pictures: tuple[Any, ...] = (),
 ) -> Steps[Ground]:
-    """Heights from tie points (level ground where there are none), refined by the sweep where there
-    is one, and the grid of the map. `pictures` says how the grey pictures are made: it is part of
+    """Heights from tie points (level ground if there are none), refined by the sweep if one is
+    given, and the grid of the map. `pictures` describes how the grey images are made; it is part of
     the key under which a swept surface is stored.
 
     Raises:
-        UsageError: the map would have no pixels, or absurdly many.
+        UsageError: the map would have no pixels, or far too many.
     """
     yield 0, 1
     xyz = alignment.ties.xyz
     flat = level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
     rough = make_views(alignment, flat)
     if not rough:
-        raise UsageError("no photo looks down at the ground: all see the horizon")
+        raise UsageError("no photo looks down at the ground: all contain the horizon")
     native = native_gsd(rough, flat)
     gsd = picture.gsd_cm / 100 if picture.gsd_cm else round_gsd(native)
     bounds = _local_bounds(picture, alignment)
@@ -118,7 +118,7 @@ def _check_place(
     picture: PictureSettings,
     alignment: Alignment,
 ) -> None:
-    """Refuses an area that no photo shows."""
+    """Refuses an area that no photo covers."""
     if bounds is None or any(v.overlaps(bounds) for v in views):
         return
     outline = np.concatenate([v.footprint for v in views]) + alignment.frame.origin
@@ -134,7 +134,7 @@ def _check_place(
 
 
 def _check_size(grid: Grid, native: float) -> None:
-    """Refuses what nobody can want: a map far finer than the photos, or larger than any survey."""
+    """Refuses maps that are far finer than the photos or larger than any survey."""
     size = f"{grid.width} x {grid.height} px"
     wide = max(grid.width, grid.height) * grid.gsd
     if grid.gsd < native / FINEST and wide < WIDEST_M:
@@ -153,7 +153,7 @@ def _check_size(grid: Grid, native: float) -> None:
 
 
 def poses_digest(alignment: Alignment) -> str:
-    """What of an alignment shapes the map."""
+    """Digest of the parts of an alignment on which the map depends."""
     order = sorted(alignment.poses)
     placed = [(alignment.poses[i], alignment.camera(i).vector) for i in order]
     return digest(order, placed, alignment.frame)
@@ -168,7 +168,7 @@ def round_gsd(gsd: float) -> float:
 def _local_bounds(
     picture: PictureSettings, alignment: Alignment
 ) -> tuple[float, float, float, float] | None:
-    """Bounds asked for, or those of the boundary, in the map frame."""
+    """The requested bounds, or those of the boundary, in the map frame."""
     frame = alignment.frame
     bounds = picture.bounds
     if picture.boundary is not None and bounds is None:

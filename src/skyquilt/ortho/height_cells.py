@@ -1,5 +1,5 @@
-"""Heights of a map that grows: a grid of cells that points of the ground fill, and the surface of
-any part of it.
+"""Heights of a growing map: a grid of cells filled from ground points, and the surface over any
+part of it.
 """
 
 from collections.abc import Iterable, Iterator
@@ -13,11 +13,12 @@ from skyquilt.model.surface import Surface
 
 Cells = NDArray[np.int64]
 WEIGHT = 0.4
-"""How far a cell follows points that come later."""
+"""Weight of new points in the height of a cell that already has one."""
 
 
 BLOCK = 32
-"""Cells along a side of the blocks that they are kept in: parts of the map are then read as arrays.
+"""Cells along a side of the blocks in which they are stored, so that parts of the map are read as
+arrays.
 """
 
 
@@ -32,7 +33,7 @@ class HeightCells:
     def add(
         self, xyz: NDArray[np.float64], *, anew: bool = False
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Takes in points (P, 3); `anew` replaces what their cells held.
+        """Adds points (P, 3) in m; `anew` replaces the former heights of their cells.
 
         Returns the cells touched, (k, 2) in order, and their heights now, (k,) in m.
         """
@@ -51,7 +52,7 @@ class HeightCells:
             held[row, column] = z[mine]
 
     def at(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Heights (k,) in m of cells (k, 2); NaN where no point has been."""
+        """Heights (k,) in m of cells (k, 2); NaN where there is no point."""
         z = np.full(len(cells), np.nan)
         for key, mine, (column, row) in _by_block(cells):
             if (held := self._blocks.get(key)) is not None:
@@ -59,7 +60,9 @@ class HeightCells:
         return z
 
     def median(self, bounds: Iterable[float]) -> float | None:
-        """Median height inside bounds (west, south, east, north) in m; None where no point is."""
+        """Median height inside bounds (west, south, east, north) in m; None if there is no
+        point.
+        """
         z = self._part(*self._reach(bounds))
         found = z[np.isfinite(z)]
         return float(np.median(found)) if len(found) else None
@@ -87,8 +90,8 @@ class HeightCells:
         return z
 
     def surface(self, bounds: Iterable[float], otherwise: float) -> Surface:
-        """Heights over bounds (west, south, east, north) in m: gaps filled from around, smoothed a
-        little.
+        """Heights over bounds (west, south, east, north) in m: gaps are filled from their
+        surroundings, and the result is slightly smoothed.
         """
         c0, r0, c1, r1 = self._reach(bounds)
         c0, r0, c1, r1 = c0 - 3, r0 - 3, c1 + 3, r1 + 3
@@ -103,8 +106,8 @@ class HeightCells:
 
 
 def _by_block(cells: Cells) -> Iterator[tuple[tuple[int, int], NDArray[np.bool_], Cells]]:
-    """Each block that some of the cells (k, 2) lie in: which block, which of them, and their
-    columns and rows in it.
+    """Groups cells (k, 2) by block: yields the block, the cells in it, and their columns and rows
+    within it.
     """
     block, inner = np.divmod(cells, BLOCK)
     for column, row in np.unique(block, axis=0).tolist():
@@ -122,7 +125,9 @@ def _medians(group: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[n
 
 
 def _filled(z: NDArray[np.float32], otherwise: float) -> NDArray[np.float32]:
-    """Gaps from ever wider surroundings; a wild cell gives way to its neighbours' median."""
+    """Fills gaps from increasingly wide surroundings; outlier cells are replaced by their
+    neighbours' median.
+    """
     known = np.isfinite(z)
     if known.sum() < 4:
         return np.full(z.shape, np.median(z[known]) if known.any() else otherwise, np.float32)

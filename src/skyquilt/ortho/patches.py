@@ -26,8 +26,8 @@ def grey_patches(
     *,
     side: int = SIDE,
 ) -> list[NDArray[np.float32] | None]:
-    """What a photo shows around map points xy (n, 2) in m: grey (side, side) each, north up;
-    None where it does not see all of it.
+    """Orthorectified grey patches (side, side) of a photo around map points xy (n, 2) in m, north
+    up; None where the photo does not cover the whole patch.
     """
     nodes = (np.arange(-1, side // COARSE + 1) + 0.5) * COARSE - side / 2
     shape = (len(xy), len(nodes), len(nodes))
@@ -43,7 +43,7 @@ def grey_patches(
 def _cut_out(
     view: View, pixels: PhotoPixels, nu: NDArray[Any], nv: NDArray[Any], side: int
 ) -> NDArray[np.float32]:
-    """The grey patch (side, side) whose nodes lie at these photo pixels."""
+    """The grey patch (side, side) with its nodes at these photo pixels."""
     size = ((side // COARSE + 2) * COARSE,) * 2
     inner = slice(COARSE, COARSE + side)
     u, v = (cv2.resize(m, size, interpolation=cv2.INTER_LINEAR)[inner, inner] for m in (nu, nv))
@@ -70,8 +70,8 @@ def grey_pairs(
     pixels: PhotoPixels,
     gsd: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Patches (n, 64, 64) of two photos each around map points (n, 2), and whether both see them
-    whole.
+    """Patches (n, 64, 64) of two photos each around map points (n, 2), and whether both photos
+    cover them completely.
     """
     patches = np.zeros((2, len(xy), SIDE, SIDE), np.float32)
     seen = np.zeros((2, len(xy)), bool)
@@ -80,9 +80,9 @@ def grey_pairs(
     for which, row in enumerate(views):
         for k, view in enumerate(row):
             sides.setdefault(view.photo, []).append((which, k))
-    for (
-        asked
-    ) in sides.values():  # a photo's patches at once: it is decoded once, and projected in one go
+    for asked in (
+        sides.values()
+    ):  # all patches of a photo together, so that it is decoded and projected once
         which, k = asked[0]
         at = np.array([place for _, place in asked])
         found = grey_patches(views[which][k], surface, pixels, xy[at], gsd)

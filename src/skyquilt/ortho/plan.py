@@ -1,4 +1,4 @@
-"""What is known of a window of the map before any pixel is touched: which photos can show where."""
+"""Planning of a map window before any pixel is read: which photos can be visible where."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,35 +22,35 @@ from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Blend
 
 TOGETHER = 6
-"""Photos projected at a time."""
+"""Number of photos projected at a time."""
 STILL = 0.5
-"""Map pixels by which changed heights may shift a photo that is not drawn again for it."""
+"""A changed height is ignored if it shifts a photo by less than this number of map pixels."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
-    """What is known of a window before any pixel is touched."""
+    """Plan of a map window."""
 
     window: Window
     """Part of the map."""
     margin: int
-    """Pixels beyond it that its merge rule must see."""
+    """Pixels beyond it that the blending method needs."""
     nodes: Sequence[Nodes]
-    """Where its nodes lie in each photo that sees any."""
+    """The nodes in image coordinates of each photo that covers any of them."""
     near: Sequence[NDArray[np.bool_]]
-    """(r, c) per photo, for the cells around the nodes: whether it can show there."""
+    """(r, c) per photo, for the cells around the nodes: whether the photo can be visible there."""
     z: NDArray[Any]
     """(r, c) heights in m of the nodes."""
     projected: Mapping[int, Nodes]
-    """The nodes of all photos that were looked at, by photo."""
+    """The nodes of all photos examined, by photo."""
 
     @property
     def shown(self) -> list[int]:
-        """Photos that can show."""
+        """Photos that can be visible."""
         return list(self.showing())
 
     def showing(self) -> dict[int, NDArray[np.bool_]]:
-        """The photos that can show, and where: (r, c) for the cells around the nodes."""
+        """The photos that can be visible, and where: (r, c) for the cells around the nodes."""
         return {n.view.photo: m for n, m in zip(self.nodes, self.near, strict=True) if m.any()}
 
 
@@ -75,8 +75,8 @@ def planned(
     low = blend.rank(np.arange(len(views)), least_scores(views, x, y, z))
     height = min((float(v.pose.map_C[2]) for v in views), default=1.0) - float(np.median(z))
     slack = blend.reach(grid.gsd) / max(height, 1e-3)
-    # between nodes a rank lies between theirs: nobody wins there whose least rank exceeds another's
-    # greatest
+    # between nodes, ranks lie between those of the nodes: a photo whose lowest rank exceeds the
+    # highest rank of another cannot be visible there
     around, best = np.ones((3, 3), np.uint8), np.full(x.shape, np.float32(np.inf))
     found: dict[int, tuple[Nodes, NDArray[Any]]] = {}
     ready = {
@@ -106,8 +106,8 @@ def planned(
 
 
 def _kept_heights(z: NDArray[Any], earlier: Plan, gsd: float) -> tuple[NDArray[Any], bool]:
-    """Heights (r, c): the earlier ones but where the new ones shift a photo visibly; whether that
-    is nowhere.
+    """Heights (r, c): the earlier ones except where the new ones shift a photo visibly; and whether
+    there is no such place.
     """
     aside = max(
         (
@@ -125,8 +125,8 @@ def _kept_heights(z: NDArray[Any], earlier: Plan, gsd: float) -> tuple[NDArray[A
 
 
 def stale(plan: Plan, earlier: Plan) -> NDArray[np.bool_]:
-    """(r, c) for the cells around the nodes: whether they look different from what an earlier plan
-    of them gave.
+    """(r, c) for the cells around the nodes: whether they differ from the result of an earlier
+    plan.
     """
     now, before = plan.showing(), earlier.showing()
     lifted = cv2.dilate((plan.z != earlier.z).view(np.uint8), np.ones((3, 3), np.uint8)) > 0

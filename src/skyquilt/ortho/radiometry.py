@@ -1,5 +1,5 @@
-"""Measured values on their way into a map: whether frames' drift is balanced, and what is told
-about it.
+"""Radiometry of a map: whether the drift of thermal frames is corrected, and how this is
+reported.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,14 +16,14 @@ from skyquilt.ortho.ground import Ground
 from skyquilt.settings import PictureSettings
 
 TAG = "DRIFT"
-"""Tag of a raster of measured values: whether they are as recorded."""
+"""Raster tag that states whether measured values are as recorded."""
 
 
 def balances_drift(settings: PictureSettings, unit: str) -> bool:
-    """Whether frames of this unit are brought to one level.
+    """Whether frames with this unit are brought to a common level.
 
-    Degrees are unless somebody asks for values as recorded. Counts are only when asked: they are
-    what a maker's formula will be applied to, and it knows nothing of our offsets.
+    Degrees are, unless recorded values are requested. Raw counts are only on request: the
+    manufacturer's formula will be applied to them, and our offsets would make its result wrong.
     """
     if not unit:
         return False
@@ -56,7 +56,7 @@ class BalanceMethod(Protocol):
         surface: Surface,
         bounds: tuple[float, float, float, float],
     ) -> Exposure:
-        """What brings photos to one brightness."""
+        """The corrections that bring photos to a common brightness."""
         ...
 
 
@@ -68,8 +68,8 @@ def balanced(
     drift: DriftMethod,
     settings: PictureSettings,
 ) -> Exposure:
-    """Exposure of placed photos of one kind: of 8-bit pictures, or the drift of measured values;
-    neutral where neither is wanted. `thumbnails` are by photo (index).
+    """Exposure of placed photos of one kind: of 8-bit images, or the drift of measured values;
+    neutral if no correction is requested. `thumbnails` are by photo (index).
     """
     bounds, unit = ground.grid.bounds, photos[0].unit
     if unit:
@@ -89,8 +89,8 @@ def drift_of(
     drift: DriftMethod,
     settings: PictureSettings,
 ) -> Exposure:
-    """What brings frames of measured values to one level; neutral where they are to stay as
-    recorded.
+    """The offsets that bring frames of measured values to a common level; neutral if they are kept
+    as recorded.
     """
     if not balances_drift(settings, unit):
         return NEUTRAL
@@ -98,14 +98,14 @@ def drift_of(
 
 
 def value_tags(unit: str, exposure: Exposure) -> dict[str, str]:
-    """What a raster says about its values; nothing for pictures."""
+    """Raster tags about the values; empty for colour images."""
     if not unit:
         return {}
     return {"UNIT": unit, TAG: _drift(balanced=bool(exposure.offsets))}
 
 
 def recorded_tags(metrics: Mapping[str, Any]) -> dict[str, str]:
-    """The same from the figures of a finished map."""
+    """The same tags from the metrics of a finished map."""
     told = metrics.get("thermal_values")
     return {"UNIT": told["unit"], TAG: _drift(balanced=told["balanced"])} if told else {}
 
@@ -117,7 +117,7 @@ def _drift(*, balanced: bool) -> str:
 def value_figures(
     photos: Sequence[Photo], exposure: Exposure, settings: PictureSettings
 ) -> dict[str, Any]:
-    """What metrics.json says under `thermal_values`; nothing for pictures."""
+    """The entry `thermal_values` of metrics.json; empty for colour images."""
     unit = photos[0].unit
     if not unit:
         return {}
@@ -141,9 +141,7 @@ def _why(unit: str, exposure: Exposure, settings: PictureSettings) -> str:
             " recorded"
         )
     if balances_drift(settings, unit):
-        return (
-            "no frames overlap enough to tell their drift; values are as recorded, resampled only"
-        )
+        return "too little overlap to estimate the drift; values are as recorded, resampled only"
     if settings.balance_thermal is None and unit == "counts":
         return (
             "counts are kept as recorded, resampled only; --balance-thermal brings frames to one"

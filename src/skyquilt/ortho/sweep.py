@@ -1,10 +1,10 @@
-"""Heights where tie points are few: a plane sweep over the ground, from the two best views of every
-place.
+"""Heights where tie points are sparse: a plane sweep over the ground, from the two best views of
+every place.
 
-The ground is shown twice, by its most vertical view and by the next one that sees it from
-elsewhere, at many heights about the surface known so far; the height at which the two pictures
-agree is kept. Coarse pictures find canopies and roofs, finer ones polish. In the manner of Collins
-(1996), on a map grid instead of an image.
+The ground is orthorectified from two photos, the most vertical view and the most vertical one from
+another place, at many heights around the current surface. The height at which the two images agree
+best is kept. Coarse images find tree crowns and roofs, finer images refine the heights. The method
+follows Collins (1996), on a map grid instead of an image.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ from skyquilt.model.surface import Surface
 
 Float = NDArray[np.float32]
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
-"""Grey picture (h, w) of a photo (index), shrunken so that its longest side is the px given."""
+"""Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
 TILE = 256
 """Pixels of a piece swept at a time."""
 MARGIN = 16
@@ -33,15 +33,15 @@ class Sweep:
     """Coarse-to-fine plane sweep."""
 
     sides: tuple[int, ...] = (400,)
-    """Longest side in px of the pictures of each pass."""
+    """Longest side in px of the images of each pass."""
     below: float = 0.05
-    """Depth searched below the known surface in the first pass, as a share of the flying height."""
+    """Search range below the current surface in the first pass, as a share of the flying height."""
     above: float = 0.05
-    """Height searched above it."""
+    """Search range above it, as a share of the flying height."""
     window: int = 7
     """Side in px of the window that must agree."""
     agree: float = 0.55
-    """Correlation from which a height is believed."""
+    """Least correlation for a height to be accepted."""
     smoothing_cells: float = 1.0
     """Standard deviation of the final Gaussian in cells."""
     version: ClassVar[int] = 3
@@ -49,7 +49,7 @@ class Sweep:
     def __call__(
         self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture
     ) -> Surface:
-        """The surface with the heights found; where pictures do not agree it stays as it was."""
+        """The surface with the heights found; unchanged where the images do not agree."""
         height = float(np.median([v.pose.map_C[2] for v in views]) - np.median(surface.z))
         if len(views) < 2 or height <= 0:
             return surface
@@ -103,9 +103,9 @@ class Sweep:
         *,
         relative: bool,
     ) -> tuple[Grid, Float, Float]:
-        """A grid of cells of gsd m, the heights on it (h, w) in m, and how far two pictures agree
-        there (h, w), 0 where they do not. Pictures are `side` px long, cameras `height` m above
-        ground; `span` as in a pass.
+        """A grid of cells of gsd m, the heights on it (h, w) in m, and the correlation of the two
+        images there (h, w), 0 where they do not agree. Images have `side` px on their longest side,
+        cameras are `height` m above ground; `span` as in a pass.
         """
         w, s, e, n = grid.bounds
         work = Grid(
@@ -136,7 +136,7 @@ class Sweep:
         row: int,
         column: int,
     ) -> tuple[Float, Float]:
-        """Heights and trust (TILE, TILE) of a piece."""
+        """Heights and correlation (TILE, TILE) of a piece."""
         full = TILE + 2 * MARGIN
         cells = np.arange(-1, full // STEP + 1) + 0.5
         x, y = np.meshgrid(
@@ -161,9 +161,7 @@ class Sweep:
         return start[inner, inner] + best, np.where(trust > self.agree, trust, 0).astype(np.float32)
 
     def _fused(self, surface: Surface, work: Grid, z: Float, trust: Float) -> Surface:
-        """Medians of believed heights in cells of four pixels; gaps keep the surface known so
-        far.
-        """
+        """Medians of accepted heights in cells of four pixels; gaps keep the current surface."""
         cell = 4
         rows, columns = -(-work.height // cell), -(-work.width // cell)
         coarse = work.coarser(cell)
@@ -209,7 +207,7 @@ def pair_labels(
     nodes: Sequence[Nodes], gsd: float
 ) -> tuple[NDArray[np.int32] | None, NDArray[np.int32] | None, float]:
     """Per node the most vertical photo and the most vertical one seen from elsewhere (-1 = none),
-    and the step in m of height that moves one picture against the other by about one pixel of gsd.
+    and the height step in m that shifts one image against the other by about one pixel of gsd.
     """
     if len(nodes) < 2:
         return None, None, 0.0
@@ -238,8 +236,8 @@ def _shown(
     grey: GreyPicture,
     side: int,
 ) -> Float:
-    """The ground at each of k heights z (k, r + 2, c + 2) as the labelled photos show it, (k, r, c)
-    in pixels instead of nodes; NaN where none does.
+    """The ground orthorectified from the labelled photos at each of k heights z (k, r + 2, c + 2),
+    as (k, r, c) in pixels instead of nodes; NaN where there is no photo.
     """
     inner = labels[1:-1, 1:-1]
     out = np.full((len(z), inner.shape[0] * STEP, inner.shape[1] * STEP), np.nan, np.float32)
@@ -271,7 +269,7 @@ def _shown(
 
 
 def _agreement(a: Float, b: Float, window: int) -> Float:
-    """Normalised cross-correlation of two pictures in a sliding window; -1 where either is
+    """Normalised cross-correlation of two images in a sliding window; -1 where either is
     missing.
     """
     missing = np.isnan(a) | np.isnan(b)

@@ -15,12 +15,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class FromTiePoints:
-    """Nearest points, their outliers removed, weighted by inverse distance, then smoothed a
-    little.
+    """Removes outliers, interpolates nearest points by inverse distance, and smooths the result
+    slightly.
     """
 
     neighbours: int = 8
-    """Points behind each cell."""
+    """Number of nearest points from which a cell is interpolated."""
     smoothing_cells: float = 1.2
     """Standard deviation of the final Gaussian in cells."""
     outlier: float = 4.0
@@ -52,9 +52,8 @@ class FromTiePoints:
     def _interpolate(self, points: Array, at: Array, cell: float) -> Array:
         k = min(self.neighbours, len(points))
         distance, index = nearest(points[:, :2], at, k)
-        # beyond the points, the reach grows with the distance to them: the rim continues the
-        # average, not one
-        # point
+        # beyond the points, the search radius grows with the distance to them, so that the rim
+        # continues an average instead of a single point
         weight = 1.0 / (distance + 0.5 * cell + 0.5 * distance[:, :1]) ** 2
         return np.asarray((weight * points[index, 2]).sum(1) / weight.sum(1))
 

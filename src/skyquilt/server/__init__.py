@@ -1,3 +1,3 @@
-"""Looks at a growing or finished run: a map server for browsers, QGIS and other programs. It never
+"""A map server for a growing or finished run, for browsers, QGIS and other programs. It never
 computes poses.
 """

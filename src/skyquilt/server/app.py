@@ -1,5 +1,5 @@
-"""The server's addresses. It reads what the mapping has written and hands in what clients send;
-poses are not its business.
+"""The web application: all endpoints of the server. It reads what the mapping has written and
+passes on what clients send; it does not compute poses.
 """
 
 import asyncio
@@ -43,7 +43,7 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         version=__version__,
         docs_url=None,
         redoc_url=None,
-        description="A map that grows while drones fly: tiles, WMS, photos, layers, news.",
+        description="A map that grows while drones fly: tiles, WMS, photos, layers, events.",
     )
     maps, wms, listed = (
         MapEndpoints(context, images),
@@ -85,20 +85,22 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
 
 
 class Guarded:
-    """Every request is meant for this server, every answer carries the headers."""
+    """Middleware: refuses requests for other hosts and adds the security headers to every
+    response.
+    """
 
     def __init__(self, app: ASGIApp, guard: Guard) -> None:
         self.app, self.guard = app, guard
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
+        """Handles one request."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
         always, asked = HEADERS, Headers(scope=scope)
         if scope["path"].startswith(RESUMABLE):
             always = HEADERS | TUS
-            # tus: for clients that cannot send PATCH or DELETE
+            # tus: a header for clients that cannot send PATCH or DELETE
             method = asked.get("x-http-method-override", scope["method"])
             scope = {**scope, "method": method.upper()}
 
@@ -112,5 +114,5 @@ class Guarded:
         if self.guard.knows(asked.get("host", "")):
             await self.app(scope, receive, with_headers)
             return
-        refused = JSONResponse({"detail": "this server answers to localhost only"}, 421)
+        refused = JSONResponse({"detail": "this server answers requests to localhost only"}, 421)
         await refused(scope, receive, with_headers)

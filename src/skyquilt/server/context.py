@@ -1,4 +1,4 @@
-"""What all addresses share: the survey, and who may write to it."""
+"""State shared by all endpoints: the survey and the write permissions."""
 
 from typing import Protocol
 
@@ -11,20 +11,20 @@ from skyquilt.server.survey import Survey
 
 
 class Writer(Protocol):
-    """The growing map that photos and layers are handed to."""
+    """The growing map that receives photos and layers."""
 
     intake: Intake
     ledger: Ledger
 
 
 class Context:
-    """Of one survey."""
+    """The shared state of one survey's endpoints."""
 
     def __init__(self, survey: Survey, guard: Guard, writer: Writer | None) -> None:
         self.survey, self.guard, self.writer = survey, guard, writer
 
     def layer(self, name: str | None) -> str:
-        """The layer of a name, or the first one."""
+        """Checks the name of a layer; None gives the first layer."""
         known = self.survey.layers()
         if name is None and known:
             return next(iter(known))
@@ -36,15 +36,15 @@ class Context:
         return str(name)
 
     def growing(self) -> Writer:
-        """The growing map, where there is one."""
+        """The growing map; an HTTP error if the survey is read-only."""
         if self.writer is None:
             raise HTTPException(
-                405, "this survey is only looked at; 'skyquilt live' takes photos and layers"
+                405, "this survey is read-only; 'skyquilt live' accepts photos and layers"
             )
         return self.writer
 
     def writing(self, request: Request) -> Writer:
-        """The growing map, for a request that may write to it."""
+        """The growing map, if the request is allowed to write to it; otherwise an HTTP error."""
         writer = self.growing()
         given = request.headers.get("authorization") or request.headers.get("x-token")
         if not self.guard.admits(given):

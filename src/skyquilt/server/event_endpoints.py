@@ -1,4 +1,4 @@
-"""MapEvents for those who look on, as server-sent events."""
+"""Map events for viewers, as server-sent events."""
 
 import asyncio
 import threading
@@ -12,15 +12,17 @@ from skyquilt.server.survey import LiveSurvey
 from skyquilt.version import __version__
 
 WAIT_S = 0.1
-"""Between looks for news at most."""
+"""Longest pause in s between checks for new events."""
 LISTEN_S = 0.02
-"""Between looks whether there may be any."""
+"""Pause in s between checks whether the survey may have changed."""
 KEEP_ALIVE_S = 15.0
-"""A comment is sent to quiet listeners so often, so that the connection is known to live."""
+"""If there are no events, a comment is sent at this interval in s, so that clients know that the
+connection is alive.
+"""
 
 
 class EventEndpoints:
-    """The address of news."""
+    """The endpoint of events."""
 
     def __init__(self, context: Context) -> None:
         self.context = context
@@ -28,7 +30,7 @@ class EventEndpoints:
 
     async def events(self, request: Request, after: int | None = None) -> StreamingResponse:
         """Server-sent events: photo, tiles, layer, note, refused, finish; `Last-Event-ID` or
-        `after` take them up.
+        `after` continue after that event.
         """
         said = request.headers.get("last-event-id", "")
         start = (
@@ -64,7 +66,7 @@ class EventEndpoints:
                 await self._pause()
 
     async def _pause(self) -> None:
-        """Until there may be news."""
+        """Waits until there may be new events."""
         known = self.context.survey.stamp()
         for _ in range(round(WAIT_S / LISTEN_S)):
             await asyncio.sleep(LISTEN_S)

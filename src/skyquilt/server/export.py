@@ -1,4 +1,4 @@
-"""A part of the map as a Cloud Optimized GeoTIFF."""
+"""Export of a part of the map as Cloud Optimized GeoTIFF."""
 
 import math
 from pathlib import Path
@@ -9,14 +9,14 @@ from skyquilt.raster import RasterSpec, write_array
 from skyquilt.raster.map_source import Bounds, MapSource, Part
 
 MOST_PIXELS = 60_000_000
-"""Largest export."""
+"""Largest export in pixels."""
 
 
 def write_cog(source: MapSource, bounds: Bounds, path: Path, gsd: float) -> Part | None:
-    """Writes bounds (map projection), at `gsd` m or coarser where that would be too large; None
-    where nothing is.
+    """Writes the map within bounds (map projection), at `gsd` m per pixel, or coarser if that would
+    be too large; None if the map is empty there.
 
-    The file appears whole or not at all.
+    The file appears complete or not at all.
     """
     area = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
     step = max(gsd, math.sqrt(area / MOST_PIXELS))

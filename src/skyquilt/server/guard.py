@@ -1,4 +1,4 @@
-"""Who may do what: tokens, hosts, limits, headers."""
+"""Protection of the server: tokens, hosts, limits and headers."""
 
 import hmac
 import ipaddress
@@ -15,45 +15,47 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-"""Sent with every answer. Scripts come from this server only; a base map's pictures may come from
-elsewhere.
+"""Sent with every response. Scripts are loaded from this server only; images of a base map may come
+from other servers.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Guard:
-    """What protects a server."""
+    """Access rules and limits of a server."""
 
     host: str = "127.0.0.1"
-    """The address it listens on."""
+    """The host name or address on which it listens."""
     token: str | None = None
-    """What writing asks for; None = nothing, on this machine only."""
+    """Token required for writing. None = no token; allowed only if the server listens on this
+    machine alone.
+    """
     most_layer_bytes: int = 20_000_000
-    """Largest posted layer."""
+    """Largest layer in bytes."""
     most_layers: int = 200
-    """Most layers."""
+    """Largest number of layers."""
     most_uploads: int = 200
-    """Uploads under way at a time."""
+    """Largest number of uploads at a time."""
     upload_stall_s: float = 10.0
-    """An upload of which nothing comes for so long has lost its connection."""
+    """If no data arrive for this time in s, the connection of an upload counts as lost."""
     upload_idle_s: float = 600.0
-    """One that nobody went on with for so long no longer counts as under way."""
+    """An upload that was not continued for this time in s no longer counts as active."""
     upload_keep_s: float = 24 * 3600.0
-    """One that nobody went on with for so long is dropped."""
+    """An upload that was not continued for this time in s is deleted."""
 
     def __post_init__(self) -> None:
         if self.token is None and not local(self.host):
             raise UsageError(
-                f"--host {self.host} can be reached from other machines, and nothing protects the"
-                " map against"
+                f"--host {self.host} can be reached from other machines, and the map is not"
+                " protected against"
                 " writing; add --token with a secret, or listen on 127.0.0.1"
             )
         if self.token is not None and len(self.token) < 8:
-            raise UsageError(f"--token has {len(self.token)} characters; take at least 8")
+            raise UsageError(f"--token has {len(self.token)} characters; use at least 8")
 
     def admits(self, given: str | None) -> bool:
-        """Whether a request may write: its `Authorization: Bearer ...` or `X-Token` holds the
-        token.
+        """Whether a request may write: its header `Authorization: Bearer ...` or `X-Token` contains
+        the token.
         """
         if self.token is None:
             return True
@@ -61,8 +63,8 @@ class Guard:
         return hmac.compare_digest(said.encode(), self.token.encode())
 
     def knows(self, host_header: str) -> bool:
-        """Whether a request was meant for this server: names that others let point here are refused
-        (DNS rebinding).
+        """Whether the host name of a request is a name of this server. Other names that resolve to
+        it are refused (protection against DNS rebinding).
         """
         if self.token is not None or not local(self.host):
             return True

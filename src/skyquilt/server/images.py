@@ -1,4 +1,4 @@
-"""Map pictures as bytes, kept until what they show changes."""
+"""Encoded map images, cached until their content changes."""
 
 import hashlib
 import json
@@ -18,20 +18,20 @@ from skyquilt.raster.map_source import MERCATOR, Bounds, MapSource, between, mer
 from skyquilt.server.survey import LiveSurvey, Survey
 
 KEPT = 3000
-"""Tiles kept in memory."""
+"""Number of tiles kept in memory."""
 TILE = 256
 """Pixels of a web tile's side."""
 
 
 def image_bytes(rgba: NDArray[np.uint8], form: str, *, transparent: bool = True) -> bytes:
-    """RGBA (h, w, 4) as PNG, WebP or JPEG; without transparency on white."""
+    """Encodes RGBA (h, w, 4) as PNG, WebP or JPEG; without transparency the background is white."""
     if not transparent or form == "image/jpeg":
         alpha = rgba[..., 3:].astype(np.uint16)
         rgb = ((rgba[..., :3] * alpha + 255 * (255 - alpha)) // 255).astype(np.uint8)
         picture_, bgr = rgb, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
     else:
         picture_, bgr = rgba, cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA)
-    if form == "image/webp":  # the codec's quickest way takes a third of the time of its usual one
+    if form == "image/webp":  # the fastest setting of the codec takes a third of the default's time
         return bytes(imagecodecs.webp_encode(np.ascontiguousarray(picture_), level=80, method=0))
     options = {
         "image/png": (".png", [cv2.IMWRITE_PNG_COMPRESSION, 1]),
@@ -46,14 +46,14 @@ def image_bytes(rgba: NDArray[np.uint8], form: str, *, transparent: bool = True)
 
 @dataclass(frozen=True, kw_only=True)
 class WebTile:
-    """A web tile, as it is sent."""
+    """A web tile as it is sent to clients."""
 
     data: bytes | None
-    """WebP; None where the map has nothing."""
+    """WebP; None if the map is empty there."""
 
     @cached_property
     def tag(self) -> str:
-        """What browsers know its content by (ETag)."""
+        """ETag of the content, for the caches of browsers."""
         return f'"{hashlib.blake2b(self.data or b"", digest_size=8).hexdigest()}"'
 
 
@@ -68,9 +68,7 @@ class Images:
         self._scales: dict[str, tuple[int, tuple[float, float]]] = {}
 
     def kept(self, layer: str, z: int, x: int, y: int) -> WebTile | None:
-        """A web tile that is at hand and shows the map as it is; None where it would have to be
-        drawn.
-        """
+        """A cached web tile that is up to date; None if it must be drawn."""
         self._forget_changed()
         key = (layer, z, x, y)
         with self._lock:
@@ -79,7 +77,7 @@ class Images:
             return self._kept.get(key)
 
     def tile(self, layer: str, z: int, x: int, y: int) -> WebTile:
-        """A web tile."""
+        """A web tile, from the cache or drawn now."""
         if (found := self.kept(layer, z, x, y)) is not None:
             return found
         before = self._known
@@ -89,7 +87,7 @@ class Images:
         )
         made = WebTile(data=None if rgba is None else image_bytes(rgba, "image/webp"))
         with self._lock:
-            if self._known == before:  # else it may have changed while it was drawn
+            if self._known == before:  # otherwise it may have changed while it was drawn
                 self._kept[layer, z, x, y] = made
                 while len(self._kept) > KEPT:
                     self._kept.popitem(last=False)
@@ -118,7 +116,7 @@ class Images:
         return float(low), float(high)
 
     def _forget_changed(self) -> None:
-        """Drops tiles that show what was drawn anew since the last look."""
+        """Removes cached tiles whose content was redrawn since the last call."""
         survey, stamp = self.survey, self.survey.stamp()
         if not isinstance(survey, LiveSurvey) or stamp == self._stamp:
             return
@@ -140,7 +138,7 @@ class Images:
 
 
 def changed_boxes(said: Mapping[str, Any]) -> list[Bounds]:
-    """Where news of tiles say that the map has changed, in EPSG:3857."""
+    """Bounding boxes of the changes reported by a `tiles` event, in EPSG:3857."""
     to_web = between("EPSG:4326", "EPSG:3857")
     found = []
     for west, south, east, north in said.get("boxes") or [said["bounds"]]:
@@ -149,7 +147,7 @@ def changed_boxes(said: Mapping[str, Any]) -> list[Bounds]:
 
 
 def _meet(tiles: NDArray[np.float64], boxes: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether web tiles (n, 3) z, x, y touch any of boxes (m, 4) in EPSG:3857."""
+    """Whether web tiles (n, 3) z, x, y intersect any of the boxes (m, 4) in EPSG:3857."""
     size = (2 * MERCATOR / 2 ** tiles[:, 0])[:, None]
     west, north = tiles[:, 1:2] * size - MERCATOR, MERCATOR - tiles[:, 2:3] * size
     beside = (west >= boxes[:, 2]) | (west + size <= boxes[:, 0])

@@ -1,4 +1,4 @@
-"""Layers over the map, and the button that ends a flight."""
+"""Endpoints of layers over the map and of the button that ends a flight."""
 
 from typing import Any
 
@@ -14,13 +14,13 @@ from skyquilt.server.survey import LiveSurvey
 
 
 class LayerEndpoints:
-    """Addresses of layers."""
+    """Endpoints of layers."""
 
     def __init__(self, context: Context) -> None:
         self.context = context
 
     def layer_list(self) -> dict[str, Any]:
-        """Layers laid over the map."""
+        """Lists the layers over the map."""
         if not isinstance(self.context.survey, LiveSurvey):
             return {"layers": []}
         rows = self.context.survey.ledger.rows("select name, at from layer order by name")
@@ -36,7 +36,9 @@ class LayerEndpoints:
         return Response(row[0], media_type="application/geo+json")
 
     async def layer_post(self, request: Request, name: str) -> JSONResponse:
-        """Lays GeoJSON (the request's body) over the map, or replaces the layer of that name."""
+        """Adds GeoJSON (the request's body) as a layer over the map, or replaces the layer of that
+        name.
+        """
         writer = self.context.writing(request)
         data = b""
         async for block in request.stream():
@@ -51,7 +53,7 @@ class LayerEndpoints:
                 put_layer, writer.ledger, shown_name(name), layer, self.context.guard.most_layers
             )
         except LayerError as error:
-            raise HTTPException(422, f"this is no layer: {error}") from error
+            raise HTTPException(422, f"this is not a layer: {error}") from error
         except OutputError as error:
             raise HTTPException(507, str(error)) from error
         if not stored:
@@ -68,8 +70,8 @@ class LayerEndpoints:
         return {"name": name}
 
     def finish(self, request: Request) -> dict[str, str]:
-        """Asks for the final map: all photos adjusted together, drawn at full resolution, kept
-        beside the live one.
+        """Requests the final map: all photos are adjusted together and drawn at full resolution. It
+        is kept beside the live map.
         """
         writer = self.context.writing(request)
         writer.ledger.put_meta("finish", "asked")

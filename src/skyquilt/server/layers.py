@@ -13,25 +13,25 @@ MOST_NESTED = 8
 
 
 class LayerError(ValueError):
-    """Why something is no layer, a sentence."""
+    """Invalid layer data; the message is a sentence."""
 
 
 def checked(data: bytes) -> dict[str, Any]:
     """A FeatureCollection from GeoJSON bytes (RFC 7946).
 
     Raises:
-        LayerError: it is none.
+        LayerError: the data are invalid.
     """
     try:
         found = json.loads(
-            data, parse_constant=lambda name: _no(f"it holds {name}, which is no number")
+            data, parse_constant=lambda name: _no(f"it contains {name}, which is not a number")
         )
     except LayerError:
         raise
     except (ValueError, RecursionError) as error:
-        raise LayerError(f"it is no JSON ({error})") from error
+        raise LayerError(f"it is not JSON ({error})") from error
     if not isinstance(found, dict):
-        raise LayerError("it is JSON, but no GeoJSON object")
+        raise LayerError("it is JSON, but not a GeoJSON object")
     kind = found.get("type")
     if kind in GEOMETRIES:
         found = {"type": "Feature", "properties": {}, "geometry": found}
@@ -68,11 +68,11 @@ def _feature(feature: Any, k: int) -> dict[str, Any]:
 
 def _places(value: Any, k: int, depth: int) -> None:
     if not isinstance(value, list) or not value or depth > MOST_NESTED:
-        raise LayerError(f"feature {k} has broken coordinates")
+        raise LayerError(f"feature {k} has invalid coordinates")
     if all(isinstance(v, int | float) and not isinstance(v, bool) for v in value):
         if len(value) < 2 or abs(value[0]) > 180 or abs(value[1]) > 90:
             raise LayerError(
-                f"feature {k} has {str(value)[:60]}, which is no longitude and latitude in degrees"
+                f"feature {k} has {str(value)[:60]}, which is not longitude and latitude in degrees"
             )
         return
     for inner in value:
@@ -80,7 +80,7 @@ def _places(value: Any, k: int, depth: int) -> None:
 
 
 def put_layer(ledger: Ledger, name: str, layer: dict[str, Any], most: int) -> bool:
-    """Stores a layer under a name; False where there are too many."""
+    """Stores a layer under a name; False if there are too many layers."""
     with ledger.change() as db:
         count = ledger.row("select count(*) from layer where name != ?", name)
         if count is not None and count[0] >= most:
@@ -93,7 +93,7 @@ def put_layer(ledger: Ledger, name: str, layer: dict[str, Any], most: int) -> bo
 
 
 def drop_layer(ledger: Ledger, name: str) -> bool:
-    """Removes a layer; False where there is none."""
+    """Removes a layer; False if it does not exist."""
     with ledger.change() as db:
         gone = db.execute("delete from layer where name = ?", (name,)).rowcount > 0
         if gone:

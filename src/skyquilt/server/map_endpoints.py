@@ -1,4 +1,4 @@
-"""The map itself: page, web tiles, TileJSON, exports."""
+"""Endpoints of the map: page, web tiles, TileJSON, exports."""
 
 import os
 import tempfile
@@ -19,22 +19,24 @@ from skyquilt.version import __version__
 
 STATIC = Path(__file__).parent / "static"
 DRAWN_AT_ONCE = 2
-"""Tiles drawn at a time: more would not be quicker, and take turns from others."""
+"""Number of tiles drawn at a time. More would not be faster and would delay other requests."""
 
 
 class MapEndpoints:
-    """Addresses of maps."""
+    """Endpoints of maps."""
 
     def __init__(self, context: Context, images: Images) -> None:
         self.context, self.images = context, images
         self._drawing = CapacityLimiter(DRAWN_AT_ONCE)
 
     def page(self) -> FileResponse:
-        """The viewer."""
+        """The page of the viewer."""
         return FileResponse(STATIC / "index.html", headers={"Cache-Control": "no-cache"})
 
     def info(self) -> dict[str, Any]:
-        """What there is: layers with their extent in degrees, counts, the newest event's number."""
+        """Describes the survey: layers with their extent in degrees, counts, number of the newest
+        event.
+        """
         found = []
         for name, source in self.context.survey.layers().items():
             bounds = source.bounds()
@@ -67,8 +69,8 @@ class MapEndpoints:
     async def tile(
         self, request: Request, z: int, x: int, y: int, layer: str | None = None
     ) -> Response:
-        """A web tile (EPSG:3857, 256 px, WebP); 204 where the map has nothing, 304 where the client
-        has it.
+        """A web tile (EPSG:3857, 256 px, WebP); 204 if the map is empty there, 304 if the client
+        has the current version.
         """
         name = self.context.layer(layer)
         if not (0 <= z <= 26 and 0 <= x < 2**z and 0 <= y < 2**z):
@@ -114,7 +116,7 @@ class MapEndpoints:
         except ValueError as error:
             raise HTTPException(400, "bbox is west,south,east,north in degrees") from error
         if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
-            raise HTTPException(400, "bbox holds no area; it is west,south,east,north in degrees")
+            raise HTTPException(400, "bbox has no area; it is west,south,east,north in degrees")
         bounds = between("EPSG:4326", source.crs).transform_bounds(west, south, east, north)
         extent = source.bounds()
         if extent is None:
@@ -135,7 +137,7 @@ class MapEndpoints:
         )
         if done is None:
             Path(path).unlink(missing_ok=True)
-            raise HTTPException(404, "the map has nothing there")
+            raise HTTPException(404, "the map is empty there")
         return FileResponse(
             path, media_type="image/tiff", filename="skyquilt-export.tif", background=gone
         )

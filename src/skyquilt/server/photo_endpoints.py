@@ -1,4 +1,4 @@
-"""Photos as they are looked up: all, those over a point, one, its file."""
+"""Endpoints of photos: all photos, those that cover a point, one photo, its file."""
 
 from typing import Annotated, Any
 
@@ -12,7 +12,7 @@ Degrees = Annotated[float, Query(ge=-180, le=180)]
 
 
 class PhotoEndpoints:
-    """Addresses of photos."""
+    """Endpoints of photos."""
 
     def __init__(self, context: Context) -> None:
         self.context = context
@@ -43,7 +43,7 @@ class PhotoEndpoints:
         """A photo at full resolution, as it was sent."""
         found = self._known(number)
         if found.path is None or not found.path.is_file():
-            raise HTTPException(404, "its file is no longer where it was")
+            raise HTTPException(404, "its file no longer exists")
         kind = {".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".png": "image/png"}.get(
             found.path.suffix.lower(), "image/tiff"
         )

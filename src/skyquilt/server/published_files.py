@@ -1,6 +1,4 @@
-"""Files of the growing map for programs that open files: `map.mbtiles` and a snapshot,
-`map.tif`.
-"""
+"""Writes the growing map as files for other programs: `map.mbtiles` and a snapshot, `map.tif`."""
 
 import json
 import math
@@ -17,17 +15,19 @@ from skyquilt.server.images import TILE, changed_boxes, image_bytes
 from skyquilt.server.survey import LiveSurvey
 
 PAUSE_S = 3.0
-"""Between looks for what has changed."""
+"""Pause in s between checks for changes."""
 SNAPSHOT_S = 20.0
-"""Between snapshots, at least."""
+"""Shortest time in s between snapshots."""
 MOST_TILES = 3000
-"""Web tiles written in one go; the rest follows in the next."""
+"""Largest number of web tiles written in one step; the others follow in the next step."""
 ZOOMS = 7
-"""Zooms of the MBTiles file, from the map's own resolution upwards."""
+"""Number of zoom levels of the MBTiles file, from the map's own resolution to coarser ones."""
 
 
 class PublishedFiles:
-    """Writes both files when the map has changed; as a context manager in a thread of its own."""
+    """Writes both files when the map has changed. As a context manager it runs in a separate
+    thread.
+    """
 
     def __init__(self, survey: LiveSurvey, folder: Path) -> None:
         self.survey, self.folder = survey, folder
@@ -50,13 +50,11 @@ class PublishedFiles:
             try:
                 self.step()
             except OutputError:
-                # the disk is full: tried again when there is room; the mapping says so to the user
+                # the disk is full: retry later; the mapping reports it to the user
                 continue
 
     def step(self, *, now: bool = False) -> None:
-        """Brings both files up to date; the snapshot not more often than every `SNAPSHOT_S`, unless
-        `now`.
-        """
+        """Updates both files; the snapshot at most every `SNAPSHOT_S` seconds, unless `now`."""
         layer = next(iter(self.survey.layers()), None)
         if layer is None or layer in ("finished", "base"):
             return
@@ -73,7 +71,7 @@ class PublishedFiles:
         hit("published")
 
     def _look(self, layer: str) -> None:
-        """Notes where the map has changed."""
+        """Records where the map has changed."""
         while told := self.survey.ledger.told(self._known):
             for _, kind, body in told:
                 said = json.loads(body)

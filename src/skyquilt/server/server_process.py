@@ -1,5 +1,5 @@
-"""The viewer in a process of its own: however many look on, they take no turn from the one that
-places photos.
+"""Runs the server in a separate process, so that the number of viewers does not slow down the
+mapping.
 """
 
 import multiprocessing
@@ -26,13 +26,13 @@ from skyquilt.server.server_thread import ServerThread, address, bound
 from skyquilt.server.survey import LiveSurvey
 
 PATIENCE_S = 60.0
-"""How long the process may take to begin."""
+"""Longest time in s that the process may take to start."""
 NICE = 5
-"""Placing photos comes first."""
+"""Niceness of the server process: the mapping has priority."""
 
 
 class UploadEndpoint:
-    """Where photos and layers are handed in; the mapping finds them in the ledger."""
+    """Receives photos and layers in the server process; the mapping reads them from the ledger."""
 
     def __init__(self, folder: Path, settings: LiveSettings) -> None:
         self.ledger = Ledger(folder, write=True)
@@ -42,29 +42,30 @@ class UploadEndpoint:
 
 @dataclass(frozen=True, kw_only=True)
 class ServerConfig:
-    """What the process is to serve."""
+    """Settings of the server process."""
 
     folder: Path
     """The survey's folder."""
     settings: LiveSettings
-    """Its limits."""
+    """Settings of the live map, for its limits."""
     guard: Guard
-    """Who may write."""
+    """Access rules."""
     base: Path | None = None
-    """An older orthophoto."""
+    """An older orthophoto as a further layer; None = none."""
 
 
 @dataclass(kw_only=True)
 class ServerProcess:
-    """A running server and the files it publishes; as a context manager it ends with its block.
+    """A running server and the files it publishes. As a context manager it stops at the end of its
+    block.
 
-    Should its process die, another one takes its place on the same socket.
+    If its process ends unexpectedly, another one is started on the same socket.
     """
 
     asked: ServerConfig
-    """What it serves."""
+    """Settings of the process."""
     port: int = 0
-    """Where it listens; 0 = a free port, to be read afterwards."""
+    """Port on which it listens; 0 = a free port, which can be read here after the start."""
     _ending: threading.Event = field(default_factory=threading.Event)
     _parts: dict[str, Any] = field(default_factory=dict)
 
@@ -72,7 +73,7 @@ class ServerProcess:
         """Starts it.
 
         Raises:
-            UsageError: packages are missing, the address is taken, or `base` is no map.
+            UsageError: packages are missing, the address is in use, or `base` is not a map.
         """
         listening = bound(self.asked.guard.host, self.port)
         self.port = int(listening.getsockname()[1])
@@ -86,7 +87,7 @@ class ServerProcess:
         return self
 
     def _start(self) -> str:
-        """Begins a process; why it could not, empty where it runs."""
+        """Starts a process; returns why it could not be started, empty if it runs."""
         context = multiprocessing.get_context("spawn")
         wire, theirs = context.Pipe()
         process = context.Process(
@@ -99,9 +100,9 @@ class ServerProcess:
         theirs.close()
         self._parts |= {"process": process, "wire": wire}
         try:
-            return str(wire.recv()) if wire.poll(PATIENCE_S) else "the viewer does not begin"
+            return str(wire.recv()) if wire.poll(PATIENCE_S) else "the viewer does not start"
         except EOFError:
-            return "the viewer's process ended as it began"
+            return "the viewer's process ended during its start"
 
     def _keep(self) -> None:
         while True:
@@ -117,7 +118,7 @@ class ServerProcess:
     ) -> None:
         self._ending.set()
         self._parts["wire"].close()
-        self._parts["thread"].join(5)  # it alone waits for the process
+        self._parts["thread"].join(5)  # this thread waits for the process
         if self._parts["thread"].is_alive():
             self._parts["process"].terminate()
             self._parts["thread"].join(5)
@@ -125,16 +126,16 @@ class ServerProcess:
 
     @property
     def url(self) -> str:
-        """Where to look."""
+        """URL of the viewer."""
         return address(self.asked.guard.host, self.port)
 
 
 def _serve(
     listening: socket.socket, asked: ServerConfig, wire: Connection, other: Connection
 ) -> None:
-    """The process: serves until its parent closes the wire, or is gone."""
+    """Main function of the process: serves until its parent closes the pipe or ends."""
     other.close()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl+C
     with suppress(OSError, AttributeError):
         os.nice(NICE)
     try:

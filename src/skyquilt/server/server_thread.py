@@ -1,4 +1,4 @@
-"""The server in a thread of its own, on a socket that is bound before anything else begins."""
+"""Runs the server in a separate thread, on a socket that is bound before anything else starts."""
 
 import socket
 import threading
@@ -18,10 +18,10 @@ def bound(host: str, port: int) -> socket.socket:
     """A listening socket; port 0 = a free one.
 
     Raises:
-        UsageError: the address is taken, or none of this machine's.
+        UsageError: the address is in use, or does not belong to this machine.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # named as TCP, so that answers are sent at once and not held back for acknowledgements (Nagle)
+    # TCP given explicitly, so that responses are sent at once (no delay by Nagle's algorithm)
     listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -31,33 +31,33 @@ def bound(host: str, port: int) -> socket.socket:
         raise UsageError(
             f"cannot listen on {host}:{port} ({error.strerror}); choose another --port or --host"
         ) from error
-    listening.listen(512)  # who comes before the server is up waits a moment
+    listening.listen(512)  # connections made before the server is ready wait in a queue
     return listening
 
 
 @dataclass(kw_only=True)
 class ServerThread:
-    """A running server; as a context manager it ends with its block."""
+    """A running server. As a context manager it stops at the end of its block."""
 
     survey: Survey
-    """What it shows."""
+    """The survey that it shows."""
     guard: Guard
-    """Who may write."""
+    """Access rules."""
     folder: Path
     """The survey's folder."""
     writer: Any = None
-    """The growing map, where there is one."""
+    """The growing map; None for a finished run."""
     port: int = 0
-    """Where it listens; 0 = a free port, to be read afterwards."""
+    """Port on which it listens; 0 = a free port, which can be read here after the start."""
     listening: socket.socket | None = None
-    """A socket that listens already; None = one is made."""
+    """A socket that is already listening; None = one is created."""
     _parts: dict[str, Any] = field(default_factory=dict)
 
     def __enter__(self) -> Self:
         """Starts it.
 
         Raises:
-            UsageError: packages are missing, or the address is taken.
+            UsageError: packages are missing, or the address is in use.
         """
         try:
             import uvicorn
@@ -101,11 +101,11 @@ class ServerThread:
 
     @property
     def url(self) -> str:
-        """Where to look."""
+        """URL of the viewer."""
         return address(self.guard.host, self.port)
 
 
 def address(host: str, port: int) -> str:
-    """What to type into a browser."""
+    """URL to open in a browser."""
     host = "127.0.0.1" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     return f"http://{host}:{port}/"

@@ -1,4 +1,4 @@
-"""What the server shows: a survey that grows, or a finished run, behind one face."""
+"""The data that the server shows: a growing survey or a finished run, with the same interface."""
 
 import json
 from collections.abc import Mapping
@@ -22,27 +22,27 @@ class Shown:
     """One photo as viewers see it."""
 
     id: int
-    """Number."""
+    """Number of the photo."""
     name: str
-    """Name, to be escaped."""
+    """Name of the photo; must be escaped in HTML."""
     state: str
     """received, waiting, placed, refined, superseded or refused."""
     record: Mapping[str, Any]
-    """All that is told of it."""
+    """All data that are sent to viewers."""
     ring: tuple[tuple[float, float], ...]
-    """Footprint, longitude and latitude."""
+    """Footprint: longitude and latitude of its vertices in degrees."""
     path: Path | None
-    """Its file, where it still lies there."""
+    """Its file; None if it no longer exists."""
 
 
 class Survey(Protocol):
-    """What the server needs to know."""
+    """Interface of the data that the server shows."""
 
     growing: bool
-    """Whether photos may still come."""
+    """Whether more photos may arrive."""
 
     def layers(self) -> dict[str, MapSource]:
-        """MapEndpoints by name, the one to show first first."""
+        """Map layers by name; the first one is the default."""
 
     def photos(self) -> list[Shown]:
         """All photos in order."""
@@ -54,40 +54,40 @@ class Survey(Protocol):
         """A number that grows with every change."""
 
     def stamp(self) -> int:
-        """A number that differs where something may have changed; cheap."""
+        """A number that differs if something may have changed; fast to read."""
 
 
 def open_survey(folder: Path, base: Path | None = None) -> "LiveSurvey | FinishedSurvey":
-    """The survey in a folder.
+    """Opens the survey in a folder.
 
     Raises:
-        UsageError: it holds none.
+        UsageError: it contains none.
     """
     if (folder / NAME).is_file():
         return LiveSurvey(folder, base=base)
     if (folder / "mosaic.tif").is_file():
         return FinishedSurvey(folder, base=base)
     raise UsageError(
-        f"{folder} holds neither a live survey ({NAME}) nor a finished run (mosaic.tif); name the"
-        " folder given to -o"
+        f"{folder} contains neither a live survey ({NAME}) nor a finished run (mosaic.tif); name"
+        " the folder given to -o"
     )
 
 
 def base_map(path: Path | None) -> dict[str, MapSource]:
-    """An older orthophoto as a layer; none where none is given.
+    """An older orthophoto as a layer; empty if no path is given.
 
     Raises:
-        UsageError: it is no georeferenced raster.
+        UsageError: it is not a georeferenced raster.
     """
     if path is None:
         return {}
     if open_map(path) is None or not FileSource(path=path).crs:
-        raise UsageError(f"--base {path} is no georeferenced map that GDAL reads")
+        raise UsageError(f"--base {path} is not a georeferenced map that GDAL can read")
     return {"base": FileSource(path=path)}
 
 
 class LiveSurvey:
-    """A survey's folder that another part of the program writes."""
+    """A live survey, read from its folder while the mapping writes to it."""
 
     growing = True
 
@@ -95,14 +95,14 @@ class LiveSurvey:
         """Opens it for reading; `base` is an older orthophoto.
 
         Raises:
-            OutputError: it cannot be read. UsageError: `base` is no map.
+            OutputError: it cannot be read. UsageError: `base` is not a map.
         """
         self.folder, self.base = folder, base_map(base)
         self.ledger = Ledger(folder, write=False)
         self.tiles = TileStore(folder / TILES, write=False)
 
     def layers(self) -> dict[str, MapSource]:
-        """Layers of the tiles, and the final map where there is one."""
+        """Layers of the tiles, and the final map if there is one."""
         frame, gsd = self.ledger.meta("frame"), self.ledger.meta("gsd")
         found: dict[str, MapSource] = {}
         if frame and gsd:
@@ -167,7 +167,7 @@ class LiveSurvey:
         return self.ledger.last_event()
 
     def stamp(self) -> int:
-        """Of the ledger's file."""
+        """The change counter of the ledger's file."""
         return self.ledger.stamp()
 
 
@@ -177,10 +177,10 @@ class FinishedSurvey:
     growing = False
 
     def __init__(self, folder: Path, *, base: Path | None = None) -> None:
-        """Reads what the run wrote.
+        """Reads the files of the run.
 
         Raises:
-            UsageError: it is not georeferenced, or `base` is no map.
+            UsageError: it is not georeferenced, or `base` is not a map.
         """
         self.folder, self.base = folder, base_map(base)
         self._photos: list[Shown] = []
@@ -240,7 +240,7 @@ class FinishedSurvey:
         return self._photos[number - 1] if 0 < number <= len(self._photos) else None
 
     def refused(self) -> list[dict[str, Any]]:
-        """Photos left out."""
+        """Photos that were left out."""
         try:
             metrics = json.loads((self.folder / "metrics.json").read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -251,11 +251,11 @@ class FinishedSurvey:
         ]
 
     def version(self) -> int:
-        """It does not change."""
+        """Constant, since a finished run does not change."""
         return 1
 
     def stamp(self) -> int:
-        """Neither does this."""
+        """Constant, since a finished run does not change."""
         return 1
 
 
@@ -266,8 +266,8 @@ def _flat(ring: list[Any]) -> list[Any]:
 
 
 def _photo_folder(folder: Path) -> Path | None:
-    """Where the photos of a run lie, as its run.toml says; those of a live survey's final map lie
-    beside it.
+    """Folder of the photos of a run, from its run.toml. The photos of a live survey's final map are
+    beside the run.
     """
     import tomllib
 
@@ -281,9 +281,7 @@ def _photo_folder(folder: Path) -> Path | None:
 
 
 def covering(photos: list[Shown], lon: float, lat: float) -> list[Shown]:
-    """Photos whose footprint holds a point, the one that looks down most steeply (nearest centre)
-    first.
-    """
+    """Photos whose footprint contains a point, the most vertical view (nearest centre) first."""
     found = []
     for photo in photos:
         if photo.state == "superseded" or len(photo.ring) < 3 or photo.record.get("at") is None:
@@ -302,7 +300,7 @@ def covering(photos: list[Shown], lon: float, lat: float) -> list[Shown]:
 
 
 def _holds(ring: np.ndarray, x: float, y: float) -> bool:
-    """Whether a polygon holds a point: the parity of crossings."""
+    """Whether a polygon contains a point, by the even-odd rule."""
     a, b = ring, np.roll(ring, -1, axis=0)
     straddles = (a[:, 1] > y) != (b[:, 1] > y)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,8 +1,9 @@
-"""Photos as they are handed in: in one request, or in parts that survive a lost connection.
+"""Endpoints of photo uploads: in one request, or in parts that can be resumed after a lost
+connection.
 
 Parts follow the tus protocol for resumable uploads, version 1.0.0: its core, and its extensions
-creation, expiration and termination. What it leaves open: the answer to the last part tells what
-became of the photo, in `Photo-Id` and `Photo-State`, or refuses it with 422 and the reason.
+creation, expiration and termination. Beyond the protocol, the response to the last part reports the
+result: the headers `Photo-Id` and `Photo-State`, or 422 with the reason if the photo is refused.
 """
 
 import asyncio
@@ -26,16 +27,16 @@ from skyquilt.server.context import Context
 from skyquilt.server.uploads import Upload, Uploads
 
 RESUMABLE = "/photos/uploads"
-"""The address of resumable uploads."""
+"""Path of the resumable uploads."""
 TUS = {"Tus-Resumable": "1.0.0"}
-"""Sent with every answer from there."""
+"""Sent with every response of that endpoint."""
 VERSIONS = {"Tus-Version": "1.0.0"}
 PART = "application/offset+octet-stream"
 """Media type of a part."""
 
 
 class UploadEndpoints:
-    """Addresses of uploads."""
+    """Endpoints of uploads."""
 
     def __init__(self, context: Context, folder: Path) -> None:
         self.context, self.uploads = context, Uploads(folder / "uploads", context.guard)
@@ -45,8 +46,8 @@ class UploadEndpoints:
     async def upload(
         self, request: Request, name: str = "photo", source: str = "upload"
     ) -> JSONResponse:
-        """Takes a photo (the body). It answers when the photo is safe: 201, 200 for a duplicate,
-        422 refused.
+        """Accepts a photo (the body). Responds when the photo is stored durably: 201, 200 for a
+        duplicate, 422 if refused.
         """
         intake = self.context.writing(request).intake
         most = intake.inbox.most_bytes
@@ -66,14 +67,14 @@ class UploadEndpoints:
     # -- in parts (tus)
 
     def upload_offer(self) -> Response:
-        """What of tus the server offers."""
+        """Reports the supported tus version and extensions."""
         most = self.context.growing().intake.inbox.most_bytes
         offered = {"Tus-Extension": "creation,expiration,termination", "Tus-Max-Size": str(most)}
         return Response(status_code=204, headers=VERSIONS | offered)
 
     def upload_begin(self, request: Request) -> Response:
-        """Begins an upload of `Upload-Length` bytes; `Upload-Metadata` may hold `filename` and
-        `source`. `Location` tells where its parts go.
+        """Starts an upload of `Upload-Length` bytes; `Upload-Metadata` may contain `filename` and
+        `source`. The header `Location` gives the URL for its parts.
         """
         most = self._tus(request).inbox.most_bytes
         size = _number(request, "upload-length")
@@ -81,7 +82,7 @@ class UploadEndpoints:
             raise HTTPException(400, "Upload-Length, the size of the photo in bytes, is needed")
         _check_size(size, most, f"a photo may have {most} bytes", {"Tus-Max-Size": str(most)})
         if size == 0:
-            raise HTTPException(422, "an empty file is no photo")
+            raise HTTPException(422, "an empty file is not a photo")
         metadata = request.headers.get("upload-metadata", "")
         about = metadata_of(metadata)
         name = about.get("filename") or about.get("name") or "photo"
@@ -91,11 +92,11 @@ class UploadEndpoints:
         return Response(status_code=201, headers=told)
 
     async def upload_state(self, request: Request, number: str) -> Response:
-        """How far an upload is: `Upload-Offset`."""
+        """Reports the progress of an upload: `Upload-Offset`."""
         intake, upload = self._tus(request), self._known(number)
         if self.uploads.offset(upload) == upload.size and not upload.outcome:
-            # All bytes are here, but the server ended or its disk was full before the photo was
-            # safe. The offset alone would tell the client that it is.
+            # All bytes have arrived, but the server ended or its disk was full before the photo was
+            # stored durably. The offset alone would tell the client that the photo is safe.
             with self._alone(number):
                 answer = await self._finished(intake, upload)
             if answer.status_code != 204:
@@ -107,7 +108,7 @@ class UploadEndpoints:
         return Response(headers=told | {"Cache-Control": "no-store"})
 
     async def upload_part(self, request: Request, number: str) -> Response:
-        """Appends a part at `Upload-Offset`; the last one makes it a photo."""
+        """Appends a part at `Upload-Offset`; the last part completes the photo."""
         intake, upload = self._tus(request), self._known(number)
         if request.headers.get("content-type", "").split(";")[0].strip().lower() != PART:
             raise HTTPException(415, f"a part has the Content-Type {PART}")
@@ -126,7 +127,7 @@ class UploadEndpoints:
         return Response(status_code=204, headers=self._progress(upload))
 
     async def upload_end(self, request: Request, number: str) -> Response:
-        """Drops an upload; a photo that was accepted stays."""
+        """Deletes an upload; a photo that was accepted is kept."""
         self._tus(request)
         self._known(number)
         with self._alone(number):
@@ -134,7 +135,7 @@ class UploadEndpoints:
         return Response(status_code=204)
 
     def _tus(self, request: Request) -> Intake:
-        """Where photos go, for a request that may write and speaks this version of tus."""
+        """The intake of photos, if the request may write and uses this version of tus."""
         writer = self.context.writing(request)
         if request.headers.get("tus-resumable") != TUS["Tus-Resumable"]:
             raise HTTPException(412, "this is tus 1.0.0; say so in Tus-Resumable", VERSIONS)
@@ -148,21 +149,21 @@ class UploadEndpoints:
 
     @contextmanager
     def _alone(self, number: str) -> Iterator[None]:
-        """While one request writes an upload, others may not."""
+        """Locks an upload while one request writes to it."""
         with self.uploads.writing(number) as mine:
             if not mine:
                 raise HTTPException(423, "another request is writing this upload; try again later")
             yield
 
     def _progress(self, upload: Upload) -> dict[str, str]:
-        """Headers that tell how far an upload is."""
+        """Headers with the progress of an upload."""
         told = {"Upload-Offset": str(self.uploads.offset(upload)), **upload.outcome}
         if not upload.outcome:
             told["Upload-Expires"] = formatdate(self.uploads.expires(upload), usegmt=True)
         return told
 
     async def _finished(self, intake: Intake, upload: Upload) -> Response:
-        """Hands in an upload that is whole."""
+        """Passes a complete upload to the intake of photos."""
         done = await run_in_threadpool(self._handed_in, intake, upload)
         if not isinstance(done, Accepted):
             self.uploads.drop(upload.id)
@@ -180,13 +181,15 @@ class UploadEndpoints:
             raise _no_room(error) from error
         if upload is None:
             raise HTTPException(
-                429, "too many uploads are under way; wait for some to end", {"Retry-After": "5"}
+                429,
+                "too many uploads are in progress; wait until some have ended",
+                {"Retry-After": "5"},
             )
         return upload
 
     async def _append(self, request: Request, upload: Upload, limit: str) -> None:
-        """Writes the body behind what is here of an upload. Of a connection that was lost, what
-        came counts; of a body that is too long or that the disk cannot take, nothing does.
+        """Appends the body to an upload. If the connection is lost, the bytes that arrived are
+        kept. If the body is too long or the disk is full, none of its bytes are kept.
         """
         path, before = self.uploads.path(upload), self.uploads.offset(upload)
         try:
@@ -201,10 +204,12 @@ class UploadEndpoints:
             _cut(path, before)
             raise
         if not whole:
-            raise HTTPException(408, "the connection was lost before all was here; send the rest")
+            raise HTTPException(
+                408, "the connection was lost before all bytes arrived; send the rest"
+            )
 
     async def _written(self, request: Request, file: BinaryIO, most: int, limit: str) -> bool:
-        """Writes the body to a file; false where the connection was lost before its end."""
+        """Writes the body to a file; False if the connection was lost before its end."""
         size = file.tell()
         try:
             async for block in _blocks(request, self.context.guard.upload_stall_s):
@@ -225,11 +230,11 @@ class UploadEndpoints:
 
 
 def metadata_of(header: str) -> dict[str, str]:
-    """Keys and values of `Upload-Metadata`: pairs with commas between them, each a key and, after
-    a space, its value in Base64.
+    """Keys and values of `Upload-Metadata`: pairs with commas between them, each a key and, after a
+    space, its value in Base64.
 
     Raises:
-        HTTPException: 400, it is none.
+        HTTPException: 400, the header is invalid.
     """
     found: dict[str, str] = {}
     for pair in header.split(",") if header.strip() else []:
@@ -237,7 +242,7 @@ def metadata_of(header: str) -> dict[str, str]:
         try:
             text = base64.b64decode(value.strip(), validate=True).decode(errors="replace")
         except ValueError:
-            raise HTTPException(400, f"Upload-Metadata: {key[:60]!r} is no Base64") from None
+            raise HTTPException(400, f"Upload-Metadata: {key[:60]!r} is not Base64") from None
         if not key or key in found:
             raise HTTPException(400, "Upload-Metadata: each value needs a key of its own")
         found[key] = text
@@ -245,10 +250,10 @@ def metadata_of(header: str) -> dict[str, str]:
 
 
 async def _blocks(request: Request, patience_s: float) -> AsyncIterator[bytes]:
-    """The body as it comes.
+    """The blocks of the body as they arrive.
 
     Raises:
-        TimeoutError: nothing came for `patience_s`.
+        TimeoutError: no data arrived for `patience_s`.
         ClientDisconnect: the connection was lost.
     """
     stream = request.stream()
@@ -261,19 +266,19 @@ async def _blocks(request: Request, patience_s: float) -> AsyncIterator[bytes]:
 
 
 def _length(request: Request) -> int:
-    """Bytes that the body is to have; 0 where the client does not say."""
+    """Number of bytes of the body as announced by the client; 0 if it was not announced."""
     return _number(request, "content-length") or 0
 
 
 def _number(request: Request, header: str) -> int | None:
-    """A header that holds a count of bytes; None where it is missing or holds something else."""
+    """A header with a number of bytes; None if it is missing or invalid."""
     text = request.headers.get(header, "")
     return int(text) if re.fullmatch("[0-9]{1,18}", text) else None
 
 
 def _check_size(size: int, most: int, limit: str, headers: dict[str, str] | None = None) -> None:
     if size > most:
-        raise HTTPException(413, f"{limit}, this makes {size} or more", headers)
+        raise HTTPException(413, f"{limit}, this one has {size} or more", headers)
 
 
 def _cut(path: Path, size: int) -> None:
@@ -282,9 +287,7 @@ def _cut(path: Path, size: int) -> None:
 
 
 def _no_room(error: OSError) -> HTTPException:
-    return HTTPException(
-        507, f"the server's disk cannot take it ({error.strerror}); send it again later"
-    )
+    return HTTPException(507, f"the server cannot store it ({error.strerror}); send it again later")
 
 
 def _state(done: Accepted) -> str:

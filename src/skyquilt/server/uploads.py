@@ -1,4 +1,4 @@
-"""Uploads under way, on disk: bytes are appended at the offset that the server knows."""
+"""Unfinished uploads, stored on disk. Bytes are appended at the offset that the server knows."""
 
 import asyncio
 import json
@@ -13,39 +13,41 @@ from pathlib import Path
 from skyquilt.server.guard import Guard
 
 SWEEP_S = 60.0
-"""Between looks for expired uploads, at most."""
+"""Longest time in s between searches for expired uploads."""
 _ID = re.compile(r"[0-9a-f]{32}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Upload:
-    """An upload under way, or one whose photo was accepted."""
+    """An unfinished upload, or one whose photo was accepted."""
 
     id: str
-    """Its name in addresses."""
+    """Its identifier in URLs."""
     name: str
     """The photo's name."""
     source: str
-    """Who sends it."""
+    """The sender."""
     size: int
-    """Bytes when it is whole."""
+    """Size of the complete file in bytes."""
     metadata: str = ""
     """`Upload-Metadata` as the client sent it."""
     outcome: dict[str, str] = field(default_factory=dict)
-    """Headers that tell what became of the photo; empty until it is accepted."""
+    """Headers that report the result; empty until the photo is accepted."""
 
 
 class Uploads:
-    """All uploads of one survey. To be used from the server's event loop alone, but for `begin`."""
+    """All uploads of one survey. Except for `begin`, it must be used only from the server's event
+    loop.
+    """
 
     def __init__(self, folder: Path, guard: Guard) -> None:
-        """They wait in `folder`."""
+        """Uploads are stored in `folder`."""
         self.folder, self.guard = folder, guard
         self._written: set[str] = set()
         self.sweep()
 
     def begin(self, name: str, source: str, size: int, metadata: str = "") -> Upload | None:
-        """A new one; None where too many are under way."""
+        """Creates an upload; None if there are too many."""
         self.folder.mkdir(parents=True, exist_ok=True)
         idle = time.time() - self.guard.upload_idle_s
         if sum(_changed(path) > idle for path in self.folder.glob("*.part")) >= (
@@ -60,7 +62,7 @@ class Uploads:
         return upload
 
     def get(self, number: str) -> Upload | None:
-        """One by its id; None where there is none, or none any more."""
+        """An upload by its id; None if it does not exist or has expired."""
         if not _ID.fullmatch(number):
             return None
         try:
@@ -73,27 +75,27 @@ class Uploads:
         return upload
 
     def path(self, upload: Upload) -> Path:
-        """Where its bytes lie."""
+        """Path of the file with its bytes."""
         return self.folder / f"{upload.id}.part"
 
     def offset(self, upload: Upload) -> int:
-        """Bytes that are here."""
+        """Number of bytes received."""
         return upload.size if upload.outcome else self.path(upload).stat().st_size
 
     def expires(self, upload: Upload) -> float:
-        """When it will be dropped, unless more comes (Unix time)."""
+        """Time (Unix time) at which it will be deleted unless more bytes arrive."""
         return self._last(upload.id) + self.guard.upload_keep_s
 
     def accept(self, upload: Upload, outcome: dict[str, str]) -> None:
-        """Its photo is safe: the bytes go; the record stays until it expires, for a client that
-        missed the last answer.
+        """Marks the upload as accepted. Its bytes are deleted; its record is kept until it expires,
+        for a client that missed the last response.
         """
         self._record(Upload(**{**asdict(upload), "outcome": outcome}))
         self.path(upload).unlink(missing_ok=True)
 
     @contextmanager
     def writing(self, number: str) -> Iterator[bool]:
-        """Holds an upload for one writer; false where another one has it."""
+        """Locks an upload for one writer; False if another one holds the lock."""
         if number in self._written:
             yield False
             return
@@ -104,26 +106,26 @@ class Uploads:
             self._written.discard(number)
 
     def drop(self, number: str) -> None:
-        """Forgets one."""
+        """Deletes an upload."""
         for ending in (".part", ".json", ".new"):
             with suppress(OSError):
                 (self.folder / f"{number}{ending}").unlink()
 
     def sweep(self) -> None:
-        """Drops what has expired, and what a crash left of uploads as they began."""
+        """Deletes expired uploads, and files that a crash left while an upload was created."""
         old = time.time() - self.guard.upload_keep_s
         for number in {path.stem for path in self.folder.glob("*.*")} - self._written:
             if self._last(number) < old:
                 self.drop(number)
 
     async def sweeping(self) -> None:
-        """Sweeps now and then, until it is cancelled."""
+        """Calls `sweep` at intervals until it is cancelled."""
         while True:
             await asyncio.sleep(min(SWEEP_S, self.guard.upload_keep_s / 4))
             self.sweep()
 
     def _last(self, number: str) -> float:
-        """When something of it last came (Unix time)."""
+        """When its data last changed (Unix time)."""
         return max(_changed(self.folder / f"{number}{ending}") for ending in (".part", ".json"))
 
     def _record(self, upload: Upload) -> None:
@@ -134,7 +136,7 @@ class Uploads:
 
 
 def _changed(path: Path) -> float:
-    """When a file was last written (Unix time); long ago where there is none."""
+    """When a file was last written (Unix time); 0 if it does not exist."""
     try:
         return path.stat().st_mtime
     except OSError:

@@ -12,12 +12,12 @@ from pyproj.exceptions import CRSError
 from skyquilt.raster.map_source import Bounds, MapSource, between
 
 LARGEST = 4096
-"""Pixels of a picture's side."""
+"""Largest width and height of an image in px."""
 FORMATS = ("image/png", "image/jpeg", "image/webp")
 
 
 class WmsError(Exception):
-    """What a client asked wrongly; `code` as the standard names it."""
+    """An invalid request; `code`: the exception code of the standard."""
 
     def __init__(self, text: str, code: str = "InvalidParameterValue") -> None:
         super().__init__(text)
@@ -26,16 +26,16 @@ class WmsError(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class MapRequest:
-    """A picture asked for."""
+    """A GetMap request."""
 
     version: str
     """1.1.1 or 1.3.0."""
     layers: tuple[str, ...]
-    """Bottom first."""
+    """Names of the layers, bottom first."""
     crs: str
-    """As pyproj reads it."""
+    """CRS in a form that pyproj reads."""
     bounds: Bounds
-    """West, south, east, north in x, y order, whatever the CRS's own."""
+    """West, south, east, north in x, y order, whatever the axis order of the CRS."""
     width: int
     """Pixels."""
     height: int
@@ -47,15 +47,15 @@ class MapRequest:
 
 
 def asked(query: Mapping[str, str]) -> dict[str, str]:
-    """Parameters by upper-case name: WMS does not mind the case of names."""
+    """Parameters by upper-case name, since names are not case-sensitive in WMS."""
     return {k.upper(): v for k, v in query.items()}
 
 
 def map_request(query: Mapping[str, str], known: Mapping[str, MapSource]) -> MapRequest:
-    """The picture that parameters (upper-case names) ask for.
+    """The request described by parameters (upper-case names).
 
     Raises:
-        WmsError: they do not fit.
+        WmsError: they are invalid.
     """
     version = (
         "1.1.1" if query.get("VERSION", query.get("WMTVER", "1.3.0")).startswith("1.1") else "1.3.0"
@@ -106,12 +106,12 @@ def _bounds(text: str, crs: str, version: str) -> Bounds:
     if version == "1.3.0" and crs != "CRS:84" and northing_first(crs):
         a, b, c, d = b, a, d, c
     if not (a < c and b < d and all(abs(v) < 1e9 for v in (a, b, c, d))):
-        raise WmsError(f"BBOX holds no area: {text[:80]!r}")
+        raise WmsError(f"BBOX has no area: {text[:80]!r}")
     return a, b, c, d
 
 
 def northing_first(crs: str) -> bool:
-    """Whether a CRS's own first axis is the northing or latitude, which WMS 1.3.0 follows."""
+    """Whether the first axis of a CRS is the northing or latitude; WMS 1.3.0 follows that order."""
     try:
         return CRS.from_user_input(crs).axis_info[0].direction.lower() == "north"
     except (CRSError, IndexError):
@@ -119,13 +119,13 @@ def northing_first(crs: str) -> bool:
 
 
 def supported(known: Mapping[str, MapSource]) -> list[str]:
-    """Projections that pictures come in."""
+    """CRSs in which images are offered."""
     own = [s.crs for s in known.values() if s.crs.startswith("EPSG:")]
     return list(dict.fromkeys(["EPSG:3857", "EPSG:4326", "CRS:84", *own]))
 
 
 def capabilities(known: Mapping[str, MapSource], url: str, version: str) -> str:
-    """The service's description."""
+    """The capabilities document of the service."""
     old = version.startswith("1.1")
     crs_tag = "SRS" if old else "CRS"
     layers = "".join(_layer(n, s, known, old=old) for n, s in known.items())
@@ -199,7 +199,7 @@ def _layer(name: str, source: MapSource, known: Mapping[str, MapSource], *, old:
 
 
 def refusal(error: WmsError, version: str) -> str:
-    """An error as the standard writes it."""
+    """An error as the XML document of the standard."""
     old = version.startswith("1.1")
     head = (
         '<ServiceExceptionReport version="1.1.1">'

@@ -1,4 +1,4 @@
-"""The WMS address: requests answered with pictures of the map."""
+"""The WMS endpoint."""
 
 import numpy as np
 from fastapi import Request, Response
@@ -12,7 +12,7 @@ from skyquilt.server.wms import WmsError, asked, capabilities, map_request, refu
 
 
 class WmsEndpoints:
-    """Capabilities, pictures, and photos below a pixel."""
+    """GetCapabilities, GetMap, and GetFeatureInfo, which lists the photos at a pixel."""
 
     def __init__(self, context: Context, images: Images) -> None:
         self.context, self.images = context, images
