@@ -21,7 +21,7 @@ from PIL import Image
 
 from skyquilt.errors import UsageError
 from skyquilt.live.settings import LiveSettings
-from skyquilt.server.guard import Guard
+from skyquilt.server.access import Guard
 from skyquilt.server.published_files import PublishedFiles
 from skyquilt.server.survey import LiveSurvey
 from tests.live.conftest import served

@@ -1,6 +1,4 @@
-"""Converts photos, priors and a start to the arrays of an adjustment, and its results to
-records.
-"""
+"""Photos, priors and a start as the arrays of an adjustment, and its results as records."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,13 +18,9 @@ from skyquilt.model.poses import Pose, Prior
 Array = NDArray[np.float64]
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 INDEPENDENT = 40
-"""Number of independent observations that carry the same information as a photo's many correlated
-ones.
-"""
+"""Independent observations that tell as much as a photo's many correlated ones."""
 YAW_LIE_DEG = 20.0
-"""A reported yaw that differs by more than this, in degrees, from the yaw of the links counts as a
-gross error.
-"""
+"""A reported yaw further than this, in degrees, from that of the links is a gross error."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -24,7 +24,7 @@ def command(
 ) -> None:
     """Show a map in a browser, with all photos that cover any point. The files are not changed."""
     with ends_at_once():
-        from skyquilt.server.guard import Guard
+        from skyquilt.server.access import Guard
         from skyquilt.server.server_thread import ServerThread
         from skyquilt.server.survey import open_survey
     survey = open_survey(folder, base=base)

@@ -190,17 +190,25 @@ def draw_map(
     Raises:
         OutputError: the disk is full or read-only.
     """
-    photos, alignment = aligned.photos, aligned.alignment
+    alignment, first = aligned.alignment, aligned.photos[0]  # all are of one kind
     thumbnails = aligned.found.thumbnails([v.photo for v in on.views])
     exposure = yield from clock.stage(
         "balance",
         _at_once(
             lambda: balanced(
-                photos, thumbnails, on, methods.balance, methods.drift, settings.picture
+                first.unit,
+                first.dtype,
+                thumbnails,
+                on,
+                methods.balance,
+                methods.drift,
+                settings.picture,
             )
         ),
     )
-    compose = orthomosaic.composer(photos, on, exposure, methods.blend, aligned.pixels)
+    compose = orthomosaic.composer(
+        first.channels, first.dtype, on, exposure, methods.blend, aligned.pixels
+    )
     steps = orthomosaic.draw(
         output,
         compose,
@@ -209,7 +217,7 @@ def draw_map(
         settings.picture.boundary,
         clock.store,
         orthomosaic.map_key(key, alignment, on, exposure),
-        photos[0].unit,
+        first.unit,
         settings.running.jobs or os.cpu_count() or 1,
     )
     drawn = yield from clock.stage("mosaic", steps)
