@@ -180,7 +180,6 @@ def seams(survey: Path, gsd: float) -> None:
     from skyquilt.workflows.artefacts import REGISTRY
     from skyquilt.workflows.methods import methods_for
     from skyquilt.workflows.mosaic import mosaic
-    from skyquilt.workflows.photo_features import find_features
 
     home = Path(tempfile.mkdtemp())
     live = LiveMap(home / "live", LiveSettings(gsd_cm=gsd))
@@ -197,7 +196,6 @@ def seams(survey: Path, gsd: float) -> None:
     cache = PixelCache(read=lambda i: read_color(photos[i]), budget_bytes=600_000_000)
     settings = MosaicSettings(balance=False)
     methods = methods_for(settings)
-    found = drain(find_features(photos, cache, methods.detector, store, 2))
     alignment = Alignment(
         method="live",
         why="",

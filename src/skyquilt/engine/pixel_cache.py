@@ -59,3 +59,10 @@ class PixelCache:
         """Drops all photos."""
         with self._lock:
             self._kept.clear()
+
+
+def pixel_budget(memory_gb: float | None) -> int:
+    """Bytes for decoded photos: the memory allowed (None = 1.2 GB) less that of code, features and
+    tiles.
+    """
+    return int(max(0.15, (memory_gb or 1.2) - 0.6) * 1e9)

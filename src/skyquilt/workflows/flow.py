@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from skyquilt.alignment.inputs import AlignmentInputs, GreyPicture
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
-from skyquilt.engine.pixel_cache import PixelCache
+from skyquilt.engine.pixel_cache import PixelCache, pixel_budget
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import SkyquiltError, UnreadablePhotoError
 from skyquilt.model.event import Event, Note
@@ -31,7 +31,7 @@ from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.radiometry import balanced
 from skyquilt.photos.pixels import read_color
-from skyquilt.settings import MosaicSettings, RunningSettings
+from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.links import Links, link_photos
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import (
@@ -120,7 +120,7 @@ def align_photos(
     store, jobs = clock.store, settings.running.jobs or os.cpu_count() or 1
     photos = given.survey.photos
     cache = PixelCache(
-        read=lambda i: read_color(photos[i]), budget_bytes=pixel_budget(settings.running)
+        read=lambda i: read_color(photos[i]), budget_bytes=pixel_budget(settings.running.memory_gb)
     )
     found = yield from clock.stage(
         "features", find_features(photos, cache, methods.detector, store, jobs)
@@ -231,11 +231,6 @@ def scene_of(
     aligned = yield from align_photos(given, methods, settings, clock)
     on = yield from find_ground(aligned, methods, settings, clock)
     return Scene(aligned=aligned, ground=on)
-
-
-def pixel_budget(running: RunningSettings) -> int:
-    """Bytes for decoded photos: what the memory allowed leaves after code, features and tiles."""
-    return int(max(0.15, (running.memory_gb or 1.2) - 0.6) * 1e9)
 
 
 def _pixels_of(
