@@ -130,9 +130,9 @@ def test_all_kinds_of_bad_at_once(mosaic, photos):
 @pytest.mark.slow
 def test_a_photo_that_cannot_be_read_any_more_when_the_map_is_drawn(mosaic, photos, monkeypatch):
     """A disk goes away in the middle: the file is named, and the same command resumes."""
-    from skyquilt.workflows import mosaic as story
+    from skyquilt.workflows import flow
 
-    read, seen = story.read_color, set()
+    read, seen = flow.read_color, set()
 
     def once(photo):
         if photo.name in seen and photo.name == "SIM_0005.jpg":
@@ -140,8 +140,8 @@ def test_a_photo_that_cannot_be_read_any_more_when_the_map_is_drawn(mosaic, phot
         seen.add(photo.name)
         return read(photo)
 
-    monkeypatch.setattr(story, "read_color", once)
-    monkeypatch.setattr(story, "pixel_budget", lambda settings: 0)
+    monkeypatch.setattr(flow, "read_color", once)
+    monkeypatch.setattr(flow, "pixel_budget", lambda memory: 0)
     mosaic(photos).refused(1, "SIM_0005.jpg", "Input/output error", "same command again")
     monkeypatch.undo()
     assert mosaic(photos).made().metrics["photos_used"] == 9

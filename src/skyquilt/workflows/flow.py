@@ -2,13 +2,11 @@
 
     SurveyInput -> AlignedPhotos -> Ground -> DrawnMap -> metrics of the run
 
-Each step is a generator of events that returns its record. What a step needs stands in its
-signature. Results are looked up in the run's store before they are made, so the same steps over the
-same store cost nothing twice: that is how a run resumes, and how a later command gets at the photos
-and the ground of a finished map.
+Each step is a generator of events that returns its record; what it needs stands in its signature.
+Results are looked up in the run's store before they are made: so a run resumes, and a later
+command gets at the photos and the ground of a finished map by the same steps.
 """
 
-import os
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,7 +115,7 @@ def align_photos(
         NoPhotosError: no photo can be decoded.
         AlignmentError: the method cannot place the photos.
     """
-    store, jobs = clock.store, settings.running.jobs or os.cpu_count() or 1
+    store, jobs = clock.store, settings.running.threads
     photos = given.survey.photos
     cache = PixelCache(
         read=lambda i: read_color(photos[i]), budget_bytes=pixel_budget(settings.running.memory_gb)
@@ -218,7 +216,7 @@ def draw_map(
         clock.store,
         orthomosaic.map_key(key, alignment, on, exposure),
         first.unit,
-        settings.running.jobs or os.cpu_count() or 1,
+        settings.running.threads,
     )
     drawn = yield from clock.stage("mosaic", steps)
     return DrawnMap(exposure=exposure, compose=compose, drawn=drawn)
