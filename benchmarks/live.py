@@ -188,7 +188,7 @@ def seams(survey: Path, gsd: float) -> None:
     ):
         live.add(path)
     time.sleep(2.2)
-    for _ in live.settle():
+    for _ in live.drain_all():
         pass
     members = list(live.members.on_map())
     photos = tuple(m.photo for m in members)

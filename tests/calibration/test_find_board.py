@@ -45,7 +45,7 @@ def test_16_bit_counts_and_gaps_make_no_difference():
 def test_a_board_that_is_larger_than_said_is_refused():
     view = FindBoard()("", frame(frontal()), Board(columns=6, rows=5, square_m=0.1))
     assert not view
-    assert "goes on beyond 6 x 5" in view.reason
+    assert "continues beyond 6 x 5" in view.reason
     assert "not corners" in view.reason
 
 

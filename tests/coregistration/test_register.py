@@ -270,7 +270,7 @@ def test_what_the_output_may_be(files, tmp_path):
 
 def test_missing_files_and_words_that_are_none(files, tmp_path):
     folder, _, _ = files
-    with pytest.raises(UsageError, match=r"is no file"):
+    with pytest.raises(UsageError, match=r"is not a file"):
         register(folder / "none.jpg", folder / "b.png", tmp_path / "out")
     output = tmp_path / "out"
     assert (

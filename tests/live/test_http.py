@@ -381,8 +381,8 @@ def test_other_sites_may_not_write_nor_point_here(site, flight):
 @pytest.mark.parametrize(
     ("body", "word"),
     [
-        (b"{", "no JSON"),
-        (b"[1]", "no GeoJSON"),
+        (b"{", "not JSON"),
+        (b"[1]", "not a GeoJSON"),
         (b'{"type": "Topology"}', "FeatureCollection"),
         (b'{"type": "Point", "coordinates": [1e9, 0]}', "degrees"),
         (b'{"type": "Point", "coordinates": [NaN, 0]}', "NaN"),

@@ -28,7 +28,7 @@ def mapped(folder, paths, **settings):
     for path in paths:
         live.add(path)
     live.blocks.last_arrival = -1e9  # as if it had been quiet for long
-    for _ in live.settle():
+    for _ in live.drain_all():
         pass
     return live
 

@@ -18,7 +18,7 @@ live = LiveMap(folder / "out", LiveSettings(features=600))
 for name in sys.argv[1:]:
     print(live.add(Path(name)).what)
 live.blocks.last_arrival = -1e9  # as if it had been quiet for long
-for update in live.settle():
+for update in live.drain_all():
     print(update.what, update.text)
 live.close()
 """

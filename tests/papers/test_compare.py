@@ -53,7 +53,7 @@ def undisturbed(flight, tmp_path_factory):
     out = tmp_path_factory.mktemp("undisturbed") / "out"
     compared(flight / "photos", out)
     found = record(out)
-    assert "measured in a model" in found["judged_by"]
+    assert "from a model" in found["judged_by"]
     return found
 
 

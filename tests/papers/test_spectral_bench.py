@@ -41,7 +41,7 @@ def listed(tmp_path_factory):
 
 
 def test_a_missing_picture_is_named(listed, tmp_path):
-    with pytest.raises(UsageError, match=r"none\.png is no file"):
+    with pytest.raises(UsageError, match=r"none\.png is not a file"):
         list(iter_spectral_bench(listed, tmp_path / "out", ("usurf",)))
 
 

@@ -28,4 +28,4 @@ def test_the_section_replaces_a_former_one_and_stays_inside_the_page():
     assert "0.15 m, 1.50 px" in once and "4 of 5" in once
     assert "no &lt;thermal&gt; photo" in once  # words from outside are escaped
     again = with_section(once, thermal_section({**RECORD, "route": "maps"}, PICTURES, (8.0, 31.5)))
-    assert again.count('id="thermal"') == 1 and "pictures of both maps" in again
+    assert again.count('id="thermal"') == 1 and "images of both maps" in again

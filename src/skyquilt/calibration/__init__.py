@@ -1,1 +1,1 @@
-"""Frames of a chess-board -> Camera [Yahyanejad 2013, 5.1, 6.3]."""
+"""Camera calibration from frames of a chess-board [Yahyanejad 2013, 5.1, 6.3]."""

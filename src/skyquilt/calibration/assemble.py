@@ -1,4 +1,4 @@
-"""Frames of one board pose, heated part by part, to one picture of the greatest contrast.
+"""Combines frames of one board pose, heated part by part, to one image of high contrast.
 
 Bimodality and weights: Yahyanejad 2013, 5.1.2, (5.1) to (5.3).
 """
@@ -19,11 +19,11 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True)
 class Assemble:
-    """Weighted mean of the frames (5.3), cell by cell, the weight growing with bimodality.
+    """Weighted mean of the frames (5.3), cell by cell; the weight increases with bimodality.
 
-    As printed, (5.3) weighs by phi, which is low where black and white part well; the weight here
-    is phi to the power of -`power`. See docs/methods.md for what each power does to simulated
-    sweeps.
+    As printed, (5.3) weights by phi, which is low where black and white are well separated; the
+    weight here is phi to the power of -`power`. docs/methods.md gives the effect of this power on
+    simulated sweeps.
     """
 
     version: ClassVar[int] = 1
@@ -34,7 +34,7 @@ class Assemble:
     """
 
     def __call__(self, frames: Iterable[NDArray[Any]], board: Board) -> Image:
-        """The assembled picture (H, W) of frames (H, W) of equal size."""
+        """The assembled image (H, W) of frames (H, W) of equal size."""
         total, weights = np.zeros(1), np.zeros(1)
         for frame in frames:
             image = grey_float(frame)
@@ -57,8 +57,8 @@ class Assemble:
 
 
 def cell_of(shape: tuple[int, ...], board: Board) -> int:
-    """Two squares (the thesis's least width of a cell) of a board that fills the frame, in px:
-    smaller ones make cells that are wider than that.
+    """Width in px of two squares (the least width of a cell in the thesis) of a board that fills
+    the frame. If the board is smaller, a cell contains more than two squares.
     """
     short, long = sorted((board.columns, board.rows))
     return max(4, int(2 * min(min(shape[:2]) / short, max(shape[:2]) / long)))
@@ -66,8 +66,8 @@ def cell_of(shape: tuple[int, ...], board: Board) -> int:
 
 def bimodality(cell: NDArray[Any]) -> float:
     """phi of (5.1): spread of the pixels below the mean plus spread of those above it, over the
-    squared distance of the two means. Low is well separated; infinite for a cell without contrast.
-    Unit: 1 / unit of the cell.
+    squared distance of the two means. Low values mean good separation; infinite for a cell without
+    contrast. Unit: 1 / unit of the cell.
     """
     values = np.asarray(cell, np.float64).ravel()
     values = values[np.isfinite(values)]
@@ -84,7 +84,7 @@ def separation(image: NDArray[np.float32], cell_px: int) -> NDArray[np.float64]:
     """1 / phi (m, n) on overlapping cells of an image (H, W), `cell_px` wide at steps of half of
     it.
 
-    phi is low where black and white part well, so its inverse is what a weight must grow with.
+    phi is low where black and white are well separated, so a weight must increase with its inverse.
     """
     step = max(1, cell_px // 2)
     rows, columns = (max(1, 1 + (size - cell_px + step - 1) // step) for size in image.shape)

@@ -23,7 +23,7 @@ class Blobs:
     """Centroids (n, 2) in px."""
     sides: Array
     """(n, 4, 2) in px: from the centroid to the middle of each side of the square before erosion,
-    clockwise as seen.
+    clockwise in the image.
     """
     white: NDArray[np.bool_]
     """(n,) whether the square is a white one."""

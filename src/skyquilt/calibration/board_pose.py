@@ -1,4 +1,6 @@
-"""Which squares of a grid are the board: the chess pattern itself decides, not the outline."""
+"""Finds which squares of a grid are the board, from the chess pattern itself and not from its
+outline.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,9 +16,9 @@ Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 _SAMPLES = 7
 _WEAKEST = 0.2
-"""A pair of neighbours must differ by this share of the median pair."""
+"""Least difference of two neighbouring squares, as a share of the median difference."""
 _ABOVE_TEXTURE = 2.0
-"""Black and white must differ by so many times the spread inside a square."""
+"""Least difference of black and white, as a multiple of the spread inside a square."""
 
 
 _INNER = 0.75
@@ -27,36 +29,36 @@ one.
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Placed:
-    """A board's place in a frame."""
+    """A board's position in a frame."""
 
     px_H_cell: Array
     """(3, 3): from (column, row) of the board, square centres at integers, to px."""
     white_first: bool
     """Whether the first square (0, 0) is a white one."""
     contrast: float
-    """White less black squares: median over neighbouring pairs, in units of the image."""
+    """White minus black squares: median over neighbouring pairs, in units of the image."""
     texture: float
     """Median spread inside a square, in units of the image."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Misplaced:
-    """A grid that is not the board asked for. False where a place is true."""
+    """Why a grid is not the requested board. Its truth value is False."""
 
     reason: str
-    """Why."""
+    """The reason as a phrase."""
     squares: int
-    """How many squares there were."""
+    """Number of squares found."""
 
     def __bool__(self) -> bool:
         return False
 
 
 def place(image: Image, grid: Lattice, board: Board) -> Placed | Misplaced:
-    """The board's place on a grid found in an image (H, W).
+    """The board's position on a grid found in an image (H, W).
 
-    Every square must differ from its neighbours as the pattern says, and only one place may fit: a
-    pattern that goes on is another board.
+    Every square must differ from its neighbours according to the pattern, and only one position may
+    fit. If the pattern continues, it is another board.
     """
     windows = list(_windows(grid, board))
     inside = [w for w in windows if _in_frame(grid.px_H_grid @ w, board, image.shape)]
@@ -64,7 +66,7 @@ def place(image: Image, grid: Lattice, board: Board) -> Placed | Misplaced:
     good = [f for f in fits.values() if f]
     seen, asked = np.ptp(grid.cells, 0) + 1, f"{board.columns} x {board.rows}"
     if len(good) > 1:
-        why = f"the pattern goes on beyond {asked} squares (squares are counted, not corners)"
+        why = f"the pattern continues beyond {asked} squares (squares are counted, not corners)"
     else:
         why = f"{seen[0]} x {seen[1]} squares were found where {asked} are expected"
         whole = [w for w in windows if _covers(w, grid, board)]
@@ -78,8 +80,8 @@ def place(image: Image, grid: Lattice, board: Board) -> Placed | Misplaced:
 
 
 def _windows(grid: Lattice, board: Board) -> Iterator[Array]:
-    """grid_H_board (3, 3) of every way to lay the board over the grid so that all squares found, or
-    all but an outer row, are covered; four turns each.
+    """grid_H_board (3, 3) of every position of the board on the grid that covers all squares found,
+    or all but an outer row; four rotations each.
     """
     low, high = grid.cells.min(0), grid.cells.max(0)
     for quarter in range(4):
@@ -94,20 +96,20 @@ def _windows(grid: Lattice, board: Board) -> Iterator[Array]:
 
 
 def _place_of(window: Array, board: Board) -> tuple[float, ...]:
-    """The rectangle that a window covers, whatever its turn."""
+    """The rectangle that a window covers, whatever its rotation."""
     ends = through(window, np.array([[0.0, 0.0], [board.columns - 1.0, board.rows - 1.0]]))
     return (*np.rint(ends.min(0)).tolist(), *np.rint(ends.max(0)).tolist())
 
 
 def _covers(window: Array, grid: Lattice, board: Board) -> bool:
-    """Whether a window holds all squares found."""
+    """Whether a window contains all squares found."""
     x0, y0, x1, y1 = _place_of(window, board)
     low, high = grid.cells.min(0), grid.cells.max(0)
     return bool(x0 <= low[0] and y0 <= low[1] and x1 >= high[0] and y1 >= high[1])
 
 
 def _judged(image: Image, grid: Lattice, window: Array, board: Board) -> Placed | None:
-    """The place, if the pattern is there."""
+    """The position, if the pattern is there."""
     H = grid.px_H_grid @ window
     level, spread = cell_levels(image, H, board)
     white_first = (round(window[0, 2] + window[1, 2]) % 2 == 0) == grid.white_even
@@ -118,8 +120,8 @@ def _judged(image: Image, grid: Lattice, window: Array, board: Board) -> Placed 
 
 
 def _in_frame(H: Array, board: Board, shape: tuple[int, ...]) -> bool:
-    """Whether the middle halves of all squares lie in the image: a lens bends the outer sides
-    inwards, and the homography does not know that.
+    """Whether the middle halves of all squares are inside the image. The outer sides are not
+    tested, since lens distortion moves them inwards and the homography does not model that.
     """
     c, r = board.columns - _INNER, board.rows - _INNER
     ends = np.array([[_INNER - 1, _INNER - 1], [c, _INNER - 1], [c, r], [_INNER - 1, r]])
@@ -143,9 +145,7 @@ def cell_levels(image: Image, H: Array, board: Board) -> tuple[Array, Array]:
 
 
 def pattern_contrast(level: Array, white_first: bool) -> float | None:
-    """Median difference of neighbours (rows, columns); None where one pair contradicts the
-    pattern.
-    """
+    """Median difference of neighbours (rows, columns); None if a pair contradicts the pattern."""
     rows, columns = np.indices(level.shape)
     sign = np.where((rows + columns) % 2 == 0, 1.0, -1.0) * (1 if white_first else -1)
     across, down = (

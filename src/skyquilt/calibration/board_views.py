@@ -1,6 +1,4 @@
-"""Frames in: one view of the board per pose, from single frames or from the frames of a heated
-sweep.
-"""
+"""One view of the board per pose, from single frames or from the frames of a heated sweep."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -21,30 +19,32 @@ from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.photos.pixels import read_color
 
 SERIES = ("auto", "views", "folders")
-"""Whether frames of one pose belong together: found out, never, or folder by folder."""
+"""How frames of one pose are grouped: detected automatically, never, or by folder."""
 _SWEEP = 3
 """Fewest frames of a pose that are assembled."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Seen:
-    """The board in every pose, or why not, with the pictures it was sought in."""
+    """The board in every pose, or the reason why it was not found, with the images that were
+    searched.
+    """
 
     views: tuple[BoardView, ...]
     """Poses with the board."""
     rejected: tuple[RejectedView, ...]
-    """Poses without."""
+    """Poses without the board."""
     pictures: dict[str, NDArray[Any]]
-    """Name of a view -> its picture (H, W), single or assembled."""
+    """Name of a view -> its image (H, W), single or assembled."""
     frames: int
-    """Frames looked at."""
+    """Number of frames searched."""
 
 
 def one_camera(photos: Sequence[Photo]) -> None:
-    """Refuses frames of several sizes: they are not of one camera.
+    """Refuses frames that are not from one camera.
 
     Raises:
-        RefusedError: they are.
+        RefusedError: they have several sizes or cameras.
     """
     sizes = Counter((p.width, p.height) for p in photos).most_common()
     if len(sizes) > 1:
@@ -88,7 +88,7 @@ def look(
 
 
 def grouped(photos: Sequence[Photo], series: str) -> tuple[list[list[Photo]], list[RejectedPhoto]]:
-    """Frames by pose; what cannot be read any more is left out."""
+    """Frames grouped by pose; frames that can no longer be read are left out."""
     ordered = sorted(photos, key=_folder)  # stable: in order of capture inside a folder
     folders = [list(g) for _, g in groupby(ordered, key=_folder)]
     if series == "folders":
@@ -126,7 +126,7 @@ def _folder(photo: Photo) -> str:
 def _view(
     pose: Sequence[Photo], board: Board, find: FindBoard
 ) -> tuple[BoardView | RejectedView, NDArray[Any] | None]:
-    """The board in one pose: in the frame, or in what its frames are assembled to."""
+    """Finds the board in one pose: in the frame, or in the image assembled from its frames."""
     name = pose[0].name if len(pose) == 1 else f"{pose[0].name} and {len(pose) - 1} more"
     try:
         alone = len(pose) < _SWEEP

@@ -34,12 +34,12 @@ class Calibrate:
 
     version: ClassVar[int] = 2
     marks: Marks = "centres"
-    """What is sighted."""
+    """Type of points used as observations."""
     tolerance: float = 3.0
     """A coefficient's tolerance in standard deviations, as in the toolbox that the thesis used."""
     rounds: int = 3
-    """How often centroids are corrected for perspective and distortion with the camera found so
-    far.
+    """How many times centroids are corrected for perspective and distortion with the current
+    camera.
     """
 
     def __call__(self, views: Sequence[BoardView], board: Board) -> Calibration:
@@ -60,7 +60,7 @@ class Calibrate:
         return self._reduced(seen, rough, board)
 
     def observations(self, view: BoardView, board: Board) -> Observations:
-        """The marks of a view that count."""
+        """The points of a view that are used."""
         points, px = (
             (board.corners, view.corners)
             if self.marks == "corners"
@@ -68,7 +68,7 @@ class Calibrate:
         )
         known = np.isfinite(px[..., 0])
         if self.marks == "centres":
-            known &= board.inner  # what lies beside the others may be anything [Y 5.1.3]
+            known &= board.inner  # the surroundings of the outer squares are unknown [Y 5.1.3]
         return Observations(
             name=view.name,
             board=points[known],
@@ -88,7 +88,7 @@ class Calibrate:
             ]
             if any(abs(value) >= tolerance for _, value, tolerance in found):
                 if names == ("p1", "p2"):
-                    continue  # a radial term may be spare although decentring is not
+                    continue  # a radial term may be unnecessary although decentring is not
                 break
             dropped += found
             free = [n for n in free if n not in names]
@@ -107,7 +107,7 @@ class Calibrate:
     def _fit(
         self, seen: Sequence[Observations], start: Solution, free: Sequence[str], board: Board
     ) -> tuple[Solution, Sequence[Observations]]:
-        """The minimum, and the observations corrected with it."""
+        """The solution, and the observations corrected with it."""
         solution, used = start, seen
         for _ in range(self.rounds if self.marks == "centres" else 1):
             used = self.corrected(seen, solution.camera, solution.poses, board)
@@ -117,7 +117,9 @@ class Calibrate:
     def corrected(
         self, seen: Sequence[Observations], camera: Camera, poses: Sequence[BoardPose], board: Board
     ) -> list[Observations]:
-        """Images of centres instead of centroids of images; corners as they are."""
+        """Converts centroids of square images to images of square centres; corners are not
+        changed.
+        """
         if self.marks == "corners":
             return list(seen)
         return [
@@ -128,7 +130,7 @@ class Calibrate:
         ]
 
     def left_over(self, view: BoardView, camera: Camera, board: Board) -> Array:
-        """Residuals (n, 2) in px of a view that had no part in a camera: only its pose is
+        """Residuals (n, 2) in px of a view that was not used for the camera: only its pose is
         fitted.
         """
         seen = [self.observations(view, board)]
@@ -145,15 +147,15 @@ def _sigma(camera: Camera, name: str) -> float:
 
 
 def _without(camera: Camera, names: Sequence[str]) -> Camera:
-    """The camera, some of its coefficients zero."""
+    """The camera with some of its coefficients set to zero."""
     changed: dict[str, Any] = dict.fromkeys(names, 0.0)
     return replace(camera, **changed)
 
 
 def _widened(camera: Camera, full: Camera, free: Sequence[str]) -> Camera:
-    """The camera, the deviations of its lengths grown by what dropping coefficients moved: below
-    the tolerance is not zero. Coefficients of other orders are other quantities, whatever their
-    names.
+    """The camera with the deviations of focal length and principal point increased by their change
+    when coefficients were dropped, since a coefficient below its tolerance is not exactly zero.
+    Distortion coefficients are not compared, since their meaning depends on the order of the model.
     """
     moved = np.where(
         [n in free and n in _LENGTHS for n in PARAMETERS], camera.vector - full.vector, 0.0
@@ -164,8 +166,8 @@ def _widened(camera: Camera, full: Camera, free: Sequence[str]) -> Camera:
 
 
 def strangers(calibration: Calibration, *, times: float = 4.0) -> dict[str, float]:
-    """Views whose RMS error in px is so many times the median view's: the board was moved, or is
-    another one.
+    """Views whose RMS error in px is more than `times` that of the median view: the board was
+    moved, or is another one.
     """
     each = np.array([rms(r) for r in calibration.residuals])
     limit = times * float(np.median(each))

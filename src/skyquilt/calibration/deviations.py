@@ -1,4 +1,4 @@
-"""How well a calibration knows its parameters."""
+"""Standard deviations of the parameters of a calibration."""
 
 from collections.abc import Sequence
 
@@ -19,14 +19,14 @@ def sigmas(
     poses: Sequence[BoardPose],
     columns: Sequence[int],
 ) -> tuple[float, ...]:
-    """Standard deviations in the order of `PARAMETERS`, 0 for what was held (`columns` says what
-    was not).
+    """Standard deviations in the order of `PARAMETERS`, 0 for fixed parameters (`columns`: the free
+    ones).
 
-    The largest of three: that of independent errors with the variance that the residuals show; one
-    that lets errors repeat in every view at the same mark of the board [the sandwich, clustered by
-    mark], because a board that is not quite flat or evenly heated is wrong in the same way in all
-    views, and more views do not make it right; and the jackknife over views, because errors of
-    neighbouring squares of one view are akin.
+    The largest of three estimates. First, independent errors with the variance of the residuals.
+    Second, errors that are the same in every view at a point of the board [sandwich estimator,
+    clustered by point]: a board that is not quite flat or evenly heated has the same errors in all
+    views, and more views do not reduce them. Third, the jackknife over views, since errors of
+    neighbouring squares in one view are correlated.
     """
     own = len(columns)
     size = own + 6 * len(views)
@@ -65,8 +65,8 @@ def _jackknife(
     poses: Sequence[BoardPose],
     columns: Sequence[int],
 ) -> Array:
-    """Variances of the intrinsics from what leaving out one view after the other moves, to first
-    order; zero for fewer than four views.
+    """Variances of the intrinsics from their changes when each view is left out, to first order;
+    zero for fewer than four views.
     """
     own = len(columns)
     if len(views) < _FEWEST or not own:
@@ -76,7 +76,7 @@ def _jackknife(
         J, r = linearised(view, camera, pose, columns)
         flat, e = J.reshape(-1, own + 6), r.ravel()
         to_pose = np.linalg.lstsq(flat[:, own:], np.column_stack([flat[:, :own], e]), rcond=None)[0]
-        free = flat[:, :own] - flat[:, own:] @ to_pose[:, :own]  # what the pose cannot take up
+        free = flat[:, :own] - flat[:, own:] @ to_pose[:, :own]  # not absorbed by the pose
         normals.append(free.T @ free)
         scores.append(free.T @ (e - flat[:, own:] @ to_pose[:, own]))
     whole = np.sum(normals, 0)

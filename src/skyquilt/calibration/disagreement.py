@@ -1,4 +1,6 @@
-"""Two calibrations of one lens from the same views: what they disagree about is not known."""
+"""Difference between two calibrations of one lens from the same views, as a measure of their
+uncertainty.
+"""
 
 from dataclasses import replace
 
@@ -11,12 +13,13 @@ _LENGTHS = ("focal", "cx", "cy")
 
 
 def widened(found: Calibration, other: Calibration) -> Calibration:
-    """A calibration whose lengths (focal length, principal point) have deviations grown by the
-    difference from another one, from other marks of the same views, over the square root of two.
+    """A calibration whose lengths (focal length, principal point) have deviations increased by the
+    difference from another one, from other points of the same views, divided by the square root of
+    two.
 
-    Heat moves the edges of squares in the same way in every view, and no residual shows what poses
-    and intrinsics have taken up of that; centres and corners take it up differently. Coefficients
-    of distortion are left alone: both calibrations may have other orders.
+    Heat moves the edges of squares in the same way in every view. Poses and intrinsics absorb part
+    of this, which no residual shows; centres and corners absorb it differently. Distortion
+    coefficients are not changed, since the two calibrations may have different orders.
     """
     apart = found.camera.vector - other.camera.vector
     apart = np.where([n in found.free and n in _LENGTHS for n in PARAMETERS], apart, 0.0)

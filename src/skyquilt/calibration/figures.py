@@ -1,5 +1,5 @@
-"""How good a calibration is: on frames kept out, against corners, and by what undistortion does to
-registration.
+"""Quality of a calibration: on views kept out, compared with corners, and by the effect of
+undistortion on registration.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,13 +27,13 @@ class Judged:
     """Figures of both calibrations."""
 
     held_out_px: Mapping[Marks, Mapping[Marks, float]]
-    """Calibrated from -> judged by -> RMS error in px of the views kept out."""
+    """Points calibrated from -> points evaluated -> RMS error in px of the views kept out."""
     pairs: int
     """Pairs of views registered by a homography."""
     unseen: bool
-    """Whether those pairs had no part in the camera that undistorts them."""
+    """Whether these pairs were not used for the camera that undistorts them."""
     mse_raw_px2: float
-    """(6.2) of the corners as they are."""
+    """(6.2) of the raw corners."""
     mse_undistorted_px2: float
     """(6.2) of the undistorted corners."""
 

@@ -1,4 +1,4 @@
-"""What a calibration leaves behind: the camera, its figures, plots, the boards as found, a page."""
+"""Output files of a calibration: the camera, its figures, plots, the detected boards, a page."""
 
 import json
 from collections.abc import Mapping
@@ -78,8 +78,8 @@ def finish(
 
 
 def _stated(found: Calibration) -> Camera:
-    """The camera with deviations that hold for a flight: a coefficient dropped is known to its
-    tolerance.
+    """The camera with deviations that are valid for a flight; a dropped coefficient has its
+    tolerance as deviation.
     """
     dropped = {name: tolerance for name, _, tolerance in found.dropped}
     return replace(
@@ -91,7 +91,7 @@ def _stated(found: Calibration) -> Camera:
 def as_record(
     seen: Seen, board: Board, key: str, centres: Calibration, corners: Calibration, judged: Judged
 ) -> dict[str, Any]:
-    """What calibration.json says."""
+    """The record of calibration.json."""
     gain = 1 - judged.mse_undistorted_px2 / judged.mse_raw_px2 if judged.mse_raw_px2 > 0 else 0.0
     return {
         "camera": key,

@@ -1,4 +1,4 @@
-"""A frame -> the board in it, without help and in front of any background."""
+"""Finds the board in a frame automatically, in front of any background."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -20,11 +20,11 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True)
 class FindBoard:
-    """Squares as blobs at several sizes, counted out by their neighbours, checked against the
+    """Finds squares as blobs at several sizes, orders them by their neighbours, and checks the
     pattern.
 
-    Nothing is asked of what lies around the board; of the squares themselves, six that touch are
-    enough to find the others.
+    Nothing is assumed about the surroundings of the board. Six touching squares are enough to find
+    the others.
     """
 
     version: ClassVar[int] = 1
@@ -33,9 +33,9 @@ class FindBoard:
     itself.
     """
     smallest_px: float = 7.0
-    """Side of the smallest squares looked for, in px of the searched picture."""
+    """Side of the smallest squares searched, in px of the searched image."""
     erosions: tuple[float, ...] = (0.06, 0.12, 0.18)
-    """Radii of erosion, in sides of the squares looked for."""
+    """Radii of erosion, in sides of the squares searched."""
     measure: Measure = field(default_factory=Measure)
     """Sub-pixel measurement."""
 
@@ -87,7 +87,7 @@ class FindBoard:
         return best
 
     def _candidates(self, image: Image, board: Board) -> Iterator[Blobs]:
-        """Blobs at sizes from a board that fills the picture downwards."""
+        """Blobs at decreasing sizes, from a board that fills the image."""
         height, width = image.shape
         short, long = sorted((board.columns, board.rows))
         side = min(min(width, height) / short, max(width, height) / long) / 1.3
@@ -102,7 +102,7 @@ class FindBoard:
 
 
 def grey_float(image: NDArray[Any]) -> Image:
-    """(H, W) float32 of a frame of one band or three; what was not measured becomes the median."""
+    """(H, W) float32 of a frame of one band or three; invalid pixels get the median."""
     if image.ndim == 3:
         image = (
             image[..., 0]
@@ -117,7 +117,7 @@ def grey_float(image: NDArray[Any]) -> Image:
 
 
 def blankness(image: Image) -> str | None:
-    """Why a frame shows nothing at all; None where it shows something."""
+    """Why a frame is blank; None if it is not."""
     low, high = np.percentile(image, [1, 99])
     if image.max() <= image.min():
         return f"it is blank: every pixel is {image.flat[0]:g}"

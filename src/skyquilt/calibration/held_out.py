@@ -1,4 +1,4 @@
-"""How well a calibration explains frames that it has not seen."""
+"""Errors of a calibration on views that were not used for it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeldOut:
-    """Cameras, each from all views but some, and those views."""
+    """Cameras, each calibrated without some views, and these views."""
 
     cameras: tuple[Camera, ...]
     """One per part."""
@@ -41,8 +41,8 @@ def hold_out(
 
 
 def error_px(held: HeldOut, judge: Calibrate, views: Sequence[BoardView], board: Board) -> float:
-    """RMS error in px of the views kept out, by the marks of `judge` (not always those calibrated
-    from).
+    """RMS error in px of the views kept out, by the points of `judge` (not always those used for
+    calibration).
     """
     return rms(
         np.concatenate(

@@ -1,4 +1,4 @@
-"""Blobs that are neighbours, counted out as squares of one board."""
+"""Assigns columns and rows of a grid to neighbouring blobs."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from skyquilt.calibration.blobs import Blobs
 
 Array = NDArray[np.float64]
 STEPS = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
-"""Column and row to the neighbour on each side, clockwise."""
+"""Steps in column and row to the neighbour on each side, clockwise."""
 _NEAR = 0.35
 _FEWEST = 6
 _OFF = 0.2
@@ -20,7 +20,7 @@ _OFF = 0.2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lattice:
-    """Squares that lie on one grid; where on the board is not known yet."""
+    """Squares on one grid; their position on the board is not known yet."""
 
     px_H_grid: Array
     """(3, 3): from (column, row), centres at integers, to px."""
@@ -45,8 +45,8 @@ def lattices(found: Blobs) -> list[Lattice]:
 
 
 def _links(found: Blobs) -> dict[int, list[tuple[int, int, int]]]:
-    """Blob -> (its side, neighbour, the neighbour's side): opposite colours that point at each
-    other.
+    """Blob -> (its side, neighbour, the neighbour's side): neighbours have opposite colours and
+    facing sides.
     """
     links: dict[int, list[tuple[int, int, int]]] = {i: [] for i in range(len(found))}
     if len(found) < _FEWEST:
@@ -89,7 +89,7 @@ def _counted(
 
 
 def _fitted(found: Blobs, cells: dict[int, tuple[int, int]]) -> Lattice | None:
-    """The grid's homography, without squares that a wrong step put elsewhere."""
+    """The grid's homography, without squares that got a wrong column or row."""
     index = np.array(list(cells))
     grid = np.array([cells[i] for i in index])
     side = 2 * np.median(np.linalg.norm(found.sides[index], axis=2))

@@ -1,4 +1,4 @@
-"""How the points of a view move with the lens and with the board."""
+"""Derivatives of the points of a view by intrinsics and board pose."""
 
 from collections.abc import Sequence
 

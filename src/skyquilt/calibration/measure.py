@@ -1,4 +1,4 @@
-"""Centroids of squares and inner corners to a fraction of a pixel, once the board's place is
+"""Subpixel measurement of square centroids and inner corners, once the board's position is
 known.
 """
 
@@ -19,28 +19,30 @@ _ROUNDS = 2
 _FEWEST = 6
 _AREA = (0.6, 1.45)
 _SMOOTH, _BESIDE, _AROUND = 0.03, 0.12, 0.6
-"""Radii in sides of a square: of smoothing, of what lies beside an edge, of what surely holds black
-and white.
+"""Radii in sides of a square: of smoothing, of the area beside an edge, of an area that certainly
+contains black and white.
 """
 _STEP = 0.6
-"""Share of the contrast around that an edge must have."""
+"""Least contrast of an edge as a share of the contrast around it."""
 _MARGIN = 0.3
-"""Cells around the board that are looked at, so that the outer sides of its squares are seen."""
+"""Margin around the board in cells, so that the outer sides of its squares are included."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
-    """Where squares lie: blobs, parted where they touch at corners, and the centroids of their
-    hulls.
+    """Positions of squares: blobs are separated where they touch at corners, and the centroids of
+    their hulls are computed.
     """
 
     version: ClassVar[int] = 1
     side_px: float = 100.0
-    """Pictures are enlarged until a square has about this side: blobs have whole pixels."""
+    """Images are enlarged until a square has about this side, since blobs consist of whole
+    pixels.
+    """
     openings: tuple[float, ...] = (0.12, 0.25)
-    """Radii of erosion and dilation in sides of a square: the larger one for squares that still
-    cling to others at their corners, by heat or blur. Corners are rounded off by it; `square_image`
-    knows that.
+    """Radii of erosion and dilation in sides of a square: the larger one is for squares that still
+    touch others at their corners, by heat or blur. It rounds off corners; `square_image` takes that
+    into account.
     """
 
     def centroids(self, image: Image, placed: Placed, board: Board) -> tuple[Array, Array, Array]:
@@ -93,11 +95,11 @@ class Measure:
 
 
 def half_way(image: Image, middle: Image, cell: Image, side: float) -> Image:
-    """Between black and white (h, w) at every pixel: at an edge half-way between what lies on both
-    sides of it, so that uneven heat does not move it; elsewhere between the levels of whole
-    squares, `middle` (rows, columns).
+    """Threshold between black and white (h, w) at every pixel. At an edge it is half-way between
+    the values on both sides, so that uneven heat does not move the edge; elsewhere half-way between
+    the levels of whole squares, `middle` (rows, columns).
 
-    `cell` (h, w, 2) says which square a pixel is of, `side` is that of a square in px.
+    `cell` (h, w, 2): the square of each pixel, `side`: side of a square in px.
     """
     whole = cv2.remap(
         middle, cell[..., 0], cell[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -110,7 +112,7 @@ def half_way(image: Image, middle: Image, cell: Image, side: float) -> Image:
 
 
 def _extremes(image: Image, radius: float) -> tuple[Image, Image]:
-    """Least and largest value around every pixel (h, w)."""
+    """Smallest and largest value around every pixel (h, w)."""
     kernel = np.ones((2 * max(1, round(radius)) + 1,) * 2, np.uint8)
     return np.asarray(cv2.erode(image, kernel), np.float32), np.asarray(
         cv2.dilate(image, kernel), np.float32
@@ -139,7 +141,7 @@ def _centroids(
     blobs: NDArray[np.uint8], covered: Image, px_H_part: Array
 ) -> Iterator[tuple[Array, float]]:
     """Centroid (2,) in px and area in px^2 of each blob within its convex hull [outlines: Suzuki];
-    pixels on the outline count by their share.
+    pixels on the outline are weighted by their covered share.
     """
     scale = float(px_H_part[0, 0])
     around = np.ones((3, 3), np.uint8)
@@ -169,7 +171,7 @@ def _centroids(
 
 def corners(image: Image, px_H_cell: Array, board: Board) -> Array:
     """Inner corners (rows - 1, columns - 1, 2) in px by the gradients around them [Forstner]; NaN
-    where they ran away.
+    where the refinement diverged.
     """
     y, x = np.mgrid[0 : board.rows - 1, 0 : board.columns - 1] + 0.5
     guess = through(px_H_cell, np.column_stack([x.ravel(), y.ravel()]))

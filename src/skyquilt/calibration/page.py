@@ -31,10 +31,10 @@ _WORDS = {"centres": "centres of squares", "corners": "corners"}
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CalibrationInput:
-    """What the page is made from."""
+    """Data of the page."""
 
     figures: Mapping[str, Any]
-    """What calibration.json says."""
+    """The record of calibration.json."""
     board: Board
     """The board."""
     centres: Calibration
@@ -42,7 +42,7 @@ class CalibrationInput:
     corners: Calibration
     """For comparison, on the same views."""
     boards: NDArray[np.uint8]
-    """(H, W, 3) RGB, all views with what was found in them."""
+    """(H, W, 3) RGB, all views with the detected squares."""
     title: str
     """Heading."""
     version: str
@@ -50,7 +50,7 @@ class CalibrationInput:
 
 
 def calibration_page(data: CalibrationInput) -> str:
-    """The whole page, in one file."""
+    """The page as one self-contained file."""
     return plain_page(
         title=f"Lens calibration from {data.title}",
         summary=_summary(data),
@@ -68,7 +68,7 @@ def calibration_page(data: CalibrationInput) -> str:
             Section(id="errors", title="Reprojection errors", blocks=tuple(_figures(data))),
             Section(
                 id="registration",
-                title="What undistortion does to registration",
+                title="Effect of undistortion on registration",
                 blocks=(_registration(data),),
             ),
             Section(id="boards", title="Boards as found", blocks=(_boards(data),)),
@@ -87,7 +87,7 @@ _LEAD = (
 
 
 def plots(data: CalibrationInput) -> Iterator[str]:
-    """Drawings as files of their own: errors over the pattern and error charts, centres first."""
+    """Drawings as separate files: errors over the pattern and error charts, centres first."""
     for draw in (_pattern, _chart):
         for found in (data.centres, data.corners):
             svg = str(draw(data, found).svg)
@@ -135,7 +135,7 @@ def _tiles(data: CalibrationInput) -> tuple[Tile, ...]:
             else "fair"
             if held < 1.5 * found.rms_px
             else "poor",
-            says="RMS of views that had no part in the camera; much above the former means too many"
+            says="RMS of views not used for the camera; if much larger than the former, too many"
             " parameters.",
         ),
         Tile(
@@ -240,7 +240,7 @@ def _pattern(data: CalibrationInput, found: Calibration) -> Figure:
     return Figure(
         svg=svg,
         title=title,
-        caption="Measured less predicted, mean over all views; the longest arrow is"
+        caption="Measured minus predicted, mean over all views; the longest arrow is"
         f" {fixed(longest, 3)} px. What"
         " repeats in all views is the board, not the lens.",
     )
@@ -272,7 +272,7 @@ def _chart(data: CalibrationInput, found: Calibration) -> Figure:
 def _registration(data: CalibrationInput) -> Sentences:
     r = data.figures["registration"]
     how = (
-        "which had no part in the camera"
+        "which were not used for the camera"
         if r["pairs_unseen_by_the_camera"]
         else "with the camera from all views"
     )
@@ -280,7 +280,7 @@ def _registration(data: CalibrationInput) -> Sentences:
         items=(
             f"{r['pairs']} pairs of views were registered by a homography through the board's"
             f" corners, {how}: a board"
-            " is flat, so all that is left is distortion and noise.",
+            " is flat, so the remaining errors are distortion and noise.",
             f"Mean squared error (6.2): {fixed(r['mse_raw_px2'], 3)} px\u00b2 raw,"
             f" {fixed(r['mse_undistorted_px2'], 3)}"
             f" px\u00b2 undistorted ({fixed(-r['reduction_percent'], 1, sign=True)} %).",

@@ -1,4 +1,6 @@
-"""Which frames show one pose: a camera that stood still while a lamp moved, or a view each."""
+"""Groups frames by pose: either the camera was fixed while the board was heated, or each frame is a
+view.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -16,8 +18,8 @@ Image = NDArray[np.float32]
 
 @dataclass(frozen=True, kw_only=True)
 class StoodStill:
-    """Whether the camera moved between two frames: their fine structure correlates where it lies,
-    or does not.
+    """Detects whether the camera moved between two frames, by the correlation of their fine
+    structure without shift.
     """
 
     version: ClassVar[int] = 1
@@ -34,18 +36,18 @@ class StoodStill:
         )
 
     def __call__(self, a: Image, b: Image) -> bool:
-        """Of two frames' structures."""
+        """Whether two frames' structures show the same pose."""
         return a.shape == b.shape and correlation(a, b) > self.correlation
 
 
 def correlation(a: Image, b: Image) -> float:
-    """Of two pictures of zero mean and equal size, at no shift; 0 for a blank one."""
+    """Correlation of two images of zero mean and equal size without shift; 0 for a blank one."""
     scale = float(np.sqrt((a * a).sum() * (b * b).sum()))
     return float((a * b).sum() / scale) if scale > 0 else 0.0
 
 
 def runs(structures: Iterable[Image], still: StoodStill) -> list[list[int]]:
-    """Indices of frames in order, parted where the camera moved."""
+    """Indices of frames in order, split where the camera moved."""
     groups: list[list[int]] = []
     last: Image | None = None
     for i, now in enumerate(structures):

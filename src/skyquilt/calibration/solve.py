@@ -1,4 +1,4 @@
-"""Intrinsics and board poses that leave the least squared reprojection error, by OpenCV."""
+"""Intrinsics and board poses that minimise the squared reprojection error, by OpenCV."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +16,7 @@ from skyquilt.model.camera import PARAMETERS, Camera
 Array = NDArray[np.float64]
 
 _ENOUGH = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-12)
-"""Steps of a fit at most, and the relative change that ends it."""
+"""Largest number of steps of a fit, and the relative change at which it ends."""
 _HELD = {
     "k1": cv2.CALIB_FIX_K1,
     "k2": cv2.CALIB_FIX_K2,
@@ -24,10 +24,10 @@ _HELD = {
     "p1": cv2.CALIB_FIX_TANGENT_DIST,
     "cx": cv2.CALIB_FIX_PRINCIPAL_POINT,
 }
-"""What holds a parameter; p2 goes with p1, and cy with cx."""
+"""OpenCV flag that fixes each parameter; p2 is fixed with p1, and cy with cx."""
 _SHORTEST = 0.1
-"""Least focal length as a share of the longer side: boards that are not tilted can be explained by
-none at all, and wild distortion.
+"""Least focal length as a share of the longer side: boards without tilt can also be fitted by a
+focal length near zero with extreme distortion.
 """
 
 
@@ -36,11 +36,11 @@ class Solution:
     """The minimum."""
 
     camera: Camera
-    """With `sigmas` of what was free."""
+    """Camera with `sigmas` of the free parameters."""
     poses: tuple[BoardPose, ...]
     """One per view."""
     residuals: tuple[Array, ...]
-    """Measured less predicted px (n, 2), per view."""
+    """Measured minus predicted px (n, 2), per view."""
 
 
 def solve(
@@ -50,11 +50,11 @@ def solve(
     free: Sequence[str] = PARAMETERS,
 ) -> Solution:
     """The intrinsics named in `free`, the focal length among them, and the pose of each view;
-    begins at `camera` and `poses`. With nothing free, poses alone are fitted. Views that do not
-    determine the camera leave everything where it began; the deviations tell.
+    starts from `camera` and `poses`. If nothing is free, only poses are fitted. If the views do not
+    determine the camera, the start is returned; this is visible in the deviations.
 
-    OpenCV tells the deviations that independent errors would have; those that count are larger,
-    see `deviations.sigmas`.
+    OpenCV's deviations assume independent errors; realistic ones are larger, see
+    `deviations.sigmas`.
     """
     if free:
         camera, poses = _calibrated(views, camera, poses, free) or (camera, poses)
@@ -78,8 +78,8 @@ def _predicted(
 def _calibrated(
     views: Sequence[Observations], camera: Camera, poses: Sequence[BoardPose], free: Sequence[str]
 ) -> tuple[Camera, list[BoardPose]] | None:
-    """Camera and poses of the minimum; None where OpenCV refuses to begin there, or where what it
-    found is no camera that sees all boards.
+    """Camera and poses of the minimum; None if OpenCV refuses the start, or if its result is not a
+    camera that sees all boards.
     """
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_ASPECT_RATIO
     flags |= cv2.CALIB_USE_EXTRINSIC_GUESS
@@ -119,7 +119,7 @@ def _placed(view: Observations, camera: Camera, pose: BoardPose) -> BoardPose:
 
 
 def _vectors(pose: BoardPose) -> tuple[Array, Array]:
-    """Rotation vector and shift; OpenCV writes into what it is given, so they are copies."""
+    """Rotation vector and translation, as copies, since OpenCV writes into its arguments."""
     turn = np.asarray(cv2.Rodrigues(pose.cam_R_board)[0], np.float64)
     return turn, pose.cam_t.reshape(3, 1).copy()
 

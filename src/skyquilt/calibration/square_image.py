@@ -1,4 +1,4 @@
-"""The centroid of a square's image is not the image of its centre: by how much."""
+"""Difference between the centroid of a square's image and the image of its centre."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ _PER_SIDE = 10
 def centroid_bias(
     camera: Camera, pose: BoardPose, centres: Array, side_m: float, rounding_px: Array | float = 0.0
 ) -> Array:
-    """Centroid of each square's image less the image of its centre (n, 2) in px.
+    """Centroid of each square's image minus the image of its centre (n, 2) in px.
 
     Squares (n, 3) in m on the board, projected with perspective and distortion; the outline is
     followed in short straight pieces, so its area and moments are exact for a pinhole and close for
@@ -45,8 +45,8 @@ def polygon_centroids(points: Array) -> tuple[Array, Array]:
 
 
 def _rounded_off(outline: Array, radius: Array) -> tuple[Array, Array]:
-    """Area (n, 4) and centroid (n, 4, 2) of what lies between a corner of an outline (n, 4 k, 2)
-    and a disc that touches both of its sides: a kite less a sector.
+    """Area (n, 4) and centroid (n, 4, 2) of the region between a corner of an outline (n, 4 k, 2)
+    and a disc that touches both of its sides: a kite minus a sector.
     """
     corner = outline[:, ::_PER_SIDE]
     one = outline[:, 1::_PER_SIDE] - corner

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 def start_camera(views: Sequence[Observations], *, width: int, height: int) -> Camera:
     """An ideal camera whose focal length in px follows from the tilt of the boards; the longer side
-    where no board is tilted.
+    if no board is tilted.
     """
     rows, right = [], []
     middle = np.array([[1, 0, -(width - 1) / 2], [0, 1, -(height - 1) / 2], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""The story of a lens: frames of a chess-board become a calibrated camera.
+"""The workflow of lens calibration: from frames of a chess-board to a calibrated camera.
 
 read -> boards -> calibrate -> judge -> report
 """
@@ -25,12 +25,14 @@ from skyquilt.photos.survey import read_survey
 
 FEWEST_VIEWS = 3
 _UNKNOWN = 0.1
-"""Share of the focal length at which its deviation says that nothing was determined."""
+"""If the deviation of the focal length is larger than this share of it, the focal length is not
+determined.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CalibrateSettings:
-    """Everything a calibration can be asked for."""
+    """Settings of a calibration."""
 
     columns: int
     """Squares in a row of the board."""
@@ -64,17 +66,17 @@ class CalibrateSettings:
 def iter_calibrate(
     frames: Path | str, output: Path | str, settings: CalibrateSettings, *, overwrite: bool = False
 ) -> Iterator[Event]:
-    """Calibrates the camera that took the frames, telling its progress; the last event is the
+    """Calibrates the camera that took the frames and yields its progress; the last event is the
     `Result`.
 
     Raises:
         RefusedError: mixed cameras, too few boards, or boards that do not determine the lens.
-        SkyquiltError: anything else a user can mend.
+        SkyquiltError: any other error that the user can correct.
     """
     frames, output, began = Path(frames), Path(output), Clock.now()
     if frames.is_dir() and frames.resolve() == output.resolve():
         raise UsageError(
-            f"{output} holds the frames; choose another folder, such as {output / 'calibration'}"
+            f"{output} contains the frames; choose another folder, such as {output / 'calibration'}"
         )
     survey = read_survey(frames)
     one_camera(survey.photos)
@@ -112,21 +114,21 @@ def iter_calibrate(
 def calibrate(
     frames: Path | str, output: Path | str, settings: CalibrateSettings, *, overwrite: bool = False
 ) -> Result:
-    """Calibrates the camera that took the frames and returns when all is written.
+    """Calibrates the camera that took the frames and returns when all files are written.
 
     Raises:
-        SkyquiltError: anything a user can mend.
+        SkyquiltError: any error that the user can correct.
     """
     for happened in iter_calibrate(frames, output, settings, overwrite=overwrite):
         if isinstance(happened, Result):
             return happened
-    raise RuntimeError("the story ended without a result")
+    raise RuntimeError("the workflow ended without a result")
 
 
 def _calibrated(
     seen: Seen, board: Board, centres: Calibrate, corners: Calibrate
 ) -> Steps[tuple[Seen, Calibration, Calibration]]:
-    """From centres and, on the same views, from corners; views that do not belong are left out
+    """Calibrations from centres and, on the same views, from corners; outlying views are left out
     first.
     """
     yield 0, 2
@@ -136,7 +138,7 @@ def _calibrated(
         reasons = [
             RejectedView(
                 name=n,
-                reason=f"its squares lie {e:.1f} px (RMS) off, far more than those of the other"
+                reason=f"the error of its squares is {e:.1f} px (RMS), far more than in the other"
                 " views",
             )
             for n, e in odd.items()
@@ -155,10 +157,10 @@ def _calibrated(
 
 
 def _enough(seen: Seen) -> None:
-    """Refuses what is too little for a calibration.
+    """Refuses too few views for a calibration.
 
     Raises:
-        RefusedError: it is.
+        RefusedError: there are too few.
     """
     if len(seen.views) >= FEWEST_VIEWS:
         return
@@ -178,7 +180,7 @@ def _reasons(rejected: Sequence[RejectedView]) -> str:
 
 
 def _determined(found: Calibration) -> None:
-    """Refuses a focal length that nothing determined.
+    """Refuses a focal length that the views do not determine.
 
     Raises:
         RefusedError: all boards were seen at the same tilt.

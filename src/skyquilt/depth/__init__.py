@@ -1,1 +1,1 @@
-"""Heights on the map grid by the thesis's three routes."""
+"""Heights on the map grid by the three methods of the thesis."""

@@ -1,4 +1,4 @@
-"""What `depth` leaves behind: a raster on the map grid, pictures, figures and a page."""
+"""Output files of `depth`: a raster on the map grid, images, figures and a page."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -21,16 +21,16 @@ from skyquilt.raster.atomic import whole_file
 
 FILES = ("depth.tif", "depth.png", "depth.json", "report.html")
 PAIRS = "pairs"
-"""Folder of the pairs' disparity fields."""
+"""Folder for the images of the pairs' disparity fields."""
 FIELD_PX = 750
-"""Width of their pictures."""
+"""Width of these images in px."""
 
 
 def seen_twice(
     views: Sequence[View], grid: Grid
 ) -> Callable[[int, int, int, int], NDArray[np.bool_]]:
-    """(row, column, height, width) -> (height, width): pixels in the footprints of two photos at
-    least.
+    """Function (row, column, height, width) -> (height, width) that gives the pixels covered by at
+    least two footprints.
     """
     outlines = [np.stack(grid.pixel(v.footprint[:, 0], v.footprint[:, 1]), 1) for v in views]
 
@@ -53,9 +53,7 @@ def write_depth(
     alignment: Alignment,
     tags: dict[str, str],
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Writes depth.tif in blocks; returns a preview (h, w) of it and which of its pixels are
-    known.
-    """
+    """Writes depth.tif in blocks; returns a preview (h, w) and its valid pixels."""
     spec = RasterSpec(
         width=grid.width,
         height=grid.height,
@@ -90,8 +88,8 @@ def _heights(surface: Surface, grid: Grid, block: Block) -> NDArray[np.float32]:
 
 
 def false_colour(z: NDArray[np.float32], known: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """RGBA (h, w, 4): low blue, high red (turbo) between the 1st and 99th percentile; clear where
-    unknown.
+    """RGBA (h, w, 4): colour map turbo (low blue, high red) between the 1st and 99th percentile;
+    transparent where unknown.
     """
     low, high = np.percentile(z[known], [1, 99]) if known.any() else (0.0, 1.0)
     index = np.clip((z - low) / max(float(high - low), 1e-6) * 255, 0, 255).astype(np.uint8)
@@ -111,7 +109,7 @@ def field_picture(field: PairField, photo: Photo) -> NDArray[np.uint8]:
 
 
 def field_name(a: Photo, b: Photo) -> str:
-    """File of a pair's picture, below PAIRS."""
+    """File name of a pair's image in the folder PAIRS."""
     return (
         "__".join(Path(p.name).with_suffix("").as_posix().replace("/", "_") for p in (a, b))
         + ".png"
@@ -119,7 +117,7 @@ def field_name(a: Photo, b: Photo) -> str:
 
 
 def former_fields(output: Path) -> list[Path]:
-    """Pictures of pairs that a former run left in the folder, as its depth.json names them."""
+    """Images of pairs from a former run in the folder, as listed in its depth.json."""
     try:
         pairs = json.loads((output / "depth.json").read_text(encoding="utf-8"))["pairs"]
         return [output / PAIRS / Path(str(p["field"])).name for p in pairs]
@@ -128,7 +126,7 @@ def former_fields(output: Path) -> list[Path]:
 
 
 def write_png(path: Path, picture: NDArray[np.uint8]) -> None:
-    """An RGB or RGBA picture as PNG."""
+    """Writes an RGB or RGBA image as PNG."""
     order = [2, 1, 0, 3][: picture.shape[2]]
     done, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., order]))
     assert done

@@ -1,9 +1,9 @@
-"""Heights above the dominant planes of many pairs, brought to one: the mosaic of disparities
-[Yahyanejad 2013, 5.2.3].
+"""Merges heights above the dominant planes of many pairs to heights above one plane: the mosaic of
+disparities [Yahyanejad 2013, 5.2.3].
 
-Each pair counts from its own dominant plane, and its homography has swallowed the slope of the
-ground. Where pairs show the same ground their heights must agree, so each gets a plane of its own
-that makes them agree best.
+The heights of each pair refer to its own dominant plane, since its homography contains the slope of
+the ground. Pairs that show the same ground must have equal heights, so a plane is added to each
+pair such that they agree best.
 """
 
 from collections.abc import Sequence
@@ -27,13 +27,13 @@ class OnePlane:
     cells: int = 60
     """Cells along the longer side."""
     damping: float = 1e-3
-    """Pull of planes and heights towards zero: what nothing ties down stays."""
+    """Weight of a prior of zero for planes and heights, which holds undetermined ones."""
     rounds: int = 4
-    """Of reweighting (Cauchy's function)."""
+    """Rounds of reweighting (Cauchy's function)."""
     version: ClassVar[int] = 1
 
     def __call__(self, fields: Sequence[Array]) -> Array:
-        """All points (n, 3), x, y, height in m, of the pairs' own (n_k, 3), without a general
+        """All points (n, 3): x, y, height in m, from those of the pairs (n_k, 3), without a general
         slope.
         """
         xyz = np.concatenate(fields)
@@ -53,7 +53,7 @@ class OnePlane:
     def _planes(
         self, z: Array, terms: Array, owner: NDArray[np.int64], cell: NDArray[np.int64]
     ) -> Array:
-        """Each pair's plane at its points (n,)."""
+        """Height of each pair's plane at its points (n,)."""
         row = np.arange(len(z))
         column = 3 * owner[:, None] + np.arange(3)
         planes = csr_matrix((terms.ravel(), (np.repeat(row, 3), column.ravel())))

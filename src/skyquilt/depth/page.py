@@ -1,4 +1,4 @@
-"""The page of a depth map."""
+"""The report page of a depth map."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,10 +17,10 @@ _ROUTES = {
     "disparities": "Disparities of all linked pairs after their homographies, signed along and"
     " normalised by their"
     " baselines, merged on the map.",
-    "reconstruction": "Heights of the whole adjustment, projected on the plane.",
+    "reconstruction": "Heights of the whole adjustment, projected to the plane.",
 }
 _MOST = 12
-"""Disparity fields shown; all of them lie in the folder."""
+"""Largest number of disparity fields shown; all of them are in the folder."""
 
 
 def depth_page(
@@ -28,8 +28,8 @@ def depth_page(
     depth: NDArray[np.uint8],
     fields: Sequence[tuple[str, NDArray[np.uint8]]],
 ) -> str:
-    """The page from what depth.json says, the map (h, w, 4) and the pairs' fields (h, w, 3) with
-    their names.
+    """The page from the record in depth.json, the map (h, w, 4) and the pairs' fields (h, w, 3)
+    with their names.
     """
     low, high = record["percentiles"]["1"], record["percentiles"]["99"]
     caption = (
@@ -76,11 +76,11 @@ def _pairs(
         for p in record["pairs"]
     )
     table = Table(
-        title="Pairs that tell heights",
+        title="Pairs that determine heights",
         head=("a", "b", "points", "on the plane", "baseline", "largest disparity, px"),
         rows=rows,
         numeric="ccnnnn",
-        note=f"Linked pairs that tell none: {len(record['pairs_without'])}.",
+        note=f"Linked pairs that determine none: {len(record['pairs_without'])}.",
     )
     words = (
         "Red: disparity along x, green: its length, blue: along y, each from its least to its"
@@ -105,7 +105,7 @@ def _tiles(record: Mapping[str, Any]) -> tuple[Tile, ...]:
         Tile(
             label="Photos",
             value=plain(record["photos_used"]),
-            says="Placed photos that see the ground.",
+            says="Placed photos that cover the ground.",
         ),
         Tile(
             label="Pairs",

@@ -19,18 +19,16 @@ from skyquilt.model.features import Features, Link
 from skyquilt.ortho.tie_surface import level
 
 LEAST_BASE = 0.05
-"""Baseline over height below which disparities tell nothing."""
+"""Least ratio of baseline to height for disparities to be used."""
 ACROSS_PX = 2.0
-"""Disparity across the baseline, px at the working width, from which a match is taken for a wrong
-one.
-"""
+"""Matches with a larger disparity across the baseline are outliers; in px at the working width."""
 LEAST_POINTS = 12
-"""Fewest points of a pair that counts."""
+"""Fewest points for a pair to be used."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PairField:
-    """What two photos say about height."""
+    """Heights from the disparities of two photos."""
 
     a: int
     """Index of the first photo."""
@@ -47,19 +45,19 @@ class PairField:
     height_m: float
     """Height of a above the plane, m."""
     level: int
-    """Points of the dominant plane."""
+    """Number of points on the dominant plane."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoField:
-    """A pair that says nothing about height: false in `if`."""
+    """A pair that determines no heights. Its truth value is False."""
 
     a: int
     """Index of the first photo."""
     b: int
     """Index of the second."""
     reason: str
-    """A plain sentence."""
+    """The reason as a phrase."""
 
     def __bool__(self) -> bool:
         return False
@@ -75,8 +73,7 @@ def pair_field(
     """Heights from the disparities of one linked pair; `z`: level in m of the ground in the map
     frame.
 
-    All matches of the link are asked, which obey one epipolar geometry, not only those on the
-    plane.
+    Uses all matches of the link, which fulfil one epipolar geometry, not only those on the plane.
     """
     a, b = views
     px = features[0].px[link.index_a], features[1].px[link.index_b]
@@ -117,8 +114,8 @@ def pair_field(
 
 
 def _placed(view: View, px: NDArray[Any], z: float, h: NDArray[Any]) -> NDArray[np.float64]:
-    """(n, 2) m: where pixels of a photo lie at heights h above the level z; along a ray that is
-    linear in h.
+    """(n, 2) positions in m of pixels of a photo at heights h above the level z; along a ray they
+    are linear in h.
     """
     low, high = (on_ground(view, px, level(at))[:, :2] for at in (z, z + 1))
     return np.asarray(low + h[:, None] * (high - low))

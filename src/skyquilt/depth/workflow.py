@@ -1,11 +1,11 @@
-"""The story of `depth`: heights on the map grid, by one of the thesis's three ways [Yahyanejad
-2013, 5.2.3].
+"""The workflow of `depth`: heights on the map grid, by one of three methods of the thesis
+[Yahyanejad 2013, 5.2.3].
 
     pair             two photos: disparities after the homography, signed along the baseline
     disparities      the same of all linked pairs, normalised by their baselines, merged on the map
     reconstruction   the heights of the whole adjustment, projected on the plane (5.8)
 
-The photos are placed as `mosaic` places them, so depth.tif has the place of its map.
+The photos are placed as by `mosaic`, so depth.tif fits the map.
 """
 
 import json
@@ -46,23 +46,23 @@ from skyquilt.workflows.methods import Methods, methods_for
 from skyquilt.workflows.survey_input import SurveyInput, read_input
 
 FEATURE_PX = 640
-"""Longest side in px of the pictures searched for features: their disparities are the map, so they
-lie dense.
+"""Longest side in px of the images searched for features. Their disparities form the map, so many
+features are needed.
 """
 ROUTES = ("auto", "pair", "disparities", "reconstruction")
-"""auto: pair for two photos, reconstruction for more."""
+"""`auto` is `pair` for two photos and `reconstruction` for more."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Depth:
-    """What a route found."""
+    """Result of a method."""
 
     surface: Surface
     """Heights."""
     fields: tuple[PairField, ...] = ()
-    """Pairs it rests on; none for the reconstruction."""
+    """Pairs used; empty for the reconstruction."""
     without: tuple[NoField, ...] = ()
-    """Linked pairs that say nothing."""
+    """Linked pairs that determine no heights."""
 
 
 def iter_depth(
@@ -74,14 +74,14 @@ def iter_depth(
     relief_m: float | None = None,
     overwrite: bool = False,
 ) -> Iterator[Event]:
-    """Makes depth.tif, its pictures and figures; the last event is the `Result`.
+    """Makes depth.tif, its images and figures; the last event is the `Result`.
 
-    `relief_m`: largest height variation on the ground, which tells what counts as the dominant
-    plane (Y 4.9).
+    `relief_m`: largest height variation on the ground in m, which determines the points of the
+    dominant plane (Y 4.9).
 
     Raises:
-        RefusedError: no two photos tell a height.
-        SkyquiltError: anything else a user can mend.
+        RefusedError: no two photos determine a height.
+        SkyquiltError: any other error that the user can correct.
     """
     settings, output, began = settings or MosaicSettings(), Path(output), Clock.now()
     if route not in ROUTES:
@@ -89,7 +89,7 @@ def iter_depth(
     given = read_input(photos, settings.input)
     survey = given.survey
     if len(survey.photos) < 2:
-        raise UsageError("depth takes two photos at least, and here is one; give its neighbour too")
+        raise UsageError("depth needs at least two photos; give a neighbouring photo too")
     if route == "auto":
         route = "pair" if len(survey.photos) == 2 else "reconstruction"
     former = former_fields(output)
@@ -117,14 +117,14 @@ def depth(
     """Makes a depth map and returns when it is finished.
 
     Raises:
-        SkyquiltError: anything a user can mend.
+        SkyquiltError: any error that the user can correct.
     """
     for happened in iter_depth(
         photos, output, settings, route=route, relief_m=relief_m, overwrite=overwrite
     ):
         if isinstance(happened, Result):
             return happened
-    raise RuntimeError("the story ended without a result")
+    raise RuntimeError("the workflow ended without a result")
 
 
 def _by_route(
@@ -138,7 +138,7 @@ def _by_route(
         scene = yield from scene_of(given, methods, settings, clock)
         if not len(scene.aligned.alignment.ties.xyz):
             raise RefusedError(
-                "no tie points: the photos do not overlap recognisably, so nothing tells heights"
+                "no tie points: the photos could not be matched, so there are no heights"
             )
         return scene, Depth(surface=scene.ground.surface)
     methods = replace(methods, sweep=None)
@@ -155,7 +155,7 @@ def _by_route(
         if found.fields:
             return scene, found
         why = why or (found.without[0].reason if found.without else "they do not match")
-    raise RefusedError(f"no two photos in sequence tell a height; of the first two: {why}")
+    raise RefusedError(f"no two photos in sequence determine a height; of the first two: {why}")
 
 
 def _disparities(
@@ -164,7 +164,7 @@ def _disparities(
     """Heights from the disparities of all linked pairs.
 
     Raises:
-        RefusedError: no pair tells a height, and `refuse` is set.
+        RefusedError: no pair determines a height, and `refuse` is set.
     """
     views = {v.photo: v for v in scene.ground.views}
     features, z = scene.aligned.found.features, float(np.median(scene.ground.surface.z))
@@ -180,7 +180,7 @@ def _disparities(
     if not fields:
         if refuse:
             raise RefusedError(
-                "no pair of photos tells a height: none is linked over a sufficient baseline"
+                "no pair of photos determines a height: none is linked with a sufficient baseline"
             )
         return Depth(surface=scene.ground.surface, without=tuple(without))
     xyz = OnePlane()([f.xyz for f in fields])
@@ -191,7 +191,7 @@ def _disparities(
 
 
 def _drawn(output: Path, route: str, scene: Scene, depth: Depth) -> Steps[dict[str, Any]]:
-    """Writes all files but depth.json; returns what that says."""
+    """Writes all files except depth.json; returns its record."""
     yield 0, 1
     alignment, ground, photos = scene.aligned.alignment, scene.ground, scene.aligned.photos
     counted = alignment.frame.vertical_datum if route == "reconstruction" else "the dominant plane"
@@ -201,7 +201,7 @@ def _drawn(output: Path, route: str, scene: Scene, depth: Depth) -> Steps[dict[s
         output / "depth.tif", depth.surface, ground.views, ground.grid, alignment, tags
     )
     if not known.any():
-        raise RefusedError("no place is seen by two placed photos, so nothing tells heights there")
+        raise RefusedError("no area is covered by two placed photos, so there are no heights")
     picture = false_colour(z, known)
     write_png(output / "depth.png", picture)
     shown: list[tuple[str, NDArray[np.uint8]]] = []

@@ -1,8 +1,8 @@
-"""One piece of work in a process of its own.
+"""Runs one task in a separate process.
 
-The processes of `multiprocessing` begin by importing the program's main script again, so a script
-without `if __name__ == "__main__":` would run a second time in each. The process here is started
-anew and told what to do; it never sees that script.
+A process started by `multiprocessing` imports the program's main script again, so a script without
+`if __name__ == "__main__":` would run a second time. The process here is a new interpreter that
+receives its task through a pipe and never imports that script.
 """
 
 import os
@@ -20,16 +20,18 @@ _ENTRY = (
     "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer);"
     f" from {__name__} import serve; serve()"
 )
-"""What the process runs: it finds modules where the program that started it finds them."""
+"""Code of the new process. It uses the same module search path as the parent process."""
 
 
 class Background(Generic[T]):
     """Runs `work(argument)` until it is done, `stop` is called, or this program ends."""
 
     def __init__(self, work: Callable[[Any], T], argument: Any) -> None:
-        """Begins; `work` is a function of a module, and all that is handed over can be pickled."""
+        """Starts the process. `work` must be a function at module level, and its argument and
+        result must be picklable.
+        """
         task = pickle.dumps((work, argument))
-        command = [sys.executable, "-P", "-c", _ENTRY]  # -P: no module from the working folder
+        command = [sys.executable, "-P", "-c", _ENTRY]  # -P: not from the working folder
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         self._outcome: T | None = None
         self._talk = threading.Thread(target=self._exchange, args=(task,), daemon=True)
@@ -37,16 +39,16 @@ class Background(Generic[T]):
 
     @property
     def pid(self) -> int:
-        """Number of the process."""
+        """Process id."""
         return self._process.pid
 
     @property
     def busy(self) -> bool:
-        """Whether the work goes on."""
+        """Whether the task is still running."""
         return self._talk.is_alive()
 
     def outcome(self) -> T | None:
-        """What the work returned, after waiting for it; None where its process ended early."""
+        """Waits for the task and returns its result; None if its process ended early."""
         self._talk.join()
         return self._outcome
 
@@ -65,8 +67,9 @@ class Background(Generic[T]):
                     pipe.close()
 
     def _exchange(self, task: bytes) -> None:
-        """Hands the task over and waits for the outcome, in a thread: the process takes a while to
-        begin, and a pipe holds little. The task's pipe stays open, see `_end_with_parent`.
+        """Sends the task and waits for the result. Runs in a thread, since the process takes time
+        to start and the buffer of a pipe is small. The pipe of the task stays open, see
+        `_end_with_parent`.
         """
         given, answer = self._process.stdin, self._process.stdout
         assert given is not None
@@ -78,12 +81,14 @@ class Background(Generic[T]):
 
 
 def serve() -> None:
-    """The process: one task from standard input, its outcome to standard output."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the program that started it
+    """Main function of the process: reads one task from standard input and writes its result to
+    standard output.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl+C is handled by the parent process
     with suppress(OSError, AttributeError):
-        os.nice(10)  # the program that started it comes first
+        os.nice(10)  # the parent process has priority
     answer = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a library prints must not get into the outcome
+    os.dup2(2, 1)  # output printed by libraries must not mix with the result
     work, argument = pickle.load(sys.stdin.buffer)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with answer:
@@ -91,6 +96,8 @@ def serve() -> None:
 
 
 def _end_with_parent() -> None:
-    """Ends this process when its input ends: the program that holds the other end is gone."""
+    """Ends this process when its standard input is closed, which means that the parent process has
+    ended.
+    """
     os.read(0, 1)
     os._exit(1)

@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 
 PACKAGE = __name__.partition(".")[0]
-"""Only modules of this package are searched: a method from elsewhere states its own version."""
+"""Only modules of this package are searched; methods of other packages state their own version."""
 _SCALARS = (bool, int, float, complex, str, bytes, np.generic, np.ndarray)
 
 
 def constants_of(thing: Any) -> dict[str, Any]:
-    """Values, as they are now, of the upper-case names in the modules that `thing` needs.
+    """Current values of the upper-case names in the modules on which `thing` depends.
 
-    `thing` is a class or a function. Its modules are its own and, recursively, all modules of this
-    package from which one of them imports something when it is loaded. That is more than it uses:
-    a constant too many makes an artefact anew, a constant too few would leave a wrong one. Modules
-    that are imported inside functions are not found, nor are literals in code: those are what a
-    method's `version` is for.
+    `thing` is a class or a function. The modules are its own module and, recursively, all modules
+    of this package that are imported at module level. That is more than it uses. A constant too
+    many only causes an artefact to be computed again; a missing constant could leave a wrong
+    artefact in use. Imports inside functions and literals in code are not found; changes of these
+    need a new `version` of the method.
     """
     values = {}
     for module in _modules(thing.__module__):
@@ -31,7 +31,9 @@ def constants_of(thing: Any) -> dict[str, Any]:
 
 
 def is_data(value: Any) -> bool:
-    """Whether a value is made of numbers, strings, arrays, records, and code known by its name."""
+    """Whether a value consists of numbers, strings, arrays, records, and functions or classes that
+    are identified by name.
+    """
     if isinstance(value, Mapping):
         return all(is_data(part) for pair in value.items() for part in pair)
     if isinstance(value, tuple | list | set | frozenset):
@@ -45,7 +47,7 @@ def is_data(value: Any) -> bool:
 
 @cache
 def _names(module: str) -> tuple[str, ...]:
-    """The module's upper-case names that hold data, those it imports included."""
+    """The module's upper-case names that contain data, including imported ones."""
     held = vars(sys.modules[module]).items()
     return tuple(sorted(name for name, value in held if name.isupper() and _constant(value)))
 
@@ -68,9 +70,10 @@ def _modules(first: str) -> tuple[str, ...]:
 
 
 def _imported(module: ModuleType) -> Iterator[str]:
-    """The modules of this package that a module's names come from.
+    """The modules of this package in which a module's names are defined.
 
-    The submodules of a package are left out: which ones it holds depends on what was loaded before.
+    Submodules of a package are left out, since which of them are present depends on what was loaded
+    before.
     """
     for value in list(vars(module).values()):
         name = value.__name__ if isinstance(value, ModuleType) else _home(value)
@@ -80,7 +83,7 @@ def _imported(module: ModuleType) -> Iterator[str]:
 
 
 def _home(value: Any) -> str:
-    """The module that a class, a function or the class of an object was defined in."""
+    """The module in which a class, a function or the class of an object is defined."""
     home = getattr(value, "__module__", None)
     return home if isinstance(home, str) else ""
 

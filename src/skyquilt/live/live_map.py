@@ -149,7 +149,7 @@ class LiveMap:
         while (update := self.work()) is not None:
             yield update
 
-    def settle(self) -> Iterator[Update]:
+    def drain_all(self) -> Iterator[Update]:
         """Works until nothing is left, including background adjustments."""
         while True:
             yield from self.drain()

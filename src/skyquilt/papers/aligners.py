@@ -1,4 +1,6 @@
-"""The papers' alignments as aligners of the workflow: `image`, `hybrid`, `flightline`."""
+"""The alignment methods of the papers as aligners of the workflow: `image`, `hybrid`,
+`flightline`.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, cast
@@ -31,20 +33,22 @@ from skyquilt.papers.ste import RansacSte
 from skyquilt.settings import MosaicSettings
 
 VLFEAT = 1.5**-0.5
-"""Ratio of distances that VLFeat's matcher asks for."""
+"""Ratio of distances required by VLFeat's matcher."""
 SECOND_PX2 = 12.0
-"""STE of an inlier, px^2 at 1500 px, where the threshold by deviations fails: 5.99 times one px,
-both ways.
+"""STE of an inlier, px^2 at 1500 px, used if the threshold from deviations fails: 5.99 times one
+px^2, in both directions.
 """
 LEAST_INLIERS = 12
-"""Matches that must agree before two photos count as registered."""
+"""Fewest inliers for two photos to count as registered."""
 DIRECT = {
     "ncc": ("similarity", "translation"),
     "phase": ("similarity", "translation"),
     "ecc": ("homography", "affine", "translation"),
     "mi": ("similarity", "translation"),
 }
-"""Estimators that register pixels instead of features, and the transformations each one finds."""
+"""Estimators that register pixels instead of features, and the transformations that each can
+estimate.
+"""
 CHAIN_PX, OVERVIEW_PX = 6.0, 3.0
 """Largest transfer error of an inlier in px of the working image, and of the overview."""
 OVERVIEW_WIDTH = 640
@@ -53,10 +57,12 @@ OVERVIEW_WIDTH = 640
 
 @dataclass(frozen=True, kw_only=True)
 class ByImage:
-    """`image`: photos registered one after the other, to the last one or to the map so far."""
+    """`image`: photos are registered one after the other, to the previous one or to the map
+    so far.
+    """
 
     method: Chain | DirectChain | ByOverview
-    """Which of them."""
+    """The search method."""
     version: ClassVar[int] = 1
     needs_links: ClassVar[bool] = False
 
@@ -79,7 +85,7 @@ class ByImage:
 
 @dataclass(frozen=True, kw_only=True)
 class Corrected:
-    """`hybrid`: placed by metadata, each photo then corrected by its pixels."""
+    """`hybrid`: photos are placed by metadata, then each is corrected by image correlation."""
 
     pose: ByReport
     """First placement."""
@@ -89,7 +95,7 @@ class Corrected:
 
     @property
     def needs_links(self) -> bool:
-        """Only to repair metadata."""
+        """Links are needed only to correct metadata."""
         return self.pose.repair
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -107,7 +113,7 @@ class Corrected:
 
 @dataclass(frozen=True, kw_only=True)
 class ByLines:
-    """`flightline`: lines mosaicked by themselves, then joined (A)."""
+    """`flightline`: flight lines are mosaicked separately, then joined (A)."""
 
     method: ByFlightline
     """The article's method."""
@@ -118,7 +124,7 @@ class ByLines:
         """Joins the photos.
 
         Raises:
-            AlignmentError: lines cannot be told apart, or do not match.
+            AlignmentError: lines cannot be separated, or do not match.
         """
         found = self.method(
             inputs.photos, inputs.frame, inputs.priors, inputs.features, inputs.order
@@ -154,7 +160,7 @@ def image(settings: MosaicSettings) -> ByImage:
 
 
 def _direct_chain(settings: MosaicSettings) -> DirectChain:
-    """`image` by pixels: no features, so nothing that concerns features may be asked for."""
+    """`image` by pixels: options that concern features are refused, since no features are used."""
     name, asked = str(settings.matching.estimator), settings.matching
     for option, value in (("detector", asked.detector), ("matcher", asked.matcher)):
         if value is not None:
@@ -174,7 +180,9 @@ def _direct_chain(settings: MosaicSettings) -> DirectChain:
 
 
 def _estimator(settings: MosaicSettings, threshold_px: float, model: str) -> Estimator:
-    """The estimator that settings name, RANSAC if none, with the thresholds of its method."""
+    """The estimator selected by the settings, RANSAC by default, with the thresholds of its
+    method.
+    """
     name, asked = settings.matching.estimator or "ransac", settings.matching.transform or model
     options: dict[str, Any] = {} if name in ("lmeds", "ste") else {"threshold_px": threshold_px}
     made: Estimator = registry.load("estimator", name)(
@@ -197,7 +205,9 @@ def hybrid(settings: MosaicSettings) -> Corrected:
 
 
 def flightline(settings: MosaicSettings) -> ByLines:
-    """Method `flightline`; its own estimator is A's, helped out where its threshold fails."""
+    """Method `flightline`; its default estimator is A's, with a second one if its threshold
+    fails.
+    """
     method = ByFlightline(
         within=Best(count=150, ratio=VLFEAT),
         across=Best(count=50, ratio=VLFEAT),
@@ -209,7 +219,9 @@ def flightline(settings: MosaicSettings) -> ByLines:
 
 
 def _lines_estimator(settings: MosaicSettings) -> Estimator:
-    """A's estimator, as published and then with a fixed threshold, unless another one is named."""
+    """A's estimator, first as published and then with a fixed threshold, unless another one is
+    selected.
+    """
     if settings.matching.estimator not in (None, "ste"):
         return _estimator(settings, CHAIN_PX, "homography")
     model = cast(Model, settings.matching.transform or "homography")
@@ -221,8 +233,8 @@ def _lines_estimator(settings: MosaicSettings) -> Estimator:
 
 
 def _least_height(inputs: AlignmentInputs) -> float | None:
-    """Least height above take-off in m, which stands for that above ground in (4.9); None where
-    none is reported.
+    """Smallest height above take-off in m, used as height above ground in (4.9); None if none is
+    reported.
     """
     heights = np.array([p.map_C[2] for p in inputs.priors])
     plausible = heights[np.isfinite(heights) & (heights > 1)]
@@ -231,7 +243,7 @@ def _least_height(inputs: AlignmentInputs) -> float | None:
 
 
 def _outside_named(alignment: Alignment, inputs: AlignmentInputs) -> Alignment:
-    """With a reason for photos that the sequence does not name."""
+    """The alignment, with a reason for photos that are not listed in the sequence."""
     missing = set(range(len(inputs.photos))) - set(inputs.order)
-    reasons = dict.fromkeys(missing, "the sequence does not name it")
+    reasons = dict.fromkeys(missing, "it is not listed in the sequence")
     return replace(alignment, rejected={**alignment.rejected, **reasons})

@@ -1,4 +1,6 @@
-"""The page of a bench: Tables 6.4 and 6.5 [Yahyanejad 2013], the truth, and every pair."""
+"""The report page of a benchmark: Tables 6.4 and 6.5 [Yahyanejad 2013], the comparison with the
+truth, and every pair.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,7 +13,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def bench_page(record: Mapping[str, Any]) -> str:
-    """The page from what bench.json says."""
+    """The page from the record in bench.json."""
     rows, methods = record["pairs"], tuple(record["methods"])
     classes = tuple(dict.fromkeys(r["class"] for r in rows))
     sections = (

@@ -11,13 +11,13 @@ from skyquilt.model.features import Features, Matches
 
 @dataclass(frozen=True, kw_only=True)
 class Best:
-    """Each other's nearest, the nearest of them first."""
+    """Mutual nearest neighbours, sorted by distance."""
 
     count: int = 150
     """Most matches."""
     ratio: float | None = None
-    """Largest distance to the nearest over distance to the second nearest; None asks for no ratio.
-    VLFeat's matcher, which A's matches come from, accepts 1.5 d1^2 < d2^2: a ratio of 0.816.
+    """Largest distance to the nearest over distance to the second nearest; None = no ratio test.
+    VLFeat's matcher, used by A, accepts 1.5 d1^2 < d2^2: a ratio of 0.816.
     """
     version: ClassVar[int] = 2
 

@@ -1,4 +1,6 @@
-"""A camera from views of a flat board (Zhang 2000), each order of distortion fitted by itself."""
+"""A camera from views of a flat board (Zhang 2000), each order of distortion is fitted
+separately.
+"""
 
 from collections.abc import Sequence
 
@@ -17,8 +19,8 @@ def board_camera(
     """The camera with distortion of an order, and the RMS error in px, from views (N, 2) px of a
     board (N, 3).
 
-    `size` is (width, height) in px. Pixels are square. Each order is a fit of its own, none is cut
-    off from a higher one.
+    `size` is (width, height) in px. Pixels are square. Each order is a separate fit, not a
+    truncated higher order.
     """
     kept, flags = order_named(order), cv2.CALIB_FIX_ASPECT_RATIO
     flags |= 0 if kept.tangential else cv2.CALIB_ZERO_TANGENT_DIST

@@ -1,4 +1,6 @@
-"""`image`, search `chain`: each photo registered to the one before it, without metadata (Y 4.2)."""
+"""`image`, search `chain`: each photo is registered to the previous one, without metadata (Y
+4.2).
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -32,8 +34,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Chain:
-    """The loop-independent mosaic: pairwise against the last photo, no repositioning, no
-    metadata.
+    """The loop-independent mosaic: each photo is registered to the previous one, without
+    repositioning and metadata.
     """
 
     match: Matcher
@@ -41,9 +43,9 @@ class Chain:
     estimate: Estimator
     """Robust estimation of the transformation, thresholds in px of the working image."""
     level: Leveller | None = None
-    """Levelled features; None = all inliers count."""
+    """Levelled features; None = all inliers are used."""
     distortion: str = "6t"
-    """Order of the lens model, fitted to the calibration that photos carry."""
+    """Order of the lens model, which is fitted to the calibration of the photos."""
     height_m: float | None = None
     """Height above ground in m that scales pieces without positions."""
     version: ClassVar[int] = 1
@@ -96,7 +98,7 @@ class DirectChain:
     register: Direct
     """Registration of two pictures."""
     distortion: str = "6t"
-    """Order of the lens model, fitted to the calibration that photos carry."""
+    """Order of the lens model, which is fitted to the calibration of the photos."""
     longest: int = 640
     """Longest side in px of the undistorted pictures that are registered."""
     height_m: float | None = None

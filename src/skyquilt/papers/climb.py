@@ -1,5 +1,5 @@
-"""Registration by climbing: any score of two pictures, over a similarity about a start, from coarse
-to fine.
+"""Registration by local maximisation of any similarity score of two images, over a similarity
+transform near a start, from coarse to fine.
 """
 
 from collections.abc import Callable
@@ -17,8 +17,8 @@ Score = Callable[[NDArray[Any], NDArray[Any], NDArray[np.bool_]], float]
 
 
 def motion(parameters: Doubles, shape: tuple[int, ...]) -> Doubles:
-    """(3, 3) of (dx, dy[, rad, log scale]) about the centre of a picture of `shape`, in its
-    pixels.
+    """(3, 3) transform from (dx, dy[, rad, log scale]) about the centre of an image of `shape`, in
+    its pixels.
     """
     dx, dy, angle, log_scale = (*parameters, 0.0, 0.0)[:4]
     c, s = np.exp(log_scale) * np.cos(angle), np.exp(log_scale) * np.sin(angle)
@@ -34,8 +34,8 @@ def reduced(image: NDArray[Any], factor: int) -> NDArray[np.float32]:
 
 
 def at_level(H: Doubles, factor: float) -> Doubles:
-    """b_H_a for pictures that are both reduced by `factor` (enlarged for its inverse), centres at
-    integers.
+    """b_H_a for images that are both reduced by `factor` (or enlarged, for its inverse), pixel
+    centres at integers.
     """
     D = np.array([[factor, 0, (factor - 1) / 2], [0, factor, (factor - 1) / 2], [0, 0, 1]])
     return np.asarray(np.linalg.inv(D) @ H @ D)
@@ -51,11 +51,11 @@ def climb(
     overlap: float,
     factors: tuple[int, ...],
 ) -> tuple[Doubles, float, float]:
-    """(b_H_a, score, overlap): a local maximum near `start` by Nelder and Mead's simplex, at each
-    reduction in turn.
+    """(b_H_a, score, overlap): a local maximum near `start` by the simplex method of Nelder and
+    Mead, at each reduction in turn.
 
-    The first simplex reaches 2 px at each level, in turns and scales as far as moves a corner by
-    that.
+    The first simplex has a size of 2 px at each level; for rotation and scale, the change that
+    moves a corner by 2 px.
     """
     H, value, share = start, -np.inf, 0.0
     for factor in factors:

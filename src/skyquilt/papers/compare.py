@@ -40,31 +40,33 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "flightline": {"method": "flightline"},
     "bundle": {"method": "bundle"},
 }
-"""Name of a column -> what it changes of the settings."""
+"""Name of a column -> the settings that it changes."""
 TRUSTED = ("pose", "hybrid")
-"""Methods shown a second time with metadata trusted, where repair changed something."""
+"""Methods that are also run with uncorrected metadata if a correction changed something."""
 MOST_POINTS = 6
-"""Points between which distances are compared."""
+"""Largest number of points between which distances are compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CompareSettings:
-    """What a comparison can be asked for."""
+    """Settings of a comparison."""
 
     mosaic: MosaicSettings
-    """What all methods share."""
+    """Settings common to all methods."""
     variants: tuple[str, ...] = tuple(VARIANTS)
     """Columns, of `VARIANTS`."""
     first: int | None = None
     """Only this many photos, the first in order of capture; None = all."""
     known: Path | None = None
-    """Points of known place (gcp_list.txt), used to judge only, never to align."""
+    """Points with known coordinates (gcp_list.txt), used only to check the results, never for
+    alignment.
+    """
 
     given: tuple[tuple[str, Any], ...] = ()
-    """Settings of single methods (names and values); each column gets those that it takes."""
+    """Settings of single methods (names and values); each column gets those that apply to it."""
 
     def asked(self, base: MosaicSettings, name: str) -> MosaicSettings:
-        """What a column is run with."""
+        """The settings of a column."""
         return base.changed(**{**dict(self._own(name)), **VARIANTS[name]})
 
     def _own(self, name: str) -> list[tuple[str, Any]]:
@@ -85,32 +87,32 @@ class CompareSettings:
                 option = OPTION_OF.get(setting, setting)
                 raise UsageError(f"--{option} has no effect on {', '.join(self.variants)}")
         for name in self.variants:
-            self.asked(self.mosaic, name)  # a word that a column does not take is refused now
+            self.asked(self.mosaic, name)  # refuses invalid values at once
 
 
 def iter_compare(
     folder: Path, output: Path, settings: CompareSettings, *, overwrite: bool = False
 ) -> Iterator[Event]:
-    """Runs every method into a folder of its own below `output`, then writes compare.json and
-    report.html. A comparison that was stopped goes on: finished runs are not made again.
+    """Runs every method in a separate folder below `output`, then writes compare.json and
+    report.html. A comparison that was stopped continues: finished runs are not repeated.
 
     Raises:
         SkyquiltError: the photos, the output or an option is wrong; a method that cannot place the
-            photos is no error but a row with its reason.
+            photos is not an error; it gets a row with the reason.
     """
     given = _first(read_input(folder, settings.mosaic.input), settings.first)
     key = digest(
         run_key(given, settings.mosaic, methods_for(settings.mosaic)), _content(settings.known)
     )
     state, goes_on = taken_up(output, key, overwrite=overwrite)
-    rows = _Rows(given, output, overwrite=overwrite or goes_on)  # runs below are its own
+    rows = _Rows(given, output, overwrite=overwrite or goes_on)  # the runs below belong to it
     base, says = _judged_by(given, output, settings, state)
     state.write(output)
     for name in _in_turn(settings.variants, base.input.distances is None):
         yield from rows.run(name, settings.asked(base, name))
         if name == "bundle" and base.input.distances is None and rows.made(name):
             base, says = _by_bundle(given, output, base)
-            if base.input.distances is not None:  # bundle is judged by them too, in a second run
+            if base.input.distances is not None:  # a second run of bundle is checked by them too
                 state.judged_by, state.times = says, rows.times(name)
                 state.write(output)
                 yield from rows.run(name, settings.asked(base, name), again=True)
@@ -170,12 +172,12 @@ class _Rows:
         return {k: self.by_name[name]["metrics"][k] for k in ("seconds", "cpu_seconds")}
 
     def contradicted(self, name: str) -> bool:
-        """Whether a run found metadata that contradict the pixels."""
+        """Whether a run found metadata that contradict the image content."""
         return bool(self.by_name[name].get("metrics", {}).get("metadata_conflicts"))
 
 
 def _first(given: SurveyInput, count: int | None) -> SurveyInput:
-    """Only so many photos, the first in order of capture."""
+    """The survey with only the first `count` photos in order of capture."""
     if count is None:
         return given
     photos = given.survey.photos[:count]
@@ -188,7 +190,7 @@ def _content(path: Path | None) -> bytes:
 
 
 def _in_turn(variants: Sequence[str], needs_bundle: bool) -> list[str]:
-    """Bundle first where its points give the distances that the others are judged by."""
+    """Runs bundle first if its points give the distances with which the others are checked."""
     if needs_bundle and "bundle" in variants:
         return ["bundle", *(v for v in variants if v != "bundle")]
     return list(variants)
@@ -197,7 +199,7 @@ def _in_turn(variants: Sequence[str], needs_bundle: bool) -> list[str]:
 def _judged_by(
     given: SurveyInput, output: Path, settings: CompareSettings, state: CompareState
 ) -> tuple[MosaicSettings, str]:
-    """Settings with the distances to judge by, and where those come from."""
+    """Settings with the known distances for the check, and their source."""
     base, found = settings.mosaic, output / "distances.csv"
     if state.judged_by and found.is_file():
         return base.changed(distances=found), state.judged_by
@@ -208,7 +210,7 @@ def _judged_by(
     control, _ = read_gcp_list(settings.known, [p.name for p in given.survey.photos])
     seen = [c for c in control if c.observations][:MOST_POINTS]
     if len(seen) < 2:
-        return base, f"fewer than two points of {settings.known.name} are seen"
+        return base, f"fewer than two points of {settings.known.name} are visible"
     path = _write_distances(found, _between(seen))
     says = f"distances between {len(seen)} points of {settings.known.name}"
     return base.changed(distances=path), says
@@ -257,7 +259,9 @@ def _write_distances(path: Path, rows: Sequence[Row]) -> Path:
 def _by_bundle(
     given: SurveyInput, output: Path, base: MosaicSettings
 ) -> tuple[MosaicSettings, str]:
-    """Distances between tie points of the bundle run: measured in its model, not on the ground."""
+    """Distances between tie points of the bundle run: from its model, not measured on the
+    ground.
+    """
     alignment = alignment_of(output / "bundle")
     points = (
         tie_targets(alignment, [p.name for p in given.survey.photos])
@@ -268,8 +272,8 @@ def _by_bundle(
         return base, "no distances are known"
     path = _write_distances(output / "distances.csv", _between(points))
     return base.changed(distances=path), (
-        f"distances between {len(points)} tie points as the bundle adjustment has them:"
-        " measured in a model, not on the ground"
+        f"distances between {len(points)} tie points of the bundle adjustment:"
+        " from a model, not measured on the ground"
     )
 
 
@@ -284,11 +288,11 @@ def alignment_of(run: Path) -> Alignment | None:
 
 
 def tie_targets(alignment: Alignment, names: Sequence[str]) -> list[ControlPoint]:
-    """Tie points on the ground, seen three times or more, far from one another, as points with
+    """Tie points on the ground with three or more observations, far from each other, as points with
     observations.
 
-    Low ones: a point on a roof or a crown lies elsewhere in a map over level ground, whoever made
-    it.
+    Low points are chosen, since a point on a roof or tree crown is displaced in any map over level
+    ground.
     """
     ties = alignment.ties
     count = np.bincount(ties.point, minlength=len(ties.xyz))
@@ -325,8 +329,8 @@ def tie_targets(alignment: Alignment, names: Sequence[str]) -> list[ControlPoint
 def _record(
     rows: Mapping[str, Mapping[str, Any]], photos: Sequence[str], says: str, folder: Path
 ) -> dict[str, Any]:
-    """What compare.json says: a column per method, after the columns of Y Table 6.1 and A Tables 1
-    and 2.
+    """The record of compare.json: a column per method, with the figures of Y Table 6.1 and A Tables
+    1 and 2.
     """
     return {
         "title": folder.name,
@@ -369,7 +373,7 @@ def _column(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _previews(output: Path, names: Sequence[str]) -> dict[str, Any]:
-    """Small pictures (h, w, 4) of the mosaics, from their overviews."""
+    """Small images (h, w, 4) of the mosaics, from their overviews."""
     import rasterio
 
     out = {}

@@ -1,4 +1,4 @@
-"""How far a comparison is, so that the same command goes on where it was stopped."""
+"""Progress of a comparison, so that the same command continues where it was stopped."""
 
 import json
 from dataclasses import asdict, dataclass, field, replace
@@ -14,19 +14,19 @@ FILES = ("compare.json", "report.html")
 
 @dataclass(kw_only=True)
 class CompareState:
-    """What is known about a comparison before it is finished."""
+    """State of a comparison before it is finished."""
 
     key: str
-    """What it is made from: photos, side files and settings."""
+    """Key of its inputs: photos, side files and settings."""
     done: bool = False
     """Whether it is finished."""
     judged_by: str = ""
-    """Where the distances come from, if they were found by the bundle adjustment."""
+    """Source of the distances, if they come from the bundle adjustment."""
     times: dict[str, dict[str, float]] = field(default_factory=dict)
     """`seconds` and `cpu_seconds` of the bundle run before those distances were known."""
 
     def write(self, output: Path) -> None:
-        """Keeps it in the comparison's folder."""
+        """Stores it in the comparison's folder."""
         path = output / STATE / "compare.json"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -36,10 +36,10 @@ class CompareState:
 
 
 def taken_up(output: Path, key: str, *, overwrite: bool) -> tuple[CompareState, bool]:
-    """The state to go on from, and whether it is that of an earlier, unfinished call.
+    """The state from which to continue, and whether it comes from an earlier, unfinished call.
 
     Raises:
-        OutputError: the folder holds a finished comparison, or one of other photos or settings.
+        OutputError: the folder contains a finished comparison, or one of other photos or settings.
     """
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; the output is a folder")
@@ -59,7 +59,7 @@ def taken_up(output: Path, key: str, *, overwrite: bool) -> tuple[CompareState, 
 
 
 def _read(output: Path) -> CompareState | None:
-    """The state of the folder; None where no method's run has begun."""
+    """The state of the folder; None if no run has started."""
     if not any(output.glob(f"*/{STATE}/run.json")):
         return None
     try:

@@ -1,4 +1,4 @@
-"""The page of a comparison: mosaics beside each other, Table 6.1 and the graphs of Fig. 6.4, A's
+"""The report page of a comparison: mosaics side by side, Table 6.1 and the graphs of Fig. 6.4, A's
 Tables 1 and 2.
 """
 
@@ -19,7 +19,7 @@ ORDER = ("position", "pose", "image", "hybrid")
 
 
 def comparison_page(record: Mapping[str, Any], previews: Mapping[str, NDArray[Any]]) -> str:
-    """The page from what compare.json says and a picture (h, w, 4) of each mosaic."""
+    """The page from the record in compare.json and an image (h, w, 4) of each mosaic."""
     every: Columns = record["methods"]
     ran = {n: c for n, c in every.items() if "refused" not in c}
     sections = (
@@ -45,7 +45,7 @@ def _lead(record: Mapping[str, Any]) -> str:
 
 
 def thesis_order(methods: Columns) -> str:
-    """Whether the order that the thesis found reappears, in sentences."""
+    """Sentences on whether the order found in the thesis is confirmed."""
     corr = {n: methods[n].get("lambda_corr") for n in ORDER if n in methods}
     known = {n: c for n, c in corr.items() if c is not None}
     if len(known) < len(ORDER):
@@ -56,10 +56,10 @@ def thesis_order(methods: Columns) -> str:
         return f"The thesis's order of the correlation reappears: {told}."
     return (
         f"The thesis found position < pose < image < hybrid in correlation; here it is {told}."
-        " Where image is ahead of"
-        " hybrid, photos fit their neighbours better than one height and the reported tilts let"
-        " them: image bends them"
-        " freely and pays with distances, which the geolocation below shows."
+        " If image is better than"
+        " hybrid, photos fit their neighbours better than a single height and the reported tilts"
+        " allow: image deforms them"
+        " freely, at the cost of wrong distances, which the geolocation below shows."
     )
 
 
@@ -165,7 +165,7 @@ def _geolocation(ran: Columns) -> Block:
         head=("", "MAE x", "MAE y", "MAE z", "RMS x", "RMS y", "RMS z"),
         rows=tuple(rows),
         numeric="tnnnnnn",
-        note="Methods that take positions as they are differ by nothing from them: that is no"
+        note="Methods that use reported positions unchanged do not differ from them; this is no"
         " accuracy.",
     )
 

@@ -1,4 +1,4 @@
-"""Direct registration of two pictures by normalised cross-correlation over an image pyramid; no
+"""Direct registration of two images by normalised cross-correlation over an image pyramid, without
 features.
 """
 
@@ -16,48 +16,48 @@ from skyquilt.papers.picture_similarity import ncc, ncc_of_shifts, summit, warpe
 Doubles = NDArray[np.float64]
 
 _COARSE = 128
-"""Longer side in px at which everything is tried."""
+"""Longer side in px of the images for the exhaustive search."""
 
 
 class Direct(Protocol):
-    """What registers pixels: `Ncc`, `PhaseCorrelation`, `Ecc`, `MutualInformation`. `start` (3, 3)
-    b_H_a or None.
+    """Interface of direct registration: `Ncc`, `PhaseCorrelation`, `Ecc`, `MutualInformation`.
+    `start`: (3, 3) b_H_a or None.
     """
 
     def __call__(
         self, a: NDArray[Any], b: NDArray[Any], start: Doubles | None = None
     ) -> Registration | NoEstimate:
-        """b_H_a with its score, or why there is none."""
+        """b_H_a with its score, or the reason why there is none."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ncc:
-    """All shifts (and the turns and scales asked for) in small pictures, then the best refined in
-    larger ones.
+    """Searches all shifts (and the requested rotations and scales) in small images, then refines
+    the best in larger ones.
     """
 
     turn: float = 0.0
-    """Largest rotation tried, degrees either way from the start; 0 looks for a translation, unless
-    `zoom` is given.
+    """Largest rotation tried, in degrees in both directions from the start; 0 searches for a
+    translation, unless `zoom` is given.
     """
     zoom: float = 1.0
-    """Largest factor between the scales tried, either way."""
+    """Largest scale factor tried, in both directions."""
     minimum: float = 0.3
-    """Least correlation that is trusted."""
+    """Least accepted correlation."""
     clear: float = 0.95
-    """Largest share of the best place's correlation that another place may have (at the coarsest
+    """Largest correlation of a second place, as a share of that of the best (at the coarsest
     level).
     """
     overlap: float = 0.2
-    """Least share of a's pixels that lie on b."""
+    """Least share of a's pixels that overlap b."""
     version: ClassVar[int] = 1
 
     def __call__(
         self, a: NDArray[Any], b: NDArray[Any], start: Doubles | None = None
     ) -> Registration | NoEstimate:
-        """b_H_a of two pictures (H, W[, C]), shifts from `start` of any size; or why there is
-        none.
+        """b_H_a of two images (H, W[, C]), with shifts of any size from `start`; or the reason why
+        there is none.
         """
         a, b = to_grey8(a), to_grey8(b)
         first = np.eye(3) if start is None else start
@@ -83,7 +83,9 @@ class Ncc:
         return Registration(model=model, b_H_a=H, score=score, overlap=share, method="NCC")
 
     def _everything(self, a: NDArray[Any], b: NDArray[Any], start: Doubles) -> Doubles | NoEstimate:
-        """The best of all shifts, turns and scales of small pictures, close enough for climbing."""
+        """The best of all shifts, rotations and scales of small images, close enough for local
+        maximisation.
+        """
         best: tuple[float, float, Doubles] = (-1.0, -1.0, start)
         size = (int(2 * max(b.shape)),) * 2
         middle = np.array(
@@ -93,7 +95,7 @@ class Ncc:
         for angle, scale in self._tried(max(a.shape)):
             H = start @ motion(np.array([0, 0, np.radians(angle), np.log(scale)]), a.shape)
             H[:2, 2] += np.array([(b.shape[1] - 1) / 2, (b.shape[0] - 1) / 2]) - (H @ centre)[:2]
-            # a turned into b's directions on a canvas about b
+            # a rotated to b's orientation on a canvas around b
             turned, inside = warped(a, np.linalg.inv(H) @ middle, size)
             field, zero = ncc_of_shifts(turned, b, inside, overlap=self.overlap)
             row, column, value, second = summit(field)
@@ -109,7 +111,7 @@ class Ncc:
         return best[2]
 
     def _tried(self, longest: int) -> list[tuple[float, float]]:
-        """(degrees, scale), so close that a corner moves by no more than 3 px between them."""
+        """(degrees, scale) in steps at which a corner moves by at most 3 px."""
         step = 6 / longest
         turns = int(np.ceil(np.radians(self.turn) / step))
         zooms = int(np.ceil(np.log(self.zoom) / step)) if self.zoom > 1 else 0

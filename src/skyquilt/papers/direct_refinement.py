@@ -1,5 +1,5 @@
-"""Direct registration from a start: phase correlation, ECC, mutual information. One call form with
-`direct.Ncc`.
+"""Direct registration from a start: phase correlation, ECC, mutual information. The interface is
+that of `direct.Ncc`.
 """
 
 from dataclasses import dataclass
@@ -22,23 +22,23 @@ Doubles = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class PhaseCorrelation:
-    """Shift, and if asked for rotation and scale, without any start: from the phases of the
-    spectra.
+    """Shift, and optionally rotation and scale, from the phases of the spectra. No start is
+    needed.
     """
 
     similarity: bool = False
-    """Rotation and scale too, from log-polar spectra; else a translation."""
+    """Whether rotation and scale are estimated too, from log-polar spectra."""
     minimum: float = 0.3
-    """Least correlation of the pictures on each other that is trusted."""
+    """Least accepted correlation of the registered images."""
     overlap: float = 0.2
-    """Least share of a's pixels that lie on b."""
+    """Least share of a's pixels that overlap b."""
     version: ClassVar[int] = 1
 
     def __call__(
         self, a: NDArray[Any], b: NDArray[Any], start: Doubles | None = None
     ) -> Registration | NoEstimate:
-        """b_H_a of two pictures (H, W[, C]); `start` is undone first, the rest may be half of the
-        picture.
+        """b_H_a of two pictures (H, W[, C]); `start` is applied first; the remaining shift may be
+        up to half of the image.
         """
         a, b = to_grey8(a), to_grey8(b)
         first = np.eye(3) if start is None else start
@@ -59,8 +59,8 @@ class PhaseCorrelation:
     def _shifted(
         self, a: NDArray[Any], b: NDArray[Any], H: Doubles
     ) -> tuple[Doubles, float, float, float]:
-        """(b_H_a, response, correlation, overlap) after two rounds: the second sees what the first
-        brought in.
+        """(b_H_a, response, correlation, overlap) after two rounds: the second uses the overlap
+        found by the first.
         """
         response = 0.0
         for _ in range(2):
@@ -78,17 +78,17 @@ class Ecc:
     """
 
     model: Literal["translation", "euclidean", "affine", "homography"] = "homography"
-    """What is estimated; a similarity OpenCV has not."""
+    """Type of the transformation; OpenCV has no similarity."""
     minimum: float = 0.3
     """Least correlation that is trusted."""
     coarsest: int = 256
     """Longer side in px at which it begins; the start must be right to a few px there."""
     reach: float = 0.2
-    """Farthest that a corner may move from the start, share of the diagonal: beyond it the search
-    has run away.
+    """Largest shift of a corner from the start, as a share of the diagonal; beyond it the search
+    has diverged.
     """
     iterations: int = 60
-    """Most per level."""
+    """Largest number of iterations per level."""
     version: ClassVar[int] = 1
 
     def __call__(
@@ -104,8 +104,8 @@ class Ecc:
                 score, small = self._level(
                     reduced(a, factor), reduced(b, factor), small / small[2, 2]
                 )
-            except cv2.error:  # not one pixel in common, or no convergence
-                return NoEstimate(reason="the pictures do not converge on each other")
+            except cv2.error:  # no common pixel, or no convergence
+                return NoEstimate(reason="the iteration does not converge")
             H = at_level(small, 1 / factor)
             H = H / H[2, 2]
         if not score >= self.minimum:
@@ -134,18 +134,18 @@ class Ecc:
 
 @dataclass(frozen=True, kw_only=True)
 class MutualInformation:
-    """Refinement where grey values of one picture say nothing about those of the other but where:
-    two spectra, say.
+    """Refinement by mutual information, for images whose grey values are not linearly related, such
+    as different spectral bands.
     """
 
     similarity: bool = True
-    """Rotation and scale too; else a translation."""
+    """Whether rotation and scale are estimated too, besides a translation."""
     bins: int = 32
-    """Of each picture's grey values."""
+    """Number of histogram bins of each image's grey values."""
     minimum: float = 0.05
-    """Least normalised mutual information that is trusted."""
+    """Least accepted normalised mutual information."""
     overlap: float = 0.2
-    """Least share of a's pixels that lie on b."""
+    """Least share of a's pixels that overlap b."""
     coarsest: int = 160
     """Longer side in px at which it begins; the start must be right to a few px there."""
     finest: int = 1
@@ -176,12 +176,12 @@ class MutualInformation:
 
 @dataclass(frozen=True, kw_only=True)
 class Started:
-    """A refinement that begins where another registration ended."""
+    """A refinement that starts from the result of another registration."""
 
     start: Direct
-    """Finds the rough place."""
+    """Finds the approximate transform."""
     refine: Direct
-    """Finds the exact one."""
+    """Refines it."""
     version: ClassVar[int] = 1
 
     def __call__(
@@ -198,11 +198,11 @@ def by_phase(model: str) -> PhaseCorrelation:
 
 
 def by_ecc(model: Literal["translation", "affine", "homography"]) -> Started:
-    """ECC from the place that cross-correlation finds."""
+    """ECC from the result of cross-correlation."""
     return Started(start=by_ncc("similarity"), refine=Ecc(model=model))
 
 
 def by_mutual_information(model: str) -> Started:
-    """Mutual information from the place that cross-correlation finds."""
+    """Mutual information from the result of cross-correlation."""
     similarity = model == "similarity"
     return Started(start=by_ncc(model), refine=MutualInformation(similarity=similarity))

@@ -1,4 +1,4 @@
-"""`flightline`: mosaics of flight lines, joined, and laid on the map by regression (Arteaga et al.
+"""`flightline`: mosaics of flight lines are joined and georeferenced by regression (Arteaga et al.
 2019).
 """
 
@@ -34,8 +34,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class ByFlightline:
-    """A's whole method: lines, pairs across lines, homographies by STE per inlier, middle-out,
-    affine regression.
+    """The complete method of A: flight lines, pairs across lines, homographies by STE per inlier,
+    from the middle outwards, affine regression.
     """
 
     within: Matcher
@@ -45,8 +45,8 @@ class ByFlightline:
     estimate: Estimator
     """RANSAC by the symmetric transfer error per inlier; A's transformation is the homography."""
     split: Literal["heading", "distance"] = "heading"
-    """How lines are told apart: `distance` is A's; `heading` also ends a line where the course
-    turns.
+    """How lines are separated: `distance` is A's method; `heading` also ends a line where the
+    course turns.
     """
     distortion: str = "none"
     """Order of the lens model; A corrects none."""
@@ -64,8 +64,8 @@ class ByFlightline:
         """Aligns photos in the order of capture given (indices).
 
         Raises:
-            AlignmentError: no positions, fewer than two lines, or (by distance) lines that run back
-                on themselves.
+            AlignmentError: no positions, fewer than two lines, or (by distance) lines that reverse
+                their direction.
         """
         xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
         lost = {
@@ -82,7 +82,7 @@ class ByFlightline:
         whole = work.joined(strips, self._pairs(order, xy, strips))
         poses, lost_too = _on_map(whole, xy, lens)
         alone = [i for s in strips for i in s if i not in whole]
-        lost |= dict.fromkeys(alone, "nothing links its flight line to the others") | lost_too
+        lost |= dict.fromkeys(alone, "its flight line is not linked to the others") | lost_too
         placed = plane_alignment(
             self.name,
             frame,
@@ -99,11 +99,10 @@ class ByFlightline:
     def _pairs(
         self, order: Sequence[int], xy: Array, strips: Sequence[dict[int, Array]]
     ) -> list[tuple[int, int]]:
-        """Photos of different strips that may share ground: A's, and by heading also those on both
-        sides of a turn.
+        """Pairs of photos of different strips that may overlap: those of A, and for `heading` also
+        pairs on both sides of a turn.
 
-        Lines that only meet at their ends, around a field, have no triangles between them but
-        obtuse ones.
+        Lines that only meet at their ends, around a field, are connected by obtuse triangles only.
         """
         pairs = pairs_across(xy, [list(s) for s in strips])
         if self.split == "distance":
@@ -115,7 +114,7 @@ class ByFlightline:
     def _lines(
         self, order: list[int], xy: Array, photos: Sequence[Photo]
     ) -> tuple[list[list[int]], list[str]]:
-        """Lines of two or more photos (indices), and what to say about them."""
+        """Lines of two or more photos (indices), and messages about them."""
         if len(order) < 4:
             raise AlignmentError(
                 f"method flightline needs positions of at least two flight lines, and {len(order)}"
@@ -144,7 +143,7 @@ class ByFlightline:
             f"{len(whole)} flight lines: {', '.join(str(len(line)) for line in whole)} photos."
         ]
         notes += (
-            [f"between flight lines, each taken as a line of its own: {', '.join(single)}."]
+            [f"between flight lines, each treated as a separate line: {', '.join(single)}."]
             if single
             else []
         )
@@ -153,7 +152,7 @@ class ByFlightline:
 
 @dataclass(kw_only=True)
 class _Work:
-    """Homographies of one survey as they are found."""
+    """Homographies of one survey, computed on demand."""
 
     method: ByFlightline
     photos: Sequence[Photo]
@@ -165,7 +164,7 @@ class _Work:
         self.joins: list[Join] = []
 
     def strips(self, line: Sequence[int]) -> list[dict[int, Array]]:
-        """Mosaics of a line, one where nothing breaks it: plane_H_work (3, 3) of each photo's
+        """Mosaics of a line (one if it is not interrupted): plane_H_work (3, 3) of each photo's
         working image.
         """
         strips: list[list[int]] = [[line[0]]]
@@ -214,8 +213,8 @@ class _Work:
     def joined(
         self, strips: Sequence[dict[int, Array]], pairs: Sequence[tuple[int, int]]
     ) -> dict[int, Array]:
-        """All strips in the plane of the middle one: plane_H_work per photo; strips that nothing
-        links are left out.
+        """All strips in the plane of the middle one: plane_H_work per photo; strips without links
+        are left out.
         """
         strip_of = {i: k for k, s in enumerate(strips) for i in s}
         matched: dict[tuple[int, int], list[tuple[Array, Array]]] = {}
@@ -238,7 +237,7 @@ class _Work:
         for k in waiting:
             first, last = self.photos[min(strips[k])].name, self.photos[max(strips[k])].name
             self.notes.append(
-                f"nothing links the flight line {first} to {last} to the others; it is left out."
+                f"the flight line {first} to {last} is not linked to the others; it is left out."
             )
         return {i: H @ strips[k][i] for k, H in whole.items() for i in strips[k]}
 
@@ -248,9 +247,7 @@ class _Work:
         whole: dict[int, Array],
         matched: dict[tuple[int, int], list[tuple[Array, Array]]],
     ) -> bool:
-        """Places strip k on those already placed, by the matches with all of them; False where that
-        fails.
-        """
+        """Places strip k by its matches with all placed strips; False if that fails."""
         a, b = [], []
         for other, H in whole.items():
             for low, high in matched.get((min(k, other), max(k, other)), []):
@@ -297,11 +294,12 @@ def _from_middle(strip: Sequence[int], before_H_photo: dict[int, Array]) -> dict
 def _on_map(
     whole: dict[int, Array], xy: Array, lens: Sequence[Camera]
 ) -> tuple[dict[int, Pose], dict[int, str]]:
-    """Poses by the affine regression of the photos' middles on their positions (A 16-21).
+    """Poses by affine regression of the photos' centres to their positions (A 16-21).
 
-    A turns the mosaic first, by the angle between the first two photos of the central line on both
-    sides, so that the regression starts near the identity; a linear regression has one solution
-    wherever it starts, so the turn is part of the affinity here. The inversion of y (A 16) is, too.
+    A first rotates the mosaic by the angle between the first two photos of the central line in both
+    systems, so that the regression starts near the identity. A linear regression has the same
+    solution for any start, so here the rotation is part of the affine transformation, as is the
+    inversion of y (A 16).
     """
     used = list(whole)
     middle = np.array([transfer(whole[i], working_K(lens[i])[None, :2, 2])[0] for i in used])
@@ -317,5 +315,5 @@ def _on_map(
         try:
             poses[i] = planar_pose(map_H_plane @ whole[i] @ working_K(lens[i]))
         except ValueError:
-            lost[i] = "its place in the mosaic is degenerate"
+            lost[i] = "its registration in the mosaic is degenerate"
     return poses, lost

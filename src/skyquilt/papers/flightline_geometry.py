@@ -11,7 +11,9 @@ Array = NDArray[np.float64]
 BINS = 9
 """Intervals of the histogram of shooting distances."""
 BELOW, ABOVE = 2, 5
-"""Widths of intervals below and above the commonest distance that belong to a line (A 2)."""
+"""Number of interval widths below and above the most frequent distance that belong to a line
+(A 2).
+"""
 TURN_DEG = 45.0
 """Change of course that ends a line, for the extension by heading."""
 
@@ -37,7 +39,7 @@ def shooting_distances(xy: Array) -> Shooting:
     """The histogram of distances of photos (n, 2) m in order of capture (A 2.1)."""
     d = np.linalg.norm(np.diff(xy, axis=0), axis=1)
     width = float(d.max() - d.min()) / BINS
-    if width < 1e-6 * d.max():  # one distance, but for rounding: no histogram
+    if width < 1e-6 * d.max():  # all distances equal, except for rounding: no histogram
         return Shooting(distance_m=d, commonest_m=float(d[0]), width_m=0.0)
     count, edges = np.histogram(d, bins=BINS)
     k = int(np.argmax(count))
@@ -59,13 +61,13 @@ def by_distance(xy: Array) -> list[list[int]]:
 def by_heading(xy: Array) -> list[list[int]]:
     """Lines where the course must stay within 45 degrees of the line's: an extension of the method.
 
-    A step belongs to a line when it is not longer than A's range allows and runs along the line so
-    far. That it is not shorter either is not asked: positions err by metres, and a step back shows
-    in the course. At a turn, the photo that ends one line does not begin the next: that one begins
-    with the step's end.
+    A step belongs to a line if it is not longer than A's range and follows the direction of the
+    line so far. A lower limit is not applied: positions have errors of metres, and a step back is
+    detected by the course. At a turn, the photo that ends one line does not start the next one;
+    that starts with the end of the step.
     """
     shooting = shooting_distances(xy)
-    # where all distances are alike, their range is no wider than the noise of positions
+    # if all distances are equal, their range is no wider than the noise of positions
     high = max(shooting.range_m[1], 1.5 * shooting.commonest_m)
     step = np.diff(xy, axis=0)
     lines: list[list[int]] = [[0]]
@@ -89,8 +91,8 @@ def _cut(count: int, starts: NDArray[Any]) -> list[list[int]]:
 
 
 def reversals(xy: Array, line: Sequence[int]) -> int:
-    """How often the course along a line turns back by more than a right angle: what distance alone
-    does not see.
+    """How often the course along a line turns by more than a right angle, which distances alone do
+    not show.
     """
     step = np.diff(xy[list(line)], axis=0)
     return int(((step[1:] * step[:-1]).sum(1) < 0).sum())
@@ -100,12 +102,9 @@ def pairs_across(xy: Array, lines: Sequence[Sequence[int]]) -> list[tuple[int, i
     """Pairs of photos (i < j) of different lines: edges of the Delaunay triangulation, those of
     triangles with an obtuse angle removed (A 2.2).
 
-    An edge goes when any triangle it belongs to is obtuse, as A prints it.
+    An edge is removed if any of its triangles is obtuse, as printed in A.
     """
-    from scipy.spatial import (
-        Delaunay,
-        QhullError,
-    )  # few ask for flight lines, and all would wait for it
+    from scipy.spatial import Delaunay, QhullError  # imported here, since only flight lines need it
 
     line_of = {i: k for k, line in enumerate(lines) for i in line}
     used = np.array(sorted(line_of))

@@ -1,4 +1,6 @@
-"""Corners (Harris and Stephens 1988), described as upright or turned SURF at one fixed scale."""
+"""Corners (Harris and Stephens 1988), described by SURF, with or without orientation, at one fixed
+scale.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -16,8 +18,8 @@ from skyquilt.papers.surf_descriptors import Means, descriptors, orientations
 
 @dataclass(frozen=True, kw_only=True)
 class Harris:
-    """Maxima of det - k trace^2 of the structure tensor. Corners have no scale: photos must not
-    differ in theirs.
+    """Maxima of det - k trace^2 of the structure tensor. Corners have no scale, so photos must have
+    the same scale.
     """
 
     count: int = 1500
@@ -31,12 +33,11 @@ class Harris:
     quality: float = 1e-4
     """Least response of a corner over the strongest corner's."""
     sigma: float = 2.0
-    """Scale in px at which corners are described, 20 times of which is the window's side."""
+    """Scale in px at which corners are described; the window's side is 20 times as long."""
     upright: bool = True
-    """No orientation: photos must not be turned against each other."""
+    """Whether keypoints have no orientation; then photos must not be rotated against each other."""
     cells: int = 10
-    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare.
-    """
+    """The image is divided into cells x cells; each keeps its strongest keypoints."""
     version: ClassVar[int] = 1
 
     def __call__(self, image: NDArray[Any]) -> Features:
@@ -63,7 +64,7 @@ class Harris:
         return Features(px=px, size=size, descriptors=signed_bytes(vectors), scale=scale)
 
     def _corners(self, grey: NDArray[np.uint8]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-        """(N, 2) px to parts of a pixel, by parabolas through the maxima, and (N,) responses."""
+        """(N, 2) px with subpixel accuracy, by parabolas through the maxima, and (N,) responses."""
         field = np.asarray(
             cv2.cornerHarris(grey.astype(np.float32), self.block, 3, self.k), np.float32
         )
@@ -80,8 +81,8 @@ class Harris:
 
 
 def _vertex(before: NDArray[Any], at: NDArray[Any], after: NDArray[Any]) -> NDArray[np.float64]:
-    """Where a parabola through three neighbouring values is highest, from the middle one, within
-    half a step.
+    """Position of the maximum of a parabola through three neighbouring values, relative to the
+    middle one, within half a step.
     """
     bend = 2.0 * at - before - after
     return np.where(bend > 0, (after - before) / 2 / np.maximum(bend, 1e-30), 0).clip(-0.5, 0.5)

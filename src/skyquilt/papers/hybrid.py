@@ -1,5 +1,5 @@
-"""`hybrid`: metadata place every photo, pixels correct it inside its error range (Y 4.1.2,
-6.1.3).
+"""`hybrid`: every photo is placed by metadata and corrected by image correlation within its error
+range (Y 4.1.2, 6.1.3).
 """
 
 from collections.abc import Callable, Sequence
@@ -19,27 +19,27 @@ from skyquilt.papers.planar import map_H_cam_of
 
 Array = NDArray[np.float64]
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
-"""Grey picture of a photo (index) with a longest side of so many px at most."""
+"""Gives the grey image of a photo (index), with at most the given px on its longest side."""
 NEIGHBOURS = 4
-"""Placed photos whose distances count."""
+"""Number of nearest placed photos whose distances are compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hybrid:
-    """Photos in order of capture; each is moved and turned to where lambda is largest, and then
-    stays.
+    """In order of capture, each photo is shifted and rotated to the maximum of lambda, and then
+    fixed.
     """
 
     optimise: Optimiser
     """How lambda is maximised."""
     alpha: float = 0.5
-    """Weight of distances against looks."""
+    """Weight of distances against image correlation."""
     across: int = 400
     """Width in px of a photo on the finest level (the thesis's scale)."""
     deviations: float = 2.0
-    """Standard deviations of position, tilt and heading that the search reaches out to."""
+    """Search range in standard deviations of position, tilt and heading."""
     seed: int = 0
-    """Of the annealing."""
+    """Seed of the annealing."""
     version: ClassVar[int] = 1
     name: ClassVar[str] = "hybrid"
 
@@ -51,7 +51,7 @@ class Hybrid:
         order: Sequence[int],
         grey: GreyPicture,
     ) -> Alignment:
-        """Corrects an alignment by metadata, the photos taken in the order given (indices)."""
+        """Corrects an alignment by metadata; photos are processed in the given order (indices)."""
         order = [i for i in order if i in placed.poses]
         gsd = self._gsd(placed)
         overview = Overview()
@@ -107,7 +107,7 @@ class Hybrid:
         gsd: float,
         grey: GreyPicture,
     ) -> tuple[Join | None, Pose]:
-        """The photo where lambda is largest."""
+        """Moves the photo to the maximum of lambda."""
         pose = placed.poses[photo]
         patch = self._patch(photo, pose, placed, gsd, grey)
         if patch is None:
@@ -140,7 +140,7 @@ class Hybrid:
 
 
 def distances(nadir: Array, placed: Alignment, done: dict[int, Pose]) -> Distances:
-    """Measured distances to the nearest photos done, and where those are now."""
+    """Measured distances to the nearest photos already placed, and their current positions."""
     index = np.array(list(done))
     reported = np.array([placed.poses[i].map_C[:2] for i in index])
     d = np.linalg.norm(reported - nadir, axis=1)
@@ -151,7 +151,7 @@ def distances(nadir: Array, placed: Alignment, done: dict[int, Pose]) -> Distanc
 
 
 def turned(pose: Pose, move: Array) -> Pose:
-    """The pose moved east and north in m and turned clockwise in degrees about the vertical."""
+    """The pose shifted east and north in m and rotated clockwise in degrees about the vertical."""
     turn = rotation_from_vector(np.array([0.0, 0.0, -np.radians(move[2])]))
     return Pose(
         cam_R_map=pose.cam_R_map @ turn.T, map_C=pose.map_C + np.array([move[0], move[1], 0.0])

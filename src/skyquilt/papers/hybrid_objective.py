@@ -1,5 +1,5 @@
-"""What `hybrid` maximises: lambda = alpha lambda_spat + (1 - alpha) lambda_corr of a photo on the
-map (Y 4.6).
+"""Objective of `hybrid`: lambda = alpha lambda_spat + (1 - alpha) lambda_corr of a photo on the map
+(Y 4.6).
 """
 
 from collections.abc import Sequence
@@ -13,21 +13,21 @@ from skyquilt.imaging.plane import Overview, Patch
 
 Array = NDArray[np.float64]
 LEAST_OVERLAP = 0.02
-"""Share of a photo that must lie on the map so far for a correlation to mean anything."""
+"""Least overlap of a photo with the map so far for a correlation, as a share of the photo."""
 STEPS = 3
 """Levels of the pyramid, each twice as coarse as the one before."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Distances:
-    """Where the new photo's neighbours lie, as measured and on the map."""
+    """Positions of the new photo's neighbours, as measured and on the map."""
 
     reported: Array
     """(n,) measured distances in m from the new nadir to those of its neighbours."""
     placed: Array
     """(n, 2) the neighbours' nadirs on the map in m."""
     weight: Array
-    """(n,) 1, or 0 where the distance is too short to be compared relatively."""
+    """(n,) 1, or 0 where the distance is too short for a relative comparison."""
 
     def quality(self, nadir: Array) -> Array:
         """lambda_spat (6.1) of nadirs (..., 2) in m: mean of 1 / (1 + |relative error|); 1 without
@@ -47,17 +47,17 @@ class Level:
     gsd: float
     """Ground size in m of its pixels."""
     patch: NDArray[np.float32]
-    """(h, w) the photo where its metadata put it."""
+    """(h, w) the photo as placed by its metadata."""
     shown: NDArray[np.float32]
-    """(h, w) 1 where the photo shows something, 0 elsewhere."""
+    """(h, w) 1 where the photo is valid, 0 elsewhere."""
     pivot: Array
     """(2,) column and row of the photo's nadir in the patch."""
     window: NDArray[np.float32]
     """(H, W) the map so far around it."""
     filled: NDArray[np.float32]
-    """(H, W) 1 where the map so far shows something."""
+    """(H, W) 1 where the map so far is valid."""
     offset: Array
-    """(2,) column and row of the patch's first pixel in the window, at the metadata's place."""
+    """(2,) column and row of the patch's first pixel in the window, as placed by metadata."""
 
     def correlation(self, move: Array) -> float:
         """CC (6.1) of photo and map in their overlap for a move (east m, north m, degrees); NaN
@@ -80,7 +80,7 @@ class Level:
         """(2, 3) patch pixels to window pixels."""
         turn = np.radians(
             move[2]
-        )  # rows run south: a clockwise turn on the ground is one in the picture
+        )  # rows point south: clockwise on the ground is clockwise in the image
         c, s = np.cos(turn), np.sin(turn)
         R = np.array([[c, -s], [s, c]])
         target = self.pivot + self.offset + np.array([move[0], -move[1]]) / self.gsd
@@ -96,13 +96,13 @@ class Objective:
     distances: Distances
     """Its neighbours."""
     nadir: Array
-    """(2,) where the metadata put it, in m."""
+    """(2,) nadir by metadata in m."""
     alpha: float
     """Weight of distances against looks."""
 
     def __call__(self, move: Array, level: int) -> float:
-        """lambda for a move (east m, north m, clockwise degrees); looks count nothing where nothing
-        overlaps.
+        """lambda for a move (east m, north m, clockwise degrees); without overlap, only distances
+        are used.
         """
         cc = self.levels[level].correlation(move)
         looks = (1 + cc) / 2 if np.isfinite(cc) else 0.0
@@ -122,7 +122,7 @@ def pyramid(
     """
     h, w = patch.shown.shape
     margin = int(np.ceil(reach_m / gsd)) + 2
-    margin += int(0.1 * max(h, w))  # room to turn
+    margin += int(0.1 * max(h, w))  # margin for rotation
     row, column = patch.row - margin, patch.column - margin
     window, filled = overview.window(row, column, h + 2 * margin, w + 2 * margin)
     levels = []
@@ -150,7 +150,7 @@ def pyramid(
 def _halved(
     pixels: NDArray[np.float32], seen: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Area averages of 2 x 2 pixels, of what is seen only."""
+    """Averages of 2 x 2 pixels, of valid ones only."""
     size = (-(-pixels.shape[1] // 2), -(-pixels.shape[0] // 2))
     even = [(0, s % 2) for s in pixels.shape]
     p, m = np.pad(pixels * seen, even), np.pad(seen, even)

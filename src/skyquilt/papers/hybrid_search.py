@@ -16,18 +16,18 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Best:
-    """Where the objective is largest."""
+    """Maximum of the objective."""
 
     move: Array
-    """(3,) east m, north m, clockwise degrees, from where the metadata put the photo."""
+    """(3,) east m, north m, clockwise degrees, relative to the placement by metadata."""
     quality: float
     """lambda there, on the finest level."""
     evaluations: int
-    """How often the objective was evaluated."""
+    """Number of evaluations of the objective."""
 
 
 class Optimiser(Protocol):
-    """Maximises an objective within a reach in m and a turn in degrees."""
+    """Interface: maximises an objective within a largest shift in m and rotation in degrees."""
 
     def __call__(self, objective: Objective, reach_m: float, turn_deg: float, seed: int) -> Best:
         """The best move."""
@@ -36,19 +36,19 @@ class Optimiser(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Anneal:
-    """Simulated annealing (Kirkpatrick et al. 1983) over an image pyramid, as the thesis has it (Y
+    """Simulated annealing (Kirkpatrick et al. 1983) over an image pyramid, as in the thesis (Y
     4.1.2).
 
-    The coarsest level searches the whole range, each finer one what its coarser neighbour cannot
-    tell.
+    The coarsest level searches the whole range; each finer level searches within the resolution of
+    the coarser one.
     """
 
     tries: tuple[int, ...] = (120, 160, 500)
     """Evaluations on each level, finest first."""
     hot: float = 0.03
-    """Temperature at first, in units of lambda."""
+    """First temperature in units of lambda."""
     cold: float = 0.0005
-    """Temperature at last."""
+    """Last temperature in units of lambda."""
     version: ClassVar[int] = 1
 
     def __call__(self, objective: Objective, reach_m: float, turn_deg: float, seed: int) -> Best:
@@ -81,7 +81,7 @@ class Anneal:
         heat: float,
         rng: np.random.Generator,
     ) -> Array:
-        """One level: steps and temperature fall geometrically."""
+        """One level: steps and temperature decrease geometrically."""
         tries = self.tries[level]
         value = objective(move, level)
         best, best_value = move, value
@@ -102,24 +102,24 @@ class Anneal:
 
 @dataclass(frozen=True, kw_only=True)
 class Surfaces:
-    """Correlation surfaces: every shift of the coarsest level at once for each of a fan of turns,
-    then a descent.
+    """Correlation surfaces: all shifts of the coarsest level at once for each of a set of
+    rotations, followed by a local search.
 
     Masked normalised correlation by Fourier transforms (Padfield 2012) gives lambda of all shifts;
-    the best of them climb the finer levels by a pattern search that ends in a parabola through the
-    last step's neighbours.
+    the best of them are refined on finer levels by a pattern search, which ends with a parabola
+    through the neighbours of the last step.
     """
 
     turn_step_deg: float = 2.0
-    """Between the turns tried."""
+    """Step between the rotations tried in degrees."""
     keep: int = 3
-    """Peaks that climb to the next level."""
+    """Number of peaks refined on the next level."""
     version: ClassVar[int] = 1
 
     def __call__(
         self, objective: Objective, reach_m: float, turn_deg: float, seed: int = 0
     ) -> Best:
-        """The best move; nothing here is random."""
+        """The best move; the search is deterministic."""
         coarse = len(objective.levels) - 1
         turns = np.linspace(
             -turn_deg, turn_deg, 2 * int(np.ceil(turn_deg / self.turn_step_deg)) + 1
@@ -145,7 +145,7 @@ class Surfaces:
     def _peak(
         self, objective: Objective, level: int, turn: float, reach_m: float
     ) -> tuple[float, Array]:
-        """The best shift for one turn on the coarsest level: (lambda, move)."""
+        """The best shift for one rotation on the coarsest level: (lambda, move)."""
         here = objective.levels[level]
         cc, columns, rows = masked_correlation(here, turn, reach_m)
         east, north = np.meshgrid(columns * here.gsd, -rows * here.gsd)
@@ -189,8 +189,8 @@ def masked_correlation(level: Level, turn_deg: float, reach_m: float) -> tuple[A
     """CC of photo and map in their overlap for all whole-pixel shifts within reach, NaN where they
     hardly overlap.
 
-    The surface (rows, columns), shifts along columns and along rows in px from the metadata's place
-    (Padfield 2012).
+    The surface (rows, columns), shifts along columns and along rows in px from the placement by
+    metadata (Padfield 2012).
     """
     place = level._placement(np.array([0.0, 0.0, turn_deg]))
     h, w = level.window.shape

@@ -1,5 +1,5 @@
-"""Lens models of lower order, and pixels on the working plane that methods in the plane register
-on.
+"""Lens models of lower order, and conversion of pixels to the working image used by the planar
+methods.
 """
 
 from dataclasses import replace
@@ -12,16 +12,16 @@ from skyquilt.model.camera import Camera, order_named
 
 Array = NDArray[np.float64]
 WORKING_WIDTH = 1500
-"""Width in px of the working image that thresholds are meant for (Y 4.2.2, A 2.1)."""
+"""Width in px of the working image for which thresholds are defined (Y 4.2.2, A 2.1)."""
 
 
 def of_order(camera: Camera, order: str) -> Camera:
     """The lens model of an order (`none`, `2`, `4`, `6`, `6t`) that fits a calibration best over
     the whole image.
 
-    Fitted by itself, focal length and principal point included, never cut from the higher one: what
-    the left-out terms did is taken over by the others as far as they can (linear least squares over
-    a grid of pixels).
+    It is fitted separately, including focal length and principal point, and not truncated from the
+    higher order. So the other terms compensate for the omitted ones as far as possible (linear
+    least squares over a grid of pixels).
     """
     kept, steps = order_named(order), 25
     grid = np.meshgrid(

@@ -1,4 +1,4 @@
-"""Least median of squares (Rousseeuw 1984): no threshold to choose, but more than half of the
+"""Least median of squares (Rousseeuw 1984). It needs no threshold, but more than half of the
 matches must be right.
 """
 
@@ -14,35 +14,35 @@ from skyquilt.matching.frame import estimated
 from skyquilt.matching.search import search
 
 _MEDIAN = 2 * np.log(2)
-"""Median of a chi-square of two degrees of freedom: of a transfer error in x and y, over its
+"""Median of a chi-square of two degrees of freedom: a transfer error in x and y, divided by its
 variance.
 """
 _FAR = 9.21
-"""99 % quantile of the same."""
+"""99 % quantile of the same distribution."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Lmeds:
-    """The model with the least median symmetric transfer error; inliers from the sigma that the
-    median tells.
+    """The model with the least median symmetric transfer error; inliers are selected by the
+    standard deviation estimated from the median.
     """
 
     model: Model = "homography"
-    """What is estimated."""
+    """Type of the transformation."""
     confidence: float = 0.9999
-    """That one sample was free of outliers when half of the matches are outliers: the number of
-    samples.
+    """Probability that a sample is free of outliers if half of the matches are outliers; determines
+    the number of samples.
     """
     max_iterations: int = 5000
-    """Cap of the samples."""
+    """Largest number of samples."""
     max_sigma_px: float = 10.0
-    """Largest standard deviation of the inliers, per axis, that is believed: more outliers than
-    half show in it.
+    """Largest accepted standard deviation of the inliers per axis; it is larger if more than half
+    of the matches are outliers.
     """
     minimum: int = 8
     """Fewest inliers of an estimate."""
     seed: int = 0
-    """Of the samples: equal seeds give equal results."""
+    """Seed of the samples; equal seeds give equal results."""
     version: ClassVar[int] = 1
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> Estimate | NoEstimate:
@@ -76,8 +76,9 @@ class Lmeds:
         return H, 2 * _FAR * variance
 
     def _variance(self, median: float, count: int) -> float:
-        """Of the inliers' transfer errors per axis, px^2; half of the STE is one way's square, few
-        matches fit too well (Rousseeuw and Leroy 1987, 5.1: 1 + 5 / (n - p)).
+        """Variance of the inliers' transfer errors per axis in px^2. Half of the STE is the squared
+        error of one direction; the factor 1 + 5 / (n - p) corrects for few matches (Rousseeuw and
+        Leroy 1987, 5.1).
         """
         small = 1 + 5 / max(count - MINIMAL[self.model], 1)
         return float(max(median / 2 / _MEDIAN * small**2, 1e-6))

@@ -1,5 +1,5 @@
-"""MAGSAC++ (Barath et al. 2020), as OpenCV has it: the threshold is marginalised over all noise
-levels up to a largest one.
+"""MAGSAC++ (Barath et al. 2020), by OpenCV: the threshold is marginalised over all noise levels up
+to a maximum.
 """
 
 from dataclasses import dataclass
@@ -19,25 +19,27 @@ Doubles = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Magsac:
-    """For daily use. OpenCV estimates homographies and affine transformations so; a similarity or
-    a translation is fitted to the inliers of an affine transformation, whose matches must
-    therefore not lie on one line.
+    """The estimator for general use. OpenCV estimates homographies and affine transformations in
+    this way. A similarity or translation is fitted to the inliers of an affine transformation, so
+    the matches must not lie on one line.
     """
 
     model: Model = "homography"
-    """What is estimated."""
+    """Type of the transformation."""
     threshold_px: float = 3.0
     """Transfer error beyond which a match is an outlier at the largest noise level: root mean
-    square of both ways.
+    square of both directions, in px.
     """
     confidence: float = 0.99
-    """That one sample was free of outliers, before the search ends."""
+    """Probability that at least one sample was free of outliers; the search ends when it is
+    reached.
+    """
     max_iterations: int = 5000
-    """Cap of the samples."""
+    """Largest number of samples."""
     minimum: int = 8
     """Fewest inliers of an estimate."""
     seed: int = 0
-    """Of the samples: equal seeds give equal results."""
+    """Seed of the samples; equal seeds give equal results."""
     version: ClassVar[int] = 2
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> Estimate | NoEstimate:
@@ -54,7 +56,9 @@ class Magsac:
         )
 
     def _find(self, a: Doubles, b: Doubles) -> Found | None:
-        """OpenCV does not tell how many samples it took: the cap is given, and no cap reported."""
+        """OpenCV does not report the number of samples: the limit is returned instead, and never
+        reported as reached.
+        """
         try:
             H = self._homography(a, b) if self.model == "homography" else self._linear(a, b)
         except cv2.error:  # fewer distinct points than one sample needs
@@ -68,7 +72,7 @@ class Magsac:
         return None if H is None else np.asarray(H, np.float64)
 
     def _linear(self, a: Doubles, b: Doubles) -> Doubles | None:
-        """An affine transformation, or a stiffer one through its inliers."""
+        """An affine transformation, or one with fewer parameters fitted to its inliers."""
         rows, inliers = cv2.estimateAffine2D(a, b, self._parameters())
         if rows is None:
             return None

@@ -1,4 +1,4 @@
-"""How far a registration lies from the truth."""
+"""Error of a registration relative to the truth."""
 
 from typing import Any
 
@@ -6,14 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 _ACROSS = 64
-"""Points along the longer side of the reference at which both are compared."""
+"""Number of points along the longer side of the reference at which both are compared."""
 
 
 def overlap_error(
     b_H_a: NDArray[Any], truth: NDArray[Any], shape_a: tuple[int, int], shape_b: tuple[int, int]
 ) -> float:
-    """RMS distance in px of b between where two transforms (3, 3) put the points of a (H, W) that
-    truly lie in b (H, W); infinite where none does, or where the transform sends one to infinity.
+    """RMS distance in px of b between the positions by two transforms (3, 3), over the points of a
+    (H, W) that are truly inside b (H, W). Infinite if there are none, or if the transform maps one
+    to infinity.
     """
     step = max(max(shape_a) / _ACROSS, 1.0)
     y, x = np.mgrid[0 : shape_a[0] - 1 : step, 0 : shape_a[1] - 1 : step]

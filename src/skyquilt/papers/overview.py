@@ -1,5 +1,5 @@
-"""`image`, search `overview`: each photo registered to the whole map so far, whose cost grows with
-it (Y 4.1.2).
+"""`image`, search `overview`: each photo is registered to the whole map so far, so the cost
+increases with its size (Y 4.1.2).
 """
 
 from collections.abc import Callable, Sequence
@@ -30,13 +30,13 @@ from skyquilt.papers.plane_registration import (
 
 Array = NDArray[np.float64]
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
-"""Grey picture of a photo (index) with a longest side of so many px at most."""
+"""Gives the grey image of a photo (index), with at most the given px on its longest side."""
 RIM_PX = 12
-"""Features of the overview nearer to its rim than this are the rim's."""
+"""Features nearer to the border of the overview than this, in px, are ignored."""
 
 
 class Detector(Protocol):
-    """Features of a picture."""
+    """Interface: finds the features of an image."""
 
     def __call__(self, image: NDArray[Any]) -> Features:
         """Keypoints and descriptors."""
@@ -49,8 +49,8 @@ class Detector(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class ByOverview:
-    """The basic image-based method of Y 4.1.2: features of the whole overview are sought anew for
-    every photo.
+    """The basic image-based method of Y 4.1.2: features of the whole overview are computed again
+    for every photo.
     """
 
     detect: Detector
@@ -60,13 +60,13 @@ class ByOverview:
     estimate: Estimator
     """Robust estimation, thresholds in px of the overview."""
     level: Leveller | None = None
-    """Levelled features; None = all inliers count."""
+    """Levelled features; None = all inliers are used."""
     distortion: str = "6t"
-    """Order of the lens model, fitted to the calibration that photos carry."""
+    """Order of the lens model, which is fitted to the calibration of the photos."""
     longest: int = 640
     """Longest side in px of a photo in the overview."""
     per_photo: int = 1500
-    """Features sought per area of a photo."""
+    """Number of features per area of a photo."""
     height_m: float | None = None
     """Height above ground in m that scales pieces without positions."""
     version: ClassVar[int] = 1
@@ -133,7 +133,7 @@ class ByOverview:
         return found if isinstance(found, NoEstimate) else (found[0] @ K, found[1])
 
     def _features(self, overview: Overview) -> Features:
-        """Features of the overview, those at its rim left out."""
+        """Features of the overview without those at its border."""
         area = overview.shown.sum() / (0.6 * self.longest**2)
         found = self.detect.counted(int(self.per_photo * max(1.0, area)))(
             overview.pixels.astype(np.uint8)

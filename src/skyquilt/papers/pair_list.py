@@ -1,4 +1,4 @@
-"""Lists of picture pairs with their truth (pairs.csv)."""
+"""Lists of image pairs with known registration (pairs.csv)."""
 
 import csv
 from dataclasses import dataclass
@@ -17,32 +17,32 @@ COLUMNS = (
     "tolerance_px",
     *(f"h{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)),
 )
-"""Columns that must be there, in any order."""
+"""Required columns, in any order."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pair:
-    """Two pictures whose registration is known."""
+    """Two images with known registration."""
 
     kind: str
     """Class of the pair."""
     source: str
-    """Where it comes from, in words of the list."""
+    """Its source, as text."""
     a: Path
     """The reference."""
     b: Path
-    """The other picture."""
+    """The other image."""
     tolerance_px: float
     """RMS error in px of b below which a registration is right."""
     b_H_a: Matrix
-    """(3, 3) the truth."""
+    """(3, 3) the true transform."""
 
 
 def read_pairs(path: Path) -> tuple[Pair, ...]:
-    """The pairs of a CSV file; pictures are named from its folder.
+    """The pairs of a CSV file; paths of images are relative to its folder.
 
     Raises:
-        SideFileError: it cannot be read, lacks columns, or holds a number that is none.
+        SideFileError: it cannot be read, lacks columns, or contains an invalid number.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")

@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 _LOWEST = 0.03
-"""Share of the spectrum's radius, next to its middle, that says nothing about rotation: shading and
-window.
+"""Share of the spectrum's radius around its centre that is not used for rotation, since it contains
+shading and the window function.
 """
 
 
 def phase_shift(a: NDArray[Any], b: NDArray[Any]) -> tuple[float, float, float]:
-    """(dx, dy, response): b(x + dx, y + dy) shows what a(x, y) shows; response 0 to 1, the peak's
+    """(dx, dy, response): b(x + dx, y + dy) corresponds to a(x, y); response 0 to 1, the peak's
     share of the energy.
 
     Both (H, W), equal shapes; shifts up to half of the size.
@@ -28,8 +28,8 @@ def phase_shift(a: NDArray[Any], b: NDArray[Any]) -> tuple[float, float, float]:
 def rotation_and_scale(a: NDArray[Any], b: NDArray[Any]) -> tuple[float, float, float]:
     """(degrees, scale, response) of b against a from the log-polar amplitudes of both spectra.
 
-    b's content is a's turned by `degrees` from x towards y and magnified by `scale`; a turn by 180
-    degrees more fits as well.
+    b's content is a's rotated by `degrees` from x towards y and magnified by `scale`. The rotation
+    is ambiguous by 180 degrees.
     """
     size = 256
     radius = min(a.shape) / 2
@@ -43,7 +43,7 @@ def rotation_and_scale(a: NDArray[Any], b: NDArray[Any]) -> tuple[float, float, 
     window = np.ones((size, 1), np.float32) @ cv2.createHanningWindow((size, 4), cv2.CV_32F)[1:2]
     logs = [(p - p.mean()) * window for p in logs]
     (along, around), response = cv2.phaseCorrelate(*logs)
-    # a magnified picture has a shrunken spectrum
+    # a magnified image has a smaller spectrum
     scale = float(np.exp(-along * np.log(radius) / size))
     return (float(around) * 180 / size + 90) % 180 - 90, scale, float(response)
 
@@ -53,8 +53,8 @@ def _window(shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 
 def _highpass(size: int) -> NDArray[np.float32]:
-    """Rises from the middle of a spectrum (Reddy and Chatterji, (12)); nothing below _LOWEST and
-    beyond the circle.
+    """High-pass filter that increases from the centre of a spectrum (Reddy and Chatterji, (12));
+    zero below _LOWEST and outside the circle.
     """
     f = (np.arange(size) - size / 2) / size
     x = np.cos(np.pi * f)[:, None] * np.cos(np.pi * f)

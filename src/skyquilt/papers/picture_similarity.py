@@ -1,4 +1,4 @@
-"""How alike two pictures with gaps are: normalised cross-correlation, for one place or for all
+"""Similarity of two images with gaps: normalised cross-correlation, for one position or for all
 shifts at once, and mutual information.
 """
 
@@ -12,8 +12,8 @@ Floats = NDArray[np.float64]
 
 
 def ncc(a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float:
-    """Zero-mean correlation in [-1, 1] of two pictures (H, W) where `mask` holds; 0 if one is flat
-    or none is left.
+    """Zero-mean correlation in [-1, 1] of two images (H, W) where `mask` is true; 0 if one is
+    constant or no pixel is left.
     """
     x, y = (np.asarray(p, np.float64)[... if mask is None else mask].ravel() for p in (a, b))
     if x.size < 2:
@@ -34,11 +34,11 @@ def ncc_of_shifts(
     """The correlation of a (Ha, Wa) and b (Hb, Wb) at every shift, and the (row, column) of no
     shift in it.
 
-    At [r + dy, c + dx] b(x + dx, y + dy) lies on a(x, y). -1 where fewer than `overlap` of the
-    smaller picture's pixels meet. By FFT, means and norms over the pixels that meet at each shift
-    (Padfield, IEEE TIP 2012).
+    At [r + dy, c + dx] b(x + dx, y + dy) lies on a(x, y). -1 where less than the share `overlap` of
+    the smaller image's pixels overlap. Computed by FFT, with means and norms over the overlapping
+    pixels at each shift (Padfield, IEEE TIP 2012).
     """
-    import scipy.fft  # few ask for all shifts, and all would wait for it
+    import scipy.fft  # imported here, since it is rarely needed
 
     masks = [np.ones(p.shape, bool) if m is None else m for p, m in ((a, mask_a), (b, mask_b))]
     centred = [
@@ -78,8 +78,8 @@ def ncc_of_shifts(
 
 
 def summit(field: Floats, *, apart: int = 4) -> tuple[float, float, float, float]:
-    """(row, column, value, second) of the highest value, the place to parts of a pixel by
-    parabolas; `second` is the highest value at least `apart` px from it.
+    """(row, column, value, second) of the highest value, with subpixel position by parabolas;
+    `second` is the highest value at least `apart` px from it.
     """
     row, column = np.unravel_index(int(field.argmax()), field.shape)
     value = float(field[row, column])
@@ -97,7 +97,7 @@ def summit(field: Floats, *, apart: int = 4) -> tuple[float, float, float, float
 def warped(
     b: NDArray[Any], b_H_a: Floats, shape: tuple[int, ...]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """b (H, W) seen in a's pixels (`shape`), and where it reaches."""
+    """b (H, W) resampled to a's pixels (`shape`), and its valid area."""
     size = (shape[1], shape[0])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     seen = cv2.warpPerspective(b.astype(np.float32), b_H_a, size, flags=flags)
@@ -109,11 +109,11 @@ def mutual_information(
     a: NDArray[Any], b: NDArray[Any], mask: NDArray[np.bool_] | None = None, *, bins: int = 32
 ) -> float:
     """Normalised mutual information (H(a) + H(b)) / H(a, b) - 1 in [0, 1] (Studholme et al. 1999)
-    where `mask` holds.
+    where `mask` is true.
 
     0 independent, 1 each determines the other. Grey values of each (H, W) are put into `bins`
-    between their 1st and 99th percentile; a value counts in two neighbouring bins by its nearness,
-    so that the result is smooth.
+    between their 1st and 99th percentile; a value is shared between two neighbouring bins by its
+    distance, so that the result is smooth.
     """
     x, y = (np.asarray(p, np.float64)[... if mask is None else mask].ravel() for p in (a, b))
     if x.size < bins:
@@ -133,7 +133,7 @@ def mutual_information(
 def _binned(
     values: NDArray[np.float64], bins: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Lower bin and nearness to the next."""
+    """Lower bin, and weight of the next one."""
     low, high = np.percentile(values, [1, 99])
     place = np.clip((values - low) / max(high - low, 1e-12), 0, 1) * (bins - 1)
     lower = place.astype(np.int64)

@@ -1,4 +1,4 @@
-"""Pieces of a mosaic that was built without metadata, laid on the map."""
+"""Georeferencing of the pieces of a mosaic that was built without metadata."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from skyquilt.papers.planar import planar_pose
 
 Array = NDArray[np.float64]
 GAP = 0.1
-"""Space between pieces whose place is unknown, over the size of the larger."""
+"""Gap between pieces without position, as a share of the size of the larger."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Piece:
-    """Photos registered to one another."""
+    """Photos registered to each other."""
 
     plane_H_cam: dict[int, Array]
     """By photo: homography (3, 3) from its undistorted image plane to the plane of the piece (x
@@ -33,17 +33,17 @@ class Laid:
     poses: dict[int, Pose]
     """By photo."""
     metric: bool
-    """False where even the scale had to be assumed."""
+    """False if the scale had to be assumed."""
 
 
 def lay(pieces: Sequence[Piece], priors: Sequence[Prior], height_m: float | None) -> Laid:
-    """Every piece by one similarity, 4 degrees of freedom, that takes the photos' middles to their
+    """Places every piece by one similarity (4 degrees of freedom) from the photos' centres to their
     positions.
 
-    That tells where on Earth the mosaic lies and changes nothing inside a piece. A piece without
-    two positions is scaled by the height above ground (`height_m`, else heights above take-off,
-    else a nominal one) and turned as its photos report; without any position it is put beside the
-    others.
+    This georeferences the mosaic and changes nothing inside a piece. A piece with fewer than two
+    positions is scaled by the height above ground (`height_m`, otherwise heights above take-off,
+    otherwise a nominal one) and rotated by the reported headings; without any position it is placed
+    beside the others.
     """
     poses: dict[int, Pose] = {}
     metric = True
@@ -59,7 +59,7 @@ def lay(pieces: Sequence[Piece], priors: Sequence[Prior], height_m: float | None
 
 
 def _posed(piece: Piece, map_H_plane: Array) -> dict[int, Pose]:
-    """Photos of a piece on the map, without those that it left degenerate."""
+    """Poses of a piece's photos on the map, without degenerate ones."""
     poses = {}
     for photo, plane_H_cam in piece.plane_H_cam.items():
         try:
@@ -70,7 +70,7 @@ def _posed(piece: Piece, map_H_plane: Array) -> dict[int, Pose]:
 
 
 def centre(H: Array) -> complex:
-    """Where a homography takes the image centre (the principal point), as x + iy."""
+    """The transformed image centre (principal point) as x + iy."""
     return complex(H[0, 2] / H[2, 2], H[1, 2] / H[2, 2])
 
 
@@ -81,7 +81,7 @@ def _similarity(
     known.
     """
     photos = list(piece.plane_H_cam)
-    # a map's y runs north where a plane's runs down: conjugate
+    # y of the map points north, y of the plane down: conjugate
     plane = np.conj([centre(piece.plane_H_cam[i]) for i in photos])
     position = np.array([complex(*priors[i].map_C[:2]) for i in photos])
     known = np.isfinite(position)
@@ -103,7 +103,7 @@ def _matrix(g: complex, c: complex) -> Array:
 
 
 def _height(piece: Piece, priors: Sequence[Prior], height_m: float | None) -> tuple[float, bool]:
-    """Metres per unit of the plane, in which a photo of scale 1 hangs one focal length above the
+    """Metres per unit of the plane, in which a photo of scale 1 is one focal length above the
     ground.
     """
     heights = np.array([priors[i].map_C[2] for i in piece.plane_H_cam])
@@ -115,7 +115,7 @@ def _height(piece: Piece, priors: Sequence[Prior], height_m: float | None) -> tu
 
 
 def _turn(piece: Piece, priors: Sequence[Prior]) -> complex:
-    """Direction that brings the photos' tops to the reported headings; 1 where none is reported."""
+    """Rotation that brings the photos to the reported headings; 1 if none is reported."""
     units = []
     for photo, H in piece.plane_H_cam.items():
         if np.isfinite(priors[photo].yaw_deg):
@@ -132,7 +132,7 @@ def _turn(piece: Piece, priors: Sequence[Prior]) -> complex:
 def _beside(
     poses: dict[int, Pose], piece: Piece, map_H_plane: Array, east: float | None
 ) -> tuple[dict[int, Pose], float]:
-    """The piece moved east of the ones before it, and its own eastern end."""
+    """The piece moved east of the previous ones, and its eastern end."""
     x = np.array([p.map_C[0] for p in poses.values()])
     reach = float(max(p.map_C[2] for p in poses.values()))
     if east is None:

@@ -1,5 +1,5 @@
-"""Photos placed in the plane: a homography from the image plane to the map, and the vertical view
-nearest to it.
+"""Photos placed in the plane: conversion between a homography from the image plane to the map and
+the nearest vertical view.
 """
 
 import numpy as np
@@ -15,11 +15,11 @@ def planar_pose(map_H_cam: Array) -> Pose:
     """The pose of a photo whose undistorted image plane (units of the focal length) `map_H_cam` (3,
     3) takes to the map in m.
 
-    The vertical view beside it looks down on where the optical axis meets the ground, from the
-    height that gives its scale there, its top where the homography has it.
+    The nearest vertical view is above the point where the optical axis meets the ground, at the
+    height that gives the scale there, with the heading of the homography.
 
     Raises:
-        ValueError: the homography is degenerate, or mirrors the picture.
+        ValueError: the homography is degenerate, or mirrors the image.
     """
     H = np.asarray(map_H_cam, np.float64)
     if not np.isfinite(H).all() or abs(H[2, 2]) < 1e-12:
@@ -27,10 +27,10 @@ def planar_pose(map_H_cam: Array) -> Pose:
     H = H / H[2, 2]
     ground = H[:2, 2]
     J = H[:2, :2] - np.outer(ground, H[2, :2])
-    # x of the image runs right and y down, x of the map east and y north: a true view turns the
-    # sense round
+    # image axes: x right, y down; map axes: x east, y north. So a valid view reverses the
+    # orientation
     if np.linalg.det(J) >= 0:
-        raise ValueError(f"a homography that mirrors the picture: {H}")
+        raise ValueError(f"a homography that mirrors the image: {H}")
     height = float(np.sqrt(-np.linalg.det(J)))
     top = -J[:, 1] / np.linalg.norm(J[:, 1]) + np.array([-J[1, 0], J[0, 0]]) / np.linalg.norm(
         J[:, 0]
@@ -45,8 +45,8 @@ def planar_pose(map_H_cam: Array) -> Pose:
 
 
 def map_H_cam_of(pose: Pose) -> Array:
-    """The homography (3, 3) from the undistorted image plane to level ground at height 0, scaled to
-    1 at its end.
+    """The homography (3, 3) from the undistorted image plane to level ground at height 0, scaled so
+    that its last element is 1.
     """
     if pose.cam_H_map is not None:
         cam_H_map = pose.cam_H_map

@@ -1,5 +1,5 @@
-"""A photo registered to another, or to a map, in the plane: what `chain`, `overview` and
-`flightline` share.
+"""Registration of a photo to another photo or a map in the plane, shared by `chain`, `overview` and
+`flightline`.
 """
 
 from collections.abc import Sequence
@@ -18,11 +18,11 @@ from skyquilt.model.poses import Alignment, Join, MapFrame, Pose, no_ties
 
 Array = NDArray[np.float64]
 LARGEST_SCALE = 1.7
-"""Factor between the scales of two neighbours beyond which a registration is not believed."""
+"""Largest accepted ratio of the scales of two neighbours."""
 
 
 class Matcher(Protocol):
-    """Putative matches of two photos."""
+    """Interface: finds putative matches of two photos."""
 
     def __call__(self, a: Features, b: Features) -> Matches:
         """Matches of a and b."""
@@ -30,15 +30,15 @@ class Matcher(Protocol):
 
 
 class Estimator(Protocol):
-    """A transformation from matches (N, 2) px."""
+    """Interface: estimates a transformation from matches (N, 2) px."""
 
     def __call__(self, a: Array, b: Array) -> Estimate | NoEstimate:
-        """b_H_a, or why there is none."""
+        """b_H_a, or the reason why there is none."""
         ...
 
 
 class Leveller(Protocol):
-    """The same transformation from features on the dominant plane (Y 4.2.2)."""
+    """Interface: estimates the transformation from features on the dominant plane (Y 4.2.2)."""
 
     def __call__(self, a: Array, b: Array, estimate: Estimate) -> "Levelled":
         """b_H_a from levelled features."""
@@ -46,7 +46,7 @@ class Leveller(Protocol):
 
 
 class Levelled(Protocol):
-    """What levelling gives."""
+    """Interface of the result of levelling."""
 
     @property
     def estimate(self) -> Estimate:
@@ -75,12 +75,11 @@ def registered(
     level: Leveller | None,
     centre: Array,
 ) -> tuple[Array, Join] | NoEstimate:
-    """b_H_a (3, 3), by features of the dominant plane where there is a leveller, and how well, or
-    why there is none.
+    """b_H_a (3, 3), from features of the dominant plane if there is a leveller, and its quality; or
+    the reason why there is none.
 
-    a, b (N, 2) px of the working images are matches of the photo's `px` (N, 2) with what it is
-    joined onto (a photo, or -1 for the map); the photo's `centre` (2,) is where a registration must
-    be plausible.
+    a, b (N, 2) px of the working images are matches of the photo's `px` (N, 2) with a photo or the
+    map (-1). The registration must be plausible at the photo's `centre` (2,).
     """
     found = estimate(a, b)
     if isinstance(found, NoEstimate):
@@ -107,8 +106,8 @@ def registered(
 
 
 def implausible(H: Array, at: Array) -> str:
-    """Why a registration of two aerial photos cannot be; empty where it can. `at` (2,) is where it
-    is judged.
+    """Why a registration of two aerial photos is implausible; empty if it is plausible. `at` (2,):
+    the point of the check.
     """
     w = H[2] @ np.array([*at, 1.0])
     mapped = H[:2] @ np.array([*at, 1.0]) / w

@@ -1,4 +1,6 @@
-"""The thesis's registrations of two spectra, with its parameters [Y 5.2, Fig. 5.8]."""
+"""Registration methods of the thesis for two spectral bands, with its parameters [Y 5.2,
+Fig. 5.8].
+"""
 
 from skyquilt.coregistration.methods import INLIERS, SAMPLES
 from skyquilt.matching.matchers import OneWay
@@ -11,7 +13,7 @@ from skyquilt.quality.registration_quality import spread_quality
 
 
 def sift() -> ByFeatures:
-    """SIFT of 43 levels."""
+    """SIFT with 43 levels."""
     return ByFeatures(detect=_sift(), relate=_outliers())
 
 

@@ -1,4 +1,4 @@
-"""An estimator and a second one for where the first one's result is no registration at all."""
+"""An estimator with a second one that is used if the first one fails completely."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -10,18 +10,17 @@ from skyquilt.matching.estimate import Estimate, Estimator, NoEstimate
 
 @dataclass(frozen=True, kw_only=True)
 class Rescued:
-    """The first estimate where it is one; where its error per inlier is beyond any registration's,
-    the second.
+    """The first estimate; if its error per inlier is too large for any registration, the second.
 
-    A's threshold grows with the outliers (A 9). Where more than a few of the matches are wrong, in
-    forest say, nearly all become inliers of a model that fits none, at 10^5 px^2 an inlier. That
-    much is no accuracy worth keeping.
+    A's threshold increases with the outliers (A 9). If more than a few matches are wrong, for
+    example in forest, nearly all become inliers of a wrong model, with errors of 10^5 px^2 per
+    inlier. Such a result is useless.
     """
 
     first: Estimator
-    """As published."""
+    """The estimator as published."""
     second: Estimator
-    """What helps out."""
+    """The estimator used if the first fails."""
     hopeless_px2: float = 5.0
     """STE per inlier above which the first one failed."""
     version: ClassVar[int] = 1

@@ -1,8 +1,8 @@
-"""The thesis's registration between spectra: features of pictures or of their edges (RFAE),
-matches, outliers removed, nine inliers believed [Y 5.2.1, 5.2.2, 6.4.1].
+"""Registration between spectral bands as in the thesis: features of images or of their edges
+(RFAE), matches, removal of outliers; nine inliers are accepted [Y 5.2.1, 5.2.2, 6.4.1].
 
-Nine inliers are no proof: random matches at a loose ratio reach them easily. These methods are here
-to be compared with; `Auto` is the one to work with.
+Nine inliers do not prove a registration: random matches with a loose ratio test often reach this
+number. These methods are for comparison; use `Auto` in practice.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,8 +24,8 @@ THRESHOLDS = (0.2, 0.4, 0.6)
 
 
 def gradient_magnitude(values: NDArray[Any]) -> NDArray[np.float32]:
-    """(H, W) in [0, 1]: length of Sobel's gradient (5.5) over its largest value; 0 where nothing
-    changes.
+    """(H, W) in [0, 1]: length of Sobel's gradient (5.5) over its largest value; 0 for a constant
+    image.
     """
     grey = to_grey8(values).astype(np.float32)
     x = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.25)
@@ -44,25 +44,27 @@ Detector = Callable[[NDArray[Any]], Features]
 Matcher = Callable[[Features, Features], Matches]
 Estimator = Callable[[NDArray[Any], NDArray[Any]], Estimate | NoEstimate]
 DELTA = 0.1
-"""Radius about an inlier that it covers, as a share of a's width [Y 6.4.1]."""
+"""Radius of the area covered by an inlier, as a share of a's width [Y 6.4.1]."""
 
 
 class Quality(Protocol):
     """Q of (6.3)."""
 
     def __call__(self, inliers: NDArray[Any], width: int, height: int, *, delta: float) -> float:
-        """Spread of inliers (n, 2) over a picture, in [0, 1]."""
+        """Spread of inliers (n, 2) over an image, in [0, 1]."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outliers:
-    """Features of two pictures to a registration: RANSAC and LMedS, the better of them by Q."""
+    """Registration from the features of two images by RANSAC and LMedS; the better result by Q is
+    used.
+    """
 
     match: Matcher
     """Matching."""
     estimators: tuple[Estimator, ...]
-    """Each gives a similarity from matches, or none."""
+    """Estimators of a similarity from matches."""
     quality: Quality
     """Q."""
 
@@ -97,10 +99,10 @@ class Outliers:
 
 @dataclass(frozen=True, kw_only=True)
 class ByFeatures:
-    """SIFT, SURF or upright SURF on the pictures themselves."""
+    """SIFT, SURF or upright SURF on the images themselves."""
 
     detect: Detector
-    """Features of an 8-bit picture."""
+    """Detector of features in an 8-bit image."""
     relate: Outliers
     """Features to a registration."""
     version: ClassVar[int] = 1
@@ -114,8 +116,8 @@ class ByFeatures:
 
 @dataclass(frozen=True, kw_only=True)
 class Rfae:
-    """Robust features along the edge [Y 5.2.2]: features of binary edge images, each picture's
-    threshold chosen by the highest Q of all pairs of thresholds.
+    """Robust features along the edge [Y 5.2.2]: features of binary edge images, the thresholds are
+    the pair with the highest Q.
     """
 
     detect: Detector
@@ -140,7 +142,7 @@ class Rfae:
 
 @dataclass(frozen=True, kw_only=True)
 class BetterByQ:
-    """Several methods, the highest Q wins [Y 6.4.1: SURF + RFAE]."""
+    """Several methods, of which the result with the highest Q is used [Y 6.4.1: SURF + RFAE]."""
 
     methods: tuple[Registers, ...]
     """The methods."""
@@ -152,7 +154,7 @@ class BetterByQ:
 
 
 def best(outcomes: Sequence[Outcome]) -> Outcome:
-    """The highest Q; of refusals the one with most matches."""
+    """The outcome with the highest Q; if all are refused, the one with most matches."""
     accepted = [o for o in outcomes if isinstance(o, Registration)]
     if accepted:
         return max(accepted, key=lambda o: o.q)

@@ -1,4 +1,6 @@
-"""The thesis's Tables 6.4 and 6.5 on any list of pairs, and what it could not have: the truth."""
+"""Tables 6.4 and 6.5 of the thesis for any list of pairs, with a comparison to the true
+registration, which the thesis did not have.
+"""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -23,7 +25,7 @@ from skyquilt.version import __version__
 CONTRACT = ("bench.json", "report.html")
 """Files of a finished run."""
 DEFAULT = ("auto", "sift", "surf", "usurf", "rfae", "surf+rfae")
-"""Methods compared unasked: the default one and the columns of Tables 6.4 and 6.5."""
+"""Methods compared by default: the default method and the columns of Tables 6.4 and 6.5."""
 STAGE = "pairs"
 
 
@@ -69,7 +71,7 @@ def iter_spectral_bench(
 
 
 def judged(pair: Pair, method: str) -> dict[str, Any]:
-    """One row of bench.json: a pair registered by a method and held against the truth."""
+    """One row of bench.json: a pair registered by a method and compared with the truth."""
     since = cpu_seconds()
     outcome, shapes = _registered(pair, method)
     spent = round(cpu_seconds() - since, 3)

@@ -1,11 +1,12 @@
 """RANSAC by the symmetric transfer error per inlier, Arteaga et al. (2019), section 2.5 and figure
 8.
 
-As printed, with five readings: (10) has (1 - eps)^s with s = 4 in the place of its exponent S; the
-errors are sums of squares, so 0.2, 0.5 and t are px^2; the four distant points are those of the two
-longest of random pairs; a model whose error exceeds ten times that of the best so far is skipped
-(taken literally the reference ratchets upwards); RANSAC-2-OPT runs once and four times more. Photos
-are to be reduced to at most 1500 x 1000 px first: the thresholds are those of such.
+As printed, with five interpretations: (10) has (1 - eps)^s with s = 4 in the place of its exponent
+S; the errors are sums of squares, so 0.2, 0.5 and t are px^2; the four distant points are those of
+the two longest of random pairs; a model whose error exceeds ten times that of the best so far is
+skipped (taken literally, the reference error could only increase); RANSAC-2-OPT runs once and four
+times more. Photos must first be reduced to at most 1500 x 1000 px, since the thresholds are for
+this size.
 """
 
 from dataclasses import dataclass, replace
@@ -38,7 +39,7 @@ class _Reference:
         return int(self.inliers.sum())
 
     def beats(self, other: "_Reference") -> bool:
-        """More inliers, or as many that scatter no more."""
+        """Whether it has more inliers, or as many with no larger scatter."""
         return self.count > other.count or (self.count == other.count and self.sigma <= other.sigma)
 
 
@@ -47,22 +48,24 @@ class RansacSte:
     """A's complete estimator: RANSAC-1-OPT up to five times, else the best of five RANSAC-2-OPT."""
 
     model: Model = "homography"
-    """A's is the homography; the others are tried in the same way."""
+    """Type of the transformation. A uses the homography; the others are estimated in the
+    same way.
+    """
     threshold_px2: float | None = None
     """Largest symmetric transfer error of an inlier in px^2. None is (9), t = sqrt(5.99) sigma over
-    all matches, which grows with the outliers themselves; a number is an extension of ours that
-    keeps it from that.
+    all matches, which increases with the outliers; a fixed number is our extension that avoids
+    this.
     """
     confidence: float = 0.99
-    """p_o, that one sample was free of outliers."""
+    """p_o: probability that at least one sample was free of outliers."""
     max_iterations: int = 1000
-    """Cap of the samples of one RANSAC-2; those of RANSAC-1, each refined over all matches, are
-    capped at a tenth.
+    """Largest number of samples of one RANSAC-2; a tenth of it for RANSAC-1, whose samples are each
+    refined over all matches.
     """
     minimum: int = 8
     """Fewest inliers of an estimate."""
     seed: int = 0
-    """Of the samples: equal seeds give equal results."""
+    """Seed of the samples; equal seeds give equal results."""
     accept_ste: ClassVar[float] = 0.2
     accept_share: ClassVar[float] = 0.75
     retry_ste: ClassVar[float] = 0.5
@@ -92,8 +95,8 @@ class RansacSte:
     def _second(
         self, rng: np.random.Generator, a: Doubles, b: Doubles, spent: int, capped: bool
     ) -> Estimate | NoEstimate:
-        """Steps 3 and 4: RANSAC-2-OPT once and four times more, the least error per inlier of
-        all.
+        """Steps 3 and 4: RANSAC-2-OPT once and four times more, the result with the least error per
+        inlier is used.
         """
         best: _Reference | None = None
         for _ in range(self.tries):
@@ -125,8 +128,8 @@ class RansacSte:
         )
 
     def _optimised(self, found: _Reference | None, a: Doubles, b: Doubles) -> _Reference | None:
-        """OPT (12), (13): the model refined over its inliers, which stay; `ste` becomes (15), per
-        inlier.
+        """OPT (12), (13): the model refined over its inliers, which are not changed; `ste` becomes
+        (15), per inlier.
         """
         if found is None or found.count < MINIMAL[self.model]:
             return None
@@ -153,7 +156,7 @@ class RansacSte:
         return None if best is None else replace(best, iterations=done, capped=done < wanted)
 
     def _ransac_2(self, rng: np.random.Generator, a: Doubles, b: Doubles) -> _Reference | None:
-        """Samples of any points, the models as they are."""
+        """Samples of any points, models without refinement."""
         size, cap = MINIMAL[self.model], self.max_iterations
         best: _Reference | None = None
         done, wanted = 0, 1
@@ -193,7 +196,9 @@ class RansacSte:
 
 
 def _distant(rng: np.random.Generator, a: Doubles, size: int) -> NDArray[np.int64]:
-    """(size,) matches far apart: all paired at random, the longest pairs taken (step i)."""
+    """(size,) matches far apart: all are paired at random, and the longest pairs are taken (step
+    i).
+    """
     order = rng.permutation(len(a))[: len(a) // 2 * 2].reshape(-1, 2)
     longest = np.argsort(-np.linalg.norm(a[order[:, 0]] - a[order[:, 1]], axis=1), kind="stable")
     return order[longest[: (size + 1) // 2]].ravel()[:size]

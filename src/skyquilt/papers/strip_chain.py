@@ -1,4 +1,4 @@
-"""One strip, mosaicked from photo to photo under one choice of lens model, features and
+"""Mosaics one strip from photo to photo with one choice of lens model, features and
 transformation.
 """
 
@@ -21,21 +21,21 @@ from skyquilt.simulate import Strip, StripSettings
 Doubles = NDArray[np.float64]
 
 LOOSE_PX = 10.0
-"""RANSAC's threshold: things on the ground must come through, or there is nothing for levelling to
-do.
+"""Threshold of RANSAC in px. It is large enough to keep points on raised objects, which the
+levelling then removes.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Variant:
-    """A curve of Y Fig. 6.5."""
+    """Parameters of a curve of Y Fig. 6.5."""
 
     name: str
-    """As in the legend."""
+    """Name in the legend."""
     distortion: str
     """`none`, `2`, `4`, `6`, `6t`."""
     levelled: bool
-    """Only features of the dominant plane."""
+    """Whether only features of the dominant plane are used."""
     model: Model
     """Transformation from photo to photo."""
 
@@ -95,5 +95,5 @@ def chained(strip: Strip, settings: StripSettings, camera: Camera, variant: Vari
 
 
 def _straight(camera: Camera, px: Doubles) -> Doubles:
-    """Pixels (N, 2) as a lens without distortion would see them."""
+    """Undistorted pixels (N, 2)."""
     return np.asarray(undistort(camera, px) * camera.focal + (camera.cx, camera.cy))

@@ -1,4 +1,4 @@
-"""The page of a strip test: eta along the strip, a curve per variant (Y Fig. 6.5)."""
+"""The report page of a strip test: eta along the strip, with a curve per variant (Y Fig. 6.5)."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -11,15 +11,15 @@ from skyquilt.report.parts import Figure, LegendItem, Section, Sentences, Table,
 from skyquilt.report.svg import Axes, drawing, polyline
 
 COLOURS = ("#8a8f94", "#b3261e", "#b8602a", "#b08a00", "#1f6f8b", "#6b5ca5", "#2c7a4b")
-"""One per variant."""
+"""Colour of each variant."""
 DASHES = ("2 3", "6 3", "6 3", "6 3", "", "8 3 2 3", "")
-"""One per variant, for those who see no colours."""
+"""Dash pattern of each variant, for readers who cannot distinguish colours."""
 GOOD = 0.97
-"""eta at the end of a strip that is still true to shape."""
+"""Least eta at the end of a strip without visible deformation."""
 
 
 def strip_page(found: Mapping[str, Any]) -> str:
-    """The page of a strip.json, one file that needs no other."""
+    """The page of a strip.json as one self-contained file."""
     variants: Sequence[Mapping[str, Any]] = found["variants"]
     best, worst = variants[-1], variants[0]
     ends = [float(np.median(v["eta_end"])) for v in variants]
@@ -41,13 +41,13 @@ def strip_page(found: Mapping[str, Any]) -> str:
             label="Homography, order 2",
             value=f"{ends[1]:.3f}",
             unit="eta",
-            says="At the end of the strip: what too simple a lens model costs.",
+            says="At the end of the strip: the effect of too simple a lens model.",
         ),
         Tile(
             label="Homography, no correction",
             value=f"{ends[0]:.3f}",
             unit="eta",
-            says="At the end of the strip: every photo bends the mosaic a little more.",
+            says="At the end of the strip: every photo adds to the bending of the mosaic.",
         ),
     ]
     photos = len(best["eta"])
@@ -160,7 +160,7 @@ def _how(found: Mapping[str, Any]) -> Section:
         f" {s['relief']:g} m high"
         f" ({100 * s['things']:.0f} % of all), with {s['noise']:g} px of noise. Which point is"
         " which is known.",
-        f"The lens is fitted anew for each order of distortion, to {s['views']} simulated views of"
+        f"The lens is fitted for each order of distortion, to {s['views']} simulated views of"
         " a board.",
         "Photo to photo: RANSAC with a loose threshold, then the features of the dominant plane (Y"
         " 4.8, 4.9).",

@@ -1,4 +1,4 @@
-"""The story of `strip-test`: Y Fig. 6.5 remade on simulated strips."""
+"""The workflow of `strip-test`: Y Fig. 6.5 reproduced with simulated strips."""
 
 import json
 import time
@@ -28,12 +28,12 @@ def iter_strip_test(
     flights: int = 5,
     overwrite: bool = False,
 ) -> Iterator[Event]:
-    """Fly strips of different seeds, mosaic each in seven ways, write strip.json and report.html;
-    yields events.
+    """Simulates strips with different seeds, mosaics each in seven variants, writes strip.json and
+    report.html; yields events.
 
     Raises:
-        UsageError: settings that do not fit.
-        OutputError: the folder holds a result already, or cannot be written.
+        UsageError: invalid settings.
+        OutputError: the folder already contains a result, or cannot be written.
         RefusedError: two photos of a strip cannot be registered.
     """
     settings = (settings or StripSettings()).checked()
@@ -64,7 +64,7 @@ def iter_strip_test(
 
 
 def _make_room(output: Path, overwrite: bool) -> None:
-    """The folder, without a former result."""
+    """Creates the folder, and removes a former result."""
     try:
         output.mkdir(parents=True, exist_ok=True)
         taken = [name for name in FILES if (output / name).exists()]

@@ -1,4 +1,4 @@
-"""SURF and upright SURF of our own (Bay, Ess, Tuytelaars and Van Gool 2008)."""
+"""Our implementation of SURF and upright SURF (Bay, Ess, Tuytelaars and Van Gool 2008)."""
 
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
@@ -13,7 +13,7 @@ from skyquilt.papers.surf_blobs import blobs
 from skyquilt.papers.surf_descriptors import Means, descriptors, orientations
 
 _SIGNED_UNIT = 160
-"""What a component of 1 is stored as; those of a SURF vector hardly exceed 0.7."""
+"""Integer that represents a component of 1; components of SURF vectors hardly exceed 0.7."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,14 +35,13 @@ class Surf:
     threshold: float = 50.0
     """Least determinant of a blob, grey levels (of 255) squared."""
     upright: bool = False
-    """No orientation: faster and more distinctive where photos are hardly turned against each
-    other.
+    """Whether keypoints have no orientation: faster and more distinctive if photos are hardly
+    rotated against each other.
     """
     length: Literal[64, 128] = 64
-    """Of the descriptor; 128 keeps the sums apart by the sign of the other direction."""
+    """Length of the descriptor; 128 separates the sums by the sign of the other direction."""
     cells: int = 10
-    """The image is cut into cells x cells; each keeps its strongest, so that no corner stays bare.
-    """
+    """The image is divided into cells x cells; each keeps its strongest keypoints."""
     version: ClassVar[int] = 1
 
     def __post_init__(self) -> None:

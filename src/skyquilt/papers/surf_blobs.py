@@ -1,7 +1,7 @@
 """Blobs by the determinant of box-filtered second derivatives: SURF's fast Hessian (Bay et al.
 2008, section 3).
 
-A lobe of l px makes a filter of side 3 l, which stands for a Gaussian of sigma 1.2 * 3 l / 9. In
+A lobe of l px gives a filter of side 3 l, which approximates a Gaussian of sigma 1.2 * 3 l / 9. In
 each octave four filters are compared; lobes grow by 2, 4, 8, ... px from filter to filter, from
 octave to octave, and so do the steps.
 """
@@ -20,7 +20,7 @@ _LAYERS = 4
 _CROSS = 0.9
 """Weight of the mixed derivative, which balances boxes against Gaussians [Bay (3)]."""
 _ROWS = 48
-"""Rows worked on at a time, so that they stay within the processor's cache."""
+"""Number of rows processed at a time, so that they fit in the processor's cache."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,7 +30,7 @@ class Blobs:
     xy: NDArray[np.float64]
     """(N, 2) px, centres at integers."""
     sigma: NDArray[np.float64]
-    """(N,) scale in px: that of the Gaussian which the filter stands for."""
+    """(N,) scale in px: that of the Gaussian approximated by the filter."""
     response: Floats
     """(N,) determinant, grey levels squared."""
 
@@ -48,12 +48,12 @@ def octave_lobes(initial: int, octaves: int) -> Iterator[tuple[int, list[int]]]:
 def blobs(
     grey: NDArray[np.uint8], *, octaves: int, lobe: int, step: int, threshold: float
 ) -> Blobs:
-    """Blobs of an image (H, W). `lobe` and `step` in px are those of the first octave, both grow
-    from there.
+    """Blobs of an image (H, W). `lobe` and `step` in px are those of the first octave; both
+    increase in later octaves.
     """
     integral = np.asarray(
         cv2.integral(grey, sdepth=cv2.CV_32S), np.int32
-    )  # wraps beyond 8 Mpx: differences stay right
+    )  # overflows beyond 8 Mpx; differences remain right
     found = []
     for k, (growth, lobes) in enumerate(octave_lobes(lobe, octaves)):
         if 3 * lobes[2] >= min(grey.shape):
@@ -75,7 +75,8 @@ def determinants(integral: NDArray[np.int32], lobe: int, step: int) -> Floats:
     """Determinant at each step-th pixel, (ceil(H / step), ceil(W / step)); 0 where the filter does
     not fit.
 
-    Each lobe counts as its mean grey level, so that values do not depend on the filter's size.
+    Each lobe is represented by its mean grey level, so that values do not depend on the filter's
+    size.
     """
     height, width = integral.shape[0] - 1, integral.shape[1] - 1
     reach = (3 * lobe - 1) // 2
@@ -161,8 +162,8 @@ def _determinant(at: _Boxes, lobe: int) -> Floats:
 def _second(
     a: NDArray[Any], b: NDArray[Any], c: NDArray[Any], d: NDArray[Any]
 ) -> NDArray[np.int32]:
-    """Outer lobes less twice the inner one, from running sums at their four edges: (d - a) - 3 (c -
-    b).
+    """Outer lobes minus twice the inner one, from running sums at their four edges: (d - a) - 3 (c
+    - b).
     """
     inner = c - b
     inner *= -3
@@ -174,8 +175,8 @@ def _second(
 def _maxima(
     stack: list[Floats], lobe: int, growth: int, step: int, threshold: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], Floats]:
-    """(xy, sigma, response) of the maxima of a middle layer among 26 neighbours, to parts of a step
-    and of a layer.
+    """(xy, sigma, response) of the maxima of a middle layer among 26 neighbours, with subpixel
+    accuracy in position and scale.
     """
     kernel = np.ones((3, 3), np.uint8)
     middle = stack[1]
@@ -203,8 +204,8 @@ _AROUND = np.arange(-1, 2)
 
 
 def summits(cube: Floats) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Where quadratics through (N, 3, 3, 3) values (scale, y, x) have their summits: offsets (N, 3)
-    from the middle, and whether those are near enough to be meant (Brown and Lowe 2002).
+    """Maxima of quadratics through (N, 3, 3, 3) values (scale, y, x): offsets (N, 3) from the
+    middle, and whether they are close enough to it (Brown and Lowe 2002).
     """
     c = cube.astype(np.float64)
     slope = (

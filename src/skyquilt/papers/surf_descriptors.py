@@ -1,9 +1,7 @@
-"""SURF's description of keypoints: orientation and descriptor from Haar wavelets (Bay et al. 2008,
-section 4).
+"""Orientation and descriptors of SURF keypoints from Haar wavelets (Bay et al. 2008, section 4).
 
-The wavelets are differences of the means of squares that stand upright in each keypoint's own
-frame: a pyramid of area means holds the means, and one lookup takes a turned grid of them out of
-it.
+The wavelets are differences of the means of squares that are aligned with each keypoint's own
+frame. A pyramid of area means contains the means, and one lookup extracts a rotated grid of them.
 """
 
 from dataclasses import dataclass
@@ -17,7 +15,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float32]
 
 _BLOCK = 4096
-"""Keypoints looked up at a time: cv2.remap takes no more than 32767 rows."""
+"""Number of keypoints processed at a time, since cv2.remap is limited to 32767 rows."""
 _GRID = 20
 """Samples along the descriptor's window of 20 sigma."""
 _SECTORS = 72
@@ -26,8 +24,8 @@ _SECTORS = 72
 
 @dataclass(frozen=True, eq=False)
 class Means:
-    """An image's area means: level 2 o is reduced by 2**o, level 2 o + 1 the same a little
-    smoother.
+    """An image's area means: level 2 o is reduced by 2**o; level 2 o + 1 is the same, slightly
+    smoothed.
     """
 
     grey: NDArray[np.uint8]
@@ -56,10 +54,10 @@ class Means:
     def grids(
         self, xy: NDArray[Any], sigma: NDArray[Any], angle: NDArray[Any], size: int
     ) -> Floats:
-        """(N, size, size) means of squares of about sigma px, sigma apart, around xy (N, 2), turned
-        by angle (N,).
+        """(N, size, size) means of squares of about sigma px, sigma apart, around xy (N, 2),
+        rotated by angle (N,).
         """
-        # one level smoother than sigma asks for: blurred photos match better, others as well
+        # one level smoother than sigma requires: blurred photos match better, others as well
         level = (
             np.floor(2 * np.log2(np.maximum(sigma, 1)) + 1)
             .astype(int)
@@ -159,8 +157,8 @@ def descriptors(
 
 
 def _fields() -> Floats:
-    """(400, 16) weight of each wavelet in each field: a Gaussian of 3.3 sigma, and shared by
-    neighbouring fields.
+    """(400, 16) weight of each wavelet in each field: a Gaussian of 3.3 sigma; wavelets are shared
+    by neighbouring fields.
     """
     ticks = np.arange(_GRID) - (_GRID - 1) / 2
     centres = (np.arange(4) - 1.5) * 5

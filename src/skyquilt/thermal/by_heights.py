@@ -1,7 +1,7 @@
-"""Two blocks joined by the heights under them [Yahyanejad 2013, 5.2.3, (5.8)].
+"""Registration of two blocks by their ground heights [Yahyanejad 2013, 5.2.3, (5.8)].
 
-Pictures of both surfaces find the rough place, as pictures do everywhere; heights measured anew, as
-densely as the photos allow, find the exact one.
+The approximate transform is found from images of both surfaces, as for other images. The exact one
+is found from heights that are measured again, as densely as the photos allow.
 """
 
 from dataclasses import replace
@@ -24,13 +24,13 @@ def finer(
     dense: Dense | None = None,
     align: AlignHeights | None = None,
 ) -> Registration | RefusedRegistration:
-    """A registration of the maps, px of the visual to px of the thermal one, sharpened by heights;
-    or why heights do not confirm it.
+    """A registration of the maps (px of the visual to px of the thermal map) refined by heights, or
+    the reason why heights do not confirm it.
     """
     fields = [_heights(scene, dense or Dense()) for scene in (visual, thermal)]
     if fields[0] is None or fields[1] is None:
         return RefusedRegistration(
-            reason="fewer than two photos of a map look down, so nothing tells heights"
+            reason="fewer than two photos of a map look down, so heights cannot be measured"
         )
     metres = [_metres_of_px(scene.ground.grid) for scene in (visual, thermal)]
     start = metres[1] @ outcome.b_H_a @ np.linalg.inv(metres[0])
@@ -58,7 +58,7 @@ def _heights(scene: Scene, dense: Dense) -> HeightField | None:
 
 
 def _metres_of_px(grid: Grid) -> Matrix:
-    """(3, 3) takes px of a block's map to m in its frame."""
+    """(3, 3) from px of a block's map to m in its frame."""
     x, y = (float(f(np.array(0))) for f in (grid.x, grid.y))
     found: NDArray[np.float64] = np.array([[grid.gsd, 0, x], [0, -grid.gsd, y], [0, 0, 1.0]])
     return found

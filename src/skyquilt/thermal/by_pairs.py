@@ -1,9 +1,10 @@
-"""Two blocks joined by their pairs [Yahyanejad 2013, 5.2.3, (5.7)].
+"""Registration of two blocks by pairs of photos [Yahyanejad 2013, 5.2.3, (5.7)].
 
-Visual and thermal photos that show the same ground are registered one by one, each laid flat by the
-pose and the surface of its own block, so that height no longer parts them, and refined by their
-colours, since the sun draws all of them aside in one direction, which no adjustment would notice.
-Their correspondences are then in both maps already, and one transform is fitted to all, in balance.
+Pairs of a visual and a thermal photo of the same ground are registered. Each photo is first
+orthorectified with the pose and the surface of its own block, so that relief causes no differences.
+The registration is refined by colours: shadows shift a refinement by brightness in the same
+direction in all pairs, which an adjustment would not detect. The correspondences are then known in
+both maps, and one transform is fitted to all of them with balanced weights.
 """
 
 from dataclasses import replace
@@ -24,25 +25,29 @@ from skyquilt.ortho.compose import Composer
 from skyquilt.workflows.flow import Scene
 
 MOST_PAIRS = 24
-"""Pairs that are registered, spread over the map: each costs a third of a second of CPU."""
+"""Largest number of pairs registered, distributed over the map; each takes a third of a second of
+CPU time.
+"""
 LEAST_OVERLAP = 0.4
-"""Share of the thermal footprint that the visual one must show."""
+"""Least share of the thermal footprint that the visual one must cover."""
 _REACH_M = 6.0
-"""By how much the positions of two flights may differ."""
+"""Largest offset in m between the positions of two flights."""
 REFINE = RefineRegistration()
-"""How a believed pair gets exact: as stiff as what two adjusted blocks differ by; a freer model
-follows shadows.
+"""Refinement of an accepted pair. The model is as rigid as the difference between two adjusted
+blocks; a model with more parameters would fit shadows.
 """
 _SIDE_PX = 1000
-"""Longest side of the pictures that a pair is registered in, or fewer where a thermal pixel is
+"""Longest side in px of the images in which a pair is registered; less if a thermal pixel is
 larger.
 """
 _GRID = 6
-"""Points per side by which a pair's transform is carried."""
+"""Points per side of the grid that represents a pair's transform."""
 
 
 def by_pairs(visual: Scene, thermal: Scene) -> Registration | RefusedRegistration:
-    """The transform from px of the visual map to those of the thermal map, or why there is none."""
+    """The transform from px of the visual map to those of the thermal map, or the reason why there
+    is none.
+    """
     asked = overlapping(visual, thermal)
     told = [r for a, b in asked if (r := _registered(visual, thermal, a, b)) is not None]
     found = [p for p, _ in told]
@@ -63,7 +68,7 @@ def by_pairs(visual: Scene, thermal: Scene) -> Registration | RefusedRegistratio
 
 
 def overlapping(visual: Scene, thermal: Scene) -> list[tuple[View, View]]:
-    """For thermal photos spread over the map, the visual photo that shows most of each."""
+    """For thermal photos distributed over the map, the visual photo that covers most of each."""
     views = [v for v in thermal.ground.views if v.photo in thermal.aligned.alignment.held]
     spread = sorted(
         {int(k) for k in np.linspace(0, len(views) - 1, MOST_PAIRS)} if views else set()
@@ -78,20 +83,20 @@ def overlapping(visual: Scene, thermal: Scene) -> list[tuple[View, View]]:
 
 
 def _shift(visual: Scene, thermal: Scene) -> NDArray[np.float64]:
-    """(2,) m from the thermal block's frame to the visual one's."""
+    """(2,) shift in m from the thermal block's frame to the visual one's."""
     ours, theirs = visual.aligned.alignment.frame, thermal.aligned.alignment.frame
     return np.asarray(np.subtract(theirs.origin, ours.origin))
 
 
 def _share(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Share of outline b that outline a covers; both nearly convex."""
+    """Share of outline b that outline a covers; both are nearly convex."""
     hulls = [cv2.convexHull((o - b.mean(0)).astype(np.float32)) for o in (a, b)]
     return float(cv2.intersectConvexConvex(*hulls)[0] / max(cv2.contourArea(hulls[1]), 1e-9))
 
 
 def _registered(visual: Scene, thermal: Scene, a: View, b: View) -> tuple[PairPoints, bool] | None:
-    """Correspondences of one pair in px of both maps, and whether by colours; None where it cannot
-    be registered.
+    """Correspondences of one pair in px of both maps, and whether it was refined by colours; None
+    if it cannot be registered.
     """
     low, high = b.footprint.min(0) - _REACH_M, b.footprint.max(0) + _REACH_M
     gsd = max(float((high - low).max()) / _SIDE_PX, thermal.ground.grid.gsd)
@@ -126,7 +131,7 @@ def _registered(visual: Scene, thermal: Scene, a: View, b: View) -> tuple[PairPo
 
 
 def _flat(scene: Scene, view: View, grid: Grid) -> Picture:
-    """One photo on a grid, by its pose and its block's surface."""
+    """One photo orthorectified to a grid, with its pose and its block's surface."""
     photo = scene.aligned.photos[view.photo]
     compose = Composer(
         grid=grid,
@@ -145,7 +150,7 @@ def _flat(scene: Scene, view: View, grid: Grid) -> Picture:
 def _points(
     flat: tuple[Picture, Picture], outcome: Registration
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(n, 2) px of a and of b, spread over what both show."""
+    """(n, 2) px of a and of b, distributed over the area that both cover."""
     a, b = (np.asarray(p.valid) for p in flat)
     x, y = (np.linspace(0, n - 1, 3 * _GRID) for n in (b.shape[1], b.shape[0]))
     px_b = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Thermal photos on the poses and the surface of the visual ones, where one drone took both."""
+"""Thermal photos placed by the poses and the surface of visual photos taken by the same drone."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,11 +31,13 @@ from skyquilt.workflows.flow import Scene
 from skyquilt.workflows.photo_features import THUMBNAIL
 
 MOST_PAIRS = 12
-"""Pairs that are registered, spread over the flight: each costs a second or two."""
+"""Largest number of pairs registered, distributed over the flight; each takes one or two
+seconds.
+"""
 KNOWN_FOCAL = 0.01
-"""Relative deviation of the thermal focal length below which it is not estimated."""
+"""The thermal focal length is not estimated if its relative standard deviation is below this."""
 _GRID = 6
-"""Points per side by which a registered pair tells its rotation."""
+"""Points per side of the grid from which the rotation of a registered pair is computed."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,15 +45,15 @@ class Rigged:
     """Thermal photos placed by the rig."""
 
     rig: Rig
-    """The cameras against one another."""
+    """The relative rotation of the cameras."""
     photos: tuple[Photo, ...]
-    """Thermal photos that were taken together with a placed visual one."""
+    """Thermal photos taken at the same time as a placed visual one."""
     alignment: Alignment
     """Their poses in the visual map's frame."""
 
 
 def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistration:
-    """Thermal photos on visual poses, or why not."""
+    """Places thermal photos by visual poses, or gives the reason why this is not possible."""
     visual, placed = scene.aligned.photos, scene.aligned.alignment
     pairs = [(i, j) for i, j in taken_together(visual, thermal) if i in placed.poses]
     if len(pairs) < FindRig.minimum:
@@ -61,13 +63,13 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
         )
     if any(placed.poses[i].cam_H_map is not None for i, _ in pairs):
         return RefusedRegistration(
-            reason="the visual photos have no poses in space; use --method bundle"
+            reason="the visual photos have no adjusted poses; use --method bundle"
         )
     first = thermal[pairs[0][1]]
     kinds = {(thermal[j].camera_key, thermal[j].channels, thermal[j].dtype) for _, j in pairs}
     if len(kinds) > 1:
         return RefusedRegistration(
-            reason=f"the thermal photos are of {len(kinds)} cameras or kinds"
+            reason=f"the thermal photos are from {len(kinds)} cameras or formats"
         )
     asked = [pairs[k] for k in np.unique(np.linspace(0, len(pairs) - 1, MOST_PAIRS).astype(int))]
     told = [p for i, j in asked if (p := _registered(scene, i, thermal[j])) is not None]
@@ -77,7 +79,7 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
     poses = {k: _turned(placed.poses[i], rig) for k, (i, _) in enumerate(pairs)}
     alignment = Alignment(
         method="rig",
-        why="both cameras flew together",
+        why="both cameras were on the same drone",
         frame=placed.frame,
         poses=poses,
         cameras={"thermal": rig.camera_b},
@@ -89,7 +91,7 @@ def rigged(scene: Scene, thermal: Sequence[Photo]) -> Rigged | RefusedRegistrati
 
 
 def _freedom(photo: Photo) -> float:
-    """Share by which the focal length may be wrong: three deviations."""
+    """Relative uncertainty of the focal length: three standard deviations."""
     if photo.calibration is not None or photo.focal.sigma_px < KNOWN_FOCAL * photo.focal.px:
         return 0.0
     return float(min(3 * photo.focal.sigma_px / photo.focal.px, 1.0))
@@ -100,7 +102,7 @@ def _turned(pose: Pose, rig: Rig) -> Pose:
 
 
 def _registered(scene: Scene, index: int, thermal: Photo) -> RigPair | None:
-    """Correspondences over the overlap of two photos taken together; None where they cannot be
+    """Correspondences over the overlap of two photos taken at the same time; None if they cannot be
     registered.
     """
     a, b = open_picture(scene.aligned.photos[index].path), open_picture(thermal.path)
@@ -124,7 +126,7 @@ def _registered(scene: Scene, index: int, thermal: Photo) -> RigPair | None:
 def drift_of_rigged(
     found: Rigged, scene: Scene, drift: DriftMethod, settings: PictureSettings
 ) -> Exposure:
-    """What brings the thermal frames to one level, if they are to be."""
+    """The offsets that bring the thermal frames to a common level, if requested."""
     unit, ground = found.photos[0].unit, scene.ground
     if not balances_drift(settings, unit):
         return NEUTRAL
@@ -136,8 +138,8 @@ def drift_of_rigged(
 def draw_rigged(
     path: Path, found: Rigged, scene: Scene, blend: Blend, exposure: Exposure = NEUTRAL
 ) -> None:
-    """thermal.tif on the visual map's grid and surface, values resampled only, but for their
-    drift.
+    """thermal.tif on the visual map's grid and surface, values are only resampled, apart from the
+    drift correction.
     """
     first, grid = found.photos[0], scene.ground.grid
     kind, real = np.dtype(first.dtype), np.dtype(first.dtype).kind == "f"
@@ -174,7 +176,7 @@ def draw_rigged(
 
 
 def rig_figures(found: Rigged, total: int) -> dict[str, Any]:
-    """What metrics.json says under `thermal`."""
+    """The entry `thermal` of metrics.json."""
     rig, first = found.rig, found.photos[0]
     return {
         "route": "rig",

@@ -1,4 +1,4 @@
-"""What the thermal chapter leaves beside the rasters."""
+"""Output files of a thermal map beside the rasters."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -16,12 +16,11 @@ from skyquilt.report.page import write_page
 from skyquilt.thermal.page import thermal_section, with_section
 
 OVERLAYS = ("thermal_checkerboard.png", "thermal_false_colour.png", "thermal_alpha.png")
-"""Pictures of both maps on one another; the first of the registration's, side by side, is left out.
-"""
+"""Overlays of both maps; the first image of a registration, side by side, is left out."""
 
 
 def write_overlays(output: Path, pictures: Sequence[NDArray[np.uint8]]) -> None:
-    """RGB pictures in the order of `register_files.OVERLAYS`."""
+    """Writes RGB images in the order of `register_files.OVERLAYS`."""
     for name, picture in zip(OVERLAYS, pictures[1:], strict=True):
         done, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
         assert done
@@ -30,7 +29,9 @@ def write_overlays(output: Path, pictures: Sequence[NDArray[np.uint8]]) -> None:
 
 
 def write_figures(output: Path, visual: Mapping[str, Any], figures: Mapping[str, Any]) -> None:
-    """metrics.json of the visual map, and under `thermal` how the other lies on it."""
+    """Writes metrics.json of the visual map, with the registration of the thermal map under
+    `thermal`.
+    """
     write_text(
         output / "metrics.json", json.dumps({**visual, **figures}, indent=1, allow_nan=False)
     )
@@ -39,8 +40,8 @@ def write_figures(output: Path, visual: Mapping[str, Any], figures: Mapping[str,
 def write_section(
     output: Path, thermal: Source, pictures: Sequence[NDArray[np.uint8]], record: Mapping[str, Any]
 ) -> None:
-    """The thermal map with its overlays (`register_files.OVERLAYS`) and figures in the visual map's
-    report.
+    """Adds the thermal map with its overlays (`register_files.OVERLAYS`) and figures to the visual
+    map's report.
     """
     page = output / "report.html"
     values = thermal.picture.values

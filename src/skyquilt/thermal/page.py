@@ -1,5 +1,5 @@
-"""Section: how a thermal map lies on the visual one, put into the finished report of the visual
-map.
+"""Report section on the registration of a thermal map to the visual one, added to the finished
+report of the visual map.
 """
 
 import re
@@ -16,51 +16,53 @@ from skyquilt.report.page import section_html
 from skyquilt.report.parts import UNITS, Block, Section, Sentences, Table
 
 LONGEST = 1000
-"""Px of the longer side of pictures in the page."""
+"""Longer side in px of images in the page."""
 _ROUTES = {
-    "rig": "One drone took both: the thermal photos lie on the poses and the surface of the visual"
-    " ones, turned by what"
-    " both cameras differ by.",
-    "maps": "Both flights are maps by themselves; the pictures of both maps were registered.",
-    "pairs": "Both flights are maps by themselves; pairs of their photos were registered and their"
-    " places carried into"
+    "rig": "One drone took both: the thermal photos are placed by the poses and the surface of the"
+    " visual ones,"
+    " rotated by the relative rotation of the cameras.",
+    "maps": "Both flights were mapped separately; the images of both maps were registered.",
+    "pairs": "Both flights were mapped separately; pairs of their photos were registered and their"
+    " correspondences transferred to"
     " both maps.",
-    "heights": "Both flights are maps by themselves; the heights under them were registered, which"
-    " look alike at any"
-    " hour.",
-    "positions": "Both flights are maps by themselves and lie where their own positions put them:"
+    "heights": "Both flights were mapped separately; their ground heights were registered, which"
+    " do not depend on the"
+    " time of day.",
+    "positions": "Both flights were mapped separately and are placed by their own positions:"
     " no registration could"
-    " be believed.",
+    " be accepted.",
 }
 _EVIDENCE = {
-    "surprise": "agreement of independent patches, -log10 of what chance would give",
-    "patches": "patches that could be asked",
-    "patches_agreeing": "of them, those that find the same place by themselves",
+    "surprise": "agreement of independent patches, -log10 of its probability by chance",
+    "patches": "patches that could be tested",
+    "patches_agreeing": "of these, patches that independently find the same position",
     "correlation": "correlation of edge orientations over the overlap",
-    "likeness": "correlation of edge orientations once sharpened",
-    "by_colour": "sharpened by the visual picture's colours (1) or by its brightness (0)",
-    "colour_surprise": "agreement of independent patches on the colours alone, -log10 of what"
-    " chance would give",
-    "correspondences": "correspondences carried into both maps",
+    "likeness": "correlation of edge orientations after refinement",
+    "by_colour": "refined by the visual image's colours (1) or by its brightness (0)",
+    "colour_surprise": "agreement of independent patches on the colours alone, -log10 of its"
+    " probability by chance",
+    "correspondences": "correspondences transferred to both maps",
     "pairs": "pairs of photos used",
-    "pairs_agreeing": "of them, those that agree",
+    "pairs_agreeing": "of these, pairs that agree",
     "pairs_tried": "pairs of photos tried",
-    "pairs_registered": "of them, those that could be registered",
-    "pairs_by_colour": "of them, those sharpened by the visual picture's colours",
+    "pairs_registered": "of these, pairs that could be registered",
+    "pairs_by_colour": "of these, pairs refined by the visual image's colours",
     "spread_deg": "spread of the pairs' rotations, degrees",
     "focal_px": "thermal focal length, px",
     "cells": "cells of heights compared",
-    "residual_m": "robust deviation of the heights' differences, m",
-    "halves_apart_m": "distance between the places that two halves of the ground find by"
-    " themselves, m",
+    "residual_m": "robust standard deviation of the height differences, m",
+    "halves_apart_m": "distance between the independent solutions of two halves of the ground, m",
 }
 _CAPTIONS = (
     ("Thermal map", "On the visual map's grid, {low} (dark) to {high} (bright)."),
     (
         "Checkerboard",
-        "Visual and thermal map by turns: what runs on across the squares' edges is registered.",
+        "Visual and thermal map alternate; if registered, structures continue across edges.",
     ),
-    ("False colour", "Visual map in green, thermal map in magenta: fringes show where edges part."),
+    (
+        "False colour",
+        "Visual map in green, thermal map in magenta: fringes show where edges do not coincide.",
+    ),
     ("Thermal over visual", "The thermal map in warm colours, half transparent."),
 )
 _BEGIN, _END = "<!-- other spectrum -->", "<!-- /other spectrum -->"
@@ -69,8 +71,8 @@ _BEGIN, _END = "<!-- other spectrum -->", "<!-- /other spectrum -->"
 def thermal_section(
     record: Mapping[str, Any], pictures: Sequence[NDArray[np.uint8]], ends: tuple[float, float]
 ) -> Section:
-    """From what metrics.json says under `thermal`, RGB pictures in the order of the captions, and
-    the values of the darkest and the brightest colour.
+    """The section from the entry `thermal` of metrics.json, RGB images in the order of the
+    captions, and the values of the darkest and the brightest colour.
     """
     unit = UNITS.get(str(record.get("unit")), "")
     low, high = (f"{fixed(v, 1)} {unit}".strip() for v in ends)
@@ -97,7 +99,7 @@ def _error(record: Mapping[str, Any]) -> Table:
         px = fixed(record.get("residual_px"), 2)
         rows.append(
             (
-                "RMS distance between these places and the transform",
+                "RMS distance between these places and their transformed positions",
                 f"{fixed(record['residual_m'], 2)} m, {px} px",
             )
         )
@@ -116,7 +118,7 @@ def _refused(record: Mapping[str, Any]) -> list[Block]:
 
 
 def with_section(page: str, section: Section) -> str:
-    """A finished report with this section at its end, in the place of a former one."""
+    """A finished report with this section at its end; a former one is replaced."""
     body = f"{_BEGIN}\n{section_html(section)}\n{_END}"
     found = re.search(f"{re.escape(_BEGIN)}.*?{re.escape(_END)}", page, re.DOTALL)
     return (

@@ -1,6 +1,4 @@
-"""How the thermal map finds its place on the visual one: the routes, and which of them is
-believed.
-"""
+"""Registration of the thermal map to the visual one: the methods, and which of them is accepted."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,30 +17,31 @@ from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registration
 
 ROUTES = ("auto", "rig", "maps", "pairs", "heights", "positions")
-"""How the thermal map finds its place: by the rig where one drone took both, by the pictures of
-both maps, by pairs of photos, by heights, or by its positions alone; auto takes the first of these
-that can be believed.
+"""Registration methods: by the rig if one drone took both, by the images of both maps, by pairs of
+photos, by heights, or by positions alone. `auto` uses the first of these that is accepted.
 """
 REFINE = RefineRegistration(free=SubpixelRefinement(freedom="affine", steps=12))
-"""How a believed registration of maps gets exact: with the freedom that pictures support."""
+"""Refinement of an accepted registration of maps, with as many parameters as the images support."""
 FAR_M = 1000.0
-"""Distance between the nearest photos of two flights beyond which they show different places."""
+"""If the nearest photos of two flights are further apart than this, in m, the flights show
+different places.
+"""
 Outcome = Registration | RefusedRegistration
-_NO_PHOTOS = RefusedRegistration(reason="the photos behind the maps are not at hand")
+_NO_PHOTOS = RefusedRegistration(reason="the photos of the maps are not available")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Joined:
-    """How the thermal map was laid on the visual one."""
+    """Result of the registration of the thermal map to the visual one."""
 
     route: str
     """One of `ROUTES` but `auto`."""
     thermal_H_visual: NDArray[np.float64]
-    """(3, 3) takes px of the visual map to those of the thermal map."""
+    """(3, 3) from px of the visual map to those of the thermal map."""
     outcome: Registration | None
-    """The registration it rests on; None for positions."""
+    """The registration used; None for positions."""
     refused: tuple[tuple[str, str], ...]
-    """Routes tried in vain, and why."""
+    """Methods that were refused, with reasons."""
 
 
 def join(
@@ -54,19 +53,19 @@ def join(
     pairs: Callable[[], Outcome] = lambda: _NO_PHOTOS,
     finer: Callable[[Registration], Outcome] = lambda outcome: outcome,
 ) -> Joined:
-    """The place of the thermal map b on the visual map a.
+    """Registers the thermal map b to the visual map a.
 
-    `auto` takes the first of pictures, pairs and heights that can be believed.
-    `pairs` registers pairs of the photos behind both maps, px of a to px of b; `finer` sharpens a
-    registration by heights measured in those photos.
+    `auto` uses the first of images, pairs and heights that is accepted. `pairs` registers pairs of
+    photos of both maps, px of a to px of b; `finer` refines a registration by heights measured in
+    those photos.
 
     Raises:
-        RefusedError: the one route asked for cannot be believed.
+        RefusedError: the requested method is refused.
     """
     guess = guess_of(a, b)
     if guess is None and route == "positions":
         raise RefusedError(
-            "the two maps have no common place: one of them is not georeferenced; use"
+            "the two maps have no common frame: one of them is not georeferenced; use"
             " --thermal-route maps"
         )
     ways: dict[str, Callable[[], Outcome]] = {
@@ -85,7 +84,7 @@ def join(
     if guess is None or route not in ("auto", "positions"):
         told = "; ".join(f"by {name}: {why}" for name, why in refused)
         raise RefusedError(
-            f"the thermal map cannot be laid on the visual one ({told}); both maps are in the"
+            f"the thermal map cannot be registered to the visual one ({told}); both maps are in the"
             " output"
         )
     full = b.full_S_picture @ guess.b_H_a @ np.linalg.inv(a.full_S_picture)
@@ -101,7 +100,9 @@ def _by_heights(
     guess: Guess | None,
     finer: Callable[[Registration], Outcome],
 ) -> Outcome:
-    """Both surfaces as pictures on the grids of their maps [Y 5.8], then the heights themselves."""
+    """Registers images of both surfaces on the grids of their maps [Y 5.8], then the heights
+    themselves.
+    """
     if not all(path.is_file() for path in surfaces):
         return RefusedRegistration(reason="a map has no surface.tif")
     one, other = (heights_on(source, path) for source, path in zip((a, b), surfaces, strict=True))
@@ -110,8 +111,8 @@ def _by_heights(
 
 
 def heights_on(source: Source, surface: Path) -> Picture:
-    """The heights of a run on the grid of its map's picture, the general slope taken away: what
-    stands out of the ground is what both surfaces share, whatever their heights count from.
+    """The heights of a run on the grid of its map's image, without the general slope. The remaining
+    relief is common to both surfaces, whatever their height datum.
     """
     ground = opened(surface)
     rows, columns = source.picture.shape
@@ -126,8 +127,8 @@ def heights_on(source: Source, surface: Path) -> Picture:
 
 
 def _sampled(ground: Source, source: Source) -> NDArray[np.float32]:
-    """The heights at the pixels (h, w) of a map's picture: both rasters are north up, their grids
-    are not the same.
+    """The heights at the pixels (h, w) of a map's image. Both rasters are north up, but have
+    different grids.
     """
     assert ground.place is not None and source.place is not None
     g, s, full = ground.place.affine, source.place.affine, source.full_S_picture
@@ -148,7 +149,7 @@ def _sampled(ground: Source, source: Source) -> NDArray[np.float32]:
 
 
 def _registered(a: Source, b: Source, one: Picture, other: Picture, guess: Guess | None) -> Outcome:
-    """In px of the files."""
+    """The registration in px of the files."""
     outcome = registration_method("auto")(one, other, guess)
     if isinstance(outcome, RefusedRegistration):
         return outcome
@@ -165,7 +166,7 @@ def refuse_apart(visual: Sequence[Photo], thermal: Sequence[Photo]) -> None:
     """Refuses flights over different places, before anything is computed.
 
     Raises:
-        RefusedError: all positions of the one lie far from all of the other.
+        RefusedError: all positions of one flight are far from all of the other.
     """
     places = [
         np.radians(
@@ -179,14 +180,14 @@ def refuse_apart(visual: Sequence[Photo], thermal: Sequence[Photo]) -> None:
     nearest = 6.371e6 * float(np.linalg.norm(a - b.transpose(1, 0, 2), axis=2).min())
     if nearest > FAR_M:
         raise RefusedError(
-            f"the thermal photos lie {nearest / 1000:.1f} km from the visual ones, by their"
+            f"the thermal photos are {nearest / 1000:.1f} km from the visual ones, by their"
             " positions; give the two"
-            " flights over one place"
+            " flights over the same place"
         )
 
 
 def opened(path: Path) -> Source:
-    """A map of ours, read to be registered.
+    """Opens one of the two maps for registration.
 
     Raises:
         RefusedError: it cannot be used.
@@ -198,7 +199,7 @@ def opened(path: Path) -> Source:
 
 
 def as_registration(joined: Joined) -> Registration:
-    """The join as a registration to be drawn."""
+    """Converts the result to a registration for drawing."""
     if joined.outcome is not None:
         return joined.outcome
     none = np.zeros((0, 2))

@@ -1,15 +1,15 @@
-"""The story of two spectra: a visual map, and the thermal map on its grid.
+"""The workflow of two spectral bands: a visual map, and the thermal map on its grid.
 
     visual mosaic -> thermal mosaic -> registration of the two -> thermal.tif on the visual grid
     visual mosaic -> photos taken together -> their cameras' rotation -> thermal.tif on the visual
     poses
 
-Where one drone took both, by times or names, the cameras' rotation is found once, and the thermal
-photos are drawn where the visual ones were. Otherwise both flights become maps by themselves, each
-by its own adjustment. What their positions leave open, a few metres, the registration of the
-finished maps closes [Yahyanejad 2013, 5.2.3]: of the pictures, or of the heights under them, which
-look alike in every spectrum, by day and night, in summer and winter (5.8). Where none is to be
-believed, the thermal map lies where its own positions put it, and says so.
+If one drone took both (by times or names), the relative rotation of the cameras is estimated once,
+and the thermal photos are drawn with the poses of the visual ones. Otherwise each flight is
+adjusted and mapped separately. The remaining offset of a few metres from their positions is removed
+by registration of the finished maps [Yahyanejad 2013, 5.2.3]: of the images, or of the ground
+heights, which are the same in every spectral band, by day and night, in summer and winter (5.8). If
+no registration is accepted, the thermal map is placed by its own positions, and this is reported.
 """
 
 from collections.abc import Iterator, Mapping
@@ -58,21 +58,23 @@ def iter_thermal(
     """Makes the visual map and the thermal map on its grid; the last event is the `Result` of both.
 
     Raises:
-        RefusedError: the one route asked for cannot be believed; both maps are there by then.
-        SkyquiltError: anything else a user can mend.
+        RefusedError: the requested method is refused; both maps have been written by then.
+        SkyquiltError: any other error that the user can correct.
     """
     asked, output = settings or MosaicSettings(), Path(output)
     settings, heated = _settings_of_both(asked)
     if route not in ROUTES:
         raise UsageError(f"--thermal-route {route!r} is not one of {', '.join(ROUTES)}")
     if not Path(thermal).is_dir():
-        raise UsageError(f"--thermal {thermal} is no folder; give the folder of the thermal photos")
+        raise UsageError(
+            f"--thermal {thermal} is not a folder; give the folder of the thermal photos"
+        )
     heats = read_input(thermal, heated.input)
     given = read_input(photos, settings.input)
     refuse_apart(given.survey.photos, heats.survey.photos)
     if not any(p.band == "thermal" for p in heats.survey.photos):
         yield Note(
-            text=f"no photo in {thermal} is known to be thermal; they are mapped as they are",
+            text=f"no photo in {thermal} is known to be thermal; they are mapped unchanged",
             warning=True,
         )
     visual = yield from make_map(
@@ -89,13 +91,11 @@ def iter_thermal(
             return
         if route == "rig":
             raise RefusedError(
-                f"the thermal photos cannot be laid on the visual poses: {result.reason}; use"
+                f"the thermal photos cannot be placed by the visual poses: {result.reason}; use"
                 " --thermal-route auto"
             )
         refused = (("rig", result.reason),)
-    yield Note(
-        text="the thermal photos become a map of their own, then it is laid on the visual one"
-    )
+    yield Note(text="the thermal photos are mapped separately, then registered to the visual map")
     crs = visual.result.metrics["crs"] or settings.picture.crs
     heat = yield from make_map(
         heats, output / FOLDER, heated.changed(crs=crs), overwrite=overwrite, rerun_from=rerun_from
@@ -104,7 +104,9 @@ def iter_thermal(
 
 
 def _settings_of_both(asked: MosaicSettings) -> tuple[MosaicSettings, MosaicSettings]:
-    """Settings of the visual and of the thermal map: side files and areas are the visual map's."""
+    """Settings of the visual and of the thermal map: side files and areas apply to the visual map
+    only.
+    """
     named = asked.input.sequence in ("time", "name")
     heated = asked.changed(
         thermal_unit=asked.input.thermal_unit or "auto",
@@ -167,10 +169,12 @@ def _finished(stage: str, began: tuple[float, float]) -> StageFinished:
 def _by_rig(
     visual: FinishedMap, thermal: Survey, picture: PictureSettings
 ) -> Result | RefusedRegistration:
-    """thermal.tif from the visual poses, where one drone took both, or why not."""
+    """thermal.tif from the visual poses if one drone took both, or the reason why this is not
+    possible.
+    """
     if not taken_together(visual.given.survey.photos, thermal.photos):
         return RefusedRegistration(
-            reason="no thermal photo was taken together with a visual one, by time or name"
+            reason="no thermal photo was taken at the same time as a visual one, by time or name"
         )
     scene = visual.scene()
     found = rigged(scene, thermal.photos)
@@ -194,7 +198,7 @@ def _leave(
     visual: Mapping[str, Any],
     figures: dict[str, Any],
 ) -> None:
-    """Overlays, the report's section, and last the figures."""
+    """Writes the overlays, the report's section, and finally the figures."""
     write_overlays(output, pictures)
     write_section(output, opened(output / "thermal.tif"), pictures, figures["thermal"])
     write_figures(output, visual, figures)
@@ -202,7 +206,7 @@ def _leave(
 
 def _figures(joined: Joined, heat: Result, b: Source) -> dict[str, Any]:
     m, outcome = heat.metrics, joined.outcome
-    # a registration by heights rests on all cells, not on its corresponding points
+    # a registration by heights uses all cells, not corresponding points
     exact = outcome is not None and "cells" in outcome.evidence
     error = residual(outcome) if outcome and len(outcome.px_a) and not exact else None
     return {

@@ -1,4 +1,4 @@
-"""Where the keypoints of one photo are expected in another, by the metadata of both."""
+"""Predicts the positions of the keypoints of one photo in another from the metadata of both."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ from skyquilt.ortho.tie_surface import level
 
 
 class ExpectedPlaces:
-    """Photos laid on level ground by their reported poses."""
+    """Photos projected to level ground by their reported poses."""
 
     def __init__(
         self,
@@ -23,7 +23,7 @@ class ExpectedPlaces:
         priors: Sequence[Prior],
         height_m: float | None = None,
     ) -> None:
-        """Places the photos; `height_m` above ground where altitudes do not give it.
+        """Places the photos; `height_m`: height above ground if the altitudes do not give it.
 
         Raises:
             AlignmentError: no photo has a position, a heading and a height above ground.

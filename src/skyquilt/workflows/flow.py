@@ -55,9 +55,11 @@ class AlignedPhotos:
     found: FeaturedPhotos
     """Photos that take part, with features; all indices refer to these."""
     priors: tuple[Prior, ...]
-    """What the metadata say, one per photo."""
+    """Pose priors from the metadata, one per photo."""
     links: Links
-    """Which photos show the same ground; none for a method that needs none."""
+    """Links between photos that show the same ground; empty for a method that does not need
+    them.
+    """
     order: tuple[int, ...]
     """Photos in the order in which they are joined."""
     alignment: Alignment
@@ -65,7 +67,7 @@ class AlignedPhotos:
     pixels: PhotoPixels
     """Full-size pixels of a photo by its index."""
     grey: GreyPicture
-    """Grey picture of a photo."""
+    """Gives the grey image of a photo."""
 
     @property
     def photos(self) -> tuple[Photo, ...]:
@@ -86,7 +88,7 @@ class AlignedPhotos:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """Aligned photos and the ground that they show."""
+    """Aligned photos and the ground."""
 
     aligned: AlignedPhotos
     """The photos."""
@@ -99,11 +101,11 @@ class DrawnMap:
     """The rasters of a map."""
 
     exposure: Exposure
-    """What brought the photos to one brightness."""
+    """The brightness corrections of the photos."""
     compose: Composer
-    """What drew them."""
+    """The composer that drew the rasters."""
     drawn: companions.Drawn
-    """Their small companions: provenance, views, preview."""
+    """The additional rasters: provenance, views, preview."""
 
 
 def align_photos(
@@ -160,7 +162,7 @@ def find_ground(
     """Heights and the map's grid.
 
     Raises:
-        UsageError: the map would have no pixels, or absurdly many.
+        UsageError: the map would have no pixels, or far too many.
     """
     steps = ground.find_ground(
         aligned.alignment,
@@ -225,7 +227,7 @@ def draw_map(
 def scene_of(
     given: SurveyInput, methods: Methods, settings: MosaicSettings, clock: Clock
 ) -> Generator[Event, None, Scene]:
-    """Aligned photos and their ground, for workflows that draw no map of them."""
+    """Aligned photos and their ground, for workflows that do not draw a map of them."""
     aligned = yield from align_photos(given, methods, settings, clock)
     on = yield from find_ground(aligned, methods, settings, clock)
     return Scene(aligned=aligned, ground=on)
@@ -234,8 +236,8 @@ def scene_of(
 def _pixels_of(
     photos: Sequence[Photo], all_photos: Sequence[Photo], cache: PixelCache
 ) -> PhotoPixels:
-    """Pixels of the photos that take part, by their own indices. They could be read once: an error
-    names the one that cannot be read any more.
+    """Pixels of the photos in use, by their indices. All of them could be read before; an error
+    names a photo that can no longer be read.
     """
     where = {p.name: i for i, p in enumerate(all_photos)}
     index = [where[p.name] for p in photos]
@@ -245,7 +247,7 @@ def _pixels_of(
             return cache(index[photo])
         except UnreadablePhotoError as error:
             raise SkyquiltError(
-                f"{photos[photo].path} could be read at first, and now {error}; see to its disk and"
+                f"{photos[photo].path} could be read before, but now {error}; check its disk and"
                 " run the same command again to resume"
             ) from error
 
@@ -265,7 +267,7 @@ def _links(
     store: Store,
     jobs: int,
 ) -> Steps[Links]:
-    """Links, unless the method of alignment does without."""
+    """Computes links if the alignment method needs them."""
     if not methods.align.needs_links or len(found.photos) < 2:
         return Links()
     return (yield from link_photos(found, frame, reported, methods, store, jobs))
@@ -293,7 +295,7 @@ def _align(known: AlignmentInputs, methods: Methods, store: Store) -> Steps[Alig
 
 
 def _at_once(work: Callable[[], T]) -> Steps[T]:
-    """A stage of one step."""
+    """Runs a stage as a single step."""
     yield 0, 1
     result = work()
     yield 1, 1

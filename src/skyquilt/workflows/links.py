@@ -1,4 +1,4 @@
-"""Which photos show the same ground: candidate pairs, matches, verified links."""
+"""Finds photos that show the same ground: candidate pairs, matches, verified links."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,9 @@ from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import FeaturedPhotos, features_recipe
 
 BATCH = 64
-"""Pairs per stored artefact: what a kill can cost."""
+"""Number of pairs per stored artefact. At most this many pairs must be matched again after a
+kill.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,13 +42,13 @@ def link_pair(
     methods: Methods,
     expected: NDArray[np.float64] | None = None,
 ) -> Link | RejectedLink:
-    """The link of photos a and b (numbers), or why there is none. `photo` is a.
+    """The link of photos a and b (numbers), or the reason why there is none. `photo` is a.
 
-    `expected` (len(features of a), 2): where the keypoints of a lie in b by the metadata, in px,
-    NaN where they do not tell; only a guided matcher needs it.
+    `expected` (len(features of a), 2): positions in px of a's keypoints in b predicted from
+    metadata, NaN where unknown; needed by a guided matcher only.
     """
     if isinstance(methods.matcher, Guided):
-        assert expected is not None, "a guided matcher is told where to look"
+        assert expected is not None, "a guided matcher needs predicted positions"
         matches = methods.matcher.for_width(photo.width)(*features, expected)
     else:
         matches = methods.matcher(*features)
@@ -54,7 +56,7 @@ def link_pair(
 
 
 class _Linker:
-    """Verifies pairs of one survey; artefacts are keyed by the photos and the methods."""
+    """Verifies pairs of one survey; the keys of artefacts depend on the photos and the methods."""
 
     def __init__(
         self,
@@ -98,7 +100,7 @@ def link_photos(
     store: Store,
     jobs: int,
 ) -> Steps[Links]:
-    """Links neighbours first; their overlap says how far apart other candidates may be."""
+    """Links neighbours first; their overlap gives the largest distance of further candidates."""
     n = len(found.photos)
     linker = _Linker(found, frame, priors, methods, store, jobs)
     xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
@@ -123,7 +125,9 @@ def link_photos(
 
 
 def _closest(pairs: Sequence[Pair], count: int, each: int) -> list[Pair]:
-    """Of pairs sorted by distance, those among the `each` closest of one of their photos."""
+    """From pairs sorted by distance, those that are among the `each` closest pairs of one of their
+    photos.
+    """
     degree = np.zeros(count, int)
     kept = []
     for i, j in pairs:
@@ -136,11 +140,10 @@ def _closest(pairs: Sequence[Pair], count: int, each: int) -> list[Pair]:
 def overlap_reach_m(
     links: Sequence[Link], found: FeaturedPhotos, xy: NDArray[np.float64]
 ) -> float | None:
-    """Distance in m of positions beyond which photos hardly overlap, learnt from links; None if too
-    few determine it.
+    """Distance in m of positions beyond which photos hardly overlap, estimated from links; None if
+    there are too few.
 
-    A link gives the shift of the picture in px and the positions give it in m. Altitudes are not
-    used.
+    A link gives the image shift in px, and the positions give it in m. Altitudes are not used.
     """
     metres_per_px, features = [], found.features
     for link in links:

@@ -1,9 +1,10 @@
-"""The parts of a mosaic: one method per stage, made from settings or given by the caller.
+"""The methods of a mosaic: one per stage, made from settings or given by the caller.
 
-Every part is a frozen dataclass with `__call__`; whatever has the same form may take its place:
+Every method is a frozen dataclass with `__call__`. It can be replaced by any object with the same
+interface:
 
-    methods = replace(methods_for(settings), detector=MyDetector())
-    skyquilt.mosaic(photos, output, settings, methods=methods)
+    methods = replace(methods_for(settings), detector=MyDetector()) skyquilt.mosaic(photos, output,
+    settings, methods=methods)
 """
 
 from dataclasses import dataclass
@@ -31,22 +32,22 @@ from skyquilt.settings import MosaicSettings
 
 
 class Detector(Protocol):
-    """Features of one photo."""
+    """Interface: finds the features of one photo."""
 
     @property
     def longest(self) -> int:
-        """Longest side in px of the picture that is searched."""
+        """Longest side in px of the image that is searched."""
         ...
 
     def of_shrunken(self, small: NDArray[Any], full: tuple[int, int]) -> Features:
-        """Features of a picture (h, w[, bands]) shrunken to `longest`, in px of the full photo,
-        whose height and width are `full`.
+        """Features of an image (h, w[, bands]) reduced to `longest`, in px of the full photo, whose
+        height and width are `full`.
         """
         ...
 
 
 class Matcher(Protocol):
-    """Putative matches of two photos."""
+    """Interface: finds putative matches of two photos."""
 
     def __call__(self, a: Features, b: Features) -> Matches:
         """Matches of a and b."""
@@ -54,7 +55,7 @@ class Matcher(Protocol):
 
 
 class Verifier(Protocol):
-    """Which matches agree with one geometry."""
+    """Interface: selects the matches that agree with one geometry."""
 
     def __call__(
         self,
@@ -66,12 +67,14 @@ class Verifier(Protocol):
         width: int,
         /,
     ) -> Link | RejectedLink:
-        """The link of photos a and b (numbers), or why there is none; `width` of a in px."""
+        """The link of photos a and b (numbers), or the reason why there is none; `width` of a in
+        px.
+        """
         ...
 
 
 class Neighbours(Protocol):
-    """Candidate pairs by position."""
+    """Interface: finds candidate pairs by position."""
 
     def __call__(self, map_xy: NDArray[Any], reach_m: float | None = None) -> list[Pair]:
         """Pairs (i < j), nearest first, of positions (n, 2) in m, NaN where unknown; `reach_m`
@@ -81,23 +84,23 @@ class Neighbours(Protocol):
 
 
 class LookAlikes(Protocol):
-    """Candidate pairs by what photos show."""
+    """Interface: finds candidate pairs by image content."""
 
     def __call__(self, features: list[Features], asked: list[int] | None = None) -> list[Pair]:
-        """Pairs (i < j) for the photos asked about, or for all."""
+        """Pairs (i < j) for the requested photos, or for all."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True)
 class Methods:
-    """The parts of a mosaic, in the order of their use."""
+    """The methods of a mosaic, in the order of their use."""
 
     detector: Detector
     """Features."""
     nearest: Neighbours
     """Pairs by position."""
     retrieval: LookAlikes
-    """Pairs by picture."""
+    """Pairs by image content."""
     matcher: Matcher | Guided
     """Matching."""
     verify: Verifier
@@ -107,23 +110,24 @@ class Methods:
     surface: SurfaceFromTies
     """Heights."""
     sweep: SurfaceFromPictures | None
-    """Refinement of the heights from the pictures."""
+    """Refinement of the heights by image matching; None = none."""
     balance: BalanceMethod
     """Exposure."""
     drift: DriftMethod
     """Offsets of thermal frames."""
     blend: Blend
-    """Merge rule."""
+    """Blending."""
 
 
 BLENDS: dict[str, type[Blend]] = {"first": First, "average": Average, "multiband": Multiband}
 FLIGHTLINE_FEATURES, FLIGHTLINE_PX = 4000, 1500
-"""Least features, and longest side of pictures, that the thresholds of flight lines are meant for.
+"""Least number of features, and longest side of images in px, for which the thresholds of method
+`flightline` are defined.
 """
 
 
 def methods_for(settings: MosaicSettings) -> Methods:
-    """The methods that settings name."""
+    """The methods selected by the settings."""
     return Methods(
         detector=detector_for(settings),
         nearest=Nearest(),
@@ -140,7 +144,7 @@ def methods_for(settings: MosaicSettings) -> Methods:
 
 
 def detector_for(settings: MosaicSettings) -> Detector:
-    """The detector that settings name, with as many features as they ask for."""
+    """The detector selected by the settings, with their number of features."""
     asked: dict[str, int] = {"count": settings.matching.features}
     if settings.method == "flightline":
         asked = {
@@ -152,7 +156,7 @@ def detector_for(settings: MosaicSettings) -> Detector:
 
 
 def matcher_for(settings: MosaicSettings) -> Matcher | Guided:
-    """The matcher that settings name."""
+    """The matcher selected by the settings."""
     name = settings.matching.matcher or "mutual"
     options = {"height_m": settings.camera.height_m} if name == "guided" else {}
     made: Matcher | Guided = registry.load("matcher", name)(**options)

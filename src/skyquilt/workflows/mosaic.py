@@ -2,7 +2,7 @@
 
     read -> features -> links -> align -> surface -> balance -> mosaic -> measure -> report
 
-Read `make_map`: it is the product. The steps are those of `skyquilt.workflows.flow`.
+Start reading at `make_map`. Its steps are those of `skyquilt.workflows.flow`.
 """
 
 import json
@@ -54,19 +54,19 @@ ARTEFACTS = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FinishedMap:
-    """A map that was made, and what it was made from."""
+    """A finished map and its inputs."""
 
     result: Result
-    """Its folder and figures."""
+    """Its folder and metrics."""
     given: SurveyInput
     """The survey."""
     methods: Methods
     """The methods."""
     settings: MosaicSettings
-    """What was asked for."""
+    """The settings of the run."""
 
     def scene(self) -> Scene:
-        """The aligned photos and the ground of this map, by the same steps from its store."""
+        """The aligned photos and the ground of this map; read from its store by the same steps."""
         store = Store(folder=self.result.output / STATE / "store", registry=REGISTRY)
         clock = Clock(store=store, began=Clock.now())
         return result_of(scene_of(self.given, self.methods, self.settings, clock))
@@ -83,11 +83,11 @@ def iter_mosaic(
 ) -> Iterator[Event]:
     """Makes a mosaic and yields its progress; the last event is the `Result`.
 
-    `methods` take the place of those that the settings name, see `methods_for`.
+    `methods` replace those selected by the settings, see `methods_for`.
 
     Raises:
-        SkyquiltError: anything a user can mend: no photos, an output that is taken, a malformed
-            side file ...
+        SkyquiltError: any error that the user can correct: no photos, an output folder in use, a
+            malformed side file ...
     """
     settings, began = settings or MosaicSettings(), Clock.now()
     given = read_input(folder, settings.input)
@@ -132,7 +132,7 @@ def make_map(
     overwrite: bool = False,
     rerun_from: str | None = None,
 ) -> Generator[Event, None, FinishedMap]:
-    """Makes the map of a survey that was read; `began` is when reading began (`Clock.now`).
+    """Makes the map of a survey that was read; `began`: time at which reading began (`Clock.now`).
 
     Raises:
         SkyquiltError: anything a user can mend.
@@ -144,7 +144,7 @@ def make_map(
     store = Store(folder=run.store, registry=REGISTRY)
     _forget(run, store, rerun_from)
     if run.done and (former := _figures(run.path / "metrics.json")):
-        yield Note(text=f"{run.path} holds this very mosaic already; nothing to do")
+        yield Note(text=f"{run.path} already contains this mosaic; nothing to do")
         result = Result(output=run.path, metrics=former)
         return FinishedMap(result=result, given=given, methods=methods, settings=settings)
     run.mark("running")
@@ -165,8 +165,8 @@ def make_map(
 
 
 def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> str:
-    """What a run depends on: content and metadata of its photos, side files, settings that shape
-    results, the methods, and the constants of all code that works on it.
+    """Key of a run: content and metadata of its photos, side files, settings that affect results,
+    the methods, and the constants of all code used.
     """
     shaping = {k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb")}
     files = (settings.picture.boundary, settings.input.distances, Path(settings.input.sequence))
@@ -181,7 +181,7 @@ def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> s
 def _measured(
     aligned: AlignedPhotos, ground: Ground, map_: DrawnMap, settings: MosaicSettings
 ) -> Steps[tuple[MeasuredSeams, dict[str, Any]]]:
-    """Seams, then the agreement of the placed photos."""
+    """Measures the seams and the agreement of the placed photos."""
     seams = yield from measure_seams(map_.compose, map_.drawn, ground)
     quality = yield from placement_quality(
         aligned.photos,
@@ -230,7 +230,7 @@ def _forget(run: RunFolder, store: Store, rerun_from: str | None) -> None:
 
 
 def _figures(path: Path) -> dict[str, Any]:
-    """The figures of a finished run; none where the file is damaged."""
+    """The metrics of a finished run; empty if the file is damaged."""
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):

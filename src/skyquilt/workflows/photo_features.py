@@ -1,6 +1,6 @@
-"""One look at each photo: features, a thumbnail and a grey picture, all from one decoding.
+"""Features, a thumbnail and a grey image of each photo, all from one decoding.
 
-Batch and live use `photo_features` alike, so that both find the same artefacts in a store.
+The batch and live workflows both use `photo_features`, so that they share artefacts in a store.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -22,10 +22,11 @@ from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.workflows.methods import Detector
 
 PICTURE = 1000
-"""Longest side in px of the grey pictures kept for matching observations and the search of heights.
+"""Longest side in px of the grey images kept for the refinement of observations and the search of
+heights.
 """
 KEPT_BYTES = 150_000_000
-"""Grey pictures held in memory at a time; the others wait in the store."""
+"""Bytes of grey images kept in memory; the others are read from the store."""
 PhotoPixels = Callable[[int], NDArray[Any]]
 """Full-size pixels of a photo by its index."""
 THUMBNAIL = 256
@@ -34,7 +35,7 @@ THUMBNAIL = 256
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PhotoFeatures:
-    """What one look at a photo's pixels gives."""
+    """Data computed from one decoding of a photo."""
 
     features: Features
     """Keypoints."""
@@ -47,7 +48,7 @@ class FeaturedPhotos:
     """Photos that could be read, with their features."""
 
     photos: tuple[Photo, ...]
-    """In order of capture."""
+    """The photos, in order of capture."""
     looks: tuple[PhotoFeatures, ...]
     """One per photo."""
     rejected: tuple[RejectedPhoto, ...]
@@ -64,7 +65,7 @@ class FeaturedPhotos:
 
 
 class GreyPictures:
-    """Grey pictures of photos, from the store; those used last stay in memory."""
+    """Grey images of photos from the store; those used last are kept in memory."""
 
     def __init__(self, photos: Sequence[Photo], pixels: PhotoPixels, store: Store) -> None:
         self._photos, self._pixels, self._store = photos, pixels, store
@@ -73,7 +74,7 @@ class GreyPictures:
         self._longest = 0
 
     def __call__(self, photo: int, longest: int) -> NDArray[np.uint8]:
-        """Grey picture of a photo (index), its longest side at most `longest` px."""
+        """Grey image of a photo (index), with at most `longest` px on its longest side."""
         if longest >= PICTURE:
             return self._cache(photo)
         if longest != self._longest:
@@ -96,24 +97,26 @@ def features_key(photo: Photo, detector: Detector) -> str:
 
 
 def features_recipe(detector: Detector) -> tuple[Any, ...]:
-    """What features and thumbnails depend on besides their photos."""
+    """Everything on which features and thumbnails depend, except for their photos."""
     return detector, THUMBNAIL, *picture_recipe()
 
 
 def picture_key(photo: Photo) -> str:
-    """The key of a photo's grey picture in the store."""
+    """The key of a photo's grey image in the store."""
     return digest(photo.digest, picture_recipe())
 
 
 def picture_recipe() -> tuple[Any, ...]:
-    """What grey pictures depend on besides their photos: part of the key of all made from them."""
+    """Everything on which grey images depend, except for their photos; part of the key of all
+    results made from them.
+    """
     return PICTURE, halved, shrink, to_grey8
 
 
 def picture_of(pixels: NDArray[Any]) -> NDArray[np.uint8]:
-    """The grey picture of a photo's pixels."""
+    """The grey image of a photo's pixels."""
     rough = halved(pixels, PICTURE)
-    if rough.dtype == np.uint8:  # one band is averaged in a third of the time of three
+    if rough.dtype == np.uint8:  # averaging one band takes a third of the time of three
         return np.ascontiguousarray(shrink(to_grey8(rough), PICTURE)[0])
     return np.ascontiguousarray(to_grey8(shrink(rough, PICTURE)[0]))
 
@@ -131,7 +134,7 @@ def thumbnail_of(pixels: NDArray[Any]) -> NDArray[Any]:
 def photo_features(
     photo: Photo, pixels: Callable[[], NDArray[Any]], detector: Detector, store: Store
 ) -> PhotoFeatures:
-    """Features and thumbnail of a photo, from the store or found now; its grey picture is stored
+    """Features and thumbnail of a photo, from the store or computed now; its grey image is stored
     beside them. `pixels` decodes the photo.
 
     Raises:
@@ -149,7 +152,7 @@ def _look(photo: Photo, pixels: NDArray[Any], detector: Detector, store: Store) 
     longest = detector.longest
     if longest > PICTURE:
         source = pixels
-    # a sensor's values become grey at the size that is searched: equalising is local
+    # sensor values are converted to grey at the size that is searched, since equalisation is local
     else:
         source = picture if rough.dtype == np.uint8 else shrink(rough, PICTURE)[0]
     found = detector.of_shrunken(shrink(source, longest)[0], pixels.shape[:2])
@@ -162,9 +165,9 @@ def find_features(
     """Features of every photo that can be decoded.
 
     Raises:
-        NoPhotosError: not one photo's pixels could be read.
+        NoPhotosError: no photo could be decoded.
     """
-    cv2.setNumThreads(1)  # parallel over photos instead
+    cv2.setNumThreads(1)  # photos are processed in parallel instead
 
     def one(index: int) -> PhotoFeatures | RejectedPhoto:
         photo = photos[index]
@@ -189,7 +192,9 @@ def find_features(
 
 
 def of_one_kind(found: FeaturedPhotos) -> FeaturedPhotos:
-    """The photos whose pixels are of the most frequent kind: a map has one type of pixel."""
+    """The photos with the most frequent kind of pixels, since all photos of a map must have the
+    same kind.
+    """
     kinds = [(p.channels, p.dtype, p.band) for p in found.photos]
     common = max(set(kinds), key=lambda k: (kinds.count(k), k))
     keep = [i for i, k in enumerate(kinds) if k == common]

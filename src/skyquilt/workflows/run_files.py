@@ -1,4 +1,4 @@
-"""The small files of a run, in the forms that users of OpenDroneMap and OpenSfM know."""
+"""The small files of a run, in the formats of OpenDroneMap and OpenSfM."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ MOST_POINTS = 20000
 
 
 def rotation_vector(R: NDArray[Any]) -> list[float]:
-    """Axis times angle in rad."""
+    """Rotation vector: axis times angle in rad."""
     return [float(v) for v in cv2.Rodrigues(R)[0].ravel()]
 
 
@@ -44,7 +44,7 @@ def write_cameras(path: Path, alignment: Alignment) -> None:
 
 
 def shot_properties(photo: Photo, alignment: Alignment, i: int) -> dict[str, Any]:
-    """What shots.geojson says of a photo."""
+    """The properties of a photo in shots.geojson."""
     pose, camera = alignment.poses[i], alignment.camera(i)
     yaw, pitch, roll = angles_from_cam_R_map(pose.cam_R_map)
     block = next((k for k, b in enumerate(alignment.blocks) if i in b), -1)
@@ -79,7 +79,7 @@ def write_shots(
 def write_footprints(
     path: Path, photos: Sequence[Photo], alignment: Alignment, views: Sequence[View]
 ) -> None:
-    """footprints.geojson: the ground that each photo shows."""
+    """footprints.geojson: the ground covered by each photo."""
     x, y = alignment.frame.origin
     features = [
         ([v.footprint + np.array([x, y])], {"filename": photos[v.photo].name}) for v in views
@@ -90,7 +90,9 @@ def write_footprints(
 def write_reconstruction(
     path: Path, photos: Sequence[Photo], alignment: Alignment, colours: NDArray[Any] | None
 ) -> None:
-    """reconstruction.json in OpenSfM's form: topocentric east-north-up about `reference_lla`."""
+    """reconstruction.json in the format of OpenSfM: topocentric east-north-up coordinates about
+    `reference_lla`.
+    """
     enu = Topocentric(alignment)
     shots = {}
     for i, pose in sorted(alignment.poses.items()):
@@ -130,7 +132,7 @@ def write_reconstruction(
 
 
 class Topocentric:
-    """From the map frame to east-north-up about the frame's origin."""
+    """Conversion from the map frame to east-north-up coordinates about the frame's origin."""
 
     def __init__(self, alignment: Alignment) -> None:
         frame = alignment.frame
@@ -155,7 +157,7 @@ class Topocentric:
             ]
         )
         self._origin = np.array(self._to_ecef.transform(lon, lat, 0.0))
-        # grid north lies `convergence` clockwise of true north
+        # grid north is `convergence` clockwise from true north
         self.map_R_enu = rotation_from_vector(
             np.array([0.0, 0.0, np.radians(frame.convergence_deg)])
         )
@@ -173,7 +175,7 @@ class Topocentric:
 def write_run(
     path: Path, settings: Mapping[str, Any], photos: str, commit: str | None, method: str
 ) -> None:
-    """run.toml: what was asked for, by which version."""
+    """run.toml: the settings and the version of the program."""
     about = {
         "version": __version__,
         "commit": commit or "unknown",
@@ -186,8 +188,8 @@ def write_run(
 
 
 def _toml(value: Any) -> str:
-    """JSON is TOML, but for characters beyond 16 bits, lone surrogates (undecodable file names) and
-    DEL.
+    """Formats a value as TOML. Its JSON form is valid TOML except for characters beyond 16 bits,
+    lone surrogates (undecodable file names) and DEL.
     """
     text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return text.encode("utf-8", "replace").decode()

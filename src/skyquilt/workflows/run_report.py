@@ -1,4 +1,4 @@
-"""The end of a run: the files beside the rasters, the report, and the figures last."""
+"""End of a run: writes the files beside the rasters, the report, and finally the metrics."""
 
 import json
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ from skyquilt.workflows.flow import AlignedPhotos
 DEPTHS, DEPTH_WIDTH = 4, 420
 """Depth maps shown, and their width in px."""
 LEAST_DISPARITIES = 12
-"""Disparities that make a depth map."""
+"""Fewest disparities for a depth map."""
 
 
 def finish_run(
@@ -37,7 +37,7 @@ def finish_run(
     settings: MosaicSettings,
     clock: Clock,
 ) -> Steps[dict[str, Any]]:
-    """Writes every file of the run but the rasters; returns the figures with times and memory."""
+    """Writes all files of the run except the rasters; returns the metrics with times and memory."""
     yield 0, 3
     alignment, photos = aligned.alignment, aligned.photos
     write_surface(output, ground, alignment)
@@ -75,7 +75,7 @@ def report_input(
     metrics: Mapping[str, Any],
     settings: MosaicSettings,
 ) -> ReportInput:
-    """What the report shows."""
+    """The data shown in the report."""
     frame, views = aligned.alignment.frame, drawn.views_grid
     x, y = np.meshgrid(views.x(np.arange(views.width)), views.y(np.arange(views.height)))
     heights = np.where(drawn.views > 0, ground.surface.at(x, y), np.float32(np.nan))
@@ -114,7 +114,7 @@ def _seam_marks(seams: MeasuredSeams, drawn: Drawn) -> list[SeamMark]:
 
 
 def _depths(aligned: AlignedPhotos) -> list[DepthPicture]:
-    """False-colour depth maps (Y 4.8) of a few registrations, spread over the survey."""
+    """False-colour depth maps (Y 4.8) of a few registrations, distributed over the survey."""
     usable = [j for j in aligned.alignment.joins if len(j.px) >= LEAST_DISPARITIES]
     if not usable:
         return []

@@ -1,4 +1,4 @@
-"""What a run begins with: photos' metadata, side files, control points, known distances."""
+"""Input of a run: metadata of photos, side files, control points, known distances."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,27 +19,27 @@ Source = Path | Sequence[Path]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SurveyInput:
-    """A survey as it was handed in; nothing is decoded yet."""
+    """The input data of a survey; photos are not decoded yet."""
 
     source: Source
-    """Where it was read from."""
+    """The folder or files from which it was read."""
     survey: Survey
     """Photos with their metadata, refused files, notes."""
     control: tuple[ControlPoint, ...]
     """Control and check points."""
     distances: tuple[KnownDistance, ...]
-    """Distances to judge the map by."""
+    """Known distances, to check the map."""
     rank: dict[str, int]
-    """Place of a photo, by its name, in the sequence in which photos are joined."""
+    """Position of each photo, by name, in the order in which photos are joined."""
 
     @property
     def title(self) -> str:
-        """The folder, or how many files."""
+        """The name of the folder, or the number of files."""
         return str(self.source) if isinstance(self.source, Path) else f"{len(self.source)} files"
 
 
 def read_input(source: Source | str, settings: InputSettings) -> SurveyInput:
-    """Reads metadata and side files; a gcp_list.txt beside the photos is used without being named.
+    """Reads metadata and side files; a gcp_list.txt beside the photos is used automatically.
 
     Raises:
         UsageError, NoPhotosError, SideFileError: there is nothing to read, or it is malformed.
@@ -67,7 +67,8 @@ def read_input(source: Source | str, settings: InputSettings) -> SurveyInput:
 
 
 def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> None:
-    """Whether options and output fit the survey, before anything is computed or replaced.
+    """Checks that options and output folder suit the survey, before anything is computed or
+    replaced.
 
     Raises:
         UsageError, SideFileError: they do not.
@@ -75,7 +76,7 @@ def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> N
     source = given.source
     if isinstance(source, Path) and source.is_dir() and source.resolve() == output.resolve():
         raise UsageError(
-            f"{output} holds the photos; choose another folder for the results, such as"
+            f"{output} contains the photos; choose another folder for the results, such as"
             f" {output / 'map'}"
         )
     frame = choose_frame(given.survey.photos, settings.picture.crs, given.control)
