@@ -236,9 +236,7 @@ def scene_of(
 def _pixels_of(
     photos: Sequence[Photo], all_photos: Sequence[Photo], cache: PixelCache
 ) -> PhotoPixels:
-    """Pixels of the photos in use, by their indices. All of them could be read before; an error
-    names a photo that can no longer be read.
-    """
+    """Pixels of the photos in use, by their indices; an error names one that can be read no more."""
     where = {p.name: i for i, p in enumerate(all_photos)}
     index = [where[p.name] for p in photos]
 
@@ -255,8 +253,7 @@ def _pixels_of(
 
 
 def _order(photos: Sequence[Photo], rank: dict[str, int]) -> list[int]:
-    ranked = [(rank[p.name], i) for i, p in enumerate(photos) if p.name in rank]
-    return [i for _, i in sorted(ranked)]
+    return [i for _, i in sorted((rank[p.name], i) for i, p in enumerate(photos) if p.name in rank)]
 
 
 def _links(
