@@ -236,7 +236,7 @@ def scene_of(
 def _pixels_of(
     photos: Sequence[Photo], all_photos: Sequence[Photo], cache: PixelCache
 ) -> PhotoPixels:
-    """Pixels of the photos in use, by their indices; an error names one that can be read no more."""
+    """Pixels of the photos in use, by their indices; an error names one that is lost."""
     where = {p.name: i for i, p in enumerate(all_photos)}
     index = [where[p.name] for p in photos]
 
