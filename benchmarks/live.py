@@ -177,10 +177,9 @@ def seams(survey: Path, gsd: float) -> None:
     from skyquilt.photos.pixels import read_color
     from skyquilt.quality.seam_measurement import measure_seams
     from skyquilt.settings import MosaicSettings
-    from skyquilt.workflows.flow import REGISTRY
+    from skyquilt.workflows.artefacts import REGISTRY
     from skyquilt.workflows.methods import methods_for
     from skyquilt.workflows.mosaic import mosaic
-    from skyquilt.workflows.photo_features import find_features
 
     home = Path(tempfile.mkdtemp())
     live = LiveMap(home / "live", LiveSettings(gsd_cm=gsd))
@@ -197,7 +196,6 @@ def seams(survey: Path, gsd: float) -> None:
     cache = PixelCache(read=lambda i: read_color(photos[i]), budget_bytes=600_000_000)
     settings = MosaicSettings(balance=False)
     methods = methods_for(settings)
-    found = drain(find_features(photos, cache, methods.detector, store, 2))
     alignment = Alignment(
         method="live",
         why="",
@@ -219,7 +217,7 @@ def seams(survey: Path, gsd: float) -> None:
         grid=grid_of(views, round_gsd(native)),
         native_gsd=native,
     )
-    compose = orthomosaic.composer(found.photos, ground, NEUTRAL, methods.blend, cache)
+    compose = orthomosaic.composer(3, "uint8", ground, NEUTRAL, methods.blend, cache)
     steps = orthomosaic.draw(
         home, compose, alignment, settings.output, None, store, "live", photos[0].unit, 2
     )

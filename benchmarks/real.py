@@ -135,7 +135,8 @@ def control_from_full_run(source: Path, work: Path) -> Path:
     from skyquilt.engine.clock import Clock, result_of
     from skyquilt.engine.store import Store
     from skyquilt.settings import InputSettings
-    from skyquilt.workflows.flow import REGISTRY, align_photos
+    from skyquilt.workflows.artefacts import REGISTRY
+    from skyquilt.workflows.flow import align_photos
     from skyquilt.workflows.methods import methods_for
     from skyquilt.workflows.survey_input import read_input
 

@@ -1,16 +1,17 @@
-"""Features of your own, all the way to camera poses.
+"""Features of your own in the real flow: a detector takes the place of SIFT, all else stays.
 
-A method is a frozen dataclass: its fields are its parameters, `__call__` does the work. Whatever
-returns `Features` can take SIFT's place; here it is Harris corners with upright SIFT descriptors.
-They are blind to photos of the way back, which are turned by 180 degrees: it shows in the number of
-links.
+A method is a frozen dataclass: its fields are its parameters, `version` changes when its results
+change, and both are part of the keys under which a run keeps its artefacts. A detector has
+`longest`, the longest side of the pictures it wants, and `of_shrunken`, which finds `Features`.
 
-python examples/03_your_own_features.py PHOTOS
+Here it is Harris corners with upright SIFT descriptors. They are blind to photos of the way back,
+which are turned by 180 degrees: it shows in the number of links and of blocks.
+
+python examples/03_your_own_features.py PHOTOS OUT
 """
 
 import sys
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -19,15 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import skyquilt
-from skyquilt.alignment.bundle import Bundle
-from skyquilt.alignment.priors import choose_frame, priors
-from skyquilt.imaging.grey import full_px, shrink, to_grey8
-from skyquilt.matching.candidates import Nearest
-from skyquilt.matching.matchers import Mutual
-from skyquilt.matching.sift import Sift
-from skyquilt.matching.verify import Verify
+from skyquilt.imaging.grey import full_px, to_grey8
 from skyquilt.model.features import Features
-from skyquilt.photos.pixels import read_color
+from skyquilt.workflows.methods import methods_for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,56 +37,37 @@ class UprightHarris:
     """Diameter in px of the patch described."""
     version: ClassVar[int] = 1
 
-    def __call__(self, image: NDArray) -> Features:
-        """Features of pixels (H, W[, C])."""
-        grey = to_grey8(shrink(image, self.longest)[0])
+    def of_shrunken(self, small: NDArray, full: tuple[int, int]) -> Features:
+        """Features of a picture (h, w[, bands]), in px of the photo of height and width `full`."""
+        grey = to_grey8(small)
         corners = cv2.goodFeaturesToTrack(grey, self.count, 0.001, 5, useHarrisDetector=True)
         points = [
             cv2.KeyPoint(float(x), float(y), self.size, 0.0) for x, y in corners.reshape(-1, 2)
         ]
         points, described = cv2.SIFT_create().compute(grey, points)
         unit = described / np.maximum(np.linalg.norm(described, axis=1, keepdims=True), 1e-9)
-        xy = np.array([p.pt for p in points])
-        scale = image.shape[1] / grey.shape[1]
+        xy, scale = np.array([p.pt for p in points]), full[1] / grey.shape[1]
         return Features(
-            px=full_px(xy, grey.shape, image.shape[:2]),
+            px=full_px(xy, grey.shape, full),
             size=np.full(len(xy), self.size * scale, np.float32),
             descriptors=unit.astype(np.float32),
             scale=scale,
         )
 
 
-def align(survey: skyquilt.Survey, detect: Callable[[NDArray], Features]) -> skyquilt.Alignment:
-    """The story's first half by hand: features, pairs, links, poses."""
-    photos = survey.photos
-    features = [detect(read_color(photo)) for photo in photos]
-    frame = choose_frame(photos, None)
-    prior = priors(photos, frame)
-    match, verify = Mutual(), Verify()
-    tried = [
-        verify(a, b, features[a], features[b], match(features[a], features[b]), photos[a].width)
-        for a, b in Nearest(neighbours=8)(np.array([p.map_C[:2] for p in prior]))
-    ]
-    links = [link for link in tried if link]
-    print(
-        f"{len(tried)} pairs, {len(links)} links, {np.mean([len(k) for k in links]):.0f} matches"
-        " each"
-    )
-    return Bundle()(photos, frame, prior, features, links)
-
-
-def main(folder: Path) -> None:
-    survey = skyquilt.read_survey(folder)
-    for name, detect in (("SIFT", Sift()), ("upright Harris", UprightHarris())):
-        print(f"{name}:")
-        alignment = align(survey, detect)
-        error = np.linalg.norm(alignment.ties.residual_px, axis=1)
-        print(f"{len(alignment.poses)} of {len(survey.photos)} photos placed,", end=" ")
-        print(f"{len(alignment.ties.xyz)} tie points,", end=" ")
-        print(f"reprojection error {error.mean():.2f} px")
+def main(photos: Path, output: Path) -> None:
+    settings = skyquilt.MosaicSettings(surface="ties")
+    usual = methods_for(settings)
+    own = replace(usual, detector=UprightHarris())
+    for name, methods in (("SIFT", usual), ("upright Harris", own)):
+        folder = output / name.replace(" ", "-").lower()
+        m = skyquilt.mosaic(photos, folder, settings, methods=methods, overwrite=True).metrics
+        print(f"{name}: {m['photos_used']} of {m['photos_total']} photos,", end=" ")
+        print(f"{m['links']} links, blocks of {m['blocks']} photos, {m['tie_points']} tie points,")
+        print(f"  reprojection error {m['reprojection_error_px']['mean']:.2f} px: {folder}")
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 2:
+    if len(sys.argv) != 3:
         sys.exit(__doc__)
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -85,7 +85,7 @@ def test_links_between_documents_lead_somewhere():
                 assert (page.parent / target).exists(), f"{page.relative_to(ROOT)} -> {target}"
 
 
-def test_the_readme_names_every_file_of_a_run_and_every_option():
+def test_the_documents_name_every_file_of_a_run_and_every_option():
     from typer.main import get_command
 
     from skyquilt.cli.app import app
@@ -93,18 +93,21 @@ def test_the_readme_names_every_file_of_a_run_and_every_option():
 
     readme = (ROOT / "README.md").read_text()
     assert [name for name in CONTRACT if f"`{name}`" not in readme] == []
+    listed = (ROOT / "docs" / "options.md").read_text()
     options = [
         o for p in get_command(app).commands["mosaic"].params for o in p.opts if o.startswith("--")
     ]
-    assert [o for o in options if f"`{o}" not in readme and f"{o}`" not in readme] == []
+    assert [o for o in options if f"`{o}" not in listed and f"{o}`" not in listed] == []
+    first = [o for o in re.findall(r"^\| `(--[\w-]+)`", readme, re.M) if o in options]
+    assert first == ["--output", "--gsd", "--gcp", "--crs", "--thermal", "--overwrite"]
 
 
-def test_the_readme_states_the_defaults():
+def test_the_options_page_states_the_defaults():
     import inspect
 
     from skyquilt.cli.mosaic import command
 
-    readme = (ROOT / "README.md").read_text()
+    readme = (ROOT / "docs" / "options.md").read_text()
     rows = dict(re.findall(r"^\| `(--[\w-]+)`[^|]*\|.*\| *([^|]*?) *\|$", readme, re.M))
     for name, parameter in inspect.signature(command).parameters.items():
         if isinstance(parameter.default, (int, float, str)) and not isinstance(
@@ -156,3 +159,52 @@ def test_benchmarks_call_what_is_there():
         if "[call-arg]" in line or "[name-defined]" in line
     ]
     assert len(programs) > 10 and not broken, broken
+
+
+def test_the_table_of_methods_and_options_is_that_of_the_code():
+    from skyquilt import registry
+
+    text = (ROOT / "docs" / "methods.md").read_text().split("## Which method takes which option")[1]
+    head, _, *rows = re.findall(r"^\|.*\|$", text, re.M)[:10]
+    columns = [c.strip().split(", ") for c in head.strip("|").split("|")][1:]
+    told = {}
+    for row in rows:
+        option, *cells = (c.strip() for c in row.strip("|").split("|"))
+        for name in re.findall(r"--([\w-]+)", option):
+            for methods, cell in zip(columns, cells, strict=True):
+                words = cells[0] if cell == "the same" else cell
+                for method in methods:
+                    only = words.removesuffix(" only") if words.endswith(" only") else method
+                    if words and only == method:
+                        told.setdefault(method, {})[name] = words.split(", ")
+    for method in registry.names("alignment"):
+        takes = registry.row("alignment", method).takes
+        assert told[method].keys() == takes.keys(), method
+        for name in ("detector", "matcher", "estimator", "transform"):
+            assert told[method].get(name, []) == list(takes.get(name, ())), (method, name)
+
+
+def test_what_the_documents_name_is_there():
+    """`package.module.Name` in the pages on methods and on the house can be imported."""
+    from importlib import import_module
+
+    lost = []
+    packages = {p.name for p in (ROOT / "src" / "skyquilt").iterdir() if p.is_dir()}
+    for page in ("methods", "architecture", "spectral", "estimators", "conventions", "decisions"):
+        text = (ROOT / "docs" / f"{page}.md").read_text()
+        for name in re.findall(r"`((?:\w+\.)+\w+)(?:\(\))?`", text):
+            parts = name.split(".")
+            if parts[0] not in packages or name.endswith((".py", ".csv", ".html")):
+                continue
+            try:
+                found = import_module(f"skyquilt.{parts[0]}")
+                for k, part in enumerate(parts[1:], 2):
+                    if part in getattr(found, "__dataclass_fields__", {}):
+                        break
+                    try:
+                        found = getattr(found, part)
+                    except AttributeError:
+                        found = import_module("skyquilt." + ".".join(parts[:k]))
+            except ImportError:
+                lost.append(f"{page}: {name}")
+    assert lost == []

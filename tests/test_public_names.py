@@ -44,3 +44,19 @@ def test_the_story_of_a_small_survey_waits_for_nothing_it_does_not_need():
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == ""
+
+
+def test_a_mosaic_imports_nothing_of_the_papers():
+    """Not even while it runs: their methods are named by strings, from above."""
+    code = (
+        "import sys, tempfile, pathlib, skyquilt, skyquilt.simulate as s;"
+        "from skyquilt.simulate.settings import Route;"
+        "from skyquilt.simulate.camera import Lens;"
+        "home = pathlib.Path(tempfile.mkdtemp());"
+        "flight = s.FlightSettings(lens=Lens().scaled(320, 240), route=Route(photos=3));"
+        "list(s.simulate(flight, home / 'f'));"
+        "skyquilt.mosaic(home / 'f' / 'photos', home / 'o', skyquilt.MosaicSettings(gsd_cm=50));"
+        "print(*(m for m in sys.modules if m.startswith('skyquilt.papers')))"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == ""

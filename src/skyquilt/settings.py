@@ -3,6 +3,7 @@
 Words are checked here, against the names that are registered; numbers against their limits.
 """
 
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from math import isfinite
@@ -190,6 +191,11 @@ class RunningSettings:
     """Memory to plan with in GB; None = 1.2."""
     seed: int = 0
     """Of everything random in methods `image`, `hybrid`, `flightline`."""
+
+    @property
+    def threads(self) -> int:
+        """Threads to use."""
+        return self.jobs or os.cpu_count() or 1
 
     def __post_init__(self) -> None:
         within("--jobs", self.jobs, 0, 1024)

@@ -9,7 +9,7 @@ from pyproj import Transformer
 
 from skyquilt.alignment.bundle import Bundle, position_noise, prune
 from skyquilt.alignment.control import Control, control_in_frame, fit_similarity_3d
-from skyquilt.alignment.setup import HALF_TURN, mirrored
+from skyquilt.alignment.setup import HALF_TURN
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import angles_from_cam_R_map, rotation_from_vector
@@ -180,9 +180,9 @@ def test_a_mirrored_camera_is_the_turned_file_s():
         p2=-1e-3,
     )
     xyz = np.random.default_rng(0).uniform((-20, -15, 40), (20, 15, 80), (50, 3))
-    turned = project(mirrored(camera), xyz @ HALF_TURN.T)
+    turned = project(camera.mirrored(), xyz @ HALF_TURN.T)
     assert np.array([799, 599]) - turned == pytest.approx(project(camera, xyz), abs=1e-9)
-    assert mirrored(mirrored(camera)) == camera
+    assert camera.mirrored().mirrored() == camera
 
 
 def test_yaws_that_lie_do_not_matter(plain):

@@ -34,12 +34,12 @@ pytestmark = pytest.mark.filterwarnings(
 
 def test_an_empty_folder(mosaic, tmp_path):
     (tmp_path / "empty").mkdir()
-    told = mosaic(tmp_path / "empty").refused(3, "no photo", "it holds nothing", "JPEG")
+    told = mosaic(tmp_path / "empty").refused(3, "no photo", "it contains nothing", "JPEG")
     assert not told.output.exists()
 
 
 def test_a_folder_that_does_not_exist(mosaic, tmp_path):
-    told = mosaic(tmp_path / "nowhere").refused(2, "nowhere", "does not exist", "give a folder")
+    told = mosaic(tmp_path / "nowhere").refused(2, "nowhere", "does not exist", "choose a folder")
     assert not told.output.exists()
 
 
@@ -100,7 +100,7 @@ def renamed_text(path: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
-        (truncated, "cut off"),
+        (truncated, "truncated"),
         (garble, "damaged"),
         late(cut_but_ended, "damaged"),
         late(emptied, "0 bytes"),
@@ -130,9 +130,9 @@ def test_all_kinds_of_bad_at_once(mosaic, photos):
 @pytest.mark.slow
 def test_a_photo_that_cannot_be_read_any_more_when_the_map_is_drawn(mosaic, photos, monkeypatch):
     """A disk goes away in the middle: the file is named, and the same command resumes."""
-    from skyquilt.workflows import mosaic as story
+    from skyquilt.workflows import flow
 
-    read, seen = story.read_color, set()
+    read, seen = flow.read_color, set()
 
     def once(photo):
         if photo.name in seen and photo.name == "SIM_0005.jpg":
@@ -140,8 +140,8 @@ def test_a_photo_that_cannot_be_read_any_more_when_the_map_is_drawn(mosaic, phot
         seen.add(photo.name)
         return read(photo)
 
-    monkeypatch.setattr(story, "read_color", once)
-    monkeypatch.setattr(story, "pixel_budget", lambda settings: 0)
+    monkeypatch.setattr(flow, "read_color", once)
+    monkeypatch.setattr(flow, "pixel_budget", lambda memory: 0)
     mosaic(photos).refused(1, "SIM_0005.jpg", "Input/output error", "same command again")
     monkeypatch.undo()
     assert mosaic(photos).made().metrics["photos_used"] == 9
@@ -327,7 +327,7 @@ def test_gps_of_one_photo_300_km_away(mosaic, photos, finished):
     told = mosaic(photos).made()
     assert told.metrics["photos_used"] == 9
     assert told.metrics["blocks"] == [9]
-    assert f"{far.name} claims to lie" in told.notes
+    assert f"{far.name} reports a position" in told.notes
     w, h = told.metrics["size_px"]
     assert max(w, h) < 1000
     assert (
@@ -350,7 +350,7 @@ def test_gps_of_one_of_two_photos_300_km_away(mosaic, photos):
     _, b = keep(photos, 0, 1)
     relabel(b, place=(49.3, 14.3))
     told = mosaic(photos).refused(2, "km wide", "positions", "--geo")
-    assert "claim to lie 301 km apart" in told.err
+    assert "report positions 301 km apart" in told.err
 
 
 @pytest.mark.slow
@@ -360,7 +360,7 @@ def test_all_positions_the_same(mosaic, photos):
     told = mosaic(photos).made()
     assert told.metrics["photos_used"] == 9
     assert told.metrics["crs"] is None
-    assert "All 9 positions are one and the same" in told.notes
+    assert "All 9 positions are identical" in told.notes
 
 
 # heights

@@ -145,7 +145,7 @@ def line(text, number, new):
         (lambda t: line(t, 0, "Middle Earth"), ("gcp.txt", "coordinate system", "Middle Earth")),
         (lambda t: line(t, 2, "1 2 three"), ("gcp.txt, line 3", "expected", "1 2 three")),
         (lambda t: t.replace("SIM_", "DJI_"), ("gcp.txt", "no photo of the survey", "DJI_")),
-        (lambda t: "\0\1\2" * 50, ("gcp.txt", "no text file")),
+        (lambda t: "\0\1\2" * 50, ("gcp.txt", "not a text file")),
     ],
 )
 def test_a_malformed_gcp_list(mosaic, flight, tmp_path, spoil, words):

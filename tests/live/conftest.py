@@ -15,7 +15,7 @@ import pytest
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.workflow import iter_live
-from skyquilt.server.guard import Guard
+from skyquilt.server.access import Guard
 from skyquilt.server.server_thread import ServerThread
 from skyquilt.server.survey import LiveSurvey
 from skyquilt.simulate import FlightSettings, simulate

@@ -9,8 +9,8 @@ import sys
 import time
 from pathlib import Path
 
-from skyquilt.live import crash_points as write_points
 from skyquilt.live import inbox
+from skyquilt.live import ledger as crash_points
 from skyquilt.live.folder_watch import Watch
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
@@ -33,7 +33,7 @@ def arm(point: str, count: int) -> None:
         if left[0] == 0:
             die()
 
-    write_points.watcher = watcher
+    crash_points.watcher = watcher
     if point == "torn":
         honest = inbox.Inbox.bring
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skyquilt.live.crash_points import POINTS
+from skyquilt.live.ledger import POINTS
 from tests.end_to_end.conftest import relabel
 
 KILLS = int(os.environ.get("SKYQUILT_KILLS", "5"))

@@ -21,7 +21,7 @@ from rasterio.vrt import WarpedVRT
 from skyquilt.errors import UsageError
 from skyquilt.live.settings import LiveSettings
 from skyquilt.raster.map_source import mercator
-from skyquilt.server.guard import Guard
+from skyquilt.server.access import Guard
 from skyquilt.server.server_thread import ServerThread
 from skyquilt.server.survey import open_survey
 from tests.interrupts import hears_interrupts

@@ -21,7 +21,7 @@ from PIL import Image
 
 from skyquilt.errors import UsageError
 from skyquilt.live.settings import LiveSettings
-from skyquilt.server.guard import Guard
+from skyquilt.server.access import Guard
 from skyquilt.server.published_files import PublishedFiles
 from skyquilt.server.survey import LiveSurvey
 from tests.live.conftest import served
@@ -305,7 +305,7 @@ def png_that_claims(width, height):
     [
         ("text.jpg", b"hello", "neither"),
         ("page.jpg", b"<html><script>alert(1)</script></html>", "neither"),
-        ("cut.jpg", None, "cut off"),
+        ("cut.jpg", None, "truncated"),
         ("bomb.png", png_that_claims(60000, 60000), "bomb"),
         ("tiny.png", png_that_claims(3, 3), "px"),
     ],

@@ -4,12 +4,12 @@ import re
 import shutil
 
 import pytest
-from skyquilt.pipelines.live.settings import LiveSettings
-from skyquilt.pipelines.live.story import LiveMap
 
 from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
+from skyquilt.live.live_map import LiveMap
+from skyquilt.live.settings import LiveSettings
+from tests.end_to_end.conftest import taken_apart
 from tests.photos.conftest import with_segment
-from tests.stories.conftest import taken_apart
 
 LIE_DEG = 40.0
 SETTINGS = LiveSettings(features=600, deterministic=True)
@@ -44,7 +44,7 @@ def heading_error_deg(live, flight, path):
     accepted = live.intake.take_file(path, path.parent.name)
     live.members.take_up()
     member = live.members.by_id[accepted.id]
-    found = live.refining.placing.metadata.first(member).cam_R_map
+    found = live.refinement.local_pose.metadata.first(member).cam_R_map
     placed, true = (
         angles_from_cam_R_map(R)[0] for R in (found, flight.rotation(member.photo.name))
     )
@@ -63,7 +63,7 @@ def test_a_turned_compass_is_learned_from_photos_that_settled(flight, drone, tmp
 
 def test_a_restart_forgets_nothing_of_it(drone, tmp_path):
     def learned(live):
-        metadata = live.refining.placing.metadata
+        metadata = live.refinement.local_pose.metadata
         return metadata.first(live.members.by_id[6]).cam_R_map.tolist(), metadata.scatter()
 
     live = LiveMap(tmp_path / "out", SETTINGS)

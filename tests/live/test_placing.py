@@ -4,12 +4,12 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from skyquilt.pipelines.live.settings import LiveSettings
-from skyquilt.pipelines.live.state import Member
-from skyquilt.pipelines.live.story import LiveMap
 
 from skyquilt.alignment.priors import photo_prior
 from skyquilt.errors import AlignmentError
+from skyquilt.live.live_map import LiveMap
+from skyquilt.live.members import Member
+from skyquilt.live.settings import LiveSettings
 
 
 @pytest.fixture
@@ -33,10 +33,10 @@ def of_own_photo(live, photos, priors):
 
 
 def test_a_window_has_a_prior_for_each_of_its_photos(live):
-    placing, members = live.refining.placing, live.members
-    window = placing.window(members.by_id[4], [1, 2, 3, 4], frozenset((1,)), [])
+    local_pose, members = live.refinement.local_pose, live.members
+    window = local_pose.window(members.by_id[4], [1, 2, 3, 4], frozenset((1,)), [])
     assert of_own_photo(live, window.photos, window.priors)
-    assert placing.settle(window)  # and it is adjusted
+    assert local_pose.adjust_locally(window)  # and it is adjusted
 
 
 def test_a_young_block_has_a_prior_for_each_of_its_photos(live, monkeypatch):
@@ -46,8 +46,8 @@ def test_a_young_block_has_a_prior_for_each_of_its_photos(live, monkeypatch):
         given.append((photos, priors))
         raise AlignmentError("that is enough")
 
-    monkeypatch.setattr(live.refining.placing, "young", stop)
-    live.refining.placing._bundled([1, 2, 3, 4], {})
+    monkeypatch.setattr(live.refinement.local_pose, "young", stop)
+    live.refinement.local_pose._bundled([1, 2, 3, 4], {})
     assert of_own_photo(live, *given[0])
 
 

@@ -8,8 +8,8 @@ SCRIPT = """
 import sys
 from pathlib import Path
 
-from skyquilt.pipelines.live.settings import LiveSettings
-from skyquilt.pipelines.live.story import LiveMap
+from skyquilt.live.settings import LiveSettings
+from skyquilt.live.live_map import LiveMap
 
 folder = Path(__file__).parent
 with (folder / "runs").open("a") as runs:

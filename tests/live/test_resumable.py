@@ -12,7 +12,7 @@ import pytest
 
 from skyquilt.errors import OutputError
 from skyquilt.live.settings import LiveSettings
-from skyquilt.server.guard import Guard
+from skyquilt.server.access import Guard
 from tests.live.conftest import served
 
 QUICK = LiveSettings(features=600, most_bytes=3_000_000)

@@ -12,7 +12,7 @@ from skyquilt.errors import UsageError
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.workflow import iter_live
-from skyquilt.server.guard import Guard
+from skyquilt.server.access import Guard
 from skyquilt.server.server_process import ServerConfig, ServerProcess
 
 

@@ -66,7 +66,7 @@ def test_a_file_that_stays_torn_is_refused_and_taken_when_it_is_whole(watched, f
     assert watched.look(0.25) == []
     done = watched.look(0.5)
     assert [type(d) for d in done] == [Refused]
-    assert "cut off" in done[0].reason
+    assert "truncated" in done[0].reason
     assert watched.look(0.5) == []  # said once
     path.write_bytes(data)
     assert [type(d) for d in watched.look(0.4)] == [Accepted]

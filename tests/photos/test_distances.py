@@ -76,8 +76,8 @@ def test_several_distances_share_their_points(tmp_path):
             LONG + "A,B,3,1,1,nine.jpg,2,2,ten.jpg\n",
             "names nine.jpg, ten.jpg; no photo of the survey",
         ),
-        (LONG + "A,B,3,x,1,one.jpg,2,2,one.jpg\n", "nothing tells where point 'A' is seen"),
-        ("point_a,point_b,metres\nA,B,3\n", "nothing tells where point 'A' is seen"),
+        (LONG + "A,B,3,x,1,one.jpg,2,2,one.jpg\n", "there is no observation of point 'A'"),
+        ("point_a,point_b,metres\nA,B,3\n", "there is no observation of point 'A'"),
         (
             LONG + "A,B,3,1,1,one.jpg,2,2,one.jpg\nA,B,4,1,1,one.jpg,2,2,one.jpg\n",
             "two different lengths",

@@ -140,4 +140,4 @@ def test_digital_zoom_lengthens_the_lens(make_jpeg):
 def test_contradicting_focal_lengths_are_named_with_both_values(make_jpeg):
     exif = exif_of("FC300S", FocalLength=(361, 100), FocalLengthIn35mmFilm=35)
     notes = read_photo(make_jpeg(exif=exif, image=pixels(120, 90))).notes
-    assert any("means 69 px, its 35 mm equivalent 121 px" in n for n in notes)
+    assert any("corresponds to 69 px, its 35 mm equivalent to 121 px" in n for n in notes)

@@ -61,7 +61,7 @@ def foreseen(path):
     """
     photo = read_photo(path)
     assert isinstance(photo, (Photo, RejectedPhoto))
-    assert isinstance(photo, Photo) or "not foreseen" not in photo.reason, photo.reason
+    assert isinstance(photo, Photo) or "of an unknown kind" not in photo.reason, photo.reason
     return photo
 
 

@@ -83,9 +83,12 @@ def test_accuracy_tags_are_the_deviations(make_jpeg):
     ("gps", "words"),
     [
         (gps_exif(0, 0), "(0, 0)"),
-        (gps_exif(95, 10), "outside the globe"),
+        (gps_exif(95, 10), "outside the valid range"),
         ({1: "N", 2: ((46, 1), (0, 1), (0, 1))}, "missing"),
-        ({1: "N", 2: ((46, 1), (0, 0), (0, 0)), 3: "E", 4: ((9, 0), (0, 1), (0, 1))}, "no number"),
+        (
+            {1: "N", 2: ((46, 1), (0, 0), (0, 0)), 3: "E", 4: ((9, 0), (0, 1), (0, 1))},
+            "not a number",
+        ),
         ({}, "no GPS position"),
     ],
 )
@@ -102,7 +105,7 @@ def test_void_xmp_position_falls_back_to_exif(make_jpeg):
         make_jpeg(exif=dji_exif(), xmp=dji_xmp(GpsLatitude="0.0", GpsLongitude="0.0"))
     )
     assert photo.position.source == "exif"
-    assert any("XMP is void" in note for note in photo.notes)
+    assert any("XMP is invalid" in note for note in photo.notes)
 
 
 def test_insane_altitude_is_noted_and_ignored(make_jpeg):
@@ -167,7 +170,7 @@ def test_broken_xmp_is_searched_as_text(make_jpeg):
     xmp = dji_xmp(RelativeAltitude="+39.80").replace("/>", ">")
     photo = read_photo(make_jpeg(exif=dji_exif(), xmp=xmp))
     assert photo.position.takeoff_m == 39.8
-    assert any("broken XML" in note for note in photo.notes)
+    assert any("not valid XML" in note for note in photo.notes)
 
 
 def test_an_xml_bomb_is_not_expanded(make_jpeg):

@@ -64,7 +64,7 @@ def test_bad_geo_txt_names_the_line(tmp_path, text, words):
 
 
 def test_void_row_is_an_error_and_missing_height_keeps_the_old_one(tmp_path, photo):
-    with pytest.raises(SideFileError, match="outside the globe"):
+    with pytest.raises(SideFileError, match="outside the valid range"):
         apply_positions([photo], written(tmp_path, "EPSG:4326\nDJI_0001 9 146\n"))
     ((after,), _) = apply_positions([photo], written(tmp_path, "EPSG:4326\nDJI_0001 9 46\n"))
     assert (after.position.latitude_deg, after.position.altitude_m, after.position.datum) == (
@@ -311,7 +311,7 @@ def test_deviations_of_a_calibration_are_the_adjustment_s_priors(tmp_path, photo
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("{", "no JSON"),
+        ("{", "not JSON"),
         ("[]", "cameras by name"),
         ('{"a": {"width": 3}}', "height"),
         ("{}", "by name"),

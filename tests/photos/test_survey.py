@@ -59,7 +59,7 @@ def test_a_bad_file_never_stops_a_survey(make_jpeg):
     survey = read_survey(folder)
     assert {p.name for p in survey.photos} == {"p1.JPG", "p2.JPG", "p3.JPG", "also.png", "also.tif"}
     reasons = {r.name: r.reason for r in survey.rejected}
-    assert "cut off" in reasons["cut.jpg"]
+    assert "truncated" in reasons["cut.jpg"]
     assert "0 bytes" in reasons["empty.jpg"]
     assert "neither JPEG" in reasons["lies.jpg"]
     assert reasons["zz-copy.jpg"] == "same file content as p1.JPG"
@@ -75,13 +75,13 @@ def test_png_under_a_jpeg_name_is_read_by_its_content(make_jpeg, tmp_path):
 def test_nothing_to_read(tmp_path):
     with pytest.raises(UsageError, match="does not exist"):
         read_survey(tmp_path / "nowhere")
-    with pytest.raises(NoPhotosError, match="holds nothing"):
+    with pytest.raises(NoPhotosError, match="contains nothing"):
         read_survey(tmp_path)
     (tmp_path / "readme.txt").write_text("x")
     with pytest.raises(NoPhotosError, match=r"readme\.txt"):
         read_survey(tmp_path)
     (tmp_path / "a.jpg").write_bytes(b"\xff\xd8\xff")
-    with pytest.raises(NoPhotosError, match=r"None of the 1 .* cut off"):
+    with pytest.raises(NoPhotosError, match=r"None of the 1 .* truncated"):
         read_survey(tmp_path)
 
 
@@ -105,7 +105,7 @@ def test_hidden_files_and_earlier_runs_are_passed_over(make_jpeg):
     (folder / "out" / "run.toml").write_text("")
     survey = read_survey(folder)
     assert len(survey.photos) == 2
-    assert any("The folder out holds an earlier run" in n for n in survey.notes)
+    assert any("The folder out contains an earlier run" in n for n in survey.notes)
 
 
 def test_a_photo_300_km_away_loses_its_position_but_stays(make_jpeg):
@@ -168,8 +168,8 @@ def test_contradictions_state_both_values(make_jpeg):
         folder = make_jpeg(f"p{i}.jpg", exif=exif, xmp=xmp, seed=i).parent
     said = " ".join(contradictions(read_survey(folder).photos))
     assert "differ by more than 30 deg in 5 photos (camera 35 to 35, aircraft 90 to 90 deg)" in said
-    assert "runs from 110 to 190 m" in said
-    assert "way flown (from GPS) and the heading differ" in said
+    assert "ranges from 110 to 190 m" in said
+    assert "direction of flight (from GPS) and the heading differ" in said
 
 
 def test_digest_is_of_the_content(make_jpeg, tmp_path):

@@ -221,7 +221,7 @@ def test_a_stated_unit_is_believed_whatever_the_values(tmp_path, stated, values,
     photo = read_photo(tmp_path / "t.tif")
     assert (photo.band, photo.unit) == ("thermal", unit)
     assert read_color(photo)[1, 1] == pytest.approx(first, abs=1e-3)
-    assert any("as the file or --thermal-unit says" in n for n in photo.notes)
+    assert any("as stated by the file or --thermal-unit" in n for n in photo.notes)
 
 
 def test_gdal_says_the_unit_of_a_band(tmp_path):

@@ -206,7 +206,7 @@ def test_large_files_become_bigtiff(tmp_path, monkeypatch):
 
 def test_mistakes_state_both_sides(tmp_path):
     array = picture(100, 100)
-    with pytest.raises(ValueError, match="JPEG takes 1 or 3 bands of uint8, asked for 3 of uint16"):
+    with pytest.raises(ValueError, match="JPEG takes 1 or 3 bands of uint8, got 3 of uint16"):
         spec_for(array.astype(np.uint16), compress="jpeg")
     with pytest.raises(ValueError, match="JPEG does not keep a nodata value"):
         spec_for(array, compress="jpeg", nodata=0)

@@ -246,7 +246,7 @@ def test_verdicts_follow_the_stated_thresholds():
     page = Page(build_report(run(metrics=weak)))
     assert "Reprojection error poor 2.50" in page.text
     assert "Only 10% of the samples could be measured" in page.text
-    assert "Pieces of 12, 6 photos" in page.text
+    assert "Blocks of 12, 6 photos" in page.text
 
 
 def test_the_file_appears_whole_or_not_at_all(tmp_path):

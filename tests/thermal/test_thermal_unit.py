@@ -13,7 +13,7 @@ from skyquilt.model.event import Note
 from skyquilt.papers import compare
 from skyquilt.papers.compare import CompareSettings, iter_compare
 from skyquilt.settings import MosaicSettings
-from skyquilt.workflows.mosaic import iter_mosaic
+from skyquilt.workflows.mosaic import make_map
 
 
 @pytest.fixture
@@ -47,11 +47,15 @@ def test_compare_reads_values_as_told_in_every_run(frames, tmp_path, monkeypatch
     overheard = []
 
     def overhearing(*args, **more):
-        for happened in iter_mosaic(*args, **more):
-            overheard.append(happened)
-            yield happened
+        steps = make_map(*args, **more)
+        while True:
+            try:
+                overheard.append(next(steps))
+            except StopIteration as stop:
+                return stop.value
+            yield overheard[-1]
 
-    monkeypatch.setattr(compare, "iter_mosaic", overhearing)
+    monkeypatch.setattr(compare, "make_map", overhearing)
     settings = CompareSettings(
         mosaic=MosaicSettings(thermal_unit="decikelvin"), variants=("position", "image")
     )

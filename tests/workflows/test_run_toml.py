@@ -28,7 +28,7 @@ def test_defaults(tmp_path):
 
 def test_every_setting_comes_back(tmp_path):
     asked = MosaicSettings(
-        method="pose",
+        method="position",
         gsd_cm=2.5,
         crs="EPSG:32633",
         gcp=Path("a b/gcp_list.txt"),

@@ -1,6 +1,4 @@
-"""Converts photos, priors and a start to the arrays of an adjustment, and its results to
-records.
-"""
+"""Photos, priors and a start as the arrays of an adjustment, and its results as records."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,20 +11,16 @@ from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.start import Start
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.geometry.frames import angle_difference_deg, cam_R_map_from_angles
-from skyquilt.model.camera import Camera, order_named
+from skyquilt.model.camera import PARAMETERS, Camera, order_named
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Pose, Prior
 
 Array = NDArray[np.float64]
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 INDEPENDENT = 40
-"""Number of independent observations that carry the same information as a photo's many correlated
-ones.
-"""
+"""Independent observations that tell as much as a photo's many correlated ones."""
 YAW_LIE_DEG = 20.0
-"""A reported yaw that differs by more than this, in degrees, from the yaw of the links counts as a
-gross error.
-"""
+"""A reported yaw further than this, in degrees, from that of the links is a gross error."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -279,17 +273,6 @@ def pose_records(setup: Setup, state: State) -> dict[int, Pose]:
     }
 
 
-def mirrored(camera: Camera) -> Camera:
-    """The calibration of the same camera's files turned by 180 degrees."""
-    return replace(
-        camera,
-        cx=camera.width - 1 - camera.cx,
-        cy=camera.height - 1 - camera.cy,
-        p1=-camera.p1,
-        p2=-camera.p2,
-    )
-
-
 def camera_records(
     photos: Sequence[Photo], setup: Setup, state: State, covariance: Array | None
 ) -> tuple[dict[str, Camera], dict[int, str]]:
@@ -298,29 +281,17 @@ def camera_records(
     cameras: dict[str, Camera] = {}
     for row, key in enumerate(setup.camera_keys):
         photo = next(p for p in photos if p.camera_key == key)
-        f, cx, cy, k1, k2, k3, p1, p2 = (float(v) for v in state.K[row])
+        known = dict(zip(PARAMETERS, (float(v) for v in state.K[row]), strict=True))
         sigmas = None
         if covariance is not None:
             at = 6 * n + 8 * row + np.arange(8)
             spread = np.sqrt(np.abs(covariance[at, at])) * setup.base.free[row]
             sigmas = tuple(float(s) for s in spread)
-        cameras[key] = Camera(
-            width=photo.width,
-            height=photo.height,
-            focal=f,
-            cx=cx,
-            cy=cy,
-            k1=k1,
-            k2=k2,
-            k3=k3,
-            p1=p1,
-            p2=p2,
-            sigmas=sigmas,
-        )
+        cameras[key] = Camera(width=photo.width, height=photo.height, sigmas=sigmas, **known)
     camera_of = {}
     for m in setup.members.tolist():
         key = photos[m].camera_key
         camera_of[m] = f"{key}/turned" if setup.turned[m] else key
         if setup.turned[m]:
-            cameras.setdefault(camera_of[m], mirrored(cameras[key]))
+            cameras.setdefault(camera_of[m], cameras[key].mirrored())
     return cameras, camera_of

@@ -1,4 +1,4 @@
-"""`skyquilt calibrate`: frames of a chess-board to a calibrated camera."""
+"""`skyquilt calibrate`: calibrates a camera from frames of a chess-board."""
 
 import re
 from pathlib import Path
@@ -24,10 +24,9 @@ def command(
     series: Annotated[
         str,
         typer.Option(
-            help="Frames of one pose, as when a lamp heats the board part by part, make one"
-            " picture: auto (frames"
-            " between which the camera stood still), folders (each folder is a pose), views"
-            " (never)."
+            help="Frames of one pose (for instance when a lamp heats the board part by part) are"
+            " combined to one image: auto (frames between which the camera stood still), folders"
+            " (each folder is a pose), views (never)."
         ),
     ] = "auto",
     jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.", min=0)] = 0,
@@ -35,8 +34,8 @@ def command(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Calibrate a lens from views of a chess-board; writes cameras.json as `mosaic --cameras` reads
-    it.
+    """Calibrate a camera from views of a chess-board; writes cameras.json as `mosaic --cameras`
+    reads it.
     """
     with ends_at_once():
         from skyquilt.calibration.workflow import CalibrateSettings, iter_calibrate
@@ -64,7 +63,7 @@ def parse_board(text: str) -> tuple[int, int]:
 
 
 def summary(result: "Result") -> str:
-    """A calibration in a few lines."""
+    """A summary of a calibration in a few lines."""
     m = result.metrics
     found, other = m["centres"], m["corners"]
     held, held_corners = (m[k]["held_out_px"] for k in ("centres", "corners"))
@@ -83,10 +82,9 @@ def summary(result: "Result") -> str:
             f" {', '.join(terms) or 'no distortion'}",
             f"reprojection error from centres {found['rms_px']:.3f} px (RMS), from corners"
             f" {other['rms_px']:.3f} px",
-            f"on views kept out, each by its own marks: {held['centres']:.3f} px, from corners"
-            f" {held_corners['corners']:.3f} px; both judged by the corners: {held['corners']:.3f}"
-            " px, from corners"
-            f" {held_corners['corners']:.3f} px",
+            f"on held-out views, each with its own marks: {held['centres']:.3f} px, from corners"
+            f" {held_corners['corners']:.3f} px; both measured at the corners:"
+            f" {held['corners']:.3f} px, from corners {held_corners['corners']:.3f} px",
             *(
                 f"left out: {name}: {reason}"
                 for name, reason in list(m["views_rejected"].items())[:10]

@@ -25,16 +25,15 @@ if TYPE_CHECKING:
 
 def command(
     photos: Annotated[
-        list[Path], typer.Argument(help="A folder of photos, or two photos and more.")
+        list[Path], typer.Argument(help="A folder of photos, or two or more photos.")
     ],
     output: Output,
     route: Annotated[
         str,
         typer.Option(
             help="pair (two photos, or the first two in sequence that match), disparities (of all"
-            " linked pairs,"
-            " merged), reconstruction (heights of the whole adjustment), auto (pair for two"
-            " photos)."
+            " linked pairs, merged), reconstruction (heights of the whole adjustment), auto (pair"
+            " for two photos)."
         ),
     ] = "auto",
     gsd: Gsd = None,
@@ -55,7 +54,7 @@ def command(
 ) -> None:
     """Depth maps: of a pair, a mosaic of disparities, or the whole reconstruction on a plane.
 
-    Where no two photos tell a height, the command refuses (exit code 7).
+    Where no two photos determine a height, the command ends with exit code 7.
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
@@ -72,7 +71,7 @@ def command(
 
 
 def summary(result: "Result") -> str:
-    """A depth map in a few lines."""
+    """A summary of a depth map in a few lines."""
     m = result.metrics
     p = m["percentiles"]
     return "\n".join(

@@ -11,12 +11,9 @@ from skyquilt.cli.options import Quiet
 
 def command(
     flight: Annotated[
-        Path,
-        typer.Argument(metavar="FLIGHT", help="A simulated flight's folder, or one of photos."),
+        Path, typer.Argument(metavar="FLIGHT", help="Folder of a simulated flight, or of photos.")
     ],
-    to: Annotated[
-        str, typer.Option("--to", help="Folder that is watched, or address of the live map.")
-    ],
+    to: Annotated[str, typer.Option("--to", help="Watched folder, or address of the live map.")],
     rate: Annotated[float, typer.Option(help="Photos per second, all drones together.")] = 1.0,
     drones: Annotated[int, typer.Option(help="Drones that share the flight.")] = 1,
     loss: Annotated[
@@ -24,19 +21,20 @@ def command(
     ] = 0.0,
     reorder: Annotated[float, typer.Option(help="Share of photos that arrive late, 0 to 1.")] = 0.0,
     previews: Annotated[
-        bool, typer.Option("--previews", help="Small pictures first, full ones later.")
+        bool, typer.Option("--previews", help="Send small previews first, full photos later.")
     ] = False,
     burst: Annotated[
-        float | None, typer.Option(help="Photos per second during half a minute in the middle.")
+        float | None,
+        typer.Option(help="Photos per second during a burst of half a minute in the middle."),
     ] = None,
     token: Annotated[
         str | None, typer.Option(envvar="SKYQUILT_TOKEN", help="Secret of the live map.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of losses and order.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of losses and order.")] = 0,
     quiet: Quiet = False,
 ) -> None:
-    """Send the photos of a flight as drones in the air would: in time, with losses, disorder,
-    previews first.
+    """Send the photos of a flight as drones in the air would: in real time, with losses, out of
+    order, previews first.
     """
     with ends_at_once():
         from skyquilt.live.replay_flight import FlySettings, fly

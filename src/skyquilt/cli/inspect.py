@@ -1,4 +1,4 @@
-"""`skyquilt inspect`: what photos say about themselves, and where that cannot be."""
+"""`skyquilt inspect`: reports the metadata of photos and where they cannot be right."""
 
 import json as json_module
 import sys
@@ -24,7 +24,7 @@ def command(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Say what photos tell about themselves, and what is missing or contradictory."""
+    """Report the metadata of photos, and what is missing or contradictory."""
     from skyquilt.photos.contradictions import contradictions
     from skyquilt.photos.survey import read_survey
 
@@ -44,7 +44,7 @@ def _show(survey: "Survey", findings: tuple[str, ...]) -> None:
 
     console = Console(soft_wrap=False)
     if not console.is_terminal:
-        console = Console(width=200)  # a pipe has no width; lines should stay whole
+        console = Console(width=200)  # a pipe has no width; lines should not be wrapped
     console.print(camera_table(survey), photo_table(survey))
     for line in sentences(survey, findings):
         console.print(line, markup=False, highlight=False)

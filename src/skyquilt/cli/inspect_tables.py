@@ -34,7 +34,9 @@ def camera_table(survey: Survey) -> Table:
 
 
 def photo_table(survey: Survey) -> Table:
-    """One row per photo, in order of capture; notes that all photos share stand below instead."""
+    """One row per photo, in order of capture; notes common to all photos are listed below the table
+    instead.
+    """
     table = Table(title="Photos, in order of capture")
     for heading in ("photo", "time", "focal px", "latitude, longitude"):
         table.add_column(heading, no_wrap=True)
@@ -49,7 +51,7 @@ def photo_table(survey: Survey) -> Table:
 
 
 def shared_notes(survey: Survey) -> tuple[str, ...]:
-    """Notes that every photo carries."""
+    """Notes that all photos have."""
     first = survey.photos[0].notes
     return tuple(n for n in first if all(n in p.notes for p in survey.photos))
 
@@ -61,7 +63,7 @@ def sentences(survey: Survey, findings: tuple[str, ...]) -> Iterator[str]:
     yield from findings
     yield from (f"Left out: {r.name}: {r.reason}." for r in survey.rejected)
     if survey.ignored:
-        yield f"No photos, ignored: {', '.join(survey.ignored)}."
+        yield f"Files that are no photos, ignored: {', '.join(survey.ignored)}."
     placed = sum(p.position is not None for p in survey.photos)
     turned = sum(p.attitude is not None for p in survey.photos)
     yield f"{len(survey.photos)} photos, {placed} with a position, {turned} with camera angles."

@@ -1,4 +1,4 @@
-"""Ctrl-C: one sentence and exit code 130, whenever it comes."""
+"""Ctrl-C: one sentence and exit code 130, at any time."""
 
 import gc
 import os
@@ -10,11 +10,11 @@ from contextlib import contextmanager
 from typing import NoReturn
 
 CODE = 130
-"""What shells know an interrupt by."""
+"""Exit code by which shells recognise an interrupt."""
 
 
 def say() -> None:
-    """The sentence, on standard error; a second Ctrl-C while the program goes down is ignored."""
+    """Prints the sentence to standard error; a second Ctrl-C during shutdown is ignored."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     resumable = (
@@ -25,8 +25,8 @@ def say() -> None:
 
 
 def leave() -> NoReturn:
-    """Ends the program, all of its threads included: Python's own way out is no place for a second
-    Ctrl-C.
+    """Ends the program with all of its threads at once: Python's normal shutdown could be broken by
+    a second Ctrl-C.
     """
     say()
     sys.stdout.flush()
@@ -35,11 +35,11 @@ def leave() -> NoReturn:
 
 @contextmanager
 def ends_at_once() -> Iterator[None]:
-    """While modules load, Ctrl-C ends the program then and there.
+    """While modules load, Ctrl-C ends the program immediately.
 
-    Nothing is under way yet that needs care, and some modules swallow every exception while they
-    load. The garbage collector rests meanwhile, and what was loaded it never looks through again:
-    modules are no garbage, and looking takes a tenth of the time that loading does.
+    There is no work yet that must be completed, and some modules swallow every exception while they
+    load. The garbage collector is off meanwhile, and afterwards it never scans the loaded modules:
+    they are no garbage, and scanning them takes a tenth of the loading time.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

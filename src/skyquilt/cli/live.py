@@ -9,11 +9,12 @@ from skyquilt.cli.interrupt import ends_at_once
 from skyquilt.cli.options import Features, Json, Quiet, ThermalUnit
 
 Output = Annotated[
-    Path, typer.Option("--output", "-o", help="Folder of the survey; the same again goes on.")
+    Path,
+    typer.Option("--output", "-o", help="Folder of the survey; an existing survey is continued."),
 ]
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the viewer; 0 = a free one.")]
 Host = Annotated[
-    str, typer.Option(help="Address to listen on; others than this machine's own need --token.")
+    str, typer.Option(help="Address to listen on; other than local ones need --token.")
 ]
 
 
@@ -24,7 +25,10 @@ def command(
     host: Host = "127.0.0.1",
     token: Annotated[
         str | None,
-        typer.Option(envvar="SKYQUILT_TOKEN", help="Secret that uploads and layers must carry."),
+        typer.Option(
+            envvar="SKYQUILT_TOKEN",
+            help="Secret that requests for uploads and layers must contain.",
+        ),
     ] = None,
     gsd: Annotated[
         float | None,
@@ -39,21 +43,22 @@ def command(
     reposition: Annotated[
         bool,
         typer.Option(
-            "--reposition/--no-reposition", help="Whether later photos may move earlier ones."
+            "--reposition/--no-reposition",
+            help="Whether later photos may change the poses of earlier ones.",
         ),
     ] = True,
     deterministic: Annotated[
         bool,
         typer.Option(
             "--deterministic",
-            help="Equal photos in equal order give equal poses, bit for bit; slower.",
+            help="The same photos in the same order give the same poses, bit for bit; slower.",
         ),
     ] = False,
     finish: Annotated[
         bool,
         typer.Option(
             "--finish",
-            help="End when no photo comes any more, with the final map in OUTPUT/finished.",
+            help="End when no more photos arrive, with the final map in OUTPUT/finished.",
         ),
     ] = False,
     thermal_unit: ThermalUnit = None,
@@ -62,20 +67,20 @@ def command(
     ] = None,
     features: Features = 1200,
     max_mb: Annotated[float, typer.Option(help="Largest photo file in MB.")] = 500,
-    max_photos: Annotated[int, typer.Option(help="Most photos taken.")] = 100_000,
+    max_photos: Annotated[int, typer.Option(help="Largest number of photos accepted.")] = 100_000,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
     """Map photos as they arrive, and show the growing map in a browser.
 
-    Photos come into the folders INBOX or over HTTP; what was accepted survives any crash.
+    Photos arrive in the folders INBOX or over HTTP; accepted photos survive any crash.
     """
     with ends_at_once():
         from skyquilt.cli.live_progress import show_live
         from skyquilt.live.live_map import LiveMap
         from skyquilt.live.settings import LiveSettings
         from skyquilt.live.workflow import iter_live
-        from skyquilt.server.guard import Guard
+        from skyquilt.server.access import Guard
         from skyquilt.server.server_process import ServerConfig, ServerProcess
     settings = LiveSettings(
         gsd_cm=gsd,

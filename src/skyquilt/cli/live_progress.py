@@ -1,4 +1,6 @@
-"""A live survey on a terminal: a line per photo, notes, and the final map's own bars."""
+"""Progress of a live survey on a terminal: a line per photo, notes, and the progress bars of the
+final map.
+"""
 
 import json
 import sys
@@ -11,11 +13,11 @@ from skyquilt.model.event import Event, Note, Result, StageStarted
 
 
 def show_live(events: Iterable[Event | Update], url: str, *, mode: str) -> None:
-    """Consumes the story; mode `normal`, `quiet` or `json`."""
+    """Consumes the events; mode `normal`, `quiet` or `json`."""
     if mode == "json":
         _line({"event": "ServerThread", "url": url})
     elif mode == "normal":
-        sys.stdout.write(f"{url} shows the map; Ctrl-C ends, the same command goes on\n")
+        sys.stdout.write(f"{url} shows the map; Ctrl-C ends, the same command continues\n")
     for happened in events:
         if mode == "json":
             _line(
@@ -34,7 +36,7 @@ def _line(record: dict[str, object]) -> None:
 
 
 def sentence(happened: Event | Update) -> str:
-    """What is worth a line; empty for the rest."""
+    """The line to print for an event; empty for events that are not printed."""
     if isinstance(happened, Note):
         return happened.text
     if isinstance(happened, Result):

@@ -1,4 +1,4 @@
-"""The command line's way in: errors as sentences, exit codes as documented."""
+"""Entry point of the command line: errors as sentences, exit codes as documented."""
 
 import os
 import sys
@@ -10,14 +10,16 @@ from skyquilt.errors import SkyquiltError
 
 
 def run() -> None:
-    """Entry point; a mendable error is one sentence on standard error and its own exit code.
+    """Entry point; an error that the user can correct is one sentence on standard error and its own
+    exit code.
 
-    Wrong options end with 2 (as all usage errors), an interrupt with 130. What is left is a mistake
-    of the program: its traceback is shown, and the exit code is 1.
+    Wrong options end with 2 (as all usage errors), an interrupt with 130. Any other exception is a
+    bug in the program: its traceback is shown, and the exit code is 1.
     """
-    # threads work on photos, not inside one product of matrices: it would only spin
+    # threads work on different photos; threads within one matrix product would only wait
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    if isinstance(sys.stdout, TextIOWrapper):  # names may hold what a terminal cannot show
+    # names may hold characters that a terminal cannot show
+    if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         with interrupt.ends_at_once():
@@ -29,13 +31,13 @@ def run() -> None:
     except KeyboardInterrupt:
         interrupt.leave()
     except SystemExit as end:
-        if end.code == interrupt.CODE:  # typer ends so, without a word
+        if end.code == interrupt.CODE:  # typer ends like this, without a message
             interrupt.leave()
         raise
 
 
 def __getattr__(name: str) -> Any:
-    """`app` too, imported when asked for."""
+    """Also provides `app`, imported on first use."""
     if name == "app":
         from skyquilt.cli.app import app
 

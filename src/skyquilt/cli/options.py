@@ -1,5 +1,5 @@
-"""Options that several commands have, each said once, and what `--quiet`, `--verbose` and `--json`
-together mean.
+"""Options that several commands share, each defined once, and what `--quiet`, `--verbose` and
+`--json` together mean.
 """
 
 from pathlib import Path
@@ -15,7 +15,7 @@ Photos = Annotated[Path, typer.Argument(help="Folder of photos (subfolders inclu
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")]
 Gsd = Annotated[
     float | None,
-    typer.Option(help="Ground size of a map pixel in cm.", show_default="the photos' own"),
+    typer.Option(help="Ground size of a map pixel in cm.", show_default="that of the photos"),
 ]
 Crs = Annotated[
     str | None, typer.Option(help="Output CRS, e.g. EPSG:32633.", show_default="local UTM")
@@ -29,24 +29,25 @@ Jobs = Annotated[int, typer.Option(help="Threads; 0 = all processors.")]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace the results of another run in OUTPUT.")
 ]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
-Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more: every stage's time.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", "-v", help="Print more: the time of every stage.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")]
 
 THERMAL_UNITS = (
-    "What values of single-band TIFFs mean: auto (they are thermal; the unit is stated in them or"
-    " found from the"
-    " values), celsius, kelvin, decikelvin, centikelvin, counts."
+    "Unit of single-band TIFFs: auto (they are thermal; the unit is read from the file or derived"
+    " from the values), celsius, kelvin, decikelvin, centikelvin, counts."
 )
-UNIT_UNSAID = "files of thermal cameras, or that state a unit, are read as auto"
+UNIT_UNSAID = "auto for files of thermal cameras or with a stated unit"
 ThermalUnit = Annotated[str | None, typer.Option(help=THERMAL_UNITS, show_default=UNIT_UNSAID)]
 
 
 def mode_of(*, quiet: bool, json: bool, verbose: bool | None = None) -> Mode:
-    """How much a command says; `verbose` is None where there is no such option.
+    """How much a command prints; `verbose` is None where there is no such option.
 
     Raises:
-        UsageError: more than one was asked for.
+        UsageError: more than one was given.
     """
     if quiet + json + bool(verbose) > 1:
         names = "--quiet and --json" if verbose is None else "--quiet, --verbose and --json"

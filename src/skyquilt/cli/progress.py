@@ -12,7 +12,8 @@ from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgre
 def show(
     events: Iterable[Event], *, mode: str, summary: Callable[[Result], str] | None = None
 ) -> None:
-    """Consumes a story and tells it: mode `normal`, `verbose`, `quiet` or `json`.
+    """Consumes the events of a workflow and reports them: mode `normal`, `verbose`, `quiet` or
+    `json`.
 
     `summary` puts the result in a few lines; that of a mosaic if none is given.
     """
@@ -90,7 +91,7 @@ def times(happened: StageFinished) -> str:
 
 
 def mosaic_summary(result: Result) -> str:
-    """A mosaic in a few lines."""
+    """A summary of a mosaic in a few lines."""
     m = result.metrics
     lines = [
         f"{m['photos_used']} of {m['photos_total']} photos in {len(m['blocks'])} block(s),"
@@ -110,7 +111,7 @@ def mosaic_summary(result: Result) -> str:
     ]
     if m["metadata_conflicts"]:
         lines.append(
-            f"{len(m['metadata_conflicts'])} contradictions between metadata and pixels: see the"
+            f"{len(m['metadata_conflicts'])} contradictions between metadata and images: see the"
             " report"
         )
     lines.append(

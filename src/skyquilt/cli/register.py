@@ -1,4 +1,4 @@
-"""`skyquilt register`: two pictures of different spectra on one another."""
+"""`skyquilt register`: registers two images of different spectra."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,30 +14,30 @@ if TYPE_CHECKING:
 
 def command(
     a: Annotated[Path, typer.Argument(metavar="A", help="The reference: a photo or a GeoTIFF.")],
-    b: Annotated[Path, typer.Argument(metavar="B", help="The picture to lay on it.")],
+    b: Annotated[Path, typer.Argument(metavar="B", help="The image to register to it.")],
     output: Output,
     method: Annotated[
         str,
         typer.Option(
-            help="auto (structure, believed only where independent patches agree), or a published"
-            " method, which"
-            " believes nine inliers: sift, surf, usurf, rfae, rfae-sift, surf+rfae; or structure."
+            help="auto (structure, accepted only where independent patches agree), or a published"
+            " method, which accepts nine inliers: sift, surf, usurf, rfae, rfae-sift, surf+rfae;"
+            " or structure."
         ),
     ] = "auto",
     metadata: Annotated[
         bool,
         typer.Option(
             "--use-metadata/--ignore-metadata",
-            help="Try first what metadata and places say beforehand.",
+            help="Try first the registration that metadata and positions suggest.",
         ),
     ] = True,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """Register two pictures of different spectra: photos, radiometric photos or maps.
+    """Register two images of different spectra: photos, radiometric photos or maps.
 
-    What cannot be registered with certainty is refused with a reason (exit code 7).
+    A registration that is not certain is refused with a reason (exit code 7).
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
@@ -51,7 +51,7 @@ def command(
 
 
 def summary(result: "Result") -> str:
-    """An accepted registration in a few lines."""
+    """A summary of an accepted registration in a few lines."""
     m = result.metrics
     return "\n".join(
         (

@@ -1,4 +1,4 @@
-"""`skyquilt simulate`: a flight of known truth over procedural terrain."""
+"""`skyquilt simulate`: a flight with known truth over procedural terrain."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -26,7 +26,7 @@ def command(
     ] = "default",
     photos: Annotated[int | None, typer.Option(help="photos planned")] = None,
     overlap: Annotated[float | None, typer.Option(help="forward overlap, percent")] = None,
-    sidelap: Annotated[float | None, typer.Option(help="sideways overlap, percent")] = None,
+    sidelap: Annotated[float | None, typer.Option(help="side overlap, percent")] = None,
     height: Annotated[float | None, typer.Option(help="above take-off, m")] = None,
     heading: Annotated[
         float | None, typer.Option(help="of the first line, degrees from north")
@@ -52,14 +52,14 @@ def command(
         float | None, typer.Option(help="height between low and high ground, m")
     ] = None,
     terrain: Annotated[
-        Literal["landscape", "chessboard"] | None, typer.Option(help="what is flown over")
+        Literal["landscape", "chessboard"] | None, typer.Option(help="kind of terrain")
     ] = None,
     season: Annotated[
         Literal["summer", "winter"] | None, typer.Option(help="of the photos")
     ] = None,
     hour: Annotated[float | None, typer.Option(help="solar time of the photos, 0-24")] = None,
     exposure_noise: Annotated[
-        float | None, typer.Option(help="relative, from photo to photo")
+        float | None, typer.Option(help="relative change from photo to photo")
     ] = None,
     motion_blur: Annotated[float | None, typer.Option(help="length, px")] = None,
     thermal: Annotated[
@@ -77,11 +77,11 @@ def command(
     checks: Annotated[int | None, typer.Option(help="check points")] = None,
     seed: Annotated[int | None, typer.Option(help="equal seeds give equal files")] = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="replace a former simulation in OUT")
+        bool, typer.Option("--overwrite", help="replace an earlier simulation in OUT")
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar")] = False,
 ) -> None:
-    """Simulate a drone survey: photos with metadata, control points, and beside them the truth."""
+    """Simulate a drone survey: photos with metadata, control points, and the truth."""
     from skyquilt import simulate as sim
     from skyquilt.simulate.weather import Weather
 
@@ -127,7 +127,7 @@ def _share(percent: float | None) -> float | None:
 
 
 def _with(settings: "FlightSettings", part: str, **values: Any) -> "FlightSettings":
-    """The settings with those values of one part that are given."""
+    """The settings with the given values of one part replaced."""
     given = {name: value for name, value in values.items() if value is not None}
     changed: Any = {part: replace(getattr(settings, part), **given)}
     return replace(settings, **changed)
@@ -145,7 +145,7 @@ def _thermal(
 
 
 def _lens(settings: "FlightSettings", size: str | None) -> Any:
-    """The preset's lens on another number of pixels."""
+    """The preset's lens with another number of pixels."""
     if size is None:
         return settings.lens
     words = size.lower().split("x")

@@ -1,4 +1,4 @@
-"""`skyquilt spectral-bench`: methods of registration on pairs whose truth is known."""
+"""`skyquilt spectral-bench`: registration methods on pairs with known truth."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,7 +31,7 @@ def command(
 ) -> None:
     """Register every pair of a list by every method, and compare with the truth.
 
-    Success ratio and mean Q per class and method are the thesis's Tables 6.4 and 6.5.
+    Success ratio and mean Q per class and method are those of the thesis's Tables 6.4 and 6.5.
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
@@ -46,5 +46,5 @@ def command(
 
 
 def summary(result: "Result") -> str:
-    """Where the results lie."""
+    """Where the results are."""
     return f"rows:   {result.output / 'bench.json'}\nreport: {result.output / 'report.html'}"

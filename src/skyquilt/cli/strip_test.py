@@ -1,4 +1,4 @@
-"""`skyquilt strip-test`."""
+"""`skyquilt strip-test`: how a strip of photos deforms under different models."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,16 +16,16 @@ def command(
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Folder for strip.json and report.html.")
     ],
-    photos: Annotated[int, typer.Option(help="Along the strip.")] = 21,
-    overlap: Annotated[float, typer.Option(help="From photo to photo, percent.")] = 70,
+    photos: Annotated[int, typer.Option(help="Number of photos along the strip.")] = 21,
+    overlap: Annotated[float, typer.Option(help="Overlap from photo to photo, percent.")] = 70,
     height: Annotated[float, typer.Option(help="Flight height above the boards, m.")] = 30,
     relief: Annotated[
-        float, typer.Option(help="Height of the highest thing on the boards, m.")
+        float, typer.Option(help="Height of the highest object on the boards, m.")
     ] = 1.2,
     tilt: Annotated[
         float, typer.Option(help="Standard deviation of pitch and roll, degrees.")
     ] = 0.3,
-    noise: Annotated[float, typer.Option(help="Standard deviation of a observation, px.")] = 0.3,
+    noise: Annotated[float, typer.Option(help="Standard deviation of an observation, px.")] = 0.3,
     flights: Annotated[
         int, typer.Option(help="Strips flown with different seeds; curves are medians.")
     ] = 5,
@@ -34,8 +34,8 @@ def command(
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
-    """How true to shape a strip of photos stays: eta under seven lens models, features and
-    transformations.
+    """How well the shape of a strip of photos is preserved: eta under seven lens models, features
+    and transformations.
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
@@ -57,7 +57,7 @@ def command(
 
 
 def _summary(result: "Result") -> str:
-    """The ends of the curves in a few lines."""
+    """The last values of the curves in a few lines."""
     lines = [
         f"{v['name']:36} eta at the end {v['eta'][-1]:.3f}" for v in result.metrics["variants"]
     ]

@@ -22,13 +22,14 @@ def command(
         Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")
     ] = None,
 ) -> None:
-    """Show a map in a browser, with all photos that cover any point. Nothing is changed."""
+    """Show a map in a browser, with all photos that cover any point. The files are not changed."""
     with ends_at_once():
-        from skyquilt.server.guard import Guard
+        from skyquilt.server.access import Guard
         from skyquilt.server.server_thread import ServerThread
         from skyquilt.server.survey import open_survey
     survey = open_survey(folder, base=base)
-    guard = Guard(host=host, token="looking-only")  # nothing can be written: there is no writer
+    # read-only: there is no writer that could need the token
+    guard = Guard(host=host, token="looking-only")
     with ServerThread(survey=survey, guard=guard, folder=folder, port=port) as serving:
         typer.echo(f"{serving.url} shows {folder}; Ctrl-C ends")
         threading.Event().wait()

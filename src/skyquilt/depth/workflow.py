@@ -40,7 +40,8 @@ from skyquilt.model.surface import Surface
 from skyquilt.raster.atomic import write_text
 from skyquilt.settings import MosaicSettings
 from skyquilt.version import __version__
-from skyquilt.workflows.flow import REGISTRY, Scene, scene_of
+from skyquilt.workflows.artefacts import REGISTRY
+from skyquilt.workflows.flow import Scene, scene_of
 from skyquilt.workflows.methods import Methods, methods_for
 from skyquilt.workflows.survey_input import SurveyInput, read_input
 

@@ -1,1 +1,1 @@
-"""How work runs: artefacts on disk, progress, threads, caches, the run's folder."""
+"""How work is executed: stored intermediate results, progress, threads, caches, the run folder."""

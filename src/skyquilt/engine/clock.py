@@ -1,4 +1,4 @@
-"""Time per stage, told as events."""
+"""Time per stage, reported as events."""
 
 import sys
 import time
@@ -11,7 +11,7 @@ from skyquilt.model.event import Event, StageFinished, StageProgress, StageStart
 
 T = TypeVar("T")
 Steps = Generator[tuple[int, int] | Event, None, T]
-"""A stage's work: yields (done, total) or events, returns its result."""
+"""Generator of a stage: yields (done, total) or events, returns its result."""
 
 
 def result_of(steps: Generator[Any, None, T]) -> T:
@@ -30,7 +30,9 @@ def cpu_seconds() -> float:
 
 
 def peak_memory_mb() -> float | None:
-    """Largest resident memory of this process in MB; None on systems that do not tell (Windows)."""
+    """Largest resident memory of this process in MB; None on systems that do not report it
+    (Windows).
+    """
     try:
         import resource
     except ImportError:
@@ -41,18 +43,19 @@ def peak_memory_mb() -> float | None:
 
 @dataclass(kw_only=True)
 class Clock:
-    """Stage times of a run."""
+    """Times of the stages of a run."""
 
     store: Store
-    """Watched to tell reused stages."""
+    """Its hits and misses show whether a stage was reused."""
     began: tuple[float, float]
-    """When the run began: wall clock and CPU time in s, as `now` gives them."""
+    """Start of the run: wall clock and CPU time in s, as `now` returns them."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall-clock time per stage in s."""
     cpu: dict[str, float] = field(default_factory=dict)
     """CPU time per stage in s."""
     peak_mb: dict[str, float] = field(default_factory=dict)
-    """Largest resident memory up to the end of each stage in MB; empty on systems that do not tell.
+    """Largest resident memory up to the end of each stage in MB; empty on systems that do not
+    report it.
     """
 
     @staticmethod
@@ -61,15 +64,15 @@ class Clock:
         return time.perf_counter(), cpu_seconds()
 
     def lap(self, stage: str, since: tuple[float, float]) -> None:
-        """Notes a stage's time from an earlier `now`."""
+        """Records a stage's time since an earlier `now`."""
         self.seconds[stage] = round(time.perf_counter() - since[0], 3)
         self.cpu[stage] = round(cpu_seconds() - since[1], 3)
         if (peak := peak_memory_mb()) is not None:
             self.peak_mb[stage] = round(peak, 1)
 
     def stage(self, name: str, work: Steps[T], *, keeps: bool = True) -> Generator[Event, None, T]:
-        """Runs a stage's steps as events and returns its result; `keeps` is False for one that
-        stores none.
+        """Runs a stage, yields its events and returns its result; `keeps` is False for a stage that
+        stores nothing.
         """
         begun, hits, misses = self.now(), self.store.hits, self.store.misses
         yield StageStarted(stage=name, total=0)

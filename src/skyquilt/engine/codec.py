@@ -1,4 +1,4 @@
-"""Records to files and back, without executing anything on the way: JSON for structure, npz for
+"""Serialises records to bytes and back without executing stored code: JSON for structure, npz for
 arrays.
 """
 
@@ -15,7 +15,7 @@ Registry = Mapping[str, type]
 
 
 def encode(value: Any) -> bytes:
-    """Bytes of dataclasses, tuples, lists, dicts, sets, arrays and scalars."""
+    """Encodes dataclasses, tuples, lists, dicts, sets, arrays and scalars as bytes."""
     arrays: dict[str, Any] = {}
     tree = _down(value, arrays)
     buffer = io.BytesIO()
@@ -24,10 +24,10 @@ def encode(value: Any) -> bytes:
 
 
 def decode(data: bytes, registry: Registry) -> Any:
-    """The value; `registry` names the dataclasses that may occur.
+    """Decodes a value; `registry` names the dataclasses that may occur.
 
     Raises:
-        ValueError: the bytes are torn, or name an unknown record.
+        ValueError: the bytes are damaged, or name an unknown record.
     """
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
@@ -35,7 +35,7 @@ def decode(data: bytes, registry: Registry) -> Any:
             return _up(tree, arrays, registry)
     except (
         Exception
-    ) as error:  # damaged zip, npy and JSON raise many kinds; all mean that there is no record
+    ) as error:  # damaged zip, npy and JSON raise many exceptions; all mean: no valid record
         raise ValueError(f"not a stored record: {error}") from error
 
 

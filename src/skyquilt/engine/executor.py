@@ -1,4 +1,4 @@
-"""Parallel work in order."""
+"""Parallel work with results in order."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -10,10 +10,11 @@ B = TypeVar("B")
 
 
 def in_order(work: Callable[[A], B], items: Iterable[A], *, jobs: int) -> Iterator[B]:
-    """work(item) for each item, in order, in `jobs` threads, never more than a few results ahead.
+    """work(item) for each item, in order, in `jobs` threads, computing at most a few results ahead
+    of the consumer.
 
     The heavy parts (OpenCV, BLAS, the JPEG codec) release the interpreter lock. An interrupt
-    cancels what has not begun and waits only for the pieces under way.
+    cancels items that have not started and waits only for those being computed.
     """
     if jobs <= 1:
         for item in items:

@@ -1,4 +1,4 @@
-"""The run's folder: who may write there, what may be resumed, what a full disk is told as."""
+"""The run folder: who may write there, what may be resumed, and errors such as a full disk."""
 
 import errno
 import json
@@ -32,15 +32,15 @@ class RunFolder:
     path: Path
     """The folder."""
     key: str
-    """What the run is made from: inputs and settings."""
+    """Identifies what the run is made from: inputs and settings."""
 
     @property
     def store(self) -> Path:
-        """Where intermediate results lie."""
+        """Folder of intermediate results."""
         return self.path / STATE / "store"
 
     def mark(self, state: str) -> None:
-        """Writes down how far the run is: `running` or `done`."""
+        """Records the state of the run: `running` or `done`."""
         target = self.path / STATE / "run.json"
         partial = target.with_suffix(".partial")
         try:
@@ -52,7 +52,7 @@ class RunFolder:
 
     @property
     def done(self) -> bool:
-        """Whether this very run was finished before."""
+        """Whether a run with the same key was finished before."""
         return _state(self.path) == (self.key, "done") and all(
             (self.path / name).is_file() for name in CONTRACT
         )
@@ -69,7 +69,7 @@ def _state(path: Path) -> tuple[str, str]:
 def open_run(path: Path, key: str, *, overwrite: bool, again: bool = False) -> RunFolder:
     """Opens a folder for a run: new, empty, the same run again (resumed), or overwritten.
 
-    `again` allows to replace another run's results, but not to write among other files.
+    With `again`, another run's results may be replaced, but nothing is written among other files.
 
     Raises:
         OutputError: it holds something else, or cannot be written.
@@ -103,10 +103,10 @@ def open_run(path: Path, key: str, *, overwrite: bool, again: bool = False) -> R
 
 
 def claim(path: Path, names: Sequence[str], *, overwrite: bool) -> None:
-    """Makes the folder, or clears the files `names` of a former run from it; other files stay.
+    """Creates the folder, or removes the files `names` of an earlier run from it; other files stay.
 
     Raises:
-        OutputError: it holds files already and `overwrite` is not given, is a file, or cannot be
+        OutputError: the folder holds files and `overwrite` is not set, is a file, or cannot be
             written.
     """
     if path.exists() and not path.is_dir():
@@ -131,7 +131,7 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def refusal(path: Path, error: OSError) -> OutputError:
-    """The error with the next step: make room and resume, or another folder."""
+    """The error, with the next step: free disk space and resume, or choose another folder."""
     if error.errno in FULL:
         return OutputError(
             f"the disk is full: cannot write to {path}. Make room and run the same command again to"

@@ -1,4 +1,4 @@
-"""Decoded photos, kept as long as memory allows."""
+"""Cache of decoded photos within a memory budget."""
 
 import threading
 from collections import OrderedDict
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 @dataclass(kw_only=True)
 class PixelCache:
-    """Least recently used photos make room when the budget is exceeded; safe to share between
-    threads.
+    """Keeps decoded photos; the least recently used are dropped when the budget is exceeded.
+    Thread-safe.
     """
 
     read: Callable[[int], NDArray[Any]]
     """Decodes a photo by its index."""
     budget_bytes: int
-    """Most bytes kept; one photo larger than that is still handed out, but not kept."""
+    """Most bytes kept; a photo larger than that is returned but not kept."""
     decoded: int = 0
     """How many times a photo was decoded."""
     _kept: OrderedDict[int, NDArray[Any]] = field(default_factory=OrderedDict)
@@ -29,7 +29,7 @@ class PixelCache:
         """Pixels of a photo, read-only."""
         with self._lock:
             own = self._busy.setdefault(photo, threading.Lock())
-        with own:  # two threads that want one photo decode it once
+        with own:  # two threads that request the same photo decode it once
             with self._lock:
                 if photo in self._kept:
                     self._kept.move_to_end(photo)
@@ -40,7 +40,7 @@ class PixelCache:
             return pixels
 
     def put(self, photo: int, pixels: NDArray[Any]) -> None:
-        """Keeps pixels decoded by a call, if they fit."""
+        """Keeps pixels that the caller decoded, if they fit."""
         with self._lock:
             self.decoded += 1
             if pixels.nbytes > self.budget_bytes:
@@ -51,11 +51,18 @@ class PixelCache:
                 self._kept.popitem(last=False)
 
     def peek(self, photo: int) -> NDArray[Any] | None:
-        """Pixels of a photo if they are at hand; nothing is decoded."""
+        """Pixels of a photo if they are cached; nothing is decoded."""
         with self._lock:
             return self._kept.get(photo)
 
     def clear(self) -> None:
-        """Forgets everything."""
+        """Drops all photos."""
         with self._lock:
             self._kept.clear()
+
+
+def pixel_budget(memory_gb: float | None) -> int:
+    """Bytes for decoded photos: the memory allowed (None = 1.2 GB) less that of code, features and
+    tiles.
+    """
+    return int(max(0.15, (memory_gb or 1.2) - 0.6) * 1e9)

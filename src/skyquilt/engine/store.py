@@ -1,5 +1,5 @@
-"""Artefacts on disk, keyed by what they were made from and by which method: resuming is looking
-them up.
+"""Intermediate results on disk, with keys made from inputs and method. A resumed run finds them by
+key.
 """
 
 import dataclasses
@@ -101,20 +101,20 @@ def _sorted(parts: Iterable[Any]) -> list[Any]:
 
 @dataclass(kw_only=True)
 class Store:
-    """A folder of artefacts: `folder/stage/key.npz`."""
+    """A folder of intermediate results: `folder/stage/key.npz`."""
 
     folder: Path
-    """Where."""
+    """The folder."""
     registry: Registry
-    """Records that may be stored."""
+    """Record types that may be stored."""
     hits: int = 0
-    """Artefacts found."""
+    """Number of results found."""
     misses: int = 0
-    """Artefacts made."""
+    """Number of results computed."""
     _made: set[str] = field(default_factory=set)
 
     def get(self, stage: str, key: str) -> Any | None:
-        """The artefact, or None when there is none or it is torn."""
+        """The stored result, or None when there is none or the file is damaged."""
         path = self.folder / stage / f"{key}.npz"
         try:
             value = decode(path.read_bytes(), self.registry)
@@ -124,7 +124,7 @@ class Store:
         return value
 
     def put(self, stage: str, key: str, value: Any) -> None:
-        """Stores an artefact; it appears whole or not at all.
+        """Stores a result atomically: the file appears complete or not at all.
 
         Raises:
             OutputError: the disk is full or the folder read-only.
@@ -142,7 +142,7 @@ class Store:
             raise refusal(path.parent, error) from error
 
     def get_or(self, stage: str, key: str, make: Callable[[], T]) -> T:
-        """The artefact, made and stored if need be."""
+        """The stored result; computed and stored if there is none."""
         value: T | None = self.get(stage, key)
         if value is None:
             value = make()
@@ -150,6 +150,6 @@ class Store:
         return value
 
     def forget(self, stages: Sequence[str]) -> None:
-        """Removes all artefacts of these stages."""
+        """Removes all results of these stages."""
         for stage in stages:
             shutil.rmtree(self.folder / stage, ignore_errors=True)

@@ -1,7 +1,8 @@
 """Projection with Brown's distortion, its inverse and its derivatives.
 
 One convention inside the project: OpenCV's, from undistorted to distorted coordinates. The thesis
-prints the other direction (Y 2.1); conversions live at the edges (`geometry.camera_formats`).
+prints the other direction (Y 2.1); conversions happen only on input and output
+(`geometry.camera_formats`).
 """
 
 from functools import lru_cache
@@ -21,23 +22,23 @@ class Projection(NamedTuple):
     px: Array
     """(N, 2) in px."""
     d_point: Array
-    """(N, 2, 3): by the point in camera coordinates."""
+    """(N, 2, 3): with respect to the point in camera coordinates."""
     d_intrinsics: Array
-    """(N, 2, 8): by the intrinsics in the order of `model.camera.PARAMETERS`; (N, 2, 0) where they
-    are fixed.
+    """(N, 2, 8): with respect to the intrinsics in the order of `model.camera.PARAMETERS`; (N, 2,
+    0) where they are fixed.
     """
 
 
 def distort(xy: Array, k: Array) -> Array:
     """Distorted image-plane coordinates (N, 2), units of the focal length.
 
-    `k` is (..., 8) in the order of `PARAMETERS`, one row or one row per point.
+    `k` is (..., 8) in the order of `PARAMETERS`, one row for all points or one row per point.
     """
     return np.stack(distort_planes(xy[..., 0], xy[..., 1], k), -1)
 
 
 def distort_planes(x: Array, y: Array, k: Array) -> tuple[Array, Array]:
-    """`distort` of coordinates that lie apart: x and y (...), `k` (8,) or a row per point."""
+    """`distort` for separate coordinate arrays: x and y (...), `k` (8,) or a row per point."""
     k1, k2, k3, p1, p2 = (k[..., i] for i in range(3, 8))
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -126,7 +127,8 @@ def rays(camera: Camera, px: Array) -> Array:
 def monotone_radius(camera: Camera) -> float:
     """Largest undistorted radius (units of the focal length) up to which distortion is invertible.
 
-    Beyond it a polynomial folds back and points far outside the view would land inside the image.
+    Beyond it a polynomial folds back and points far outside the field of view would be projected
+    into the image.
     """
     r = np.linspace(0, 3, 601)[1:]
     k1, k2, k3 = camera.k1, camera.k2, camera.k3

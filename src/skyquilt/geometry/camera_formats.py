@@ -1,9 +1,8 @@
-"""Cameras in OpenSfM's and OpenDroneMap's form: lengths in units of the longer side, from the image
-centre.
+"""Cameras in the formats of OpenSfM and OpenDroneMap: lengths in units of the longer side, from the
+image centre.
 
-Both put the origin at ((w - 1) / 2, (h - 1) / 2) with pixel centres at integers, and their
-distortion runs from undistorted to distorted as OpenCV's does, so coefficients carry over with
-their signs.
+Both put the origin at ((w - 1) / 2, (h - 1) / 2) with pixel centres at integers. Their distortion
+runs from undistorted to distorted as OpenCV's does, so coefficients keep their signs.
 """
 
 import math
@@ -13,8 +12,8 @@ from typing import Any
 from skyquilt.model.camera import Camera
 
 DEVIATIONS = "standard_deviations"
-"""Key of the deviations, in the units of the values; readers of OpenSfM's form pass over keys they
-do not know.
+"""Key of the standard deviations, in the units of the values; readers of OpenSfM's format ignore
+keys they do not know.
 """
 _NAMES = ("focal_x", "c_x", "c_y", "k1", "k2", "k3", "p1", "p2")
 
@@ -23,8 +22,8 @@ def camera_from_opensfm(record: Mapping[str, Any]) -> Camera:
     """A `brown`, `perspective`, `simple_radial` or `radial` camera.
 
     Raises `ValueError` for any other projection and for a broken record. `focal_x` and `focal_y`
-    become their mean: pixels are square here. Deviations are read where `camera_to_opensfm` wrote
-    them.
+    become their mean: pixels are square here. Standard deviations are read from the key that
+    `camera_to_opensfm` writes.
     """
     kind = str(record.get("projection_type", "perspective"))
     if kind not in ("brown", "perspective", "simple_radial", "radial"):
@@ -54,8 +53,8 @@ def camera_from_opensfm(record: Mapping[str, Any]) -> Camera:
 
 
 def _deviations(record: Mapping[str, Any], unit: int) -> tuple[float, ...] | None:
-    """One sigma of each parameter in px; None where the record has none. Raises `ValueError` for
-    broken ones.
+    """Standard deviation of each parameter in px; None where the record has none. Raises
+    `ValueError` for invalid ones.
     """
     stated = record.get(DEVIATIONS)
     if stated is None:
@@ -69,8 +68,8 @@ def _deviations(record: Mapping[str, Any], unit: int) -> tuple[float, ...] | Non
 
 
 def camera_to_opensfm(camera: Camera) -> dict[str, Any]:
-    """The camera as a `brown` record, ready for JSON; its deviations, if it has any, under a key
-    that others ignore.
+    """The camera as a `brown` record, ready for JSON; its standard deviations, if it has any, under
+    a key that other software ignores.
     """
     unit = max(camera.width, camera.height)
     stated = {}

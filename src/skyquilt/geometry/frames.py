@@ -99,27 +99,27 @@ Array = NDArray[np.float64]
 
 
 def turning(a: Array, b: Array) -> Array:
-    """b_R_a (3, 3) that takes directions a (n, 3) best to b (n, 3): Wahba's problem (Markley
-    1988).
+    """The rotation b_R_a (3, 3) that best takes directions a (n, 3) to b (n, 3): Wahba's problem
+    (Markley 1988).
     """
     a, b = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (a, b))
     return nearest_rotation(b.T @ a)
 
 
 def nearest_rotation(m: Array) -> Array:
-    """The rotation next to a matrix (3, 3)."""
+    """The rotation matrix nearest to a matrix (3, 3)."""
     u, _, vt = np.linalg.svd(m)
     return np.asarray(u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt)
 
 
 def angle_deg(a: Array, b: Array) -> float:
-    """Degrees between two rotations (3, 3)."""
+    """Angle between two rotations (3, 3) in degrees."""
     return float(np.degrees(2 * np.arcsin(min(1.0, np.linalg.norm(a - b) / np.sqrt(8)))))
 
 
 def median_rotation(rotations: Sequence[Array], *, rounds: int = 50) -> Array:
-    """The chordal L1 mean (Hartley et al. 2013) by Weiszfeld's reweighting: up to half of them may
-    be wrong.
+    """The chordal L1 mean (Hartley et al. 2013) by Weiszfeld's reweighting: robust against up to
+    half of the rotations being wrong.
     """
     stack = np.stack(rotations)
     mean = nearest_rotation(np.median(stack, axis=0))

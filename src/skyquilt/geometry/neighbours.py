@@ -1,5 +1,5 @@
-"""Nearest points in the plane, exactly, by OpenCV: for few photos SciPy's tree takes longer to load
-than to ask.
+"""Exact nearest neighbours in the plane, by OpenCV: for few photos, loading SciPy's tree takes
+longer than the search.
 """
 
 from typing import Any
@@ -9,21 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 _SINGLE_TREE = 4
-"""FLANN_INDEX_KDTREE_SINGLE: one tree, searched to the end, unlike FLANN's others."""
+"""FLANN_INDEX_KDTREE_SINGLE: a single tree with exact search, unlike FLANN's other indices."""
 _TO_THE_END = -1
 
 
 def nearest(
     points: NDArray[Any], at: NDArray[Any], k: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The k points (n, 2) next to each place `at` (m, 2): distances (m, k), ascending, and indices
-    (m, k).
+    """The k points (n, 2) nearest to each place `at` (m, 2): distances (m, k), ascending, and
+    indices (m, k).
 
-    Neighbours are told apart in single precision about the points' middle; k may not exceed n.
+    Distances are computed in single precision about the centre of the points; k may not exceed n.
     """
     if not 0 < k <= len(points):
         raise ValueError(
-            f"1 to {len(points)} neighbours of {len(points)} points can be asked for, not {k}"
+            f"1 to {len(points)} neighbours of {len(points)} points can be requested, not {k}"
         )
     points, at = np.asarray(points, np.float64), np.asarray(at, np.float64)
     middle = points.mean(0)

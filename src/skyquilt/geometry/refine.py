@@ -1,4 +1,4 @@
-"""The least symmetric transfer error: a transformation refined over all of its matches [A (7),
+"""Least symmetric transfer error: a transformation refined over all of its matches [A (7),
 (12)].
 """
 
@@ -14,7 +14,7 @@ Doubles = NDArray[np.float64]
 
 
 def _directions(*places: tuple[tuple[int, int, float], ...]) -> Doubles:
-    """(K, 3, 3): what each parameter of a model adds to its matrix."""
+    """(K, 3, 3): derivative of a model's matrix with respect to each parameter."""
     G = np.zeros((len(places), 3, 3))
     for k, place in enumerate(places):
         for i, j, value in place:
@@ -33,12 +33,12 @@ _DIRECTIONS = {
 
 
 def refine(model: str, H: Doubles, a: ArrayLike, b: ArrayLike, *, steps: int = 20) -> Doubles:
-    """b_H_a (3, 3) of `model` with a locally least sum of symmetric transfer errors over points a,
-    b (N, 2).
+    """b_H_a (3, 3) of `model` with a local minimum of the sum of symmetric transfer errors over
+    points a, b (N, 2).
 
-    Levenberg and Marquardt with analytic derivatives, at most `steps` steps, from H, which must be
-    of the model; it is never left for a worse one. The points are moved and scaled, both images by
-    one factor, so that errors keep their ratio.
+    Levenberg-Marquardt with analytic derivatives, at most `steps` steps, starting from H, which
+    must be of the model; the error never increases. The points are centred and scaled, both images
+    by one factor, so that errors keep their ratio.
     """
     a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
     both = normalisation(np.stack([a, b]), np.ones((2, len(a))))
@@ -81,7 +81,7 @@ def _linearised(G: Doubles, H: Doubles, a: Doubles, b: Doubles) -> tuple[Doubles
     x, y = (np.column_stack([p, np.ones(len(p))]) for p in (a, b))
     p, q = x @ H.T, y @ M.T
     dp = np.tensordot(x, G, (1, 2))  # (N, K, 3)
-    dq = -np.tensordot(q, G, (1, 2)) @ M.T  # the inverse moves by -M G M
+    dq = -np.tensordot(q, G, (1, 2)) @ M.T  # derivative of the inverse: -M G M
     J, r = [], []
     for value, derivative, target in ((p, dp, b), (q, dq, a)):
         with np.errstate(all="ignore"):

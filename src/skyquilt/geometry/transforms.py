@@ -1,8 +1,8 @@
 """Plane transformations between two images, as matrices b_H_a that take a's pixels to b's.
 
 Four models: translation (2 degrees of freedom), similarity (4), affine (6), homography (8), each
-fitted by a normalised direct linear transform. Everything works on one set of points as on many at
-once, because a random search in Python is fast only when it tries hundreds at a time.
+fitted by a normalised direct linear transform. All functions take one set of points or many sets at
+once, because a random search in Python is fast only when it tries hundreds of samples per call.
 """
 
 from typing import Literal
@@ -14,20 +14,20 @@ Model = Literal["translation", "similarity", "affine", "homography"]
 Doubles = NDArray[np.float64]
 
 MODELS: tuple[Model, ...] = ("translation", "similarity", "affine", "homography")
-"""From the stiffest to the most flexible."""
+"""From the fewest to the most degrees of freedom."""
 MINIMAL: dict[str, int] = {"translation": 1, "similarity": 2, "affine": 3, "homography": 4}
-"""Fewest correspondences that determine each model."""
+"""Smallest number of correspondences that determines each model."""
 _FLAT = 1e-9
-"""Spread across a line over spread along it (variances) below which points count as one line."""
+"""Ratio of the variances across and along a line below which points count as collinear."""
 
 
 def fit(model: str, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None) -> Doubles | None:
-    """The b_H_a (3, 3) that takes points a (N, 2) to b (N, 2) best, N at least MINIMAL[model].
+    """The b_H_a (3, 3) that best takes points a (N, 2) to b (N, 2), N at least MINIMAL[model].
 
-    Least squares of the distances in b; of a homography the algebraic error of the normalised DLT
+    Least squares of the distances in b; for a homography the algebraic error of the normalised DLT
     (Hartley and Zisserman, Multiple View Geometry, 4.1, 4.4). `weights` (N,), not negative,
-    multiply the squares; None is all alike. None where the points do not determine the model (too
-    few, coincident, on one line) or are not finite.
+    multiply the squares; None weights all equally. None where the points do not determine the model
+    (too few, coincident, collinear) or are not finite.
     """
     a, b = np.asarray(a, np.float64).reshape(-1, 2), np.asarray(b, np.float64).reshape(-1, 2)
     if weights is None:
@@ -42,7 +42,7 @@ def fit(model: str, a: ArrayLike, b: ArrayLike, weights: ArrayLike | None = None
 
 
 def fit_many(model: str, a: Doubles, b: Doubles, weights: Doubles | None = None) -> Doubles:
-    """b_H_a (M, 3, 3) of M sets of points, a and b (M, N, 2), weights (M, N) or None; NaN where
+    """b_H_a (M, 3, 3) for M sets of points, a and b (M, N, 2), weights (M, N) or None; NaN where
     undetermined.
     """
     if model not in MINIMAL:
@@ -70,19 +70,19 @@ def _identity(a: Doubles, b: Doubles, w: Doubles) -> Doubles:
 
 
 def _similarity(a: Doubles, b: Doubles, w: Doubles) -> Doubles:
-    """(M, 2, 2) rotation times scale about the centres, in closed form: sum conj(a) b / sum
+    """(M, 2, 2) rotation times scale about the centroids, in closed form: sum conj(a) b / sum
     |a|^2.
     """
     za, zb = a[..., 0] + 1j * a[..., 1], b[..., 0] + 1j * b[..., 1]
     spread = (w * np.abs(za) ** 2).sum(1)
     with np.errstate(all="ignore"):
         s = np.where(spread > 0, (w * np.conj(za) * zb).sum(1) / spread, np.nan)
-    s = np.where(np.abs(s) > _FLAT, s, np.nan)  # all of a in one point of b
+    s = np.where(np.abs(s) > _FLAT, s, np.nan)  # all points of a fall on one point of b
     return np.stack([s.real, -s.imag, s.imag, s.real], -1).reshape(-1, 2, 2)
 
 
 def _affine(a: Doubles, b: Doubles, w: Doubles) -> Doubles:
-    """(M, 2, 2) linear part about the centres, from the normal equations."""
+    """(M, 2, 2) linear part about the centroids, from the normal equations."""
     aw = w[..., None] * a
     aa, ba = np.swapaxes(aw, 1, 2) @ a, np.swapaxes(b, 1, 2) @ aw
     determinant = aa[:, 0, 0] * aa[:, 1, 1] - aa[:, 0, 1] ** 2
@@ -104,7 +104,9 @@ _LINEAR = {"translation": _identity, "similarity": _similarity, "affine": _affin
 
 
 def transfer(H: Doubles, xy: ArrayLike) -> Doubles:
-    """Points (N, 2) through H (..., 3, 3): (..., N, 2). A point on the horizon goes to infinity."""
+    """Transforms points (N, 2) by H (..., 3, 3): (..., N, 2). A point on the horizon goes to
+    infinity.
+    """
     xy = np.asarray(xy, np.float64)
     p = xy @ np.swapaxes(H[..., :2], -1, -2) + H[..., None, :, 2]
     with np.errstate(all="ignore"):
@@ -115,8 +117,8 @@ _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 
 
 def inverse(H: Doubles) -> Doubles:
-    """Inverses of (..., 3, 3), in closed form; not finite where there is none. Their last element
-    is not made 1.
+    """Inverses of (..., 3, 3), in closed form; not finite where there is none. The last element is
+    not scaled to 1.
     """
     # the cross products of its rows; NumPy's own function takes five times as long for few matrices
     a, b = H[..., _NEXT, :], H[..., _LAST, :]
@@ -140,14 +142,14 @@ def symmetric_transfer_errors(H: Doubles, a: ArrayLike, b: ArrayLike) -> Doubles
 
 
 _SINGULAR = 1e-7
-"""Of normalised coordinates: determinants and gaps of singular values below this mean that points
-determine nothing.
+"""For normalised coordinates: if a determinant or a gap between singular values is below this, the
+points do not determine the model.
 """
 
 
 def normalisation(points: Doubles, weights: Doubles) -> Doubles:
-    """(M, 3, 3) that move points (M, N, 2) to their weighted centre and to a mean square distance
-    of 2.
+    """(M, 3, 3) that move points (M, N, 2) to their weighted centroid and scale them to a mean
+    square distance of 2.
 
     NaN where all points coincide.
     """
@@ -184,12 +186,12 @@ def homographies(a: Doubles, b: Doubles, weights: Doubles) -> Doubles:
 
 
 def _of_four(a: Doubles, b: Doubles) -> Doubles:
-    """Exactly, over the projective basis that four points are; many times cheaper than the SVD it
-    equals.
+    """Exact solution from the projective bases of four points; many times faster than the SVD with
+    the same result.
     """
     basis_a, basis_b = _basis(a), _basis(b)
     cross = [np.cross(basis_a[:, :, i], basis_a[:, :, j]) for i, j in ((1, 2), (2, 0), (0, 1))]
-    return np.asarray(basis_b @ np.stack(cross, 1))  # up to a factor the inverse of basis_a
+    return np.asarray(basis_b @ np.stack(cross, 1))  # the inverse of basis_a, up to a factor
 
 
 def _basis(p: Doubles) -> Doubles:

@@ -1,1 +1,1 @@
-"""Pixel mathematics that several stages need: arrays in, arrays out."""
+"""Image processing that several stages need: arrays in, arrays out."""

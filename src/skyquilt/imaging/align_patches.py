@@ -9,9 +9,9 @@ Float = NDArray[np.float32]
 def translate(
     reference: Float, moving: Float, *, margin: int = 3, iterations: int = 4
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where the content of reference patches lies in moving ones.
+    """Shifts of the content of moving patches against reference patches.
 
-    Lucas and Kanade (1981), inverse compositional, gain and offset taken out by normalising both
+    Lucas and Kanade (1981), inverse compositional, gain and offset removed by normalising both
     patches.
 
     Args:
@@ -21,8 +21,8 @@ def translate(
         iterations: Gauss-Newton steps.
 
     Returns:
-        Shifts (n, 2) in px, x then y, and the correlation (n,) reached; both NaN where a shift ran
-        out of the margin or a patch is blank.
+        Shifts (n, 2) in px, x then y, and the correlation (n,) reached; both NaN where a shift
+        exceeded the margin or a patch is uniform.
     """
     n, s, _ = reference.shape
     if not n:
@@ -52,7 +52,7 @@ def _normalised(flat: Float) -> Float:
 
 
 def _sampled(moving: Float, shift: NDArray[np.float64], margin: int, s: int) -> Float:
-    """Moving patches (n, s * s) at their shifts, bilinear."""
+    """Moving patches (n, s * s) sampled at their shifts, bilinear."""
     n = len(moving)
     whole = np.floor(shift).astype(int)
     part = (shift - whole).astype(np.float32)

@@ -1,5 +1,5 @@
 """Fourier transforms of stacks of small patches, by OpenCV: a third of SciPy's time at 64 px, and
-nothing to load.
+no further library to load.
 """
 
 from typing import Any

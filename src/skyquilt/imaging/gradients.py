@@ -1,4 +1,4 @@
-"""Gradients of patches, and whether there is enough of them to tell one place from another."""
+"""Gradients of patches, and whether they suffice to determine a shift."""
 
 from functools import lru_cache
 from typing import Any
@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 NOISE = 1.5
-"""Standard deviation of the noise of a pixel value taken for granted, for pictures of 0 to 255."""
+"""Assumed standard deviation of the noise of a pixel value, for images of 0 to 255."""
 TEXTURE = 2.0
-"""Times the noise's own gradient that a patch must vary in every direction to have texture."""
+"""A patch has texture where its gradient in every direction exceeds this multiple of the noise's
+own gradient.
+"""
 RIM = 2
-"""Px at the border of a patch where its gradient is not used."""
+"""Width in px of a patch's border where its gradient is not used."""
 _DERIVE = np.array([-1, -2, 0, 2, 1], np.float32) / 8
 _SMOOTH = np.array([1, 4, 6, 4, 1], np.float32) / 16
 
@@ -21,8 +23,8 @@ Spectra = NDArray[np.complex64]
 
 
 def gradients(patches: NDArray[Any]) -> Spectra:
-    """Complex gradients (n, S, S), gx + i gy per px, of patches (n, S, S), lightly smoothed;
-    rim 0.
+    """Complex gradients (n, S, S), gx + i gy per px, of patches (n, S, S), lightly smoothed; 0 at
+    the border.
     """
     n, size, _ = patches.shape
     if not n:
@@ -42,8 +44,8 @@ def gradients(patches: NDArray[Any]) -> Spectra:
 def weakest_gradient(patches: NDArray[Any]) -> NDArray[np.float64]:
     """RMS gradient (n,) per px of patches (n, S, S) along the direction in which each varies least.
 
-    A patch that holds one straight edge varies along one direction only and fixes no shift along
-    the other.
+    A patch with one straight edge varies along one direction only and does not determine the shift
+    along the other.
     """
     g = gradients(patches) * np.sqrt(window(patches.shape[1]))
     xx, yy = (g.real**2).sum((1, 2)), (g.imag**2).sum((1, 2))
@@ -53,7 +55,7 @@ def weakest_gradient(patches: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def has_texture(patches: NDArray[Any], *, noise: float = NOISE) -> NDArray[np.bool_]:
-    """Whether each of n patches (n, S, S) varies enough in every direction to fix a shift.
+    """Whether each of n patches (n, S, S) varies enough in every direction to determine a shift.
 
     `noise` is the standard deviation of a value's noise in the patches' own unit.
     """

@@ -1,4 +1,4 @@
-"""Pictures for feature detection: small, grey, 8 bit, whatever came from the sensor."""
+"""Images for feature detection: small, grey, 8 bit, for every kind of sensor."""
 
 from typing import Any
 
@@ -8,38 +8,40 @@ from numpy.typing import NDArray
 
 
 def shrink(image: NDArray[Any], longest: int) -> tuple[NDArray[Any], float]:
-    """The image area-averaged so that its longest side is at most `longest` px, and the scale it
-    lost.
+    """The image area-averaged so that its longest side is at most `longest` px, and the scale
+    factor.
 
-    The scale is full-size px per px of the result, exact for both axes to within rounding of the
-    size.
+    The scale is full-size px per px of the result; the size is rounded, so it is exact to within
+    that rounding on both axes.
     """
     width, size = image.shape[1], _fitting(image, longest)
     return (image, 1.0) if size is None else (averaged(image, size), width / size[0])
 
 
 def halved(image: NDArray[Any], longest: int) -> NDArray[Any]:
-    """The image, averaged over 2 x 2 px as often as `shrink` to the longest side does; it shrinks
-    to the same.
+    """Halves the image (means of 2 x 2 px) while `shrink` to the longest side would do so; `shrink`
+    then gives the same result.
     """
     size = _fitting(image, longest)
     return image if size is None else _halved(image, size)
 
 
 def _fitting(image: NDArray[Any], longest: int) -> tuple[int, int] | None:
-    """(width, height) with the longest side as asked for; None where it is no longer."""
+    """(width, height) with the requested longest side; None where the image is no longer than
+    that.
+    """
     height, width = image.shape[:2]
     scale = max(width, height) / longest
     return (round(width / scale), round(height / scale)) if scale > 1 else None
 
 
 def averaged(image: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
-    """Area averages: the image (h, w[, bands]) at a smaller size (width, height)."""
+    """The image (h, w[, bands]) area-averaged to a smaller size (width, height)."""
     return np.asarray(cv2.resize(_halved(image, size), size, interpolation=cv2.INTER_AREA))
 
 
 def _halved(image: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
-    # averages of 2 x 2 have a path of their own in OpenCV, ten times as fast as any other ratio
+    # OpenCV has a special path for averages of 2 x 2, ten times as fast as any other ratio
     while image.shape[1] >= 3 * size[0] and image.shape[0] % 2 == 0 and image.shape[1] % 2 == 0:
         half = (image.shape[1] // 2, image.shape[0] // 2)
         image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA))
@@ -48,7 +50,8 @@ def _halved(image: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
 
 def to_grey8(image: NDArray[Any]) -> NDArray[np.uint8]:
     """Grey, 8 bit (H, W). Radiometric input is stretched between its 1st and 99th percentile, then
-    equalised locally, because a scene's few degrees fill a small part of a thermal sensor's range.
+    equalised locally, because the few degrees of a scene fill a small part of a thermal sensor's
+    range.
     """
     if image.ndim == 3:
         image = (
@@ -69,8 +72,8 @@ def to_grey8(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def full_px(px: NDArray[Any], shape: tuple[int, int], full: tuple[int, int]) -> NDArray[np.float64]:
-    """Pixels (N, 2) of a shrunken image of `shape` (H, W) in the full image's (H, W), centres at
-    integers.
+    """Converts pixels (N, 2) of a shrunken image of `shape` (H, W) to those of the full image (H,
+    W), centres at integers.
     """
     factor = np.array([full[1] / shape[1], full[0] / shape[0]])
     return np.asarray((np.asarray(px, np.float64) + 0.5) * factor - 0.5)

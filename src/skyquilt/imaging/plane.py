@@ -1,4 +1,4 @@
-"""Photos warped onto a plane, and the overview that they build up, centre first."""
+"""Photos warped onto a plane, and the overview image that they are merged into, centre first."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,10 +13,10 @@ from skyquilt.model.camera import Camera
 from skyquilt.model.surface import Surface
 
 NODES = 4
-"""Pixels between the points at which a view is projected exactly."""
+"""Spacing in pixels of the points at which a view is projected exactly."""
 CENTRE = 0.5
-"""Side of the central region of a photo that is laid over what is there, over that of the photo (Y
-6.1.3).
+"""Side of a photo's central region, which replaces earlier content, as a share of the photo's side
+(Y 6.1.3).
 """
 
 
@@ -31,16 +31,16 @@ class Patch:
     pixels: NDArray[np.float32]
     """(h, w) grey values."""
     shown: NDArray[np.bool_]
-    """(h, w) where the photo shows something."""
+    """(h, w) where the photo has content."""
     central: NDArray[np.bool_]
-    """(h, w) the central region of the photo."""
+    """(h, w) the photo's central region."""
 
 
 def to_grid(
     picture: NDArray[np.uint8], camera: Camera, cam_H_grid: NDArray[Any], *, margin: int = 0
 ) -> Patch | None:
-    """A grey picture (h, w) of a photo of any size on a grid, or None if it sees the horizon or
-    nothing.
+    """A grey image (h, w) of a photo of any size, warped to a grid; None if it sees the horizon or
+    falls outside.
 
     `cam_H_grid` (3, 3) takes (column, row, 1) of the grid to the undistorted image plane (units of
     the focal length).
@@ -67,8 +67,8 @@ def to_grid(
 def view_patch(
     picture: NDArray[np.uint8], view: View, surface: Surface, gsd: float
 ) -> Patch | None:
-    """A grey picture (h, w) of a placed photo, of any size, orthorectified; column = east / gsd,
-    row = -north / gsd.
+    """A grey image (h, w) of a placed photo, of any size, orthorectified; column = east / gsd, row
+    = -north / gsd.
 
     Projected exactly at every `NODES`-th pixel and interpolated between.
     """
@@ -100,8 +100,8 @@ def _seen(
     column: int,
     row: int,
 ) -> Patch:
-    """What a grey picture (h, w) of a photo shows at the photo's pixels u, v, where those are
-    real.
+    """The patch of a grey image (h, w) of a photo, sampled at the photo's pixels u, v, where those
+    are real.
     """
     places, shown, central = [], real, real
     for px, size, small in (
@@ -138,10 +138,9 @@ def _rim(camera: Camera, grid_H_cam: NDArray[Any], per_side: int = 8) -> NDArray
 
 
 class Overview:
-    """The map so far, grey, on a grid without end: O_i = Merge(O_(i-1), I'_i) (Y 4.1).
+    """The map so far, grey, on an unbounded grid: O_i = Merge(O_(i-1), I'_i) (Y 4.1).
 
-    The central region of a photo is laid over what is there, the rest only where nothing is (Y
-    6.1.3).
+    A photo's central region replaces earlier content; the rest only fills empty pixels (Y 6.1.3).
     """
 
     def __init__(self) -> None:
@@ -161,7 +160,9 @@ class Overview:
     def window(
         self, row: int, column: int, height: int, width: int
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Pixels and mask (height, width) of any part of the grid, empty beyond what is there."""
+        """Pixels and mask (height, width) of any part of the grid, empty outside the merged
+        area.
+        """
         pixels, shown = np.zeros((height, width), np.float32), np.zeros((height, width), bool)
         r0, c0 = max(row, self.row), max(column, self.column)
         r1 = min(row + height, self.row + self.shown.shape[0])
@@ -177,7 +178,9 @@ class Overview:
         return slice(r, r + height), slice(c, c + width)
 
     def _reach(self, r0: int, c0: int, r1: int, c1: int) -> None:
-        """Grows the arrays, generously, so that they hold rows r0 to r1 and columns c0 to c1."""
+        """Grows the arrays, with a reserve, so that they hold rows r0 to r1 and columns c0 to
+        c1.
+        """
         if not self.shown.size:
             self.row, self.column = r0, c0
             self.pixels, self.shown = (

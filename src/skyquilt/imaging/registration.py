@@ -6,10 +6,10 @@ shift d:
     ncc(d) = Re sum W conj(ga(x)) gb(x + d) / sqrt(sum W |ga(x)|^2 * sum W |gb(x + d)|^2)
     W = w(x) w(x + d)
 
-By Cauchy-Schwarz it is 1 at the true shift of equal patches and less elsewhere, so the window pulls
-nothing towards zero; gradients drop the offset, the norm drops the gain; exchanging the patches
-negates the shift. All sums are correlations, found by FFT; the summit is found by Newton's method
-on their Fourier series.
+By Cauchy-Schwarz it is 1 at the true shift of equal patches and less elsewhere, so the window does
+not bias the shift towards zero. Gradients remove the offset, the norm removes the gain. Exchanging
+the patches negates the shift. All sums are correlations, computed by FFT; the peak is found by
+Newton's method on their Fourier series.
 """
 
 from dataclasses import dataclass
@@ -22,26 +22,24 @@ from skyquilt.imaging.fourier import fft2, ifft2
 from skyquilt.imaging.gradients import Spectra, Stack, gradients, window
 
 RADIUS = 8
-"""Largest shift in px looked for along each axis."""
+"""Largest shift in px searched along each axis."""
 MIN_PEAK = 0.35
-"""Correlation below which a summit is weak: that of 3000 pairs of unrelated real patches stays
-below.
-"""
+"""Correlation below which a peak is weak: 3000 pairs of unrelated real patches stay below."""
 BROAD_PEAK = 0.7
-"""Correlation below which a broad summit is weak: smooth patches have few details, which chance can
-match.
+"""Correlation below which a broad peak is weak: smooth patches have few details, which can match by
+chance.
 """
 APART = 4
-"""Px from a summit at which the correlation has fallen below MAX_RATIO of it, or the summit is
+"""If the correlation this many px from the peak is still above MAX_RATIO of it, the peak is
 broad.
 """
 MAX_RATIO = 0.8
-"""Second summit over the first above which the place is ambiguous."""
+"""Ratio of second to first peak above which the shift is ambiguous."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shift:
-    """How far a second patch's content lies from the first's: b(x + dx, y + dy) shows what a(x, y)
+    """Shift of a second patch's content against the first's: b(x + dx, y + dy) shows what a(x, y)
     shows.
     """
 
@@ -50,15 +48,15 @@ class Shift:
     dy: float
     """Px along rows, downwards."""
     peak: float
-    """Correlation at the summit, at most 1."""
+    """Correlation at the peak, at most 1."""
     second: float
-    """Correlation at the next highest summit; 0 if there is no other."""
+    """Correlation at the next highest peak; 0 if there is no other."""
     reason: str = ""
-    """Why it is not to be trusted; empty if it is."""
+    """Why it is not reliable; empty if it is."""
 
     @property
     def ok(self) -> bool:
-        """Whether the shift is to be trusted."""
+        """Whether the shift is reliable."""
         return not self.reason
 
     def __bool__(self) -> bool:
@@ -83,7 +81,8 @@ def shifts_between(a: NDArray[Any], b: NDArray[Any], *, radius: int = RADIUS) ->
             f" {a.shape[1]}"
         )
     shifts = []
-    for k in range(0, len(a), 32):  # a block's arrays stay within the processor's cache
+    # so that the arrays of a block stay within the processor's cache
+    for k in range(0, len(a), 32):
         shifts += _block(gradients(a[k : k + 32]), gradients(b[k : k + 32]), radius)
     return shifts
 
@@ -104,9 +103,9 @@ def _block(ga: Spectra, gb: Spectra, radius: int) -> list[Shift]:
     weak = np.where(_farther(inner, start) > MAX_RATIO * peak, BROAD_PEAK, MIN_PEAK)
     second = _second(field, row, column)
     rules = {
-        "summit at the edge of the search": np.abs(start).max(1) == radius,
-        "no clear summit": ~steep,
-        "weak summit": peak < weak,
+        "peak at the edge of the search": np.abs(start).max(1) == radius,
+        "no clear peak": ~steep,
+        "weak peak": peak < weak,
         "ambiguous": second > MAX_RATIO * peak,
     }
     reasons = np.select(list(rules.values()), list(rules), default="")
@@ -132,7 +131,7 @@ def _energies(ga: Spectra, gb: Spectra, w: Stack, radius: int) -> Stack:
     """
     power = np.empty_like(ga)
     power.real = (ga.real**2 + ga.imag**2) * w
-    # the window is symmetric, so a's energy at d equals that of the turned field: one transform
+    # the window is symmetric, so a's energy at d equals that of the flipped field: one transform
     # serves both
     power.imag = (gb.real**2 + gb.imag**2) * w
     both = ifft2(np.conj(fft2(w[None])) * fft2(power))
@@ -151,8 +150,8 @@ def _slope(values: Stack, row: NDArray[Any], column: NDArray[Any]) -> NDArray[np
 def _summit(
     cross: Spectra, start: NDArray[Any], slope: NDArray[np.float64], *, steps: int = 4
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Shifts (n, 2: row, column) where log correlation minus its slowly varying norm is highest,
-    and whether each was reached within a pixel of `start`.
+    """Shifts (n, 2: row, column) of the peak of log correlation minus its slowly varying norm, and
+    whether each was reached within a pixel of `start`.
     """
     d = start.astype(np.float64)
     good = np.ones(len(d), bool)
@@ -189,7 +188,7 @@ def _taylor(cross: Spectra, d: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _farther(inner: Stack, start: NDArray[Any]) -> Stack:
-    """(n,) the highest correlation APART px or more from the summits at shifts `start` (n, 2)."""
+    """(n,) the highest correlation APART px or more from the peaks at shifts `start` (n, 2)."""
     shift = np.arange(inner.shape[1]) - inner.shape[1] // 2
     rows, columns = np.abs(shift - start[:, :1]), np.abs(shift - start[:, 1:])
     away = np.maximum(rows[:, :, None], columns[:, None, :]) >= APART
@@ -197,10 +196,11 @@ def _farther(inner: Stack, start: NDArray[Any]) -> Stack:
 
 
 def _second(field: Stack, row: NDArray[Any], column: NDArray[Any]) -> Stack:
-    """(n,) the highest local maximum but the one at (row, column), which count without the field's
-    margin.
+    """(n,) the highest local maximum except the one at (row, column); the field's margin does not
+    count.
 
-    The flank of a broad summit is no second summit: smooth patches with one clear place have such.
+    The flank of a broad peak is no second peak: smooth patches with one clear position have such
+    flanks.
     """
     inner = field[:, 1:-1, 1:-1]
     summit = np.ones(inner.shape, bool)

@@ -1,5 +1,5 @@
-"""What each photo sees of the map: footprints and coarse grids of where a map pixel lies in a
-photo.
+"""What each photo sees of the map: footprints, and coarse grids of the photo pixels of map
+points.
 """
 
 from collections.abc import Sequence
@@ -17,14 +17,14 @@ from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 
 STEP = 16
-"""Map pixels between the nodes at which photos are projected; in between, positions are
+"""Map pixels between the nodes at which photos are projected; positions in between are
 interpolated.
 
 Nodes are the centres of STEP x STEP cells, with one ring of cells around a window: then OpenCV's
 resize, ten times as fast as a general warp, interpolates them exactly.
 """
 BORDER_PX = 2.0
-"""Photo pixels at the border that are not used."""
+"""Width in photo pixels of the border that is not used."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -36,12 +36,12 @@ class View:
     camera: Camera
     """Its calibration."""
     pose: Pose
-    """Where it was."""
+    """Its exterior orientation."""
     footprint: NDArray[np.float64]
     """(k, 2) outline on the ground in m (map frame)."""
 
     def overlaps(self, bounds: tuple[float, float, float, float]) -> bool:
-        """Whether the footprint's box meets bounds (west, south, east, north)."""
+        """Whether the footprint's bounding box intersects bounds (west, south, east, north)."""
         low, high = self.footprint.min(0), self.footprint.max(0)
         return bool(
             low[0] < bounds[2]
@@ -53,7 +53,7 @@ class View:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Nodes:
-    """Where the nodes of a window lie in one photo."""
+    """Photo pixels of the nodes of a window, for one photo."""
 
     view: View
     """The photo."""
@@ -66,8 +66,8 @@ class Nodes:
     seen: NDArray[np.bool_]
     """(r, c) whether the node lies in the photo."""
     real: NDArray[np.bool_]
-    """(r, c) whether the projection means anything: before the camera, and where
-    distortion does not fold back.
+    """(r, c) whether the projection is valid: in front of the camera, and where distortion does not
+    fold back.
     """
     height: float
     """Median height of the camera above the window's ground in m."""
@@ -76,8 +76,8 @@ class Nodes:
 def footprint(
     camera: Camera, pose: Pose, surface: Surface, *, per_side: int = 8
 ) -> NDArray[np.float64]:
-    """Outline (4 * per_side, 2) in m of the image's rim on the surface; empty if the rim sees the
-    horizon.
+    """Outline (4 * per_side, 2) in m of the image border on the surface; empty if the border sees
+    the horizon.
     """
     s = np.linspace(0, 1, per_side, endpoint=False)
     w, h = camera.width - 1.0, camera.height - 1.0
@@ -98,7 +98,7 @@ def footprint(
 
 
 def _planar_footprint(rim: NDArray[Any], cam_H_map: NDArray[Any]) -> NDArray[np.float64]:
-    """Rim (n, 3) of the image plane on the map (n, 2) in m; empty if some of it lies beyond the
+    """Points (n, 3) of the image plane on the map (n, 2) in m; empty if some of them lie beyond the
     horizon.
     """
     xyw = rim @ np.linalg.inv(cam_H_map).T
@@ -120,8 +120,8 @@ def make_views(alignment: Alignment, surface: Surface) -> list[View]:
 
 
 def project_nodes(view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> Nodes:
-    """Nodes at map coordinates (r, c), or at k heights z (k, r, c) over them: photo pixels and
-    scores.
+    """Photo pixels and scores of nodes at map coordinates (r, c), or at k heights z (k, r, c) over
+    them.
     """
     camera, C = view.camera, view.pose.map_C
     planes = view.pose.planes_to_camera(x, y, z)
@@ -142,8 +142,8 @@ def project_nodes(view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any])
 def project_all(
     views: Sequence[View], x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]
 ) -> list[Nodes]:
-    """`project_nodes` of many views at the same nodes (r, c): where those are few, several times as
-    fast.
+    """`project_nodes` for many views at the same nodes (r, c): several times as fast where the
+    nodes are few.
     """
     if len(views) < 2 or any(v.pose.cam_H_map is not None for v in views):
         return [project_nodes(v, x, y, z) for v in views]
@@ -170,13 +170,13 @@ def _photo_pixels(
     k: NDArray[Any],
     limit: NDArray[Any] | float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Columns, rows of places in camera coordinates, and which are real; `k` (..., 8), `limit`: the
-    lens's radius.
+    """Photo columns and rows of points in camera coordinates, and which are real; `k` (..., 8),
+    `limit`: the radius up to which the distortion is invertible.
     """
     across, down, depth = planes
     ahead = np.maximum(depth, 1e-3)
     px, py = across / ahead, down / ahead
-    # behind the camera, or where the distortion polynomial folds back, a point is nowhere in the
+    # behind the camera, or where the distortion polynomial folds back, a point has no pixel in the
     # photo
     real = (depth > 0.1) & (px * px + py * py < limit**2)
     u, v = (
@@ -187,7 +187,9 @@ def _photo_pixels(
 
 
 def _scores(dx: NDArray[Any], dy: NDArray[Any], dz: NDArray[Any]) -> NDArray[np.float32]:
-    """Squared tangents of the angle off the vertical of places that far from a camera in m."""
+    """Squared tangents of the angle off the vertical, for places at these offsets in m from a
+    camera.
+    """
     return np.asarray(((dx**2 + dy**2) / np.maximum(dz**2, 1e-6)).astype(np.float32))
 
 
@@ -208,8 +210,8 @@ def inside_everywhere(
 ) -> NDArray[np.bool_]:
     """Whether each pixel lies in the photo, from dense photo pixels u, v (h, w) of these nodes.
 
-    Next to a node without a real projection the interpolated u and v sweep over the whole photo:
-    those do not count.
+    Next to a node without a real projection the interpolated u and v can fall anywhere in the
+    photo: those pixels are False.
     """
     within = inside(nodes.view.camera, u, v)
     if nodes.real.all():
@@ -228,7 +230,9 @@ def node_places(
 
 
 def overlapping(views: Sequence[View], x: NDArray[Any], y: NDArray[Any]) -> list[View]:
-    """The views whose footprint's box meets that of nodes at x, y (r, c) in m, rows southwards."""
+    """The views whose footprint's bounding box intersects that of nodes at x, y (r, c) in m, rows
+    southwards.
+    """
     bounds = (float(x[0, 0]), float(y[-1, 0]), float(x[0, -1]), float(y[0, 0]))
     return [view for view in views if view.overlaps(bounds)]
 
@@ -236,7 +240,7 @@ def overlapping(views: Sequence[View], x: NDArray[Any], y: NDArray[Any]) -> list
 def least_scores(
     views: Sequence[View], x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]
 ) -> NDArray[np.float32]:
-    """(views,) no node at x, y, z (r, c) in m, rows southwards, has a smaller score in that
+    """(views,) lower bound of the scores of nodes at x, y, z (r, c) in m, rows southwards, in each
     view.
     """
     east, north, up = np.array([v.pose.map_C for v in views]).reshape(-1, 3).T
@@ -269,7 +273,9 @@ def densify(values: NDArray[np.float32], height: int, width: int) -> NDArray[np.
 
 
 def on_ground(view: View, px: NDArray[Any], surface: Surface) -> NDArray[np.float64]:
-    """Where pixels (n, 2) of a placed photo lie on the surface: (n, 3) in m (map frame)."""
+    """Positions (n, 3) in m (map frame) where the rays of pixels (n, 2) of a placed photo meet the
+    surface.
+    """
     ray, pose = rays(view.camera, np.asarray(px, np.float64).reshape(-1, 2)), view.pose
     if pose.cam_H_map is not None:
         xyw = ray @ np.linalg.inv(pose.cam_H_map).T
@@ -289,7 +295,7 @@ def _meet(pose: Pose, direction: NDArray[Any], surface: Surface) -> NDArray[np.f
 
 
 def native_gsd(views: Sequence[View], surface: Surface) -> float:
-    """Median ground size in m of a photo pixel at the photos' centres."""
+    """Median ground size in m of a photo pixel, at the image centres."""
     C = np.array([v.pose.map_C for v in views])
     drop = C[:, 2] - surface.at(C[:, 0], C[:, 1])
     return float(np.median(drop / np.array([v.camera.focal for v in views])))

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.live.background_adjustment import BlockAdjustment
-from skyquilt.live.crash_points import hit
+from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member, about_record
 from skyquilt.live.refinement import Refinement
 from skyquilt.live.settings import CLOSING

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from skyquilt.errors import UsageError
 from skyquilt.live.closed_files import ClosedFiles
-from skyquilt.live.crash_points import hit
 from skyquilt.live.inbox import ending_of
+from skyquilt.live.ledger import hit
 from skyquilt.live.photo_intake import Accepted, Intake, Refused
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.photos.read import read_photo

@@ -16,8 +16,7 @@ from itertools import chain
 from pathlib import Path
 
 from skyquilt.errors import OutputError
-from skyquilt.live.crash_points import hit
-from skyquilt.live.ledger import Ledger
+from skyquilt.live.ledger import Ledger, hit
 
 ENDINGS = {
     b"\xff\xd8\xff": ".jpg",

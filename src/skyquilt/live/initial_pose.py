@@ -7,9 +7,9 @@ import numpy as np
 
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.errors import UnreadablePhotoError
-from skyquilt.live.crash_points import hit
 from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.events import MapEvents
+from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member, Queues
 from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.live.update import Update

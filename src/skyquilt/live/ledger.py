@@ -4,18 +4,49 @@ layers.
 SQLite in WAL mode with `synchronous=FULL`: committed data survive a kill and a power cut; an
 uncommitted transaction leaves nothing behind. There is one writer (the mapping) and any number of
 readers, in this process or in others.
+
+Also the crash points: names for the moments at which data has just become durable. Crash tests end
+the process there.
 """
 
 import json
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from skyquilt.errors import OutputError
+
+POINTS = (
+    "photo file synced",
+    "photo file named",
+    "photo row committed",
+    "photo placed",
+    "tiles written",
+    "drawing told",
+    "photo refined",
+    "block closed",
+    "folder seen",
+    "published",
+)
+"""All crash points, in the order in which a photo passes them."""
+
+
+def _nothing(name: str) -> None:
+    """Does nothing: the default outside tests."""
+
+
+watcher: Callable[[str], None] = _nothing
+"""Called with the name of each point that is reached. Tests replace it."""
+
+
+def hit(name: str) -> None:
+    """Reports that a point was reached."""
+    watcher(name)
+
 
 NAME = "live.db"
 """Name of the file in the survey's folder."""

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from skyquilt.errors import OutputError
-from skyquilt.live.crash_points import hit
 from skyquilt.live.inbox import Arrived, Inbox
-from skyquilt.live.ledger import Ledger
+from skyquilt.live.ledger import Ledger, hit
 from skyquilt.live.settings import LiveSettings
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.photos.read import read_photo

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.live.adjustment_schedule import Schedule
-from skyquilt.live.crash_points import hit
 from skyquilt.live.events import MapEvents
+from skyquilt.live.ledger import hit
 from skyquilt.live.links import link_bytes
 from skyquilt.live.local_pose import Change, LocalPose
 from skyquilt.live.members import Member, Queues, about_record

@@ -14,7 +14,7 @@ from skyquilt.engine.executor import in_order
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
 from skyquilt.imaging.views import View, footprint
-from skyquilt.live.crash_points import hit
+from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member
 from skyquilt.live.newest_blend import Newest
 from skyquilt.live.reduced_pictures import SmallPictures, measured

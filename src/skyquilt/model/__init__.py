@@ -1,1 +1,3 @@
-"""The nouns: frozen records that flow from stage to stage. No I/O, no algorithms."""
+"""The records: frozen dataclasses that flow from stage to stage. No input or output, no
+algorithms.
+"""

@@ -59,8 +59,8 @@ class BoardView:
     height: int
     """Of the frame in px."""
     centroids: Array
-    """Centroids of the squares' images (rows, columns, 2) in px, not yet corrected for perspective;
-    NaN where a square could not be measured.
+    """Centroids of the squares' images (rows, columns, 2) in px, before the correction for
+    perspective; NaN where a square could not be measured.
     """
     corners: Array
     """Inner corners (rows - 1, columns - 1, 2) in px."""
@@ -69,19 +69,21 @@ class BoardView:
     their centroids were taken.
     """
     contrast: float
-    """White less black squares, in units of the frame's own noise."""
+    """Brightness of white squares minus that of black squares, in units of the frame's own
+    noise.
+    """
     frames: int = 1
     """Frames it was assembled from."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RejectedView:
-    """A frame without a usable board. False where a view is true."""
+    """A frame without a usable board. False in `if`, where a view is true."""
 
     name: str
     """Frame or series."""
     reason: str
-    """A sentence's end: 'X was left out: ...'."""
+    """The reason as the end of a sentence: 'X was left out: ...'."""
 
     def __bool__(self) -> bool:
         return False

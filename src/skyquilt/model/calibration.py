@@ -1,4 +1,4 @@
-"""A calibrated lens, and how well it explains the boards that were seen."""
+"""A calibrated camera, and how well it explains the observed boards."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,12 +10,12 @@ from skyquilt.model.camera import PARAMETERS, Camera
 
 Array = NDArray[np.float64]
 Marks = Literal["centres", "corners"]
-"""What is sighted on a board: centres of squares, or corners between them."""
+"""What is observed on a board: centres of squares, or corners between them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BoardPose:
-    """Where a board stands: x_cam = cam_R_board @ x_board + cam_t."""
+    """Pose of a board: x_cam = cam_R_board @ x_board + cam_t."""
 
     cam_R_board: Array
     """(3, 3)."""
@@ -43,14 +43,14 @@ class Observations:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration:
-    """Intrinsics with their deviations, a pose per view, and what is left over."""
+    """Intrinsics with their standard deviations, a board pose per view, and the residuals."""
 
     marks: Marks
-    """What was sighted."""
+    """What was observed."""
     camera: Camera
-    """The result; `sigmas` are one sigma, 0 for what was held."""
+    """The result; `sigmas` are standard deviations, 0 for parameters that were held fixed."""
     free: tuple[str, ...]
-    """The parameters that were determined, in the order of `PARAMETERS`."""
+    """The parameters that were estimated, in the order of `PARAMETERS`."""
     dropped: tuple[tuple[str, float, float], ...]
     """Name, value and tolerance of each coefficient that was smaller than its tolerance, in the
     order of dropping.
@@ -60,7 +60,7 @@ class Calibration:
     poses: tuple[BoardPose, ...]
     """One per view."""
     residuals: tuple[Array, ...]
-    """Measured less predicted (n, 2) in px, one array per view."""
+    """Measured minus predicted (n, 2) in px, one array per view."""
 
     @property
     def rms_px(self) -> float:
@@ -74,7 +74,7 @@ class Calibration:
         return float(x), float(y)
 
     def sigma(self, name: str) -> float:
-        """Standard deviation of a parameter; 0 for one that was held."""
+        """Standard deviation of a parameter; 0 for one that was held fixed."""
         return self.camera.sigmas[PARAMETERS.index(name)] if self.camera.sigmas else 0.0
 
 

@@ -1,6 +1,6 @@
-"""The interior orientation of a camera, and the orders of distortion that lens models come in."""
+"""The interior orientation of a camera, and the distortion terms that lens models use."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,27 @@ class Camera:
         """A camera without distortion whose principal point is the image centre."""
         return cls(width=width, height=height, focal=focal, cx=(width - 1) / 2, cy=(height - 1) / 2)
 
+    def rescaled(self, width: int, height: int) -> "Camera":
+        """The same lens on an image of another size in px with the same field of view."""
+        s = max(width, height) / max(self.width, self.height)
+        if s == 1.0:
+            return self
+        sigmas = self.sigmas and (*(v * s for v in self.sigmas[:3]), *self.sigmas[3:])
+        return replace(
+            self,
+            width=width,
+            height=height,
+            focal=self.focal * s,
+            cx=(self.cx + 0.5) * s - 0.5,
+            cy=(self.cy + 0.5) * s - 0.5,
+            sigmas=sigmas,
+        )
+
+    def mirrored(self) -> "Camera":
+        """The calibration of the same camera's files turned by 180 degrees."""
+        cx, cy = self.width - 1 - self.cx, self.height - 1 - self.cy
+        return replace(self, cx=cx, cy=cy, p1=-self.p1, p2=-self.p2)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
@@ -67,11 +88,11 @@ class Order:
     radial: int
     """Radial coefficients: terms up to r^(2 radial)."""
     tangential: bool
-    """Whether it has tangential ones."""
+    """Whether it has tangential coefficients."""
 
     @property
     def terms(self) -> tuple[bool, bool, bool, bool, bool]:
-        """Of k1, k2, k3, p1, p2 those it has."""
+        """Which of k1, k2, k3, p1, p2 the model has."""
         k1, k2, k3 = (self.radial > k for k in range(3))
         return k1, k2, k3, self.tangential, self.tangential
 
@@ -83,11 +104,11 @@ ORDERS = {
     "6": Order(radial=3, tangential=False),
     "6t": Order(radial=3, tangential=True),
 }
-"""By name: radial terms up to r^0, r^2, r^4, r^6, and r^6 with tangential ones."""
+"""By name: radial terms up to r^0, r^2, r^4, r^6, and r^6 with tangential terms."""
 
 
 def order_named(name: str) -> Order:
-    """The order of a name.
+    """The order with this name.
 
     Raises:
         ValueError: there is none.

@@ -1,4 +1,4 @@
-"""How one image lies on another, and by what evidence."""
+"""The transformation between two images, and the evidence for it."""
 
 from dataclasses import dataclass
 
@@ -21,7 +21,7 @@ class Estimate:
     iterations: int
     """Samples tried."""
     capped: bool
-    """True when the search ended at its cap, before its confidence was reached."""
+    """True when the search reached its limit of iterations before its confidence was reached."""
     method: str
     """Which step found it: `RANSAC`, `LMedS`, `MAGSAC`, `RANSAC-1-OPT`, `RANSAC-2-OPT`."""
 
@@ -38,7 +38,7 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class NoEstimate:
-    """No transformation that could be trusted: false in `if`, carries its reason."""
+    """No transformation was reliable: false in `if`, carries the reason."""
 
     reason: str
     """`too few matches (7 of 8)`, `weak inliers (5 of 80 matches)`, `weak peak (0.12 of 0.3)`, ...
@@ -50,17 +50,17 @@ class NoEstimate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Registration:
-    """A transformation that the pixels themselves agree on."""
+    """A transformation estimated from the pixels themselves."""
 
     model: str
     """`translation`, `similarity`, `euclidean`, `affine` or `homography`."""
     b_H_a: NDArray[np.float64]
     """(3, 3) takes a's pixels to b's; last element 1."""
     score: float
-    """What was maximised, where it is highest: a correlation (at most 1), normalised mutual
-    information, or the response of a phase correlation.
+    """Maximum of the similarity measure: a correlation (at most 1), normalised mutual information,
+    or the response of a phase correlation.
     """
     overlap: float
-    """Share of a's pixels that lie on b."""
+    """Share of a's pixels that fall inside b."""
     method: str
     """`NCC`, `phase`, `ECC` or `MI`."""

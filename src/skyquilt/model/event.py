@@ -1,4 +1,4 @@
-"""What a story says while it runs: progress bars, journals, viewers and tests read the same
+"""Events that a workflow yields while it runs. Progress bars, logs, viewers and tests read the same
 events.
 """
 
@@ -10,7 +10,7 @@ from typing import Any
 
 @dataclass(frozen=True, kw_only=True)
 class StageStarted:
-    """A stage begins."""
+    """A stage starts."""
 
     stage: str
     """Its name."""
@@ -20,7 +20,7 @@ class StageStarted:
 
 @dataclass(frozen=True, kw_only=True)
 class StageProgress:
-    """A stage has come further."""
+    """A stage reports progress."""
 
     stage: str
     """Its name."""
@@ -46,12 +46,12 @@ class StageFinished:
 
 @dataclass(frozen=True, kw_only=True)
 class Note:
-    """Something worth saying."""
+    """A message for the user."""
 
     text: str
     """A plain sentence."""
     warning: bool = False
-    """True when a user should look."""
+    """True when the user should act on it or check the result."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,15 +69,15 @@ Event = StageStarted | StageProgress | StageFinished | Note | Result
 
 @dataclass(frozen=True, kw_only=True)
 class MetadataConflict:
-    """A photo whose metadata the pixels contradict."""
+    """A photo whose metadata contradict its image observations."""
 
     photo: str
     """Photo.name."""
     field: str
     """`yaw`, `altitude`, `position` or `focal`."""
     reported: float
-    """What the metadata say: degrees, m above the datum, m off, px."""
+    """Value in the metadata: degrees, m above the datum, m off, px."""
     estimated: float
-    """What the photos together say, same unit."""
+    """Value estimated from all photos, same unit."""
     meaning: str
     """A plain sentence."""

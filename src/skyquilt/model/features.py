@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 DESCRIPTOR_UNIT = 400
-"""What a component of 1 is stored as; components of a RootSIFT vector hardly exceed 0.6."""
+"""Integer that stands for a component of 1; components of a RootSIFT vector rarely exceed 0.6."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -18,14 +18,15 @@ class Features:
     size: NDArray[np.float32]
     """(N,) diameter in px of the full sensor image."""
     descriptors: NDArray[np.uint8 | np.int8 | np.float32]
-    """(N, D), any multiple of a vector of unit length: DESCRIPTOR_UNIT times it as uint8 (signed:
-    int8), a quarter of the memory of floats, or floats. Where `binary`, uint8 whose bits are the
-    descriptor.
+    """(N, D), each row a multiple of a unit vector: scaled by DESCRIPTOR_UNIT as uint8 (signed:
+    int8), which takes a quarter of the memory of floats, or as floats. Where `binary`, uint8 whose
+    bits are the descriptor.
     """
     scale: float
     """Full-resolution px per px of the image the keypoints were found in."""
     binary: bool = False
-    """True where descriptors are bits, to be compared by the number of those that differ (Hamming).
+    """True where descriptors are bit strings, compared by the number of bits that differ (Hamming
+    distance).
     """
 
     def __len__(self) -> int:
@@ -35,8 +36,8 @@ class Features:
     def unit(self) -> NDArray[np.float32]:
         """(N, D) descriptors of unit length: the dot product of two is their similarity.
 
-        Bits become -1 and 1, (N, 8 D), so that 1 - similarity is twice the share of bits that
-        differ.
+        Bits 0 and 1 become -1 and 1, (N, 8 D), so that 1 - similarity is twice the share of bits
+        that differ.
         """
         if self.binary:
             signs = (
@@ -68,7 +69,7 @@ class Matches:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Link:
-    """Two photos that show the same ground, verified."""
+    """Two photos with verified matches: they show the same ground."""
 
     a: int
     """Index of the first photo."""
@@ -87,7 +88,7 @@ class Link:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RejectedLink:
-    """A pair that could not be verified: false in `if`, carries its reason."""
+    """A pair whose matches failed verification: false in `if`, carries the reason."""
 
     a: int
     """Index of the first photo."""

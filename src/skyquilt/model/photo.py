@@ -1,4 +1,4 @@
-"""One photo as it describes itself: measurements with error models, never facts."""
+"""One photo as its metadata describe it: measurements with standard deviations, not facts."""
 
 from dataclasses import dataclass
 from datetime import datetime
@@ -8,7 +8,7 @@ from typing import Literal
 from skyquilt.model.camera import Camera
 
 Datum = Literal["takeoff", "sea_level", "ellipsoid", "control", "unknown"]
-"""What a height is counted from; `control`: whatever the heights of the control points are."""
+"""What a height refers to; `control`: the same zero as the heights of the control points."""
 
 
 Stored = Literal["", "celsius", "kelvin", "decikelvin", "centikelvin", "counts"]
@@ -26,8 +26,8 @@ class GeoPosition:
     longitude_deg: float
     """Degrees, east positive."""
     altitude_m: float | None
-    """Height in m above `datum`; None where the photo gives none. The most trustworthy of those
-    found.
+    """Height in m above `datum`; None where the photo gives none. Where several are given, the most
+    reliable one.
     """
     datum: Datum
     """Zero of `altitude_m`."""
@@ -65,7 +65,7 @@ class Attitude:
     source: str = "xmp-gimbal"
     """Where it was read: `xmp-gimbal`, `xmp-camera`, `xmp-flight`, `geo.txt`, `csv`."""
     sigma_yaw_deg: float = 5.0
-    """Standard deviation of the yaw in degrees, when it does not lie altogether."""
+    """Standard deviation of the yaw in degrees, provided that the value is no gross error."""
     sigma_tilt_deg: float = 1.0
     """Standard deviation of pitch and of roll in degrees."""
 
@@ -86,7 +86,7 @@ class Focal:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Photo:
-    """One photo: where its pixels are and what its metadata claim."""
+    """One photo: where its pixels are and what its metadata report."""
 
     name: str
     """Unique in the survey: the path below the survey's folder, with forward slashes."""
@@ -113,14 +113,14 @@ class Photo:
     calibration: Camera | None = None
     """Intrinsics that metadata or a side file give, distortion included."""
     focal: Focal
-    """Always present; a guess with a wide deviation where nothing is known."""
+    """Always present; a guess with a large standard deviation where nothing is known."""
     position: GeoPosition | None
-    """None where the photo has none or it is void, e.g. (0, 0); then a note says so."""
+    """None where the photo has none or it is invalid, e.g. (0, 0); then a note reports it."""
     attitude: Attitude | None
     """The camera's attitude as reported."""
     flight_yaw_deg: float | None = None
-    """Heading of the aircraft as reported, degrees clockwise from true north; a second opinion on
-    the yaw.
+    """Heading of the aircraft as reported, degrees clockwise from true north; an independent check
+    of the yaw.
     """
     time: datetime | None
     """Capture time with sub-seconds; naive local time unless the photo states an offset."""
@@ -128,17 +128,17 @@ class Photo:
     """EXIF Orientation as written; never applied."""
     rolling_shutter: bool | None = None
     """True for known electronic (rolling) shutters, False for known global/mechanical ones, None
-    unknown.
+    where unknown.
     """
     editor: str | None = None
     """Software that rewrote the file after the camera, where the metadata name one."""
     notes: tuple[str, ...] = ()
-    """Plain sentences: what is missing, void or contradictory."""
+    """Plain sentences: what is missing, invalid or contradictory."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RejectedPhoto:
-    """A file that takes no part, and why. Never an exception: a bad photo never stops a survey."""
+    """A file that is not used, and why. Never an exception: a bad photo never stops a survey."""
 
     name: str
     """As in `Photo.name`."""
@@ -148,16 +148,18 @@ class RejectedPhoto:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Survey:
-    """What lies in a folder."""
+    """The content of a folder of photos."""
 
     photos: tuple[Photo, ...]
     """In order of capture (time, then name)."""
     rejected: tuple[RejectedPhoto, ...] = ()
     """Image files that could not be used, with reasons."""
     ignored: tuple[str, ...] = ()
-    """Names of files that are no photos (text, video, archives), left alone."""
+    """Names of files that are no photos (text, video, archives) and are not read."""
     notes: tuple[str, ...] = ()
-    """Plain sentences about the survey as a whole (two cameras, clocks apart, duplicates ...)."""
+    """Plain sentences about the survey as a whole (two cameras, different clocks, duplicates
+    ...).
+    """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -187,16 +189,16 @@ class ControlPoint:
     crs: str
     """As pyproj reads it, e.g. `EPSG:32615`."""
     observations: tuple[PointObservation, ...]
-    """Where it was seen."""
+    """Its observations in photos."""
     sigma_m: float = 0.02
     """Standard deviation of each coordinate in m."""
     check: bool = False
-    """True: kept out of the adjustment, used to judge it."""
+    """True: not used in the adjustment, but to check it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KnownDistance:
-    """A distance measured on the ground, by which maps are judged (Y 6.1)."""
+    """A distance measured on the ground, used to check maps (Y 6.1)."""
 
     a: str
     """Label of one end."""
@@ -205,6 +207,6 @@ class KnownDistance:
     metres: float
     """Length in m."""
     observations_a: tuple[PointObservation, ...]
-    """Where a was seen."""
+    """Observations of a."""
     observations_b: tuple[PointObservation, ...]
-    """Where b was seen."""
+    """Observations of b."""

@@ -1,4 +1,4 @@
-"""Where photos are: the map frame, poses, and the outcome of an alignment."""
+"""Where photos are: the map frame, poses, and the result of an alignment."""
 
 from dataclasses import dataclass, field
 
@@ -18,9 +18,9 @@ class MapFrame:
     crs: str | None
     """As pyproj reads it; None when nothing says where on Earth the survey is."""
     origin: tuple[float, float]
-    """Easting and northing in m of the frame's zero; heights are not shifted."""
+    """Easting and northing in m of the frame's origin; heights are not shifted."""
     vertical_datum: Datum
-    """What heights count from."""
+    """What heights refer to."""
     convergence_deg: float = 0.0
     """Meridian convergence: grid yaw = true yaw - convergence."""
     metric: bool = True
@@ -31,7 +31,7 @@ class MapFrame:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prior:
-    """What the metadata say about one photo's pose, in the map frame; NaN where they say
+    """What the metadata report about one photo's pose, in the map frame; NaN where they report
     nothing.
     """
 
@@ -50,7 +50,7 @@ class Prior:
     sigma_tilt_deg: float
     """Standard deviation of pitch and roll."""
     yaw_source: str = ""
-    """Where the yaw was read."""
+    """Which metadata the yaw was read from."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,16 +68,16 @@ class Pose:
     """
 
     def to_camera(self, xyz_map: Array) -> Array:
-        """Points (..., 3) in the map frame in camera coordinates (for a photo placed in the plane:
-        up to scale).
+        """Transforms points (..., 3) from the map frame to camera coordinates (for a photo placed
+        in the plane: up to scale).
         """
         if self.cam_H_map is not None:
             return np.asarray(xyz_map[..., :2] @ self.cam_H_map[:, :2].T + self.cam_H_map[:, 2])
         return np.asarray((xyz_map - self.map_C) @ self.cam_R_map.T)
 
     def planes_to_camera(self, x: Array, y: Array, z: Array) -> tuple[Array, Array, Array]:
-        """`to_camera` of coordinates that lie apart, in arrays that broadcast: for many points
-        three times as fast.
+        """`to_camera` for separate coordinate arrays, which are broadcast: three times as fast for
+        many points.
         """
         if self.cam_H_map is not None:
             a, b, c = (row[0] * x + row[1] * y + row[2] for row in self.cam_H_map)
@@ -98,30 +98,32 @@ class TiePoints:
     photo: NDArray[np.int64]
     """(N,) index of the photo of each observation."""
     px: Array
-    """(N, 2) where it was seen."""
+    """(N, 2) observed pixel."""
     residual_px: Array
-    """(N, 2) projected minus seen."""
+    """(N, 2) projected minus observed."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ControlResidual:
-    """How well a control or check point is met."""
+    """Residuals of a control or check point."""
 
     name: str
     """Label."""
     check: bool
-    """True: took no part in the adjustment."""
+    """True: not used in the adjustment."""
     error_m: Array
     """(3,) solution minus survey in m: x, y, z (NaN where the survey gives no height)."""
     reprojection_px: float
     """RMS over its observations in px."""
     observations: int
-    """Number of photos that show it."""
+    """Number of photos in which it was observed."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Join:
-    """How a method that adds one photo after the other joined this one to those before it."""
+    """How a method that adds photos one after the other registered this photo to those before
+    it.
+    """
 
     photo: int
     """Index of the photo."""
@@ -130,13 +132,13 @@ class Join:
     matches: int
     """Putative correspondences, or 0 where pixels were compared."""
     inliers: int
-    """Those that agree with the transformation."""
+    """Matches that agree with the transformation."""
     ste_px2: float
     """Symmetric transfer error per inlier in px^2 (A 15) of the working image; NaN where pixels
     were compared.
     """
     score: float
-    """Quality of the placement (Y 4.6) where pixels were compared, else NaN."""
+    """Quality of the placement (Y 4.6) where pixels were compared, otherwise NaN."""
     moved_m: float
     """Distance of the photo's nadir from its reported position in m; NaN where none is known."""
     px: Array
@@ -144,7 +146,7 @@ class Join:
     d_px: Array
     """(M, 2) their disparity vectors (Y 4.8) in px of the working image."""
     levelled: NDArray[np.bool_]
-    """(M,) False for features off the dominant plane, left out (Y 4.9)."""
+    """(M,) False for features off the dominant plane; they are left out (Y 4.9)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -166,11 +168,11 @@ class Alignment:
     camera_of: dict[int, str]
     """Photo index -> name of its calibration."""
     blocks: tuple[tuple[int, ...], ...]
-    """Photos that hang together by tie points, largest block first; single photos placed by
-    metadata last.
+    """Photos connected by tie points, largest block first; single photos placed by metadata
+    last.
     """
     ties: TiePoints
-    """Tie points; empty for methods without."""
+    """Tie points; empty for methods that compute none."""
     rejected: dict[int, str] = field(default_factory=dict)
     """Photo index -> reason."""
     control: tuple[ControlResidual, ...] = ()
@@ -178,13 +180,13 @@ class Alignment:
     loo_rms_m: tuple[float, float, float] | None = None
     """RMS over photos of the position residual of each photo predicted from all the others."""
     notes: tuple[str, ...] = ()
-    """Plain sentences worth a reader's attention."""
+    """Messages for the user."""
     joins: tuple[Join, ...] = ()
     """Steps of a method that adds one photo after the other, in that order."""
 
     @property
     def held(self) -> tuple[int, ...]:
-        """Placed photos that tie points hold to others, ascending."""
+        """Placed photos that are connected to others by tie points, ascending."""
         return tuple(
             sorted(i for block in self.blocks if len(block) > 1 for i in block if i in self.poses)
         )

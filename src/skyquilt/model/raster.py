@@ -1,4 +1,4 @@
-"""The pixel grid of a map, and pixels with their place."""
+"""The pixel grid of a map, and windows of it."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,4 +1,4 @@
-"""Two pictures laid on one another, or why they are not."""
+"""The registration of two images, or why it failed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,14 +13,14 @@ Model = Literal["identity", "similarity", "affine", "homography"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Picture:
-    """What is to be registered."""
+    """An image to be registered."""
 
     values: NDArray[Any]
     """(H, W) or (H, W, 3), as recorded: 8 bit, 16 bit or real numbers, NaN where nothing was
     measured.
     """
     valid: NDArray[np.bool_] | None = None
-    """(H, W) where there is a picture at all; None = to be found out."""
+    """(H, W) where the image has content; None = to be determined from the values."""
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -30,62 +30,62 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Guess:
-    """What is known of a registration beforehand: from metadata, or from the place of two maps."""
+    """What is known about a registration beforehand: from metadata, or from the positions of two
+    maps.
+    """
 
     b_H_a: Matrix
     """(3, 3) the most likely transform of a's pixels to b's."""
     reach: float = 0.15
-    """Largest shift from it, as a share of b's longer side."""
+    """Largest expected shift from it, as a share of b's longer side."""
     rotation_deg: float = 6.0
-    """Largest rotation from it, degrees."""
+    """Largest expected rotation from it, degrees."""
     scale: float = 1.25
-    """Largest factor from it, either way."""
+    """Largest expected change of scale from it, as a factor in either direction."""
     source: str = ""
-    """What it was taken from, in words."""
+    """Where it comes from, as a phrase."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Registration:
-    """Two pictures that show the same, and how; a is the reference."""
+    """A registration of two images that show the same ground; a is the reference."""
 
     model: Model
     """Family of the transform."""
     b_H_a: Matrix
     """(3, 3) takes a's pixels (x, y, centres at integers) to b's."""
     px_a: NDArray[np.float64]
-    """(n, 2) inliers in px of a: features, or middles of patches that find their place by
-    themselves.
-    """
+    """(n, 2) inliers in px of a: features, or centres of patches that were matched one by one."""
     px_b: NDArray[np.float64]
     """(n, 2) where they lie in b."""
     evidence: Mapping[str, float] = field(default_factory=dict)
-    """What acceptance rests on, by name."""
+    """Figures on which acceptance was decided, by name."""
     note: str = ""
-    """A sentence on what is special about it."""
+    """A sentence on what is special about this registration."""
     q: float = 0.0
     """Spread of the inliers over a [Yahyanejad 2013, (6.3)], in [0, 1]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RefusedRegistration:
-    """Pictures that could not be laid on one another: false in `if`, carries its reason."""
+    """Two images could not be registered: false in `if`, carries the reason."""
 
     reason: str
     """One sentence."""
     inliers: int = 0
-    """How many there were."""
+    """Number of inliers."""
     evidence: Mapping[str, float] = field(default_factory=dict)
-    """What the refusal rests on, by name."""
+    """Figures on which the refusal was decided, by name."""
 
     def __bool__(self) -> bool:
         return False
 
 
 class Registers(Protocol):
-    """A way to lay two pictures on one another."""
+    """A method that registers two images."""
 
     def __call__(
         self, a: Picture, b: Picture, guess: Guess | None = None
     ) -> Registration | RefusedRegistration:
-        """The registration of b to a in px of the pictures, or why there is none."""
+        """Registers b to a, in px of the images, or returns why that failed."""
         ...

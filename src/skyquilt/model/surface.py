@@ -1,4 +1,4 @@
-"""The height surface that photos are orthorectified over."""
+"""The height surface over which photos are orthorectified."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -24,7 +24,9 @@ class Surface:
     """What it was made from: `tie points` or `plane`."""
 
     def at(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float32]:
-        """Heights in m at map coordinates of any shape, bilinear; the rim is continued outwards."""
+        """Heights in m at map coordinates of any shape, bilinear; beyond the border the nearest
+        height.
+        """
         shape = np.shape(x)
         column = ((np.asarray(x) - self.x0) / self.cell).astype(np.float32)
         row = ((np.asarray(y) - self.y0) / self.cell).astype(np.float32)
@@ -46,14 +48,14 @@ class Surface:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HeightField:
-    """Heights as measured, gaps left open, on a regular grid in the map frame; row 0 is the
+    """Measured heights, with gaps, on a regular grid in the map frame; row 0 is the
     southernmost.
     """
 
     z: NDArray[np.float32]
-    """(rows, cols) heights in m above the frame's vertical datum; meaningless where not known."""
+    """(rows, cols) heights in m above the frame's vertical datum; meaningless where not `known`."""
     known: NDArray[np.bool_]
-    """(rows, cols) where two pictures agree on the height."""
+    """(rows, cols) where two images agree on the height."""
     x0: float
     """Easting of column 0 in m (map frame)."""
     y0: float
@@ -62,12 +64,12 @@ class HeightField:
     """Spacing in m."""
 
     def coarser(self, cell: float) -> "HeightField":
-        """Means over cells of about the size asked for; known where three in five of the heights in
-        it are.
+        """Means over cells of about the requested size; known where more than 60 % of their heights
+        are.
         """
         factor = min(
             1.0, self.cell / cell
-        )  # one for both axes, so that cells stay square: see `shrunken`
+        )  # one factor for both axes, so that cells stay square: see `shrunken`
         share, total = (
             np.asarray(cv2.resize(one, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
             for one in (self.known.astype(np.float32), np.where(self.known, self.z, np.float32(0)))

@@ -15,7 +15,6 @@ from skyquilt.engine.folder import STATE
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import UsageError
 from skyquilt.imaging.views import View
-from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Window
 from skyquilt.ortho.blend import Blend
@@ -43,18 +42,17 @@ SPOOL = "mosaic.spool"
 
 
 def composer(
-    photos: Sequence[Photo], ground: Ground, exposure: Exposure, blend: Blend, pixels: PhotoPixels
+    bands: int, dtype: str, ground: Ground, exposure: Exposure, blend: Blend, pixels: PhotoPixels
 ) -> Composer:
     """The composer of a survey's map; all photos have pixels of one kind."""
-    first = photos[ground.views[0].photo]
     return Composer(
         grid=ground.grid,
         views=ground.views,
         surface=ground.surface,
         blend=blend,
         pixels=pixels,
-        bands=first.channels,
-        dtype=np.dtype(first.dtype),
+        bands=bands,
+        dtype=np.dtype(dtype),
         exposure=exposure,
     )
 

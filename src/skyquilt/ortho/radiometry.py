@@ -61,20 +61,21 @@ class BalanceMethod(Protocol):
 
 
 def balanced(
-    photos: Sequence[Photo],
+    unit: str,
+    dtype: str,
     thumbnails: Mapping[int, NDArray[Any]],
     ground: Ground,
     balance: BalanceMethod,
     drift: DriftMethod,
     settings: PictureSettings,
 ) -> Exposure:
-    """Exposure of placed photos of one kind: of 8-bit images, or the drift of measured values;
-    neutral if no correction is requested. `thumbnails` are by photo (index).
+    """Exposure of placed photos of one kind, or the drift of measured values; neutral where neither
+    is wanted. `unit` and `dtype` are those of the pixels, `thumbnails` are by photo (index).
     """
-    bounds, unit = ground.grid.bounds, photos[0].unit
+    bounds = ground.grid.bounds
     if unit:
         return drift_of(ground.views, thumbnails, ground.surface, bounds, unit, drift, settings)
-    if not settings.balance or photos[0].dtype != "uint8":
+    if not settings.balance or dtype != "uint8":
         return NEUTRAL
     three = {i: t[..., None] if t.ndim == 2 else t for i, t in thumbnails.items()}
     return balance(ground.views, three, ground.surface, bounds)

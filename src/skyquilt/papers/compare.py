@@ -25,7 +25,7 @@ from skyquilt.raster.atomic import write_text
 from skyquilt.report.page import write_page
 from skyquilt.settings import OPTION_OF, MosaicSettings
 from skyquilt.version import __version__
-from skyquilt.workflows.flow import REGISTRY
+from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.methods import methods_for
 from skyquilt.workflows.mosaic import make_map, run_key
 from skyquilt.workflows.survey_input import SurveyInput, read_input

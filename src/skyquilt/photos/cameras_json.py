@@ -1,4 +1,4 @@
-"""`cameras.json` as OpenDroneMap and OpenSfM write it."""
+"""Reads `cameras.json` as OpenDroneMap and OpenSfM write it."""
 
 import json
 import re
@@ -10,7 +10,6 @@ from skyquilt.errors import SideFileError
 from skyquilt.geometry.camera_formats import camera_from_opensfm
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Focal, Photo
-from skyquilt.photos.calibration import rescaled
 
 _SIGMA_SHARE = 0.01
 
@@ -25,7 +24,7 @@ def read_cameras_json(path: Path) -> dict[str, Camera]:
         ) from error
     except ValueError as error:
         raise SideFileError(
-            f"{path.name} is no JSON ({error}). Give the file as it was written."
+            f"{path.name} is not JSON ({error}). Use the file as it was written."
         ) from error
     if (
         not isinstance(records, dict)
@@ -42,15 +41,15 @@ def read_cameras_json(path: Path) -> dict[str, Camera]:
 def apply_cameras(
     photos: Sequence[Photo], cameras: Mapping[str, Camera], *, file: Path
 ) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """The photos with the calibrations that fit them, and notes; raises `SideFileError` where none
-    fits.
+    """The photos with the calibrations that fit them, and notes; raises `SideFileError` where no
+    calibration fits.
     """
     fitting = {p.camera_key: _fitting(p, cameras) for p in photos}
     if not any(fitting.values()):
         raise SideFileError(
             f"{file.name} has cameras {', '.join(cameras)}; the photos are by {', '.join(fitting)}."
             " "
-            "Rename a camera to 'all', or give a calibration of this camera."
+            "Rename a camera to 'all', or provide a calibration of this camera."
         )
     without = [key for key, camera in fitting.items() if camera is None]
     notes = (f"{file.name} has no calibration for {', '.join(without)}.",) if without else ()
@@ -58,8 +57,8 @@ def apply_cameras(
 
 
 def _fitting(photo: Photo, cameras: Mapping[str, Camera]) -> Camera | None:
-    """By equal key, else by a key that holds the photo's model words, else `all` or the only
-    one.
+    """The camera with the photo's key, else one whose key contains all words of the photo's model
+    name, else `all` or the only one.
     """
     exact = [c for key, c in cameras.items() if key == photo.camera_key]
     words = set(re.split(r"[\s_]+", photo.camera_key.lower().rpartition(f" {photo.width}x")[0]))
@@ -77,7 +76,7 @@ def _fitting(photo: Photo, cameras: Mapping[str, Camera]) -> Camera | None:
 def _calibrated(photo: Photo, camera: Camera | None) -> Photo:
     if camera is None:
         return photo
-    own = rescaled(camera, width=photo.width, height=photo.height)
+    own = camera.rescaled(photo.width, photo.height)
     sigma = own.sigmas[0] if own.sigmas else _SIGMA_SHARE * own.focal
     notes = tuple(n for n in photo.notes if "focal length" not in n)
     focal = Focal(px=own.focal, sigma_px=sigma, source="calibrated")

@@ -1,4 +1,4 @@
-"""Where a survey's metadata contradict each other: measurements, never facts."""
+"""Checks whether a survey's metadata contradict each other: they are measurements, not facts."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -18,12 +18,12 @@ _METRES_PER_DEGREE = 111_320.0
 
 
 def contradictions(photos: Sequence[Photo]) -> tuple[str, ...]:
-    """Plain sentences, both values in each; photos in order of capture."""
+    """Sentences that report both contradicting values; `photos` in order of capture."""
     return (*_yaws(photos), *_tracks(photos), *_altitudes(photos), *_focals(photos))
 
 
 def yaw_disagreement_deg(photo: Photo) -> float | None:
-    """Camera yaw less flight yaw in [-180, 180) degrees; None where one is missing or the view is
+    """Camera yaw minus flight yaw in [-180, 180) degrees; None where one is missing or the view is
     oblique.
     """
     if photo.attitude is None or photo.flight_yaw_deg is None:
@@ -49,7 +49,7 @@ def _yaws(photos: Sequence[Photo]) -> Iterator[str]:
 
 
 def _tracks(photos: Sequence[Photo]) -> Iterator[str]:
-    """The way from the last photo against the aircraft's heading: a sideways flight, or a wrong
+    """Direction of flight from GPS against the aircraft's heading: a sideways flight, or a wrong
     heading.
     """
     apart = []
@@ -62,9 +62,9 @@ def _tracks(photos: Sequence[Photo]) -> Iterator[str]:
     if len(odd) > max(2, len(apart) // 4):
         median = float(np.median([d for _, d in apart]))
         yield (
-            f"The way flown (from GPS) and the heading differ by more than {_YAW_APART_DEG:.0f} deg"
-            " at "
-            f"{len(odd)} of {len(apart)} steps, by {median:.0f} deg in the median:"
+            "The direction of flight (from GPS) and the heading differ by more than"
+            f" {_YAW_APART_DEG:.0f} deg at"
+            f" {len(odd)} of {len(apart)} steps, by {median:.0f} deg in the median:"
             f" {sentence_of(odd)}."
         )
 
@@ -94,7 +94,7 @@ def _altitudes(photos: Sequence[Photo]) -> Iterator[str]:
         {p.position.datum for p in photos if p.position and p.position.altitude_m is not None}
     )
     if len(datums) > 1:
-        yield f"The heights count from different zeros: {', '.join(datums)}."
+        yield f"The heights refer to different zeros: {', '.join(datums)}."
     placed = [p.position for p in photos if p.position]
     both = [
         p.sea_level_m - p.takeoff_m
@@ -103,7 +103,7 @@ def _altitudes(photos: Sequence[Photo]) -> Iterator[str]:
     ]
     if both and max(both) - min(both) > _ALTITUDE_APART_M:
         yield (
-            "Height above sea level less height above take-off should be one number, but runs from"
+            "Height above sea level minus height above take-off should be constant, but ranges from"
             " "
             f"{min(both):.0f} to {max(both):.0f} m: one of the two drifts."
         )
@@ -111,7 +111,7 @@ def _altitudes(photos: Sequence[Photo]) -> Iterator[str]:
         heights = [p.altitude_m for p in placed if p.datum == datum and p.altitude_m is not None]
         if max(heights) - min(heights) > _ALTITUDE_RANGE_M:
             yield (
-                f"Heights ({datum.replace('_', ' ')}) run from {min(heights):.0f} to"
+                f"Heights ({datum.replace('_', ' ')}) range from {min(heights):.0f} to"
                 f" {max(heights):.0f} m: "
                 "the flight climbed, or the altitude drifts."
             )
@@ -122,7 +122,7 @@ def _focals(photos: Sequence[Photo]) -> Iterator[str]:
         focals = [p.focal.px for p in photos if p.camera_key == key]
         if max(focals) > 1.05 * min(focals):
             yield (
-                f"Photos of {key} claim focal lengths from {min(focals):.0f} to {max(focals):.0f}"
+                f"Photos of {key} report focal lengths from {min(focals):.0f} to {max(focals):.0f}"
                 " px."
             )
 

@@ -1,9 +1,9 @@
 """Known distances on the ground: a CSV with the header `point_a,point_b,metres`.
 
-Where the points are seen is told in one of three ways: by further columns
+The observations of the points are given in one of three ways: by further columns
 `px_a,py_a,image_a,px_b,py_b,image_b`, several rows for several observations; by writing a point as
 `px py image`; or by the names of points in gcp_list.txt. Pixels have their centres at integers, as
-there.
+in gcp_list.txt.
 """
 
 import csv
@@ -43,7 +43,7 @@ def read_distances(
             )
         if lengths.setdefault((ends[0], ends[1]), metres) != metres:
             raise SideFileError(
-                f"{place}: {ends[0]} to {ends[1]} has two different lengths. Correct one of its"
+                f"{place}: {ends[0]} to {ends[1]} has two different lengths. Correct one of the"
                 " rows."
             )
         for end, label in zip(_ENDS, ends, strict=True):
@@ -59,7 +59,7 @@ def read_distances(
         raise SideFileError(
             f"{path.name} names {sentence_of(sorted(set(strangers)))}; no photo of the survey is"
             " called that."
-            " Correct the image names or take the rows out."
+            " Correct the image names or remove the rows."
         )
     return tuple(
         KnownDistance(
@@ -74,14 +74,14 @@ def read_distances(
 
 
 def _rows(path: Path) -> list[tuple[str, Mapping[str, str]]]:
-    """Rows by column name, each with its place in the file for messages."""
+    """Rows by column name, each with its position in the file for messages."""
     lines = read_lines(path)
     table = list(csv.reader([line for _, line in lines], skipinitialspace=True))
     header = [re.sub(r"[\s(\[].*", "", cell.strip().lower()) for cell in table[0]] if table else []
     missing = [c for c in _NEEDED if c not in header]
     if missing or len(table) < 2:
         raise SideFileError(
-            f"{path.name}: expected a header with {', '.join(_NEEDED)} and a line per distance,"
+            f"{path.name}: expected a header with {', '.join(_NEEDED)} and one line per distance,"
             f" found '{', '.join(header)}' and {max(0, len(table) - 1)} lines. See the"
             " documentation of --distances."
         )
@@ -105,7 +105,7 @@ def _observations(
     known: Mapping[str, Sequence[PointObservation]],
     place: str,
 ) -> Sequence[PointObservation]:
-    """Observations that a row tells of one end."""
+    """The observations of one end that a row gives."""
     words = [row.get(f"{c}_{end}", "").strip() for c in ("px", "py", "image")]
     if not any(words):
         if known.get(label):
@@ -114,7 +114,7 @@ def _observations(
     x, y = finite(number(words[0])), finite(number(words[1]))
     if x is None or y is None or not words[2]:
         raise SideFileError(
-            f"{place}: nothing tells where point '{label}' is seen; add columns px_{end}, py_{end},"
+            f"{place}: there is no observation of point '{label}'; add columns px_{end}, py_{end},"
             f" image_{end},"
             " or name a point of gcp_list.txt"
         )

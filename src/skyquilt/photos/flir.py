@@ -23,7 +23,7 @@ _ZERO_CELSIUS = 273.15
 
 @dataclass(frozen=True, kw_only=True)
 class FlirCamera:
-    """The radiometric constants of one frame; temperatures in K, distance in m, the rest without
+    """The radiometric constants of one frame; temperatures in K, distance in m, the others without
     unit.
     """
 
@@ -46,14 +46,14 @@ class FlirCamera:
     x: float = 1.0
 
     def signal(self, kelvin: float) -> float:
-        """Counts that a black body of this temperature yields."""
+        """Counts recorded for a black body of this temperature."""
         return self.planck_r1 / (
             self.planck_r2 * (math.exp(self.planck_b / kelvin) - self.planck_f)
         ) - (self.planck_o)
 
     @property
     def transmission(self) -> float:
-        """Of the air between object and camera, from humidity and distance."""
+        """Transmission of the air between object and camera, from humidity and distance."""
         t = self.atmosphere_k - _ZERO_CELSIUS
         water = self.humidity * math.exp(1.5587 + 0.06939 * t - 2.7816e-4 * t**2 + 6.8455e-7 * t**3)
         d, w = math.sqrt(max(self.distance_m, 0.0)), math.sqrt(max(water, 0.0))
@@ -62,7 +62,9 @@ class FlirCamera:
         return self.x * first + (1 - self.x) * second
 
     def celsius(self, counts: NDArray[np.generic]) -> NDArray[np.float32]:
-        """Object temperature in deg C, shape as given; NaN where the counts are no radiance."""
+        """Object temperature in deg C, shape as given; NaN where the counts correspond to no
+        radiance.
+        """
         tau, e, w = self.transmission, self.emissivity, self.window_transmission
         seen = (counts.astype(np.float64) - (1 - w) * self.signal(self.window_k)) / w
         seen -= (1 - tau) * self.signal(self.atmosphere_k) + (1 - e) * tau * self.signal(
@@ -80,7 +82,7 @@ class FlirCamera:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FlirFrame:
-    """Raw counts of one frame and what turns them into temperatures."""
+    """Raw counts of one frame, and the constants to convert them to temperatures."""
 
     counts: NDArray[np.uint16]
     """(height, width)."""
@@ -100,7 +102,7 @@ def read_flir(jpeg: JpegHeader) -> FlirFrame | None:
         return FlirFrame(counts=counts, camera=_camera(records.get(_CAMERA, b"")))
     except (
         Exception
-    ):  # struct, Pillow and numpy raise many kinds on garbage; all mean that there is no frame
+    ):  # struct, Pillow and numpy raise many exceptions on bad data; all mean: no frame
         return None
 
 
@@ -117,7 +119,7 @@ def _records(block: bytes) -> dict[int, bytes]:
 
 
 def _order(record: bytes) -> str:
-    """Every record opens with the number 2 in its own byte order."""
+    """Byte order of a record: every record starts with the number 2 in its own byte order."""
     return "<" if record[:2] == b"\x02\x00" else ">"
 
 
@@ -128,7 +130,7 @@ def _counts(record: bytes) -> NDArray[np.uint16]:
     if body.startswith(b"\x89PNG"):
         with Image.open(io.BytesIO(body)) as image:
             if image.size != (width, height) or not image.mode.startswith("I"):
-                raise ValueError("its raw PNG is no 16-bit image of the size the record states")
+                raise ValueError("its raw PNG is not a 16-bit image of the size in the record")
             swapped = np.asarray(image, dtype=np.uint16)
         return np.asarray(
             swapped.byteswap(), dtype=np.uint16
@@ -173,7 +175,9 @@ def _camera(record: bytes) -> FlirCamera | None:
 
 
 def _is_thermometer(camera: FlirCamera) -> bool:
-    """Whether hotter means more counts, through air that lets something pass."""
+    """Whether the constants are plausible: more counts for higher temperatures, and air that
+    transmits.
+    """
     try:
         steps = [camera.signal(kelvin) for kelvin in (150.0, 250.0, 350.0, 1000.0)]
         return (

@@ -1,9 +1,9 @@
 """OpenDroneMap's `gcp_list.txt`: a coordinate system, then `x y z px py image [name] [check]`.
 
-Rows with one name, or without names the same x, y and z, are observations of one point. z may be
-NaN. Pixels have their centres at integers. A check point, kept out of the adjustment, has a name
-that starts with `check` or the word `check` in the eighth column: both are extensions that
-OpenDroneMap reads over.
+Rows with the same name, or without names the same x, y and z, are observations of one point. z may
+be NaN. Pixels have their centres at integers. A check point, which is not used in the adjustment,
+has a name that starts with `check` or the word `check` in the eighth column: OpenDroneMap ignores
+both extensions.
 """
 
 from collections.abc import Iterable
@@ -34,11 +34,11 @@ class _Observation:
 def read_gcp_list(
     path: Path, photo_names: Iterable[str]
 ) -> tuple[tuple[ControlPoint, ...], tuple[str, ...]]:
-    """Control points seen in the photos of a survey, and notes on rows of photos that are not in
-    it.
+    """Control points observed in the photos of a survey, and notes on rows of photos that are not
+    in it.
 
     `photo_names` are `Photo.name`s. Raises `SideFileError` where a line is malformed, one point has
-    two places, or no row names a photo of the survey.
+    two positions, or no row names a photo of the survey.
     """
     lines = read_lines(path)
     if len(lines) < 2:
@@ -67,12 +67,14 @@ def read_gcp_list(
 def _notes(path: Path, strangers: list[str], points: list[ControlPoint]) -> tuple[str, ...]:
     unseen = [p.name for p in points if not p.observations]
     missing = (
-        f"{path.name} names photos that are not there: {sentence_of(strangers)}."
+        f"{path.name} names photos that are not in the survey: {sentence_of(strangers)}."
         if strangers
         else ""
     )
     lost = (
-        f"Control points seen in no photo of the survey: {sentence_of(unseen)}." if unseen else ""
+        f"Control points without an observation in the survey: {sentence_of(unseen)}."
+        if unseen
+        else ""
     )
     return tuple(n for n in (missing, lost) if n)
 
@@ -109,7 +111,7 @@ def _point(
     label = first.name or f"point {i}"
     if len({(s.x, s.y, s.z) for s in group}) > 1:
         raise SideFileError(
-            f"{path.name}: point {label} has two different places. Correct one of its rows."
+            f"{path.name}: point {label} has two different places. Correct one of the rows."
         )
     seen = ((names.find(s.image), s) for s in group)
     return ControlPoint(

@@ -1,4 +1,4 @@
-"""What a file says before its pixels: JPEG segments, size, type, EXIF, XMP, raw thermal data."""
+"""File headers: JPEG segments, size, type, EXIF, XMP, raw thermal data."""
 
 import hashlib
 import io
@@ -20,6 +20,7 @@ SOI, EOI, SOS = 0xD8, 0xD9, 0xDA
 APP1, APP3 = 0xE1, 0xE3
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _BARE = frozenset({0x01, *range(0xD0, 0xD8)})  # markers without a length
+_FLIR = b"FLIR\x00"
 _EXIF = b"Exif\x00"
 _XMP = b"http://ns.adobe.com/xap/1.0/\x00"
 _XMP_MORE = b"http://ns.adobe.com/xmp/extension/\x00"
@@ -27,18 +28,23 @@ _XMP_MORE = b"http://ns.adobe.com/xmp/extension/\x00"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JpegHeader:
-    """What stands before the first scan."""
+    """The content of a JPEG file before the first scan."""
 
     width: int
-    """Width in px as coded."""
+    """Width in px as encoded."""
     height: int
-    """Height in px as coded."""
+    """Height in px as encoded."""
     channels: int
     """Colour components: 1, 3 or 4."""
     segments: tuple[tuple[int, bytes], ...]
     """Marker and payload of every APP segment, in the order of the file."""
     scan_offset: int
     """Byte at which the first scan begins."""
+
+    @property
+    def radiometric(self) -> bool:
+        """Whether segments of the kind that FLIR and DJI keep raw thermal data in are there."""
+        return any(m == APP3 or (m == APP1 and p.startswith(_FLIR)) for m, p in self.segments)
 
     @property
     def exif(self) -> bytes:
@@ -58,9 +64,7 @@ class JpegHeader:
         return (*main, more) if more else tuple(main)
 
     def joined(self, marker: int, prefix: bytes = b"") -> bytes:
-        """Payloads of one marker that start with `prefix`, the prefix dropped, one after
-        another.
-        """
+        """Payloads of one marker that start with `prefix`, joined without the prefix."""
         return b"".join(
             p[len(prefix) :] for m, p in self.segments if m == marker and p.startswith(prefix)
         )
@@ -69,11 +73,11 @@ class JpegHeader:
 def _next_marker(file: BinaryIO) -> int:
     byte = file.read(1)
     if byte != b"\xff":
-        raise UnreadablePhotoError("its JPEG header is broken or cut off")
+        raise UnreadablePhotoError("its JPEG header is broken or truncated")
     while byte == b"\xff":  # fill bytes may precede a marker
         byte = file.read(1)
     if not byte:
-        raise UnreadablePhotoError("its JPEG header is cut off")
+        raise UnreadablePhotoError("its JPEG header is truncated")
     return byte[0]
 
 
@@ -81,14 +85,14 @@ def _payload(file: BinaryIO) -> bytes:
     length = int.from_bytes(file.read(2), "big") - 2
     payload = file.read(max(length, 0))
     if length < 0 or len(payload) < length:
-        raise UnreadablePhotoError("its JPEG header is cut off")
+        raise UnreadablePhotoError("its JPEG header is truncated")
     return payload
 
 
 def read_jpeg_header(file: BinaryIO) -> JpegHeader:
-    """Walk the segments up to the first scan.
+    """Reads the segments up to the first scan.
 
-    Raises `UnreadablePhotoError` where the header is broken, cut off or declares no image.
+    Raises `UnreadablePhotoError` where the header is broken, truncated or declares no image.
     """
     file.seek(2)
     segments: list[tuple[int, bytes]] = []
@@ -100,11 +104,8 @@ def read_jpeg_header(file: BinaryIO) -> JpegHeader:
             raise UnreadablePhotoError("it is a JPEG without an image in it")
         payload = _payload(file)
         if marker in _FRAMES and len(payload) >= 6:
-            frame = (
-                int.from_bytes(payload[3:5], "big"),
-                int.from_bytes(payload[1:3], "big"),
-                payload[5],
-            )
+            height, width = (int.from_bytes(payload[k : k + 2], "big") for k in (1, 3))
+            frame = width, height, payload[5]
         elif 0xE0 <= marker <= 0xEF:
             segments.append((marker, payload))
     if frame is None or 0 in frame:
@@ -119,11 +120,11 @@ def read_jpeg_header(file: BinaryIO) -> JpegHeader:
 
 
 def has_end(file: BinaryIO, scan_offset: int) -> bool:
-    """Whether the pixels are closed by an end-of-image marker.
+    """Whether the pixels end with an end-of-image marker.
 
     Inside the coded pixels FF D9 cannot occur (FF is stuffed), so the first one after the scan's
-    start is the image's own end, whatever previews or padding follow it. The tail is tried first,
-    as it mostly lies there.
+    start is the image's own end, whatever previews or padding follow it. The end of the file is
+    searched first, because the marker is usually there.
     """
     size = file.seek(0, io.SEEK_END)
     file.seek(max(scan_offset, size - 2))
@@ -147,10 +148,10 @@ _TIFF_MAGIC = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Header:
-    """The head of one image file."""
+    """The header of one image file."""
 
     kind: Kind
-    """Format by content, whatever the name says."""
+    """Format by content, independent of the file name."""
     width: int
     """Width in px."""
     height: int
@@ -168,7 +169,9 @@ class Header:
 
 
 def read_header(path: Path) -> Header:
-    """Read the head of an image; raises `UnreadablePhotoError` with the reason, nothing else."""
+    """Reads the header of an image; raises `UnreadablePhotoError` with the reason, and no other
+    exception.
+    """
     try:
         with path.open("rb") as file:
             kind = _kind(file)
@@ -177,17 +180,16 @@ def read_header(path: Path) -> Header:
         raise
     except OSError as error:
         raise UnreadablePhotoError(f"it cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # tifffile and Pillow raise many kinds on garbage
-        raise UnreadablePhotoError(
-            f"its header is broken ({type(error).__name__}: {error})"
-        ) from error
+    except Exception as error:  # tifffile and Pillow raise many exceptions on broken data
+        broken = f"its header is broken ({type(error).__name__}: {error})"
+        raise UnreadablePhotoError(broken) from error
 
 
 def content_digest(path: Path) -> str:
-    """BLAKE2b of the file (hex); of a JPEG over 1 MiB of its size, first and last 256 KiB.
+    """BLAKE2b of the file (hex); for a JPEG over 1 MiB, of its size and its first and last 256 KiB.
 
-    Coded pixels shift everything behind a change, so the ends betray it; other formats are hashed
-    whole.
+    A change in coded pixels shifts all bytes after it, so it changes the end of the file; other
+    formats are hashed completely.
     """
     digest = hashlib.blake2b(digest_size=16)
     with path.open("rb") as file:
@@ -214,13 +216,13 @@ def _kind(file: BinaryIO) -> Kind:
         return "tiff"
     if head == b"\x89PNG\r\n\x1a\n":
         return "png"
-    raise UnreadablePhotoError("it is neither JPEG, TIFF nor PNG inside, whatever its name says")
+    raise UnreadablePhotoError("its content is neither JPEG, TIFF nor PNG, whatever its name")
 
 
 def _jpeg(file: BinaryIO) -> Header:
     head = read_jpeg_header(file)
     if not has_end(file, head.scan_offset):
-        raise UnreadablePhotoError("it is cut off: its JPEG data never end")
+        raise UnreadablePhotoError("it is truncated: its JPEG data never end")
     return Header(
         kind="jpeg",
         width=head.width,
@@ -234,14 +236,14 @@ def _jpeg(file: BinaryIO) -> Header:
 
 
 def _tiff(file: BinaryIO) -> Header:
-    import tifffile  # most photos are JPEGs
+    import tifffile  # imported here because most photos are JPEGs
 
     exif = read_tiff_tags(file)
     file.seek(0)
     with tifffile.TiffFile(file) as tiff:
         page = tiff.pages[0]
         if not isinstance(page, tifffile.TiffPage) or page.dtype is None:
-            raise UnreadablePhotoError("it is a TIFF of a kind that cannot be decoded")
+            raise UnreadablePhotoError("its kind of TIFF cannot be decoded")
         _check_extent(page, file)
         packet = page.tags[700].value if 700 in page.tags else b""
         alpha = sum(int(e) in (1, 2) for e in page.extrasamples)
@@ -263,7 +265,7 @@ def _check_extent(page: "tifffile.TiffPage", file: BinaryIO) -> None:
     have = file.seek(0, io.SEEK_END)
     if need > have:
         raise UnreadablePhotoError(
-            f"it is cut off: its pixels need {need} bytes, the file has {have}"
+            f"it is truncated: its pixels need {need} bytes, the file has {have}"
         )
 
 
@@ -274,13 +276,13 @@ def _stored_as(dtype: "np.dtype[np.generic]") -> Dtype:
         return "uint16"
     if dtype.kind in "iuf":
         return "float32"
-    raise UnreadablePhotoError(f"its pixels are of type {dtype}; whole or real numbers are needed")
+    raise UnreadablePhotoError(f"its pixels are {dtype}; integers or real numbers are needed")
 
 
 def _png(file: BinaryIO) -> Header:
     file.seek(-12, io.SEEK_END)
     if b"IEND" not in file.read(12):
-        raise UnreadablePhotoError("it is cut off: its PNG data never end")
+        raise UnreadablePhotoError("it is truncated: its PNG data never end")
     file.seek(0)
     with Image.open(file) as image:
         packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""

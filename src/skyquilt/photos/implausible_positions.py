@@ -1,5 +1,5 @@
-"""Positions that cannot be: one far from all others, all in one place, a whole flight at height
-zero.
+"""Detects implausible positions: one far from all others, all in one place, a whole flight at
+height zero.
 """
 
 from collections.abc import Sequence
@@ -19,11 +19,12 @@ _STUCK_PHOTOS = 4
 
 
 def without_outliers(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """The photos, with positions taken off those that lie absurdly far away, and a note for each.
+    """The photos, without the positions that are implausibly far from the others, and a note for
+    each.
 
-    Absurd is more than 5 km from the median and more than 20 times the median distance to it; three
-    positions are the least that can tell which one is wrong. The photo stays, and its note keeps
-    the value.
+    Implausible is more than 5 km from the median and more than 20 times the median distance to it;
+    it takes at least three positions to decide which one is wrong. The photo stays, and its note
+    keeps the value.
     """
     placed = [p for p in photos if p.position]
     if len(placed) < 3:
@@ -32,16 +33,16 @@ def without_outliers(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[
     limit = max(_FAR_M, _FAR_SPREADS * float(np.median(list(distance.values()))))
     far = {name: d for name, d in distance.items() if d > limit}
     notes = tuple(
-        f"{name} claims to lie {d / 1000:.0f} km from the others." for name, d in far.items()
+        f"{name} reports a position {d / 1000:.0f} km from the others." for name, d in far.items()
     )
     return tuple(_unplaced(p, far[p.name]) if p.name in far else p for p in photos), notes
 
 
 def without_ground_heights(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """Heights above sea level in place of heights above take-off that stay at zero through a whole
-    flight.
+    """Replaces heights above take-off that stay at zero during a whole flight by heights above sea
+    level.
 
-    Some firmware writes `RelativeAltitude` 0 throughout; nobody maps from below 2 m.
+    Some firmware always writes `RelativeAltitude` 0; nobody maps from below 2 m.
     """
     heights = [
         p.position.takeoff_m for p in photos if p.position and p.position.takeoff_m is not None
@@ -53,20 +54,19 @@ def without_ground_heights(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], 
 
 
 def without_stuck(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """The photos, without positions where four or more report one and the same: a receiver that
-    stood still.
+    """The photos, without positions where all are identical in four or more photos: the receiver
+    was stuck.
 
-    Believed, they would shrink the map to a point.
+    Such positions would shrink the map to a point.
     """
     placed = [p for p in photos if p.position]
     if len(placed) < _STUCK_PHOTOS or distances_to_median(placed).max() > _STUCK_M:
         return tuple(photos), ()
     place = placed[0].position
     note = (
-        f"All {len(placed)} positions are one and the same"
-        f" ({place.latitude_deg:.6f}, {place.longitude_deg:.6f}): the receiver stood still, and"
-        " they were not"
-        " used. Give positions in a geo.txt, or control points."
+        f"All {len(placed)} positions are identical"
+        f" ({place.latitude_deg:.6f}, {place.longitude_deg:.6f}): the receiver was stuck, and"
+        " they were not used. Provide positions in a geo.txt, or control points."
         if place
         else ""
     )
@@ -85,11 +85,11 @@ def _unraised(photo: Photo) -> Photo:
 
 
 def _far_pair(placed: Sequence[Photo]) -> tuple[str, ...]:
-    """Of two positions nobody can tell which one is wrong, but that one is."""
+    """With two positions far apart, one of them is wrong, but it cannot be decided which."""
     apart = 2 * float(distances_to_median(placed)[0]) if len(placed) == 2 else 0.0
     if apart <= _FAR_M:
         return ()
-    return (f"{placed[0].name} and {placed[1].name} claim to lie {apart / 1000:.0f} km apart.",)
+    return (f"{placed[0].name} and {placed[1].name} report positions {apart / 1000:.0f} km apart.",)
 
 
 def distances_to_median(photos: Sequence[Photo]) -> NDArray[np.float64]:

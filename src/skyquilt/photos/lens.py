@@ -1,4 +1,4 @@
-"""The focal length of a photo, by a camera database and by what the photo itself says."""
+"""The lens of a photo: sensor database, focal length, and calibrations in XMP."""
 
 import csv
 import math
@@ -8,10 +8,10 @@ from functools import cache
 from importlib.resources import files
 from typing import Literal
 
-from skyquilt.model.camera import Camera
+from skyquilt.model.camera import PARAMETERS, Camera
 from skyquilt.model.photo import Focal
 from skyquilt.photos import tags as tag
-from skyquilt.photos.tags import Exif
+from skyquilt.photos.tags import Exif, Xmp
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,13 +23,13 @@ class Sensor:
     model: str
     """As in EXIF."""
     image_width: int | None
-    """Long side in px of the images this row is for; None = all of the model."""
+    """Long side in px of the images to which this row applies; None = all images of the model."""
     width_mm: float
     """Length of the sensor's long side in mm."""
     focal_mm: float | None
-    """Focal length of a lens that cannot be changed, in mm; used where EXIF has none."""
+    """Focal length of a fixed lens in mm; used where EXIF has none."""
     shutter: Literal["rolling", "global", ""]
-    """`global` stands for mechanical shutters too."""
+    """`global` includes mechanical shutters."""
     band: Literal["visible", "thermal"]
     """Spectrum."""
 
@@ -60,10 +60,11 @@ def _table() -> dict[str, tuple[Sensor, ...]]:
 
 
 def find_sensor(*, model: str, long_side: int) -> Sensor | None:
-    """The row for an EXIF model name and the long side in px of its images as taken; None if
+    """The row for an EXIF model name and the long side in px of its images as captured; None if
     unknown.
 
-    A model with rows for several image sizes (a visible and a thermal eye) needs the right size.
+    For a model with rows for several image sizes (a visible and a thermal camera) the size must
+    match.
     """
     rows = _table().get(_plain(model), ())
     exact = [r for r in rows if r.image_width == long_side]
@@ -74,7 +75,7 @@ def find_sensor(*, model: str, long_side: int) -> Sensor | None:
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 _PLAUSIBLE = (0.2, 60.0)
-"""A focal length outside these multiples of the long side is a slip of the pen, not a lens."""
+"""A focal length outside these multiples of the long side is an error, not a lens."""
 _MOST_ZOOM = 16.0
 _APART = 1.2
 """Focal lengths that differ by more than this factor contradict each other; 35 mm values are
@@ -83,11 +84,9 @@ rounded.
 
 
 def native_scale(exif: Exif, width: int, height: int) -> tuple[float, str]:
-    """How many px of the file stand for one px as taken, and a note where the sizes disagree in
-    shape.
+    """Pixels of the file per pixel as captured, and a note where the aspect ratios differ.
 
-    EXIF keeps the size the camera wrote; a reduced copy still carries it. 1.0 where EXIF says
-    nothing.
+    EXIF keeps the size that the camera wrote, also in a reduced copy. 1.0 where EXIF has no size.
     """
     x, y = exif.number(tag.PIXELS_X), exif.number(tag.PIXELS_Y)
     if not x or not y or x < 1 or y < 1:
@@ -112,8 +111,8 @@ def find_focal(
     height: int,
     thermal: bool = False,
 ) -> Focal:
-    """The first of: calibrated, mm on the sensor, focal-plane resolution, 35 mm equivalent, a
-    guess.
+    """The first available of: calibrated, mm on the sensor, focal-plane resolution, 35 mm
+    equivalent, a guess.
     """
     candidates = (
         _calibrated(calibration),
@@ -130,16 +129,16 @@ def find_focal(
 
 
 def digital_zoom(exif: Exif) -> float:
-    """By how much the camera enlarged the middle of its image; 1.0 where EXIF says nothing."""
+    """Factor by which the camera enlarged the middle of its image; 1.0 where EXIF has none."""
     zoom = exif.number(tag.ZOOM) or 1.0
     return zoom if 1.0 < zoom <= _MOST_ZOOM else 1.0
 
 
 def focal_notes(exif: Exif, sensor: Sensor | None, width: int, height: int) -> tuple[str, ...]:
-    """Where EXIF's ways to the focal length disagree, and a digital zoom."""
+    """Notes on focal lengths in EXIF that disagree, and on a digital zoom."""
     zoom = digital_zoom(exif)
     zoomed = (
-        f"It was taken with a digital zoom of {zoom:g}; the focal length counts it in."
+        f"It was taken with a digital zoom of {zoom:g}; the focal length includes it."
         if zoom > 1
         else ""
     )
@@ -147,7 +146,7 @@ def focal_notes(exif: Exif, sensor: Sensor | None, width: int, height: int) -> t
     rounded = _from_35mm(exif, width, height)
     if direct and rounded and not 1 / _APART < direct.px / rounded.px < _APART:
         return zoomed, (
-            f"Its focal length in mm means {direct.px:.0f} px, its 35 mm equivalent"
+            f"Its focal length in mm corresponds to {direct.px:.0f} px, its 35 mm equivalent to"
             f" {rounded.px:.0f} px; "
             "one of them is wrong."
         )
@@ -187,3 +186,105 @@ def _from_35mm(exif: Exif, width: int, height: int) -> Focal | None:
         return None
     px = mm / _DIAGONAL_35MM * math.hypot(width, height)
     return Focal(px=px, sigma_px=0.05 * px, source="35mm")
+
+
+_SIGMA_SHARE = {"focal": 0.01, "centre": 0.003}
+_SIGMA_RADIAL, _SIGMA_TANGENTIAL = 0.01, 0.001
+"""Standard deviations assumed for a manufacturer's distortion coefficients."""
+
+
+def read_calibration(
+    *, exif: Exif, xmp: Xmp, sensor: Sensor | None, width: int, height: int, scale: float
+) -> Camera | None:
+    """The first of DJI's `DewarpData`, Pix4D's `Camera:Perspective*` and DJI's
+    `CalibratedFocalLength`.
+
+    `scale` is this file's px per px as captured (`lens.native_scale`): the calibration refers to
+    the latter.
+    """
+    native = (round(width / scale), round(height / scale))
+    found = (
+        _dewarp(xmp, native)
+        or _perspective(exif, xmp, sensor, native)
+        or _calibrated_focal(xmp, native)
+    )
+    return found and found.rescaled(width, height)
+
+
+def _dewarp(xmp: Xmp, size: tuple[int, int]) -> Camera | None:
+    """`date;fx,fy,cx,cy,k1,k2,p1,p2,k3`, cx and cy from the image centre; flag 1: already
+    undistorted.
+    """
+    _, _, numbers = xmp.text("DewarpData").partition(";")
+    try:
+        fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(n) for n in numbers.split(","))
+    except ValueError:
+        return None
+    if xmp.number("DewarpFlag") == 1:
+        k1 = k2 = k3 = p1 = p2 = 0.0
+    return _camera(size, (fx + fy) / 2, (cx + size[0] / 2, cy + size[1] / 2), (k1, k2, k3, p1, p2))
+
+
+def _perspective(
+    exif: Exif, xmp: Xmp, sensor: Sensor | None, size: tuple[int, int]
+) -> Camera | None:
+    """Lengths in mm on the sensor, from its corner; distortion as OpenCV's k1, k2, k3, p1, p2."""
+    mm = xmp.number("Camera:PerspectiveFocalLength")
+    if not mm or xmp.text("Camera:ModelType").lower() == "fisheye":
+        return None
+    px_per_mm = _px_per_mm(exif, sensor, size)
+    if xmp.text("Camera:PerspectiveFocalLengthUnits").lower().startswith("pix"):
+        px_per_mm = 1.0
+    if px_per_mm is None:
+        return None
+    point = xmp.numbers("Camera:PrincipalPoint")
+    centre = (
+        (point[0] * px_per_mm, point[1] * px_per_mm)
+        if len(point) == 2
+        else (size[0] / 2, size[1] / 2)
+    )
+    distortion = xmp.numbers("Camera:PerspectiveDistortion")
+    return _camera(size, mm * px_per_mm, centre, distortion if len(distortion) == 5 else None)
+
+
+def _px_per_mm(exif: Exif, sensor: Sensor | None, size: tuple[int, int]) -> float | None:
+    resolution = exif.number(tag.PLANE_X)
+    mm = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(int(exif.number(tag.PLANE_UNIT) or 2))
+    if resolution and mm:
+        return resolution / mm
+    return max(size) / sensor.width_mm if sensor else None
+
+
+def _calibrated_focal(xmp: Xmp, size: tuple[int, int]) -> Camera | None:
+    """DJI's value in px; its optical centre is counted from the image's corner."""
+    focal = xmp.number("CalibratedFocalLength")
+    x, y = xmp.number("CalibratedOpticalCenterX"), xmp.number("CalibratedOpticalCenterY")
+    centre = (x, y) if x and y else (size[0] / 2, size[1] / 2)
+    return _camera(size, focal, centre, None) if focal else None
+
+
+def _camera(
+    size: tuple[int, int],
+    focal: float,
+    centre: tuple[float, float],
+    distortion: tuple[float, ...] | None,
+) -> Camera | None:
+    """A camera from px counted from the corner; None where the numbers are not plausible for a
+    lens.
+    """
+    long = max(size)
+    inside = all(0.25 * s < c < 0.75 * s for c, s in zip(centre, size, strict=True))
+    if not (
+        0.2 * long < focal < 60 * long and inside and all(abs(k) < 10 for k in distortion or ())
+    ):
+        return None
+    k1, k2, k3, p1, p2 = distortion or (0.0,) * 5
+    sigmas = (
+        _SIGMA_SHARE["focal"] * focal,
+        *(_SIGMA_SHARE["centre"] * long,) * 2,
+        *(_SIGMA_RADIAL,) * 3,
+        *(_SIGMA_TANGENTIAL,) * 2,
+    )
+    values = (focal, centre[0] - 0.5, centre[1] - 0.5, k1, k2, k3, p1, p2)
+    known = dict(zip(PARAMETERS, values, strict=True))
+    return Camera(width=size[0], height=size[1], sigmas=sigmas, **known)

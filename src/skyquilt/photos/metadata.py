@@ -1,6 +1,7 @@
-"""What a photo says of itself: position, angles, capture time, the program that wrote it.
+"""The metadata of a photo: position, angles, capture time, the program that wrote it.
 
-XMP comes before EXIF, since makers put the better figure there; every height has its datum.
+XMP is preferred to EXIF, because manufacturers put the better value there; every height has its
+datum.
 """
 
 import math
@@ -16,20 +17,20 @@ _HEIGHTS = (-500.0, 9500.0)
 _RTK_FLOAT, _RTK_FIXED = 34, 50
 _DRONE_SIGMA = (1.5, 3.0)
 _CAMERA_SIGMA = (5.0, 15.0)
-"""Horizontal and vertical deviation in m where nothing says more; a camera's receiver is no
-autopilot's.
+"""Horizontal and vertical standard deviation in m where none is stated; a camera's receiver is
+worse than an autopilot's.
 """
 
 
 def read_position(exif: Exif, xmp: Xmp) -> tuple[GeoPosition | None, tuple[str, ...]]:
-    """The measured position, or None, with sentences on what was void or insane."""
+    """The measured position, or None, with sentences on what was invalid or implausible."""
     notes: list[str] = []
     found = _place(_xmp_degrees(xmp), "XMP", notes)
     source = "xmp"
     if found is None:
         found, source = _place(_exif_degrees(exif), "EXIF", notes), "exif"
     if found is None:
-        return None, tuple(notes or ["It carries no GPS position."])
+        return None, tuple(notes or ["It has no GPS position."])
     takeoff, sea, ellipsoid = _heights(exif, xmp, notes)
     sigma_xy, sigma_z = _sigmas(exif, xmp, drone=_flown(xmp))
     altitude, datum = _best_height(takeoff, sea, ellipsoid)
@@ -49,13 +50,13 @@ def read_position(exif: Exif, xmp: Xmp) -> tuple[GeoPosition | None, tuple[str, 
 
 
 def why_void(latitude: float | None, longitude: float | None) -> str:
-    """Why a pair of degrees is no position; empty when it is one."""
+    """Why a pair of degrees is not a position; empty when it is one."""
     if latitude is None or longitude is None:
-        return "one of latitude and longitude is missing or no number"
+        return "one of latitude and longitude is missing or not a number"
     if latitude == 0 and longitude == 0:
-        return "it is (0, 0), which receivers write without a fix"
+        return "it is (0, 0), which receivers write without a satellite fix"
     if not (abs(latitude) <= 90 and abs(longitude) <= 180):
-        return f"({latitude:g}, {longitude:g}) lies outside the globe"
+        return f"({latitude:g}, {longitude:g}) is outside the valid range"
     return ""
 
 
@@ -66,13 +67,15 @@ def _place(
         return None
     reason = why_void(*pair)
     if reason:
-        notes.append(f"The GPS position in {origin} is void: {reason}.")
+        notes.append(f"The GPS position in {origin} is invalid: {reason}.")
         return None
     return pair[0] or 0.0, pair[1] or 0.0
 
 
 def _xmp_degrees(xmp: Xmp) -> tuple[float | None, float | None] | None:
-    """DJI's `GpsLongtitude` is its own spelling; other makers use the same names."""
+    """Degrees from XMP. `GpsLongtitude` is DJI's own spelling; other manufacturers use the same
+    names.
+    """
     names = ("GpsLatitude",), ("GpsLongitude", "GpsLongtitude")
     if not any(xmp.text(*n) for n in names):
         return None
@@ -116,12 +119,12 @@ def _heights(
 def _sane(height: float | None, what: str, notes: list[str]) -> float | None:
     if height is None or _HEIGHTS[0] <= height <= _HEIGHTS[1]:
         return height
-    notes.append(f"The {what} of {height:g} m is no flying height on this planet and was ignored.")
+    notes.append(f"The {what} of {height:g} m is not a possible flying height and was ignored.")
     return None
 
 
 def _flown(xmp: Xmp) -> bool:
-    """Whether an autopilot wrote the metadata."""
+    """Whether the metadata were written by an autopilot."""
     return any(key.startswith(("drone-", "Camera:")) for key in xmp.values)
 
 
@@ -133,7 +136,9 @@ def _is_rtk(xmp: Xmp) -> bool:
 def _best_height(
     takeoff: float | None, sea: float | None, ellipsoid: float | None
 ) -> tuple[float | None, Datum]:
-    """RTK's ellipsoid height, else take-off (a barometer, steady over a flight), else sea level."""
+    """RTK's ellipsoid height, else height above take-off (from a barometer, stable during a
+    flight), else above sea level.
+    """
     if ellipsoid is not None:
         return ellipsoid, "ellipsoid"
     if takeoff is not None:
@@ -142,8 +147,8 @@ def _best_height(
 
 
 def _sigmas(exif: Exif, xmp: Xmp, *, drone: bool) -> tuple[float, float]:
-    """Horizontal and vertical standard deviation in m: RTK's own, an accuracy tag, or what is
-    usual.
+    """Horizontal and vertical standard deviation in m: RTK's own, an accuracy tag, or a typical
+    value.
     """
     xy, z = _DRONE_SIGMA if drone else _CAMERA_SIGMA
     error = as_number(exif.gps.get(tag.GPS_ERROR))
@@ -167,9 +172,9 @@ def read_attitude(xmp: Xmp) -> tuple[Attitude | None, tuple[str, ...]]:
     """Belly angles, or None, with sentences on what is missing.
 
     `Gimbal*Degree` (DJI, Autel) and `drone-parrot:Camera*Degree` are gimbal angles (pitch -90 =
-    nadir). Pix4D's `Camera:Yaw/Pitch/Roll` (senseFly, Parrot Sequoia, MicaSense) count as belly
-    angles do: pitch 0 = nadir. Some write -90 there for nadir, and are taken so: no survey looks
-    backwards to the horizon.
+    nadir). Pix4D's `Camera:Yaw/Pitch/Roll` (senseFly, Parrot Sequoia, MicaSense) are belly angles:
+    pitch 0 = nadir. Some files contain -90 there for nadir and are read as gimbal angles, because
+    no survey camera looks backwards to the horizon.
     """
     for names in _GIMBAL:
         yaw, pitch, roll = (xmp.number(name) for name in names)
@@ -177,7 +182,7 @@ def read_attitude(xmp: Xmp) -> tuple[Attitude | None, tuple[str, ...]]:
             return _from_gimbal(yaw, pitch, roll, "xmp-gimbal")
     yaw, pitch, roll = (xmp.number(f"Camera:{a}") for a in ("Yaw", "Pitch", "Roll"))
     if yaw is None:
-        return None, ("It carries no camera angles.",)
+        return None, ("It has no camera angles.",)
     if pitch is not None and pitch < _LOOKS_DOWN_AT_MINUS_90:
         return _from_gimbal(yaw, pitch, roll, "xmp-camera")
     attitude = Attitude(
@@ -187,7 +192,7 @@ def read_attitude(xmp: Xmp) -> tuple[Attitude | None, tuple[str, ...]]:
 
 
 def read_flight_yaw(xmp: Xmp) -> float | None:
-    """Heading of the aircraft in degrees clockwise from north; None where it is not given."""
+    """Heading of the aircraft in degrees clockwise from north; None where it is absent."""
     return xmp.number("FlightYawDegree", "DroneYawDegree")
 
 
@@ -197,7 +202,7 @@ def _from_gimbal(
     notes = (
         ()
         if pitch is not None
-        else ("It gives a gimbal yaw but no pitch; straight down is assumed.",)
+        else ("It has a gimbal yaw but no pitch; straight down is assumed.",)
     )
     belly = belly_from_gimbal(yaw, -90.0 if pitch is None else pitch, roll or 0.0)
     attitude = Attitude(yaw_deg=belly[0], pitch_deg=belly[1], roll_deg=belly[2], source=source)
@@ -210,8 +215,8 @@ _MOMENT = re.compile(
 
 
 def read_time(exif: Exif, xmp: Xmp) -> datetime | None:
-    """EXIF DateTimeOriginal with sub-seconds and offset, else the GPS clock (UTC), else XMP; None
-    if none.
+    """EXIF DateTimeOriginal with sub-seconds and offset, else the GPS time (UTC), else XMP; None if
+    there is none.
     """
     moment = parse_moment(exif.text(tag.TAKEN), exif.text(tag.SUBSEC), exif.text(tag.OFFSET))
     if moment is None:
@@ -224,13 +229,13 @@ def read_time(exif: Exif, xmp: Xmp) -> datetime | None:
 
 
 def modified_time(exif: Exif) -> datetime | None:
-    """EXIF DateTime: when the file was last written by something that says so."""
+    """EXIF DateTime: when a program that updates this tag last wrote the file."""
     return parse_moment(exif.text(tag.MODIFIED))
 
 
 def parse_moment(text: str, subseconds: str = "", offset: str = "") -> datetime | None:
-    """`2016:06:23 16:31:59` (also ISO 8601) with sub-seconds and `+02:00` inside or apart; else
-    None.
+    """Time from `2016:06:23 16:31:59` (also ISO 8601) with sub-seconds and an offset such as
+    `+02:00`, in the text or passed separately; else None.
     """
     found = _MOMENT.match(text.strip())
     if not found:
@@ -278,6 +283,6 @@ _PROGRAMS = re.compile(
 
 
 def find_editor(exif: Exif, xmp: Xmp) -> str | None:
-    """The program that EXIF or XMP names, if it is no camera's firmware; else None."""
+    """The program that EXIF or XMP names, unless it is a camera's firmware; else None."""
     named = (exif.text(tag.SOFTWARE), xmp.text("xmp:CreatorTool"), xmp.text("softwareAgent"))
     return next((name for name in named if _PROGRAMS.search(name)), None)

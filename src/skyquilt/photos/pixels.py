@@ -1,8 +1,8 @@
-"""Pixels of a photo: sensor coordinates everywhere, EXIF Orientation never applied.
+"""Pixels of a photo: always in sensor coordinates, EXIF Orientation never applied.
 
 At `reduction` r a reduced pixel covers r x r full ones and the size is rounded up: pixel (i, j) of
 the reduced image has its centre at (r * i + (r - 1) / 2, r * j + (r - 1) / 2) of the full one.
-Reduced JPEGs are decoded at that scale (no full decode takes place).
+Reduced JPEGs are decoded directly at that scale.
 """
 
 import io
@@ -30,17 +30,17 @@ _HARMLESS = re.compile(
 
 
 def read_color(photo: Photo, *, reduction: Reduction = 1) -> Pixels:
-    """Pixels as recorded: (height, width, 3) uint8 RGB, or (height, width) of a single band, or all
-    bands.
+    """Pixels as recorded: (height, width, 3) uint8 RGB, (height, width) for a single band, or
+    (height, width, bands).
 
-    Type and unit are `photo.dtype` and `photo.unit`; thermal frames are float32 with NaN for no
-    measurement. Raises `UnreadablePhotoError` where the data are broken.
+    Type and unit are `photo.dtype` and `photo.unit`; thermal frames are float32 with NaN where
+    there is no measurement. Raises `UnreadablePhotoError` where the data are broken.
     """
     return _read(photo, reduction, gray=False)
 
 
 def read_gray(photo: Photo, *, reduction: Reduction = 1) -> NDArray[np.uint8]:
-    """Brightness (height, width) uint8 for finding features; see `to_gray` for other types.
+    """Brightness (height, width) uint8 for feature detection; see `to_gray` for other types.
 
     Raises `UnreadablePhotoError` where the data are broken.
     """
@@ -50,7 +50,8 @@ def read_gray(photo: Photo, *, reduction: Reduction = 1) -> NDArray[np.uint8]:
 def to_gray(pixels: Pixels) -> NDArray[np.uint8]:
     """Brightness (height, width) uint8 of decoded pixels; other types than uint8 are stretched.
 
-    The stretch maps each frame's own 0.5 to 99.5 percent of finite values to 0-255; NaN becomes 0.
+    Each frame is stretched from its own 0.5 and 99.5 percentiles of finite values to 0-255; NaN
+    becomes 0.
     """
     if pixels.ndim == 3 and pixels.dtype == np.uint8 and pixels.shape[2] == 3:
         return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
@@ -65,7 +66,7 @@ def to_gray(pixels: Pixels) -> NDArray[np.uint8]:
 
 
 def reduce_pixels(pixels: Pixels, reduction: int) -> Pixels:
-    """Area mean over reduction x reduction px, the size rounded up, type and shape of bands
+    """Area mean over reduction x reduction px; the size is rounded up, type and band layout are
     kept.
     """
     if reduction == 1:
@@ -82,13 +83,13 @@ def _read(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
         pixels = _decode(photo, reduction, gray=gray)
     except UnreadablePhotoError:
         raise
-    except Exception as error:  # decoders raise many kinds; all mean the same to a survey
+    except Exception as error:  # decoders raise many exceptions; all mean: unreadable
         raise UnreadablePhotoError(f"its pixels cannot be decoded ({error})") from error
     want = (-(-photo.height // reduction), -(-photo.width // reduction))
     if pixels.shape[:2] != want:
         found = f"{pixels.shape[1]}x{pixels.shape[0]}"
         raise UnreadablePhotoError(
-            f"its pixels are {found} where its header promised {want[1]}x{want[0]}"
+            f"its pixels are {found} but its header states {want[1]}x{want[0]}"
         )
     return pixels
 
@@ -111,7 +112,8 @@ def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
 def decode_jpeg(data: bytes, *, gray: bool = False, reduction: Reduction = 1) -> NDArray[np.uint8]:
     """A JPEG file's bytes as (height, width, 3) RGB or (height, width), at full or reduced scale.
 
-    Raises `UnreadablePhotoError` where data are missing or corrupt, instead of filling in grey.
+    Raises `UnreadablePhotoError` where data are missing or corrupt, where a decoder would fill in
+    grey.
     """
     height, width, _, _ = simplejpeg.decode_jpeg_header(data)
     wanted = {
@@ -132,7 +134,7 @@ def _thermal_jpeg(path: Path) -> Pixels:
     header = read_header(path)
     frame = header.jpeg and thermal_frame_of_jpeg(header.jpeg, make=header.exif.text(MAKE))
     if not frame:
-        raise UnreadablePhotoError("its radiometric frame is gone")
+        raise UnreadablePhotoError("its radiometric frame is missing")
     return frame.values
 
 
@@ -145,7 +147,7 @@ def _png(data: bytes, channels: int) -> Pixels:
 
 def read_tiff(path: Path) -> Pixels:
     """The first page of a TIFF as (height, width, bands), signed and wide types as float32."""
-    import tifffile  # most photos are JPEGs
+    import tifffile  # imported here because most photos are JPEGs
 
     with tifffile.TiffFile(path) as tiff:
         page = tiff.pages[0]

@@ -1,4 +1,4 @@
-"""One file to one `Photo`."""
+"""Reads one file as a `Photo`."""
 
 from dataclasses import dataclass
 from datetime import timedelta
@@ -11,9 +11,15 @@ from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Stored
 from skyquilt.photos import tags as tag
-from skyquilt.photos.calibration import read_calibration
 from skyquilt.photos.headers import Header, content_digest, read_header
-from skyquilt.photos.lens import Sensor, find_focal, find_sensor, focal_notes, native_scale
+from skyquilt.photos.lens import (
+    Sensor,
+    find_focal,
+    find_sensor,
+    focal_notes,
+    native_scale,
+    read_calibration,
+)
 from skyquilt.photos.metadata import (
     find_editor,
     modified_time,
@@ -31,18 +37,18 @@ from skyquilt.photos.thermal import (
 )
 
 _SMALLEST = 32
-_STRANGE = "its metadata are of a kind that was not foreseen"
+_STRANGE = "its metadata are of an unknown kind"
 _LARGEST_THERMAL = 1280
 
 
 def read_photo(
     path: Path, *, name: str | None = None, thermal_unit: str | None = None
 ) -> Photo | RejectedPhoto:
-    """What a file says of itself, its pixels not decoded; a bad file is a `RejectedPhoto`.
+    """The metadata of a file, without decoding its pixels; a bad file is a `RejectedPhoto`.
 
-    `thermal_unit`: what values of a single-band TIFF mean (`model.photo.Stored`); `auto` = it is
-    thermal, its unit is stated in it or found from its values; None = whether it is thermal at all
-    is found out too.
+    `thermal_unit`: meaning of the values of a single-band TIFF (`model.photo.Stored`); `auto` = it
+    is thermal, and its unit is read from the file or derived from its values; None = whether it is
+    thermal is determined too.
     """
     name = name or path.name
     try:
@@ -52,7 +58,7 @@ def read_photo(
         return RejectedPhoto(name=name, reason=str(error))
     except OSError as error:
         return RejectedPhoto(name=name, reason=f"it cannot be read ({error.strerror or error})")
-    except Exception as error:  # the last net: one strange file must not end a survey of thousands
+    except Exception as error:  # one unexpected file must not stop a survey of thousands
         return RejectedPhoto(name=name, reason=f"{_STRANGE} ({type(error).__name__}: {error})")
 
 
@@ -123,6 +129,8 @@ def _lens(header: Header, width: int, height: int, *, thermal: bool) -> _Lens:
 
 def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame | None:
     if header.jpeg:
+        if not header.jpeg.radiometric:
+            return None
         return thermal_frame_of_jpeg(header.jpeg, make=header.exif.text(tag.MAKE))
     if (
         header.kind != "tiff"
@@ -140,7 +148,7 @@ def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame
         return None
     try:
         frame = thermal_frame_of_values(np.asarray(read_tiff(path)[..., 0]), stored)
-    except Exception as error:  # tifffile raises many kinds; all mean that there are no pixels
+    except Exception as error:  # tifffile raises many exceptions; all mean: no pixels
         raise UnreadablePhotoError(f"its pixels cannot be decoded ({error})") from error
     return frame if known or frame.unit == "celsius" else None
 
@@ -177,9 +185,9 @@ def _rolling(header: Header, sensor: Sensor | None) -> bool | None:
 
 
 def _broken_notes(header: Header) -> tuple[str, ...]:
-    exif = "Its EXIF block is broken and was read as far as it went." if header.exif.broken else ""
+    exif = "Its EXIF block is broken and was read as far as possible." if header.exif.broken else ""
     xmp = (
-        "Its XMP packet is broken XML; values were searched in it as text."
+        "Its XMP packet is not valid XML; it was searched for values as text."
         if header.xmp.broken
         else ""
     )
@@ -189,14 +197,14 @@ def _broken_notes(header: Header) -> tuple[str, ...]:
 def _other_notes(header: Header, lens: _Lens) -> tuple[str, ...]:
     time = read_time(header.exif, header.xmp)
     guess = _focal_note(lens.focal.source, header.exif.text(tag.MODEL))
-    return "" if time else "It carries no capture time.", guess, _edit_note(header)
+    return "" if time else "It has no capture time.", guess, _edit_note(header)
 
 
 def _focal_note(source: str, model: str) -> str:
     if source != "guess":
         return ""
-    camera = f"the camera database does not know '{model}'" if model else "no camera model is named"
-    return f"It gives no usable focal length and {camera}: one is guessed from the format."
+    camera = f"the camera database has no '{model}'" if model else "no camera model is named"
+    return f"It has no usable focal length and {camera}: one is guessed from the format."
 
 
 def _edit_note(header: Header) -> str:
@@ -212,5 +220,5 @@ def _edit_note(header: Header) -> str:
         and written
         and written.replace(tzinfo=None) - taken.replace(tzinfo=None) > timedelta(minutes=1)
     ):
-        return f"It was written again at {written:%Y-%m-%d %H:%M:%S}, after the capture."
+        return f"The file was written again at {written:%Y-%m-%d %H:%M:%S}, after the capture."
     return ""

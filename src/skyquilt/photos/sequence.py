@@ -1,4 +1,4 @@
-"""The order in which photos are joined: by time, by name, or as a file says."""
+"""The order in which photos are joined: by time, by name, or from a file."""
 
 import re
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ def sequence_of(names: Sequence[str], how: str) -> list[int]:
     """Indices of photos (names in order of capture) in the order of `how`: `time`, `name`, or a
     file's path.
 
-    A file has one photo's name a line; photos that it does not name are left out.
+    A file has one photo name per line; photos that are not in it are left out.
 
     Raises:
         SideFileError: the file cannot be read, names no photo or an unknown one, or one twice.
@@ -32,17 +32,17 @@ def sequence_of(names: Sequence[str], how: str) -> list[int]:
             if strangers
             else "is empty"
         )
-        raise SideFileError(f"{path.name} {what}; expected one photo's name a line.")
+        raise SideFileError(f"{path.name} {what}; expected one photo name per line.")
     order = [index[f] for f in found if f is not None]
     if len(set(order)) < len(order):
         twice = sorted({names[i] for i in order if order.count(i) > 1})
         raise SideFileError(
-            f"{path.name} names {sentence_of(twice)} more than once. Take one line out."
+            f"{path.name} names {sentence_of(twice)} more than once. Remove one of the lines."
         )
     return order
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
-    """Names as people count: 2 before 10."""
+    """Sort key for the natural order of names: 2 before 10."""
     parts = re.split(r"(\d+)", name.lower())
     return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts if p]

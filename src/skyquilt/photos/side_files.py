@@ -16,9 +16,10 @@ from skyquilt.photos.srt import read_srt
 def apply_positions(
     photos: Sequence[Photo], file: Path
 ) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """The photos as `.csv`, `.mrk`, `.srt` or (any other ending) `geo.txt` places them, and notes.
+    """The photos with the positions from a `.csv`, `.mrk`, `.srt` or (any other ending) `geo.txt`
+    file, and notes.
 
-    Raises `SideFileError` where the file is malformed or knows none of the photos.
+    Raises `SideFileError` where the file is malformed or contains none of the photos.
     """
     ending = file.suffix.lower()
     if ending == ".csv":
@@ -59,7 +60,7 @@ def read_positions_csv(path: Path) -> tuple[SideRow, ...]:
     Columns (case, blanks and underscores do not matter): name or filename; lat, lon in degrees; alt
     (above sea level), rel_alt (above take-off) or ellipsoid in m; yaw, pitch, roll in degrees
     (pitch 0 = nadir; below -45 it is read as a gimbal's); accuracy, vertical_accuracy in m. Only
-    the name is obligatory.
+    the name is required.
     """
     lines = [line for _, line in read_lines(path)]
     if not lines:
@@ -121,7 +122,7 @@ if TYPE_CHECKING:
 
 
 def read_geo_txt(path: Path) -> tuple[SideRow, ...]:
-    """All rows, in degrees; raises `SideFileError` with the line that is wrong."""
+    """All rows, in degrees; raises `SideFileError` that names the wrong line."""
     lines = read_lines(path)
     if len(lines) < 2:
         raise SideFileError(
@@ -167,7 +168,7 @@ def _geo_txt_row(line: str, place: str, to_degrees: "Transformer", datum: Datum)
 
 
 def _split(line: str) -> tuple[str, list[float]]:
-    """The name (it may hold spaces) and the numbers behind it."""
+    """The name (which may contain spaces) and the numbers after it."""
     words = line.replace(",", " ").split()
     numbers: list[float] = []
     while words and (value := number(words[-1])) is not None:
@@ -186,7 +187,7 @@ _METRES_PER_DEGREE = 111_320.0
 
 
 def read_mrk(path: Path, photo_names: Sequence[str]) -> tuple[SideRow, ...]:
-    """Camera positions for the photos whose index the file has; raises `SideFileError`."""
+    """Camera positions of the photos whose index is in the file; raises `SideFileError`."""
     shots = {}
     for i, line in read_lines(path):
         found = _LINE.match(line)
@@ -194,7 +195,7 @@ def read_mrk(path: Path, photo_names: Sequence[str]) -> tuple[SideRow, ...]:
             raise SideFileError(
                 f"{path.name}, line {i}: expected a DJI shot record (index, time, [week], N, E, V,"
                 " Lat, Lon, "
-                f"Ellh ...), found '{line[:60]}'. Give the file as the drone wrote it."
+                f"Ellh ...), found '{line[:60]}'. Use the file as the drone wrote it."
             )
         shots[int(found[1])] = [float(v) if v else None for v in found.groups()[1:]]
     pairs = ((name, shots.get(_index(name))) for name in photo_names)

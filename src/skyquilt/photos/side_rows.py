@@ -1,4 +1,4 @@
-"""Rows of side files: how their text is read, and how they override what the photos say."""
+"""Rows of side files: how their text is read, and how they override the photos' metadata."""
 
 import math
 import re
@@ -18,7 +18,7 @@ _SHOWN = 8
 
 @dataclass(frozen=True, kw_only=True)
 class SideRow:
-    """What one row says of one photo; None = the row does not say."""
+    """One row for one photo; None = the row has no such value."""
 
     name: str
     """File name as written, with or without folder and ending."""
@@ -39,8 +39,8 @@ class SideRow:
 
 
 class PhotoNames:
-    """Finds the photo a side file means: by path, by file name, by name without ending, whatever
-    the case.
+    """Finds the photo that a side file refers to: by path, by file name, or by name without ending,
+    ignoring case.
     """
 
     def __init__(self, names: Iterable[str]) -> None:
@@ -51,7 +51,7 @@ class PhotoNames:
                 self._by_key.setdefault(key, []).append(name)
 
     def find(self, written: str) -> str | None:
-        """The one photo meant; None where there is none or the name fits several."""
+        """The one photo that matches; None where there is none or several match."""
         path = PurePosixPath(written.strip().replace("\\", "/").lower())
         for key in (str(path), path.name, path.stem):
             found = self._by_key.get(key, [])
@@ -72,7 +72,7 @@ def apply_rows(
     """The photos with the rows' positions and angles in place of their own, and notes.
 
     Raises `SideFileError` where not one row names a photo of the survey, or a row's position is
-    void.
+    invalid.
     """
     names = PhotoNames(p.name for p in photos)
     found = {names.find(row.name): row for row in rows}
@@ -81,18 +81,18 @@ def apply_rows(
         raise SideFileError(
             f"{file.name} names {sentence_of(strangers)}; none of the {len(photos)} photos is"
             " called that "
-            f"(they are {sentence_of([p.name for p in photos])}). Correct the names or leave the"
-            " file away."
+            f"(they are {sentence_of([p.name for p in photos])}). Correct the names or omit the"
+            " file."
         )
     _check(rows, file)
     changed = tuple(_override(p, found, source) for p in photos)
     without = [p.name for p in photos if p.name not in found]
     notes = (
         f"{file.name} placed {len(photos) - len(without)} of {len(photos)} photos.",
-        f"{file.name} names photos that are not there: {sentence_of(strangers)}."
+        f"{file.name} names photos that are not in the survey: {sentence_of(strangers)}."
         if strangers
         else "",
-        f"{file.name} says nothing of {sentence_of(without)}; their own metadata count."
+        f"{file.name} has no row for {sentence_of(without)}; their own metadata are used."
         if without
         else "",
     )
@@ -104,7 +104,7 @@ def _check(rows: Sequence[SideRow], file: Path) -> None:
         placed = row.latitude_deg is not None or row.longitude_deg is not None
         if placed and (reason := why_void(row.latitude_deg, row.longitude_deg)):
             raise SideFileError(
-                f"{file.name}: the position of {row.name} is void: {reason}. Correct that row."
+                f"{file.name}: the position of {row.name} is invalid: {reason}. Correct that row."
             )
 
 
@@ -168,13 +168,13 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
             " permissions."
         ) from error
     if "\x00" in text:
-        raise SideFileError(f"{path.name} is no text file; expected lines of words and numbers.")
+        raise SideFileError(f"{path.name} is not a text file; expected lines of words and numbers.")
     lines = ((i, line.strip()) for i, line in enumerate(text.splitlines(), 1))
     return [(i, line) for i, line in lines if line and not line.startswith("#")]
 
 
 def number(text: str) -> float | None:
-    """A number, NaN included; None for a word."""
+    """A number, including NaN; None for other text."""
     try:
         return float(text)
     except ValueError:
@@ -182,7 +182,7 @@ def number(text: str) -> float | None:
 
 
 def finite(value: float | None) -> float | None:
-    """The number, or None for NaN and infinities too."""
+    """The number; None for NaN and infinities."""
     return value if value is not None and math.isfinite(value) else None
 
 
@@ -203,5 +203,5 @@ def read_crs(text: str, *, file: str) -> "CRS":
         raise SideFileError(
             f"{file}: the first line must name a coordinate system such as 'EPSG:4326' or 'WGS84"
             " UTM 15N', "
-            f"but it is '{text}'. Put one there."
+            f"but it is '{text}'. Add one."
         ) from error

@@ -33,27 +33,30 @@ class _Sample:
 def read_srt(path: Path, photos: Sequence[Photo]) -> tuple[SideRow, ...]:
     """Positions for photos that are frames of the video; raises `SideFileError`.
 
-    Matched by capture time within 0.5 s where both state one; else by the frame number that ends
-    the name, when every photo's name ends in a number that the file has.
+    Matched by capture time within 0.5 s where both have one; else by the frame number at the end of
+    the name, if every photo's name ends in a number that is in the file.
     """
     samples = _samples(path)
     if not samples:
         raise SideFileError(
-            f"{path.name} holds no latitude and longitude; expected a DJI telemetry subtitle file."
+            f"{path.name} contains no latitude and longitude; expected a DJI telemetry subtitle"
+            " file."
         )
     rows = _by_time(samples, photos) or _by_frame(samples, photos)
     if not rows:
         raise SideFileError(
             f"{path.name} has {len(samples)} positions, but neither capture times nor numbers at"
             " the end of "
-            "the photos' names say which is which. Name the frames by their number"
+            "the photos' names identify them. Name the frames by their number"
             " (frame_000123.jpg)."
         )
     return rows
 
 
 def _samples(path: Path) -> list[_Sample]:
-    """Blocks start with their number and a line `00:00:01,000 --> 00:00:02,000`."""
+    """Blocks of subtitles, which start with their number and a line `00:00:01,000 -->
+    00:00:02,000`.
+    """
     lines = [line for _, line in read_lines(path)]
     starts = [
         i for i, line in enumerate(lines) if "-->" in line and i > 0 and lines[i - 1].isdigit()

@@ -1,4 +1,4 @@
-"""A folder of files to a `Survey`: what a run begins with."""
+"""Reads a folder of files as a `Survey`, the input of a run."""
 
 import os
 from collections import Counter
@@ -28,23 +28,23 @@ _SIDE_NAMES = frozenset({"geo.txt", "gcp_list.txt"})
 
 @dataclass(frozen=True, kw_only=True)
 class FoundFiles:
-    """What lies in the input."""
+    """The files in the input."""
 
     photos: tuple[tuple[str, Path], ...]
     """Name in the survey and file, sorted by name."""
     ignored: tuple[str, ...]
     """Names of all other files."""
     geo: Path | None
-    """A `geo.txt` that lies at the top."""
+    """A `geo.txt` at the top of the folder."""
     runs: tuple[str, ...]
-    """Folders of earlier runs, left alone."""
+    """Folders of earlier runs, which are not read."""
 
 
 def find_files(source: Path | Sequence[Path]) -> FoundFiles:
-    """Photos by their endings below a folder, or among files given one by one.
+    """Finds photos by file name extension in a folder and its subfolders, or among single files.
 
-    Hidden files and folders are passed over, and so are folders of earlier runs (they hold
-    `run.toml`, or `.skyquilt` while they are under way). Raises `UsageError` where something named
+    Hidden files and folders are skipped, and so are folders of earlier runs (they contain
+    `run.toml`, or `.skyquilt` while a run is not finished). Raises `UsageError` where a given path
     does not exist.
     """
     if isinstance(source, (str, Path)) and Path(source).is_dir():
@@ -52,7 +52,7 @@ def find_files(source: Path | Sequence[Path]) -> FoundFiles:
     paths = [Path(source)] if isinstance(source, (str, Path)) else [Path(p) for p in source]
     for path in paths:
         if not path.exists():
-            raise UsageError(f"{path} does not exist; give a folder of photos.")
+            raise UsageError(f"{path} does not exist; choose a folder of photos.")
     return _listed(paths)
 
 
@@ -75,7 +75,9 @@ def _walk(folder: Path, runs: list[str], top: Path) -> Iterator[Path]:
 
 
 def _listed(paths: Sequence[Path]) -> FoundFiles:
-    """Files keep their bare names where these differ, else their path below the common folder."""
+    """Single files: they keep their file names where these differ, else their path below the common
+    folder.
+    """
     files: list[Path] = []
     for path in paths:
         files += [p for _, p in _in_folder(path).photos] if path.is_dir() else [path]
@@ -88,7 +90,9 @@ def _listed(paths: Sequence[Path]) -> FoundFiles:
 
 
 def _text(name: str) -> str:
-    """A name that can be written to any file: Linux allows bytes in names that are no text."""
+    """A name that can be written to any text file: Linux allows bytes in file names that are no
+    valid text.
+    """
     return name.encode("utf-8", "backslashreplace").decode()
 
 
@@ -112,7 +116,7 @@ def read_survey(
     pixels.
 
     `geo` is a side file of positions (`geo.txt`, CSV, `.SRT`, `.MRK`); without one, a `geo.txt` at
-    the top of the folder counts. `cameras` is a `cameras.json`, `thermal_unit` as in `read_photo`.
+    the top of the folder is used. `cameras` is a `cameras.json`, `thermal_unit` as in `read_photo`.
     A bad photo becomes a `RejectedPhoto`. Raises `UsageError` for a folder that does not exist,
     `NoPhotosError` where no photo can be read, `SideFileError` for a bad side file.
     """
@@ -148,7 +152,7 @@ def read_survey(
 
 
 def capture_order(photo: Photo) -> tuple[bool, datetime, str]:
-    """Sorts by wall-clock time, then name; photos without a time come last."""
+    """Sort key: wall-clock time, then name; photos without a time come last."""
     time = photo.time.replace(tzinfo=None) if photo.time else datetime.max
     return photo.time is None, time, photo.name
 
@@ -166,15 +170,13 @@ def _without_copies(photos: Iterable[Photo]) -> tuple[tuple[Photo, ...], tuple[R
 
 
 def _run_notes(found: FoundFiles) -> tuple[str, ...]:
-    return tuple(
-        f"The folder {run} holds an earlier run and was passed over." for run in found.runs
-    )
+    return tuple(f"The folder {run} contains an earlier run and was skipped." for run in found.runs)
 
 
 def _nothing_sentence(
     folder: Path | Sequence[Path], found: FoundFiles, rejected: Sequence[RejectedPhoto]
 ) -> str:
-    where = str(folder) if isinstance(folder, (str, Path)) else f"the {len(folder)} files given"
+    where = str(folder) if isinstance(folder, (str, Path)) else f"the {len(folder)} given files"
     if rejected:
         reasons = "; ".join(f"{r.name}: {r.reason}" for r in rejected[:5])
         return (
@@ -183,7 +185,8 @@ def _nothing_sentence(
         )
     held = f"only other files ({sentence_of(found.ignored)})" if found.ignored else "nothing"
     return (
-        f"There is no photo in {where}: it holds {held}. Give a folder of JPEG, TIFF or PNG photos."
+        f"There is no photo in {where}: it contains {held}. Choose a folder of JPEG, TIFF or PNG"
+        " photos."
     )
 
 
@@ -191,7 +194,7 @@ _LONG_GAP_H = 12.0
 
 
 def survey_notes(photos: Sequence[Photo], copies: int = 0) -> tuple[str, ...]:
-    """Plain sentences: several cameras or bands, rolling shutters, clocks, what most photos
+    """Notes for the user: several cameras or bands, rolling shutters, clocks, what most photos
     lack.
     """
     return (
@@ -207,11 +210,11 @@ def _cameras(photos: Sequence[Photo]) -> Iterator[str]:
     keys = Counter(p.camera_key for p in photos)
     if len(keys) > 1:
         listed = sentence_of([f"{key} ({n})" for key, n in keys.items()])
-        yield f"There are {len(keys)} cameras: {listed}; each is calibrated by itself."
+        yield f"There are {len(keys)} cameras: {listed}; each is calibrated separately."
     bands = Counter(p.band for p in photos)
     if len(bands) > 1:
         counts = " and ".join(f"{n} {band}" for band, n in sorted(bands.items()))
-        yield f"The spectra are mixed: {counts} photos."
+        yield f"Different spectra are mixed: {counts} photos."
     rolling = sorted({p.camera_key for p in photos if p.rolling_shutter})
     if rolling:
         yield f"Rolling (electronic) shutter, not modelled: {sentence_of(rolling)}."
@@ -222,8 +225,8 @@ def _thermal_units(photos: Sequence[Photo]) -> Iterator[str]:
     listed = " and ".join(f"{n} as {unit}" for unit, n in units.most_common())
     if len(units) > 1:
         yield (
-            f"Thermal TIFFs are read in different units, {listed}; --thermal-unit says which is"
-            " right for all."
+            f"Thermal TIFFs are read in different units, {listed}; set one for all with"
+            " --thermal-unit."
         )
     elif units:
         yield f"Thermal TIFFs are read as {listed.split(' as ')[1]} ({sum(units.values())})."
@@ -233,7 +236,7 @@ def _gaps(photos: Sequence[Photo]) -> Iterator[str]:
     void = [p.name for p in photos if p.position is None]
     if void:
         which = (
-            "No photo carries"
+            "No photo has"
             if len(void) == len(photos)
             else f"{len(void)} of {len(photos)} photos lack"
         )
@@ -241,7 +244,7 @@ def _gaps(photos: Sequence[Photo]) -> Iterator[str]:
             f": {sentence_of(void)}." if len(void) < len(photos) else "."
         )
     if all(p.attitude is None for p in photos):
-        yield "No photo carries camera angles."
+        yield "No photo has camera angles."
     guessed = sorted({p.camera_key for p in photos if p.focal.source == "guess"})
     if guessed:
         yield f"The focal length is guessed for {sentence_of(guessed)}."
@@ -253,7 +256,7 @@ def _gaps(photos: Sequence[Photo]) -> Iterator[str]:
 def _clocks(photos: Sequence[Photo]) -> Iterator[str]:
     timeless = [p.name for p in photos if p.time is None]
     if timeless and len(timeless) < len(photos):
-        yield f"Without a capture time, put last: {sentence_of(timeless)}."
+        yield f"Without a capture time, sorted last: {sentence_of(timeless)}."
     times = sorted(p.time.replace(tzinfo=None) for p in photos if p.time)
     gap = max(((b - a).total_seconds() / 3600 for a, b in pairwise(times)), default=0.0)
     if gap > _LONG_GAP_H:

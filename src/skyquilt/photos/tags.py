@@ -1,4 +1,4 @@
-"""EXIF tags and XMP packets as numbers and words; whatever is broken reads as absent."""
+"""EXIF tags and XMP packets as numbers and text; broken values are treated as absent."""
 
 import io
 import math
@@ -26,12 +26,12 @@ GPS_TIME, GPS_ERROR, GPS_DATE = 7, 0x1F, 0x1D
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Exif:
-    """Tags by number: of the image and photo directories in `tags`, of the GPS directory in
+    """Tags by number: those of the image and Exif directories in `tags`, of the GPS directory in
     `gps`.
     """
 
     tags: Mapping[int, Any] = field(default_factory=dict)
-    """IFD0 and the Exif directory in one (their numbers do not clash)."""
+    """IFD0 and the Exif directory together (their numbers do not overlap)."""
     gps: Mapping[int, Any] = field(default_factory=dict)
     """The GPS directory."""
     broken: bool = False
@@ -42,19 +42,19 @@ class Exif:
         return as_text(self.tags.get(tag))
 
     def number(self, tag: int) -> float | None:
-        """A tag as a finite number; None where it is absent or void."""
+        """A tag as a finite number; None where it is absent or invalid."""
         return as_number(self.tags.get(tag))
 
 
 def as_text(value: Any) -> str:
-    """Text up to the first NUL, stripped; empty for anything that is no text."""
+    """Text up to the first NUL, stripped; empty for other types."""
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
     return value.split("\x00")[0].strip() if isinstance(value, str) else ""
 
 
 def as_number(value: Any) -> float | None:
-    """A finite float of a number, rational or one-element tuple; else None."""
+    """A finite float from a number, rational or one-element tuple; else None."""
     if isinstance(value, (tuple, list)):
         value = value[0] if len(value) == 1 else None
     if isinstance(value, bytes):
@@ -67,12 +67,12 @@ def as_number(value: Any) -> float | None:
 
 
 def parse_exif(block: bytes) -> Exif:
-    """Tags of an EXIF block as it stands in a JPEG or PNG (a TIFF header and directories)."""
+    """Tags of an EXIF block as stored in a JPEG or PNG (a TIFF header and directories)."""
     return read_tiff_tags(io.BytesIO(block)) if block else Exif()
 
 
 def read_tiff_tags(file: BinaryIO) -> Exif:
-    """Tags of a TIFF file or block, read from its directories alone; never raises."""
+    """Tags of a TIFF file or block, read from its directories only; never raises."""
     exif = Image.Exif()
     try:
         with warnings.catch_warnings():
@@ -83,14 +83,14 @@ def read_tiff_tags(file: BinaryIO) -> Exif:
             return Exif(tags=tags, gps=_directory(exif, GPS_IFD))
     except (
         Exception
-    ):  # Pillow raises a dozen kinds on garbage, and a broken block must not stop a survey
+    ):  # Pillow raises many exceptions on invalid data, and a broken block must not stop a survey
         return Exif(broken=True)
 
 
 def _directory(exif: Image.Exif, which: int) -> dict[int, Any]:
     try:
         found = exif.get_ifd(which)
-    except Exception:  # as above: one broken directory leaves the others readable
+    except Exception:  # as above: one broken directory does not affect the others
         return {}
     return {k: v for k, v in found.items() if isinstance(k, int)}
 
@@ -114,15 +114,15 @@ _ELEMENT = re.compile(r"<([\w-]+:[\w-]+)[^<>]*>([^<>]*)</\1\s*>")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Xmp:
-    """Values by `prefix:Name`, with the usual prefixes whatever the file calls them."""
+    """Values by `prefix:Name`, with the usual prefixes, whatever prefixes the file uses."""
 
     values: Mapping[str, str] = field(default_factory=dict)
-    """All simple properties; of a list the items joined by commas."""
+    """All simple properties; the items of a list are joined by commas."""
     broken: bool = False
-    """A packet was there but was no XML; what a search could recover is in `values`."""
+    """There was a packet, but it was not XML; values found by a text search are in `values`."""
 
     def text(self, *names: str) -> str:
-        """The first of `names` that is there and not empty; `Name` alone means any prefix."""
+        """The first of `names` that is present and not empty; `Name` alone means any prefix."""
         for name in names:
             keys = (
                 [name] if ":" in name else [k for k in self.values if k.partition(":")[2] == name]
@@ -140,7 +140,7 @@ class Xmp:
         return None
 
     def numbers(self, name: str) -> tuple[float, ...]:
-        """A list such as `1.0,2.0`; empty where an item is no number."""
+        """A list such as `1.0,2.0`; empty where an item is not a number."""
         items = [parse_number(part) for part in re.split(r"[,\s]+", self.text(name)) if part]
         return () if None in items else tuple(i for i in items if i is not None)
 
@@ -164,7 +164,7 @@ def parse_xmp(packets: Sequence[bytes]) -> Xmp:
             found = dict(_properties(ElementTree.fromstring(_body(packet))))
         except (
             Exception
-        ):  # not XML, or forbidden XML: a search still finds plain name="value" pairs
+        ):  # not XML, or forbidden XML: a text search still finds plain name="value" pairs
             found, broken = _searched(packet), True
         values = {**found, **values}
     return Xmp(values=values, broken=broken)

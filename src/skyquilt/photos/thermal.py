@@ -1,4 +1,4 @@
-"""Radiometric thermal frames: raw data, never the palette."""
+"""Radiometric thermal frames: the raw data, never the displayed palette."""
 
 import re
 from dataclasses import dataclass
@@ -55,13 +55,13 @@ def thermal_frame_of_jpeg(jpeg: JpegHeader, *, make: str) -> ThermalFrame | None
     flir = read_flir(jpeg)
     if flir is not None and flir.camera is not None:
         note = (
-            "Temperatures follow from FLIR's constants with emissivity"
+            "Temperatures are computed with FLIR's constants and emissivity"
             f" {flir.camera.emissivity:.2f}."
         )
         return ThermalFrame(values=flir.camera.celsius(flir.counts), unit="celsius", note=note)
     if flir is not None:
         note = (
-            "It is a FLIR frame without radiometric constants: values are counts, no temperatures."
+            "It is a FLIR frame without radiometric constants: values are counts, not temperatures."
         )
         return ThermalFrame(values=flir.counts.astype(np.float32), unit="counts", note=note)
     return _dji(jpeg) if "dji" in make.lower() else None
@@ -79,13 +79,13 @@ def _dji(jpeg: JpegHeader) -> ThermalFrame | None:
     counts = np.frombuffer(raw, dtype="<u2").reshape(size[1], size[0])
     note = (
         "It is a DJI radiometric frame: values are sensor counts, ordered as temperatures are; "
-        "degrees need the maker's own library, and the palette is no measurement."
+        "degrees need the manufacturer's library, and the palette contains no measurements."
     )
     return ThermalFrame(values=counts.astype(np.float32), unit="counts", note=note)
 
 
 def stated_unit(text: str) -> Stored:
-    """The unit that a TIFF's description or GDAL's metadata name; empty where they name none."""
+    """The unit named in a TIFF's description or in GDAL's metadata; empty where none is named."""
     found = _STATED.search(text)
     word = (found[1] or found[2]).lower().replace(" ", "") if found else ""
     return _WORDS.get(word, "")
@@ -94,31 +94,31 @@ def stated_unit(text: str) -> Stored:
 def thermal_frame_of_values(values: NDArray[np.generic], stored: Stored = "") -> ThermalFrame:
     """Degrees Celsius from a single-band thermal TIFF whose values mean `stored`.
 
-    Where nobody says it, the median value does. Whole numbers: hundredths or tenths of a kelvin;
-    real numbers: kelvin or degrees Celsius; else counts.
+    Where the meaning is not stated, it is derived from the median value. Integers: hundredths or
+    tenths of a kelvin; real numbers: kelvin or degrees Celsius; otherwise counts.
     """
     real = values.astype(np.float32)
     whole = values.dtype.kind in "iu"
     if whole:
         real[values == 0] = np.nan
     if stored:
-        note = f"Its values are read as {stored}, as the file or --thermal-unit says."
+        note = f"Its values are read as {stored}, as stated by the file or --thermal-unit."
         return _frame(real, stored, note)
     finite = real[np.isfinite(real)]
     middle = float(np.median(finite)) if finite.size else float("nan")
     found = _likely(middle, whole=whole)
     if found == "counts":
         words = (
-            "fits no unit of temperature: values are counts, unless --thermal-unit says what"
-            " they are."
+            "fits no unit of temperature: values are counts, unless --thermal-unit states their"
+            " unit."
         )
     else:
-        words = f"reads as {found}; no unit is stated (--thermal-unit says it)."
+        words = f"fits {found}; no unit is stated (set it with --thermal-unit)."
     return _frame(real, found, f"Its median value {middle:g} {words}")
 
 
 def _likely(middle: float, *, whole: bool) -> Stored:
-    """The unit in which a median value is a temperature on Earth."""
+    """The unit in which a median value is a plausible temperature on Earth."""
     ranges: tuple[tuple[tuple[float, float], Stored], ...] = (
         ((_CENTIKELVIN, "centikelvin"), (_DECIKELVIN, "decikelvin"))
         if whole

@@ -1,4 +1,4 @@
-"""Which photos of two cameras were taken together, by their times or their names."""
+"""Finds photos of two cameras that were taken together, by their times or their names."""
 
 import re
 from collections.abc import Sequence
@@ -9,21 +9,21 @@ import numpy as np
 from skyquilt.model.photo import Photo
 
 SECONDS = 0.75
-"""Longest time between two shots of one release."""
+"""Longest time between two photos of one trigger."""
 CONTRADICTION_S = 5.0
-"""Time between shots of equal names from which these are chance: stamps of whole seconds, cameras
-that write late.
+"""Time difference above which equal numbers in names are chance. Below it, time stamps may be
+rounded to seconds, or a camera may write late.
 """
 APART_M = 5.0
-"""Distance of reported positions from which two photos are not of one drone."""
+"""Distance between reported positions above which two photos are not from the same drone."""
 _EARTH_M = 6371008.8
 
 
 def taken_together(a: Sequence[Photo], b: Sequence[Photo]) -> list[tuple[int, int]]:
-    """Pairs (index of a, index of b), each photo in one at most, by ascending index of b.
+    """Pairs (index of a, index of b), each photo in at most one, by ascending index of b.
 
-    By equal numbers in the names, where neither times nor positions contradict; for photos that
-    have no partner by name, by the nearest time.
+    Photos are paired by equal numbers in the names, where neither times nor positions contradict;
+    photos without a partner by name are paired by the nearest time.
     """
     named: dict[tuple[str, ...], list[int]] = {}
     for i, photo in enumerate(a):
@@ -59,7 +59,7 @@ def _gap_s(a: Photo, b: Photo) -> float | None:
 
 
 def _possible(a: Photo, b: Photo) -> bool:
-    """Whether nothing contradicts that both were taken at one moment from one place."""
+    """Whether time and position allow that both photos were taken at the same moment and place."""
     gap = _gap_s(a, b)
     if gap is not None and gap > CONTRADICTION_S:
         return False

@@ -1,1 +1,1 @@
-"""How good a map is, in figures."""
+"""Measures of the quality of a map."""

@@ -22,13 +22,13 @@ class AxisErrors:
     rms_m: Axes
     """Root mean square error along x, y, z in m."""
     mean_m: Axes
-    """Mean error along x, y, z in m: what a shift of the whole map would take away."""
+    """Mean error along x, y, z in m: the part that a shift of the whole map would remove."""
     count: int
-    """Positions compared."""
+    """Number of positions compared."""
 
 
 def geolocation_errors(estimated: NDArray[Any], reference: NDArray[Any]) -> AxisErrors:
-    """Errors of positions (n, 3) in m against a reference (n, 3); NaN where either says nothing."""
+    """Errors of positions (n, 3) in m against a reference (n, 3); NaN where either has no value."""
     if np.shape(estimated) != np.shape(reference) or np.shape(estimated)[1:] != (3,):
         raise ValueError(
             f"two (n, 3) arrays expected, got {np.shape(estimated)} and {np.shape(reference)}"
@@ -43,11 +43,11 @@ def geolocation_errors(estimated: NDArray[Any], reference: NDArray[Any]) -> Axis
 
 
 def gps_residuals(alignment: Alignment, priors: Sequence[Prior]) -> Array:
-    """(n, 3) solution minus reported position in m (map frame) of the photos held by tie points, in
-    the order of `alignment.held`; NaN where none was reported.
+    """(n, 3) solution minus reported position in m (map frame) of the photos connected by tie
+    points, in the order of `alignment.held`; NaN where no position was reported.
 
-    Where control points give the heights, the offset of their datum from the photos' is no
-    residual.
+    Where control points determine the heights, the offset between their datum and that of the
+    photos is removed first.
     """
     residual = np.array(
         [alignment.poses[i].map_C - priors[i].map_C for i in alignment.held]

@@ -1,4 +1,4 @@
-"""Patches of ground out of georeferenced rasters, whatever their grids."""
+"""Patches of ground from georeferenced rasters with different grids."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from rasterio.enums import Resampling
 from rasterio.windows import Window
 
 MARGIN = 3
-"""Px of a raster read around what is asked for, for interpolation."""
+"""Margin in px read around a requested window, for interpolation."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ground:
-    """Grey pixels with their place, north up."""
+    """Grey pixels with their georeference, north up."""
 
     grey: NDArray[np.float32]
     """(H, W) values; 0 where unknown."""
@@ -35,7 +35,7 @@ class Ground:
         """A patch (size, size) of pixels of `gsd` m centred on (x, y), and the share of it that is
         known.
 
-        What is unknown gets the mean of the rest.
+        Unknown pixels get the mean of the others.
         """
         step = (np.arange(size) - (size - 1) / 2) * gsd
         columns = np.float32((x + step - self.west) / self.px_x - 0.5)
@@ -79,9 +79,9 @@ def read_ground(
 def patches(
     raster: rasterio.DatasetReader, places: NDArray[np.float64], gsd: float, size: int
 ) -> Iterator[tuple[NDArray[np.float32], float]]:
-    """The patch of pixels of `gsd` m around each place (n, 2) in m, as `Ground.patch` gives it.
+    """The patch of pixels of `gsd` m around each place (n, 2) in m, as returned by `Ground.patch`.
 
-    A coarse raster is read once and whole, a fine one window by window, so memory stays small.
+    A coarse raster is read once as a whole, a fine one window by window, to limit memory.
     """
     factor = max(1, round(gsd / raster.transform.a))
     whole = read_ground(raster, factor) if factor > 1 else None
@@ -93,7 +93,7 @@ def patches(
 
 
 def _around(raster: rasterio.DatasetReader, x: float, y: float, half: float) -> Window:
-    """The window that holds a square of `half` m to each side, and a margin; cut at the raster's
+    """The window that holds a square of `half` m to each side and a margin, cut at the raster's
     edges.
     """
     px = raster.transform.a

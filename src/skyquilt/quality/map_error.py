@@ -1,4 +1,4 @@
-"""Map error: how far a mosaic's content lies from the same content in a true orthophoto."""
+"""Map error: displacement between a mosaic's content and the same content in a true orthophoto."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ from skyquilt.quality.ground_error import patches
 SIZE = 64
 """Side of a patch in px."""
 LEAST_KNOWN = 0.7
-"""Share of a coarse patch that both rasters must know; of the last, all."""
+"""Share of a coarse patch that must be known in both rasters; in the last level, all of it."""
 Array = NDArray[np.float64]
 
 
@@ -31,9 +31,9 @@ class MapSample:
     error_y_m: float
     """Mosaic minus truth, north, in m."""
     ok: bool
-    """False: no trustworthy displacement was found."""
+    """False: no reliable displacement was found."""
     reason: str
-    """Why not; empty if it was."""
+    """Why not; empty where `ok`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,19 +55,19 @@ class MapError:
     """Errors of a mosaic; None where nothing was measured."""
 
     absolute: ErrorFigures | None
-    """As the coordinates stand."""
+    """Errors of the coordinates as they are."""
     relative: ErrorFigures | None
-    """After the bias is taken away: what remains of it when the map is shifted to fit."""
+    """Errors after the bias is removed, that is, after a shift of the whole map."""
     bias_x_m: float | None
     """Median error, east, in m."""
     bias_y_m: float | None
     """Median error, north, in m."""
     measured: int
-    """Points with a trustworthy displacement."""
+    """Points with a reliable displacement."""
     attempted: int
     """Points where both rasters are known and the truth has texture."""
     samples: tuple[MapSample, ...]
-    """All attempted points."""
+    """All points that were tried."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,13 +75,13 @@ class _Level:
     """Points compared at one ground resolution."""
 
     offset: Array
-    """(n, 2) truth minus mosaic in m, east and north; meaningful where found."""
+    """(n, 2) truth minus mosaic in m, east and north; valid where `found`."""
     attempted: NDArray[np.bool_]
-    """(n,) both known, and textured."""
+    """(n,) both rasters known, and textured."""
     found: NDArray[np.bool_]
-    """(n,) trustworthy."""
+    """(n,) the displacement is reliable."""
     reason: list[str]
-    """Why not."""
+    """Why it is not."""
 
 
 def map_error(
@@ -90,9 +90,9 @@ def map_error(
     """Errors of a GeoTIFF against another in the same CRS, at about `points` places on a regular
     grid.
 
-    Found from coarse to fine: first wherever the truth may lie within `search_m`, then around what
-    the neighbourhood agrees on. `noise`: standard deviation of a value's noise, in the rasters'
-    unit.
+    The search runs from coarse to fine: first over all displacements up to `search_m`, then around
+    the displacement on which neighbouring points agree. `noise`: standard deviation of a value's
+    noise, in the rasters' unit.
     """
     with rasterio.open(mosaic) as m, rasterio.open(truth) as t:
         _check(m, t)
@@ -115,7 +115,7 @@ def map_error(
 
 
 def _check(m: rasterio.DatasetReader, t: rasterio.DatasetReader) -> None:
-    """Refuses rasters that cannot be laid on each other."""
+    """Refuses rasters that cannot be compared."""
     if m.crs != t.crs:
         raise ValueError(f"the mosaic is in {m.crs}, the truth in {t.crs}: one CRS expected")
     for raster in (m, t):
@@ -132,7 +132,7 @@ def _places(m: rasterio.DatasetReader, t: rasterio.DatasetReader, points: int) -
     east, north = min(m.bounds.right, t.bounds.right), min(m.bounds.top, t.bounds.top)
     if west >= east or south >= north:
         raise ValueError(
-            f"the mosaic {tuple(m.bounds)} and the truth {tuple(t.bounds)} share no ground"
+            f"the mosaic {tuple(m.bounds)} and the truth {tuple(t.bounds)} do not overlap"
         )
     spacing = np.sqrt((east - west) * (north - south) / points)
     x, y = (
@@ -145,8 +145,8 @@ def _places(m: rasterio.DatasetReader, t: rasterio.DatasetReader, points: int) -
 
 
 def _factors(gsd: float, search_m: float) -> list[int]:
-    """Pixel sizes of the levels in px of the mosaic: the first reaches `search_m` in 16, the last
-    is 1.
+    """Pixel sizes of the levels in px of the mosaic: `search_m` is at most 16 px of the first, the
+    last is 1.
     """
     factors = [max(1, int(np.ceil(search_m / (16 * gsd))))]
     while factors[-1] > 1:
@@ -164,7 +164,7 @@ def _compare(
     radius: int,
     noise: float,
 ) -> _Level:
-    """Looks for the mosaic's patches in the truth around places + guess."""
+    """Searches for the mosaic's patches in the truth around places + guess."""
     gsd = m.transform.a * factor
     a, known_a = zip(*patches(m, places, gsd, SIZE), strict=True)
     b, known_b = zip(*patches(t, places + guess, gsd, SIZE), strict=True)
@@ -185,8 +185,8 @@ def _metres(shift: Shift, gsd: float) -> Array:
 
 
 def _agreed(places: Array, level: _Level, guess: Array) -> Array:
-    """(n, 2) what the five nearest points that were found agree on (their median); the guess if
-    none was.
+    """(n, 2) median displacement of the five nearest points that were found; the guess if none
+    was.
     """
     if not level.found.any():
         return guess

@@ -1,5 +1,5 @@
-"""The quality function of the thesis, for any method: lambda, its two parts, and the graphs beside
-them (Y 6.1).
+"""The quality function of the thesis, for any method: lambda, its two parts, and the graphs that
+belong to it (Y 6.1).
 """
 
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from skyquilt.quality.replay import (
 )
 
 ACROSS = 400
-"""Width in px of the photos that are compared: the thesis's scale."""
+"""Width in px of the photos that are compared: that of the thesis."""
 
 
 def placement_quality(
@@ -38,7 +38,7 @@ def placement_quality(
     alpha: float,
     order: Sequence[int],
 ) -> Steps[dict[str, Any]]:
-    """Replays the placements in the order given at one ground resolution, and measures known
+    """Replays the placements in the given order at one ground resolution, and measures known
     distances.
     """
     yield 0, 1
@@ -110,8 +110,8 @@ def _place(
     views: dict[int, View],
     ground: Ground,
 ) -> NDArray[np.float64] | None:
-    """Where the map shows a point: by the observation that looks most steeply down, whose photo
-    wins there.
+    """Where the map shows a point: from the most vertical observation whose photo the map shows
+    there.
     """
     best, place = np.inf, None
     for observation in observations:

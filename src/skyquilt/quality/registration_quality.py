@@ -20,7 +20,7 @@ def eta(lengths: ArrayLike, reference: ArrayLike) -> float:
     """(4.7): orthorectification quality, 4 / sum of max(l, l') / min(l, l'), in (0, 1], 1 =
     undeformed.
 
-    Both (4,): width, height and both diagonals of a target as mapped and as it is.
+    Both (4,): width, height and both diagonals of a target in the map and in reality.
     """
     found, true = np.asarray(lengths, np.float64), np.asarray(reference, np.float64)
     if found.shape != (4,) or true.shape != (4,) or not (found > 0).all() or not (true > 0).all():
@@ -35,11 +35,11 @@ def mean_squared_error(estimated: ArrayLike, points: ArrayLike) -> float:
 
 
 def spread_quality(inliers: ArrayLike, width: int, height: int, *, delta: float) -> float:
-    """Q of (6.3): share of the image nearer than `delta` px to an inlier, times the largest
+    """Q of (6.3): share of the image that is nearer than `delta` px to an inlier, times the largest
     distance between two inliers over the image's diagonal; in [0, 1], 0 for fewer than two.
 
     `inliers` (n, 2) in px, centres at integers; the diagonal runs between the corner pixels'
-    centres, so that 1 can be reached. Only what lies in the image counts as covered.
+    centres, so that 1 can be reached. Only pixels inside the image count as covered.
     """
     px = np.asarray(inliers, np.float64).reshape(-1, 2)
     if len(px) < 2:

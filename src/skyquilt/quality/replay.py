@@ -1,4 +1,4 @@
-"""Correlation of each photo with the map so far, replayed in order of capture, and the thesis's
+"""Correlation of each photo with the map so far, computed in order of capture, and the thesis's
 quality function lambda (Y 4.6, 6.1, Fig. 6.4).
 """
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from skyquilt.imaging.plane import Overview, Patch
 
 LEAST_PX = 200
-"""Pixels that must overlap for a correlation to mean anything."""
+"""Smallest overlap in px for a correlation to be used."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -26,7 +26,7 @@ class Replay:
 
 
 def replay(patches: Iterable[Patch | None]) -> Replay:
-    """Adds photos, all on one grid, to an overview, centre first; None is a photo that is not
+    """Merges photos, all on one grid, into an overview, centre first; None is a photo that is not
     placed.
     """
     overview, last = Overview(), None
@@ -55,21 +55,22 @@ def _agreement(patch: Patch, pixels: NDArray[np.float32], shown: NDArray[np.bool
 
 
 def _alone(last: Patch, patch: Patch) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """What the last photo shows on this one's part of the grid."""
+    """The last photo's content on this photo's part of the grid."""
     alone = Overview()
     alone.merge(last)
     return alone.window(patch.row, patch.column, *patch.shown.shape)
 
 
 def correlation(x: NDArray[Any], y: NDArray[Any], mask: NDArray[np.bool_] | None = None) -> float:
-    """CC of (6.1), covariance over the product of the standard deviations, of two images of one
+    """CC of (6.1), covariance over the product of the standard deviations, of two images of equal
     shape.
 
-    `mask` (the images' shape, without a last axis of bands) says where both show something. NaN
-    where there is no overlap, or where one image is constant in it and correlation means nothing.
+    `mask` (the images' shape, without a last axis of bands) is True where both have content. NaN
+    where there is no overlap, or where one image is constant in it and the correlation is
+    undefined.
     """
     if x.shape != y.shape:
-        raise ValueError(f"two images of one shape expected, got {x.shape} and {y.shape}")
+        raise ValueError(f"two images of equal shape expected, got {x.shape} and {y.shape}")
     if mask is not None:
         x, y = x[mask], y[mask]
     if x.size == 0:
@@ -82,15 +83,15 @@ def correlation(x: NDArray[Any], y: NDArray[Any], mask: NDArray[np.bool_] | None
 
 
 def lambda_spat(actual: ArrayLike, estimated: ArrayLike) -> float:
-    """(6.1): mean over distances d of 1 / (1 + |d - estimate| / d), in (0, 1]; both (m,), any one
-    unit.
+    """(6.1): mean over distances d of 1 / (1 + |d - estimate| / d), in (0, 1]; both (m,), in the
+    same unit.
     """
     return float(np.mean(1 / (1 + _relative(actual, estimated))))
 
 
 def lambda_spat_of_table(actual: ArrayLike, estimated: ArrayLike) -> float:
-    """What Table 6.1 prints as lambda_spat, which is not (6.1) but 1 - sum |d - estimate| / d; both
-    (m,).
+    """The values printed as lambda_spat in Table 6.1, which follow not (6.1) but 1 - sum |d -
+    estimate| / d; both (m,).
     """
     return float(1 - np.sum(_relative(actual, estimated)))
 
@@ -98,8 +99,8 @@ def lambda_spat_of_table(actual: ArrayLike, estimated: ArrayLike) -> float:
 def lambda_corr(correlations: ArrayLike) -> float:
     """(6.1): mean of (1 + CC) / 2 over the photos added, in [0, 1].
 
-    `correlations` (n,): CC of each new photo with the mosaic so far; NaN (the first photo, no
-    overlap) is left out. NaN if nothing is left.
+    `correlations` (n,): CC of each new photo with the mosaic so far; NaN values (the first photo,
+    no overlap) are ignored. NaN if there are no others.
     """
     cc = np.asarray(correlations, np.float64)
     cc = cc[np.isfinite(cc)]
@@ -107,7 +108,9 @@ def lambda_corr(correlations: ArrayLike) -> float:
 
 
 def lambda_quality(spat: float, corr: float, *, alpha: float = 0.5) -> float:
-    """(4.6): alpha lambda_spat + (1 - alpha) lambda_corr; alpha weighs distances against looks."""
+    """(4.6): alpha lambda_spat + (1 - alpha) lambda_corr; alpha weighs distances against visual
+    agreement.
+    """
     return alpha * spat + (1 - alpha) * corr
 
 

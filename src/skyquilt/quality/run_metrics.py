@@ -1,4 +1,4 @@
-"""How good the result is, in figures: everything that goes into metrics.json but times."""
+"""The figures of a run: everything that goes into metrics.json except times."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -30,7 +30,7 @@ def xyz(values: Sequence[float] | NDArray[Any] | None) -> dict[str, float | None
 
 
 def _rms(values: NDArray[np.float64]) -> float:
-    """NaN for none."""
+    """Root mean square; NaN for an empty array."""
     return float(np.sqrt((values**2).mean())) if len(values) else np.nan
 
 
@@ -59,8 +59,9 @@ def alignment_figures(alignment: Alignment, priors: Sequence[Prior]) -> dict[str
 def control_figures(alignment: Alignment) -> dict[str, Any]:
     """Control and check points.
 
-    Where heights count from the take-off point (or nobody knows), and no control point ties them to
-    the survey's, both differ by a constant: the median, told apart from the errors.
+    Where heights refer to the take-off point or to an unknown zero, and no control point connects
+    them to the survey's datum, the two differ by a constant. It is estimated as the median and
+    reported apart from the errors.
     """
     points = alignment.control
     dz = np.array([c.error_m[2] for c in points], float)
@@ -84,7 +85,7 @@ def control_figures(alignment: Alignment) -> dict[str, Any]:
 
 
 def camera_figures(photos: Sequence[Photo], alignment: Alignment) -> dict[str, Any]:
-    """Intrinsics with deviations and what the metadata said of the focal length."""
+    """Intrinsics with standard deviations, and the focal length reported by the metadata."""
     out: dict[str, Any] = {}
     for i in sorted(alignment.poses):
         key = alignment.camera_of[i]
@@ -148,7 +149,7 @@ def figures(
 
 
 def _holes(seen: NDArray[np.bool_], cell_m2: float) -> dict[str, float]:
-    """Places inside the map that no photo shows: how many, and their area in m2."""
+    """Places inside the map that no photo shows: their number and their area in m2."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(
         np.pad(~seen, 1, constant_values=True).astype(np.uint8), connectivity=4
     )
@@ -158,6 +159,6 @@ def _holes(seen: NDArray[np.bool_], cell_m2: float) -> dict[str, float]:
 
 
 def _reasons(reasons: Sequence[str]) -> dict[str, int]:
-    """How often each reason occurs, details in brackets left out."""
+    """How often each reason occurs, ignoring details in brackets."""
     short = [r.split(" (")[0] for r in reasons]
     return {r: short.count(r) for r in sorted(set(short))}

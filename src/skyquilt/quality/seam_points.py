@@ -1,6 +1,4 @@
-"""Points spread along the seams of a mosaic, from the raster that says which photo each pixel
-shows.
-"""
+"""Points spread along the seams of a mosaic, from the raster that holds the photo of each pixel."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +9,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, kw_only=True)
 class SeamPoint:
-    """A place where two photos meet."""
+    """A point where two photos meet."""
 
     row: float
     """Row in the label raster, centres at integers."""
@@ -25,10 +23,10 @@ class SeamPoint:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Edges:
-    """All pixel edges between two photos, those of one pair of photos after another."""
+    """All pixel edges between two photos, grouped by pair of photos."""
 
     place: NDArray[np.float64]
-    """(m, 2) rows and columns of the edges' middles."""
+    """(m, 2) rows and columns of the edges' midpoints."""
     first: NDArray[np.int64]
     """(k,) index of the first edge of each pair."""
     length: NDArray[np.int64]
@@ -42,9 +40,9 @@ def seam_points(
 ) -> list[SeamPoint]:
     """Points spread evenly along all seams of a label raster (H, W) of integers, 0 = no photo.
 
-    A point about every `spacing_px`, or less often to keep to `limit`; every pair of photos that
-    share a seam has at least one, as long as there are no more pairs than `limit` (else the longest
-    seams have).
+    One point about every `spacing_px`, fewer where `limit` would be exceeded. Every pair of photos
+    that share a seam has at least one; if there are more pairs than `limit`, only the longest seams
+    have.
     """
     edges = _edges(labels)
     if limit < 1 or not len(edges.length):
@@ -81,7 +79,7 @@ def _edges(labels: NDArray[Any]) -> _Edges:
 
 
 def _shares(length: NDArray[np.int64], spacing_px: float, limit: int) -> NDArray[np.int64]:
-    """Number of points per seam: one each, the rest by length, `limit` in all at most."""
+    """Number of points per seam: one each, the others by length, at most `limit` in all."""
     if len(length) >= limit:
         return np.isin(np.arange(len(length)), np.argsort(-length, kind="stable")[:limit]).astype(
             np.int64
@@ -94,7 +92,7 @@ def _shares(length: NDArray[np.int64], spacing_px: float, limit: int) -> NDArray
 
 
 def _spread(place: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """`count` of the places of a seam, at equal steps along its main direction."""
+    """`count` of the points of a seam, at equal steps along its main direction."""
     if count == 0:
         return place[:0]
     away = place - place.mean(0)

@@ -1,5 +1,5 @@
-"""Seam disparity: how far two photos disagree about the ground where the mosaic changes between
-them.
+"""Seam disparity: the displacement between two photos where the mosaic changes from one to the
+other.
 """
 
 from collections.abc import Sequence
@@ -14,12 +14,12 @@ from skyquilt.imaging.registration import RADIUS, shifts_between
 from skyquilt.quality.seam_points import SeamPoint
 
 LEAST_MEASURED = 0.6
-"""Share of the attempted points that must be measured for the figures to stand."""
+"""Share of the attempted points that must be measured for the figures to be reliable."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PatchPairs:
-    """What two photos show around each of n points, each orthorectified at the native
+    """The content of two photos around each of n points, orthorectified at the native
     resolution.
     """
 
@@ -32,7 +32,7 @@ class PatchPairs:
 
 
 class PatchSource(Protocol):
-    """Whoever can orthorectify: cuts both photos' patches around points of a seam."""
+    """An object that orthorectifies: cuts both photos' patches around points of a seam."""
 
     def __call__(self, points: Sequence[SeamPoint], /) -> PatchPairs:
         """The patches, centred on the points, in their order."""
@@ -55,9 +55,9 @@ class SeamSample:
     dy: float
     """Displacement of b's patch against a's in native px, south."""
     ok: bool
-    """False: no trustworthy displacement was found."""
+    """False: no reliable displacement was found."""
     reason: str
-    """Why not; empty if it was."""
+    """Why not; empty where `ok`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,15 +73,15 @@ class SeamReport:
     p95_cm: float | None
     """95th percentile in cm."""
     measured: int
-    """Points with a trustworthy displacement."""
+    """Points with a reliable displacement."""
     attempted: int
-    """Points whose patches both photos see whole and with texture."""
+    """Points with texture whose whole patch lies in both photos."""
     samples: tuple[SeamSample, ...]
-    """All attempted points."""
+    """All points that were tried."""
 
     @property
     def stands(self) -> bool:
-        """Whether enough of the attempted points were measured for the figures to be believed."""
+        """Whether enough of the attempted points were measured for the figures to be reliable."""
         return self.measured > 0 and self.measured >= LEAST_MEASURED * self.attempted
 
 
@@ -95,9 +95,9 @@ def seam_disparity(
 ) -> SeamReport:
     """Measures the displacement at points of seams.
 
-    `gsd_m` is the ground size of a patch's pixel in m, `radius` the largest displacement looked for
-    in px and `noise` the standard deviation of a value in the patches' unit. A weak summit is a
-    failure, not absent: it counts as attempted.
+    `gsd_m` is the ground size of a patch's pixel in m, `radius` the largest displacement searched
+    in px and `noise` the standard deviation of a value in the patches' unit. A weak correlation
+    peak is a failed measurement: it counts as attempted.
     """
     if not points:
         return _report([], gsd_m)

@@ -1,4 +1,6 @@
-"""Pixels to files: Cloud Optimized GeoTIFF, GeoJSON, and the boundary a user hands in."""
+"""Writes and reads raster and vector files: Cloud Optimized GeoTIFF, GeoJSON, and the boundary that
+a user provides.
+"""
 
 from skyquilt.raster.blocks import Block
 from skyquilt.raster.cog import CogWriter, write_array

@@ -1,7 +1,7 @@
-"""Encoded tiles to a Cloud Optimized GeoTIFF in GDAL's own order.
+"""Assembles encoded tiles into a Cloud Optimized GeoTIFF in GDAL's own order.
 
 Directories first (full size, its mask, each overview, its mask), then tiles row by row, smallest
-overview first, each mask tile behind its image tile, with the leader and trailer that GDAL's
+overview first, each mask tile after its image tile, with the leader and trailer that GDAL's
 structural metadata promise (https://gdal.org/drivers/raster/cog.html).
 """
 
@@ -73,7 +73,7 @@ def _framed(data: bytes) -> bytes:
 
 
 def _spans(spec: RasterSpec, index: Index) -> NDArray[np.int64]:
-    """Bytes that each tile takes in the file, flattened row by row; 0 for empty ones."""
+    """Bytes that each tile takes up in the file, flattened row by row; 0 for empty ones."""
     sizes = index.reshape(-1, 3).astype(np.int64)
     frames = 16 if spec.mask else 8
     return np.where(sizes[:, IMAGE] > 0, sizes[:, IMAGE] + sizes[:, MASK] + frames, 0)
@@ -109,8 +109,8 @@ def _tile_tags(offsets: NDArray[Any], counts: NDArray[Any], big: bool) -> list[T
 
 
 def _ghost(mask: bool) -> bytes:
-    """GDAL's structural metadata between header and first directory; the blank leaves room for
-    YES.
+    """GDAL's structural metadata between header and first directory; the space at the end leaves
+    room for YES.
     """
     text = (
         "LAYOUT=IFDS_BEFORE_DATA\nBLOCK_ORDER=ROW_MAJOR\nBLOCK_LEADER=SIZE_AS_UINT4\n"
@@ -190,9 +190,9 @@ def metadata_xml(spec: RasterSpec) -> str:
 
 
 def _text(value: str) -> str:
-    return escape(escape(_clean(value)))  # GDAL escapes twice, and unescapes twice
+    return escape(escape(_clean(value)))  # GDAL escapes and unescapes twice
 
 
 def _clean(text: str) -> str:
-    """Without the control characters that XML 1.0 has no way to write."""
+    """The text without the control characters that XML 1.0 cannot represent."""
     return "".join(letter for letter in str(text) if letter >= " " or letter in "\t\n\r")

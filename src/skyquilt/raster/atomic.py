@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and errors that say what the disk lacks."""
+"""Files that appear complete or not at all, and errors that say what is wrong with the disk."""
 
 import errno
 import shutil
@@ -14,10 +14,10 @@ CHUNK = 1 << 20
 
 @contextmanager
 def whole_file(path: Path, *, needed: int = 0) -> Iterator[BinaryIO]:
-    """A file open for writing that takes its name when the block ends well, and vanishes when it
-    does not.
+    """Opens a file for writing. It gets its name when the block ends without error, and is removed
+    otherwise.
 
-    `needed` is its size in bytes, if known: too little room is an `OutputError` before the first
+    `needed` is its size in bytes, if known: too little space is an `OutputError` before the first
     byte.
     """
     path = Path(path)
@@ -36,15 +36,16 @@ def whole_file(path: Path, *, needed: int = 0) -> Iterator[BinaryIO]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file whole, UTF-8."""
-    data = text.encode("utf-8", "backslashreplace")  # names of files need not be text
+    """Writes a text file atomically, UTF-8."""
+    # file names may hold bytes that are no valid text
+    data = text.encode("utf-8", "backslashreplace")
     with whole_file(path, needed=len(data)) as file:
         file.write(data)
 
 
 @contextmanager
 def mended(path: Path, *, needed: int = 0) -> Iterator[None]:
-    """Turn the operating system's refusal to write `path` into an `OutputError` with the next
+    """Turns an operating system error while writing `path` into an `OutputError` with the next
     step.
     """
     try:
@@ -54,7 +55,7 @@ def mended(path: Path, *, needed: int = 0) -> Iterator[None]:
 
 
 def free_bytes(folder: Path) -> int:
-    """Free space in bytes where `folder` lies (or will lie)."""
+    """Free space in bytes on the disk where `folder` is, or will be."""
     folder = Path(folder).absolute()
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent

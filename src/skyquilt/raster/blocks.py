@@ -1,4 +1,4 @@
-"""Super-blocks: squares of tiles, walked along a Z so that few overview tiles are open at a
+"""Super-blocks: squares of tiles, visited in Z-order so that few overview tiles are open at a
 time.
 """
 
@@ -22,8 +22,8 @@ class Block:
     """Side of a tile in px."""
 
     def tiles(self) -> Iterator[tuple[int, int, slice, slice]]:
-        """(tile_row, tile_col, rows, columns): what `write_tile` takes, slices into the block's
-        pixels.
+        """(tile_row, tile_col, rows, columns): the arguments of `write_tile`, and slices into the
+        block's pixels.
         """
         for row in range(0, self.height, self.tile):
             for col in range(0, self.width, self.tile):

@@ -1,5 +1,5 @@
-"""The area a user wants mapped: polygons of GeoJSON, KML, GeoPackage or Shapefile in the output
-CRS, and the map's pixels inside them.
+"""The area to be mapped: polygons from GeoJSON, KML, GeoPackage or Shapefile in the output CRS, and
+the map's pixels inside them.
 """
 
 import json
@@ -35,16 +35,16 @@ from shapely.prepared import prep
 from skyquilt.errors import SideFileError
 
 SEGMENTS = 100
-"""Pieces that an outline's extent is cut into before it is projected: straight lines do not stay
-straight.
+"""An outline is divided into segments of at most its extent over this number before it is
+projected, because straight lines become curved.
 """
 
 
 def read_boundary(path: Path, crs: str | None) -> Polygon | MultiPolygon:
-    """All polygons of a GeoJSON, KML, KMZ, WKT, GeoPackage or Shapefile, united, in `crs`.
+    """The union of all polygons of a GeoJSON, KML, KMZ, WKT, GeoPackage or Shapefile, in `crs`.
 
-    WKT is in the output CRS already; the others state theirs. An ungeoreferenced output (`crs`
-    None) takes WKT only.
+    WKT is in the output CRS already; the others state theirs. For an output without georeference
+    (`crs` None) only WKT is accepted.
     """
     path = Path(path)
     reader = READERS.get(path.suffix.lower())
@@ -74,7 +74,7 @@ def inside(
 ) -> NDArray[np.bool_]:
     """(height, width), True where a pixel's centre lies in the polygon, for a window of a raster.
 
-    `affine` is the whole raster's (a, b, c, d, e, f), the polygon in its CRS.
+    `affine` is that of the whole raster (a, b, c, d, e, f); the polygon is in its CRS.
     """
     from rasterio.features import geometry_mask
     from rasterio.transform import Affine
@@ -134,7 +134,7 @@ def _projected(
 
 
 Shapes = tuple[list[BaseGeometry], str | None]
-"""Two-dimensional shapes and their CRS as pyproj reads it; None = the output's."""
+"""Two-dimensional shapes and their CRS as pyproj reads it; None = the output's CRS."""
 
 WGS84 = "EPSG:4326"
 
@@ -156,12 +156,12 @@ def _geometries(content: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def read_kml(path: Path) -> Shapes:
-    """All polygons of a KML file; a path that ends where it began counts as one."""
+    """All polygons of a KML file; a path whose last point equals its first counts as a polygon."""
     return _kml_shapes(path.read_bytes()), WGS84
 
 
 def read_kmz(path: Path) -> Shapes:
-    """Every KML inside the archive."""
+    """All polygons of every KML file inside the archive."""
     with zipfile.ZipFile(path) as archive:
         names = [name for name in archive.namelist() if name.lower().endswith(".kml")]
         return [shape for name in names for shape in _kml_shapes(archive.read(name))], WGS84
@@ -216,7 +216,7 @@ def read_geopackage(path: Path) -> Shapes:
 
 
 def _gpkg_header(blob: bytes) -> int:
-    """Bytes before the WKB: 8 and an envelope of 0, 32, 48 or 64."""
+    """Number of bytes before the WKB: 8 plus an envelope of 0, 32, 48 or 64."""
     return 8 + (0, 32, 48, 48, 64)[blob[3] >> 1 & 7]
 
 
@@ -243,7 +243,8 @@ def _shp_polygon(record: bytes) -> list[BaseGeometry]:
     starts = [*struct.unpack_from(f"<{parts}i", record, 44), count]
     places = np.frombuffer(record, "<f8", 2 * count, 44 + 4 * parts).reshape(count, 2)
     rings = [Polygon(places[start:end]) for start, end in pairwise(starts)]
-    return [reduce(lambda area, ring: area.symmetric_difference(ring), rings)]  # holes lie inside
+    # rings inside others are holes
+    return [reduce(lambda area, ring: area.symmetric_difference(ring), rings)]
 
 
 READERS: dict[str, Callable[[Path], Shapes]] = {

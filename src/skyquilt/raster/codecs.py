@@ -1,4 +1,4 @@
-"""A tile's pixels and its mask to the bytes that a TIFF holds."""
+"""Encodes a tile's pixels and mask as the bytes stored in a TIFF."""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from skyquilt.raster.spec import RasterSpec
 
 MCU = 16
-"""Side in px of what 4:2:0 JPEG codes together: ringing never leaves it."""
+"""Side in px of the unit that 4:2:0 JPEG codes together: ringing stays within it."""
 
 DEFLATE_LEVEL = 6
 ZSTD_LEVEL = 3
 
 
 class TileEncoder:
-    """Encodes tiles of one raster; no state that changes, so any number of threads may share it."""
+    """Encodes tiles of one raster. It has no mutable state, so many threads may share it."""
 
     def __init__(self, spec: RasterSpec) -> None:
         self.spec = spec
@@ -52,8 +52,8 @@ class TileEncoder:
         return pack_mask(whole)
 
     def _filled(self, pixels: NDArray[Any], valid: NDArray[np.bool_] | None) -> NDArray[Any]:
-        """The whole tile (tile, tile, bands): edges repeated outwards, something harmless where not
-        valid.
+        """The whole tile (tile, tile, bands): pixels outside the raster repeat its edge, invalid
+        pixels get values that do no harm.
         """
         tile = self.spec.tile
         below, right = tile - pixels.shape[0], tile - pixels.shape[1]
@@ -73,7 +73,7 @@ class TileEncoder:
 
     def _jpeg_stream(self, pixels: NDArray[Any]) -> bytes:
         colour, sampling = ("RGB", "420") if self.spec.bands == 3 else ("GRAY", "Gray")
-        fast = self.spec.quality <= 95  # the fast transform loses more than fine quantisation keeps
+        fast = self.spec.quality <= 95  # the fast transform loses more than fine quantisation
         pixels = np.ascontiguousarray(pixels)
         return bytes(
             simplejpeg.encode_jpeg(pixels, self.spec.quality, colour, sampling, fastdct=fast)
@@ -112,8 +112,8 @@ def smooth_fill(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[Any]:
     """Pixels (uint8) with every invalid one set to the mean of the valid ones in or around its JPEG
     unit.
 
-    So the rim keeps its colour. Units without valid neighbours become black, for viewers that
-    ignore masks.
+    This keeps the colours at the border of the valid area. Units without valid neighbours become
+    black, for viewers that ignore masks.
     """
     pixels, small = pixels.copy(), (valid.shape[1] // MCU, valid.shape[0] // MCU)
     units, inside = _units(pixels), _units(valid[..., None])
@@ -137,7 +137,7 @@ def _units(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def pack_mask(valid: NDArray[np.bool_]) -> bytes:
-    """One bit per pixel, deflated."""
+    """One bit per pixel, compressed with deflate."""
     return bytes(imagecodecs.zlib_encode(np.packbits(valid, axis=1).tobytes(), level=1))
 
 

@@ -1,6 +1,4 @@
-"""Writing a Cloud Optimized GeoTIFF tile by tile, overviews along with it, in little memory,
-resumable.
-"""
+"""Writes a Cloud Optimized GeoTIFF tile by tile, with overviews, in little memory, resumable."""
 
 import threading
 from collections.abc import Iterator
@@ -23,12 +21,12 @@ VERSION = 1
 
 
 class CogWriter:
-    """Writes one raster. As a context manager: leaving it well assembles the file, an error leaves
-    none.
+    """Writes one raster. As a context manager it assembles the file on a normal exit; after an
+    error there is no file.
 
-    With a `digest` (of whatever the pixels depend on) the spool outlives an error or a kill, and
-    the next writer with the same digest and specification skips the blocks that were finished;
-    without, it is removed.
+    With a `digest` (of everything that the pixels depend on) the spool survives an error or a kill,
+    and the next writer with the same digest and specification skips the finished blocks. Without a
+    digest the spool is removed.
     """
 
     def __init__(
@@ -42,10 +40,10 @@ class CogWriter:
         fsync: bool = False,
         bigtiff: bool | None = None,
     ) -> None:
-        """Open, or reopen, the spool (a folder; beside `path` by default).
+        """Opens, or reopens, the spool (a folder; beside `path` by default).
 
-        A block is 2^block_level tiles wide: 2048 px by default. `fsync` survives power cuts too.
-        `bigtiff` None = where the size demands it.
+        A block is 2^block_level tiles wide: 2048 px by default. With `fsync`, finished blocks also
+        survive a power failure. `bigtiff` None = BigTIFF where the size requires it.
         """
         self.path, self.spec = Path(path), spec
         self._resumable, self._bigtiff, self._side = bool(digest), bigtiff, spec.tile << block_level
@@ -65,7 +63,9 @@ class CogWriter:
             self._finish(self._block(*self._pyramid.restore(record)))
 
     def blocks(self) -> Iterator[Block]:
-        """The blocks that are still to do, in an order that keeps few overview tiles open."""
+        """The blocks that are still to be written, in an order that keeps few overview tiles
+        open.
+        """
         for row, col in self._all_blocks():
             if (row, col) not in self._finished:
                 yield self._block(row, col)
@@ -73,18 +73,20 @@ class CogWriter:
     def write_tile(
         self, tile_row: int, tile_col: int, pixels: Pixels, valid: Valid | None = None
     ) -> None:
-        """Encode and spool one tile of the full size; may be called by several threads at once.
+        """Encodes and spools one tile of the full resolution; thread-safe.
 
-        Pixels are (h, w, bands), or (h, w) for one band, cut at the raster's edge; `valid` is (h,
-        w), None = all (or, with a nodata value, what differs from it). Each tile is written once.
-        What is not valid becomes nodata, or masked, or 0.
+        Pixels are (h, w, bands), or (h, w) for one band, cut at the raster's edge. `valid` is (h,
+        w), None = all (or, with a nodata value, all pixels that differ from it). Each tile is
+        written once. Invalid pixels become nodata, masked, or 0.
         """
         part = self._checked(tile_row, tile_col, pixels, valid)
         self._claim(tile_row, tile_col)
         self._pyramid.store(0, tile_row, tile_col, part)
 
     def write_block(self, block: Block, pixels: Pixels, valid: Valid | None = None) -> None:
-        """Write and finish a whole block: pixels (height, width, bands), valid (height, width)."""
+        """Writes and finishes a whole block: pixels (height, width, bands), valid (height,
+        width).
+        """
         for row, col, rows, cols in block.tiles():
             self.write_tile(
                 row, col, pixels[rows, cols], None if valid is None else valid[rows, cols]
@@ -92,8 +94,8 @@ class CogWriter:
         self.finish_block(block)
 
     def finish_block(self, block: Block) -> None:
-        """Make a block survive a kill. Tiles of it that were never written are empty: nothing is
-        valid.
+        """Makes a block durable: it survives a kill. Its tiles that were not written are empty,
+        with no valid pixel.
         """
         for row, col, _, _ in block.tiles():
             if not self._written[row, col]:
@@ -103,7 +105,7 @@ class CogWriter:
         self._finish(block)
 
     def close(self) -> None:
-        """Assemble the file and remove the spool; nothing happens the second time."""
+        """Assembles the file and removes the spool; a second call does nothing."""
         if self._closed:
             return
         if missing := len(self._all_blocks()) - len(self._finished):
@@ -118,7 +120,7 @@ class CogWriter:
         self._spool.close(remove=True)
 
     def abort(self) -> None:
-        """Give up; the spool stays if a digest was given."""
+        """Stops without a file; the spool stays if a digest was given."""
         if not self._closed:
             self._closed = True
             self._spool.close(remove=not self._resumable)
@@ -162,7 +164,7 @@ class CogWriter:
             self._written[row, col] = True
 
     def _checked(self, row: int, col: int, pixels: Pixels, valid: Valid | None) -> Part | None:
-        """Pixels (h, w, bands) and what is valid of them; None if nothing is."""
+        """Pixels (h, w, bands) and their validity; None if no pixel is valid."""
         spec, (rows, cols) = self.spec, self.spec.grids[0]
         if not (0 <= row < rows and 0 <= col < cols):
             raise ValueError(f"tile ({row}, {col}) lies outside the raster's {rows} x {cols} tiles")
@@ -188,7 +190,7 @@ class CogWriter:
 def write_array(
     path: Path, array: NDArray[Any], spec: RasterSpec, valid: Valid | None = None
 ) -> None:
-    """Write a raster that fits in memory: (height, width, bands), or (height, width) for one
+    """Writes a raster that fits in memory: (height, width, bands), or (height, width) for one
     band.
     """
     with CogWriter(path, spec) as writer:

@@ -1,4 +1,6 @@
-"""Four pixels become one: the step between overview levels, aware of what is valid."""
+"""Reduces 2 x 2 pixels to one: the step between overview levels, which takes validity into
+account.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,9 +16,9 @@ Valid = NDArray[np.bool_]
 def halve(pixels: Array, valid: Valid | None, how: str) -> tuple[Array, Valid | None]:
     """Half-size pixels (ceil(h/2), ceil(w/2), bands) and validity of (h, w, bands) ones.
 
-    A pixel of the half is valid where any of its four is; only valid ones contribute. `valid` None
-    = all. Odd edges count twice. The plain rule runs over everything, then the few mixed pixels are
-    done again.
+    A reduced pixel is valid where any of its four pixels is; only valid ones contribute. `valid`
+    None = all. Odd edges count twice. All pixels are reduced as if valid; then the few partly valid
+    ones are computed again.
     """
     pixels = _even(pixels)
     plain, mixed = RULES[how]
@@ -33,7 +35,7 @@ def halve(pixels: Array, valid: Valid | None, how: str) -> tuple[Array, Valid | 
 
 
 def _even(array: Array) -> Array:
-    """Repeat the last row or column of an odd-sized array."""
+    """Repeats the last row or column of an odd-sized array."""
     h, w = array.shape[:2]
     if h % 2 == 0 and w % 2 == 0:
         return array

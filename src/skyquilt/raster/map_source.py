@@ -1,4 +1,4 @@
-"""Pictures of any part of a map, in any projection, from wherever its pixels are."""
+"""Images of any part of a map, in any projection, from any kind of source."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,11 +14,11 @@ from pyproj import Transformer
 from skyquilt.raster.tile_store import LEVELS, SIDE, Address, TileStore
 
 MERCATOR = 20037508.342789244
-"""Half the width of Web Mercator's world in m."""
+"""Half the width of the Web Mercator square in m."""
 NODES = 16
-"""Pixels between exactly transformed points."""
+"""Spacing in px of the points that are transformed exactly."""
 MOST_TILES = 320
-"""Tiles read for one picture."""
+"""Largest number of tiles read for one image."""
 Bounds = tuple[float, float, float, float]
 """West, south, east, north."""
 
@@ -30,7 +30,7 @@ class Part:
     pixels: NDArray[Any]
     """(h, w, bands)."""
     shown: NDArray[np.bool_]
-    """(h, w)."""
+    """(h, w) where the map has content."""
     west: float
     """Left edge in m."""
     north: float
@@ -40,17 +40,17 @@ class Part:
 
 
 class MapSource(Protocol):
-    """A map that can be read by parts."""
+    """A map that can be read in parts."""
 
     @property
     def crs(self) -> str:
         """Its projection."""
 
     def bounds(self) -> Bounds | None:
-        """Its extent in its own projection; None while there is nothing."""
+        """Its extent in its own projection; None while it is empty."""
 
     def part(self, bounds: Bounds, gsd: float) -> Part | None:
-        """Pixels over bounds, about as fine as `gsd`; None where nothing is."""
+        """Pixels within the bounds, about as fine as `gsd`; None where the map has no content."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,12 +64,12 @@ class TileSource:
     crs: str
     """Projection of the tiles."""
     origin: tuple[float, float]
-    """Easting and northing of the frame's zero in m."""
+    """Easting and northing of the map frame's origin in m."""
     gsd: float
-    """Pixels of level 0 in m."""
+    """Ground size of a pixel of level 0 in m."""
 
     def bounds(self) -> Bounds | None:
-        """Extent of what the layer shows."""
+        """Extent of the layer's content."""
         found = self.tiles.extent(self.layer, self.gsd)
         if found is None:
             return None
@@ -77,7 +77,7 @@ class TileSource:
         return found[0] + x, found[1] + y, found[2] + x, found[3] + y
 
     def part(self, bounds: Bounds, gsd: float) -> Part | None:
-        """The level that is just finer than asked for, joined."""
+        """The tiles of the level that is about as fine as requested, joined."""
         level = int(np.clip(np.floor(np.log2(max(gsd / self.gsd, 1e-9)) + 0.25), 0, LEVELS - 1))
         x, y = self.origin
         west, south, east, north = bounds[0] - x, bounds[1] - y, bounds[2] - x, bounds[3] - y
@@ -144,7 +144,7 @@ class FileSource:
         return west, south, east, north  # type: ignore[has-type]
 
     def part(self, bounds: Bounds, gsd: float) -> Part | None:
-        """Read through the file's overviews."""
+        """The part, read from a suitable overview of the file."""
         import rasterio
         from rasterio.windows import from_bounds
 
@@ -187,9 +187,9 @@ def picture(
     height: int,
     scale: tuple[float, float] | None = None,
 ) -> NDArray[np.uint8] | None:
-    """RGBA (height, width, 4) of bounds in any projection; None where the map has nothing.
+    """RGBA (height, width, 4) of bounds in any projection; None where the map has no content.
 
-    `scale`: values (degrees Celsius, counts) shown as black and as white, for measured values.
+    `scale`: for measured values, those (degrees Celsius, counts) shown as black and as white.
     """
     columns, rows = (
         np.arange(-1, width // NODES + 2) * NODES,
@@ -229,13 +229,15 @@ def picture(
 
 
 def _dense(nodes: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
-    """Nodes at every NODES-th pixel, the first one at -NODES, interpolated at all pixels."""
+    """Values at every NODES-th pixel, the first one at -NODES, interpolated to all pixels."""
     c, r = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     return np.asarray(cv2.remap(nodes, c / NODES + 1, r / NODES + 1, cv2.INTER_LINEAR), np.float32)
 
 
 def coloured(pixels: NDArray[Any], scale: Sequence[float] | None = None) -> NDArray[np.uint8]:
-    """RGB (h, w, 3) of a map's pixels; measured values from black over red and yellow to white."""
+    """RGB (h, w, 3) of a map's pixels; measured values in colours from black over red and yellow to
+    white.
+    """
     if pixels.dtype == np.uint8:
         return pixels if pixels.shape[2] == 3 else np.repeat(pixels[..., :1], 3, 2)
     values = pixels[..., 0].astype(np.float32)
@@ -245,7 +247,7 @@ def coloured(pixels: NDArray[Any], scale: Sequence[float] | None = None) -> NDAr
 
 
 def mercator(z: int, x: int, y: int) -> Bounds:
-    """Bounds in EPSG:3857 of a tile."""
+    """Bounds of a tile in EPSG:3857."""
     size = 2 * MERCATOR / 2**z
     return (
         x * size - MERCATOR,

@@ -1,4 +1,6 @@
-"""MBTiles 1.3: web tiles in one SQLite file, which QGIS and tablets open while it grows."""
+"""MBTiles 1.3: web tiles in one SQLite file, which QGIS and tablets can open while it is being
+written.
+"""
 
 import sqlite3
 from collections.abc import Iterable, Sequence
@@ -46,7 +48,7 @@ def write_mbtiles(
             with db:
                 db.executemany("insert or replace into metadata values (?, ?)", list(about.items()))
                 for z, x, y, data in tiles:
-                    key = (z, x, 2**z - 1 - y)  # rows count from the south there
+                    key = (z, x, 2**z - 1 - y)  # MBTiles counts rows from the south
                     if data is None:
                         db.execute(
                             "delete from tiles where zoom_level=? and tile_column=? and tile_row=?",
@@ -56,12 +58,12 @@ def write_mbtiles(
                         db.execute("insert or replace into tiles values (?, ?, ?, ?)", (*key, data))
     except sqlite3.Error as error:
         raise OutputError(
-            f"{path} cannot be written ({error}); make room, it is tried again"
+            f"{path} cannot be written ({error}); make room; it will be tried again"
         ) from error
 
 
 def touched(boxes: Sequence[Bounds], z: int) -> set[tuple[int, int]]:
-    """Columns and rows of the tiles of a zoom that boxes in EPSG:3857 meet."""
+    """Columns and rows of the tiles of a zoom level that intersect boxes in EPSG:3857."""
     size = 2 * MERCATOR / 2**z
     found = set()
     for west, south, east, north in boxes:

@@ -1,5 +1,5 @@
-"""The levels of a raster being written: each tile is encoded once and gives its half to the one
-above.
+"""The levels of a raster during writing: each tile is encoded once and passes its reduced half to
+the level above.
 """
 
 import struct
@@ -35,10 +35,11 @@ class _Open:
 
 
 class Pyramid:
-    """Encodes tiles into a spool, level upon level; open overview tiles are all it holds in memory.
+    """Encodes tiles into a spool, level by level; only incomplete overview tiles are held in
+    memory.
 
-    The halves that tiles of `block_level` give away are spooled too: a resumed run rebuilds the
-    levels above from them (`record`, `restore`). Safe for several threads.
+    The halves of tiles of `block_level` are spooled too: a resumed run rebuilds the levels above
+    from them (`record`, `restore`). Thread-safe.
     """
 
     def __init__(self, encoder: TileEncoder, spool: Spool, block_level: int) -> None:
@@ -57,7 +58,7 @@ class Pyramid:
         self._lock = threading.Lock()
 
     def store(self, level: int, row: int, col: int, part: Part | None) -> None:
-        """Encode one whole tile, and pass its half up."""
+        """Encodes one whole tile, and passes its half to the level above."""
         half = None
         if part is not None:
             image, mask = self._encoder(*part)
@@ -69,16 +70,14 @@ class Pyramid:
         self._pass_up(level, row, col, half)
 
     def record(self, row: int, col: int) -> bytes:
-        """What a resumed run needs to know about a finished block: where its tiles are, and its
-        half.
-        """
+        """What a resumed run needs about a finished block: where its tiles are, and its half."""
         half = self._halves.pop((row, col), (0, 0))
         return _RECORD.pack(row, col, *half) + b"".join(
             part.tobytes() for part in self._slices(row, col)
         )
 
     def restore(self, record: bytes) -> tuple[int, int]:
-        """Take a block of an earlier run as stored; returns its row and column."""
+        """Takes over a block of an earlier run; returns its row and column."""
         row, col, offset, size = _RECORD.unpack_from(record)
         at = _RECORD.size
         for part in self._slices(row, col):

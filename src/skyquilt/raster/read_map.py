@@ -1,4 +1,4 @@
-"""Georeferenced rasters read by pieces or reduced: maps of ours or of other programs."""
+"""Reads georeferenced rasters in parts or reduced: our maps or those of other programs."""
 
 import warnings
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapFile:
-    """A raster with its place."""
+    """A raster file and its georeference."""
 
     path: Path
     """The file."""
@@ -20,7 +20,7 @@ class MapFile:
     height: int
     """Rows."""
     bands: int
-    """Bands of picture: 1 or 3; an alpha band is validity and does not count."""
+    """Number of image bands: 1 or 3; an alpha band is validity and does not count."""
     dtype: str
     """Type of its pixels."""
     affine: tuple[float, float, float, float, float, float]
@@ -32,12 +32,15 @@ class MapFile:
 
 
 def open_map(path: Path) -> MapFile | None:
-    """A raster's description, or None where the file has no place or is none that GDAL reads."""
+    """A raster's description, or None where the file is not georeferenced or GDAL cannot read
+    it.
+    """
     import rasterio
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # told by None
+            # reported by None
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
             raster = rasterio.open(path)
         with raster:
             placed = raster.crs is not None or not raster.transform.is_identity

@@ -1,4 +1,4 @@
-"""What a raster file shall be: size, type, place, compression."""
+"""The specification of a raster file: size, type, georeference, compression."""
 
 import hashlib
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ DTYPES = ("uint8", "uint16", "uint32", "int16", "float32")
 
 @dataclass(frozen=True, kw_only=True)
 class RasterSpec:
-    """All that a COG writer must know before the first pixel."""
+    """Everything that a COG writer must know before the first pixel."""
 
     width: int
     """Columns."""
@@ -38,7 +38,7 @@ class RasterSpec:
     mask: bool = False
     """Write an internal 1-bit mask of valid pixels at every level."""
     overviews: Resampling = "average"
-    """How four pixels become one."""
+    """How four pixels are reduced to one."""
     tile: int = 512
     """Side of a tile in px, a multiple of 16."""
     tags: dict[str, str] = field(default_factory=dict)
@@ -51,19 +51,17 @@ class RasterSpec:
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1 or self.bands < 1:
             raise ValueError(
-                f"a raster needs at least 1 x 1 x 1, asked for {self.width} x {self.height} x"
+                f"a raster needs at least 1 x 1 x 1, got {self.width} x {self.height} x"
                 f" {self.bands}"
             )
         if self.dtype not in DTYPES:
-            raise ValueError(f"dtype is one of {', '.join(DTYPES)}, asked for {self.dtype}")
+            raise ValueError(f"dtype is one of {', '.join(DTYPES)}, got {self.dtype}")
         if self.tile < 16 or self.tile % 16:
-            raise ValueError(f"tile is a multiple of 16 px, asked for {self.tile}")
+            raise ValueError(f"tile is a multiple of 16 px, got {self.tile}")
         if self.compress == "jpeg" and (self.dtype != "uint8" or self.bands not in (1, 3)):
-            raise ValueError(
-                f"JPEG takes 1 or 3 bands of uint8, asked for {self.bands} of {self.dtype}"
-            )
+            raise ValueError(f"JPEG takes 1 or 3 bands of uint8, got {self.bands} of {self.dtype}")
         if self.nodata is not None and self.compress == "jpeg":
-            raise ValueError("JPEG does not keep a nodata value; ask for a mask instead")
+            raise ValueError("JPEG does not keep a nodata value; use a mask instead")
         if self.nodata is not None and not _holds(np.dtype(self.dtype), self.nodata):
             raise ValueError(f"{self.dtype} cannot hold the nodata value {self.nodata}")
         for what, names in (("band_names", self.band_names), ("band_units", self.band_units)):
@@ -103,7 +101,7 @@ class RasterSpec:
         return min(self.tile, h - row * self.tile), min(self.tile, w - col * self.tile)
 
     def digest(self, salt: str = "") -> str:
-        """Hex digest of the specification and of whatever the caller adds."""
+        """Hex digest of the specification and of `salt`."""
         return hashlib.sha256(f"{self!r}|{salt}".encode()).hexdigest()
 
 

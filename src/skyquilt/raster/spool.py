@@ -1,8 +1,8 @@
-"""Encoded tiles on their way into a file: an append-only heap and a journal of what is finished.
+"""Encoded tiles before the file is assembled: an append-only heap and a journal of what is
+finished.
 
-The heap grows with every tile. Each record of the journal says how far the heap reached when a
-piece of work was finished; what a killed run left behind its last whole record is cut off on
-reopening.
+The heap grows with every tile. Each record of the journal holds the heap's length when a piece of
+work was finished. After a kill, everything behind the last complete record is cut off on reopening.
 """
 
 import os
@@ -19,10 +19,9 @@ _HEAD = struct.Struct("<IIQ")
 
 
 class Spool:
-    """A folder with `tiles.bin` and `journal.bin`, valid for one key only. Safe for several
-    threads.
+    """A folder with `tiles.bin` and `journal.bin`, valid for one key only. Thread-safe.
 
-    What lies there under another key is dropped; with `fresh` everything is.
+    Content under another key is discarded; with `fresh` any content is.
     """
 
     def __init__(self, folder: Path, key: str, *, fresh: bool = False, fsync: bool = False) -> None:
@@ -37,7 +36,7 @@ class Spool:
             if fresh or not found or found[0][0] != key.encode():
                 found = []
             self.records = tuple(payload for payload, _, _ in found[1:])
-            """Payloads that `commit` was given, in earlier runs too."""
+            """Payloads passed to `commit`, in earlier runs too."""
             self._heap, self._journal = heap.open("r+b", CHUNK), journal.open("r+b", 0)
             self._reader = heap.open("rb", 0)
             self._end = found[-1][1] if found else 0
@@ -47,7 +46,7 @@ class Spool:
             self.commit(key.encode())
 
     def append(self, data: bytes) -> int:
-        """Add bytes to the heap; returns their offset."""
+        """Appends bytes to the heap; returns their offset."""
         with self._lock, mended(self.folder):
             offset = self._end
             self._heap.write(data)
@@ -55,7 +54,7 @@ class Spool:
             return offset
 
     def commit(self, payload: bytes) -> None:
-        """Make everything appended so far survive a kill, and remember `payload` with it."""
+        """Makes everything appended so far survive a kill, and stores `payload` with it."""
         with self._lock, mended(self.folder):
             self._heap.flush()
             if self._fsync:
@@ -66,18 +65,18 @@ class Spool:
                 os.fsync(self._journal.fileno())
 
     def read(self, offset: int, size: int) -> bytes:
-        """Bytes of the heap."""
+        """Reads bytes from the heap."""
         with self._lock, mended(self.folder):
             self._heap.flush()
             self._reader.seek(offset)
             return self._reader.read(size)
 
     def close(self, *, remove: bool = False) -> None:
-        """Close the files; with `remove` the folder goes too."""
+        """Closes the files; with `remove` the folder is removed too."""
         for file in (self._heap, self._journal, self._reader):
             try:
                 file.close()
-            except OSError:  # what could not be flushed was never committed
+            except OSError:  # bytes that could not be flushed were never committed
                 continue
         if remove:
             shutil.rmtree(self.folder, ignore_errors=True)
@@ -89,7 +88,7 @@ def _cut(file: IO[bytes], end: int) -> None:
 
 
 def _whole_records(journal: bytes, heap_size: int) -> list[tuple[bytes, int, int]]:
-    """(payload, end of heap, end of record) of every record up to the first torn one."""
+    """(payload, end of heap, end of record) of every record up to the first incomplete one."""
     found, at = [], 0
     while at + _HEAD.size <= len(journal):
         size, crc, heap_end = _HEAD.unpack_from(journal, at)

@@ -25,10 +25,10 @@ class Tag:
     kind: int
     """TIFF type, one of the constants of this module."""
     values: "Sequence[float] | np.ndarray | bytes"
-    """Numbers, or bytes for ASCII (without the closing NUL) and UNDEFINED."""
+    """Numbers, or bytes for ASCII (without the final NUL) and UNDEFINED."""
 
     def payload(self) -> tuple[int, bytes]:
-        """(count, bytes) as the file holds them."""
+        """(count, bytes) as stored in the file."""
         if isinstance(self.values, bytes):
             data = self.values + b"\0" if self.kind == ASCII else self.values
             return len(data), data
@@ -91,8 +91,8 @@ def place_tags(spec: RasterSpec) -> list[Tag]:
 def crs_tags(crs: str) -> tuple[Tag, ...]:
     """GeoKeyDirectory, doubles and text of a CRS; pixels are areas.
 
-    A plain EPSG code is three keys; for anything else GDAL writes a 1 x 1 file, whose tags are
-    taken.
+    A plain EPSG code is three keys; for any other CRS, GDAL writes a 1 x 1 file and its tags are
+    copied.
     """
     import pyproj
 

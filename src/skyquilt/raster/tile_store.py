@@ -1,4 +1,4 @@
-"""The growing map: square tiles in the survey's own grid, with coarser levels, in one transactional
+"""The growing map: square tiles on the survey's own grid, with coarser levels, in one SQLite
 file.
 """
 
@@ -20,12 +20,12 @@ from skyquilt.model.raster import Grid
 from skyquilt.raster.halving import halve
 
 SIDE = 256
-"""Pixels of a tile's side."""
+"""Side of a tile in px."""
 LEVELS = 10
-"""Levels, each with pixels twice as large as the one before."""
+"""Number of levels, each with pixels twice as large as the one before."""
 QUALITY = 90
 KEPT = 256
-"""Decoded tiles at hand."""
+"""Number of decoded tiles that are cached."""
 TABLES = (
     "create table if not exists tile(layer text, level integer, row integer, col integer, version"
     " integer not null,"
@@ -43,8 +43,8 @@ PAID = "delete from owed where layer=? and level=? and row=? and col=?"
 
 @dataclass(frozen=True, order=True)
 class Address:
-    """Which tile: row counts southwards, column eastwards from the map frame's origin, in tiles of
-    that level.
+    """Address of a tile: row counts southwards, column eastwards from the map frame's origin, in
+    tiles of that level.
     """
 
     layer: str
@@ -58,11 +58,11 @@ class Address:
 
     @property
     def parent(self) -> "Address":
-        """The tile of the next coarser level that holds this one."""
+        """The tile of the next coarser level that contains this one."""
         return Address(self.layer, self.level + 1, self.row >> 1, self.col >> 1)
 
     def children(self) -> list["Address"]:
-        """The four tiles below, row by row."""
+        """The four tiles of the next finer level, row by row."""
         return [
             Address(self.layer, self.level - 1, 2 * self.row + r, 2 * self.col + c)
             for r in (0, 1)
@@ -70,7 +70,7 @@ class Address:
         ]
 
     def grid(self, gsd: float) -> Grid:
-        """Its pixels; `gsd` in m is that of level 0."""
+        """Its pixel grid; `gsd` in m is that of level 0."""
         size = gsd * 2**self.level
         return Grid(
             west=self.col * SIDE * size,
@@ -88,11 +88,11 @@ class Tile:
     pixels: NDArray[Any]
     """(SIDE, SIDE, bands) uint8 or float32."""
     shown: NDArray[np.bool_]
-    """(SIDE, SIDE) where there is anything."""
+    """(SIDE, SIDE) where there is content."""
 
 
 def encoded(tile: Tile) -> bytes:
-    """Bytes of a tile: JPEG with a mask, or measured values without loss."""
+    """Encodes a tile: JPEG with a mask, or measured values without loss."""
     mask = zlib.compress(np.packbits(tile.shown).tobytes(), 1)
     if tile.pixels.dtype == np.uint8:
         body = simplejpeg.encode_jpeg(
@@ -104,7 +104,7 @@ def encoded(tile: Tile) -> bytes:
 
 
 def decoded(body: bytes) -> Tile:
-    """The tile of such bytes."""
+    """Decodes a tile."""
     n = int.from_bytes(body[1:5], "little")
     mask = np.frombuffer(zlib.decompress(body[5 : 5 + n]), np.uint8)
     shown = np.unpackbits(mask)[: SIDE * SIDE].reshape(SIDE, SIDE).astype(bool)
@@ -118,7 +118,7 @@ class TileStore:
     """Tiles by address; one writer, many readers."""
 
     def __init__(self, path: Path, *, write: bool) -> None:
-        """Opens the file, which `write` makes where it is missing.
+        """Opens the file; `write` creates it where it is missing.
 
         Raises:
             OutputError: it cannot be opened.
@@ -188,11 +188,11 @@ class TileStore:
         owing: Iterable[Address] = (),
         drawn: Iterable[Address] = (),
     ) -> None:
-        """Writes tiles, all in one transaction; the coarser ones above them are made by
+        """Writes tiles, all in one transaction; the coarser ones above them are updated by
         `raise_levels`.
 
-        `owing`: tiles of other layers that are to follow; they are remembered until they are
-        `drawn`.
+        `owing`: tiles of other layers that must still be drawn; they stay in the list of owed tiles
+        until they are passed as `drawn`.
 
         Raises:
             OutputError: the disk is full.
@@ -216,13 +216,13 @@ class TileStore:
                 ) from error
 
     def owed(self) -> list[Address]:
-        """Tiles that are to follow others and have not yet, in order."""
+        """Tiles of other layers that are still to be drawn, in order."""
         with self._lock:
             found = self._db.execute("select layer, level, row, col from owed").fetchall()
         return [Address(str(layer), int(z), int(r), int(c)) for layer, z, r, c in found]
 
     def raise_levels(self, changed: Iterable[Address], *, drawn: Iterable[Address] = ()) -> int:
-        """Makes every coarser tile above those of level 0 that changed; returns how many.
+        """Updates every coarser tile above those of level 0 that changed; returns how many.
         `drawn`: as for `put`.
         """
         done: dict[Address, Tile] = {}
@@ -257,7 +257,7 @@ class TileStore:
         return Tile(pixels=pixels, shown=shown)
 
     def addresses(self, layer: str, level: int) -> list[Address]:
-        """All tiles of a level."""
+        """Addresses of all tiles of a level."""
         with self._lock:
             found = self._db.execute(
                 "select row, col from tile where layer=? and level=?", (layer, level)
@@ -265,7 +265,7 @@ class TileStore:
         return [Address(layer, level, int(r), int(c)) for r, c in found]
 
     def layers(self) -> list[str]:
-        """Names of the layers that hold anything, without a look at every tile."""
+        """Names of the layers with content, without reading every tile."""
         found: list[str] = []
         with self._lock:
             while name := self._db.execute(
@@ -275,8 +275,8 @@ class TileStore:
             return [n for n in found if self._db.execute(TOP, (n, LEVELS - 1)).fetchone()]
 
     def extent(self, layer: str, gsd: float) -> tuple[float, float, float, float] | None:
-        """West, south, east, north in m (map frame) of what a layer shows, to a few of its pixels;
-        None if nothing.
+        """West, south, east, north in m (map frame) of a layer's content, accurate to a few of its
+        pixels; None if it is empty.
         """
         with self._lock:
             stamp = (
@@ -291,7 +291,7 @@ class TileStore:
         return found
 
     def _extent(self, layer: str, gsd: float) -> tuple[float, float, float, float] | None:
-        """From the finest level that has only a handful of tiles."""
+        """The extent, from the finest level that has only a few tiles."""
         level = LEVELS - 1
         while level > 0 and len(self.addresses(layer, level - 1)) <= 6:
             level -= 1
@@ -326,8 +326,8 @@ def _key(address: Address) -> tuple[str, int, int, int]:
 
 
 def covering(layer: str, level: int, gsd: float, bounds: Iterable[float]) -> list[Address]:
-    """Tiles of a level that bounds (west, south, east, north) in m of the map frame touch; `gsd` of
-    level 0.
+    """Tiles of a level that intersect bounds (west, south, east, north) in m of the map frame;
+    `gsd` of level 0.
     """
     west, south, east, north = bounds
     size = SIDE * gsd * 2**level

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from skyquilt.raster.atomic import write_text
 
 DECIMALS = 9
-"""Of a degree: a tenth of a millimetre."""
+"""Decimals of a degree: a tenth of a millimetre."""
 UNGEOREFERENCED = (
     "not georeferenced: the coordinates are those of the mosaic, not longitude and latitude"
 )
@@ -24,22 +24,22 @@ Project = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 def points(
     path: Path, features: Iterable[tuple[ArrayLike, Properties]], *, crs: str | None
 ) -> None:
-    """Write a collection of points, each (x, y) or (x, y, height) in `crs`, with their
+    """Writes a collection of points, each (x, y) or (x, y, height) in `crs`, with their
     properties.
     """
     _write(path, features, crs, "Point", lambda place, project: _places([place], project)[0])
 
 
 def lines(path: Path, features: Iterable[tuple[ArrayLike, Properties]], *, crs: str | None) -> None:
-    """Write a collection of lines, each (n, 2) or (n, 3) in `crs`, with their properties."""
+    """Writes a collection of lines, each (n, 2) or (n, 3) in `crs`, with their properties."""
     _write(path, features, crs, "LineString", _places)
 
 
 def polygons(
     path: Path, features: Iterable[tuple[Sequence[ArrayLike], Properties]], *, crs: str | None
 ) -> None:
-    """Write a collection of polygons: each a list of rings (n, 2) or (n, 3) in `crs`, the outer one
-    first.
+    """Writes a collection of polygons: each a list of rings (n, 2) or (n, 3) in `crs`, the outer
+    one first.
     """
     _write(path, features, crs, "Polygon", _rings)
 
@@ -51,8 +51,8 @@ def _write(
     kind: str,
     coordinates: Any,
 ) -> None:
-    """Heights pass through as they are. Without a CRS coordinates do too, and every feature says
-    so.
+    """Heights are written unchanged. Without a CRS coordinates are too, and every feature has a
+    note that says so.
     """
     project = _projection(crs) if crs else lambda places: places
     extra = {} if crs else {"note": UNGEOREFERENCED}
@@ -95,7 +95,7 @@ def _rings(rings: Sequence[ArrayLike], project: Project) -> list[list[list[float
 
 
 def _ring(places: list[list[float]], *, outer: bool) -> list[list[float]]:
-    """Closed; anticlockwise if outer, clockwise if a hole."""
+    """The ring closed; anticlockwise if outer, clockwise if a hole."""
     if places[0] != places[-1]:
         places = [*places, places[0]]
     xy = np.array(places)[:, :2] - places[0][:2]
@@ -104,7 +104,7 @@ def _ring(places: list[list[float]], *, outer: bool) -> list[list[float]]:
 
 
 def _plain(value: Any) -> Any:
-    """What JSON can hold: numpy numbers become Python's, NaN and infinity null."""
+    """Converts to JSON types: numpy numbers become Python's, NaN and infinity null."""
     if isinstance(value, np.ndarray | list | tuple):
         return [_plain(item) for item in value]
     if isinstance(value, Mapping):

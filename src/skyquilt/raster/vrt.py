@@ -1,4 +1,4 @@
-"""A GDAL virtual raster: somebody else's pixels with ground control points of ours."""
+"""A GDAL virtual raster: the pixels of another file with our ground control points."""
 
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ def vrt(
     """XML of a raster of `size` (width, height) whose pixels are those of `source`.
 
     px (n, 2) are columns and rows counted from the outer corner, ground (n, 2) x and y of `crs` (or
-    of another picture's plane, if None).
+    pixels of another image, if None).
     """
     points = "\n".join(
         f'    <GCP Id="{k}" Pixel="{p[0]:.4f}" Line="{p[1]:.4f}" X="{g[0]:.9f}" Y="{g[1]:.9f}"/>'

@@ -1,4 +1,4 @@
-"""Stage: a finished run -> one self-contained page."""
+"""The report of a finished run: one self-contained HTML page."""
 
 from skyquilt.report.input import CameraResiduals, ReportInput, SeamMark, Shot
 from skyquilt.report.page import build_report, write_report

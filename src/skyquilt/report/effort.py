@@ -9,7 +9,7 @@ WIDE, ROW, LEFT = 760.0, 28.0, 150.0
 
 
 def time_section(data: ReportInput) -> Section:
-    """A bar per stage in the order they ran."""
+    """A bar per stage in execution order."""
     told = mapping(data.metrics.get("seconds"))
     stages = {str(k): s for k, v in told.items() if k != "total" and (s := number(v)) is not None}
     if not stages:

@@ -1,4 +1,4 @@
-"""Pictures and graphs of several lines for pages of sections."""
+"""Images, and graphs of several lines, for report pages."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -23,13 +23,13 @@ COLOURS = (
     "#c2185b",
     "#00897b",
 )
-"""Of lines in one graph, in order."""
+"""Colours of the lines in one graph, in order."""
 
 
 def picture(
     pixels: NDArray[Any], title: str, caption: str, *, longest: int = 1000, wide: bool = False
 ) -> Figure:
-    """A picture (H, W, 3 or 4) uint8 as a figure; what is transparent in it is shown white."""
+    """An image (H, W, 3 or 4) uint8 as a figure; transparent parts are shown white."""
     small = shrunk(pixels, longest)
     if small.shape[2] == 4:
         alpha = small[..., 3:].astype(np.float32) / 255
@@ -53,7 +53,9 @@ def lines(
     y_label: str,
     first: float = 1.0,
 ) -> Markup:
-    """Lines of values (n,) over their number, counted from `first`; NaN breaks a line."""
+    """Graph of values (n,) against their number, counted from `first`; a line is interrupted at
+    NaN.
+    """
     values = np.concatenate([v[np.isfinite(v)] for _, v in series] or [np.zeros(1)])
     low, high = (float(values.min()), float(values.max())) if values.size else (0.0, 1.0)
     pad = 0.06 * (high - low) or 0.5

@@ -1,6 +1,4 @@
-"""The ground in drawings: metres from the north-west corner, and pictures of layers that share
-them.
-"""
+"""Drawings of the ground: metres from the north-west corner, and pictures made of shared layers."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,7 +16,7 @@ MAP_WIDTH = 1072
 
 @dataclass(frozen=True, kw_only=True)
 class Ground:
-    """The area all pictures show."""
+    """The area that all pictures show."""
 
     bounds: Bounds
     """West, south, east, north in m (map frame)."""
@@ -37,12 +35,12 @@ class Ground:
 
     @property
     def diagonal(self) -> float:
-        """Corner to corner in m."""
+        """Length of the diagonal in m."""
         return float(np.hypot(self.width, self.height))
 
     @property
     def decimals(self) -> int:
-        """Decimals that resolve a part in 20 000 of the ground."""
+        """Number of decimals that resolves 1/20 000 of the ground."""
         return decimals_of(nice(self.diagonal, 20_000))
 
     def xy(self, points: ArrayLike) -> NDArray[np.float64]:
@@ -51,7 +49,7 @@ class Ground:
         return np.stack([points[:, 0] - self.bounds[0], self.bounds[3] - points[:, 1]], 1)
 
     def box(self, bounds: Bounds) -> Markup:
-        """Attributes that put an image onto bounds."""
+        """Attributes that place an image at the bounds."""
         west, south, east, north = bounds
         numbers = (west - self.bounds[0], self.bounds[3] - north, east - west, north - south)
         return Markup('x="{}" y="{}" width="{}" height="{}" preserveAspectRatio="none"').format(
@@ -60,7 +58,7 @@ class Ground:
 
 
 def ground_of(data: ReportInput) -> Ground | None:
-    """The area of the map and the photos' centres; None if nothing has a place."""
+    """The area that covers the map and the photos' centres; None if nothing has a position."""
     corners = [
         np.reshape(b, (2, 2)) for b in (data.bounds, data.views_bounds, data.surface_bounds) if b
     ][:1]
@@ -82,12 +80,12 @@ def ground_of(data: ReportInput) -> Ground | None:
 
 
 def use(layer: str, cls: str = "") -> Markup:
-    """A layer of the page's definitions, drawn in the style of a class."""
+    """Draws a layer of the page's definitions in the style of a class."""
     return Markup('<use href="#layer-{}" class="{}"/>').format(layer, cls)
 
 
 def fit(ground: Ground, width: float, shortest: float, tallest: float) -> tuple[float, str]:
-    """Height in px of a picture of this width, and the transform that fits the ground into it."""
+    """Height in px of a picture of this width, and the transform from the ground to it."""
     height = float(np.clip(width * ground.height / ground.width, shortest, tallest))
     scale = min(width / ground.width, height / ground.height)
     x, y = (width - scale * ground.width) / 2, (height - scale * ground.height) / 2
@@ -95,7 +93,7 @@ def fit(ground: Ground, width: float, shortest: float, tallest: float) -> tuple[
 
 
 def picture(ground: Ground, layers: Iterable[Markup], title: str) -> Markup:
-    """Layers above one another, with a scale bar."""
+    """Draws layers on top of one another, with a scale bar."""
     height, transform = fit(ground, WIDTH, 200, 460)
     scale = min(WIDTH / ground.width, height / ground.height)
     world = Markup('<g transform="{}">{}</g>').format(transform, Markup().join(layers))

@@ -1,4 +1,4 @@
-"""The figures at the top, each with a plain sentence and the thresholds behind its verdict."""
+"""The headline figures, each with a sentence that explains it and its thresholds."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -13,12 +13,12 @@ SEAMS_MEASURED = 0.6
 
 
 def verdict(value: float, good: float, fair: float) -> Verdict:
-    """Small is good."""
+    """The verdict on a figure where smaller is better."""
     return "good" if value <= good else "fair" if value <= fair else "poor"
 
 
 def tiles(data: ReportInput) -> tuple[Tile, ...]:
-    """All headline figures there are data for."""
+    """All headline figures for which there are data."""
     return tuple(_tiles(data))
 
 
@@ -44,7 +44,7 @@ def _tiles(data: ReportInput) -> Iterator[Tile]:
 
 
 def photos(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
-    """Used of total."""
+    """Photos used, of all photos."""
     used, total = number(m.get("photos_used")), number(m.get("photos_total"))
     if used is None or not total:
         return None
@@ -54,32 +54,32 @@ def photos(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         value=f"{fixed(used, 0)} of {fixed(total, 0)}",
         anchor="rejected",
         verdict="good" if share >= 0.95 else "fair" if share >= 0.8 else "poor",
-        says="Every photo left out may leave a gap. Good from 95\u202f%, fair from 80\u202f%.",
+        says="A photo that is left out may leave a gap. Good from 95\u202f%, fair from 80\u202f%.",
     )
 
 
 def georeference(m: Mapping[str, Any], data: ReportInput) -> Tile:
-    """Where on Earth."""
+    """Whether the map is georeferenced."""
     if not data.crs:
         return Tile(
             label="Coordinates",
             value="not georeferenced",
             verdict="poor",
             anchor="map",
-            says="Nothing says where on Earth this is. Photos with GPS, geo.txt or control points"
-            " would.",
+            says="The position on Earth is unknown. It needs photos with GPS, a geo.txt or control"
+            " points.",
         )
     return Tile(
         label="Coordinates",
         value=data.crs,
         verdict="good",
         anchor="map",
-        says=f"{crs_name(data.crs)}The map lies where a GIS expects it.",
+        says=f"{crs_name(data.crs)}A GIS shows the map at its place.",
     )
 
 
 def crs_name(crs: str) -> str:
-    """A sentence that names the commonest systems."""
+    """A sentence with the name of a common coordinate system; empty for others."""
     code = crs.upper().removeprefix("EPSG:")
     if (
         len(code) == 5
@@ -92,16 +92,16 @@ def crs_name(crs: str) -> str:
 
 
 def blocks(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
-    """Pieces that hang together."""
+    """Blocks of connected photos."""
     sizes = [n for v in items(m.get("blocks")) if (n := number(v)) is not None]
     if not sizes:
         return None
-    says = "All photos hang together by what they show. One block is good."
+    says = "All photos are connected by tie points. One block is good."
     if len(sizes) > 1:
         listed = ", ".join(fixed(n, 0) for n in sizes[:6]) + (" \u2026" if len(sizes) > 6 else "")
         says = (
-            f"Pieces of {listed} photos, each placed by its own GPS: expect steps between them."
-            " One is good."
+            f"Blocks of {listed} photos, each placed by its own GPS: expect offsets between them."
+            " One block is good."
         )
     return Tile(
         label="Blocks",
@@ -121,8 +121,8 @@ def gsd(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
             label="Pixel size", value=significant(value), unit="units", says="The scale is unknown."
         )
     says = (
-        f"Side of one map pixel on the ground; things of about {fixed(value * 300, 0)} cm can be"
-        " told apart."
+        f"Side of one map pixel on the ground; objects of about {fixed(value * 300, 0)} cm can be"
+        " recognised."
     )
     return Tile(
         label="Ground sampling distance", value=significant(value * 100), unit="cm", says=says
@@ -130,7 +130,7 @@ def gsd(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
 
 
 def area(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
-    """Ground the map covers."""
+    """Area of ground that the map covers."""
     value = number(m.get("area_m2"))
     if value is None and data.preview is not None and data.bounds is not None and data.preview.size:
         west, south, east, north = data.bounds
@@ -149,12 +149,12 @@ def area(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         label="Area",
         value=fixed(value / 1e4, 2) if large else fixed(value, 0),
         unit="ha" if large else "m\u00b2",
-        says="Ground the map covers, holes left out.",
+        says="Area of the map without holes.",
     )
 
 
 def reprojection(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
-    """How well the geometry explains the photos."""
+    """Reprojection error of the tie points."""
     error = mapping(m.get("reprojection_error_px"))
     mean, rms = number(error.get("mean")), number(error.get("rms"))
     shown = mean if mean is not None else rms
@@ -169,14 +169,13 @@ def reprojection(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         unit="px",
         anchor="residuals",
         verdict=verdict(shown, 1, 2),
-        says=f"Mean distance between a point as seen and as computed{behind}{also}. Good up to 1"
-        " px, "
-        "fair up to 2.",
+        says=f"Mean distance between observed and computed image points{behind}{also}. Good up to"
+        " 1 px, fair up to 2.",
     )
 
 
 def gps(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
-    """How far the reported positions lie from the solved ones."""
+    """Distance between reported and solved positions."""
     x, y, z = axes(m.get("gps_residual_rms_m"))
     if x is None or y is None:
         return None
@@ -188,15 +187,13 @@ def gps(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         unit="m",
         anchor="positions",
         verdict=verdict(flat, 3, 10),
-        says=f"RMS horizontal distance of the photos from their GPS{height}. It judges the GPS more"
-        " "
-        "than the map: "
-        "up to 3 m is normal, up to 10 m poor but usable.",
+        says=f"RMS horizontal distance of the photos from their GPS positions{height}. It describes"
+        " the GPS more than the map: up to 3 m is normal, up to 10 m poor but usable.",
     )
 
 
 def leave_one_out(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
-    """How well each position is predicted by all others."""
+    """How well each position is predicted from all others."""
     value = m.get("gps_leave_one_out_rms_m")
     x, y, _ = axes(value)
     shown = float(np.hypot(x, y)) if x is not None and y is not None else number(value)
@@ -208,14 +205,14 @@ def leave_one_out(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         unit="m",
         anchor="positions",
         verdict=verdict(shown, 3, 10),
-        says="Each photo\u2019s GPS predicted from all the others. Close to the GPS residual means "
-        "no photo bends the map "
-        "to itself. Good up to 3 m, fair up to 10.",
+        says="Error of each photo\u2019s GPS position predicted from all other photos. A value near"
+        " the GPS residual means that no single photo deforms the map. Good up to 3 m, fair up"
+        " to 10.",
     )
 
 
 def seam(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
-    """How well neighbours fit where they meet."""
+    """Displacement between neighbouring photos at the seams."""
     seams = mapping(m.get("seam_disparity_px"))
     median, p95 = number(seams.get("median")), number(seams.get("p95"))
     if median is None:
@@ -223,13 +220,13 @@ def seam(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
     measured, attempted = number(seams.get("measured")), number(seams.get("attempted"))
     share = measured / attempted if measured is not None and attempted else None
     judged = verdict(median, 2, 5)
-    also = f" 95\u202f% lie below {fixed(p95, 1)} px." if p95 is not None else ""
-    says = f"Typical step where two photos meet.{also} Good up to 2 px, fair up to 5."
+    also = f" 95\u202f% are below {fixed(p95, 1)} px." if p95 is not None else ""
+    says = f"Typical displacement where two photos meet.{also} Good up to 2 px, fair up to 5."
     if share is not None and share < SEAMS_MEASURED:
         judged = "poor" if judged == "poor" else "fair"
         says = (
             f"Only {share:.0%} of the samples could be measured; below {SEAMS_MEASURED:.0%} the "
-            "figure does not stand."
+            "figure is not reliable."
         )
     return Tile(
         label="Seam disparity",
@@ -242,7 +239,7 @@ def seam(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
 
 
 def checks(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
-    """Error at points that took no part."""
+    """Error at points that were not used in the adjustment."""
     rows = [mapping(v) for v in items(m.get("control")) if mapping(v).get("check")]
     off = [(number(r.get("dx_m")), number(r.get("dy_m"))) for r in rows]
     flat = [float(np.hypot(dx, dy)) for dx, dy in off if dx is not None and dy is not None]
@@ -256,14 +253,14 @@ def checks(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         unit="m",
         anchor="control",
         verdict=verdict(rms, 2 * pixel, 5 * pixel),
-        says=f"RMS horizontal error at {count(len(flat), 'surveyed point')} kept out of the "
-        "adjustment: the most honest "
+        says=f"RMS horizontal error at {count(len(flat), 'surveyed point')} not used in the "
+        "adjustment: the most independent "
         f"figure here. Good up to 2 pixels ({fixed(2 * pixel, 3)} m), fair up to 5.",
     )
 
 
 def time(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
-    """How long it took."""
+    """Duration of the run."""
     total = number(mapping(m.get("seconds")).get("total"))
     if total is None:
         return None
@@ -274,7 +271,7 @@ def time(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
 
 
 def memory(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
-    """The most it needed."""
+    """Largest memory use."""
     peak = number(m.get("peak_memory_mb"))
     if peak is None:
         return None
@@ -283,7 +280,7 @@ def memory(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         label="Memory",
         value=fixed(peak / 1000 if large else peak, 2 if large else 0),
         unit="GB" if large else "MB",
-        says="The most the run needed at any moment.",
+        says="Largest memory use during the run.",
     )
 
 

@@ -1,4 +1,4 @@
-"""Rasters as data URIs, colour scales, and the outline of what is not transparent."""
+"""Rasters as data URIs, colour scales, and outlines of opaque areas."""
 
 import struct
 import zlib
@@ -15,7 +15,7 @@ ACCENT = (31, 111, 139)
 
 
 def shrunk(image: NDArray[Any], longest: int, interpolation: int = cv2.INTER_AREA) -> NDArray[Any]:
-    """The image with its longer side at most so many px."""
+    """The image, reduced so that its longer side is at most `longest` px."""
     factor = longest / max(image.shape[:2])
     if factor >= 1:
         return image
@@ -24,7 +24,7 @@ def shrunk(image: NDArray[Any], longest: int, interpolation: int = cv2.INTER_ARE
 
 
 def jpeg_uri(rgba: NDArray[Any], quality: int = 80) -> str:
-    """A JPEG of (H, W, 4) uint8, its alpha left out."""
+    """A JPEG of (H, W, 4) uint8, without its alpha channel."""
     data = simplejpeg.encode_jpeg(
         np.ascontiguousarray(rgba),
         quality=quality,
@@ -38,7 +38,7 @@ def jpeg_uri(rgba: NDArray[Any], quality: int = 80) -> str:
 def png_uri(index: NDArray[np.uint8], colours: NDArray[np.uint8]) -> str:
     """A PNG of (H, W) indices into colours (n <= 256, 4) RGBA."""
     height, width = index.shape
-    rows = np.zeros((height, width + 1), np.uint8)  # each row starts with its filter: none
+    rows = np.zeros((height, width + 1), np.uint8)  # each row starts with its PNG filter type: none
     rows[:, 1:] = index
     chunks = (
         (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)),
@@ -55,7 +55,7 @@ def png_uri(index: NDArray[np.uint8], colours: NDArray[np.uint8]) -> str:
 
 
 def thinned(values: NDArray[Any], most: int) -> NDArray[Any]:
-    """Every n-th row and column, so that neither side has more than about so many."""
+    """Every n-th row and column, so that neither side has more than about `most`."""
     step = max(1, -(-max(values.shape[:2]) // most))
     return values[::step, ::step]
 
@@ -75,8 +75,7 @@ def css(rgb: NDArray[Any]) -> str:
 def outline(
     alpha: NDArray[np.uint8], *, tolerance: float = 0.7, limit: int = 200
 ) -> list[NDArray[np.float64]]:
-    """Rings (k, 2) in px (the image spans 0 to its size) around what is not transparent, and around
-    holes.
+    """Rings (k, 2) in px (the image spans 0 to its size) around opaque areas and around holes.
 
     At most `limit` rings, the largest ones.
     """
@@ -87,7 +86,9 @@ def outline(
 
 
 def shaded(z: NDArray[Any], cell: float) -> NDArray[np.uint8]:
-    """RGBA (h, w, 4) of heights in m, lit from the north-west; transparent where not finite."""
+    """RGBA (h, w, 4) of heights in m, shaded with light from the north-west; transparent where not
+    finite.
+    """
     valid = np.isfinite(z)
     low, high = height_range(z)
     filled = np.where(valid, z, low).astype(np.float32)
@@ -99,6 +100,6 @@ def shaded(z: NDArray[Any], cell: float) -> NDArray[np.uint8]:
 
 
 def height_range(z: NDArray[Any]) -> tuple[float, float]:
-    """Both ends of the colour scale for heights of which some are finite."""
+    """Both ends of the colour scale for heights, of which some are finite."""
     low, high = (float(v) for v in np.percentile(z[np.isfinite(z)], [1, 99]))
     return (low, high) if high - low > 1e-6 else (low - 0.5, high + 0.5)

@@ -1,5 +1,5 @@
-"""What a finished run hands to its report: plain arrays and numbers, nothing that needs another
-stage.
+"""The input of the report: plain arrays and numbers from a finished run, independent of other
+stages.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ class Shot:
     xyz: NDArray[Any]
     """(3,) solved camera centre in m (map frame)."""
     reported_xyz: NDArray[Any]
-    """(3,) position its metadata report in m (map frame); NaN where they say nothing."""
+    """(3,) position reported by its metadata in m (map frame); NaN where there is none."""
     block: int = 0
     """Number of its block, the largest is 0."""
     method: str = ""
@@ -41,14 +41,14 @@ class CameraResiduals:
     height: int
     """Image height in px."""
     px: NDArray[Any]
-    """(N, 2) where the points were seen."""
+    """(N, 2) observed pixels."""
     residual_px: NDArray[Any]
-    """(N, 2) projected minus seen."""
+    """(N, 2) projected minus observed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeamMark:
-    """One place on a seam where the two photos were compared."""
+    """A place on a seam where the two photos were compared."""
 
     x: float
     """Easting in m (map frame)."""
@@ -60,21 +60,21 @@ class SeamMark:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DepthPicture:
-    """Disparities of one registration in false colour."""
+    """Disparities of one registration in false colours."""
 
     name: str
-    """The photo registered."""
+    """Name of the registered photo."""
     pixels: NDArray[Any]
     """(h, w, 3) uint8."""
     features: int
-    """Inliers it was made from."""
+    """Number of inliers."""
     removed: int
-    """Those left out as not on the dominant plane."""
+    """Number of features left out because they are off the dominant plane."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReportInput:
-    """Everything the page shows. What is absent is left out, with a sentence why."""
+    """Everything the page shows. Absent data are replaced by a sentence that says why."""
 
     metrics: Mapping[str, Any]
     """The content of metrics.json, with `control`, `cameras`, `notes`, `warnings` where there are
@@ -83,9 +83,9 @@ class ReportInput:
     preview: NDArray[Any] | None = None
     """(H, W, 4) uint8 RGBA, north up: the mosaic, reduced."""
     bounds: Bounds | None = None
-    """Of the preview."""
+    """Bounds of the preview."""
     origin: tuple[float, float] = (0.0, 0.0)
-    """Added to map coordinates this gives coordinates in `crs`."""
+    """Offset in m from map coordinates to coordinates in `crs`."""
     crs: str | None = None
     """As pyproj reads it; None when nothing says where on Earth the survey is."""
     metric: bool = True
@@ -93,13 +93,13 @@ class ReportInput:
     views: NDArray[Any] | None = None
     """(h, w) integers: number of photos that see each cell, row 0 is the northernmost."""
     views_bounds: Bounds | None = None
-    """Of the views."""
+    """Bounds of the views."""
     surface: NDArray[Any] | None = None
     """(h, w) float heights in m, NaN where unknown, row 0 is the northernmost."""
     surface_bounds: Bounds | None = None
-    """Of the surface."""
+    """Bounds of the surface."""
     vertical_datum: str = "unknown"
-    """What heights count from: `takeoff`, `sea_level`, `ellipsoid`, `control`, `unknown`, or any
+    """What heights refer to: `takeoff`, `sea_level`, `ellipsoid`, `control`, `unknown`, or any
     phrase.
     """
     shots: Sequence[Shot] = ()
@@ -109,7 +109,7 @@ class ReportInput:
     seams: Sequence[SeamMark] = ()
     """Samples along the seams."""
     depths: Sequence[DepthPicture] = ()
-    """Depth maps of registrations; a few, of methods that have them."""
+    """Depth maps of a few registrations, for methods that compute them."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """The resolved settings, nested as they are."""
     title: str = "Survey"

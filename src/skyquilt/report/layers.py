@@ -1,4 +1,4 @@
-"""The layers of the map, each drawn once in the page's definitions and used by every picture."""
+"""The layers of the map, each drawn once in the page's definitions and reused by every picture."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from skyquilt.report.svg import arrows, dots, path, polyline
 PREVIEW_PX, VIEWS_PX, SURFACE_PX = 1600, 700, 480
 MOST_SHOTS, MOST_SEAMS = 2500, 4000
 MANY = 300
-"""From here on marks are drawn finer."""
+"""Number of photos from which marks are drawn finer."""
 SEAM_EDGES = (0.5, 1.0, 2.0, 5.0)
 SEAM_COLOURS = ("#2166ac", "#67a9cf", "#f6e27f", "#ef8a62", "#c2183b", "#8b8f96")
 SEAM_LABELS = (
@@ -36,24 +36,24 @@ BLOCK_COLOURS = ("#ffd54a", "#4fc3f7", "#f48fb1", "#aed581", "#ffab66", "#c5b3f5
 
 @dataclass(frozen=True, kw_only=True)
 class Layer:
-    """What can be switched on and off over the map."""
+    """A layer of the map that can be switched on and off."""
 
     id: str
-    """Its definition carries the id `layer-...`."""
+    """Id of the layer; its definition has the id `layer-...`."""
     label: str
-    """Words on its switch."""
+    """Label of its switch."""
     shape: Markup
-    """Its definition: one element that carries the id."""
+    """Its definition: one element with that id."""
     styles: tuple[str, ...] = ("",)
-    """Classes it is drawn in, one above the other."""
+    """CSS classes in which it is drawn, one on top of the other."""
     on: bool = False
-    """Shown from the start."""
+    """Whether it is shown initially."""
     legend: tuple[LegendItem, ...] = ()
-    """Colours, where they mean something."""
+    """Explanation of its colours, if they have a meaning."""
 
 
 def layers_of(data: ReportInput, ground: Ground) -> tuple[Layer, ...]:
-    """All layers there are data for, from below to above."""
+    """All layers for which there are data, from bottom to top."""
     found = (
         mosaic(data, ground),
         surface(data, ground),
@@ -80,7 +80,7 @@ def mosaic(data: ReportInput, ground: Ground) -> Layer | None:
 def clipped(
     name: str, rgba: NDArray[Any], bounds: Bounds, ground: Ground, *, within: str = ""
 ) -> Markup:
-    """A raster as JPEG, cut along the outline of its alpha and along another clip path."""
+    """A raster as JPEG, clipped to the outline of its alpha and to another clip path."""
     height, width = rgba.shape[:2]
     west, south, east, north = bounds
     metres = np.array([(east - west) / width, (north - south) / height])
@@ -99,7 +99,7 @@ def clipped(
 
 
 def overlap(data: ReportInput, ground: Ground) -> Layer | None:
-    """Number of photos per cell, in steps of colour."""
+    """Number of photos per cell, as steps of colour."""
     if data.views is None or data.views_bounds is None or not (np.asarray(data.views) > 0).any():
         return None
     colours = view_colours()
@@ -228,7 +228,7 @@ def exaggeration(shots: Sequence[Shot], ground: Ground) -> float:
 
 
 def gps(shots: Sequence[Shot], ground: Ground) -> Layer | None:
-    """Arrows from where the metadata place a photo towards where it was found, exaggerated."""
+    """Arrows from the reported towards the solved position of each photo, exaggerated."""
     tails, off = reported(shots)[:, :2], placed(shots)[:, :2] - reported(shots)[:, :2]
     near = np.linalg.norm(off, axis=1) < ground.diagonal
     if not near.any():
@@ -258,7 +258,7 @@ def seams(marks: Sequence[SeamMark], ground: Ground) -> Layer | None:
     stride = -(-len(marks) // MOST_SEAMS)
     xy = ground.xy([[m.x, m.y] for m in marks[::stride]])
     kind = seam_kinds(marks[::stride])
-    order = (5, 0, 1, 2, 3, 4)  # the worst on top
+    order = (5, 0, 1, 2, 3, 4)  # the largest disparities on top
     shapes = [
         path(dots(xy[kind == k], ground.decimals), f"s{k}") for k in order if (kind == k).any()
     ]

@@ -1,4 +1,6 @@
-"""The large map: all layers on one drawing, switches above it, names under the pointer."""
+"""The large map: all layers in one drawing, with switches and the names of photos under the
+pointer.
+"""
 
 import json
 from collections.abc import Sequence
@@ -20,25 +22,25 @@ class MapView:
     definitions: Markup
     """Shapes of all layers."""
     layers: tuple[Layer, ...]
-    """For the switches."""
+    """The layers, for the switches."""
     world: Markup
-    """The layers in use, in m."""
+    """References to the layers, in m."""
     transform: str
     """From m to px of the drawing."""
     furniture: Markup
     """Scale bar and north arrow, in px."""
     width: int
-    """Of the drawing in px."""
+    """Width of the drawing in px."""
     height: float
-    """Of the drawing in px."""
+    """Height of the drawing in px."""
     facts: str
     """JSON for the script: the ground and the photos."""
     extent: str
-    """A sentence: what the corners' coordinates are."""
+    """A sentence about the coordinates of the corners."""
 
 
 def map_view(data: ReportInput, ground: Ground, layers: Sequence[Layer]) -> MapView:
-    """The map of these layers."""
+    """Builds the map from these layers."""
     height, transform = fit(ground, MAP_WIDTH, 400, 720)
     scale = min(MAP_WIDTH / ground.width, height / ground.height)
     world = [
@@ -62,7 +64,7 @@ def map_view(data: ReportInput, ground: Ground, layers: Sequence[Layer]) -> MapV
 
 
 def facts(data: ReportInput, ground: Ground) -> str:
-    """What the script needs, safe inside a script element."""
+    """Data for the script as JSON, escaped for a script element."""
     west, _, _, north = ground.bounds
     shots = [
         [
@@ -86,7 +88,7 @@ def facts(data: ReportInput, ground: Ground) -> str:
 
 
 def about(data: ReportInput, k: int, ground: Ground) -> str:
-    """What is said of one photo under the pointer."""
+    """Text shown for a photo under the pointer."""
     shot = data.shots[k]
     several = any(s.block != data.shots[0].block for s in (data.shots[0], data.shots[-1], shot))
     words = [f"block {shot.block + 1}"] if several or shot.block else []
@@ -97,13 +99,13 @@ def about(data: ReportInput, k: int, ground: Ground) -> str:
 
 
 def extent(data: ReportInput, ground: Ground) -> str:
-    """The corners in words."""
+    """The coordinates of the corners as a sentence."""
     west, south, east, north = data.bounds or ground.bounds
     east_0, north_0 = data.origin
     if not data.crs:
         size = f"{fixed(east - west, 1)} by {fixed(north - south, 1)} {ground.unit}"
         return (
-            f"The map measures {size}; its coordinates count from an arbitrary point and north"
+            f"The map measures {size}; its coordinates start at an arbitrary point and north"
             " is unknown."
         )
     return (

@@ -1,4 +1,4 @@
-"""Reading figures that may be absent, and writing them for people."""
+"""Reads figures that may be absent, and formats them for readers."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -41,7 +41,9 @@ def items(value: Any) -> tuple[Any, ...]:
 
 
 def fixed(value: Any, decimals: int = 2, *, sign: bool = False) -> str:
-    """`1 234.50` with a true minus sign and thin spaces between thousands; a dash for no figure."""
+    """`1 234.50` with a true minus sign and thin spaces between thousands; a dash where there is no
+    figure.
+    """
     figure = number(value)
     if figure is None:
         return DASH
@@ -53,7 +55,7 @@ def fixed(value: Any, decimals: int = 2, *, sign: bool = False) -> str:
 
 
 def significant(value: Any, digits: int = 3, *, sign: bool = False) -> str:
-    """A figure with so many significant digits, never in powers of ten between 1e-6 and 1e9."""
+    """A figure with `digits` significant digits, never in powers of ten between 1e-6 and 1e9."""
     figure = number(value)
     if figure is None:
         return DASH
@@ -102,7 +104,7 @@ def count(n: float, noun: str, plural: str = "") -> str:
 
 
 def nice(span: float, parts: float) -> float:
-    """A round step (1, 2, 5 times a power of ten) that divides the span into about so many
+    """A round step (1, 2, 5 times a power of ten) that divides the span into about `parts`
     parts.
     """
     raw = span / max(parts, 1e-9)
@@ -113,5 +115,5 @@ def nice(span: float, parts: float) -> float:
 
 
 def decimals_of(step: float) -> int:
-    """Decimals that tell multiples of a round step apart."""
+    """Number of decimals needed to distinguish multiples of a round step."""
     return max(0, -math.floor(math.log10(step) + 1e-9)) if step > 0 else 0

@@ -1,4 +1,4 @@
-"""Sections on how often the ground was seen and how high it lies."""
+"""Sections on the number of photos per place and on the heights of the ground."""
 
 import numpy as np
 
@@ -20,15 +20,17 @@ DATUMS = {
 
 
 def overlap_section(data: ReportInput, ground: Ground | None, layers: dict[str, Layer]) -> Section:
-    """How many photos see each place."""
-    blocks: tuple[Block, ...] = (Missing(why="No count of photos per place was made in this run."),)
+    """Number of photos that show each place."""
+    blocks: tuple[Block, ...] = (
+        Missing(why="The number of photos per place was not computed in this run."),
+    )
     if data.views is not None and (np.asarray(data.views) > 0).any():
         blocks = (_histogram(data.views),)
         if ground and "overlap" in layers:
             title = "Photos that see each place"
             caption = (
-                "Single coverage is flat and unchecked; from three photos on, heights can be "
-                "measured and mistakes found."
+                "Where only one photo shows the ground, heights cannot be measured and errors "
+                "cannot be detected. Three or more photos allow both."
             )
             svg = picture(
                 ground,
@@ -61,8 +63,8 @@ def _heights(z: np.ndarray, low: float, high: float, unit: str) -> Figure:
         marks=((median, f"median {fixed(median, 1)}"),),
     )
     caption = (
-        "A few cells far from all others would be outliers that passed; they tear the map"
-        " where they lie."
+        "A few cells far from all others are probably undetected outliers; they distort the map"
+        " at that place."
     )
     return Figure(svg=svg, title=title, caption=caption)
 
@@ -91,7 +93,7 @@ def _histogram(views: np.ndarray) -> Figure:
 
 
 def surface_section(data: ReportInput, ground: Ground | None, layers: dict[str, Layer]) -> Section:
-    """The heights the photos were rectified over."""
+    """The heights over which the photos were rectified."""
     blocks: tuple[Block, ...] = (
         Missing(why="The photos were placed on a plane: there is no height surface to show."),
     )
@@ -110,8 +112,8 @@ def surface_section(data: ReportInput, ground: Ground | None, layers: dict[str, 
         svg = picture(ground, [use("heights")], title)
         bar = colour_bar(stops, f"{fixed(low, 1)} {unit}", f"{fixed(high, 1)} {unit}", "height")
         caption = (
-            f"Lit from the north-west, from {fixed(z.min(), 1)} to {fixed(z.max(), 1)} {unit}. "
-            "Errors here shift the map sideways, most at the photos\u2019 rims."
+            f"Heights from {fixed(z.min(), 1)} to {fixed(z.max(), 1)} {unit}, shaded from the "
+            "north-west. Height errors displace the map horizontally, most near photo edges."
         )
         blocks = (Figure(svg=svg + bar, title=title, caption=caption), _heights(z, low, high, unit))
         if z.max() - z.min() < 1e-3:

@@ -1,4 +1,4 @@
-"""The page: sections in order, one template, one file."""
+"""Builds the page: sections in order, one template, one file."""
 
 import re
 from contextlib import suppress
@@ -35,7 +35,7 @@ HERE = Path(__file__).parent
 
 
 def build_report(data: ReportInput) -> str:
-    """The whole page as text: no other file and no network is needed to read it."""
+    """The whole page as text; it can be read without other files and without a network."""
     ground = ground_of(data)
     layers = layers_of(data, ground) if ground else ()
     named = {layer.id: layer for layer in layers}
@@ -68,14 +68,12 @@ def build_report(data: ReportInput) -> str:
 
 
 def write_report(path: Path, data: ReportInput) -> None:
-    """Build the page and put it at `path`, whole or not at all; `OutputError` if it cannot be
-    written.
-    """
+    """Builds the page and writes it to `path` atomically; `OutputError` if it cannot be written."""
     write_page(path, build_report(data))
 
 
 def write_page(path: Path, page: str) -> None:
-    """Put a page at `path`, whole or not at all; `OutputError` if it cannot be written."""
+    """Writes a page to `path` atomically; `OutputError` if it cannot be written."""
     path = Path(path)
     partial = path.with_name(path.name + ".partial")
     try:
@@ -91,7 +89,7 @@ def write_page(path: Path, page: str) -> None:
 
 
 def attention(data: ReportInput) -> tuple[tuple[str, str], ...]:
-    """What deserves a look first: sentences with the section that shows more."""
+    """Warnings to be read first: sentences, each with the section that shows more."""
     m = data.metrics
     found = [(plain(w), "") for w in items(m.get("warnings"))[:20]]
     found += [
@@ -107,7 +105,7 @@ def attention(data: ReportInput) -> tuple[tuple[str, str], ...]:
 
 
 def tied(words: str) -> str:
-    """Figures and their units kept on one line."""
+    """The text with non-breaking spaces between figures and their units."""
     return re.sub(r"(\d) (px|m|cm|s|GB|MB)\b", "\\1\u00a0\\2", words)
 
 
@@ -120,7 +118,9 @@ def plain_page(
     sections: tuple[Section, ...],
     tiles: tuple[Tile, ...] = (),
 ) -> str:
-    """A page of sections without a map; `source` says where the figures lie. Whole in itself."""
+    """A self-contained page of sections without a map; `source` says in which files the figures
+    are.
+    """
     return _template("plain.html.j2").render(
         title=title,
         summary=summary,
@@ -133,7 +133,7 @@ def plain_page(
 
 
 def section_html(section: Section) -> str:
-    """One section as it stands in a page."""
+    """The HTML of one section."""
     return _template("section.html.j2").render(section=section)
 
 
@@ -152,4 +152,4 @@ def _template(name: str = "page.html.j2") -> Template:
 
 @cache
 def _asset(name: str) -> Markup:
-    return Markup((HERE / name).read_text(encoding="utf-8"))  # ours, not the user's
+    return Markup((HERE / name).read_text(encoding="utf-8"))  # our own files, not user text

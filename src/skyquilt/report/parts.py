@@ -1,4 +1,4 @@
-"""What a page consists of, and how values are written.
+"""The parts of a page, and units and values as text.
 
 `page.html.j2` draws each kind of part and escapes every string that is not `Markup`.
 """
@@ -12,7 +12,7 @@ from skyquilt.report.input import ReportInput
 from skyquilt.report.numbers import fixed, mapping, plain
 
 Verdict = Literal["good", "fair", "poor", "plain"]
-"""How a figure is to be taken; `plain` judges nothing."""
+"""How good a figure is; `plain` means no verdict."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,9 +26,9 @@ class Tile:
     unit: str = ""
     """Its unit."""
     verdict: Verdict = "plain"
-    """Whether this is good."""
+    """Verdict on the figure."""
     says: str
-    """One sentence: what it means and where good ends."""
+    """One sentence: what it means and its thresholds."""
     anchor: str = ""
     """Id of the section that shows more."""
 
@@ -38,7 +38,7 @@ class LegendItem:
     """A colour and what it stands for."""
 
     colour: str
-    """Any CSS colour."""
+    """A CSS colour."""
     text: str
     """Its meaning."""
 
@@ -50,7 +50,7 @@ class Figure:
     svg: Markup
     """The drawing."""
     title: str
-    """What is shown; also read out by screen readers."""
+    """What is shown; also read by screen readers."""
     caption: str
     """How to read it."""
     legend: tuple[LegendItem, ...] = ()
@@ -69,7 +69,7 @@ class Table:
     head: tuple[str, ...]
     """Column titles."""
     rows: tuple[tuple[str, ...], ...]
-    """Cells, as many in each row as in the head."""
+    """Cells, as many in each row as column titles."""
     numeric: str
     """One letter per column: `n` for numbers, `t` for text, `c` for names in code style."""
     note: str = ""
@@ -90,10 +90,10 @@ class Sentences:
 
 @dataclass(frozen=True, kw_only=True)
 class Missing:
-    """A part that is not there."""
+    """Stands for a part that has no data."""
 
     why: str
-    """One sentence."""
+    """The reason, one sentence."""
     kind: Literal["missing"] = "missing"
 
 
@@ -102,7 +102,7 @@ Block = Figure | Table | Sentences | Missing
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A heading and what stands below it."""
+    """A heading and the content below it."""
 
     id: str
     """Anchor."""
@@ -111,18 +111,18 @@ class Section:
     lead: str = ""
     """One or two sentences."""
     blocks: tuple[Block, ...]
-    """In order."""
+    """The content, in order."""
     folded: bool = False
-    """Collapsed until asked for."""
+    """Collapsed until the reader opens it."""
 
 
 UNITS = {"celsius": "\u00b0C", "counts": "counts"}
-"""Units as people write them."""
+"""Units as printed."""
 
 
 def values_section(data: ReportInput) -> tuple[Section, ...]:
-    """What measured values mean and whether frames were brought to one level; nothing for
-    pictures.
+    """Meaning of measured values, and whether the frames were balanced; nothing for colour
+    images.
     """
     told = mapping(data.metrics.get("thermal_values"))
     if not told:

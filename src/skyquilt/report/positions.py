@@ -1,4 +1,4 @@
-"""Section: reported positions against solved ones."""
+"""Section: reported and solved positions."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,7 +21,7 @@ SERIES = (("east", "x0"), ("north", "x1"), ("up", "x2"))
 def positions_section(
     data: ReportInput, ground: Ground | None, layers: dict[str, Layer]
 ) -> Section:
-    """GPS residuals on the map, along the flight and as a table."""
+    """GPS residuals on the map, in order of capture and as a table."""
     shots = data.shots
     off = placed(shots) - reported(shots)
     known = np.isfinite(off[:, 0]) & np.isfinite(off[:, 1])
@@ -33,9 +33,9 @@ def positions_section(
     return Section(
         id="positions",
         title="GPS and solution",
-        lead="What is left when the map is finished: solved minus reported position. Random short "
-        "arrows are the noise "
-        "of the receiver; neighbours that all point one way show a drift or a shift.",
+        lead="Residuals of the finished map: solved minus reported position. Short arrows in random"
+        " directions are noise of the receiver; neighbouring arrows in the same direction show a"
+        " drift or a shift.",
         blocks=(*blocks, _worst(shots, off, known)),
     )
 
@@ -47,18 +47,16 @@ def _arrows(
     far = int((length >= ground.diagonal).sum())
     title = "From the reported to the solved position"
     caption = (
-        f"Arrows start where the photo says it was taken and are drawn {factor:g} times as long "
-        "as the residual."
+        f"Arrows start at the reported position of the photo and are drawn {factor:g} times as"
+        " long as the residual."
     )
     if factor == 1:
         caption = (
-            "Arrows lead from where the photo says it was taken to where it was found, at"
-            " true length."
+            "Arrows point from the reported to the solved position of the photo, at true length."
         )
     if far:
         caption += (
-            f" {count(far, 'photo')} reported further away than the map is wide: not drawn,"
-            " see the table."
+            f" {count(far, 'photo')} with a residual larger than the map: not drawn, see the table."
         )
     under = [use("mosaic", "faded")] if "mosaic" in layers else []
     svg = picture(ground, [*under, *(use("gps", c) for c in layers["gps"].styles)], title)
@@ -66,7 +64,7 @@ def _arrows(
 
 
 def _series(off: NDArray[Any], unit: str) -> Figure:
-    """East, north and up in order of capture, in three strips."""
+    """East, north and up in order of capture, as three graphs."""
     title = "Residuals in order of capture"
     stride = -(-len(off) // 1500)
     strip = (HEIGHT + 50) / 3
@@ -96,8 +94,8 @@ def _series(off: NDArray[Any], unit: str) -> Figure:
         )
     svg = drawing(parts, title, WIDTH, strip * 3 + 32)
     caption = (
-        "A step or a slope that lasts for many photos is a fault of the receiver or the"
-        " barometer, not noise."
+        "A step or a trend over many photos is an error of the receiver or the barometer, not"
+        " noise."
     )
     return Figure(svg=svg, title=title, caption=caption)
 

@@ -16,7 +16,7 @@ MOST_DISTANCES = 60
 
 
 def quality_section(data: ReportInput) -> Section:
-    """How photos agree where they are placed, and known distances on the map."""
+    """Agreement of photos at their places, and known distances on the map."""
     quality = mapping(data.metrics.get("quality"))
     if not quality:
         return Section(
@@ -32,9 +32,8 @@ def quality_section(data: ReportInput) -> Section:
         id="quality",
         title="Quality",
         blocks=tuple(blocks),
-        lead="The placements are replayed in order of capture, reduced to one ground resolution:"
-        " how well does each"
-        " photo fit what lies there already?",
+        lead="The photos are placed again in order of capture, at one ground resolution: how well"
+        " does each photo fit the map so far?",
     )
 
 
@@ -48,17 +47,17 @@ def _lambda(quality: Mapping[str, Any]) -> Table:
         (
             "\u03bb spat",
             _percent(quality.get("lambda_spat")),
-            "known distances kept, mean of 1 / (1 + relative error)",
+            "agreement with known distances, mean of 1 / (1 + relative error)",
         ),
         (
             "\u03bb spat, as printed",
             _percent(quality.get("lambda_spat_of_table")),
-            "1 less the sum of relative errors",
+            "1 minus the sum of relative errors",
         ),
         (
             "\u03bb",
             _percent(quality.get("lambda")),
-            f"distances weigh {_plain(quality.get('alpha'), 2)}",
+            f"weight of distances {_plain(quality.get('alpha'), 2)}",
         ),
     ]
     ste = mapping(quality.get("ste_per_inlier_px2"))
@@ -106,7 +105,7 @@ def _distances(quality: Mapping[str, Any]) -> list[Block]:
 
 def _graphs(quality: Mapping[str, Any]) -> list[Block]:
     both = [
-        ("with the photo before", _array(quality.get("correlation_with_last_of_photo"))),
+        ("with the previous photo", _array(quality.get("correlation_with_last_of_photo"))),
         ("with the map so far", _array(quality.get("correlation_with_map_of_photo"))),
     ]
     if max((np.isfinite(v).sum() for _, v in both), default=0) < 2:
@@ -119,8 +118,8 @@ def _graphs(quality: Mapping[str, Any]) -> list[Block]:
             title="Correlation",
             legend=legend,
             wide=True,
-            caption="A dip is a photo that does not fit what lies there: moving things, relief, or"
-            " a wrong place.",
+            caption="A low value is a photo that does not fit the map so far: moving objects,"
+            " relief, or a wrong position.",
         )
     ]
     off = _array(quality.get("off_position_over_width"))
@@ -136,7 +135,7 @@ def _graphs(quality: Mapping[str, Any]) -> list[Block]:
                 svg=lower,
                 title="Distance from the reported position",
                 wide=True,
-                caption="Over the width of a photo on the ground.",
+                caption="As a multiple of the width of a photo on the ground.",
             )
         )
     return figures
@@ -147,11 +146,9 @@ def _depths(data: ReportInput) -> list[Block]:
         picture(
             d.pixels,
             f"Depth map of {d.name}",
-            f"Disparity vectors of {count(d.features, 'inlier')} after the transformation: red"
-            " their x, green their"
-            f" length, blue their y, each stretched to its range; {count(d.removed, 'feature')} off"
-            " the dominant"
-            " plane left out.",
+            f"Disparity vectors of {count(d.features, 'inlier')} after the transformation: red is"
+            " x, green the length, blue y, each stretched to its range;"
+            f" {count(d.removed, 'feature')} off the dominant plane left out.",
             longest=420,
         )
         for d in data.depths

@@ -1,4 +1,4 @@
-"""Section: what the geometry leaves unexplained in the photos."""
+"""Section: residuals of the tie points."""
 
 from typing import Any
 
@@ -29,14 +29,14 @@ from skyquilt.report.svg import (
 
 COLUMNS, ROWS = 8, 6
 FEWEST = 10
-"""Observations a cell of the image needs for its mean."""
+"""Smallest number of observations in a cell of the image for a mean."""
 MOST_CAMERAS = 6
 CELLS = 61
-"""Cells per side of the density picture."""
+"""Cells per side of the density image."""
 
 
 def residuals_section(data: ReportInput) -> Section:
-    """Density, mean field per camera, histogram."""
+    """Density of the residuals, mean residuals over the image per camera, histogram."""
     cameras = [_finite(r) for r in data.residuals]
     cameras = sorted((r for r in cameras if len(r.px)), key=lambda r: -len(r.px))
     if not cameras:
@@ -53,7 +53,7 @@ def residuals_section(data: ReportInput) -> Section:
     return Section(
         id="residuals",
         title="Reprojection residuals",
-        lead="Computed minus observed place of every tie point in every photo that shows it.",
+        lead="Computed minus observed image position of every tie point in every photo of it.",
         blocks=tuple(blocks),
     )
 
@@ -67,7 +67,7 @@ def _finite(r: CameraResiduals) -> CameraResiduals:
 
 
 def _density(residual: NDArray[Any]) -> Figure:
-    """Where residual vectors end, darker where there are more."""
+    """Density of the end points of residual vectors, darker where there are more."""
     title = "Residual vectors"
     rms = float(np.sqrt((residual**2).sum(1).mean()))
     reach = max(nice(3 * float(np.percentile(np.abs(residual), 95)) / 2, 1), 1e-3)
@@ -96,10 +96,10 @@ def _density(residual: NDArray[Any]) -> Figure:
         (WIDTH - axes.width) / 2,
     )
     beyond = int((~inside).sum())
-    outside = f" {count(beyond, 'observation')} further out not drawn." if beyond else ""
+    outside = f" {count(beyond, 'observation')} outside the graph not drawn." if beyond else ""
     caption = (
         f"{count(len(residual), 'observation')}. A round, centred cloud is noise; a shifted or "
-        f"long one is a fault.{outside}"
+        f"elongated one is a systematic error.{outside}"
     )
     return Figure(svg=svg, title=title, caption=caption)
 
@@ -137,11 +137,11 @@ def _lengths(residual: NDArray[Any]) -> Figure:
         counts,
         title=title,
         x_label="length, px",
-        y_label="sightings",
+        y_label="observations",
         marks=((median, f"median {fixed(median, 2)}"), (p95, f"95\u202f% below {fixed(p95, 2)}")),
     )
     beyond = int((length > edges[-1]).sum())
-    caption = "Many short ones and a thin tail are good; a hump far out would be wrong matches."
+    caption = "Many short residuals and few long ones are good; a second peak means wrong matches."
     return Figure(
         svg=svg,
         title=title,
@@ -175,11 +175,9 @@ def _field(r: CameraResiduals) -> Figure:
     left = systematic(r, mean, n)
     judged = "good" if left <= 0.15 else "fair" if left <= 0.5 else "poor"
     caption = (
-        f"{count(int(n.sum()), 'observation')} in cells of {FEWEST} or more. With the share of"
-        " chance "
-        "taken off, "
-        f"{fixed(left, 2)} px RMS are systematic: {judged} (good up to 0.15 px, fair up to 0.5). "
-        "Arrows that point in or out all round would be a wrong radial distortion."
+        f"{count(int(n.sum()), 'observation')} in cells of {FEWEST} or more. Without the random"
+        f" part, {fixed(left, 2)} px RMS are systematic: {judged} (good up to 0.15 px, fair up to"
+        " 0.5). Arrows that all point inwards or outwards mean a wrong radial distortion."
     )
     return Figure(svg=svg, title=title, caption=caption)
 
@@ -193,7 +191,9 @@ def _key(step: float, length: float, height: float) -> Markup:
 
 
 def systematic(r: CameraResiduals, mean: NDArray[Any], n: NDArray[Any]) -> float:
-    """RMS in px of the cells' means (k, 2) beyond what residuals of this spread give by chance."""
+    """RMS in px of the cells' means (k, 2), minus what random residuals of this spread
+    contribute.
+    """
     chance = (r.residual_px**2).sum(1).mean() / n
     return float(np.sqrt(max(0.0, np.average((mean**2).sum(1) - chance, weights=n))))
 

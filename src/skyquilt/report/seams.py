@@ -1,4 +1,4 @@
-"""Section: how well neighbouring photos fit along the seams of the mosaic."""
+"""Section: displacement between neighbouring photos along the seams of the mosaic."""
 
 from typing import Any
 
@@ -29,8 +29,7 @@ def seams_section(data: ReportInput, ground: Ground | None, layers: dict[str, La
         id="seams",
         title="Seams",
         lead="Where the mosaic changes from one photo to the next, both photos are compared: the "
-        "displacement between "
-        "them is the step a reader sees in a road or a roof.",
+        "displacement between them is visible as a step in roads and roofs.",
         blocks=tuple(blocks),
     )
 
@@ -43,9 +42,7 @@ def _picture(ground: Ground, layers: dict[str, Layer], attempted: int, measured:
     )
     share = measured / attempted
     stands = (
-        "enough for the figures to stand"
-        if share >= SEAMS_MEASURED
-        else "too few for the figures to stand"
+        "enough for reliable figures" if share >= SEAMS_MEASURED else "too few for reliable figures"
     )
     caption = (
         f"{fixed(measured, 0)} of {count(attempted, 'sample')} measured ({share:.0%}): {stands} "
@@ -69,9 +66,7 @@ def _histogram(measured: NDArray[Any]) -> Figure:
         marks=((median, f"median {fixed(median, 2)}"), (p95, f"95\u202f% below {fixed(p95, 2)}")),
     )
     beyond = int((measured > edges[-1]).sum())
-    caption = (
-        "In px of the map. Up to 2 px is not noticed in print; more than 5 px is a broken line."
-    )
+    caption = "In map px. Up to 2 px is not visible in print; more than 5 px interrupts lines."
     return Figure(
         svg=svg,
         title=title,

@@ -1,5 +1,5 @@
-"""Small drawings: axes with round ticks, bars, lines, arrows. Colours come from the style sheet's
-classes.
+"""Small drawings: axes with round ticks, bars, lines, arrows. Colours come from classes of the
+style sheet.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,7 +18,7 @@ LEFT, RIGHT, TOP, BOTTOM = 64, 14, 12, 46
 
 
 def coordinate(value: float, decimals: int = 1) -> str:
-    """A short number for an attribute."""
+    """A short number for an SVG attribute."""
     text = f"{value:.{decimals}f}"
     return text.rstrip("0").rstrip(".") if "." in text else text
 
@@ -32,7 +32,7 @@ def polyline(points: ArrayLike, decimals: int = 1, *, close: bool = False) -> st
 
 
 def dots(points: ArrayLike, decimals: int = 1) -> str:
-    """Path data of one point each; round line caps make them discs of a constant size on the
+    """Path data of single points; round line caps draw them as discs of constant size on the
     screen.
     """
     return "".join(
@@ -47,7 +47,7 @@ def arrows(
     head: float = 0.28,
     longest: float = np.inf,
 ) -> str:
-    """Path data of arrows (k, 2) -> (k, 2); heads grow with the arrow up to `longest`."""
+    """Path data of arrows (k, 2) -> (k, 2); arrow heads grow with the arrow up to `longest`."""
     along = tips - tails
     length = np.linalg.norm(along, axis=1, keepdims=True)
     keep = length[:, 0] > 0
@@ -61,12 +61,12 @@ def arrows(
 
 
 def path(d: str, cls: str) -> Markup:
-    """A path of a class of the style sheet; nothing if it has no data."""
+    """A path with a class of the style sheet; nothing if it has no data."""
     return Markup('<path class="{}" d="{}"/>').format(cls, d) if d else Markup()
 
 
 def text(x: float, y: float, words: str, cls: str = "", *, turn: int = 0) -> Markup:
-    """Words at a place; classes `mid` and `end` align them."""
+    """Text at a position; classes `mid` and `end` align it."""
     turned = (
         Markup(' transform="rotate({} {} {})"').format(turn, coordinate(x), coordinate(y))
         if turn
@@ -85,7 +85,7 @@ def line(x1: float, y1: float, x2: float, y2: float, cls: str) -> Markup:
 
 
 def rect(x: float, y: float, width: float, height: float, cls: str, fill: str = "") -> Markup:
-    """A rectangle, by class or with a colour of its own."""
+    """A rectangle, filled by its class or with its own colour."""
     own = Markup(' style="fill:{}"').format(fill) if fill else ""
     return Markup('<rect class="{}" x="{}" y="{}" width="{}" height="{}"{}/>').format(
         cls, *(coordinate(v, 2) for v in (x, y, width, height)), own
@@ -99,7 +99,7 @@ def drawing(
     height: float = HEIGHT,
     left: float = 0,
 ) -> Markup:
-    """An SVG element of its own; `left` px of it lie left of x = 0."""
+    """A complete SVG element; `left` px of it are left of x = 0."""
     inner = Markup().join(content)
     return Markup('<svg viewBox="{} 0 {} {}" role="img" aria-label="{}">{}</svg>').format(
         coordinate(-left), coordinate(width), coordinate(height), title, inner
@@ -115,28 +115,28 @@ class Axes:
     y: tuple[float, float]
     """Range of y, bottom to top."""
     width: float = WIDTH
-    """Of the whole drawing in px."""
+    """Width of the whole drawing in px."""
     height: float = HEIGHT
-    """Of the whole drawing in px."""
+    """Height of the whole drawing in px."""
     left: float = LEFT
-    """Room for the labels of y."""
+    """Space in px for the labels of y."""
     bottom: float = BOTTOM
-    """Room for the labels of x."""
+    """Space in px for the labels of x."""
 
     def px(self, x: ArrayLike) -> NDArray[np.float64]:
-        """Horizontal places in the drawing."""
+        """Horizontal positions in px of the drawing."""
         span = self.width - self.left - RIGHT
         return self.left + (np.asarray(x, np.float64) - self.x[0]) / (self.x[1] - self.x[0]) * span
 
     def py(self, y: ArrayLike) -> NDArray[np.float64]:
-        """Vertical places in the drawing."""
+        """Vertical positions in px of the drawing."""
         floor = self.height - self.bottom
         return floor - (np.asarray(y, np.float64) - self.y[0]) / (self.y[1] - self.y[0]) * (
             floor - TOP
         )
 
     def points(self, xy: ArrayLike) -> NDArray[np.float64]:
-        """Places (k, 2) in the drawing."""
+        """Positions (k, 2) in px of the drawing."""
         pairs = np.asarray(xy, np.float64)
         return np.stack([self.px(pairs[:, 0]), self.py(pairs[:, 1])], 1)
 
@@ -149,7 +149,7 @@ class Axes:
         unit: str = "",
         y_parts: float = 0,
     ) -> Markup:
-        """Lines, numbers and names of both axes."""
+        """Grid lines, tick labels and names of both axes."""
         floor, right = self.height - self.bottom, self.width - RIGHT
         parts = []
         for value, label in ticks(*self.y, y_parts or (floor - TOP) / 42):
@@ -173,7 +173,7 @@ class Axes:
         return Markup().join(parts)
 
     def marker(self, x: float, label: str, level: int = 0) -> Markup:
-        """A vertical line with words beside it; `level` moves them down a line."""
+        """A vertical line with a label beside it; `level` moves the label down by lines."""
         at, middle = float(self.px(x)), (self.left + self.width - RIGHT) / 2
         words = text(
             at + (6 if at < middle else -6),
@@ -230,7 +230,7 @@ def columns(
     x_label: str,
     y_label: str,
 ) -> Markup:
-    """One column per label, its share in percent written above."""
+    """One column per label, with its share in percent above it."""
     shares = np.asarray(shares, np.float64)
     axes = Axes(
         x=(0.0, float(len(labels))), y=(0.0, max(float(shares.max(initial=0)) * 1.18, 1e-9))
@@ -249,7 +249,7 @@ def columns(
 
 
 def colour_bar(stops: Sequence[str], low: str, high: str, name: str) -> Markup:
-    """A horizontal colour scale with its ends and its meaning."""
+    """A horizontal colour scale with labels at its ends and its name."""
     n = len(stops)
     boxes = "".join(
         f'<rect x="{k * 240 / n:.1f}" width="{240 / n + 0.5:.1f}" height="12" fill="{c}"/>'

@@ -33,20 +33,20 @@ MEANINGS = {
     "p2": "tangential distortion",
 }
 FAR = 3.0
-"""Deviations of the prior at which a parameter is called far from it."""
+"""Number of standard deviations of the prior from which a parameter counts as far from it."""
 CONFLICTS = {
     "yaw": (
-        "The image top does not point where the metadata say: the file was turned afterwards, or "
-        "the compass is off."
+        "The image top does not point in the reported direction: the file was rotated afterwards,"
+        " or the compass is wrong."
     ),
     "altitude": (
-        "The reported height does not fit the image scale: a drifting barometer or another zero of"
-        " heights."
+        "The reported height does not fit the image scale: a drifting barometer or a different"
+        " zero of heights."
     ),
-    "position": "The GPS position lies far from where the pixels put the photo; it was given little"
-    " weight.",
+    "position": "The GPS position is far from the position estimated from the images; it was given"
+    " little weight.",
     "focal": (
-        "The focal length found differs from the reported one: check the camera, a zoom or a"
+        "The estimated focal length differs from the reported one: check the camera, a zoom or a"
         " resized file."
     ),
 }
@@ -54,14 +54,14 @@ UNITS = {"yaw": "\u00b0", "altitude": " m", "position": " m", "focal": " px"}
 
 
 def calibration_section(data: ReportInput) -> Section:
-    """Intrinsics with deviations and priors, a table per camera."""
+    """Intrinsics with standard deviations and priors, a table per camera."""
     cameras = mapping(data.metrics.get("cameras"))
     blocks: list[Block] = [_camera(str(k), v) for k, v in list(cameras.items())[:12] if mapping(v)]
     if not blocks:
         blocks = [
             Missing(
                 why="No calibration was estimated: the values in the photos\u2019 metadata were "
-                "taken as they are."
+                "used unchanged."
             )
         ]
     if len(cameras) > 12:
@@ -99,11 +99,11 @@ def _camera(name: str, parameters: Mapping[str, Any]) -> Table:
                 fixed(moved, 1, sign=True),
             )
         )
-    note = "The last column is the change from the prior in units of its deviation."
+    note = "The last column is the change from the prior in units of its standard deviation."
     if far:
         note += (
-            f" More than {FAR:.0f} for {', '.join(far)}: the prior was wrong or the flight cannot "
-            "determine it."
+            f" More than {FAR:.0f} for {', '.join(far)}: the prior is wrong or the flight does not"
+            " determine it."
         )
     return Table(
         title=name,
@@ -118,9 +118,7 @@ def control_section(data: ReportInput) -> Section:
     """Control and check points."""
     points = [mapping(v) for v in items(data.metrics.get("control"))]
     if not any(points):
-        why = (
-            "No surveyed points were given: absolute accuracy rests on the photos\u2019 GPS alone."
-        )
+        why = "No surveyed points were given: absolute accuracy depends on the photos\u2019 GPS."
         return Section(id="control", title="Control and check points", blocks=(Missing(why=why),))
     rows = tuple(
         (
@@ -136,14 +134,14 @@ def control_section(data: ReportInput) -> Section:
     offset = number(data.metrics.get("control_height_offset_m"))
     if offset:
         sums.append(
-            f"Heights differ by {fixed(offset, 2, sign=True)} m between the two datums; that is"
-            " taken out."
+            f"Heights differ by {fixed(offset, 2, sign=True)} m between the two datums; this"
+            " offset is removed."
         )
     return Section(
         id="control",
         title="Control and check points",
-        lead="Solution minus survey. Control points pulled the solution; check points took no part "
-        "and are the honest test.",
+        lead="Solution minus survey. Control points were used in the adjustment; check points were "
+        "not and are an independent test.",
         blocks=(
             Table(
                 title="Residuals",
@@ -175,7 +173,7 @@ def _rms(points: list[Mapping[str, Any]], check: bool, name: str) -> str:
 
 
 def conflicts_section(data: ReportInput) -> Section:
-    """What the metadata say and the pixels deny."""
+    """Metadata that contradict the image observations."""
     found = [mapping(v) for v in items(data.metrics.get("metadata_conflicts"))]
     found = [c for c in found if c]
     if not found:
@@ -190,7 +188,7 @@ def conflicts_section(data: ReportInput) -> Section:
             plain(c.get("field")),
             _figure(c, "reported"),
             _figure(c, "estimated"),
-            CONFLICTS.get(str(c.get("field")), "The metadata and the pixels disagree."),
+            CONFLICTS.get(str(c.get("field")), "The metadata and the images disagree."),
         )
         for c in found[:MOST_ROWS]
     )
@@ -207,9 +205,8 @@ def conflicts_section(data: ReportInput) -> Section:
     return Section(
         id="conflicts",
         title="Metadata conflicts",
-        lead="Metadata are measurements, not facts. These were contradicted by the photos"
-        " themselves "
-        "and not relied on.",
+        lead="Metadata are measurements, not facts. These contradict the image observations and"
+        " were not used as reported.",
         blocks=(table,),
     )
 
@@ -225,7 +222,7 @@ def _figure(conflict: Mapping[str, Any], key: str) -> str:
 
 
 def rejected_section(data: ReportInput) -> Section:
-    """Photos that take no part."""
+    """Photos that were not used."""
     rejected = mapping(data.metrics.get("photos_rejected"))
     if not rejected:
         why = (
@@ -250,7 +247,7 @@ def _cut(n: int) -> str:
 
 
 def notes_section(data: ReportInput) -> Section:
-    """Sentences the stages left."""
+    """Notes of the stages."""
     notes = tuple(plain(v) for v in items(data.metrics.get("notes")))[:MOST_ROWS]
     blocks: tuple[Block, ...] = (
         (Sentences(items=notes),) if notes else (Missing(why="No stage left a note."),)

@@ -8,21 +8,18 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 from fastapi import FastAPI, Response
-from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
+from fastapi.responses import FileResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
-from starlette.datastructures import Headers, MutableHeaders
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from skyquilt import __version__
-from skyquilt.server.context import Context, Writer
+from skyquilt.server.access import RESUMABLE, Context, Guard, Guarded, Writer
 from skyquilt.server.event_endpoints import EventEndpoints
-from skyquilt.server.guard import HEADERS, Guard
 from skyquilt.server.images import Images
 from skyquilt.server.layer_endpoints import LayerEndpoints
 from skyquilt.server.map_endpoints import STATIC, MapEndpoints
 from skyquilt.server.photo_endpoints import PhotoEndpoints
 from skyquilt.server.survey import Survey
-from skyquilt.server.upload_endpoints import RESUMABLE, TUS, UploadEndpoints
+from skyquilt.server.upload_endpoints import UploadEndpoints
 from skyquilt.server.wms_endpoints import WmsEndpoints
 
 
@@ -82,37 +79,3 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     app.add_middleware(Guarded, guard=guard)
     return app
-
-
-class Guarded:
-    """Middleware: refuses requests for other hosts and adds the security headers to every
-    response.
-    """
-
-    def __init__(self, app: ASGIApp, guard: Guard) -> None:
-        self.app, self.guard = app, guard
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handles one request."""
-        if scope["type"] != "http":
-            await self.app(scope, receive, send)
-            return
-        always, asked = HEADERS, Headers(scope=scope)
-        if scope["path"].startswith(RESUMABLE):
-            always = HEADERS | TUS
-            # tus: a header for clients that cannot send PATCH or DELETE
-            method = asked.get("x-http-method-override", scope["method"])
-            scope = {**scope, "method": method.upper()}
-
-        async def with_headers(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                headers = MutableHeaders(scope=message)
-                for name, value in always.items():
-                    headers.setdefault(name, value)
-            await send(message)
-
-        if self.guard.knows(asked.get("host", "")):
-            await self.app(scope, receive, with_headers)
-            return
-        refused = JSONResponse({"detail": "this server answers requests to localhost only"}, 421)
-        await refused(scope, receive, with_headers)

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 from fastapi import Request
 from fastapi.responses import StreamingResponse
 
-from skyquilt.server.context import Context
+from skyquilt.server.access import Context
 from skyquilt.server.survey import LiveSurvey
 from skyquilt.version import __version__
 

@@ -8,7 +8,7 @@ from fastapi.responses import JSONResponse
 
 from skyquilt.errors import OutputError
 from skyquilt.live.photo_intake import shown_name
-from skyquilt.server.context import Context
+from skyquilt.server.access import Context
 from skyquilt.server.layers import LayerError, checked, drop_layer, put_layer
 from skyquilt.server.survey import LiveSurvey
 

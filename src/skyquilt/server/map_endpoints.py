@@ -11,7 +11,7 @@ from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
 from skyquilt.raster.map_source import between
-from skyquilt.server.context import Context
+from skyquilt.server.access import Context
 from skyquilt.server.export import write_cog
 from skyquilt.server.images import Images
 from skyquilt.server.survey import LiveSurvey

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 from fastapi import HTTPException, Query
 from fastapi.responses import FileResponse
 
-from skyquilt.server.context import Context
+from skyquilt.server.access import Context
 from skyquilt.server.survey import Shown, covering
 
 Degrees = Annotated[float, Query(ge=-180, le=180)]

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 from skyquilt.errors import OutputError
-from skyquilt.live.crash_points import hit
+from skyquilt.live.ledger import hit
 from skyquilt.raster.map_source import MERCATOR, Bounds, between, mercator, picture
 from skyquilt.raster.mbtiles import touched, write_mbtiles
 from skyquilt.server.export import write_cog

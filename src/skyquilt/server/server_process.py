@@ -20,7 +20,7 @@ from skyquilt.live.ledger import Ledger
 from skyquilt.live.live_map import PHOTOS
 from skyquilt.live.photo_intake import Intake
 from skyquilt.live.settings import LiveSettings
-from skyquilt.server.guard import Guard
+from skyquilt.server.access import Guard
 from skyquilt.server.published_files import PublishedFiles
 from skyquilt.server.server_thread import ServerThread, address, bound
 from skyquilt.server.survey import LiveSurvey

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from skyquilt.errors import UsageError
-from skyquilt.server.guard import Guard
+from skyquilt.server.access import Guard
 from skyquilt.server.survey import Survey
 
 NEEDED = "the live map and its viewer need some more packages: pip install 'skyquilt[live]'"

@@ -23,13 +23,9 @@ from starlette.requests import ClientDisconnect
 
 from skyquilt.errors import OutputError
 from skyquilt.live.photo_intake import Accepted, Intake, Refused, shown_name
-from skyquilt.server.context import Context
+from skyquilt.server.access import RESUMABLE, TUS, Context
 from skyquilt.server.uploads import Upload, Uploads
 
-RESUMABLE = "/photos/uploads"
-"""Path of the resumable uploads."""
-TUS = {"Tus-Resumable": "1.0.0"}
-"""Sent with every response of that endpoint."""
 VERSIONS = {"Tus-Version": "1.0.0"}
 PART = "application/offset+octet-stream"
 """Media type of a part."""

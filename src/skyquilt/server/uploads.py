@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from skyquilt.server.guard import Guard
+from skyquilt.server.access import Guard
 
 SWEEP_S = 60.0
 """Longest time in s between searches for expired uploads."""

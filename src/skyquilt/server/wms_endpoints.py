@@ -5,7 +5,7 @@ from fastapi import Request, Response
 from fastapi.responses import JSONResponse
 
 from skyquilt.raster.map_source import between, picture
-from skyquilt.server.context import Context
+from skyquilt.server.access import Context
 from skyquilt.server.images import Images, image_bytes
 from skyquilt.server.survey import covering
 from skyquilt.server.wms import WmsError, asked, capabilities, map_request, refusal

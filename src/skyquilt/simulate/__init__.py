@@ -1,6 +1,6 @@
-"""A flight of known truth over procedural terrain.
+"""Simulates a flight over procedural terrain with known truth.
 
-Imports no stage: an oracle shares no code with the judged.
+It imports no stage: an oracle must share no code with what it tests.
 """
 
 from skyquilt.simulate.flight import Waypoint

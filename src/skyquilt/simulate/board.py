@@ -1,5 +1,5 @@
-"""Frames of a chess-board of known truth: single views, and a sweep of a lamp that heats it part by
-part.
+"""Frames of a chess-board with known truth: single views, and a series in which a lamp heats it
+part by part.
 """
 
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ from skyquilt.simulate.grid import Doubles, Floats
 _STEP = 0.004
 """Side in m of the board's texture cells, per 0.1 m of a square."""
 _OVER = 2
-"""Rays per pixel and axis."""
+"""Rays per pixel along each axis."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,24 +29,24 @@ class Chessboard:
     square: float = 0.10
     """Side of a square, m."""
     margin: float = 0.05
-    """White rim around the squares, m."""
+    """White border around the squares, m."""
     spread: float = 0.02
-    """Heat that leaks sideways: radius in sides of a square."""
+    """Lateral spread of heat: radius in sides of a square."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BoardPose:
-    """Where the board stands before the camera (x right, y down, z forward)."""
+    """Pose of the board in front of the camera (x right, y down, z forward)."""
 
     rotation: Doubles
     """(3, 3): board axes (x right, y down, z away) to camera axes."""
     shift: Doubles
-    """(3,): the board's middle in camera coordinates, m."""
+    """(3,): centre of the board in camera coordinates, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """What the camera does to what it sees."""
+    """Sensor effects: noise, blur and drift."""
 
     noise: float = 0.05
     """Standard deviation per pixel, K."""
@@ -58,18 +58,18 @@ class Sensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Lamp:
-    """A lamp that sweeps over the board line by line."""
+    """A lamp that moves over the board line by line."""
 
     frames: int = 92
     """Frames taken during the sweep."""
     lines: int = 4
     """Lines of the sweep."""
     radius: float = 1.6
-    """Of the heated spot, in sides of a square."""
+    """Radius of the heated spot, in sides of a square."""
     rise: float = 6.0
     """Temperature that black paper gains under the lamp, K."""
     white: float = 0.25
-    """What white paper absorbs of that."""
+    """Share of it that white paper gains."""
     cooling: float = 0.18
     """Share of the gain that is lost from frame to frame."""
 
@@ -77,8 +77,8 @@ class Lamp:
 def tilted(
     angle_x: float, angle_y: float, spin: float, shift: tuple[float, float, float]
 ) -> BoardPose:
-    """A pose by three turns in degrees, about x, y and the line of sight, and the place of the
-    middle in m.
+    """A pose from three rotations in degrees, about x, y and the optical axis, and the centre's
+    position in m.
     """
     a, b, c = np.radians([angle_x, angle_y, spin])
     rx = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
@@ -88,7 +88,7 @@ def tilted(
 
 
 def five_poses(lens: Lens, board: Chessboard, rng: np.random.Generator) -> list[BoardPose]:
-    """Five tilted poses in which the whole board is in the picture."""
+    """Five tilted poses with the whole board inside the image."""
     wide = max(board.columns / lens.width, board.rows / lens.height) * board.square * lens.focal
     poses = []
     for angle_x, angle_y, x, y in (
@@ -113,7 +113,7 @@ def sweep(
     sensor: Sensor,
     rng: np.random.Generator,
 ) -> Iterator[Floats]:
-    """Frames (height, width) in K, the camera and the board standing still."""
+    """Frames (height, width) in K, with camera and board at rest."""
     black, where = _ink(board), _rays_on_board(lens, board, pose)
     absorbs = black + (1 - black) * lamp.white
     gain, y, x = np.zeros_like(black), *np.indices(black.shape).astype(np.float32)
@@ -139,7 +139,7 @@ def still(
     *,
     clutter: float = 0.0,
 ) -> Floats:
-    """One frame (height, width) of an evenly warmed board, black 6 K above white, before a
+    """One frame (height, width) of an evenly heated board, black 6 K above white, in front of a
     background whose texture has a standard deviation of `clutter` K.
     """
     where = _rays_on_board(lens, board, pose)
@@ -154,7 +154,7 @@ def _cell(board: Chessboard) -> float:
 
 
 def _ink(board: Chessboard) -> Floats:
-    """1 for black, 0 for white, on a raster over the board and its rim; shares where an edge
+    """1 for black, 0 for white, on a raster over the board and its border; fractions where an edge
     crosses a cell.
     """
     cell, fine = _cell(board), 8
@@ -172,8 +172,8 @@ def _ink(board: Chessboard) -> Floats:
 
 
 def _rays_on_board(lens: Lens, board: Chessboard, pose: BoardPose) -> Floats:
-    """Column and row (height, width, 2, finer by `_OVER`) of the board's raster that every ray
-    meets; far outside where it misses.
+    """Column and row (height, width, 2, finer by `_OVER`) of the board's raster where each ray
+    meets it; far outside where a ray misses it.
     """
     fine = (
         (np.arange(lens.width * _OVER) + 0.5) / _OVER - 0.5,
@@ -190,7 +190,7 @@ def _rays_on_board(lens: Lens, board: Chessboard, pose: BoardPose) -> Floats:
 
 
 def _lamp_at(share: float, lamp: Lamp, size: Doubles) -> tuple[float, float]:
-    """Where the lamp points, m from the raster's corner, after a share of the sweep; there and
+    """Position of the lamp, m from the raster's corner, after a share of its path; forward and
     back.
     """
     line = min(int(share * lamp.lines), lamp.lines - 1)
@@ -202,7 +202,7 @@ def _lamp_at(share: float, lamp: Lamp, size: Doubles) -> tuple[float, float]:
 def _frame(
     board: Floats, where: Floats, sensor: Sensor, rng: np.random.Generator, behind: float | Floats
 ) -> Floats:
-    """What the sensor makes of a board's temperatures and of those behind it."""
+    """The sensor's image of a board's temperatures and of those behind it."""
     height, width = where.shape[0] // _OVER, where.shape[1] // _OVER
     seen = cv2.remap(
         board, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE

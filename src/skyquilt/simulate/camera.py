@@ -80,13 +80,13 @@ class Lens:
         return out
 
     def turned(self) -> "Lens":
-        """The lens that describes files whose pixels were turned by 180 degrees."""
+        """The lens for files whose pixels were rotated by 180 degrees."""
         return replace(
             self, offset_x=-self.offset_x, offset_y=-self.offset_y, p1=-self.p1, p2=-self.p2
         )
 
     def scaled(self, width: int, height: int) -> "Lens":
-        """The same field of view on another number of pixels."""
+        """The lens with the same field of view and another number of pixels."""
         ratio = width / self.width
         return replace(
             self,

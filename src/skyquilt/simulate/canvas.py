@@ -1,4 +1,4 @@
-"""A block of the country while it is painted."""
+"""A block of the terrain during painting."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,16 +13,16 @@ from skyquilt.simulate.noise import Noise
 from skyquilt.simulate.weather import Weather
 
 WARM_K = np.float32(1.5)
-"""Kelvin by which a surface twice as bright as its material is warmer."""
+"""Temperature difference in K of a surface twice as bright as its material."""
 _SHIFT = 4  # fractional bits of polygon vertices
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Canvas:
-    """Arrays that painters write into; the record itself never changes."""
+    """Arrays that painters write into; the record itself does not change."""
 
     grid: Grid
-    """Where the block lies."""
+    """Position of the block."""
     look: Floats
     """(h, w, 4) red, green, blue in 0-255 and temperature in degrees Celsius, all before light and
     shadow.
@@ -30,32 +30,32 @@ class Canvas:
     height: Floats
     """(h, w) surface above the base, m."""
     ground: Floats
-    """(h, w) bare ground above the base, m; not written to."""
+    """(h, w) bare ground above the base, m; must not be written to."""
     noise: Noise
-    """Of the scene."""
+    """Noise of the scene."""
     weather: Weather
-    """Of the scene."""
+    """Weather of the scene."""
 
     @cached_property
     def grain(self) -> Floats:
-        """White noise per cell, a little softened."""
+        """White noise per cell, slightly smoothed."""
         return np.asarray(
             cv2.GaussianBlur(self.noise.grain(self.grid, 5), (0, 0), 0.6)
         ) * np.float32(1.9)
 
     @cached_property
     def fine(self) -> Floats:
-        """Tufts and clods: a few cells to half a metre."""
+        """Noise with wavelengths from a few cells to half a metre: tufts and clods."""
         return self.noise.fractal(self.grid, 0.5, 0.12, 0.8, 6)
 
     @cached_property
     def patchy(self) -> Floats:
-        """Patches of one to some metres."""
+        """Noise with wavelengths of one to several metres: patches."""
         return self.noise.fractal(self.grid, 4.0, 0.9, 0.7, 7)
 
     @cached_property
     def broad(self) -> Floats:
-        """Changes over tens of metres."""
+        """Noise with wavelengths of tens of metres."""
         return self.noise.fractal(self.grid, 45.0, 11.0, 0.7, 8)
 
     def polygon(self, outline: Doubles) -> Floats:
@@ -65,7 +65,7 @@ class Canvas:
         return mask.astype(np.float32) / np.float32(255)
 
     def line(self, lines: Doubles | list[Doubles], width: float) -> Floats:
-        """Coverage (h, w) of map polylines of some width in m."""
+        """Coverage (h, w) of map polylines, with a width in m."""
         mask = np.zeros(self.height.shape, dtype=np.uint8)
         thick = max(1, round(width / self.grid.res))
         fixed = [self._fixed(line) for line in (lines if isinstance(lines, list) else [lines])]
@@ -73,7 +73,7 @@ class Canvas:
         return mask.astype(np.float32) / np.float32(255)
 
     def touches(self, points: Doubles, margin: float) -> bool:
-        """Whether the bounding box of map points comes within `margin` m of the block."""
+        """Whether the bounding box of map points is within `margin` m of the block."""
         if self.grid.width == 0 or self.grid.height == 0:
             return False
         low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
@@ -81,7 +81,7 @@ class Canvas:
         return bool(low[0] <= xs[-1] and high[0] >= xs[0] and low[1] <= ys[0] and high[1] >= ys[-1])
 
     def part(self, x: float, y: float, reach: float) -> "Canvas":
-        """Views on the cells within `reach` m of a map point; may be empty."""
+        """A canvas with views of the cells within `reach` m of a map point; may be empty."""
         grid = self.grid.around(x, y, reach)
         at = self.grid.inside(grid)
         part = Canvas(
@@ -108,7 +108,7 @@ class Canvas:
     def lay(
         self, material: Material, cover: Floats | NDArray[np.bool_], texture: Floats | float = 0.0
     ) -> None:
-        """Paint a material where `cover` (h, w, 0-1) is; `texture` is a relative change of
+        """Paints a material where `cover` (h, w, 0-1) is above 0; `texture` is a relative change of
         brightness.
         """
         where = cover > 0

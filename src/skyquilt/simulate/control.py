@@ -1,4 +1,4 @@
-"""Lay out targets, survey them, and find them in the photos."""
+"""Places targets, surveys them, and observes them in the photos."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ _MARGIN_PX = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class Observation:
-    """A target in a photo."""
+    """An observation of a target in a photo."""
 
     point: str
     """Target name."""
@@ -40,19 +40,19 @@ class Surveyed:
     """A target with its true and its measured coordinates."""
 
     target: Target
-    """As it lies there."""
+    """The target."""
     true: tuple[float, float, float]
     """Easting, northing, height above the sea, m."""
     measured: tuple[float, float, float]
-    """The same as surveyed."""
+    """Surveyed easting, northing and height above the sea, m."""
 
 
 def lay_out(
     settings: Control, country: Country, lens: Lens, shots: Sequence[Shot], reach: float, gsd: float
 ) -> tuple[Target, ...]:
-    """Targets on open ground that several photos see, spread as far as can be.
+    """Targets on open ground that several photos show, as far apart as possible.
 
-    `reach` is how far from the next nadir they may lie, m.
+    `reach` is the largest distance to the nearest nadir, m.
     """
     wanted = settings.points + settings.checks
     if wanted == 0:
@@ -65,7 +65,7 @@ def lay_out(
     clear = np.array([_open(country.layout, place) for place in anywhere])
     views = _views(lens, shots, anywhere)
     places = anywhere[:wanted]
-    for least in (1, 2, 3, 4):  # as many views as enough places have
+    for least in (1, 2, 3, 4):  # the largest number of views that enough places have
         good = clear & (views >= least)
         if good.sum() >= 3 * wanted:
             places = anywhere[good]
@@ -84,7 +84,7 @@ def lay_out(
 
 
 def _views(lens: Lens, shots: Sequence[Shot], places: Doubles) -> NDArray[np.int64]:
-    """How many photos see each place (n, 2), were the ground level."""
+    """Number of photos that show each place (n, 2), for level ground."""
     points = np.column_stack([places, np.zeros(len(places))])
     size = np.array([lens.width, lens.height])
     count = np.zeros(len(places), dtype=np.int64)
@@ -95,7 +95,7 @@ def _views(lens: Lens, shots: Sequence[Shot], places: Doubles) -> NDArray[np.int
 
 
 def _open(layout: Layout, place: Doubles) -> bool:
-    """Whether nothing stands over or beside a place."""
+    """Whether no object covers a place or is close to it."""
     x, y = place
     clear = all(np.hypot(t.x - x, t.y - y) > t.radius + 2.5 for t in layout.trees)
     clear = clear and all(np.hypot(h.x - x, h.y - y) > h.length / 2 + 6.0 for h in layout.houses)
@@ -108,7 +108,7 @@ def _open(layout: Layout, place: Doubles) -> bool:
 
 
 def _spread(places: Doubles, count: int) -> Doubles:
-    """The place farthest out, then again and again the one farthest from all chosen."""
+    """The outermost place, then repeatedly the place farthest from all chosen ones."""
     chosen = [places[int(np.argmax(np.hypot(*(places - places.mean(axis=0)).T)))]]
     while len(chosen) < min(count, len(places)):
         nearest = np.min([np.hypot(*(places - c).T) for c in chosen], axis=0)
@@ -117,7 +117,7 @@ def _spread(places: Doubles, count: int) -> Doubles:
 
 
 def survey(settings: Control, country: Country, place: Place) -> list[Surveyed]:
-    """Measure the targets' coordinates."""
+    """Measures the targets' coordinates."""
     rng = np.random.default_rng([country.seed, 42])
     out = []
     for target in country.targets:
@@ -141,7 +141,7 @@ def observations(
     shots: Sequence[Shot],
     reports: Sequence[Report],
 ) -> list[Observation]:
-    """Where the targets are seen, nothing standing in between."""
+    """Observations of the targets, where nothing hides them."""
     if not country.targets:
         return []
     rng = np.random.default_rng([country.seed, 43])
@@ -187,7 +187,7 @@ def _in_sight(scene: Scene, eye: Doubles, point: Doubles) -> bool:
 def write_gcp_list(
     path: Path, crs: str, points: Sequence[Surveyed], seen: Sequence[Observation]
 ) -> None:
-    """OpenDroneMap's `gcp_list.txt`; a check point says so in the eighth column."""
+    """Writes OpenDroneMap's `gcp_list.txt`; check points are marked in the eighth column."""
     by_name = {point.target.name: point for point in points}
     lines = [crs]
     for observation in sorted(seen, key=lambda s: (s.point, s.photo)):

@@ -19,7 +19,7 @@ _EXIF_IFD, _GPS_IFD, _XMP_TAG = 0x8769, 0x8825, 700
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """What a camera writes into every file."""
+    """Metadata that a camera writes into every file."""
 
     model: str
     """Camera model."""
@@ -32,7 +32,7 @@ class Body:
 def write_jpeg(
     path: Path, pixels: NDArray[np.uint8], report: Report, body: Body, quality: int
 ) -> None:
-    """A photo (h, w, 3) with its metadata."""
+    """Writes a photo (h, w, 3) with its metadata."""
     exif = _exif(report, body, pixels.shape[1])
     buffer = BytesIO()
     Image.fromarray(pixels).save(
@@ -42,13 +42,13 @@ def write_jpeg(
     xmp = _xmp(report)
     if xmp is not None:
         segment = b"http://ns.adobe.com/xap/1.0/\x00" + xmp
-        at = 4 + int.from_bytes(data[4:6], "big")  # behind the EXIF segment
+        at = 4 + int.from_bytes(data[4:6], "big")  # after the EXIF segment
         data = data[:at] + b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big") + segment + data[at:]
     path.write_bytes(data)
 
 
 def write_tiff(path: Path, counts: NDArray[np.uint16], report: Report, body: Body) -> None:
-    """A thermal frame (h, w) in hundredths of a kelvin, with its metadata."""
+    """Writes a thermal frame (h, w) in hundredths of a kelvin, with its metadata."""
     exif = _exif(report, body, counts.shape[1])
     exif[0x010E] = "unit: centikelvin (temperature in K times 100)"
     tags = ImageFileDirectory_v2()
@@ -110,7 +110,7 @@ def _degrees(value: float) -> tuple[IFDRational, IFDRational, IFDRational]:
 
 
 def _xmp(report: Report) -> bytes | None:
-    """The packet as drones of the usual make write it; None where it would be empty."""
+    """The XMP packet as DJI drones write it; None where it would be empty."""
     if report.gimbal is None or report.takeoff is None or report.flight_yaw is None:
         return None
     values = {

@@ -1,4 +1,6 @@
-"""Form a photo: cast its rays, pick up the colours, and do to them what lenses and sensors do."""
+"""Forms a photo: casts its rays, samples the colours, and applies the effects of lens and
+sensor.
+"""
 
 from dataclasses import dataclass
 from functools import cache
@@ -30,10 +32,10 @@ def _leaves() -> Floats:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Exposer:
-    """A camera over a scene; keeps the rays of its pixels."""
+    """A camera over a scene; stores the rays of its pixels."""
 
     scene: Scene
-    """What is photographed."""
+    """The scene."""
     lens: Lens
     """The true camera."""
     directions: Floats
@@ -54,7 +56,7 @@ class Exposer:
     def _flanks(self, hits: Floats, heights: Floats, window: Grid) -> Floats:
         """Brightness (h, w) of leaves and plaster on steep flanks, a texture of x, y and z.
 
-        A raster has no texture along the vertical: without this, flanks would be streaks.
+        A raster has no texture along the vertical: without this, flanks would show streaks.
         """
         surface = self.scene.height[window.slices]
         slope_x = cv2.Sobel(surface, cv2.CV_32F, 1, 0, scale=1 / (8 * window.res))
@@ -90,7 +92,7 @@ class Exposer:
     def visible(
         self, shot: Shot, settings: Pictures, gain: float, rng: np.random.Generator
     ) -> NDArray[np.uint8]:
-        """(h, w, 3) as the camera stores it."""
+        """The visible image (h, w, 3) as the camera stores it."""
         hits, heights, window = self.pixels(shot)
         seen = sample(np.ascontiguousarray(self.scene.rgb[window.slices]), hits).astype(np.float32)
         seen *= self._flanks(hits, heights, window)[..., None]
@@ -103,7 +105,7 @@ class Exposer:
     def heat(
         self, shot: Shot, noise: float, offset: float, rng: np.random.Generator
     ) -> NDArray[np.uint16]:
-        """(h, w) hundredths of a kelvin."""
+        """The thermal image (h, w) in hundredths of a kelvin."""
         if self.scene.thermal is None:
             raise ValueError("the scene was drawn without temperatures")
         hits, _, window = self.pixels(shot)
@@ -116,12 +118,14 @@ class Exposer:
 
 
 def exposer(scene: Scene, lens: Lens) -> Exposer:
-    """Prepare a camera over a scene."""
+    """Prepares a camera over a scene."""
     return Exposer(scene=scene, lens=lens, directions=lens.rays())
 
 
 def footprint(lens: Lens, shot: Shot, level: float) -> Doubles:
-    """Map places (n, 2) where the image border meets a level height above the base."""
+    """Map positions (n, 2) where the rays of the image border meet a level height above the
+    base.
+    """
     w, h = lens.width - 0.5, lens.height - 0.5
     side = np.linspace(0, 1, 9)[:-1]
     x = np.concatenate(

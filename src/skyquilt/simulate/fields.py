@@ -1,4 +1,4 @@
-"""Painters of the land itself: parcels with their crops, borders, roads, ponds."""
+"""Painters of the land: parcels with their crops, borders, roads, ponds."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,12 +15,12 @@ from skyquilt.simulate.layout import Layout, Parcel, Road
 
 @dataclass(frozen=True, kw_only=True)
 class Cover:
-    """How a use of land looks."""
+    """Appearance of a land use."""
 
     material: m.Material
     """Its colour."""
     grain: float
-    """Relative contrast cell by cell."""
+    """Relative contrast from cell to cell."""
     fine: float
     """Contrast of tufts and clods."""
     patchy: float
@@ -30,7 +30,7 @@ class Cover:
     rows: float = 0.0
     """Contrast of crop rows."""
     height: float = 0.0
-    """Of the plants, m."""
+    """Height of the plants, m."""
 
 
 COVERS = {
@@ -56,7 +56,7 @@ COVERS = {
 
 
 def paint_parcels(canvas: Canvas, layout: Layout) -> None:
-    """Cover the ground, each parcel as its use asks."""
+    """Paints the ground of each parcel according to its use."""
     index = np.zeros(canvas.height.shape, dtype=np.int32)
     near = [p for p in layout.parcels if canvas.touches(p.outline, 1.0)]
     if not near:
@@ -112,7 +112,7 @@ def _rows(
 
 
 def paint_borders(canvas: Canvas, layout: Layout) -> None:
-    """Ragged strips of grass between parcels."""
+    """Paints irregular strips of grass between parcels."""
     for parcel in layout.parcels:
         if parcel.kind != "yard" and canvas.touches(parcel.outline, 2.0):
             strip = cv2.GaussianBlur(
@@ -126,7 +126,9 @@ def paint_borders(canvas: Canvas, layout: Layout) -> None:
 
 
 def paint_roads(canvas: Canvas, layout: Layout) -> None:
-    """Gravel tracks with a green middle, then asphalt: all shoulders, all lanes, all markings."""
+    """Paints gravel tracks with a green middle, then asphalt: all shoulders, all lanes, all
+    markings.
+    """
     near = [road for road in layout.roads if canvas.touches(road.line, road.width)]
     for road in near:
         if not road.paved:
@@ -174,7 +176,7 @@ def _track(canvas: Canvas, road: Road) -> None:
 
 
 def paint_ponds(canvas: Canvas, layout: Layout) -> None:
-    """Level, dark, nearly featureless water in a ring of reed."""
+    """Paints level, dark, nearly featureless water in a ring of reed."""
     for shore in layout.ponds:
         if not canvas.touches(shore, 3.0):
             continue

@@ -1,4 +1,4 @@
-"""Plan a flight and fly it: where each photo is truly taken."""
+"""Plans a flight and flies it: the true poses of all photos."""
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -24,16 +24,16 @@ class Waypoint:
     heading: float
     """Degrees clockwise from the map's north; the image top points there."""
     line: int
-    """Which flight line."""
+    """Index of the flight line."""
     drone: int = 0
-    """Which drone."""
+    """Index of the drone."""
     time: float = 0.0
     """Seconds since the first photo of the flight."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """A photo as truly taken."""
+    """The true pose of a photo."""
 
     name: str
     """File name."""
@@ -81,13 +81,15 @@ def site(points: list[Waypoint], heading: float) -> tuple[float, float]:
 
 
 def _axes(heading: float) -> Doubles:
-    """Rows: unit vectors along and to the right of a heading."""
+    """Unit vectors along and to the right of a heading, as rows."""
     s, c = np.sin(np.radians(heading)), np.cos(np.radians(heading))
     return np.array([[s, c], [c, -s]])
 
 
 def _counts(route: Route, forward: float, sideways: float) -> list[int]:
-    """Photos on each line, for a site or for a number of photos on a nearly square one."""
+    """Number of photos on each line, for a given site, or for a number of photos on a nearly square
+    site.
+    """
     if route.site is not None:
         along, across = route.site
         return [int(np.ceil(along / forward - 1e-9)) + 1] * (
@@ -112,8 +114,8 @@ def _lines(counts: list[int], forward: float, sideways: float, heading: float) -
 
 
 def _around(photos: int, forward: float, heading: float) -> list[Waypoint]:
-    """Once around a rectangle of sides about 3 : 2, nose ahead; the last photo is beside the
-    first.
+    """Waypoints once around a rectangle with sides of about 3 : 2, nose ahead; the last photo is
+    beside the first.
     """
     length = photos * forward
     long_ = round(0.3 * length / forward) * forward
@@ -134,7 +136,9 @@ def _around(photos: int, forward: float, heading: float) -> list[Waypoint]:
 
 
 def _shared(points: list[Waypoint], drones: int) -> list[Waypoint]:
-    """Each drone gets a run of neighbouring lines (of photos where lines are too few)."""
+    """Assigns a run of neighbouring lines to each drone (a run of photos where there are too few
+    lines).
+    """
     lines = max(p.line for p in points) + 1
     if lines >= drones:
         return [replace(p, drone=p.line * drones // lines) for p in points]
@@ -142,7 +146,7 @@ def _shared(points: list[Waypoint], drones: int) -> list[Waypoint]:
 
 
 def _timed(points: list[Waypoint], interval: float) -> list[Waypoint]:
-    """All drones start together; photos in order of time."""
+    """Waypoints with times: all drones start together; photos in order of time."""
     clock: dict[int, tuple[float, int]] = {}
     timed = []
     for p in points:
@@ -157,8 +161,8 @@ def _timed(points: list[Waypoint], interval: float) -> list[Waypoint]:
 
 
 def fly(points: list[Waypoint], route: Route, takeoff: float, seed: int, prefix: str) -> list[Shot]:
-    """The true shots, lost ones left out; `takeoff` is the height of the take-off point above the
-    base.
+    """The true shots, without the lost ones; `takeoff` is the height of the take-off point above
+    the base.
     """
     rng = np.random.default_rng([seed, 21, len(prefix)])
     lost = _losses(len(points), route.lost, rng)
@@ -181,8 +185,8 @@ def fly(points: list[Waypoint], route: Route, takeoff: float, seed: int, prefix:
 
 
 def _losses(count: int, lost: int, rng: np.random.Generator) -> set[int]:
-    """Numbers of lost photos: spread out, never neighbours, never the first or last where that can
-    be.
+    """Indices of lost photos: spread out, never neighbours, and not the first or last if
+    possible.
     """
     if lost == 0:
         return set()

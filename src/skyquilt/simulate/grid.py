@@ -1,4 +1,4 @@
-"""North-up grids in the local map frame, and windows of them."""
+"""North-up grids in the local map frame, and windows of these grids."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,12 +13,12 @@ Doubles = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:
-    """A window of one endless north-up raster; pixel centres lie half a cell inside the edges."""
+    """A window of an unbounded north-up raster; pixel centres are half a cell inside the edges."""
 
     left: float
-    """Map x of the left edge of column 0 of the endless raster, m."""
+    """Map x of the left edge of column 0 of the unbounded raster, m."""
     top: float
-    """Map y of the upper edge of row 0 of the endless raster, m."""
+    """Map y of the upper edge of row 0 of the unbounded raster, m."""
     res: float
     """Cell size, m."""
     width: int
@@ -26,9 +26,9 @@ class Grid:
     height: int
     """Rows of this window."""
     col: int = 0
-    """First column of this window in the endless raster."""
+    """First column of this window in the unbounded raster."""
     row: int = 0
-    """First row of this window in the endless raster."""
+    """First row of this window in the unbounded raster."""
 
     def window(self, row: int, col: int, height: int, width: int) -> "Grid":
         """A part of this grid, clipped to it; rows and columns count from this grid's own
@@ -53,7 +53,7 @@ class Grid:
 
     @property
     def slices(self) -> tuple[slice, slice]:
-        """Where this window lies in an array of the endless raster that starts at row 0, column
+        """Slices of this window in an array of the unbounded raster that starts at row 0, column
         0.
         """
         return slice(self.row, self.row + self.height), slice(self.col, self.col + self.width)
@@ -86,6 +86,6 @@ class Grid:
         return self.window(int(np.floor(v)) - n, int(np.floor(u)) - n, 2 * n + 2, 2 * n + 2)
 
     def inside(self, part: "Grid") -> tuple[slice, slice]:
-        """Slices of a part (of the same endless raster) in an array of this window."""
+        """Slices of a part (of the same unbounded raster) in an array of this window."""
         r, c = part.row - self.row, part.col - self.col
         return slice(r, r + part.height), slice(c, c + part.width)

@@ -1,4 +1,4 @@
-"""The bare ground: hills, with ponds lying level in them."""
+"""The bare ground: hills with level ponds."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,19 +17,19 @@ _BANK_M = 9.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Basin:
-    """A pond's level and how strongly it pulls the ground to it."""
+    """Level of a pond, and the weight with which it levels the ground around it."""
 
     grid: Grid
     """Coarse grid over the pond and its banks."""
     pull: Floats
-    """(height, width) 1 in the water, falling to 0 at the top of the banks."""
+    """(height, width) weight: 1 in the water, falling to 0 at the top of the banks."""
     level: float
     """Water level, m above the base."""
     shore: Doubles
     """(n, 2) map polygon."""
 
     def weight(self, grid: Grid) -> Floats | None:
-        """The pull on a window; None where the pond is far."""
+        """The weight on a window; None where the pond is far away."""
         corner = self.grid.pixels(np.array([[grid.xs[0], grid.ys[0]], [grid.xs[-1], grid.ys[-1]]]))
         if (
             (corner[1] < 0).any()
@@ -50,23 +50,23 @@ class Ground:
     """Heights of the bare ground above the base elevation."""
 
     noise: Noise
-    """Of the scene."""
+    """Noise of the scene."""
     relief: float
     """Height between low and high places of a site, m."""
     shores: tuple[Doubles, ...] = ()
-    """Ponds."""
+    """Outlines of the ponds."""
 
     def hills(self, grid: Grid) -> Floats:
-        """Without ponds; (height, width), m."""
+        """Heights without ponds; (height, width), m."""
         coarse = max(
             1, int(1.0 / grid.res)
-        )  # nothing below 10 m here: compute it per metre and enlarge
+        )  # no wavelength below 10 m: compute it per metre and enlarge
         if coarse < 3 or min(grid.width, grid.height) < 8:
             return self.noise.fractal(grid, 170.0, 10.0, 0.42, 1) * np.float32(self.relief / 3.6)
         return _enlarged(self.hills, grid, coarse)
 
     def heights(self, grid: Grid) -> Floats:
-        """(height, width), m above the base."""
+        """Heights (height, width), m above the base."""
         out = self.hills(grid)
         for basin in self.basins:
             weight = basin.weight(grid)
@@ -107,7 +107,9 @@ def _point(x: float, y: float) -> Grid:
 
 
 def _enlarged(field: Callable[[Grid], Floats], grid: Grid, factor: int) -> Floats:
-    """A smooth field computed on cells `factor` times as large, aligned with the endless raster."""
+    """A smooth field computed on cells `factor` times as large, aligned with the unbounded
+    raster.
+    """
     c0, r0 = grid.col // factor - 1, grid.row // factor - 1
     c1, r1 = (grid.col + grid.width) // factor + 2, (grid.row + grid.height) // factor + 2
     large = Grid(

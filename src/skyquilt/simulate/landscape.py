@@ -1,4 +1,4 @@
-"""Settle the country: cut it into parcels, lay the roads, build and plant."""
+"""Generates the landscape: divides it into parcels, and adds roads, buildings and trees."""
 
 import numpy as np
 
@@ -19,7 +19,8 @@ from skyquilt.simulate.layout import (
 )
 
 _ESTATE_M = 400.0
-"""Large countries are cut into estates of this size first, so that every one has all kinds of land.
+"""Large areas are first divided into estates of this size, so that each estate has all land
+uses.
 """
 
 
@@ -48,7 +49,7 @@ def landscape(bounds: tuple[float, float, float, float], seed: int) -> Layout:
 
 
 def _estates(bounds: tuple[float, float, float, float]) -> list[tuple[float, float, float, float]]:
-    """Boxes of the plan that cover the bounds once turned."""
+    """Rectangles of the plan that cover the bounds after rotation."""
     x0, y0, x1, y1 = bounds
     reach = 0.5 * float(np.hypot(x1 - x0, y1 - y0)) + max(abs(x0 + x1), abs(y0 + y1)) / 2 + 20
     n = max(1, round(2 * reach / _ESTATE_M))
@@ -61,7 +62,7 @@ def _estates(bounds: tuple[float, float, float, float]) -> list[tuple[float, flo
 
 
 def _shuffled(lots: list[Lot], rng: np.random.Generator) -> list[Lot]:
-    """Lots in random order, but middle ones first, so that small sites see every kind."""
+    """Lots in random order, but central ones first, so that small sites contain every land use."""
     middle = np.mean([lot.box for lot in lots], axis=0)
     far = [
         float(
@@ -124,7 +125,7 @@ def _furnish(
 def _yard(
     lot: Lot, frame: Frame, rng: np.random.Generator
 ) -> tuple[list[House], list[Tree], list[Car]]:
-    """Houses in a loose row, each with a car and garden trees."""
+    """Houses in an irregular row, each with a car and garden trees."""
     a0, b0, a1, b1 = lot.box
     houses, trees, cars = [], [], []
     for a in np.arange(a0 + 14, a1 - 10, 22):
@@ -168,7 +169,7 @@ def _grove(
     radius: tuple[float, float],
     height: tuple[float, float],
 ) -> list[Tree]:
-    """Trees on a grid, more or less shaken."""
+    """Trees on a grid with random offsets."""
     a0, b0, a1, b1 = lot.box
     margin = 4.0
     a, b = np.meshgrid(
@@ -225,7 +226,7 @@ def _tree(
 
 
 def _shore(lot: Lot, frame: Frame, rng: np.random.Generator) -> Doubles:
-    """A rounded pond in the middle of a lot."""
+    """Outline of a rounded pond in the middle of a lot."""
     a0, b0, a1, b1 = lot.box
     angle = np.linspace(0, 2 * np.pi, 90)
     phase = rng.uniform(0, 6, 3)

@@ -1,4 +1,4 @@
-"""The plan of the country: parcels, roads, and what stands on them, as vectors."""
+"""The plan of the terrain as vectors: parcels, roads, and objects."""
 
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -25,7 +25,7 @@ KINDS = (
     "wood",
     "wheat",
 )
-"""What parcels are used for, in the order in which shuffled parcels get their use."""
+"""Land uses of parcels, in the order in which they are assigned to the shuffled parcels."""
 
 _SMALL_M2 = 2600.0
 
@@ -46,7 +46,7 @@ class Parcel:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Road:
-    """A way along parcel borders."""
+    """A road along parcel borders."""
 
     line: Doubles
     """(n, 2) map polyline, m."""
@@ -75,7 +75,7 @@ class House:
     rise: float
     """Height of the ridge above the eaves, m; 0 is a flat roof."""
     roof: int
-    """Which roof covering."""
+    """Index of the roof covering."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,11 +87,11 @@ class Tree:
     y: float
     """Map y, m."""
     radius: float
-    """Of the crown, m."""
+    """Radius of the crown, m."""
     height: float
     """m."""
     conifer: bool
-    """A cone, else a dome."""
+    """True for a cone, False for a dome."""
     tint: float
     """Brightness of the leaves, about 1."""
 
@@ -107,17 +107,17 @@ class Car:
     angle_deg: float
     """Degrees from map x."""
     paint: int
-    """Which colour."""
+    """Index of the colour."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Layout:
-    """All that lies on the ground."""
+    """All objects on the ground."""
 
     parcels: tuple[Parcel, ...] = ()
-    """Cover everything."""
+    """Parcels; they cover the whole area."""
     roads: tuple[Road, ...] = ()
-    """Paved ones last, so that they are painted over tracks."""
+    """Roads; paved ones last, so that they are painted over tracks."""
     houses: tuple[House, ...] = ()
     """Buildings."""
     trees: tuple[Tree, ...] = ()
@@ -125,12 +125,12 @@ class Layout:
     cars: tuple[Car, ...] = ()
     """Cars."""
     ponds: tuple[Doubles, ...] = field(default=())
-    """Shores, (n, 2) map polygons."""
+    """Outlines of the ponds, (n, 2) map polygons."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frame:
-    """The direction of parcels, bent gently so that nothing is quite straight."""
+    """The direction of parcels, slightly bent so that no border is exactly straight."""
 
     angle: float
     """Rotation, rad."""
@@ -138,7 +138,7 @@ class Frame:
     """Amplitude of the bend, m."""
 
     def place(self, points: Doubles) -> Doubles:
-        """Plan (n, 2) to map (n, 2)."""
+        """Converts plan coordinates (n, 2) to map coordinates (n, 2)."""
         a, b = points[:, 0], points[:, 1]
         a = a + self.bend * np.sin(b / 61.0 + 0.7) + 0.4 * self.bend * np.sin(b / 23.0)
         b = b + self.bend * np.sin(a / 71.0 + 2.1) + 0.4 * self.bend * np.sin(a / 27.0 + 1)
@@ -147,7 +147,7 @@ class Frame:
 
 
 def dense(points: Doubles, step: float = 4.0) -> Doubles:
-    """A polyline (n, 2) with a vertex every few metres."""
+    """The polyline (n, 2) with a vertex every `step` m."""
     parts = []
     for start, end in pairwise(points):
         n = max(int(np.hypot(*(end - start)) / step), 1)
@@ -162,7 +162,7 @@ def rectangle(a0: float, b0: float, a1: float, b1: float) -> Doubles:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lot:
-    """A rectangle of the plan before it is bent into the map."""
+    """A rectangle of the plan before the transformation to the map."""
 
     box: tuple[float, float, float, float]
     """a0, b0, a1, b1, m."""
@@ -173,8 +173,8 @@ def divide(
     rng: np.random.Generator,
     cuts: list[tuple[Doubles, float]],
 ) -> list[Lot]:
-    """Halve a box until its parts are fields; the cuts go to `cuts` with the length of the side
-    they cut.
+    """Divides a box repeatedly until its parts have the size of fields; appends each cut to `cuts`
+    with the length of the divided side.
     """
     a0, b0, a1, b1 = box
     long_, short = max(a1 - a0, b1 - b0), min(a1 - a0, b1 - b0)

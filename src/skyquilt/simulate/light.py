@@ -19,7 +19,7 @@ def shadow_reach(weather: Weather) -> float:
 
 
 def lit(height: Floats, res: float, weather: Weather) -> Floats:
-    """Share (h, w) of direct sun, 1 on level open ground, 0 in shadow, from heights in m."""
+    """Share (h, w) of direct sunlight, 1 on level open ground, 0 in shadow, from heights in m."""
     east, north, up = weather.sun
     up = max(float(up), 0.12)
     soft = cv2.GaussianBlur(height, (0, 0), 1.0)
@@ -31,8 +31,8 @@ def lit(height: Floats, res: float, weather: Weather) -> Floats:
 
 
 def _shadow(height: Floats, res: float, sun: Floats) -> Floats:
-    """1 in shadow: the surface's running maximum towards the sun, less the rise of the ray, by
-    doubling.
+    """1 in shadow: the running maximum of the surface towards the sun, minus the rise of the ray,
+    computed by doubling.
     """
     flat = float(np.hypot(sun[0], sun[1]))
     rise = float(sun[2]) / flat * res
@@ -40,7 +40,7 @@ def _shadow(height: Floats, res: float, sun: Floats) -> Floats:
     best = np.full_like(height, -1e9)
     highest, done = height, 1
     offset = 1
-    while True:  # `highest` covers `done` cells from where it stands; look from one cell away
+    while True:  # `highest` covers `done` cells from its own position; continue one cell away
         shifted = _shifted(highest, sun[0] / flat * offset, -sun[1] / flat * offset) - np.float32(
             rise * offset
         )
@@ -57,7 +57,7 @@ def _shadow(height: Floats, res: float, sun: Floats) -> Floats:
 
 
 def _shifted(raster: Floats, dx: float, dy: float) -> Floats:
-    """The raster as seen from `dx`, `dy` cells away: out(r, c) = raster(r + dy, c + dx)."""
+    """The raster shifted by `dx`, `dy` cells: out(r, c) = raster(r + dy, c + dx)."""
     h, w = raster.shape
     dx, dy = round(dx), round(dy)
     rows, cols = np.clip(np.arange(h) + dy, 0, h - 1), np.clip(np.arange(w) + dx, 0, w - 1)
@@ -65,8 +65,8 @@ def _shifted(raster: Floats, dx: float, dy: float) -> Floats:
 
 
 def shine(look: Floats, direct: Floats, weather: Weather) -> Floats:
-    """(h, w, 4) colours and temperatures under light: visible shading, and warmth where the sun
-    lies.
+    """(h, w, 4) colours and temperatures with sunlight: visible shading, and heating where the sun
+    shines.
     """
     strength = np.float32(0.25 + 0.75 * weather.strength)
     sun, sky = (1 - _AMBIENT) * direct[..., None] * _SUN_TINT, _AMBIENT * _SKY_TINT

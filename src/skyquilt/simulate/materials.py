@@ -1,4 +1,4 @@
-"""What surfaces look like, in both spectra and both seasons."""
+"""Colours and temperatures of surface materials in summer and winter."""
 
 from dataclasses import dataclass
 
@@ -15,16 +15,16 @@ class Material:
     """One kind of surface."""
 
     summer: Colour
-    """Red, green, blue, 0-255, in full sun on level ground."""
+    """Red, green, blue, 0-255, in direct sunlight on level ground."""
     winter: Colour
     """The same in winter."""
     day_k: float
-    """Warmer than the air by so many kelvin when fully heated by the sun."""
+    """Temperature above the air when fully heated by the sun, K."""
     night_k: float
-    """Warmer than the air before sunrise, kelvin."""
+    """Temperature above the air before sunrise, K."""
 
     def look(self, weather: Weather) -> Floats:
-        """(4,) red, green, blue, temperature in degrees Celsius."""
+        """(4,) red, green, blue, and temperature in degrees Celsius."""
         rgb = self.summer if weather.season == "summer" else self.winter
         excess = weather.warmth * self.day_k + (1 - weather.warmth) * self.night_k
         return np.array([*rgb, weather.air_c + excess], dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Endless seeded noise: the same place gives the same value, whatever window asks."""
+"""Unbounded seeded noise: a place has the same value in every window."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -39,14 +39,14 @@ def _spline(positions: Doubles) -> tuple[sparse.csr_matrix, NDArray[np.int64]]:
 
 @dataclass(frozen=True, kw_only=True)
 class Noise:
-    """Smooth random fields of a seed."""
+    """Smooth random fields from a seed."""
 
     seed: int
     """Equal seeds give equal fields."""
 
     def smooth(self, grid: Grid, wavelength: float, key: int) -> Floats:
-        """A field (height, width), zero mean, unit deviation, no features below the wavelength
-        (m).
+        """A field (height, width) with zero mean, unit standard deviation and no features below the
+        wavelength (m).
         """
         down, rows = _spline(grid.ys / wavelength)
         across, cols = _spline(grid.xs / wavelength)
@@ -55,8 +55,8 @@ class Noise:
         return np.ascontiguousarray(field.T) * np.float32(1 / _SPREAD)
 
     def fractal(self, grid: Grid, longest: float, shortest: float, gain: float, key: int) -> Floats:
-        """Octaves from the longest wavelength down to the shortest (m), each `gain` times the
-        last.
+        """Sum of octaves from the longest wavelength down to the shortest (m), each with `gain`
+        times the amplitude of the one before.
         """
         total = np.zeros((grid.height, grid.width), dtype=np.float32)
         weight, wavelength, power, octave = 1.0, longest, 0.0, 0
@@ -67,7 +67,7 @@ class Noise:
         return total / np.float32(np.sqrt(power))
 
     def grain(self, grid: Grid, key: int) -> Floats:
-        """White noise per cell of the endless raster, unit deviation."""
+        """White noise per cell of the unbounded raster, unit standard deviation."""
         tile = _lattice(self.seed, key, _TILE)
         rows = (grid.row + np.arange(grid.height)) % _TILE
         cols = (grid.col + np.arange(grid.width)) % _TILE

@@ -1,4 +1,4 @@
-"""Flights by name."""
+"""Preset flights by name."""
 
 from collections.abc import Callable
 
@@ -46,12 +46,12 @@ PRESETS: dict[str, Callable[[], FlightSettings]] = {
     "drones": _drones,
 }
 """Name -> settings: 40 photos in four lines; a small quick one; one line; once around with losses;
-with a thermal flight; three drones at once with clocks apart.
+with a thermal flight; three drones at once with different clock errors.
 """
 
 
 def preset(name: str) -> FlightSettings:
-    """Settings by name; raises UsageError with the names there are."""
+    """Settings by name; raises UsageError that lists the names."""
     if name not in PRESETS:
         raise UsageError(f"there is no preset '{name}'; choose one of {', '.join(PRESETS)}")
     return PRESETS[name]()

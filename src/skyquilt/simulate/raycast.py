@@ -1,4 +1,6 @@
-"""Where rays meet a height field: first hits, so that trees and walls hide what lies behind."""
+"""Intersections of rays with a height field: first hits, so that trees and walls hide what is
+behind them.
+"""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 
 from skyquilt.simulate.grid import Doubles, Floats
 
-# px: side of the cells in which hits are first bracketed, in the photo and in the raster alike
+# px: side of the cells in which hits are first bracketed, in the photo and in the raster
 _CELL = 16
 _LEVEL_M = 0.35  # height between two levels of the bracketing march
 _STEP_PX = 2.0  # raster px between two samples of the exact march
@@ -35,7 +37,7 @@ class Rays:
         return Rays(start=self.start[mask], slope=self.slope[mask])
 
     def coarse(self) -> "Rays":
-        """The rays at the centres of cells."""
+        """One ray per cell, at its centre."""
         h, w = self.start.shape[:2]
         rows = np.minimum(np.arange(_CELL // 2, h + _CELL - 1, _CELL), h - 1)
         cols = np.minimum(np.arange(_CELL // 2, w + _CELL - 1, _CELL), w - 1)
@@ -46,11 +48,12 @@ class Rays:
 def rays_of(
     directions: Floats, rotation: Doubles, centre: Doubles, origin: Doubles, res: float
 ) -> Rays:
-    """Rays of ideal image coordinates (h, w, 2) from a camera.
+    """Rays of undistorted image coordinates (h, w, 2) from a camera.
 
-    `origin` is the map place of raster pixel (0, 0).
+    `origin` is the map position of raster pixel (0, 0).
 
-    Heights count from the same zero as centre[2]. Raises ValueError where a ray does not look down.
+    Heights refer to the same zero as centre[2]. Raises ValueError where a ray does not point
+    downwards.
     """
     to_map = rotation.T.astype(np.float32)
     x, y = directions[..., 0], directions[..., 1]
@@ -69,10 +72,11 @@ def rays_of(
 def sample(
     raster: NDArray[Any], pixels: Floats, interpolation: int = cv2.INTER_LINEAR
 ) -> NDArray[Any]:
-    """Values of a raster at pixels (h, w, 2) or (n, 2), edges repeated."""
+    """Values of a raster at pixels (h, w, 2) or (n, 2); outside, the nearest edge value."""
     if pixels.ndim == 3:
         return _remap(raster, pixels, interpolation)
-    count, wide = len(pixels), 1024  # lists are folded, since images have at most 32767 rows
+    # lists are reshaped to several columns, since images have at most 32767 rows
+    count, wide = len(pixels), 1024
     folded = np.zeros((-(-count // wide), wide, 2), dtype=np.float32)
     folded.reshape(-1, 2)[:count] = pixels
     values = _remap(raster, folded, interpolation)
@@ -85,7 +89,9 @@ def _remap(raster: NDArray[Any], pixels: Floats, interpolation: int) -> NDArray[
 
 
 def _cells(raster: Floats, reach: int) -> tuple[Floats, Floats]:
-    """Least and greatest height per cell of the raster, spread by `reach` cells to be safe."""
+    """Least and greatest height per cell of the raster, over `reach` cells around it as a
+    margin.
+    """
     h, w = raster.shape
     padded = np.pad(raster, ((0, -h % _CELL), (0, -w % _CELL)), mode="edge")
     blocks = padded.reshape(padded.shape[0] // _CELL, _CELL, padded.shape[1] // _CELL, _CELL)
@@ -95,7 +101,7 @@ def _cells(raster: Floats, reach: int) -> tuple[Floats, Floats]:
 
 
 def _bracket(raster: Floats, rays: Rays) -> tuple[Floats, Floats]:
-    """Heights (cells) above and below every first hit of the cell's rays."""
+    """Heights (cells) above and below all first hits of a cell's rays."""
     low, high = _cells(raster, 2)
     top, bottom = float(high.max()) + 0.05, float(low.min()) - 0.05
     levels = np.linspace(top, bottom, int(np.ceil((top - bottom) / _LEVEL_M)) + 2, dtype=np.float32)
@@ -136,7 +142,7 @@ def _march(raster: Floats, rays: Rays, above: Floats, below: Floats, steps: int)
 def _polish(
     raster: Floats, rays: Rays, z_over: Floats, z_under: Floats, f_over: Floats, f_under: Floats
 ) -> Floats:
-    """Close in on the crossing between heights over and under the surface."""
+    """Refines the intersection between heights above and below the surface."""
     for k in range(5):
         share = (
             np.float32(0.5)
@@ -170,5 +176,5 @@ def first_hits(raster: Floats, rays: Rays) -> tuple[Floats, Floats]:
 
 
 def _spread(cells: NDArray[Any], height: int, width: int) -> NDArray[Any]:
-    """Cell values to pixels."""
+    """Repeats cell values for their pixels."""
     return np.repeat(np.repeat(cells, _CELL, axis=0), _CELL, axis=1)[:height, :width]

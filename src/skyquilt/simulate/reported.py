@@ -1,4 +1,4 @@
-"""What photos say about themselves: the truth, with noise and with lies."""
+"""The metadata that photos report: the truth with noise and gross errors."""
 
 from dataclasses import dataclass
 
@@ -13,14 +13,14 @@ from skyquilt.simulate.settings import Reporting
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """Where the local map frame lies on Earth."""
+    """Position of the local map frame on Earth."""
 
     crs: str
     """UTM zone, e.g. `EPSG:32633`."""
     easting: float
-    """Of the map origin, m."""
+    """Easting of the map origin, m."""
     northing: float
-    """Of the map origin, m."""
+    """Northing of the map origin, m."""
     convergence: float
     """Degrees from true north to the map's north at the origin, clockwise positive."""
 
@@ -32,7 +32,7 @@ class Place:
 
 
 def place_at(latitude: float, longitude: float) -> Place:
-    """The map frame whose origin is the whole metre next to a place, in its UTM zone."""
+    """The map frame whose origin is the position rounded to whole metres, in its UTM zone."""
     zone = int((longitude + 180) // 6) + 1
     crs = f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
     to = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
@@ -63,18 +63,18 @@ class Report:
     flight_yaw: float | None
     """Degrees from true north."""
     clock: float
-    """Seconds since the survey's nominal start, by the drone's clock."""
+    """Seconds since the survey's nominal start, according to the drone's clock."""
     focal: float | None
     """px."""
     turned: bool
-    """The file's pixels were turned by 180 degrees after the flight."""
+    """The file's pixels were rotated by 180 degrees after the flight."""
     lies: tuple[str, ...]
-    """Which fields are grossly wrong: `yaw`, `altitude`, `position`, `focal`."""
+    """Fields with gross errors: `yaw`, `altitude`, `position`, `focal`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """Heights that reports count from."""
+    """Zero heights of the reports."""
 
     base: float
     """Base level above the sea, m."""
@@ -109,7 +109,7 @@ def report_all(
 
 
 def _position_errors(shots: list[Shot], settings: Reporting, rng: np.random.Generator) -> Doubles:
-    """(n, 3) errors in m; alike over `gps_correlation` seconds per drone (Gauss-Markov)."""
+    """(n, 3) errors in m; correlated over `gps_correlation` seconds per drone (Gauss-Markov)."""
     vertical = 1.5 * settings.gps_noise if settings.gps_noise_z is None else settings.gps_noise_z
     white = rng.normal(0, 1, (len(shots), 3)) * np.array(
         [settings.gps_noise, settings.gps_noise, vertical]
@@ -128,7 +128,9 @@ def _position_errors(shots: list[Shot], settings: Reporting, rng: np.random.Gene
 
 
 def _liars(shots: list[Shot]) -> set[int]:
-    """The photos of the middle line; the middle third of a single line."""
+    """The photos with gross errors: those of the middle line, or the middle third of a single
+    line.
+    """
     lines = sorted({shot.waypoint.line for shot in shots})
     if len(lines) == 1:
         return set(range(len(shots) // 3, 2 * len(shots) // 3))

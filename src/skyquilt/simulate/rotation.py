@@ -1,4 +1,4 @@
-"""Rotations of the simulator's own; nothing is shared with the stages it will judge.
+"""The simulator's own rotations; no code is shared with the stages that it tests.
 
 Map: x east, y north, z up. Camera: x right, y down, z along the view. Body: x nose, y right wing, z
 down.
@@ -30,15 +30,15 @@ def camera_rotation(yaw: float, pitch: float, roll: float) -> Doubles:
 
 
 def gimbal_angles(yaw: float, pitch: float, roll: float) -> tuple[float, float, float]:
-    """Yaw, pitch, roll of a gimbal (nose camera, pitch -90 at nadir) that looks as the belly camera
-    does.
+    """Yaw, pitch, roll of a gimbal (nose camera, pitch -90 at nadir) with the same view as the
+    belly camera.
     """
     belly = _turn(2, yaw) @ _turn(1, pitch) @ _turn(0, roll)
     nose = belly @ _NOSE_CAMERA_OF_BELLY.T
     lift = np.degrees(np.arcsin(np.clip(-nose[2, 0], -1, 1)))
     if (
         np.hypot(nose[0, 0], nose[1, 0]) < 1e-9
-    ):  # nadir: yaw and roll turn about one axis, so roll rests
+    ):  # nadir: yaw and roll have the same axis, so roll is set to 0
         return wrap(np.degrees(np.arctan2(-nose[0, 1], nose[1, 1]))), float(lift), 0.0
     turn = np.degrees(np.arctan2(nose[1, 0], nose[0, 0]))
     bank = np.degrees(np.arctan2(nose[2, 1], nose[2, 2]))
@@ -46,5 +46,5 @@ def gimbal_angles(yaw: float, pitch: float, roll: float) -> tuple[float, float, 
 
 
 def wrap(degrees: float) -> float:
-    """To [-180, 180)."""
+    """Wraps an angle to [-180, 180)."""
     return float((degrees + 180.0) % 360.0 - 180.0)

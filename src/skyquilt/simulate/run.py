@@ -1,4 +1,4 @@
-"""The simulator's story: settings in, a folder of photos with their truth out."""
+"""The workflow of the simulator: from settings to a folder of photos with their truth."""
 
 import shutil
 from collections.abc import Generator, Iterator
@@ -25,7 +25,7 @@ _OURS = ("photos", "thermal", "truth", "gcp_list.txt")
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far the simulation is."""
+    """Progress of the simulation."""
 
     stage: str
     """`terrain`, `photos`, `thermal terrain`, `thermal` or `truth`."""
@@ -34,31 +34,31 @@ class Progress:
     total: int
     """Steps of this stage."""
     name: str = ""
-    """What was finished."""
+    """Name of the item that was finished."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Flight:
-    """One flight of one kind of camera, flown and reported."""
+    """One flight with one kind of camera, flown and reported."""
 
     lens: Lens
-    """True camera."""
+    """The true camera."""
     shots: list[Shot]
     """True poses."""
     reports: list[Report]
-    """Metadata."""
+    """The metadata."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class World:
-    """Everything that is decided before the first pixel is drawn."""
+    """Everything that is determined before the first pixel is drawn."""
 
     settings: FlightSettings
-    """What was asked for."""
+    """The requested settings."""
     place: Place
-    """Where on Earth."""
+    """Position on Earth."""
     start: Start
-    """Heights that reports count from."""
+    """Zero heights of the reports."""
     country: Country
     """The terrain."""
     visible: Flight
@@ -68,9 +68,9 @@ class World:
 
 
 def prepare(settings: FlightSettings, waypoints: list[Waypoint] | None = None) -> World:
-    """Plan, fly and report; `waypoints` replaces the planned route.
+    """Plans, flies and reports; `waypoints` replaces the planned route.
 
-    Raises UsageError for settings that do not fit.
+    Raises UsageError for settings that do not fit together.
     """
     settings = settings.checked()
     points = plan(settings.route, settings.lens) if waypoints is None else waypoints
@@ -110,7 +110,7 @@ def prepare(settings: FlightSettings, waypoints: list[Waypoint] | None = None) -
 def _thermal_flight(
     settings: FlightSettings, thermal: Thermal, points: list[Waypoint], place: Place, start: Start
 ) -> Flight:
-    """Over the same site, with its own lines."""
+    """The thermal flight over the same site, with its own lines."""
     route = replace(
         settings.route,
         pattern=settings.route.pattern if settings.route.pattern == "strip" else "block",
@@ -134,7 +134,7 @@ def _thermal_flight(
 def _bounds(
     settings: FlightSettings, flights: list[Flight | None]
 ) -> tuple[float, float, float, float]:
-    """What all photos can see of the lowest ground, with a margin."""
+    """The area that all photos can see of the lowest ground, with a margin."""
     lowest = -0.9 * settings.scene.relief - 1.0
     parts = [footprint(f.lens, shot, lowest) for f in flights if f is not None for shot in f.shots]
     ground = np.concatenate(parts)
@@ -149,10 +149,10 @@ def simulate(
     overwrite: bool = False,
     waypoints: list[Waypoint] | None = None,
 ) -> Iterator[Progress]:
-    """Fly a survey of known truth and write it; yields progress.
+    """Simulates a survey with known truth and writes it; yields progress.
 
-    Raises UsageError for settings that do not fit, OutputError where the folder is not free or not
-    writable.
+    Raises UsageError for settings that do not fit together, OutputError where the folder is not
+    empty or not writable.
     """
     world = prepare(settings, waypoints)
     try:
@@ -165,7 +165,9 @@ def simulate(
 
 
 def _make_room(output: Path, overwrite: bool) -> None:
-    """An empty place, or one that only this simulator's former files leave."""
+    """Prepares the output folder; with `overwrite`, only files of an earlier simulation are
+    removed.
+    """
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; a folder is needed")
     if output.is_dir() and any(output.iterdir()):
@@ -206,7 +208,7 @@ def _write(world: World, output: Path) -> Iterator[Progress]:
 def _drawn(
     world: World, output: Path, stage: str, res: float, *, heat: bool
 ) -> Generator[Progress, None, Scene]:
-    """Draw the country; returns the scene."""
+    """Draws the terrain; returns the scene."""
     thermal = world.settings.thermal
     weather = thermal.weather if heat and thermal is not None else world.settings.weather
     scene = empty_scene(world.country.grid(res), thermal=heat, scratch=output / ".scratch" / stage)
@@ -216,7 +218,7 @@ def _drawn(
 
 
 def _photograph(world: World, scene: Scene, output: Path) -> Generator[Progress, None, list[Taken]]:
-    """Take and write the visible photos; returns what was taken."""
+    """Takes and writes the visible photos; returns what was taken."""
     pictures, flight = world.settings.pictures, world.visible
     camera = exposer(scene, flight.lens)
     folder = output / "photos"
@@ -245,7 +247,7 @@ def _photograph(world: World, scene: Scene, output: Path) -> Generator[Progress,
 def _film(
     world: World, flight: Flight, thermal: Thermal, output: Path
 ) -> Generator[Progress, None, list[Taken]]:
-    """Take and write the thermal frames; returns what was taken."""
+    """Takes and writes the thermal frames; returns what was taken."""
     res = thermal.height / thermal.lens.focal
     scene = yield from _drawn(world, output, "thermal terrain", res, heat=True)
     camera = exposer(scene, flight.lens)

@@ -1,4 +1,4 @@
-"""The whole country as rasters: colours and temperatures under light, and surface heights."""
+"""The whole terrain as rasters: colours and temperatures under sunlight, and surface heights."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -23,12 +23,12 @@ from skyquilt.simulate.things import paint_things
 from skyquilt.simulate.weather import Weather
 
 _BLOCK = 1536
-_IN_MEMORY = 60_000_000  # cells; larger countries are kept in files
+_IN_MEMORY = 60_000_000  # cells; larger scenes are kept in files
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSettings:
-    """What the country is like."""
+    """Settings of the terrain."""
 
     kind: Literal["landscape", "chessboard"] = "landscape"
     """A farmed landscape, or a level chess-board for distortion tests."""
@@ -37,19 +37,19 @@ class SceneSettings:
     base: float = 440.0
     """Height of the base level above the sea, m."""
     latitude: float = 46.6
-    """Of the map origin, degrees."""
+    """Latitude of the map origin, degrees."""
     longitude: float = 14.3
-    """Of the map origin, degrees."""
+    """Longitude of the map origin, degrees."""
     square: float = 2.0
     """Side of a chess-board square, m."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """Rasters of the country; row 0, column 0 of the arrays is that of the grid."""
+    """Rasters of the terrain; row 0, column 0 of the arrays is that of the grid."""
 
     grid: Grid
-    """Where and how fine."""
+    """Position and cell size."""
     height: Floats
     """(h, w) surface with houses and trees, m above the base."""
     rgb: NDArray[np.uint8]
@@ -60,25 +60,25 @@ class Scene:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Country:
-    """The country before it is drawn: cheap, and exact at any point."""
+    """The terrain before it is drawn: cheap to compute, and exact at any point."""
 
     settings: SceneSettings
-    """What it is like."""
+    """Its settings."""
     bounds: tuple[float, float, float, float]
     """x0, y0, x1, y1 in the local map frame, m."""
     seed: int
-    """Equal seeds give equal countries."""
+    """Equal seeds give equal terrain."""
     targets: tuple[Target, ...] = field(default=())
-    """Control point targets on the ground."""
+    """Targets of control points on the ground."""
 
     @cached_property
     def layout(self) -> Layout:
-        """What lies where."""
+        """Parcels, roads and objects."""
         return Layout() if self.settings.kind == "chessboard" else landscape(self.bounds, self.seed)
 
     @cached_property
     def noise(self) -> Noise:
-        """The country's noise."""
+        """The noise of the terrain."""
         return Noise(seed=self.seed)
 
     @cached_property
@@ -87,14 +87,14 @@ class Country:
         return Ground(noise=self.noise, relief=self.settings.relief, shores=self.layout.ponds)
 
     def grid(self, res: float) -> Grid:
-        """The raster over the bounds; its corner lies on a multiple of the cell size."""
+        """The raster over the bounds; its corner is at a multiple of the cell size."""
         x0, y0, x1, y1 = self.bounds
         left, top = np.floor(x0 / res) * res, np.ceil(y1 / res) * res
         width, height = int(np.ceil((x1 - left) / res)), int(np.ceil((top - y0) / res))
         return Grid(left=float(left), top=float(top), res=res, width=width, height=height)
 
     def paint(self, grid: Grid, weather: Weather) -> Canvas:
-        """One block without light."""
+        """Paints one block without sunlight."""
         ground = self.ground.heights(grid)
         look = np.zeros((grid.height, grid.width, 4), dtype=np.float32)
         canvas = Canvas(
@@ -120,7 +120,7 @@ class Country:
         return canvas
 
     def draw(self, scene: Scene, weather: Weather, *, scratch: Path) -> Iterator[tuple[int, int]]:
-        """Fill a scene, first its surfaces, then their light, block by block; yields (done,
+        """Fills a scene, first its surfaces, then their light, block by block; yields (done,
         total).
         """
         looks = _room(scene.grid, (4,), np.float16, scratch / "look")
@@ -135,7 +135,7 @@ class Country:
 
 
 def empty_scene(grid: Grid, *, thermal: bool, scratch: Path) -> Scene:
-    """Room for a scene, in memory or in files below `scratch`."""
+    """Allocates a scene, in memory or in files below `scratch`."""
     return Scene(
         grid=grid,
         height=_room(grid, (), np.float32, scratch / "height"),
@@ -147,7 +147,7 @@ def empty_scene(grid: Grid, *, thermal: bool, scratch: Path) -> Scene:
 def _light(
     scene: Scene, looks: NDArray[np.float16], block: Grid, weather: Weather, *, flat: bool
 ) -> None:
-    """Light one block, seeing its neighbours' shadows."""
+    """Computes the light of one block, including shadows from neighbouring blocks."""
     margin = int(np.ceil(shadow_reach(weather) / scene.grid.res)) + 4
     wide = scene.grid.window(
         block.row - margin, block.col - margin, block.height + 2 * margin, block.width + 2 * margin
@@ -165,7 +165,7 @@ def _light(
 
 
 def _paint_squares(canvas: Canvas, square: float) -> None:
-    """A chess-board with a little grain."""
+    """Paints a chess-board with slight noise."""
     x, y = canvas.grid.xs, canvas.grid.ys
     odd = (np.floor(x / square)[None, :] + np.floor(y / square)[:, None]) % 2
     canvas.look[..., :3] = (70 + 120 * odd[..., None]) * (
@@ -175,7 +175,7 @@ def _paint_squares(canvas: Canvas, square: float) -> None:
 
 
 def _room(grid: Grid, tail: tuple[int, ...], dtype: type, path: Path) -> NDArray[Any]:
-    """An array for the whole grid, in a file where it is large."""
+    """Allocates an array for the whole grid, in a file where it is large."""
     shape = (grid.height, grid.width, *tail)
     if grid.height * grid.width <= _IN_MEMORY:
         return np.zeros(shape, dtype=dtype)

@@ -1,4 +1,4 @@
-"""What a simulated flight is like: one record of records, and presets by name."""
+"""Settings of a simulated flight, as nested records."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -14,7 +14,7 @@ Pattern = Literal["block", "strip", "roundtrip"]
 
 @dataclass(frozen=True, kw_only=True)
 class Route:
-    """Where photos are taken."""
+    """The flight route."""
 
     pattern: Pattern = "block"
     """Parallel lines, one line, or a rectangle flown once around."""
@@ -27,28 +27,28 @@ class Route:
     overlap: float = 0.75
     """Forward overlap, share of the footprint."""
     sidelap: float = 0.60
-    """Sideways overlap between lines."""
+    """Side overlap between lines."""
     height: float = 60.0
-    """Above the take-off point, m."""
+    """Height above the take-off point, m."""
     heading: float = 20.0
     """Direction of the first line, degrees from the map's north."""
     speed: float = 6.0
     """Ground speed, m/s."""
     jitter: float = 0.5
-    """Standard deviation of the true place around the plan, each axis, m."""
+    """Standard deviation of the true position around the plan, each axis, m."""
     yaw_noise: float = 2.0
     """Standard deviation of the true yaw around the heading, degrees."""
     tilt_noise: float = 1.0
     """Standard deviation of the true pitch and of the true roll, degrees."""
     drones: int = 1
-    """Flying at once, each on its share of the lines."""
+    """Drones that fly at the same time, each on its share of the lines."""
     lost: int = 0
     """Photos planned but not delivered, never two neighbours."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pictures:
-    """How pixels are formed."""
+    """How the pixels are formed."""
 
     exposure_noise: float = 0.05
     """Standard deviation of the logarithm of each photo's exposure."""
@@ -61,7 +61,7 @@ class Pictures:
     noise: float = 1.5
     """Standard deviation of the sensor noise, levels of 255."""
     quality: int = 92
-    """Of the JPEG."""
+    """JPEG quality."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,15 +74,16 @@ class Reporting:
     """Standard deviation of the height above sea level, m; 1.5 times the horizontal one where None.
     """
     gps_correlation: float = 0.0
-    """Time in s over which position errors stay alike; 0 is independent errors."""
+    """Correlation time in s of position errors; 0 means independent errors."""
     barometer_noise: float = 0.3
     """Standard deviation of the height above take-off, m."""
     altitude_drift: float = 0.0
-    """Error of all reported heights that grows evenly to this value over the flight, m."""
+    """Error of all reported heights that grows linearly to this value over the flight, m."""
     angle_noise: float = 0.5
     """Standard deviation of each reported angle, degrees."""
     yaw_lie: YawLie = "none"
-    """One whole line: files turned by 180 degrees in a viewer, or only the yaw tag 180 degrees off.
+    """Error of one whole line: files rotated by 180 degrees in a viewer, or only the yaw tag wrong
+    by 180 degrees.
     """
     focal_error: float = 0.01
     """Relative error of the focal length in the EXIF."""
@@ -91,7 +92,7 @@ class Reporting:
     attitude_missing: bool = False
     """No gimbal or flight angles (no XMP at all)."""
     gps_missing: int = 0
-    """Photos without position."""
+    """Number of photos without position."""
     clock_offsets: tuple[float, ...] = (0.0, 40.0, -25.0)
     """Clock error of each drone, s, repeated as needed."""
 
@@ -101,9 +102,9 @@ class Control:
     """Surveyed targets."""
 
     points: int = 5
-    """Control points."""
+    """Number of control points."""
     checks: int = 4
-    """Check points."""
+    """Number of check points."""
     accuracy: float = 0.02
     """Standard deviation of each surveyed coordinate, m."""
     pixel_noise: float = 0.3
@@ -133,7 +134,7 @@ class Thermal:
     sidelap: float = 0.65
     """Sideways overlap."""
     height: float = 75.0
-    """Above take-off, m."""
+    """Height above take-off, m."""
     weather: Weather = field(default_factory=lambda: Weather(hour=13.0))
     """Its own time of day and season."""
     drift: float = 0.2
@@ -147,34 +148,35 @@ class FlightSettings:
     """A whole simulated survey; equal settings give equal bytes."""
 
     seed: int = 1
-    """Of everything random."""
+    """Seed of all random numbers."""
     lens: Lens = field(default_factory=Lens)
     """The true camera."""
     scene: SceneSettings = field(default_factory=SceneSettings)
-    """The country."""
+    """The terrain."""
     weather: Weather = field(default_factory=Weather)
     """Season and hour of the visible flight."""
     route: Route = field(default_factory=Route)
     """Where photos are taken."""
     pictures: Pictures = field(default_factory=Pictures)
-    """How they look."""
+    """How photos are formed."""
     reporting: Reporting = field(default_factory=Reporting)
-    """What they say about themselves."""
+    """How metadata are reported."""
     control: Control = field(default_factory=Control)
     """Targets on the ground."""
     thermal: Thermal | None = None
-    """A thermal flight as well."""
+    """The thermal flight, if there is one."""
     gsd: float | None = None
-    """Cell size of the country's raster, m; the nominal ground resolution of the photos where None.
+    """Cell size of the terrain's raster, m; the nominal ground resolution of the photos where
+    None.
     """
 
     @property
     def resolution(self) -> float:
-        """Cell size of the country's raster and of the true orthophoto, m."""
+        """Cell size of the terrain's raster and of the true orthophoto, m."""
         return self.gsd if self.gsd is not None else self.route.height / self.lens.focal
 
     def checked(self) -> "FlightSettings":
-        """Itself; raises UsageError where values do not fit together."""
+        """The settings unchanged; raises UsageError where values do not fit together."""
         for rules in (_route_rules(self), _other_rules(self)):
             for holds, sentence in rules:
                 if not holds:

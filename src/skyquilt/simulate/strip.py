@@ -1,5 +1,5 @@
-"""A strip over chess-boards as a camera sights it: corners, things on the boards, views to
-calibrate with.
+"""A strip of photos over chess-boards: observed corners, raised points, and views for
+calibration.
 """
 
 from dataclasses import dataclass, field
@@ -32,35 +32,35 @@ def _wide() -> Lens:
 
 @dataclass(frozen=True, kw_only=True)
 class StripSettings:
-    """A row of photos from above over level boards with things on them."""
+    """A row of photos from above over level boards with objects on them."""
 
     photos: int = 21
-    """Along the strip."""
+    """Number of photos along the strip."""
     overlap: float = 0.70
-    """From photo to photo."""
+    """Overlap from photo to photo."""
     height: float = 30.0
-    """Above the boards, m."""
+    """Flight height above the boards, m."""
     relief: float = 1.2
-    """Height of the highest thing on the boards, m."""
+    """Height of the highest object on the boards, m."""
     things: float = 0.25
-    """Share of the sighted points that lie on things, at heights of 0 to `relief`, smaller ones
-    more often.
+    """Share of the observed points that are on objects, at heights of 0 to `relief`, low ones more
+    often.
     """
     square: float = 1.0
     """Side of a board's square, m."""
     noise: float = 0.3
-    """Standard deviation of a observation, px per axis."""
+    """Standard deviation of an observation, px per axis."""
     tilt: float = 0.3
-    """Standard deviation of pitch and of roll, degrees: held by hand, from above."""
+    """Standard deviation of pitch and of roll, degrees, as for a hand-held camera."""
     views: int = 30
-    """Of the board that the camera is calibrated with."""
+    """Number of views of the board from which the camera is calibrated."""
     lens: Lens = field(default_factory=_wide)
     """The true camera."""
     seed: int = 1
-    """Of everything random."""
+    """Seed of all random numbers."""
 
     def checked(self) -> "StripSettings":
-        """Itself; raises UsageError where values do not fit together."""
+        """The settings unchanged; raises UsageError where values do not fit together."""
         rules = [
             (2 <= self.photos <= 500, f"photos must be 2 to 500, not {self.photos}"),
             (
@@ -83,26 +83,26 @@ class StripSettings:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Strip:
-    """What the camera saw, and what was there."""
+    """The observations of the camera, and the truth."""
 
     ids: tuple[Doubles, ...]
-    """Per photo (N,), which point of the ground each observation is of, increasing."""
+    """Per photo (N,), index of the ground point of each observation, increasing."""
     px: tuple[Doubles, ...]
-    """Per photo (N, 2), observations with noise."""
+    """Per photo (N, 2), observations in px with noise."""
     targets: tuple[Doubles, ...]
     """Per photo (4, 2) px without noise: corners, in order around it, of the board square of four
     by four below it.
     """
     views: tuple[Doubles, ...]
-    """Of the calibration: (88, 2) px per view, with noise."""
+    """Calibration views: (88, 2) px per view, with noise."""
     board: Doubles
     """(88, 3) the board's corners, m."""
     raised: Doubles
-    """(points,) height of each point of the ground above the boards, m."""
+    """(points,) height of each ground point above the boards, m."""
 
 
 def fly_strip(settings: StripSettings) -> Strip:
-    """Fly over the boards; raises UsageError for settings that do not fit."""
+    """Simulates the strip; raises UsageError for settings that do not fit together."""
     settings = settings.checked()
     rng, lens = np.random.default_rng([settings.seed, 77]), settings.lens
     route = Route(
@@ -140,7 +140,7 @@ def fly_strip(settings: StripSettings) -> Strip:
 
 
 def _points(settings: StripSettings, centres: Doubles, rng: np.random.Generator) -> Doubles:
-    """(n, 3) corners of all squares, and points on things among them."""
+    """(n, 3) corners of all squares, and points on objects among them."""
     reach = (
         settings.height
         * np.hypot(settings.lens.width, settings.lens.height)

@@ -1,4 +1,4 @@
-"""Targets that surveyors lay out on the ground."""
+"""Targets of surveyors on the ground."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,11 +25,11 @@ class Target:
     radius: float
     """m."""
     check: bool
-    """Kept for judging."""
+    """True: a check point."""
 
 
 def paint_targets(canvas: Canvas, targets: Sequence[Target]) -> None:
-    """Discs of four quarters, anti-aliased, lying on the bare ground."""
+    """Paints discs of four quarters, anti-aliased, on the bare ground."""
     for target in targets:
         part = canvas.part(target.x, target.y, 1.4 * target.radius)
         if part.grid.width == 0 or part.grid.height == 0:

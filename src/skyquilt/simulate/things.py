@@ -1,4 +1,4 @@
-"""Painters of what stands on the land: houses, trees, cars."""
+"""Painters of objects: houses, trees, cars."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from skyquilt.simulate.layout import Car, House, Layout, Tree
 
 
 def paint_things(canvas: Canvas, layout: Layout, ground: Ground) -> None:
-    """Everything that rises above the ground, in the order cars, houses, trees."""
+    """Paints everything that rises above the ground, in the order cars, houses, trees."""
     for car in layout.cars:
         _car(canvas.part(car.x, car.y, 4.0), car, ground)
     for house in layout.houses:

@@ -1,4 +1,4 @@
-"""Write down the truth: `truth.json` and the true rasters."""
+"""Writes the truth: `truth.json` and the true rasters."""
 
 import json
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ _HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 
 @dataclass(frozen=True, kw_only=True)
 class Taken:
-    """A photo as it was taken, as it was written and as it looks."""
+    """A photo with its true pose, its metadata and its exposure."""
 
     shot: Shot
     """The true pose."""
@@ -49,7 +49,7 @@ def write_truth(
     points: Sequence[Surveyed],
     seen: Sequence[Observation],
 ) -> None:
-    """`truth.json`: everything that an adjustment could be judged by."""
+    """Writes `truth.json`: everything that is needed to check an adjustment."""
     lenses = {"visible": settings.lens}
     if settings.thermal is not None:
         lenses["thermal"] = settings.thermal.lens
@@ -118,7 +118,9 @@ def _point(point: Surveyed, seen: Sequence[Observation]) -> dict[str, Any]:
 
 
 def covered(grid: Grid, lens: Lens, shots: Sequence[Shot], level: float) -> Grid:
-    """The part of the scene's grid that the footprints at a level (above the base) cover."""
+    """The part of the scene's grid that is covered by the footprints at a level (above the
+    base).
+    """
     ground = grid.pixels(np.concatenate([footprint(lens, shot, level) for shot in shots]))
     low, high = np.floor(ground.min(axis=0)).astype(int), np.ceil(ground.max(axis=0)).astype(int)
     return grid.window(low[1], low[0], high[1] - low[1] + 1, high[0] - low[0] + 1)
@@ -127,7 +129,7 @@ def covered(grid: Grid, lens: Lens, shots: Sequence[Shot], level: float) -> Grid
 def write_raster(
     path: Path, raster: NDArray[Any], part: Grid, place: Place, *, add: float = 0.0, **tags: str
 ) -> None:
-    """A tiled GeoTIFF of a part of a scene's raster (h, w) or (h, w, bands), written in strips."""
+    """Writes a tiled GeoTIFF of a part of a scene's raster (h, w) or (h, w, bands), in strips."""
     bands = 1 if raster.ndim == 2 else raster.shape[2]
     corner = (
         place.easting + part.left + part.col * part.res,
@@ -161,7 +163,7 @@ def write_raster(
 
 
 def write_rasters(folder: Path, scene: Scene, part: Grid, place: Place, base: float) -> None:
-    """The true orthophoto and the true surface."""
+    """Writes the true orthophoto and the true surface."""
     write_raster(folder / "truth_ortho.tif", scene.rgb, part, place)
     write_raster(
         folder / "truth_surface.tif",
@@ -175,6 +177,6 @@ def write_rasters(folder: Path, scene: Scene, part: Grid, place: Place, base: fl
 
 
 def write_thermal(folder: Path, scene: Scene, part: Grid, place: Place) -> None:
-    """The true temperatures, as a raster of hundredths of a kelvin."""
+    """Writes the true temperatures as a raster of hundredths of a kelvin."""
     if scene.thermal is not None:
         write_raster(folder / "truth_thermal.tif", scene.thermal, part, place, UNIT="centikelvin")

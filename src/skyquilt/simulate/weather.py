@@ -1,4 +1,4 @@
-"""Season and hour: where the sun stands, how strong it is, how warm the air is."""
+"""Season and hour: direction and strength of the sun, air temperature."""
 
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -16,10 +16,10 @@ _AIR_C = {"summer": 22.0, "winter": 1.0}
 
 @dataclass(frozen=True, kw_only=True)
 class Weather:
-    """A cloudless moment."""
+    """A moment with a cloudless sky."""
 
     season: Season = "summer"
-    """Changes the vegetation, the sun's height and the warmth."""
+    """Affects the vegetation, the sun's elevation and the temperature."""
     hour: float = 10.5
     """Local solar time, 0-24."""
 
@@ -41,12 +41,12 @@ class Weather:
 
     @property
     def strength(self) -> float:
-        """How much of the sun's light arrives: 0 at night, 1 high in the sky."""
+        """Strength of the sunlight: 0 at night, 1 for a high sun."""
         return float(np.clip(self.sun[2] / 0.5, 0.0, 1.0))
 
     @property
     def warmth(self) -> float:
-        """How far the sun has heated things: lags behind the light by two hours, 0 at night."""
+        """Heating by the sun: two hours behind the light, 0 at night."""
         earlier = Weather(season=self.season, hour=self.hour - 2.0)
         scale = 1.0 if self.season == "summer" else 0.45
         return scale * float(np.clip(0.35 * self.strength + 0.65 * earlier.strength, 0.0, 1.0))

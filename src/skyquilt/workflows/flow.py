@@ -8,7 +8,6 @@ is fast. In this way a run resumes, and a later command reads the photos and the
 finished map.
 """
 
-import os
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +18,9 @@ from numpy.typing import NDArray
 from skyquilt.alignment.inputs import AlignmentInputs, GreyPicture
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
-from skyquilt.engine.pixel_cache import PixelCache
+from skyquilt.engine.pixel_cache import PixelCache, pixel_budget
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import SkyquiltError, UnreadablePhotoError
-from skyquilt.model import camera, features, poses, raster, surface
 from skyquilt.model.event import Event, Note
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import Alignment, MapFrame, Prior
@@ -32,13 +30,12 @@ from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.radiometry import balanced
 from skyquilt.photos.pixels import read_color
-from skyquilt.settings import MosaicSettings, RunningSettings
+from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.links import Links, link_photos
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import (
     FeaturedPhotos,
     GreyPictures,
-    PhotoFeatures,
     PhotoPixels,
     features_recipe,
     find_features,
@@ -48,28 +45,6 @@ from skyquilt.workflows.photo_features import (
 from skyquilt.workflows.survey_input import SurveyInput
 
 T = TypeVar("T")
-REGISTRY = {
-    c.__name__: c
-    for c in (
-        PhotoFeatures,
-        features.Features,
-        features.Link,
-        features.RejectedLink,
-        features.Matches,
-        camera.Camera,
-        poses.Alignment,
-        poses.MapFrame,
-        poses.Pose,
-        poses.TiePoints,
-        poses.ControlResidual,
-        poses.Join,
-        surface.Surface,
-        RejectedPhoto,
-        companions.BlockExtras,
-        raster.Grid,
-    )
-}
-"""Record types that the store may contain."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -143,10 +118,10 @@ def align_photos(
         NoPhotosError: no photo can be decoded.
         AlignmentError: the method cannot place the photos.
     """
-    store, jobs = clock.store, settings.running.jobs or os.cpu_count() or 1
+    store, jobs = clock.store, settings.running.threads
     photos = given.survey.photos
     cache = PixelCache(
-        read=lambda i: read_color(photos[i]), budget_bytes=pixel_budget(settings.running)
+        read=lambda i: read_color(photos[i]), budget_bytes=pixel_budget(settings.running.memory_gb)
     )
     found = yield from clock.stage(
         "features", find_features(photos, cache, methods.detector, store, jobs)
@@ -216,17 +191,25 @@ def draw_map(
     Raises:
         OutputError: the disk is full or read-only.
     """
-    photos, alignment = aligned.photos, aligned.alignment
+    alignment, first = aligned.alignment, aligned.photos[0]  # all are of one kind
     thumbnails = aligned.found.thumbnails([v.photo for v in on.views])
     exposure = yield from clock.stage(
         "balance",
         _at_once(
             lambda: balanced(
-                photos, thumbnails, on, methods.balance, methods.drift, settings.picture
+                first.unit,
+                first.dtype,
+                thumbnails,
+                on,
+                methods.balance,
+                methods.drift,
+                settings.picture,
             )
         ),
     )
-    compose = orthomosaic.composer(photos, on, exposure, methods.blend, aligned.pixels)
+    compose = orthomosaic.composer(
+        first.channels, first.dtype, on, exposure, methods.blend, aligned.pixels
+    )
     steps = orthomosaic.draw(
         output,
         compose,
@@ -235,8 +218,8 @@ def draw_map(
         settings.picture.boundary,
         clock.store,
         orthomosaic.map_key(key, alignment, on, exposure),
-        photos[0].unit,
-        settings.running.jobs or os.cpu_count() or 1,
+        first.unit,
+        settings.running.threads,
     )
     drawn = yield from clock.stage("mosaic", steps)
     return DrawnMap(exposure=exposure, compose=compose, drawn=drawn)
@@ -249,13 +232,6 @@ def scene_of(
     aligned = yield from align_photos(given, methods, settings, clock)
     on = yield from find_ground(aligned, methods, settings, clock)
     return Scene(aligned=aligned, ground=on)
-
-
-def pixel_budget(running: RunningSettings) -> int:
-    """Bytes for decoded photos: the allowed memory minus the memory for code, features and
-    tiles.
-    """
-    return int(max(0.15, (running.memory_gb or 1.2) - 0.6) * 1e9)
 
 
 def _pixels_of(

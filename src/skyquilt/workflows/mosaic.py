@@ -25,8 +25,8 @@ from skyquilt.quality.run_metrics import figures
 from skyquilt.quality.seam_measurement import MeasuredSeams, measure_seams
 from skyquilt.settings import MosaicSettings
 from skyquilt.version import __version__
+from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.flow import (
-    REGISTRY,
     AlignedPhotos,
     DrawnMap,
     Scene,

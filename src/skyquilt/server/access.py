@@ -1,0 +1,181 @@
+"""Who may do what: tokens, hosts, limits, headers; and what all addresses share."""
+
+import hmac
+import ipaddress
+from dataclasses import dataclass
+from typing import Protocol
+
+from fastapi import HTTPException, Request
+from fastapi.responses import JSONResponse
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from skyquilt.errors import UsageError
+from skyquilt.live.ledger import Ledger
+from skyquilt.live.photo_intake import Intake
+from skyquilt.server.survey import Survey
+
+RESUMABLE = "/photos/uploads"
+"""The address of resumable uploads."""
+TUS = {"Tus-Resumable": "1.0.0"}
+"""Sent with every answer from there."""
+
+HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob: https:;"
+    " style-src 'self' 'unsafe-inline'; script-src 'self'; connect-src 'self'; object-src 'none';"
+    " frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+"""Sent with every response. Scripts are loaded from this server only; images of a base map may come
+from other servers.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Guard:
+    """Access rules and limits of a server."""
+
+    host: str = "127.0.0.1"
+    """The host name or address on which it listens."""
+    token: str | None = None
+    """Token required for writing. None = no token; allowed only if the server listens on this
+    machine alone.
+    """
+    most_layer_bytes: int = 20_000_000
+    """Largest layer in bytes."""
+    most_layers: int = 200
+    """Largest number of layers."""
+    most_uploads: int = 200
+    """Largest number of uploads at a time."""
+    upload_stall_s: float = 10.0
+    """If no data arrive for this time in s, the connection of an upload counts as lost."""
+    upload_idle_s: float = 600.0
+    """An upload that was not continued for this time in s no longer counts as active."""
+    upload_keep_s: float = 24 * 3600.0
+    """An upload that was not continued for this time in s is deleted."""
+
+    def __post_init__(self) -> None:
+        if self.token is None and not local(self.host):
+            raise UsageError(
+                f"--host {self.host} can be reached from other machines, and the map is not"
+                " protected against"
+                " writing; add --token with a secret, or listen on 127.0.0.1"
+            )
+        if self.token is not None and len(self.token) < 8:
+            raise UsageError(f"--token has {len(self.token)} characters; use at least 8")
+
+    def admits(self, given: str | None) -> bool:
+        """Whether a request may write: its header `Authorization: Bearer ...` or `X-Token` contains
+        the token.
+        """
+        if self.token is None:
+            return True
+        said = (given or "").removeprefix("Bearer ").strip()
+        return hmac.compare_digest(said.encode(), self.token.encode())
+
+    def knows(self, host_header: str) -> bool:
+        """Whether the host name of a request is a name of this server. Other names that resolve to
+        it are refused (protection against DNS rebinding).
+        """
+        if self.token is not None or not local(self.host):
+            return True
+        return local(
+            host_header.rsplit(":", 1)[0] if not host_header.endswith("]") else host_header
+        )
+
+
+def local(host: str) -> bool:
+    """Whether an address means this machine only."""
+    bare = host.strip("[]").lower()
+    if bare == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(bare).is_loopback
+    except ValueError:
+        return False
+
+
+class Guarded:
+    """Middleware: refuses requests for other hosts and adds the security headers to every
+    response.
+    """
+
+    def __init__(self, app: ASGIApp, guard: Guard) -> None:
+        self.app, self.guard = app, guard
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handles one request."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        always, asked = HEADERS, Headers(scope=scope)
+        if scope["path"].startswith(RESUMABLE):
+            always = HEADERS | TUS
+            # tus: a header for clients that cannot send PATCH or DELETE
+            method = asked.get("x-http-method-override", scope["method"])
+            scope = {**scope, "method": method.upper()}
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in always.items():
+                    headers.setdefault(name, value)
+            await send(message)
+
+        if self.guard.knows(asked.get("host", "")):
+            await self.app(scope, receive, with_headers)
+            return
+        refused = JSONResponse({"detail": "this server answers requests to localhost only"}, 421)
+        await refused(scope, receive, with_headers)
+
+
+class Writer(Protocol):
+    """The growing map that receives photos and layers."""
+
+    intake: Intake
+    ledger: Ledger
+
+
+class Context:
+    """The shared state of one survey's endpoints."""
+
+    def __init__(self, survey: Survey, guard: Guard, writer: Writer | None) -> None:
+        self.survey, self.guard, self.writer = survey, guard, writer
+
+    def layer(self, name: str | None) -> str:
+        """Checks the name of a layer; None gives the first layer."""
+        known = self.survey.layers()
+        if name is None and known:
+            return next(iter(known))
+        if name not in known:
+            raise HTTPException(
+                404,
+                f"there is no layer {str(name)[:60]!r}; there are {', '.join(known) or 'none yet'}",
+            )
+        return str(name)
+
+    def growing(self) -> Writer:
+        """The growing map; an HTTP error if the survey is read-only."""
+        if self.writer is None:
+            raise HTTPException(
+                405, "this survey is read-only; 'skyquilt live' accepts photos and layers"
+            )
+        return self.writer
+
+    def writing(self, request: Request) -> Writer:
+        """The growing map, if the request is allowed to write to it; otherwise an HTTP error."""
+        writer = self.growing()
+        given = request.headers.get("authorization") or request.headers.get("x-token")
+        if not self.guard.admits(given):
+            raise HTTPException(
+                401,
+                "writing needs the token that the server was started with",
+                {"WWW-Authenticate": "Bearer"},
+            )
+        origin = request.headers.get("origin")
+        if origin is not None and origin.split("://")[-1] != request.headers.get("host", ""):
+            raise HTTPException(403, "pages of other sites may not write here")
+        return writer

@@ -1,0 +1,29 @@
+"""What the store of a run may hold."""
+
+from skyquilt.model import camera, features, poses, raster, surface
+from skyquilt.model.photo import RejectedPhoto
+from skyquilt.ortho import companions
+from skyquilt.workflows.photo_features import PhotoFeatures
+
+REGISTRY = {
+    c.__name__: c
+    for c in (
+        PhotoFeatures,
+        features.Features,
+        features.Link,
+        features.RejectedLink,
+        features.Matches,
+        camera.Camera,
+        poses.Alignment,
+        poses.MapFrame,
+        poses.Pose,
+        poses.TiePoints,
+        poses.ControlResidual,
+        poses.Join,
+        surface.Surface,
+        RejectedPhoto,
+        companions.BlockExtras,
+        raster.Grid,
+    )
+}
+"""Records that the store may hold."""
