@@ -63,7 +63,7 @@ def test_undistortion_makes_registration_better(done):
 def test_a_taken_folder_is_left_alone(done, frames):
     with pytest.raises(OutputError, match="--overwrite"):
         calibrate(frames, done.output, SETTINGS)
-    with pytest.raises(UsageError, match="holds the frames"):
+    with pytest.raises(UsageError, match="contains the frames"):
         calibrate(frames, frames, SETTINGS)
 
 

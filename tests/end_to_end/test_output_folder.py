@@ -282,7 +282,7 @@ def test_the_folder_of_photos_itself_is_no_output(mosaic, photos):
     for options in ((), ("--overwrite",)):
         told = mosaic(photos, *options, output=photos)
         assert told.code == 2
-        assert "holds the photos" in told.err
+        assert "contains the photos" in told.err
     assert sorted(p.name for p in photos.iterdir()) == before
 
 

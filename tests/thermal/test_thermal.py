@@ -134,5 +134,5 @@ def test_heights_lie_on_the_grid_of_the_map_without_their_slope(maps, tmp_path):
 def test_wrong_words(tmp_path):
     with pytest.raises(UsageError, match="thermal-route"):
         list(iter_thermal(tmp_path, tmp_path, tmp_path / "out", route="guess"))
-    with pytest.raises(UsageError, match="no folder"):
+    with pytest.raises(UsageError, match="not a folder"):
         list(iter_thermal(tmp_path, tmp_path / "none", tmp_path / "out"))
