@@ -15,6 +15,7 @@ import sys
 import tempfile
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rasterio
@@ -136,8 +137,9 @@ def measure_floor(options: argparse.Namespace) -> dict[str, Cost | float]:
         results["file_mb"], results["file_gdal_mb"] = (
             path.stat().st_size / 1e6 for path in (ours, gdal)
         )
-    decode = min(results[name].cpu_median for name in ("decode", "decode_fast_upsample"))  # type: ignore[union-attr]
-    results["floor"] = decode + results["encode"].cpu_median  # type: ignore[union-attr]
+    costs: dict[str, Any] = results
+    decode = min(costs[name].cpu_median for name in ("decode", "decode_fast_upsample"))
+    costs["floor"] = decode + costs["encode"].cpu_median
     return results
 
 
@@ -167,7 +169,7 @@ def main() -> None:
             *(run_mosaic(options.photos, further) for _ in range(options.run)), strict=True
         )
         results["run"] = Cost.of(list(cpu), list(wall), max(peak))
-        results["ratio"] = results["run"].cpu_median / results["floor"]  # type: ignore[union-attr, operator]
+        costs["ratio"] = costs["run"].cpu_median / costs["floor"]
     report = {"machine": machine()} | {
         key: asdict(value) if isinstance(value, Cost) else value for key, value in results.items()
     }

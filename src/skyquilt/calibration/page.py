@@ -22,7 +22,8 @@ _SIDE = 340.0
 _STYLE = (
     ".grid{stroke:#ddd}.axis{stroke:#999}.tick,.name{font:12px"
     " sans-serif;fill:#444}.mid{text-anchor:middle}"
-    ".end{text-anchor:end}.cloud{stroke:#1f6f8b;stroke-width:3;stroke-linecap:round;fill:none;opacity:.55}"
+    ".end{text-anchor:end}"
+    ".cloud{stroke:#1f6f8b;stroke-width:3;stroke-linecap:round;fill:none;opacity:.55}"
     ".vectors{stroke:#1f6f8b;stroke-width:1.2;fill:none}"
     ".marker{fill:none;stroke:#b8602a;stroke-width:1.5}"
 )

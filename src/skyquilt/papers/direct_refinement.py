@@ -128,7 +128,8 @@ class Ecc:
         rows = 3 if self.model == "homography" else 2
         stop: Any = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, self.iterations, 1e-6)
         matrix = np.ascontiguousarray(H[:rows], np.float32)
-        score, found = cv2.findTransformECC(a, b, matrix, kind, stop, None, 5)  # type: ignore[call-overload]
+        search: Any = cv2.findTransformECC  # OpenCV's type hints lack the call without a mask
+        score, found = search(a, b, matrix, kind, stop, None, 5)
         return float(score), np.vstack([np.asarray(found, np.float64), [[0, 0, 1]]])[:3]
 
 

@@ -173,8 +173,10 @@ def _layer(name: str, source: MapSource, known: Mapping[str, MapSource], *, old:
             )
         else:
             boxes = (
-                f"<EX_GeographicBoundingBox><westBoundLongitude>{west}</westBoundLongitude><eastBoundLongitude>{east}"
-                f"</eastBoundLongitude><southBoundLatitude>{south}</southBoundLatitude><northBoundLatitude>{north}"
+                "<EX_GeographicBoundingBox>"
+                f"<westBoundLongitude>{west}</westBoundLongitude>"
+                f"<eastBoundLongitude>{east}</eastBoundLongitude>"
+                f"<southBoundLatitude>{south}</southBoundLatitude><northBoundLatitude>{north}"
                 "</northBoundLatitude></EX_GeographicBoundingBox>"
             )
         for crs in supported(known):

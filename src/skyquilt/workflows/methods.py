@@ -171,7 +171,7 @@ def _epipolar(settings: MosaicSettings) -> str:
 
 
 def blend_for(settings: MosaicSettings) -> Blend:
-    """The merge rule; `flightline` averages unless another one is asked for (A 2.5)."""
+    """The blending method; `flightline` averages unless another one is selected (A 2.5)."""
     name = settings.picture.blend
     if name == "auto":
         name = "average" if settings.method == "flightline" else "feather"

@@ -114,7 +114,7 @@ def mosaic(
     """Makes a mosaic of the photos in a folder and returns when it is finished.
 
     Raises:
-        SkyquiltError: anything a user can mend.
+        SkyquiltError: any error that the user can correct.
     """
     for event in iter_mosaic(folder, output, settings, methods=methods, overwrite=overwrite):
         if isinstance(event, Result):
@@ -135,7 +135,7 @@ def make_map(
     """Makes the map of a survey that was read; `began`: time at which reading began (`Clock.now`).
 
     Raises:
-        SkyquiltError: anything a user can mend.
+        SkyquiltError: any error that the user can correct.
     """
     began, methods = began or Clock.now(), methods or methods_for(settings)
     check_input(given, output, settings)
