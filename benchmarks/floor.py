@@ -168,6 +168,7 @@ def main() -> None:
         cpu, wall, peak = zip(
             *(run_mosaic(options.photos, further) for _ in range(options.run)), strict=True
         )
+        costs: dict[str, Any] = results
         results["run"] = Cost.of(list(cpu), list(wall), max(peak))
         costs["ratio"] = costs["run"].cpu_median / costs["floor"]
     report = {"machine": machine()} | {

@@ -181,7 +181,8 @@ def test_headings_missing(mosaic, photos):
     ("text", "words"),
     [
         (
-            "point_a,point_b,metres,px_a,py_a,image_a,px_b,py_b,image_b\nA,B,3,1,1,nine.jpg,2,2,SIM_0001.jpg\n",
+            "point_a,point_b,metres,px_a,py_a,image_a,px_b,py_b,image_b\n"
+            "A,B,3,1,1,nine.jpg,2,2,SIM_0001.jpg\n",
             ("names nine.jpg", "no photo of the survey"),
         ),
         ("point_a,point_b,metres\nA,B,3\n", ("there is no observation of point 'A'",)),

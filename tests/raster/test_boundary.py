@@ -47,7 +47,8 @@ def kml():
     )
     return (
         "<kml"
-        f' xmlns="http://www.opengis.net/kml/2.2"><Document><Polygon>{rings}</Polygon></Document></kml>'
+        ' xmlns="http://www.opengis.net/kml/2.2">'
+        f"<Document><Polygon>{rings}</Polygon></Document></kml>"
     )
 
 
