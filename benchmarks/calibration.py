@@ -16,7 +16,7 @@ import numpy as np
 
 from skyquilt.calibration.assemble import Assemble
 from skyquilt.calibration.calibrate import Calibrate
-from skyquilt.calibration.disagreement import widened
+from skyquilt.calibration.deviations import widened
 from skyquilt.calibration.find_board import FindBoard
 from skyquilt.calibration.workflow import CalibrateSettings, calibrate
 from skyquilt.cli.calibrate import parse_board

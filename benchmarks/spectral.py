@@ -21,8 +21,7 @@ from skyquilt.coregistration.methods import registration_method
 from skyquilt.coregistration.pictures import open_picture
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.model.registration import Picture
-from skyquilt.papers.overlap_error import overlap_error
-from skyquilt.papers.pair_list import Pair, read_pairs
+from skyquilt.papers.pair_list import Pair, overlap_error, read_pairs
 
 METHOD = registration_method("auto")
 

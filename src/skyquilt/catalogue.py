@@ -33,12 +33,12 @@ DIRECT = ("ncc", "phase", "ecc", "mi")
 """Estimators that register pixels; the others estimate from matches of features."""
 REGISTRATIONS = {
     "auto": "skyquilt.coregistration.methods:auto",
-    "sift": "skyquilt.papers.registrations:sift",
-    "surf": "skyquilt.papers.registrations:surf",
-    "usurf": "skyquilt.papers.registrations:usurf",
-    "rfae": "skyquilt.papers.registrations:rfae",
-    "rfae-sift": "skyquilt.papers.registrations:rfae_sift",
-    "surf+rfae": "skyquilt.papers.registrations:surf_and_rfae",
+    "sift": "skyquilt.papers.rfae:sift",
+    "surf": "skyquilt.papers.rfae:surf",
+    "usurf": "skyquilt.papers.rfae:usurf",
+    "rfae": "skyquilt.papers.rfae:rfae",
+    "rfae-sift": "skyquilt.papers.rfae:rfae_sift",
+    "surf+rfae": "skyquilt.papers.rfae:surf_and_rfae",
     "structure": "skyquilt.coregistration.methods:structure",
 }
 TRANSFORMS = ("translation", "similarity", "affine", "homography")

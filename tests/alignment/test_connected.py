@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy import sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 
-from skyquilt.alignment.connected import connected, outwards, spanning_tree
+from skyquilt.alignment.tracks import connected, outwards, spanning_tree
 
 graphs = st.tuples(st.integers(0, 10**6), st.integers(1, 60), st.integers(0, 120))
 

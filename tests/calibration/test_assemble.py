@@ -3,7 +3,7 @@ import pytest
 
 from skyquilt.calibration.assemble import Assemble, bimodality, cell_of, separation
 from skyquilt.calibration.calibrate import Calibrate
-from skyquilt.calibration.disagreement import widened
+from skyquilt.calibration.deviations import widened
 from skyquilt.calibration.find_board import FindBoard
 from skyquilt.calibration.series import StoodStill, mostly_still, runs
 from skyquilt.simulate.board import Lamp, Sensor, sweep

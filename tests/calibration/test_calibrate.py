@@ -6,7 +6,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from skyquilt.calibration.calibrate import Calibrate, strangers
-from skyquilt.calibration.held_out import error_px, hold_out
+from skyquilt.calibration.figures import error_px, hold_out
 from skyquilt.calibration.solve import solve
 from skyquilt.calibration.start import start_camera, start_pose
 from skyquilt.geometry.camera import project

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skyquilt.coregistration.metadata import from_metadata
+from skyquilt.coregistration.pictures import from_metadata
 from skyquilt.model.photo import Attitude, Focal, GeoPosition, Photo
 
 LATITUDE, LONGITUDE = 46.5, -92.0

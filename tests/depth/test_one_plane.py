@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skyquilt.depth.one_plane import OnePlane
+from skyquilt.depth.pairs import OnePlane
 
 
 def ground(x, y):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skyquilt.depth.parallax import heights_above_plane
+from skyquilt.depth.pairs import heights_above_plane
 from skyquilt.geometry.frames import cam_R_map_from_angles
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skyquilt.coregistration.workflow import register
-from skyquilt.papers.overlap_error import overlap_error
+from skyquilt.papers.pair_list import overlap_error
 from skyquilt.simulate import FlightSettings, simulate
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route, Thermal

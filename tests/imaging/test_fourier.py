@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.fft
 
-from skyquilt.imaging.fourier import fft2, ifft2
+from skyquilt.imaging.registration import fft2, ifft2
 
 
 @pytest.mark.parametrize("shape", [(1, 64, 64), (5, 48, 36), (3, 7, 11)])

@@ -8,7 +8,7 @@ from skyquilt.imaging.views import make_views
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Pose
 from skyquilt.ortho.tie_surface import level
-from skyquilt.papers.planar import map_H_cam_of
+from skyquilt.papers.pieces import map_H_cam_of
 from tests.alignment.flights import CAMERA, CELL, fly, line
 from tests.alignment.surveys import alignment
 

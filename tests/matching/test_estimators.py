@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from skyquilt.geometry.transforms import MODELS, fit, symmetric_transfer_errors, transfer
-from skyquilt.matching.estimate import polished
+from skyquilt.matching.estimate import needed, polished, samples
 from skyquilt.matching.ransac import Ransac
-from skyquilt.matching.search import needed, samples
 from skyquilt.papers.lmeds import Lmeds
 from skyquilt.papers.magsac import Magsac
 from skyquilt.papers.ste import RansacSte, _distant

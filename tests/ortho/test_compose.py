@@ -11,7 +11,7 @@ import pytest
 from skyquilt.geometry.camera import project
 from skyquilt.imaging.registration import shifts_between
 from skyquilt.imaging.views import STEP, inside
-from skyquilt.live.newest_blend import Newest
+from skyquilt.live.tile_drawing import Newest
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Average, Feather, First, Multiband

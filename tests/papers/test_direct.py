@@ -5,11 +5,16 @@ import numpy as np
 import pytest
 
 from skyquilt.geometry.transforms import transfer
-from skyquilt.papers.climb import levels, motion
-from skyquilt.papers.direct import Ncc
+from skyquilt.papers.direct import Ncc, levels, motion
 from skyquilt.papers.direct_refinement import Ecc, MutualInformation, PhaseCorrelation
-from skyquilt.papers.phase import phase_shift, rotation_and_scale
-from skyquilt.papers.picture_similarity import mutual_information, ncc, ncc_of_shifts, summit
+from skyquilt.papers.picture_similarity import (
+    mutual_information,
+    ncc,
+    ncc_of_shifts,
+    phase_shift,
+    rotation_and_scale,
+    summit,
+)
 from tests.texture import texture
 
 SIZE = (300, 400)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skyquilt.papers.overlap_error import overlap_error
+from skyquilt.papers.pair_list import overlap_error
 
 
 def shifted(x, y=0.0):

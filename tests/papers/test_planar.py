@@ -9,7 +9,7 @@ from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angle
 from skyquilt.imaging.views import make_views, on_ground, project_nodes
 from skyquilt.model.poses import Pose
 from skyquilt.ortho.tie_surface import level
-from skyquilt.papers.planar import map_H_cam_of, planar_pose
+from skyquilt.papers.pieces import map_H_cam_of, planar_pose
 from tests.alignment.flights import CAMERA, CORNERS
 from tests.alignment.surveys import alignment
 

@@ -11,7 +11,7 @@ import pytest
 from skyquilt.errors import OutputError, RefusedError, UsageError
 from skyquilt.model.camera import ORDERS
 from skyquilt.model.event import Result, StageProgress
-from skyquilt.papers.board_camera import board_camera
+from skyquilt.papers.strip_chain import board_camera
 from skyquilt.papers.strip_test import iter_strip_test
 from skyquilt.simulate import StripSettings, fly_strip
 

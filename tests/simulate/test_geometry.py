@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 
 from skyquilt.geometry.frames import belly_from_gimbal, cam_R_map_from_angles
-from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.camera import Lens, camera_rotation, gimbal_angles
 from skyquilt.simulate.expose import exposer
 from skyquilt.simulate.flight import Shot, Waypoint
 from skyquilt.simulate.grid import Grid
 from skyquilt.simulate.raycast import first_hits, rays_of, sample
-from skyquilt.simulate.rotation import camera_rotation, gimbal_angles
 from skyquilt.simulate.scene import Country, Scene, SceneSettings, empty_scene
 from skyquilt.simulate.settings import Pictures
 from skyquilt.simulate.weather import Weather

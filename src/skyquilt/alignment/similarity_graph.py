@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.connected import connected, outwards, spanning_tree
+from skyquilt.alignment.tracks import connected, outwards, spanning_tree
 
 DENSE = 300
 """Largest number of photos for which the normal equations are solved as a full matrix."""

@@ -1,15 +1,54 @@
-"""Standard deviations of the parameters of a calibration."""
+"""Standard deviations of the parameters of a calibration, the derivatives they come from, and views
+that disagree with the others.
+"""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.calibration.linearised import linearised
-from skyquilt.model.calibration import BoardPose, Observations
+from skyquilt.geometry.camera import project_with_derivatives
+from skyquilt.model.calibration import BoardPose, Calibration, Observations
 from skyquilt.model.camera import PARAMETERS, Camera
 
 Array = NDArray[np.float64]
+
+
+def linearised(
+    view: Observations, camera: Camera, pose: BoardPose, columns: Sequence[int]
+) -> tuple[Array, Array]:
+    """Derivatives (n, 2, columns + 6) of a view's points by intrinsics (columns of `PARAMETERS`)
+    and pose, and residuals (n, 2) in px.
+    """
+    turned = view.board @ pose.cam_R_board.T
+    vector = np.broadcast_to(camera.vector, (len(turned), len(PARAMETERS)))
+    at = project_with_derivatives(vector, turned + pose.cam_t)
+    spin = np.zeros((len(turned), 3, 3))  # d(turned) by the rotation vector: -[turned]x
+    spin[:, 0, 1], spin[:, 0, 2], spin[:, 1, 2] = turned[:, 2], -turned[:, 1], turned[:, 0]
+    spin -= np.swapaxes(spin, 1, 2)
+    J = np.concatenate([at.d_intrinsics[:, :, columns], at.d_point @ spin, at.d_point], 2)
+    return J, view.px - at.px
+
+
+_LENGTHS = ("focal", "cx", "cy")
+
+
+def widened(found: Calibration, other: Calibration) -> Calibration:
+    """A calibration whose lengths (focal length, principal point) have deviations increased by the
+    difference from another one, from other points of the same views, divided by the square root of
+    two.
+
+    Heat moves the edges of squares in the same way in every view. Poses and intrinsics absorb part
+    of this, which no residual shows; centres and corners absorb it differently. Distortion
+    coefficients are not changed, since the two calibrations may have different orders.
+    """
+    apart = found.camera.vector - other.camera.vector
+    apart = np.where([n in found.free and n in _LENGTHS for n in PARAMETERS], apart, 0.0)
+    sigmas = np.hypot(found.camera.sigmas or np.zeros(len(apart)), apart / np.sqrt(2))
+    return replace(found, camera=replace(found.camera, sigmas=tuple(sigmas.tolist())))
+
+
 _FEWEST = 4
 
 

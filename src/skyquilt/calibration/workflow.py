@@ -12,7 +12,7 @@ from skyquilt.calibration import figures as calibrate_judging
 from skyquilt.calibration import files as calibrate_files
 from skyquilt.calibration.board_views import SERIES, Seen, look, one_camera
 from skyquilt.calibration.calibrate import Calibrate, strangers
-from skyquilt.calibration.disagreement import widened
+from skyquilt.calibration.deviations import widened
 from skyquilt.calibration.find_board import FindBoard
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.folder import claim

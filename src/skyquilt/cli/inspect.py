@@ -2,11 +2,111 @@
 
 import json as json_module
 import sys
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.table import Table
+
+from skyquilt.model.photo import GeoPosition, Photo, Survey
+
+_SHUTTERS = {True: "rolling (not modelled)", False: "global or mechanical", None: "unknown"}
+_DATUMS = {
+    "takeoff": "take-off",
+    "sea_level": "sea level",
+    "ellipsoid": "ellipsoid",
+    "unknown": "?",
+}
+
+
+def camera_table(survey: Survey) -> Table:
+    """One row per camera."""
+    table = Table("camera", "photos", "size", "type", "focal length", "shutter", title="Cameras")
+    for key in dict.fromkeys(p.camera_key for p in survey.photos):
+        group = [p for p in survey.photos if p.camera_key == key]
+        one = group[0]
+        kind = f"{one.band} {one.channels} x {one.dtype} {one.unit}".strip()
+        table.add_row(
+            key,
+            str(len(group)),
+            f"{one.width}x{one.height}",
+            kind,
+            _focal(one),
+            _SHUTTERS[one.rolling_shutter],
+        )
+    return table
+
+
+def photo_table(survey: Survey) -> Table:
+    """One row per photo, in order of capture; notes common to all photos are listed below the table
+    instead.
+    """
+    table = Table(title="Photos, in order of capture")
+    for heading in ("photo", "time", "focal px", "latitude, longitude"):
+        table.add_column(heading, no_wrap=True)
+    for heading in ("height m", "yaw / pitch / roll", "flight yaw"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("notes")
+    shared = set(shared_notes(survey))
+    for photo in survey.photos:
+        notes = " ".join(n for n in photo.notes if n not in shared)
+        table.add_row(photo.name, *_cells(photo), notes)
+    return table
+
+
+def shared_notes(survey: Survey) -> tuple[str, ...]:
+    """Notes that all photos have."""
+    first = survey.photos[0].notes
+    return tuple(n for n in first if all(n in p.notes for p in survey.photos))
+
+
+def sentences(survey: Survey, findings: tuple[str, ...]) -> Iterator[str]:
+    """What is missing or contradictory, what was left out and why."""
+    yield from (f"All photos: {note}" for note in shared_notes(survey) if len(survey.photos) > 1)
+    yield from survey.notes
+    yield from findings
+    yield from (f"Left out: {r.name}: {r.reason}." for r in survey.rejected)
+    if survey.ignored:
+        yield f"Files that are no photos, ignored: {', '.join(survey.ignored)}."
+    placed = sum(p.position is not None for p in survey.photos)
+    turned = sum(p.attitude is not None for p in survey.photos)
+    yield f"{len(survey.photos)} photos, {placed} with a position, {turned} with camera angles."
+
+
+def _cells(photo: Photo) -> tuple[str, ...]:
+    attitude, yaw = photo.attitude, photo.flight_yaw_deg
+    angles = (
+        f"{attitude.yaw_deg:.1f} / {attitude.pitch_deg:.1f} / {attitude.roll_deg:.1f}"
+        if attitude
+        else "-"
+    )
+    return (
+        photo.time.isoformat(sep=" ", timespec="milliseconds").removesuffix(".000")
+        if photo.time
+        else "-",
+        _focal(photo),
+        _place(photo.position),
+        _height(photo.position),
+        angles,
+        f"{yaw:.1f}" if yaw is not None else "-",
+    )
+
+
+def _focal(photo: Photo) -> str:
+    return f"{photo.focal.px:.0f} +- {photo.focal.sigma_px:.0f} ({photo.focal.source})"
+
+
+def _place(position: GeoPosition | None) -> str:
+    return f"{position.latitude_deg:.6f}, {position.longitude_deg:.6f}" if position else "-"
+
+
+def _height(position: GeoPosition | None) -> str:
+    if position is None or position.altitude_m is None:
+        return "-"
+    return f"{position.altitude_m:.1f} ({_DATUMS[position.datum]})"
+
 
 if TYPE_CHECKING:
     from skyquilt.model.photo import Survey
@@ -39,8 +139,6 @@ def command(
 
 def _show(survey: "Survey", findings: tuple[str, ...]) -> None:
     from rich.console import Console
-
-    from skyquilt.cli.inspect_tables import camera_table, photo_table, sentences
 
     console = Console(soft_wrap=False)
     if not console.is_terminal:

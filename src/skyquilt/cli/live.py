@@ -76,7 +76,7 @@ def command(
     Photos arrive in the folders INBOX or over HTTP; accepted photos survive any crash.
     """
     with ends_at_once():
-        from skyquilt.cli.live_progress import show_live
+        from skyquilt.cli.progress import show_live
         from skyquilt.live.live_map import LiveMap
         from skyquilt.live.settings import LiveSettings
         from skyquilt.live.workflow import iter_live

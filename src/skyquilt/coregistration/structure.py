@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.coregistration.decision import Decide
-from skyquilt.coregistration.index_features import IndexFeatures, index_features, mutual
-from skyquilt.coregistration.log_gabor import phase
+from skyquilt.coregistration.index_features import IndexFeatures, index_features, mutual, phase
 from skyquilt.coregistration.orientation import Pyramid, shrunken
 from skyquilt.coregistration.subpixel import Fit, SubpixelRefinement
 from skyquilt.coregistration.usable import Usable, both_usable

@@ -2,13 +2,15 @@
 dominant plane.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix, diags, hstack
+from scipy.sparse.linalg import lsmr
 
-from skyquilt.depth.parallax import heights_above_plane
 from skyquilt.geometry.camera import rays
 from skyquilt.geometry.transforms import transfer
 from skyquilt.imaging.views import View, on_ground
@@ -17,6 +19,80 @@ from skyquilt.matching.ransac import Ransac
 from skyquilt.model.estimate import NoEstimate
 from skyquilt.model.features import Features, Link
 from skyquilt.ortho.tie_surface import level
+
+Array = NDArray[np.float64]
+
+
+def heights_above_plane(
+    d: Array, w: Array, b_T: Array, depth: Array, height_a: float
+) -> tuple[Array, Array, Array]:
+    """Heights (n,) above the plane, disparities (n,) along the baseline and (n,) across it.
+
+    `d` (n, 2): disparities in photo b, units of the focal length; `w` (n, 2): positions of the
+    points predicted by the plane's homography, same unit, undistorted; `b_T` (3,): centre of photo
+    a in camera coordinates of b; `depth` (n,): depth of the plane in b at w, `height_a`: height of
+    a above the plane, all in the same unit, which is also that of the heights. NaN where the
+    baseline points at the point itself. Disparities are positive for points above the plane.
+    """
+    g = b_T[:2] - w * b_T[2]
+    long = np.linalg.norm(g, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (d * g).sum(1) / long
+        across = (d[:, 0] * g[:, 1] - d[:, 1] * g[:, 0]) / long
+        s = along / long
+        share = s * depth / (1 + s * (depth - b_T[2]))
+    return np.asarray(share * height_a), np.asarray(along), np.asarray(across)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnePlane:
+    """Least squares for the height of each cell of the ground and a plane for each pair, outliers
+    down-weighted.
+    """
+
+    cells: int = 60
+    """Cells along the longer side."""
+    damping: float = 1e-3
+    """Weight of a prior of zero for planes and heights, which holds undetermined ones."""
+    rounds: int = 4
+    """Rounds of reweighting (Cauchy's function)."""
+    version: ClassVar[int] = 1
+
+    def __call__(self, fields: Sequence[Array]) -> Array:
+        """All points (n, 3): x, y, height in m, from those of the pairs (n_k, 3), without a general
+        slope.
+        """
+        xyz = np.concatenate(fields)
+        owner = np.repeat(np.arange(len(fields)), [len(f) for f in fields])
+        middle, extent = xyz[:, :2].mean(0), max(float(np.ptp(xyz[:, :2], axis=0).max()), 1e-9)
+        terms = np.c_[np.ones(len(xyz)), (xyz[:, :2] - middle) / extent]
+        z = xyz[:, 2].copy()
+        if len(fields) > 1:
+            place = np.floor((xyz[:, :2] - xyz[:, :2].min(0)) / extent * self.cells).astype(
+                np.int64
+            )
+            _, cell = np.unique(place @ [self.cells + 1, 1], return_inverse=True)
+            z += self._planes(z, terms, owner, cell)
+        z -= terms @ np.linalg.lstsq(terms, z, rcond=None)[0]
+        return np.asarray(np.c_[xyz[:, :2], z])
+
+    def _planes(
+        self, z: Array, terms: Array, owner: NDArray[np.int64], cell: NDArray[np.int64]
+    ) -> Array:
+        """Height of each pair's plane at its points (n,)."""
+        row = np.arange(len(z))
+        column = 3 * owner[:, None] + np.arange(3)
+        planes = csr_matrix((terms.ravel(), (np.repeat(row, 3), column.ravel())))
+        both = hstack([planes, -csr_matrix((np.ones(len(z)), (row, cell)))]).tocsr()
+        weight, change = np.ones(len(z)), np.zeros(len(z))
+        for _ in range(self.rounds):
+            root = np.sqrt(weight)
+            solved = lsmr(diags(root) @ both, -z * root, damp=self.damping, maxiter=2000)[0]
+            change = planes @ solved[: planes.shape[1]]
+            lacking = z + both @ solved
+            weight = 1 / (1 + (lacking / (1.48 * np.median(np.abs(lacking)) + 1e-9)) ** 2)
+        return np.asarray(change)
+
 
 LEAST_BASE = 0.05
 """Least ratio of baseline to height for disparities to be used."""

@@ -28,9 +28,8 @@ from skyquilt.depth.files import (
     write_depth,
     write_png,
 )
-from skyquilt.depth.one_plane import OnePlane
 from skyquilt.depth.page import depth_page
-from skyquilt.depth.pairs import NoField, PairField, pair_field
+from skyquilt.depth.pairs import NoField, OnePlane, PairField, pair_field
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.folder import STATE, claim
 from skyquilt.engine.store import Store

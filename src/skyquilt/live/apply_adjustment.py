@@ -4,11 +4,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.live.background_adjustment import BlockAdjustment
+from skyquilt.live.events import Update
 from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member, about_record
 from skyquilt.live.refinement import Refinement
 from skyquilt.live.settings import CLOSING
-from skyquilt.live.update import Update
 from skyquilt.model.poses import Pose
 
 

@@ -1,8 +1,9 @@
 """Events for viewers. Each event is a row of the ledger, written in the same transaction as the
-change that it reports.
+change that it reports. `Update` is what one unit of work reports to its caller.
 """
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,25 @@ import numpy as np
 from skyquilt.live.members import Member, Members
 from skyquilt.live.tile_drawing import Canvas
 from skyquilt.raster.tile_store import Address
+
+
+@dataclass(frozen=True, kw_only=True)
+class Update:
+    """Describes one unit of work that was done."""
+
+    what: str
+    """placed, waiting, refined, loose, refused, drawn, closed or noted."""
+    photo: int | None = None
+    """The photo concerned."""
+    moved: tuple[int, ...] = ()
+    """Photos that have moved."""
+    tiles: int = 0
+    """Tiles written."""
+    text: str = ""
+    """A message for the user; may be empty."""
+    seconds: float = 0.0
+    """Duration in s."""
+
 
 MOST_BOXES = 24
 """Largest number of boxes with which a change of the map is reported."""

@@ -8,11 +8,10 @@ import numpy as np
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.live.drone_metadata import Metadata
-from skyquilt.live.events import MapEvents
+from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member, Queues
 from skyquilt.live.redraw_queue import RedrawQueue
-from skyquilt.live.update import Update
 from skyquilt.ortho.ground import round_gsd
 
 ABOVE_M = 50.0

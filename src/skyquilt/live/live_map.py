@@ -21,7 +21,7 @@ from skyquilt.live.adjustment_schedule import Blocks, Schedule
 from skyquilt.live.apply_adjustment import ApplyAdjustment
 from skyquilt.live.background_adjustment import BackgroundAdjustment, adjust_block
 from skyquilt.live.drone_metadata import Metadata
-from skyquilt.live.events import MapEvents
+from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.free_memory import give_back
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.initial_pose import InitialPose
@@ -35,7 +35,6 @@ from skyquilt.live.redraw_queue import RedrawQueue
 from skyquilt.live.refinement import Refinement
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.tile_drawing import Canvas
-from skyquilt.live.update import Update
 from skyquilt.model import features, poses
 from skyquilt.ortho.height_cells import HeightCells
 from skyquilt.photos.pixels import read_color

@@ -6,11 +6,10 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.live.events import MapEvents
+from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member, Members, pose_from, pose_record
 from skyquilt.live.tile_drawing import LEAST_MOVE, NEWEST, Canvas
-from skyquilt.live.update import Update
 from skyquilt.model.poses import Pose
 from skyquilt.raster.tile_store import Address
 

@@ -6,13 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.live.adjustment_schedule import Schedule
-from skyquilt.live.events import MapEvents
+from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.ledger import hit
 from skyquilt.live.links import link_bytes
 from skyquilt.live.local_pose import Change, LocalPose
 from skyquilt.live.members import Member, Queues, about_record
 from skyquilt.live.redraw_queue import RedrawQueue
-from skyquilt.live.update import Update
 from skyquilt.model.poses import Pose
 
 LOOP = 12

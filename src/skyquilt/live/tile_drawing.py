@@ -4,8 +4,9 @@ redrawn where those have changed.
 
 import os
 from collections import OrderedDict, defaultdict
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +17,37 @@ from skyquilt.engine.store import Store
 from skyquilt.imaging.views import View, footprint
 from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member
-from skyquilt.live.newest_blend import Newest
 from skyquilt.live.reduced_pictures import SmallPictures, measured
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Pose
 from skyquilt.model.raster import Window
 from skyquilt.model.surface import Surface
-from skyquilt.ortho.blend import Blend, Feather
+from skyquilt.ortho.blend import Blend, Feather, First, Float, Layer, Order
 from skyquilt.ortho.compose import Composed, Composer
 from skyquilt.ortho.height_cells import HeightCells
 from skyquilt.ortho.plan import Plan
 from skyquilt.raster.tile_store import SIDE, Address, Tile, TileStore, covering
+
+
+@dataclass(frozen=True, kw_only=True)
+class Newest:
+    """The photo taken last is shown, with hard seams."""
+
+    margin: ClassVar[int] = 0
+    version: ClassVar[int] = 1
+
+    def rank(self, order: Order, score: Float) -> Float:
+        """Order of capture, newest first."""
+        return np.where(np.isfinite(score), np.float32(-order), np.float32(np.inf))
+
+    def reach(self, gsd: float) -> float:
+        """Zero, since only one photo contributes to each pixel."""
+        return 0.0
+
+    def merge(self, layers: Sequence[Layer], gsd: float) -> tuple[NDArray[Any], NDArray[np.int32]]:
+        """Takes each pixel from the last layer that covers it; layers are in order of capture."""
+        return First().merge(list(reversed(layers)), gsd)
+
 
 NEWEST = "-newest"
 """Suffix of the names of layers that show the newest photo instead of the most vertical view."""

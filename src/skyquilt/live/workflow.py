@@ -8,12 +8,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from skyquilt.errors import OutputError, SkyquiltError
+from skyquilt.live.events import Update
 from skyquilt.live.final_map import iter_finish
 from skyquilt.live.folder_watch import Watch
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.photo_intake import Refused
 from skyquilt.live.settings import LiveSettings
-from skyquilt.live.update import Update
 from skyquilt.model.event import Event, Note, Result
 
 IDLE_S = 0.01

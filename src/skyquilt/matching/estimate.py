@@ -1,17 +1,136 @@
-"""Functions shared by all estimators: checks of the points, and the record of a transformation with
-its inliers.
+"""What all estimators of a plane transformation share: checks of the points, the random search, the
+final fit, and the record of a transformation with its inliers.
 """
 
-from typing import Protocol
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skyquilt.geometry.refine import refine
-from skyquilt.geometry.transforms import MINIMAL, fit, symmetric_transfer_errors
+from skyquilt.geometry.transforms import MINIMAL, fit, fit_many, symmetric_transfer_errors
 from skyquilt.model.estimate import Estimate, NoEstimate
 
 Doubles = NDArray[np.float64]
+
+_FIRST, _LARGEST = 16, 256
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Found:
+    """The best model of a search."""
+
+    b_H_a: Doubles
+    """(3, 3) transformation."""
+    iterations: int
+    """Samples tried."""
+    capped: bool
+    """True if more samples would have been needed."""
+
+
+def samples(rng: np.random.Generator, total: int, size: int, count: int) -> NDArray[np.int64]:
+    """(count, size) indices below `total`, those of a row distinct."""
+    drawn = np.empty((count, size), np.int64)
+    for k in range(size):
+        new = rng.integers(total - k, size=count)
+        for earlier in np.sort(drawn[:, :k], axis=1).T:  # skip indices already drawn
+            new += new >= earlier
+        drawn[:, k] = new
+    return drawn
+
+
+def needed(confidence: float, share: float, size: int, cap: int) -> int:
+    """Number of samples until one is free of outliers with that confidence, at most cap + 1 [A
+    (10), with its exponent S read as (1 - eps)^s].
+    """
+    clean = share**size
+    if clean >= 1:
+        return 1
+    if clean <= 0 or (count := math.log(1 - confidence) / math.log1p(-clean)) > cap:
+        return cap + 1
+    return max(1, math.ceil(count))
+
+
+def search(
+    model: str,
+    a: Doubles,
+    b: Doubles,
+    *,
+    cost: Callable[[Doubles], Doubles],
+    support: Callable[[Doubles], int],
+    confidence: float,
+    cap: int,
+    seed: int,
+) -> Found | None:
+    """The model with the lowest cost among those from random minimal samples; None if no sample
+    determines one.
+
+    `cost` maps symmetric transfer errors (M, N) px^2 to costs (M,). `support` maps those of one
+    model (N,) to its number of inliers, which determines how many samples are enough. Equal seeds
+    give equal results.
+    """
+    rng, size = np.random.default_rng(seed), MINIMAL[model]
+    best, least, done, wanted, batch = None, np.inf, 0, cap + 1, _FIRST
+    while done < min(wanted, cap):
+        index = samples(rng, len(a), size, min(batch, min(wanted, cap) - done))
+        H = fit_many(model, a[index], b[index])
+        errors = symmetric_transfer_errors(H, a, b)
+        costs = cost(errors)
+        top = int(costs.argmin())
+        if costs[top] < least and np.isfinite(H[top]).all():
+            best, least = H[top], costs[top]
+            wanted = needed(confidence, support(errors[top]) / len(a), size, cap)
+        done, batch = done + len(index), min(2 * batch, _LARGEST)
+    return None if best is None else Found(b_H_a=best, iterations=done, capped=done < wanted)
+
+
+Search = Callable[[Doubles, Doubles], Found | None]
+"""Finds the best model from random samples of matches a, b (N, 2) px; None if no sample determines
+one.
+"""
+Finalise = Callable[[NDArray[Any], Doubles, Doubles], tuple[Doubles, float] | NoEstimate]
+"""b_H_a of a search -> the one to refine, and the largest symmetric transfer error of an inlier in
+px^2.
+"""
+
+
+def estimated(
+    name: str,
+    model: str,
+    a: ArrayLike,
+    b: ArrayLike,
+    *,
+    minimum: int,
+    find: Search,
+    finalise: Finalise,
+) -> Estimate | NoEstimate:
+    """b_H_a from matches a, b (N, 2) px by the loss of `find` and `finalise`, or the reason why
+    there is none.
+    """
+    a, b = matched(a, b)
+    if (few := too_few(model, len(a), minimum)) is not None:
+        return few
+    found = find(a, b)
+    if found is None:
+        return NoEstimate(reason=f"no {model} fits the matches")
+    final = finalise(found.b_H_a, a, b)
+    if isinstance(final, NoEstimate):
+        return final
+    H, inliers = polished(model, final[0], a, b, final[1])
+    if (feeble := weak(model, int(inliers.sum()), len(a), minimum)) is not None:
+        return feeble
+    return Estimate(
+        model=model,
+        b_H_a=H,
+        inliers=inliers,
+        iterations=found.iterations,
+        capped=found.capped,
+        ste_per_inlier=float(symmetric_transfer_errors(H, a[inliers], b[inliers]).mean()),
+        method=name,
+    )
 
 
 class Estimator(Protocol):

@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skyquilt.geometry.transforms import Model
-from skyquilt.matching.estimate import Estimate, NoEstimate
-from skyquilt.matching.frame import estimated
-from skyquilt.matching.search import search
+from skyquilt.matching.estimate import Estimate, NoEstimate, estimated, search
 
 
 @dataclass(frozen=True, kw_only=True)

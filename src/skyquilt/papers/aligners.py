@@ -28,8 +28,7 @@ from skyquilt.papers.hybrid_search import Anneal, Surfaces
 from skyquilt.papers.lens_order import WORKING_WIDTH
 from skyquilt.papers.overview import ByOverview
 from skyquilt.papers.plane_registration import Estimator
-from skyquilt.papers.rescued import Rescued
-from skyquilt.papers.ste import RansacSte
+from skyquilt.papers.ste import RansacSte, Rescued
 from skyquilt.settings import MosaicSettings
 
 VLFEAT = 1.5**-0.5

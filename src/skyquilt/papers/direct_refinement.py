@@ -12,10 +12,14 @@ from numpy.typing import NDArray
 from skyquilt.geometry.transforms import transfer
 from skyquilt.imaging.grey import to_grey8
 from skyquilt.model.estimate import NoEstimate, Registration
-from skyquilt.papers.climb import at_level, climb, levels, motion, reduced
-from skyquilt.papers.direct import Direct, by_ncc
-from skyquilt.papers.phase import phase_shift, rotation_and_scale
-from skyquilt.papers.picture_similarity import mutual_information, ncc, warped
+from skyquilt.papers.direct import Direct, at_level, by_ncc, climb, levels, motion, reduced
+from skyquilt.papers.picture_similarity import (
+    mutual_information,
+    ncc,
+    phase_shift,
+    rotation_and_scale,
+    warped,
+)
 
 Doubles = NDArray[np.float64]
 

@@ -26,7 +26,7 @@ from skyquilt.papers.flightline_geometry import (
     reversals,
 )
 from skyquilt.papers.lens_order import of_order, to_working, working_K
-from skyquilt.papers.planar import planar_pose
+from skyquilt.papers.pieces import planar_pose
 from skyquilt.papers.plane_registration import Estimator, Matcher, implausible, plane_alignment
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Join, Pose, Prior
 from skyquilt.papers.hybrid_objective import Distances, Objective, pyramid
 from skyquilt.papers.hybrid_search import Optimiser
-from skyquilt.papers.planar import map_H_cam_of
+from skyquilt.papers.pieces import map_H_cam_of
 
 Array = NDArray[np.float64]
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]

@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skyquilt.geometry.transforms import MINIMAL, Model, symmetric_transfer_errors
-from skyquilt.matching.estimate import Doubles, Estimate, NoEstimate
-from skyquilt.matching.frame import estimated
-from skyquilt.matching.search import search
+from skyquilt.matching.estimate import Doubles, Estimate, NoEstimate, estimated, search
 
 _MEDIAN = 2 * np.log(2)
 """Median of a chi-square of two degrees of freedom: a transfer error in x and y, divided by its

@@ -10,9 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skyquilt.geometry.transforms import Model, fit
-from skyquilt.matching.estimate import Estimate, NoEstimate
-from skyquilt.matching.frame import estimated
-from skyquilt.matching.search import Found
+from skyquilt.matching.estimate import Estimate, Found, NoEstimate, estimated
 
 Doubles = NDArray[np.float64]
 

@@ -16,8 +16,7 @@ from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgre
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.model.registration import RefusedRegistration, Registration
 from skyquilt.papers.bench_page import bench_page
-from skyquilt.papers.overlap_error import overlap_error
-from skyquilt.papers.pair_list import Pair, read_pairs
+from skyquilt.papers.pair_list import Pair, overlap_error, read_pairs
 from skyquilt.raster.atomic import write_text
 from skyquilt.settings import one_of
 from skyquilt.version import __version__

@@ -2,8 +2,10 @@
 transformation.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,13 +14,45 @@ from skyquilt.geometry.camera import undistort
 from skyquilt.geometry.transforms import Model, transfer
 from skyquilt.matching.levelled import Level
 from skyquilt.matching.ransac import Ransac
-from skyquilt.model.camera import Camera
+from skyquilt.model.camera import Camera, order_named
 from skyquilt.model.estimate import NoEstimate
-from skyquilt.papers.board_camera import board_camera
 from skyquilt.quality.registration_quality import eta, four_lengths
 from skyquilt.simulate import Strip, StripSettings
 
 Doubles = NDArray[np.float64]
+
+
+def board_camera(
+    board: Doubles, views: Sequence[Doubles], size: tuple[int, int], order: str
+) -> tuple[Camera, float]:
+    """The camera with distortion of an order, and the RMS error in px, from views (N, 2) px of a
+    board (N, 3).
+
+    `size` is (width, height) in px. Pixels are square. Each order is a separate fit, not a
+    truncated higher order.
+    """
+    kept, flags = order_named(order), cv2.CALIB_FIX_ASPECT_RATIO
+    flags |= 0 if kept.tangential else cv2.CALIB_ZERO_TANGENT_DIST
+    for fixed in (cv2.CALIB_FIX_K1, cv2.CALIB_FIX_K2, cv2.CALIB_FIX_K3)[kept.radial :]:
+        flags |= fixed
+    points = [board.astype(np.float32)] * len(views)
+    seen = [v.astype(np.float32) for v in views]
+    rms, K, d, _, _ = cv2.calibrateCamera(points, seen, size, np.eye(3), np.zeros(5), flags=flags)
+    k1, k2, p1, p2, k3 = (float(v) for v in np.ravel(d)[:5])
+    camera = Camera(
+        width=size[0],
+        height=size[1],
+        focal=float(K[0, 0]),
+        cx=float(K[0, 2]),
+        cy=float(K[1, 2]),
+        k1=k1,
+        k2=k2,
+        k3=k3,
+        p1=p1,
+        p2=p2,
+    )
+    return camera, float(rms)
+
 
 LOOSE_PX = 10.0
 """Threshold of RANSAC in px. It is large enough to keep points on raised objects, which the

@@ -2,8 +2,7 @@
 a user provides.
 """
 
-from skyquilt.raster.blocks import Block
-from skyquilt.raster.cog import CogWriter, write_array
+from skyquilt.raster.cog import Block, CogWriter, write_array
 from skyquilt.raster.spec import RasterSpec
 
 __all__ = ["Block", "CogWriter", "RasterSpec", "write_array"]

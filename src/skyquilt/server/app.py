@@ -11,7 +11,6 @@ from fastapi import FastAPI, Response
 from fastapi.responses import FileResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 
-from skyquilt import __version__
 from skyquilt.server.access import RESUMABLE, Context, Guard, Guarded, Writer
 from skyquilt.server.event_endpoints import EventEndpoints
 from skyquilt.server.images import Images
@@ -20,7 +19,8 @@ from skyquilt.server.map_endpoints import STATIC, MapEndpoints
 from skyquilt.server.photo_endpoints import PhotoEndpoints
 from skyquilt.server.survey import Survey
 from skyquilt.server.upload_endpoints import UploadEndpoints
-from skyquilt.server.wms_endpoints import WmsEndpoints
+from skyquilt.server.wms import WmsEndpoints
+from skyquilt.version import __version__
 
 
 def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) -> FastAPI:

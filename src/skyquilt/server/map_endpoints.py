@@ -12,8 +12,7 @@ from starlette.background import BackgroundTask
 
 from skyquilt.raster.map_source import between
 from skyquilt.server.access import Context
-from skyquilt.server.export import write_cog
-from skyquilt.server.images import Images
+from skyquilt.server.images import Images, write_cog
 from skyquilt.server.survey import LiveSurvey
 from skyquilt.version import __version__
 

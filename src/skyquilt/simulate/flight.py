@@ -5,9 +5,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.camera import Lens, camera_rotation, wrap
 from skyquilt.simulate.grid import Doubles
-from skyquilt.simulate.rotation import camera_rotation, wrap
 from skyquilt.simulate.settings import Route
 
 _TURN_S = 6.0  # seconds lost between two lines

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from pyproj import CRS, Proj, Transformer
 
+from skyquilt.simulate.camera import gimbal_angles, wrap
 from skyquilt.simulate.flight import Shot
 from skyquilt.simulate.grid import Doubles
-from skyquilt.simulate.rotation import gimbal_angles, wrap
 from skyquilt.simulate.settings import Reporting
 
 

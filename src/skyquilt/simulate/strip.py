@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from skyquilt.errors import UsageError
-from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.camera import Lens, camera_rotation
 from skyquilt.simulate.flight import fly, plan
 from skyquilt.simulate.grid import Doubles
-from skyquilt.simulate.rotation import camera_rotation
 from skyquilt.simulate.settings import Route
 
 

@@ -35,7 +35,7 @@ from skyquilt.settings import MosaicSettings, PictureSettings
 from skyquilt.thermal.by_heights import finer
 from skyquilt.thermal.by_pairs import by_pairs
 from skyquilt.thermal.by_rig import draw_rigged, drift_of_rigged, rig_figures, rigged
-from skyquilt.thermal.files import write_figures, write_overlays, write_section
+from skyquilt.thermal.page import write_figures, write_overlays, write_section
 from skyquilt.thermal.routes import ROUTES, Joined, as_registration, join, opened, refuse_apart
 from skyquilt.workflows.flow import Scene
 from skyquilt.workflows.mosaic import FinishedMap, make_map
