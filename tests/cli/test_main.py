@@ -148,3 +148,28 @@ def test_an_interrupt_ends_with_130_and_says_how_to_go_on():
     )
     assert done.returncode == 130
     assert done.stderr == "skyquilt: interrupted; run the same command again to resume\n"
+
+
+def test_help_comes_in_panels_the_six_options_most_people_need_first():
+    import inspect
+
+    from skyquilt.cli import mosaic
+
+    panels = {}
+    for name, parameter in inspect.signature(mosaic.command).parameters.items():
+        panel = getattr(parameter.annotation.__metadata__[0], "rich_help_panel", None)
+        if name != "photos":
+            panels.setdefault(panel, []).append(name)
+    assert list(panels)[0] == mosaic.COMMON
+    assert panels[mosaic.COMMON] == ["output", "gsd", "gcp", "crs", "thermal", "overwrite"]
+    assert None not in panels and len(panels) > 8
+    printed = described_panels()
+    assert [p for p in printed if p in panels] == list(panels)
+
+
+def described_panels():
+    """Titles of the panels of `skyquilt mosaic --help`, in order."""
+    result = CliRunner(env={"COLUMNS": "120", "TERM": "dumb"}).invoke(
+        commands.app, ["mosaic", "--help"]
+    )
+    return re.findall(r"^\u256d\u2500 (.*?) \u2500", result.output, re.M)
