@@ -160,7 +160,7 @@ def test_help_comes_in_panels_the_six_options_most_people_need_first():
         panel = getattr(parameter.annotation.__metadata__[0], "rich_help_panel", None)
         if name != "photos":
             panels.setdefault(panel, []).append(name)
-    assert list(panels)[0] == mosaic.COMMON
+    assert next(iter(panels)) == mosaic.COMMON
     assert panels[mosaic.COMMON] == ["output", "gsd", "gcp", "crs", "thermal", "overwrite"]
     assert None not in panels and len(panels) > 8
     printed = described_panels()
