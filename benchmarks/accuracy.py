@@ -1,10 +1,10 @@
-"""Simulated flights: poses, surface and map against the truth, in one table.
+"""Simulated flights: errors of poses, surface and map against the truth, in one table.
 
     python benchmarks/accuracy.py [--flights default,default+gcp,strip] [--work FOLDER] [--json
     FILE]
 
-A flight is simulated once and kept in the work folder. `+gcp` uses its control points (check points
-stay out). Every figure has an error window on both sides: a result that is suspiciously good fails
+A flight is simulated once and kept in the work folder. `+gcp` uses its control points, but not its
+check points. Every figure has a lower and an upper limit: a result that is suspiciously good fails
 too.
 """
 

@@ -1,10 +1,9 @@
-"""What a bundle adjustment costs: this project's and pycolmap's Ceres on the same synthetic
-problems.
+"""Cost of a bundle adjustment: Skyquilt's and pycolmap's Ceres on the same synthetic problems.
 
     python -m benchmarks.adjustment [--runs 5]
 
-Both get the same observations and positions as priors, Cauchy's loss, focal length and radial
-distortion free, one thread, and stop at their default tolerance; the table says how far from the
+Both use the same observations, position priors, Cauchy loss, free focal length and radial
+distortion, and one thread, and stop at their default tolerance. The table says how far from the
 exact minimum each stopped.
 """
 

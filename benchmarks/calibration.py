@@ -2,7 +2,7 @@
 boards.
 
 python benchmarks/calibration.py sweeps [SEEDS]   # five poses of 92 frames each per seed
-python benchmarks/calibration.py weights          # powers of 1 / phi in assembled pictures
+python benchmarks/calibration.py weights          # powers of 1 / phi in assembled images
 python benchmarks/calibration.py boards FOLDER COLUMNSxROWS SQUARE   # real frames
 """
 

@@ -1,5 +1,5 @@
-"""What work costs: CPU seconds, wall seconds and peak memory, of this process or of a tree of
-others.
+"""Measures CPU seconds, wall seconds and peak memory of this process, or of another one and
+its children.
 """
 
 import os

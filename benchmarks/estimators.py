@@ -1,11 +1,11 @@
-"""Robust estimators on synthetic matches: error and success from 0 to 80 % outliers.
+"""Robust estimators on synthetic matches: error and success rate for 0 to 80 % outliers.
 
     python benchmarks/estimators.py [-o FILE] [--trials 10] [--noise 0.2] [--matches 150]
 
-Two photos of 1500 x 1000 px that differ by a homography as of neighbours in a flight line: shifted
-by a third, turned and scaled a little, tilted. Right matches err by `noise` px per axis, wrong ones
-lie anywhere in the frame. The error is the RMS of the true transfer over the frame; a trial
-succeeds with an error of at most 3 px.
+Two photos of 1500 x 1000 px differ by a homography that is typical of neighbours in a flight line:
+a shift by a third of the photo, a small rotation, scale and tilt. Right matches have errors of
+`noise` px per axis, wrong ones are anywhere in the frame. The error is the RMS transfer error
+against the true homography over the frame; a trial succeeds with an error of at most 3 px.
 """
 
 import argparse

@@ -1,12 +1,12 @@
-"""What is the least CPU time a mosaic can cost, and how far above it is `skyquilt mosaic`?
+"""The least CPU time that a mosaic can cost, and the CPU time of `skyquilt mosaic` for comparison.
 
-The floor is (a) decoding every JPEG once at full resolution plus (b) encoding the finished COG,
-overviews included, from memory. `--run` measures the whole command beside it, from a cold store, in
-its own process.
+The lower limit is (a) decoding every JPEG once at full resolution plus (b) encoding the finished
+COG from memory, overviews included. `--run` also measures the whole command, with an empty store,
+in a separate process.
 
     python benchmarks/floor.py PHOTOS --mosaic OUT/mosaic.tif --run 3 -- --gsd 2
 
-Words after `--` go to skyquilt mosaic.
+Words after `--` are passed to skyquilt mosaic.
 """
 
 import argparse

@@ -1,10 +1,11 @@
-"""A flight of thousands of 2 MP photos from three drones, simulated in minutes rather than hours.
+"""Simulates a flight of thousands of 2 MP photos from three drones, in minutes rather than hours.
 
 python benchmarks/large_flight.py FOLDER [--photos 2000]
 
-The simulator's country, camera, noise and reports; only its rays are cut short: they meet the
-smoothed ground (hills, not houses and trees, which are painted flat), so nothing hides anything.
-That is right for time and memory per photo, and would be wrong for any figure about accuracy.
+Terrain, camera, noise and metadata are those of the simulator. Only the ray casting is simplified:
+rays meet a smoothed ground (hills; houses and trees are painted on it flat), so nothing is hidden
+by anything else. The photos are suitable for measuring time and memory per photo, but not for
+measuring accuracy.
 """
 
 import argparse

@@ -1,13 +1,12 @@
-"""How quickly does a photo appear, how good is the growing map, and does the work per photo stay
-bounded?
+"""The live map: time until a photo appears, quality of the growing map, CPU time per photo.
 
-python benchmarks/live.py latency SURVEY [--rate 1.0] [--gsd 5]   file complete to tile in hand
+python benchmarks/live.py latency SURVEY [--rate 1.0] [--gsd 5]   file complete to tile fetched
 python benchmarks/live.py browser SURVEY                          to tile shown by a browser
-python benchmarks/live.py viewers SURVEY [--viewers 20]           the same while viewers pan about
+python benchmarks/live.py viewers SURVEY [--viewers 20]           the same with moving viewers
 python benchmarks/live.py cost SURVEY                             CPU seconds per photo and step
-python benchmarks/live.py seams SURVEY [--gsd 5]                  seam disparity, live against batch
+python benchmarks/live.py seams SURVEY [--gsd 5]                  seam disparity, live and batch
 
-`live_scaling.py` asks whether the work per photo stays bounded.
+`live_scaling.py` measures whether the work per photo stays bounded.
 """
 
 import argparse

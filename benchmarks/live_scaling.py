@@ -1,13 +1,13 @@
-"""Does the work per photo, and the memory, stay bounded as a live map grows?
+"""Measures whether the work per photo, and the memory, stay bounded as a live map grows.
 
-python benchmarks/large_flight.py FLIGHT   first: 2,000 photos of 2 MP from three drones
-python benchmarks/live_scaling.py FLIGHT    then: all into a live map, with a burst
+python benchmarks/large_flight.py FLIGHT   first: simulates 2,000 photos of 2 MP from three drones
+python benchmarks/live_scaling.py FLIGHT   then: adds all of them to a live map, with a burst
 
-Photos are handed in as fast as the map takes them, but for the burst: 90 photos, of each of which
-the map has a third of a second before the next one comes. What counts is CPU time per photo of the
-process that places, links and draws; that of the background process is told besides. CPU seconds
-grow longer where other work shares caches and cores: so a fixed piece of work is timed after every
-photo, and figures are given in its time too.
+Photos are added as fast as the map accepts them, except in the burst: 90 photos at intervals of a
+third of a second. The figure is CPU time per photo of the process that places, links and draws;
+that of the background process is reported separately. CPU times are longer when other work shares
+caches and cores. So a fixed piece of work is timed after every photo, and figures are also given in
+units of its time.
 """
 
 import argparse

@@ -1,7 +1,6 @@
-"""Those who look at a live map while it is measured: one real browser, or many viewers that pan
-about.
+"""Viewers of a live map during a measurement: one real browser, or many simulated viewers that pan.
 
-python benchmarks/live_viewers.py URL 20   pans until it is ended, then tells its requests' times
+python benchmarks/live_viewers.py URL 20   pans until it is stopped, then prints request times
 """
 
 import http.client

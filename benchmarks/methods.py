@@ -1,13 +1,13 @@
-"""Both papers' methods on simulated surveys: A's Tables 1 and 2 for six-line surveys, and the loop
-of the thesis.
+"""The methods of both papers on simulated surveys: A's Tables 1 and 2 for surveys of six lines, and
+the closed loop of the thesis.
 
     python benchmarks/methods.py [--surveys six-73,six-168,loop] [--work FOLDER] [--json FILE]
 
-six-N: N photos in six lines; flightline and bundle, geolocation MAE and RMS per axis against the
-TRUE positions (which the papers could not have), and CPU seconds. loop: the thesis's round trip of
-40 planned photos, three lost; each method's step where the loop closes: how far apart the first and
-the last photo put the same ground over level ground (bundle, which knows the relief, is not asked;
-null for others: too far apart to be registered).
+six-N: N photos in six lines, by flightline and bundle: geolocation MAE and RMS per axis against the
+TRUE positions (which the papers did not have), and CPU seconds. loop: the thesis's round trip of 40
+planned photos, three of them lost. For each method, the distance on level ground between the places
+where the first and the last photo show the same ground (not for bundle, which uses the relief; null
+if the two are too far apart to be registered).
 
 Photos have 640 x 480 px (six lines) and 1600 x 1200 px (loop). A survey is simulated once and kept
 in the work folder.

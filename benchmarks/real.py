@@ -1,10 +1,10 @@
-"""The real surveys beside the checkout: figures against what is asked of them.
+"""The real surveys beside the checkout: their figures compared with required limits.
 
     python benchmarks/real.py [--data ../shared/data] [--only brighton,caliterra,...] [--work
     FOLDER]
 
-`stripped` is brighton without any metadata; `stripped+gcp` adds three control points whose pixels
-and coordinates come from the full run's own tie points, and judges by the others.
+`stripped` is brighton without any metadata. `stripped+gcp` adds three control points, whose pixels
+and coordinates come from tie points of the full run; further tie points are check points.
 """
 
 import argparse

@@ -1,11 +1,12 @@
-"""What chance reaches, and what other rotations, scales and places cost: `auto` on pairs made from
-known ones.
+"""`register` with method `auto` on pairs made from known ones: registrations accepted by chance,
+and the effect of other rotations, scales and shifts.
 
     python benchmarks/spectral.py PAIRS.csv [--unrelated 300] [--rounds 3]
 
-Unrelated: A of one pair with the MIRRORED B of any: no registration of them can be right, even
-where two pairs of the list show the same place, and the pictures' statistics are those of the true
-pairs. Variations: each pair's B turned, scaled, shifted and darkened anew; the truth is known.
+Unrelated: image A of one pair with the MIRRORED image B of any pair. No registration of them can be
+right, even if two pairs of the list show the same place, and the images have the statistics of the
+true pairs. Variations: image B of each pair is rotated, scaled, shifted and darkened; the truth is
+known.
 """
 
 import argparse

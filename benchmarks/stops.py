@@ -1,15 +1,15 @@
-"""How many files lie on the way of one photo, and of one upload?
+"""Counts the source files that one photo, and one upload, pass through.
 
-python benchmarks/stops.py            # both, over a small simulated flight
-python benchmarks/stops.py --stops    # and every file with its functions on the way
+python benchmarks/stops.py            # both, with a small simulated flight
+python benchmarks/stops.py --stops    # and every file with its functions
 
-*Photo*: from the folder to the drawn map, on the default road. A function lies on the way if it is
-handed the photo as an argument: the folder or the photo's path, its record, or its pixels; or a
-list of these of all photos, or the survey.
+*Photo*: from the folder to the drawn map, with default options. A function counts if it receives
+the photo as an argument: the folder or the photo's path, its record, its pixels, a list of these
+for all photos, or the survey.
 *Upload*: from the request to its acceptance. Every function that runs for it counts.
 
-Files of ours are counted, by `sys.setprofile`, but for records (`model`) and errors. Files of more
-than 300 lines on either way are named.
+Only files of Skyquilt are counted, by `sys.setprofile`, without records (`model`) and errors. Files
+of more than 300 lines are named.
 """
 
 import argparse

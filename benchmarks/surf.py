@@ -1,11 +1,11 @@
-"""SURF of our own beside OpenCV's detectors: time, repeatability and matching score under known
-warps.
+"""Skyquilt's SURF compared with OpenCV's detectors: time, repeatability and matching score under
+known transformations.
 
     python benchmarks/surf.py [PHOTO ...] [-o FILE]
 
-Without photos a simulated texture is used. Warps are of the photo reduced to 1000 px; the truth is
-the warp itself. OpenCV's own SURF is no reference here: no wheel has it. Where mahotas is
-installed, its SURF is measured too.
+Without photos, a simulated texture is used. A photo is reduced to 1000 px and transformed; the true
+transformation is known. OpenCV's own SURF cannot be compared, since no wheel contains it. If
+mahotas is installed, its SURF is measured too.
 """
 
 import argparse

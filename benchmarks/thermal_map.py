@@ -1,12 +1,12 @@
-"""How far the thermal map lies from where it belongs on the visual map, on a simulated flight.
+"""Error of the thermal map's registration to the visual map, on a simulated flight.
 
     skyquilt simulate FLIGHT --preset thermal [--thermal-season winter --thermal-hour 5]
     skyquilt mosaic FLIGHT/photos --thermal FLIGHT/thermal -o OUT [--thermal-route
-    maps|pairs|heights] python benchmarks/thermal_map.py OUT FLIGHT
+    maps|pairs|heights]
+    python benchmarks/thermal_map.py OUT FLIGHT
 
-Both maps are compared with their own truth, and the difference of the two displacements is the
-error of the join: what the visual map is off by the ground truth, the thermal map should be off by
-too.
+Both maps are compared with their own truth. The difference of the two displacements is the error of
+the registration: where the visual map has an error, the thermal map should have the same one.
 """
 
 import json

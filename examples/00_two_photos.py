@@ -1,4 +1,4 @@
-"""Two photos: what do they have in common?
+"""Match two photos and print how they are linked.
 
 python examples/00_two_photos.py A.jpg B.jpg
 """

@@ -1,4 +1,4 @@
-"""A folder of photos to a map, with the story's events told as they come.
+"""Make a map from a folder of photos, and print the workflow's events as they occur.
 
 python examples/01_folder_to_cog.py PHOTOS OUT [GSD_CM]
 """

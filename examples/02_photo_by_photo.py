@@ -1,6 +1,6 @@
-"""Photo by photo: each new one is linked to its neighbours among those already there.
+"""Photo by photo: each new photo is linked to its neighbours among the earlier ones.
 
-Stages are plain objects: no pipeline is needed to use them one at a time, as photos come in.
+Stages are plain objects. They can be used one at a time, without a workflow, as photos arrive.
 
 python examples/02_photo_by_photo.py PHOTOS
 """

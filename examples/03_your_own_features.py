@@ -1,11 +1,12 @@
-"""Features of your own in the real flow: a detector takes the place of SIFT, all else stays.
+"""Your own features in the whole workflow: another detector replaces SIFT, all else is unchanged.
 
 A method is a frozen dataclass: its fields are its parameters, `version` changes when its results
-change, and both are part of the keys under which a run keeps its artefacts. A detector has
-`longest`, the longest side of the pictures it wants, and `of_shrunken`, which finds `Features`.
+change, and both are part of the keys under which a run stores its artefacts. A detector has
+`longest`, the longest side of the images it works on, and `of_shrunken`, which finds `Features`.
 
-Here it is Harris corners with upright SIFT descriptors. They are blind to photos of the way back,
-which are turned by 180 degrees: it shows in the number of links and of blocks.
+The detector here finds Harris corners and describes them by upright SIFT. These features cannot be
+matched with photos of the opposite flight direction, which are turned by 180 degrees: the numbers
+of links and blocks show it.
 
 python examples/03_your_own_features.py PHOTOS OUT
 """

@@ -1,5 +1,5 @@
-"""How far is a map off? Against the true orthophoto of a simulated flight, or against any better
-map.
+"""Measure the error of a map against the true orthophoto of a simulated flight, or against any more
+accurate map.
 
 python examples/04_map_against_truth.py MOSAIC.tif TRUTH.tif
 """
