@@ -66,7 +66,7 @@ def main() -> None:
         f" {np.__version__}"
     )
     print(
-        f"{'problem':<12}{'sightings':>10} "
+        f"{'problem':<12}{'observations':>12} "
         f" {'solver':<22}{'CPU s':>8}{'min':>8}{'max':>8}{'above the minimum':>20}"
     )
     for name, layout in SIZES.items():
