@@ -297,11 +297,11 @@ def test_the_module_runs_and_a_reader_that_leaves_is_no_error(flight, tmp_path):
 
 @pytest.mark.slow
 def test_a_mistake_of_the_program_is_not_hidden(mosaic, flight, monkeypatch):
-    from skyquilt.workflows import mosaic as story
+    from skyquilt.workflows import mosaic as workflow
 
     def broken(*args, **words):
         raise ZeroDivisionError("by nobody")
 
-    monkeypatch.setattr(story.judging, "figures", broken)
+    monkeypatch.setattr(workflow, "figures", broken)
     with pytest.raises(ZeroDivisionError):
         mosaic(flight / "photos")

@@ -299,12 +299,12 @@ def test_an_output_inside_the_folder_of_photos_is_no_input(mosaic, photos):
 def test_an_unfinished_output_inside_the_folder_of_photos_is_no_input_either(
     mosaic, photos, monkeypatch
 ):
-    from skyquilt.workflows import mosaic as story
+    from skyquilt.workflows import mosaic as workflow
 
     def interrupted(*args, **words):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(story.reporting, "seams", interrupted)
+    monkeypatch.setattr(workflow, "measure_seams", interrupted)
     told = mosaic(photos, output=photos / "map")
     assert told.code == 130
     assert (photos / "map" / "mosaic.tif").is_file()
