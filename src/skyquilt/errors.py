@@ -1,16 +1,14 @@
-"""What a user can mend: every error here states what was found, what was expected and the next
-step.
-"""
+"""Errors that a user can correct. Each states what was found, what was expected, and the next step."""
 
 
 class SkyquiltError(Exception):
-    """Base of all errors that a user can mend; `exit_code` is what the command line ends with."""
+    """Base of all errors that a user can correct; `exit_code` is the exit code of the command."""
 
     exit_code = 1
 
 
 class UsageError(SkyquiltError):
-    """The command's words do not fit together or name something that is not there."""
+    """The options contradict each other, or name something that does not exist."""
 
     exit_code = 2
 
@@ -22,7 +20,7 @@ class NoPhotosError(SkyquiltError):
 
 
 class AlignmentError(SkyquiltError):
-    """The photos cannot be placed by the method asked for."""
+    """The photos cannot be placed by the requested method."""
 
     exit_code = 4
 

@@ -1,4 +1,4 @@
-"""What a mosaic can be asked for, in groups: each stage gets the group that concerns it.
+"""The settings of a mosaic in groups: each stage gets the group that concerns it.
 
 Words are checked here, against the names that are registered; numbers against their limits.
 """
@@ -271,14 +271,14 @@ _ASKED = {
     "lines": ("lines", "heading"),
     "heading": ("heading_deg", None),
 }
-"""Options that belong to some methods only: the setting, and its value where nobody asked."""
+"""Options of some methods only: the setting, and its value if the option is not given."""
 OPTION_OF = {setting: option for option, (setting, _) in _ASKED.items()}
 """Setting -> option (without `--`), of those."""
 
 
 @dataclass(frozen=True, kw_only=True, init=False)
 class MosaicSettings:
-    """Everything a mosaic can be asked for; the defaults are meant to be right."""
+    """All settings of a mosaic; the defaults suit most surveys."""
 
     method: str
     """A registered alignment, or auto."""

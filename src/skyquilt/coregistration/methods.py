@@ -17,7 +17,7 @@ INLIERS = 9
 
 @dataclass(frozen=True, kw_only=True)
 class RegisterSettings:
-    """Everything a registration of two pictures can be asked for."""
+    """All settings of a registration of two pictures."""
 
     method: str = "auto"
     """A registered way of registration."""

@@ -1,4 +1,4 @@
-"""The story of two pictures: read, register, draw, tell.
+"""The workflow of two pictures: read, register, draw, report.
 
 A is the reference; b_H_a takes its pixels to B's. A refusal is a result too: it is written down,
 and raised.
@@ -52,7 +52,7 @@ def iter_register(
 
     Raises:
         RefusedError: there is no registration to be trusted; raised after the `Result`.
-        SkyquiltError: anything else a user can mend.
+        SkyquiltError: anything else a user can correct.
     """
     settings, output = settings or RegisterSettings(), Path(output)
     opened = open_picture(Path(a)), open_picture(Path(b))
@@ -94,12 +94,12 @@ def register(
     """Registers picture B to picture A and returns when the files are written, refused or not.
 
     Raises:
-        SkyquiltError: anything a user can mend, but for a refusal, which the result tells.
+        SkyquiltError: anything a user can correct. A refusal is part of the result.
     """
     for happened in iter_register(a, b, output, settings, overwrite=overwrite):
         if isinstance(happened, Result):
             return happened
-    raise RuntimeError("the story ended without a result")
+    raise RuntimeError("the workflow ended without a result")
 
 
 def outcome_of(a: Source, b: Source, method: str, guess: Guess | None) -> Outcome:

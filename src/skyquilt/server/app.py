@@ -47,8 +47,8 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         WmsEndpoints(context, images),
         PhotoEndpoints(context),
     )
-    layers, news = LayerEndpoints(context), EventEndpoints(context)
-    app.state.ending = news.ending
+    layers, events = LayerEndpoints(context), EventEndpoints(context)
+    app.state.ending = events.ending
 
     get, post = {"methods": ["GET"]}, {"methods": ["POST"]}
     for path, work, options in (
@@ -72,7 +72,7 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         ("/layers", layers.layer_post, post),
         ("/layers/{name}", layers.layer_get, {**get, "response_class": Response}),
         ("/layers/{name}", layers.layer_delete, {"methods": ["DELETE"]}),
-        ("/events", news.events, {**get, "response_class": StreamingResponse}),
+        ("/events", events.events, {**get, "response_class": StreamingResponse}),
         ("/finish", layers.finish, post),
     ):
         app.add_api_route(path, work, **options)
