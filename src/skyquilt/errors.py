@@ -1,5 +1,6 @@
 """Errors that a user can correct: each says what was found, what was expected, and what to do."""
 
+
 class SkyquiltError(Exception):
     """Base of all errors that a user can correct; `exit_code` is the exit code of the command."""
 
