@@ -61,6 +61,7 @@ def test_a_turned_compass_is_learned_from_photos_that_settled(flight, drone, tmp
     live.close()
 
 
+@pytest.mark.slow
 def test_a_restart_forgets_nothing_of_it(drone, tmp_path):
     def learned(live):
         metadata = live.refinement.local_pose.metadata

@@ -266,6 +266,7 @@ def test_a_full_disk_is_told_and_the_upload_goes_on(site, client, flight, monkey
     assert told.headers["photo-state"] == "received"
 
 
+@pytest.mark.slow
 def test_uploads_that_nobody_goes_on_with_expire_while_the_server_runs(tmp_path):
     with served(tmp_path / "out", QUICK, guard=Guard(upload_keep_s=2.0)) as site:
         client = Client(site.web)

@@ -104,6 +104,7 @@ def test_settings_that_were_refused_can_be_corrected(flight, tmp_path):
     compared(flight / "photos", tmp_path / "out", ("bundle: links", 1))
 
 
+@pytest.mark.slow
 def test_killed_between_methods_the_same_command_goes_on(flight, tmp_path, undisturbed):
     out = tmp_path / "out"
     words = [

@@ -58,16 +58,16 @@ def test_upright_features_link_photos_of_one_heading_only(flight, tmp_path, dete
     assert max(made.metrics["blocks"]) >= 3
 
 
-@pytest.mark.parametrize("matcher", ["guided", pytest.param("one-way", marks=SLOW)])
+@pytest.mark.slow
+@pytest.mark.parametrize("matcher", ["guided", "one-way"])
 def test_bundle_by_every_matcher(flight, tmp_path, matcher):
     made = placed(flight, tmp_path, matcher=matcher)
     assert made.metrics["blocks"] == [9]
     assert 0.005 < off_m(flight, tmp_path / "out") < 0.3  # four map pixels of the photos
 
 
-@pytest.mark.parametrize(
-    "estimator", ["lmeds", *(pytest.param(e, marks=SLOW) for e in ("ransac", "magsac"))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("estimator", ["ransac", "lmeds", "magsac"])
 def test_bundle_by_every_estimator(flight, tmp_path, estimator):
     made = placed(flight, tmp_path, estimator=estimator)
     assert made.metrics["blocks"] == [9]

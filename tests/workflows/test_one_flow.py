@@ -34,6 +34,7 @@ def test_the_scene_of_a_finished_map_is_found_not_made(flight, tmp_path, monkeyp
     assert np.array_equal(again.scene().ground.surface.z, scene.ground.surface.z)
 
 
+@pytest.mark.slow
 def test_both_surveys_of_a_thermal_map_are_read_once(flight, tmp_path, monkeypatch):
     read, folders = survey_input.read_survey, []
 
