@@ -329,6 +329,7 @@ def test_fixed_intrinsics_stay_and_free_ones_move():
     ] != block.start.K[0, 0]
 
 
+@pytest.mark.slow
 def test_surveyed_points_hold_the_block():
     """Four points known to a centimetre take out the GPS's common error."""
     before, after = [], []

@@ -40,6 +40,7 @@ def off(outcome):
     return error(outcome.b_H_a, TRUTH, SHAPE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "sky"), [(0, (0.25, 0.32, 0.45)), (5, (0.2, 0.2, 0.2)), (7, (0.5, 0.7, 1.0))]
 )

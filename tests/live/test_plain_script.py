@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 SCRIPT = """
 import sys
 from pathlib import Path
@@ -24,6 +26,7 @@ live.close()
 """
 
 
+@pytest.mark.slow
 def test_a_plain_script_runs_once_and_its_blocks_are_adjusted_in_the_background(flight, tmp_path):
     (tmp_path / "plain.py").write_text(SCRIPT)
     command = [sys.executable, str(tmp_path / "plain.py"), *map(str, flight.photos[:4])]

@@ -57,6 +57,7 @@ def undisturbed(flight, tmp_path_factory):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stage", "time", "not_again"),
     [

@@ -66,6 +66,7 @@ def test_known_motions(method, parameters, within):
     assert 0.2 < found.overlap <= 1 and found.b_H_a[2, 2] == 1
 
 
+@pytest.mark.slow
 def test_a_start_brings_the_refinements_near():
     (a, b), H = pair(150.3, -60.2, 1.2, 0.1, seed=2)
     near = H @ motion(np.array([3.0, -2.0, 0.01, 0.005]), SIZE)

@@ -40,6 +40,7 @@ def in_frame(scene, origin):
     return replace(scene, aligned=replace(scene.aligned, alignment=moved))
 
 
+@pytest.mark.slow
 def test_a_misplaced_block_is_brought_back(scene, other):
     asked = overlapping(scene, other)
     assert 5 <= len(asked) <= 9
