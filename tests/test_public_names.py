@@ -33,7 +33,17 @@ def test_importing_the_package_imports_nothing_heavy():
     assert out.stdout.strip() == ""
 
 
-def test_the_story_of_a_small_survey_waits_for_nothing_it_does_not_need():
+def test_the_commands_are_listed_without_loading_numpy():
+    """`skyquilt --help` and `--version` answer at once: each command imports its work when run."""
+    code = (
+        "import sys, skyquilt.cli.app;"
+        " print(*(m for m in ('numpy', 'cv2', 'rich.table', 'pydantic') if m in sys.modules))"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == ""
+
+
+def test_a_small_survey_waits_for_nothing_it_does_not_need():
     """SciPy alone takes a third of a second to load: large surveys ask for it, small ones do not
     wait for it.
     """

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
-from skyquilt.model.photo import GeoPosition, Photo, Survey
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from skyquilt.model.photo import GeoPosition, Photo, Survey
 
 _SHUTTERS = {True: "rolling (not modelled)", False: "global or mechanical", None: "unknown"}
 _DATUMS = {
@@ -21,8 +23,10 @@ _DATUMS = {
 }
 
 
-def camera_table(survey: Survey) -> Table:
+def camera_table(survey: "Survey") -> "Table":
     """One row per camera."""
+    from rich.table import Table
+
     table = Table("camera", "photos", "size", "type", "focal length", "shutter", title="Cameras")
     for key in dict.fromkeys(p.camera_key for p in survey.photos):
         group = [p for p in survey.photos if p.camera_key == key]
@@ -39,10 +43,12 @@ def camera_table(survey: Survey) -> Table:
     return table
 
 
-def photo_table(survey: Survey) -> Table:
+def photo_table(survey: "Survey") -> "Table":
     """One row per photo, in order of capture; notes common to all photos are listed below the table
     instead.
     """
+    from rich.table import Table
+
     table = Table(title="Photos, in order of capture")
     for heading in ("photo", "time", "focal px", "latitude, longitude"):
         table.add_column(heading, no_wrap=True)
@@ -56,13 +62,13 @@ def photo_table(survey: Survey) -> Table:
     return table
 
 
-def shared_notes(survey: Survey) -> tuple[str, ...]:
+def shared_notes(survey: "Survey") -> tuple[str, ...]:
     """Notes that all photos have."""
     first = survey.photos[0].notes
     return tuple(n for n in first if all(n in p.notes for p in survey.photos))
 
 
-def sentences(survey: Survey, findings: tuple[str, ...]) -> Iterator[str]:
+def sentences(survey: "Survey", findings: tuple[str, ...]) -> Iterator[str]:
     """What is missing or contradictory, what was left out and why."""
     yield from (f"All photos: {note}" for note in shared_notes(survey) if len(survey.photos) > 1)
     yield from survey.notes
@@ -75,7 +81,7 @@ def sentences(survey: Survey, findings: tuple[str, ...]) -> Iterator[str]:
     yield f"{len(survey.photos)} photos, {placed} with a position, {turned} with camera angles."
 
 
-def _cells(photo: Photo) -> tuple[str, ...]:
+def _cells(photo: "Photo") -> tuple[str, ...]:
     attitude, yaw = photo.attitude, photo.flight_yaw_deg
     angles = (
         f"{attitude.yaw_deg:.1f} / {attitude.pitch_deg:.1f} / {attitude.roll_deg:.1f}"
@@ -94,22 +100,18 @@ def _cells(photo: Photo) -> tuple[str, ...]:
     )
 
 
-def _focal(photo: Photo) -> str:
+def _focal(photo: "Photo") -> str:
     return f"{photo.focal.px:.0f} +- {photo.focal.sigma_px:.0f} ({photo.focal.source})"
 
 
-def _place(position: GeoPosition | None) -> str:
+def _place(position: "GeoPosition | None") -> str:
     return f"{position.latitude_deg:.6f}, {position.longitude_deg:.6f}" if position else "-"
 
 
-def _height(position: GeoPosition | None) -> str:
+def _height(position: "GeoPosition | None") -> str:
     if position is None or position.altitude_m is None:
         return "-"
     return f"{position.altitude_m:.1f} ({_DATUMS[position.datum]})"
-
-
-if TYPE_CHECKING:
-    from skyquilt.model.photo import Survey
 
 
 def command(
