@@ -53,42 +53,27 @@ class Sweep:
         height = float(np.median([v.pose.map_C[2] for v in views]) - np.median(surface.z))
         if len(views) < 2 or height <= 0:
             return surface
-        for number, side in enumerate(self.sides):
-            gsd = (
-                float(
-                    np.median(
-                        [
-                            height / v.camera.focal * max(v.camera.width, v.camera.height)
-                            for v in views
-                        ]
-                    )
-                )
-                / side
+        # length in m that the longest side of an image covers on the ground
+        extent = float(
+            np.median(
+                [height / v.camera.focal * max(v.camera.width, v.camera.height) for v in views]
             )
-            low, high = (-self.below * height, self.above * height) if number == 0 else (-3.0, 3.0)
-            surface = self._pass(
-                surface, views, grid, grey, side, gsd, height, (low, high), relative=number > 0
-            )
-        return surface
-
-    def _pass(
-        self,
-        surface: Surface,
-        views: Sequence[View],
-        grid: Grid,
-        grey: GreyPicture,
-        side: int,
-        gsd: float,
-        height: float,
-        span: tuple[float, float],
-        *,
-        relative: bool,
-    ) -> Surface:
-        """One pass; `span` in m, or in steps of about one pixel of disparity when `relative`."""
-        work, z, trust = self.searched(
-            surface, views, grid, grey, side, gsd, height, span, relative=relative
         )
-        return self._fused(surface, work, z, trust)
+        for number, side in enumerate(self.sides):
+            low, high = (-self.below * height, self.above * height) if number == 0 else (-3.0, 3.0)
+            work, z, trust = self.searched(
+                surface,
+                views,
+                grid,
+                grey,
+                side,
+                extent / side,
+                height,
+                (low, high),
+                relative=number > 0,
+            )
+            surface = self._fused(surface, work, z, trust)
+        return surface
 
     def searched(
         self,
@@ -105,7 +90,8 @@ class Sweep:
     ) -> tuple[Grid, Float, Float]:
         """A grid of cells of gsd m, the heights on it (h, w) in m, and the correlation of the two
         images there (h, w), 0 where they do not agree. Images have `side` px on their longest side,
-        cameras are `height` m above ground; `span` as in a pass.
+        cameras are `height` m above ground; `span` in m, or in steps of about one pixel of
+        disparity when `relative`.
         """
         w, s, e, n = grid.bounds
         work = Grid(
