@@ -149,6 +149,8 @@ class PictureSettings:
     """One of `BLENDS`; auto = feather, and average for method `flightline`, whose blend it is."""
     feather_px: float = 6.0
     """Width of feathered seams in map pixels."""
+    max_view_angle: float = 70.0
+    """Largest angle from the vertical in degrees at which a photo is shown."""
     balance: bool = True
     """Bring photos to one brightness: 8-bit pictures; for measured values see `balance_thermal`."""
     balance_thermal: bool | None = None
@@ -160,6 +162,7 @@ class PictureSettings:
         one_of("--blend", self.blend, ("auto", *BLENDS))
         within("--gsd", self.gsd_cm, 0.05, 10000)
         within("--feather", self.feather_px, 0, 10000)
+        within("--max-view-angle", self.max_view_angle, 0, 90)
         b = self.bounds
         if b and not (all(isfinite(v) for v in b) and b[0] < b[2] and b[1] < b[3]):
             raise UsageError(

@@ -137,6 +137,9 @@ def command(
         str, option(PICTURE, "Where photos meet: auto, feather, first, average, multiband.")
     ] = "auto",
     feather: Annotated[float, option(PICTURE, "Width of feathered seams in map pixels.")] = 6.0,
+    max_view_angle: Annotated[
+        float, option(PICTURE, "Largest angle from the vertical, in degrees, that photos show.")
+    ] = 70.0,
     balance: Annotated[
         bool, option(PICTURE, "Bring photos to one brightness.", "--balance/--no-balance")
     ] = True,
@@ -256,6 +259,7 @@ def command(
         boundary=boundary,
         blend=blend,
         feather_px=feather,
+        max_view_angle=max_view_angle,
         balance=balance,
         balance_thermal=balance_thermal,
         thermal_unit=thermal_unit,
