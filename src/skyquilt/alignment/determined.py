@@ -8,14 +8,23 @@ from numpy.typing import NDArray
 
 from skyquilt.geometry.camera import project_with_derivatives, rays
 from skyquilt.model.camera import Camera
-from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Pose, Prior, TiePoints
 
 Array = NDArray[np.float64]
 FEWEST = 8
 """Fewest tie points of a photo in the map."""
-LOOSEST = 0.02
-"""Largest deviation of a photo's picture on the ground, as a share of its longer side."""
+LOOSEST = 0.007
+"""Largest deviation of a photo's picture on the ground, as a share of its longer side, where tie
+points alone determine it.
+"""
+LOOSEST_TOLD = 0.02
+"""The same where its position and its heading are reported: that of a usual drone's metadata."""
+LEAST_COVERED = 0.04
+"""Least share of the picture that such tie points cover; smaller groups of wrong matches agree by
+chance.
+"""
+AGAIN = 1.2
+"""A photo is looked at again when it has this many times as many points as before."""
 INDEPENDENT = 40
 """Independent observations that tell as much as a photo's many correlated ones."""
 GRID = np.stack(np.meshgrid(*2 * [np.linspace(0.02, 0.98, 5)]), -1).reshape(-1, 2)
@@ -24,46 +33,95 @@ STEEPEST = np.tan(np.radians(70.0))
 """Places seen flatter than this are left out: they are not shown."""
 
 
-def weak_photos(
-    alignment: Alignment, photos: Sequence[Photo], priors: Sequence[Prior]
-) -> dict[int, str]:
+def weak_photos(alignment: Alignment, priors: Sequence[Prior]) -> dict[int, str]:
     """Connected photos whose pose is not determined by tie points and metadata together, with
     reasons that give the figures.
+
+    Each block grows photo by photo from the two with most tie points in common: a photo joins by
+    the points that photos of the block show already. So photos that are linked with each other, but
+    as a group with few others, do not support each other.
     """
-    ties = alignment.ties
-    order = np.argsort(ties.photo, kind="stable")
-    held = alignment.held
-    cuts = np.searchsorted(ties.photo[order], [*held, len(photos)])
-    found = {}
-    for i, first in zip(held, cuts, strict=False):
-        last = np.searchsorted(ties.photo[order], i, "right")
-        own = order[first:last]
-        why = why_weak(
-            alignment.poses[i],
-            alignment.camera(i),
+    found: dict[int, str] = {}
+    for block in alignment.blocks:
+        if len(block) > 1:
+            found |= _Growth(alignment, block, priors).left_out()
+    return found
+
+
+class _Growth:
+    """The growth of one block."""
+
+    def __init__(self, alignment: Alignment, block: Sequence[int], priors: Sequence[Prior]) -> None:
+        self.alignment, self.priors = alignment, priors
+        ties = alignment.ties
+        order = np.argsort(ties.photo, kind="stable")
+        cuts = np.searchsorted(ties.photo[order], [[i, i + 1] for i in block])
+        self.own = {i: order[a:b] for i, (a, b) in zip(block, cuts.tolist(), strict=True)}
+        self.first = np.searchsorted(ties.point, np.arange(len(ties.xyz) + 1))
+        self.shown = np.zeros(len(ties.xyz), np.bool_)
+        self.number = np.zeros(max(block) + 1, np.int64)
+
+    def left_out(self) -> dict[int, str]:
+        """The photos that never joined, with reasons."""
+        start = max(self.own, key=lambda i: len(self.own[i]))
+        left, reasons = set(self.own) - {start}, dict[int, str]()
+        self._join(start)
+        tried = np.zeros(len(self.number), np.int64)
+        while left:
+            ready = [i for i in left if self.number[i] > AGAIN * tried[i]]
+            if not ready:
+                break
+            photo = max(ready, key=lambda i: (self.number[i], -i))
+            tried[photo] = self.number[photo]
+            why = self._why_weak(photo)
+            if why and len(left) < len(self.own) - 1:
+                reasons[photo] = why
+                continue
+            reasons.pop(photo, None)
+            left.remove(photo)
+            self._join(photo)
+        return {i: reasons.get(i, self._why_weak(i)) for i in sorted(left)}
+
+    def _join(self, photo: int) -> None:
+        points = self.alignment.ties.point[self.own[photo]]
+        new = np.unique(points[~self.shown[points]])
+        self.shown[new] = True
+        for a, b in zip(self.first[new].tolist(), self.first[new + 1].tolist(), strict=True):
+            np.add.at(self.number, self.alignment.ties.photo[a:b], 1)
+
+    def _why_weak(self, photo: int) -> str:
+        ties, own = self.alignment.ties, self.own[photo]
+        own = own[self.shown[ties.point[own]]]
+        return why_weak(
+            self.alignment.poses[photo],
+            self.alignment.camera(photo),
             ties.xyz[ties.point[own]],
             ties.px[own],
             ties.residual_px[own],
-            priors[i],
+            self.priors[photo],
         )
-        if why:
-            found[i] = why
-    return found
 
 
 def why_weak(
     pose: Pose, camera: Camera, xyz: Array, px: Array, residual_px: Array, prior: Prior | None
 ) -> str:
-    """Why tie points (n, 3) observed at px (n, 2) do not determine a pose; empty if they do."""
+    """Why tie points (n, 3) observed at px (n, 2) do not determine a pose, alone or with metadata;
+    empty if they do.
+    """
     if len(px) < FEWEST:
         return f"it has only {len(px)} tie points"
-    deviation = deviation_px(pose, camera, xyz, residual_px, prior)
-    limit = LOOSEST * max(camera.width, camera.height)
-    if deviation <= limit:
+    wide, share = max(camera.width, camera.height), covered(px, camera)
+    alone = deviation_px(pose, camera, xyz, residual_px, None)
+    if alone <= LOOSEST * wide and share >= LEAST_COVERED:
         return ""
+    if prior is not None and np.isfinite([*prior.map_C[:2], prior.yaw_deg]).all():
+        told = deviation_px(pose, camera, xyz, residual_px, prior)
+        if told <= LOOSEST_TOLD * wide:
+            return ""
     return (
-        f"its {len(px)} tie points cover {covered(px, camera):.0%} of its picture and leave its"
-        f" place uncertain by {deviation:.0f} px (at most {limit:.0f} px are allowed)"
+        f"it hangs on the other photos by too little: {len(px)} tie points in common cover"
+        f" {share:.1%} of its picture ({LEAST_COVERED:.0%} are needed) and leave its place uncertain"
+        f" by {alone:.1f} px (at most {LOOSEST * wide:.1f})"
     )
 
 

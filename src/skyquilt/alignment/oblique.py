@@ -65,7 +65,7 @@ def found_oblique(alignment: Alignment, priors: Sequence[Prior]) -> frozenset[in
     """
     linked = [*alignment.held, *alignment.rejected]
     found = {i for i in alignment.held if tilt_deg(alignment.poses[i].cam_R_map) > OBLIQUE_DEG}
-    found |= set(alignment.rejected)
+    found |= alignment.rejected.keys() | weak_photos(alignment, priors).keys()
     guessed = {i for i in found if priors[i].sigma_tilt_deg > STATED_DEG}
     return frozenset(guessed if len(guessed) <= MOST_OBLIQUE * len(linked) else ())
 
@@ -81,7 +81,7 @@ def hung(
     """The alignment with the photos kept aside placed by its tie points, the best linked first, and
     without those that hang on it by too little.
     """
-    weak = weak_photos(alignment, photos, priors)
+    weak = weak_photos(alignment, priors)
     alignment = _without(alignment, weak)
     left = set(aside)
     while left:
@@ -142,8 +142,10 @@ def _placed(
     xyz = alignment.ties.xyz[point]
     pose, good = resected(camera, xyz, px, AGREE_PX * scale)
     if pose is None:
-        what = f"{int(good.sum())} of {len(px)} tie points agree on its place"
-        why = f"it is oblique, and only {what} ({FEWEST} are needed)"
+        why = (
+            f"it hangs on the other photos by too little: {int(good.sum())} of {len(px)} tie points"
+            f" agree on its place ({FEWEST} are needed)"
+        )
         return replace(alignment, rejected=alignment.rejected | {photo: why})
     error = project(camera, pose.to_camera(xyz)) - px
     why = why_weak(pose, camera, xyz[good], px[good], error[good], None)
