@@ -21,6 +21,7 @@ BLENDS = ("feather", "first", "average", "multiband")
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
 THERMAL_UNITS = ("auto", "celsius", "kelvin", "decikelvin", "centikelvin", "counts")
+VERTICAL_DATUMS = ("ellipsoid", "egm96", "takeoff")
 DISTORTIONS = ("none", "2", "4", "6", "6t")
 
 
@@ -63,12 +64,18 @@ class InputSettings:
     """One of `THERMAL_UNITS`: what values of single-band TIFFs mean; None = found from the file, as
     is whether they are thermal.
     """
+    lever_arm: tuple[float, float, float] | None = None
+    """From the antenna, to which reported positions refer, to the camera: right, forward, up in m
+    in the aircraft's body; None = positions are those of the camera.
+    """
     repair: bool = True
     """Treat metadata as measurements that may be wrong."""
 
     def __post_init__(self) -> None:
         if self.thermal_unit is not None:
             one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
+        for value in self.lever_arm or ():
+            within("--lever-arm", value, -20, 20)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,6 +148,8 @@ class PictureSettings:
     """Ground size of a map pixel in cm; None = the photos' own."""
     crs: str | None = None
     """Output CRS as PROJ knows it; None = the local UTM zone."""
+    vertical_datum: str | None = None
+    """One of `VERTICAL_DATUMS`: zero of the map's heights; None = what most photos state."""
     bounds: tuple[float, float, float, float] | None = None
     """West, south, east, north in the output CRS."""
     boundary: Path | None = None
@@ -160,6 +169,8 @@ class PictureSettings:
 
     def __post_init__(self) -> None:
         one_of("--blend", self.blend, ("auto", *BLENDS))
+        if self.vertical_datum is not None:
+            one_of("--vertical-datum", self.vertical_datum, VERTICAL_DATUMS)
         within("--gsd", self.gsd_cm, 0.05, 10000)
         within("--feather", self.feather_px, 0, 10000)
         within("--max-view-angle", self.max_view_angle, 0, 90)
@@ -273,6 +284,7 @@ _ASKED = {
     "optimiser": ("optimiser", "surfaces"),
     "lines": ("lines", "heading"),
     "heading": ("heading_deg", None),
+    "vertical-datum": ("vertical_datum", None),
 }
 """Options of some methods only: the setting, and its value if the option is not given."""
 OPTION_OF = {setting: option for option, (setting, _) in _ASKED.items()}

@@ -120,8 +120,8 @@ def why_weak(
             return ""
     return (
         f"it hangs on the other photos by too little: {len(px)} tie points in common cover"
-        f" {share:.1%} of its picture ({LEAST_COVERED:.0%} are needed) and leave its place uncertain"
-        f" by {alone:.1f} px (at most {LOOSEST * wide:.1f})"
+        f" {share:.1%} of its picture ({LEAST_COVERED:.0%} are needed) and leave its place"
+        f" uncertain by {alone:.1f} px (at most {LOOSEST * wide:.1f})"
     )
 
 

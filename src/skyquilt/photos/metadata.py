@@ -196,6 +196,12 @@ def read_flight_yaw(xmp: Xmp) -> float | None:
     return xmp.number("FlightYawDegree", "DroneYawDegree")
 
 
+def read_flight_tilt(xmp: Xmp) -> tuple[float, float]:
+    """Pitch and roll of the aircraft in degrees; 0 where they are absent."""
+    pitch, roll = (xmp.number(f"Flight{axis}Degree") for axis in ("Pitch", "Roll"))
+    return pitch or 0.0, roll or 0.0
+
+
 def _from_gimbal(
     yaw: float, pitch: float | None, roll: float | None, source: str
 ) -> tuple[Attitude, tuple[str, ...]]:
