@@ -11,7 +11,7 @@ from skyquilt.alignment.adjust import adjust, covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
 from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
-from skyquilt.alignment.oblique import STATED_DEG, found_oblique, hung, reported_oblique
+from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
 from skyquilt.alignment.start import Start, find_start
@@ -105,14 +105,8 @@ class Bundle:
             problem, state = _believe_positions_less(problem, state, setup)
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
         done = _outcome(photos, frame, setup, start, used, problem, state, reports)
-        if setup.georeferenced or any(not c.check for c in reports) or _angles_reported(priors):
-            return done
-        return levelled(done)
-
-
-def _angles_reported(priors: Sequence[Prior]) -> bool:
-    """Whether any photo reports its tilt."""
-    return any(p.sigma_tilt_deg <= STATED_DEG for p in priors)
+        held = setup.georeferenced or any(not c.check for c in reports)
+        return done if held or tilts_reported(priors) else levelled(done)
 
 
 def _sharpened(

@@ -37,19 +37,33 @@ def weak_photos(alignment: Alignment, priors: Sequence[Prior]) -> dict[int, str]
     """Connected photos whose pose is not determined by tie points and metadata together, with
     reasons that give the figures.
 
-    Each block grows photo by photo from the two with most tie points in common: a photo joins by
-    the points that photos of the block show already. So photos that are linked with each other, but
-    as a group with few others, do not support each other.
+    Each block grows photo by photo from the one with most tie points: a photo joins by the points
+    that photos of the block show already. So photos that are linked with each other, but as a group
+    with few others, do not support each other: the largest group is the block.
     """
     found: dict[int, str] = {}
     for block in alignment.blocks:
         if len(block) > 1:
-            found |= _Growth(alignment, block, priors).left_out()
+            found |= _left_out(alignment, block, priors)
     return found
 
 
+def _left_out(
+    alignment: Alignment, block: Sequence[int], priors: Sequence[Prior]
+) -> dict[int, str]:
+    """The photos outside the largest group of a block, with reasons."""
+    whole = _Growth(alignment, block, priors)
+    groups, rest = list[set[int]](), set(block)
+    while rest:
+        groups.append(rest - whole.grown(rest).keys())
+        rest -= groups[-1]
+        if len(rest) <= max(map(len, groups)):
+            break
+    return whole.grown(set(block), max(groups, key=len))
+
+
 class _Growth:
-    """The growth of one block."""
+    """The growth of groups in one block."""
 
     def __init__(self, alignment: Alignment, block: Sequence[int], priors: Sequence[Prior]) -> None:
         self.alignment, self.priors = alignment, priors
@@ -58,36 +72,37 @@ class _Growth:
         cuts = np.searchsorted(ties.photo[order], [[i, i + 1] for i in block])
         self.own = {i: order[a:b] for i, (a, b) in zip(block, cuts.tolist(), strict=True)}
         self.first = np.searchsorted(ties.point, np.arange(len(ties.xyz) + 1))
-        self.shown = np.zeros(len(ties.xyz), np.bool_)
-        self.number = np.zeros(max(block) + 1, np.int64)
+        self.last = max(block)
 
-    def left_out(self) -> dict[int, str]:
-        """The photos that never joined, with reasons."""
-        start = max(self.own, key=lambda i: len(self.own[i]))
-        left, reasons = set(self.own) - {start}, dict[int, str]()
+    def grown(self, photos: set[int], among: set[int] | None = None) -> dict[int, str]:
+        """Those of these photos that never join a group, with reasons; it starts with the photo
+        that has most tie points, of those `among` which it shall.
+        """
+        ties = self.alignment.ties
+        self.shown = np.zeros(len(ties.xyz), np.bool_)
+        self.number = np.zeros(max(self.last, int(ties.photo.max(initial=0))) + 1, np.int64)
+        start = max(sorted(among or photos), key=lambda i: len(self.own[i]))
+        left, reasons = photos - {start}, dict[int, str]()
         self._join(start)
         tried = np.zeros(len(self.number), np.int64)
-        while left:
-            ready = [i for i in left if self.number[i] > AGAIN * tried[i]]
-            if not ready:
-                break
+        while ready := [i for i in left if self.number[i] > AGAIN * tried[i]]:
             photo = max(ready, key=lambda i: (self.number[i], -i))
             tried[photo] = self.number[photo]
             why = self._why_weak(photo)
-            if why and len(left) < len(self.own) - 1:
+            if why:
                 reasons[photo] = why
                 continue
             reasons.pop(photo, None)
             left.remove(photo)
             self._join(photo)
-        return {i: reasons.get(i, self._why_weak(i)) for i in sorted(left)}
+        return {i: reasons.get(i) or self._why_weak(i) for i in sorted(left)}
 
     def _join(self, photo: int) -> None:
         points = self.alignment.ties.point[self.own[photo]]
         new = np.unique(points[~self.shown[points]])
         self.shown[new] = True
         for a, b in zip(self.first[new].tolist(), self.first[new + 1].tolist(), strict=True):
-            np.add.at(self.number, self.alignment.ties.photo[a:b], 1)
+            self.number[self.alignment.ties.photo[a:b]] += 1
 
     def _why_weak(self, photo: int) -> str:
         ties, own = self.alignment.ties, self.own[photo]

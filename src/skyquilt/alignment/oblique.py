@@ -59,6 +59,11 @@ def tilted(prior: Prior) -> bool:
     return prior.sigma_tilt_deg <= STATED_DEG and tilt_deg(R) > OBLIQUE_DEG
 
 
+def tilts_reported(priors: Sequence[Prior]) -> bool:
+    """Whether any photo reports its tilt."""
+    return any(p.sigma_tilt_deg <= STATED_DEG for p in priors)
+
+
 def found_oblique(alignment: Alignment, priors: Sequence[Prior]) -> frozenset[int]:
     """Photos without reported tilt that the adjustment turned far from the vertical, and those that
     it could not hold; none if most are.
