@@ -152,7 +152,7 @@ def deviation_px(
     """Predicted standard deviation in px of the picture on the ground, at the worst place shown,
     from the covariance of the pose with all points held.
     """
-    spread = max(0.5, 1.48 * float(np.median(np.linalg.norm(residual_px, axis=1))) / 1.18)
+    spread = max(0.5, float(np.median(np.linalg.norm(residual_px, axis=1))) / 1.18)
     weight = min(1.0, INDEPENDENT / len(xyz)) / spread**2
     J = pose_derivatives(pose, camera, xyz)
     normal = weight * np.einsum("nki,nkj->ij", J, J)
