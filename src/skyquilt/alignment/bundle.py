@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import DENSE_LIMIT, adjust, covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
-from skyquilt.alignment.deviations import believed, observed_noise, robust_scale
+from skyquilt.alignment.deviations import believed, observed_noise, point_deviations, robust_scale
 from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
@@ -21,7 +21,7 @@ from skyquilt.alignment.triangulate import polish, triangulated
 from skyquilt.errors import AlignmentError
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
+from skyquilt.model.poses import Accuracy, Alignment, MapFrame, Prior, TiePoints
 
 Array = NDArray[np.float64]
 
@@ -30,6 +30,10 @@ ROLLS_PX = 0.3
 """Cameras that move by more than this in px of the photo while a photo is read out turn, too."""
 TURN_RAD_S = np.radians(1.5)
 """Deviation of the rates at which they turn, in rad/s; it makes up for errors of velocities too."""
+SAMPLED = 400
+"""Ground points whose accuracy is predicted, about."""
+UNDETERMINED = 0.7
+"""A focal length whose deviation stays above this share of its prior's is not determined."""
 DOUBTED = 2.5
 """Positions that a block misses by more than this many deviations are not what they claim."""
 
@@ -52,7 +56,7 @@ class Bundle:
     """
     match_observations: LeastSquaresMatching | None = field(default_factory=LeastSquaresMatching)
     """Refinement of observations in larger images; None leaves keypoints unchanged."""
-    version: ClassVar[int] = 14
+    version: ClassVar[int] = 15
 
     def __call__(
         self,
@@ -337,6 +341,53 @@ def _outcome(
         blocks=tuple(b for b in blocks if b),
         ties=ties,
         rejected=weak,
-        control=residuals_of_control(control, frame, setup, problem, state),
+        control=residuals_of_control(control, frame, setup, problem, state, full),
+        accuracy=None if full is None else _accuracy(setup, problem, state, full),
+        notes=_undetermined(setup, problem, state, full),
         loo_rms_m=leave_one_out(problem, state, full) if setup.georeferenced else None,
     )
+
+
+def _accuracy(setup: Setup, problem: Problem, state: State, covariance: Array) -> Accuracy:
+    """Predicted deviations of a sample of ground points."""
+    seen = np.flatnonzero(np.bincount(problem.point, minlength=len(state.X)) >= 2)
+    sample = seen[:: max(1, len(seen) // SAMPLED)]
+    tied = bool(np.isfinite(problem.X0).any())
+    stated = np.median(setup.stated_sigma_C, axis=0)
+    return Accuracy(
+        xyz=state.X[sample],
+        sigma_m=point_deviations(problem, state, covariance, sample),
+        shared_m=(0.0, 0.0) if tied else (float(stated[0]), float(stated[2])),
+        focal_share=_focal_share(problem, covariance),
+        design_effect=problem.design_effect,
+    )
+
+
+def _focal_share(problem: Problem, covariance: Array) -> float:
+    """Largest ratio of a focal length's deviation after the adjustment to that before."""
+    m = len(problem.K0)
+    at = len(covariance) - CAMERA * m + CAMERA * np.arange(m)
+    after = np.sqrt(np.abs(covariance[at, at]))
+    return float(np.max(np.where(problem.free[:, 0], after / problem.sigma_K[:, 0], 0.0)))
+
+
+def _undetermined(
+    setup: Setup, problem: Problem, state: State, covariance: Array | None
+) -> tuple[str, ...]:
+    """Sentences about what the flight does not determine."""
+    if covariance is None:
+        return ()
+    notes = []
+    m, height = len(problem.K0), float(np.median(_heights(state)))
+    for row, key in enumerate(setup.camera_keys):
+        at = len(covariance) - CAMERA * m + CAMERA * row
+        share = float(np.sqrt(abs(covariance[at, at])) / state.K[row, 0])
+        told = float(problem.sigma_K[row, 0] / state.K[row, 0])
+        if problem.free[row, 0] and share > UNDETERMINED * told and share * height > 0.01:
+            notes.append(
+                f"This flight does not determine the focal length of {key}: it stays as uncertain"
+                f" as its metadata ({100 * share:.1f} %), and heights of the ground with it"
+                f" ({share * height:.2g} m, one standard deviation); control points, oblique photos"
+                " or lines at two heights would."
+            )
+    return tuple(notes)

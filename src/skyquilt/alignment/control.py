@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from skyquilt.alignment.adjust import adjust
+from skyquilt.alignment.deviations import point_deviations
 from skyquilt.alignment.heights import control_height
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import Setup
@@ -218,7 +219,12 @@ def _with_points(
 
 
 def residuals_of_control(
-    control: Sequence[Control], frame: MapFrame, setup: Setup, problem: Problem, state: State
+    control: Sequence[Control],
+    frame: MapFrame,
+    setup: Setup,
+    problem: Problem,
+    state: State,
+    covariance: Array | None = None,
 ) -> tuple[ControlResidual, ...]:
     """Errors of all control and check points at the solution, intersected from the final poses
     alone.
@@ -226,6 +232,13 @@ def residuals_of_control(
     if not control or frame.crs is None:
         return ()
     X, rms = intersected(control, setup, problem, state)
+    sigma = np.full(X.shape, np.nan)
+    if covariance is not None:
+        own, solved = _alone(control, setup, problem, state)
+        own = replace(own, sigma_px=np.full(len(own.px), MARKED_PX))
+        seen = np.flatnonzero(np.bincount(own.point, minlength=len(X)) >= 2)
+        sigma[seen] = point_deviations(own, solved, covariance, seen)
+        sigma = np.hypot(sigma, [[c.sigma_m] for c in control])
     return tuple(
         ControlResidual(
             name=c.name,
@@ -233,6 +246,7 @@ def residuals_of_control(
             error_m=x - c.xyz,
             reprojection_px=float(r),
             observations=len(_placed(c, setup)[0]),
+            sigma_m=None if not c.check or np.isnan(s).any() else s,
         )
-        for c, x, r in zip(control, X, rms, strict=True)
+        for c, x, r, s in zip(control, X, rms, sigma, strict=True)
     )

@@ -123,8 +123,24 @@ def command(
         option(
             CAMERA,
             "Lens terms to calibrate, or, for methods that do not, to keep of a known calibration:"
-            " none, 2, 4, 6 (radial order), 6t (and tangential).",
-            default="4 to calibrate, 6t to keep",
+            " none, 2, 4, 6 (radial order), 6t (and tangential), full (and the aspect ratio).",
+            default="full to calibrate, 6t to keep",
+        ),
+    ] = None,
+    shutter: Annotated[
+        str | None,
+        option(
+            CAMERA,
+            "How photos are exposed: global (all rows at once) or rolling (one after the other).",
+            default="as metadata and the table of cameras say",
+        ),
+    ] = None,
+    shutter_readout: Annotated[
+        float | None,
+        option(
+            CAMERA,
+            "Time in ms in which a rolling shutter reads a photo out.",
+            default="as the table says",
         ),
     ] = None,
     height: Annotated[
@@ -267,6 +283,8 @@ def command(
         transform=transform,
         features=features,
         distortion=distortion,
+        shutter=shutter,
+        shutter_readout_ms=shutter_readout,
         height_m=height,
         heading_deg=heading,
         surface=surface,

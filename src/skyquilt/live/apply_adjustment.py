@@ -1,5 +1,7 @@
 """Applies the result of a block adjustment to the map."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
