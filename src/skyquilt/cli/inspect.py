@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from skyquilt.model.photo import GeoPosition, Photo, Survey
 
-_SHUTTERS = {True: "rolling (not modelled)", False: "global or mechanical", None: "unknown"}
+_SHUTTERS = {True: "rolling", False: "global or mechanical", None: "unknown"}
 _DATUMS = {
     "takeoff": "take-off",
     "sea_level": "sea level",

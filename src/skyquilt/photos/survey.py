@@ -217,7 +217,7 @@ def _cameras(photos: Sequence[Photo]) -> Iterator[str]:
         yield f"Different spectra are mixed: {counts} photos."
     rolling = sorted({p.camera_key for p in photos if p.rolling_shutter})
     if rolling:
-        yield f"Rolling (electronic) shutter, not modelled: {sentence_of(rolling)}."
+        yield f"Rolling (electronic) shutter: {sentence_of(rolling)}."
 
 
 def _thermal_units(photos: Sequence[Photo]) -> Iterator[str]:
