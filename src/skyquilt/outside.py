@@ -10,6 +10,7 @@ import os
 import re
 import stat
 import unicodedata
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -109,6 +110,24 @@ def read_bounded(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
     if len(data) > most:
         raise OSError(errno.EFBIG, f"it has more than {most // 10**6} MB", str(path))
     return data
+
+
+def walk(top: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
+    """Folders below `top`, each with the names of its subfolders, from which the caller may remove
+    some, and of its other files, both sorted. Links to folders are not followed; folders that
+    cannot be read count as empty. Unlike `os.walk` it takes any depth.
+    """
+    waiting = [top]
+    while waiting:
+        here = waiting.pop()
+        try:
+            with os.scandir(here) as found:
+                entries = [(e.name, e.is_dir(follow_symlinks=False)) for e in found]
+        except OSError:
+            continue
+        folders = sorted(name for name, folder in entries if folder)
+        yield here, folders, sorted(name for name, folder in entries if not folder)
+        waiting += [here / name for name in reversed(folders)]
 
 
 def check_picture(

@@ -169,10 +169,10 @@ def read_tiff(file: BinaryIO, size: tuple[int, int]) -> Pixels:
     import tifffile  # imported here because most photos are JPEGs
 
     with tifffile.TiffFile(file) as tiff:
-        page = tiff.pages[0]
+        page = tiff.pages.first
         _same_size((int(page.imagewidth), int(page.imagelength)), size)
         pixels = np.asarray(page.asarray(maxworkers=1))
-        planar = isinstance(page, tifffile.TiffPage) and page.planarconfig == 2 and pixels.ndim == 3
+        planar = page.planarconfig == 2 and pixels.ndim == 3
     if planar:
         pixels = np.moveaxis(pixels, 0, -1)
     if pixels.dtype not in (np.uint8, np.uint16):

@@ -41,7 +41,6 @@ from skyquilt.photos.thermal import (
 )
 
 T = TypeVar("T")
-_STRANGE = "its metadata are of an unknown kind"
 _LARGEST_THERMAL = 1280
 
 
@@ -74,7 +73,7 @@ def rejected(name: str, error: Exception) -> RejectedPhoto:
         return RejectedPhoto(name=name, reason=plain(str(error)))
     if isinstance(error, OSError):
         return RejectedPhoto(name=name, reason=f"it cannot be read ({error.strerror or error})")
-    words = plain(f"{_STRANGE} ({type(error).__name__}: {error})", 300)
+    words = plain(f"it is of an unknown kind ({type(error).__name__}: {error})", 300)
     return RejectedPhoto(
         name=name, reason=words, trace="".join(traceback.format_exception(error))[-20_000:]
     )
