@@ -32,6 +32,7 @@ from skyquilt.live.initial_pose import InitialPose
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.links import LiveLinks
 from skyquilt.live.local_pose import LocalPose
+from skyquilt.live.lock import FolderLock
 from skyquilt.live.members import Members, Queues
 from skyquilt.live.neighbours import Neighbours
 from skyquilt.live.photo_intake import Intake, Refused
@@ -72,7 +73,8 @@ class LiveMap:
         """Opens the folder, or continues an earlier run.
 
         Raises:
-            OutputError: it cannot be written. UsageError: it was started with other settings.
+            OutputError: it cannot be written, or another live map works there. UsageError: it was
+                started with other settings.
         """
         cv2.setNumThreads(1)
         self.folder, self.settings = Path(folder), settings or LiveSettings()
@@ -80,6 +82,7 @@ class LiveMap:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
+        self.lock = FolderLock(self.folder)
         self.ledger = Ledger(self.folder, write=True)
         self._same_settings()
         self.inbox = Inbox(self.ledger, self.folder / PHOTOS, most_bytes=self.settings.most_bytes)
@@ -338,3 +341,4 @@ class LiveMap:
         self.background.stop()
         self.tiles.close()
         self.ledger.close()
+        self.lock.close()
