@@ -44,7 +44,7 @@ def real(value: Any, low: float = -math.inf, high: float = math.inf) -> float | 
     if isinstance(value, str):
         text = value.strip()
         value = text if len(text) <= MOST_DIGITS and _REAL.fullmatch(text) else None
-    if value is None or isinstance(value, bool):
+    if value is None or isinstance(value, (bool, bytes, bytearray)):
         return None
     try:
         number = float(value)

@@ -70,7 +70,7 @@ class PhotoNames:
 
 def sentence_of(names: Sequence[str]) -> str:
     """`a, b, c and 7 more`."""
-    head = ", ".join(names[:_SHOWN])
+    head = ", ".join(plain(name, 80) for name in names[:_SHOWN])
     return f"{head} and {len(names) - _SHOWN} more" if len(names) > _SHOWN else head
 
 

@@ -72,7 +72,10 @@ def read_boundary(path: Path, crs: str | None) -> Polygon | MultiPolygon:
             raise SideFileError(
                 f"{path.name}: a boundary needs at least one polygon, found {', '.join(kinds)}"
             )
-        return _polygonal(_projected(union_all(areas), path, source, crs))
+        outline = _polygonal(_projected(union_all(areas), path, source, crs))
+        if outline.is_empty or not np.isfinite(outline.bounds).all():
+            raise SideFileError(f"{path.name}: nothing is left of its outline in {crs}")
+        return outline
     except SideFileError:
         raise
     except OSError as error:
