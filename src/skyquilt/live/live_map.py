@@ -299,10 +299,10 @@ class LiveMap:
         if not self.queues.untried or self.members.frame is None:
             return None
         member = self.queues.untried[0]
-        if member.state != "superseded" and not self.live_links.has_features(member.id):
-            self.live_links.features(member.id)
-            return Update(what="noted", photo=member.id)
         with concerning(member.id):
+            if member.state != "superseded" and not self.live_links.has_features(member.id):
+                self.live_links.features(member.id)
+                return Update(what="noted", photo=member.id)
             return self.refinement.refine(member)
 
     def _drawn_first(self) -> Update | None:

@@ -184,8 +184,13 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
     text = read_text(path)
     if "\x00" in text:
         raise SideFileError(f"{path.name} is not a text file; expected lines of words and numbers.")
-    lines = ((i, line.strip()) for i, line in enumerate(text.splitlines(), 1))
+    lines = ((i, _clean(line.strip())) for i, line in enumerate(text.splitlines(), 1))
     return [(i, line) for i, line in lines if line and not line.startswith("#")]
+
+
+def _clean(line: str) -> str:
+    """A line without control characters other than tabs: parts of it are shown in messages."""
+    return line if line.isprintable() else "\t".join(map(plain, line.split("\t")))
 
 
 def read_text(path: Path) -> str:

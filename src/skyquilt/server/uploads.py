@@ -166,7 +166,9 @@ class Uploads:
     async def sweeping(self) -> None:
         """Calls `sweep` at intervals until it is cancelled."""
         while True:
-            await asyncio.sleep(min(SWEEP_S, self.guard.upload_keep_s / 4))
+            await asyncio.sleep(
+                min(SWEEP_S, self.guard.upload_keep_s / 4, self.guard.upload_empty_s / 4)
+            )
             self.sweep()
 
     def _last(self, number: str) -> float:
