@@ -22,7 +22,8 @@ BLENDS = ("feather", "first", "average", "multiband")
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
 THERMAL_UNITS = ("auto", "celsius", "kelvin", "decikelvin", "centikelvin", "counts")
-DISTORTIONS = ("none", "2", "4", "6", "6t")
+DISTORTIONS = ("none", "2", "4", "6", "6t", "full")
+SHUTTERS = ("global", "rolling")
 
 
 def one_of(option: str, value: str, allowed: Iterable[str]) -> None:
@@ -68,11 +69,24 @@ class InputSettings:
     """Treat metadata as measurements that may be wrong."""
     max_mp: float = MOST_MP
     """Largest area of a photo in megapixels; larger ones are left out before they are decoded."""
+    shutter: str | None = None
+    """One of `SHUTTERS`: how the cameras expose; None = as metadata and table of cameras say."""
+    shutter_readout_ms: float | None = None
+    """Time in ms in which a rolling shutter reads a photo out; None = as the table says."""
 
     def __post_init__(self) -> None:
         within("--max-mp", self.max_mp, 0.01, 10_000)
         if self.thermal_unit is not None:
             one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
+        if self.shutter is not None:
+            one_of("--shutter", self.shutter, SHUTTERS)
+        if self.shutter_readout_ms is not None and not 0 < self.shutter_readout_ms <= 1000:
+            raise UsageError(
+                f"--shutter-readout {self.shutter_readout_ms:g} is no readout of a camera, which"
+                " takes more than 0 and at most 1000 ms; for a global shutter say --shutter global"
+            )
+        if self.shutter == "global" and self.shutter_readout_ms is not None:
+            raise UsageError("--shutter global has no readout; leave --shutter-readout out")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,9 +123,9 @@ class CameraSettings:
     """What is assumed or adjusted of the cameras."""
 
     distortion: str | None = None
-    """One of `DISTORTIONS`: what self-calibration may change of the lens model (None = 4), or, for
-    methods that do not calibrate, the order fitted to a calibration that photos bring along (None =
-    6t; `flightline` none).
+    """One of `DISTORTIONS`: what self-calibration may change of the lens model (None = full), or,
+    for methods that do not calibrate, the order fitted to a calibration that photos bring along
+    (None = 6t; `flightline` none).
     """
     height_m: float | None = None
     """Height above ground for methods without tie points, where altitudes do not give it."""

@@ -17,7 +17,7 @@ from skyquilt.alignment.problem import (
 from skyquilt.geometry.frames import rotation_from_vector
 from tests.alignment.blocks import make_block, seen_by
 
-ALL = np.ones(8, bool)
+ALL = np.ones(10, bool)
 
 
 def bent(seed=0, cameras=2):
@@ -60,12 +60,12 @@ def test_jacobians_are_those_of_the_residuals(seed):
     def close(exact, numeric):
         assert np.abs(exact - numeric).max() < 2e-6 * max(1.0, np.abs(numeric).max())
 
-    zero = [np.zeros((n, 6)), np.zeros((m, 8)), np.zeros((P, 3))]
+    zero = [np.zeros((n, 6)), np.zeros((m, 10)), np.zeros((P, 3))]
     for axis in range(6):
         step = [z.copy() for z in zero]
         step[0][:, axis] = 1
         close(lin.J_photo[:, :, axis], difference(step, 1e-5))
-    for axis in range(8):
+    for axis in range(10):
         step = [z.copy() for z in zero]
         step[1][:, axis] = 1
         close(lin.J_camera[:, :, axis], difference(step, 1e-3 if axis < 3 else 1e-5))

@@ -291,7 +291,7 @@ def test_deviations_of_a_calibration_are_the_adjustment_s_priors(tmp_path, photo
             cx=750,
             cy=500,
             k1=-0.1,
-            sigmas=(9.0, 4.0, 5.0, 0.03, 0.04, 0.0, 0.0, 2e-3),
+            sigmas=(9.0, 4.0, 5.0, 0.03, 0.04, 0.0, 0.0, 2e-3, 1e-3),
         )
     )
     path = written(tmp_path, json.dumps({"all": record}), "cameras.json")

@@ -7,10 +7,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.adjust import adjust, covariance
+from skyquilt.alignment.adjust import DENSE_LIMIT, adjust, covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
+from skyquilt.alignment.deviations import believed, observed_noise, robust_scale
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
-from skyquilt.alignment.problem import Problem, State, residuals_px
+from skyquilt.alignment.problem import CAMERA, READOUT, Problem, State, residuals_px, swept
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
 from skyquilt.alignment.start import Start, find_start
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
@@ -23,13 +24,21 @@ from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
 Array = NDArray[np.float64]
 
 
+ROLLS_PX = 0.3
+"""Cameras that move by more than this in px of the photo while a photo is read out turn, too."""
+TURN_RAD_S = np.radians(1.5)
+"""Deviation of the rates at which they turn, in rad/s; it makes up for errors of velocities too."""
+DOUBTED = 2.5
+"""Positions that a block misses by more than this many deviations are not what they claim."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Bundle:
     """Bundle adjustment of all linked photos at once."""
 
-    distortion: str = "4"
-    """Distortion that self-calibration may change: `none`, `2`, `4`, `6` (radial order) or
-    `6t` (and tangential).
+    distortion: str = "full"
+    """What self-calibration may change of the lens: distortion `none`, `2`, `4`, `6` (radial
+    order), `6t` (and tangential) or `full` (and the aspect ratio).
     """
     per_photo: int = 400
     """Observations per photo in the adjustment; all other tie points are triangulated
@@ -41,7 +50,7 @@ class Bundle:
     """
     match_observations: LeastSquaresMatching | None = field(default_factory=LeastSquaresMatching)
     """Refinement of observations in larger images; None leaves keypoints unchanged."""
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 13
 
     def __call__(
         self,
@@ -68,13 +77,18 @@ class Bundle:
         used = setup.sensor_tracks(tracks)
         problem, state = setup.problem(thin(used, sizes, per_photo=self.per_photo))
         problem, state = _rough(problem, state)
+        setup = setup.moving_as(photos, state.C)
+        problem = replace(problem, velocity=setup.base.velocity)
         if grey is not None and self.match_observations is not None:
             used = _sharpened(used, photos, setup, problem, state, self.match_observations, grey)
             problem, _ = setup.problem(thin(used, sizes, per_photo=self.per_photo))
             state = triangulated(problem, state)
         problem, state = _fine(problem, state)
+        setup = setup.moving_as(photos, state.C)
+        problem = replace(problem, velocity=setup.base.velocity)
+        problem, state = _weighed(problem, state, setup)
         if self.repair:
-            problem, state = _believe_positions_less(problem, state, setup)
+            problem, state = _believe_positions(problem, state, setup)
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
         return _outcome(photos, frame, setup, start, used, problem, state, reports)
 
@@ -123,6 +137,30 @@ def _fine(problem: Problem, state: State) -> tuple[Problem, State]:
     ).state
 
 
+def _weighed(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
+    """The adjustment repeated with observations as sharp as their residuals show them to be, and
+    with the weight that those are worth; with turns of the cameras where rows were exposed one
+    after the other.
+    """
+    reach = np.linalg.norm(swept(problem, state), axis=1) / _heights(state)
+    rolls = bool((reach * state.K[problem.camera, 0] > ROLLS_PX).any())
+    if rolls and 9 * len(state.C) + CAMERA * len(state.K) <= DENSE_LIMIT:
+        readout = np.abs(state.K[problem.camera, READOUT])
+        problem = replace(problem, sigma_turn=np.maximum(TURN_RAD_S * readout, 1e-9))
+    for _ in range(2):
+        scale = robust_scale(problem, state)
+        problem = replace(problem, sigma_px=problem.sigma_px * scale)
+        noise = observed_noise(problem.with_loss(2.0), state, setup.size[setup.members])
+        problem = believed(problem.with_loss(2.0), noise)
+        state = adjust(problem, state, iterations=15, tolerance=3e-4, damping=1e-6).state
+    return problem, state
+
+
+def _heights(state: State) -> Array:
+    """Heights (n,) in m of the cameras above the points."""
+    return np.maximum(state.C[:, 2] - np.median(state.X[:, 2]), 1.0)
+
+
 def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]:
     """Removes observations with residuals above `limit` deviations and points left with one
     observation; control points are kept.
@@ -139,30 +177,44 @@ def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]
         photo=problem.photo[good],
         px=problem.px[good],
         sigma_px=problem.sigma_px[good],
+        share=problem.share[good],
         X0=problem.X0[points],
         sigma_X=problem.sigma_X[points],
     )
     return thinner, replace(state, X=state.X[points])
 
 
-def _believe_positions_less(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
-    """Replaces the stated horizontal accuracy of positions by their scatter between neighbours
-    where that is larger.
+def _believe_positions(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
+    """Positions believed as far as the photos confirm them.
 
-    Only differences from photo to photo count. A smooth misfit may be a deformation of the block,
-    and positions with less weight would permit it. (Heights are checked by image scale before the
-    adjustment.)
+    The start gave them deviations as wide as their scatter about it, which is coarse. Here they get
+    those that they state, or their scatter between neighbours where that is larger. Only
+    differences from photo to photo count: a smooth misfit may be a deformation of the block, and
+    positions with less weight would permit it. Where a block then still misses its positions by
+    more than these deviations allow, they are not what they claim (a drifting barometer, a plain
+    GPS that states centimetres), and what the start gave stays.
     """
-    for _ in range(2):
+    started = problem.sigma_C
+    doubted = np.zeros(started.shape, bool)
+    for _ in range(3):
         error = state.C - problem.C0
-        sigma = problem.sigma_C.copy()
+        sigma = started.copy()
         for block in setup.block_rows:
-            noise = position_noise(error[block][:, :2])
-            sigma[block, :2] = np.maximum(setup.stated_sigma_C[block][:, :2], noise)
+            for axes in (slice(0, 2), slice(2, 3)):
+                stated = setup.stated_sigma_C[block][:, axes]
+                wanted = np.maximum(stated, position_noise(error[block][:, axes]))
+                trusted = ~doubted[block][:, axes]
+                sigma[block, axes] = np.where(trusted, wanted, sigma[block, axes])
         if np.allclose(sigma, problem.sigma_C, rtol=0.15, equal_nan=True):
             break
         problem = replace(problem, sigma_C=sigma)
         state = adjust(problem.with_loss(2.0), state, iterations=10, tolerance=1e-4).state
+        misfit = np.abs(state.C - problem.C0) / problem.sigma_C
+        for block in setup.block_rows:
+            for axes in (slice(0, 2), slice(2, 3)):
+                known = misfit[block][:, axes][np.isfinite(misfit[block][:, axes])]
+                if len(known) and 1.48 * np.median(known) > DOUBTED:
+                    doubted[block, axes] = True
     return problem, state
 
 
@@ -197,7 +249,8 @@ def leave_one_out(
         precision = np.diag(1 / problem.sigma_C[i][axes] ** 2) / np.sqrt(
             1 + (white @ white) / problem.loss_C**2
         )
-        own = C_covariance[6 * i + 3 : 6 * i + 6, 6 * i + 3 : 6 * i + 6][np.ix_(axes, axes)]
+        at = problem.photo_unknowns * i + 3
+        own = C_covariance[at : at + 3, at : at + 3][np.ix_(axes, axes)]
         full = np.full(3, np.nan)
         full[axes] = np.linalg.solve(np.eye(len(e)) - own @ precision, e)
         out.append(full)
@@ -240,10 +293,7 @@ def _outcome(
     seen = np.bincount(ties.photo, minlength=len(photos))
     weak = {int(i): f"it has only {seen[i]} tie points" for i in setup.members if seen[i] < 8}
     full = covariance(problem, state)
-    variance = _variance_factor(problem, state)
-    cameras, camera_of = camera_records(
-        photos, setup, state, None if full is None else full * variance
-    )
+    cameras, camera_of = camera_records(photos, setup, state, full)
     poses = {i: p for i, p in pose_records(setup, state).items() if i not in weak}
     blocks = tuple(tuple(i for i in b if i not in weak) for b in start.blocks)
     metric = frame.metric and (start.metric or any(not c.check for c in control))
@@ -260,9 +310,3 @@ def _outcome(
         control=residuals_of_control(control, frame, setup, problem, state),
         loo_rms_m=leave_one_out(problem, state, full) if setup.georeferenced else None,
     )
-
-
-def _variance_factor(problem: Problem, state: State) -> float:
-    """Robust variance of the whitened observations."""
-    e = residuals_px(problem, state) / problem.sigma_px[:, None]
-    return float((1.48 * np.nanmedian(np.abs(e))) ** 2)

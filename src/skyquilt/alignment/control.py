@@ -20,6 +20,10 @@ from skyquilt.model.poses import ControlResidual, MapFrame
 Array = NDArray[np.float64]
 
 
+MARKED_PX = 0.5
+"""Deviation in px of a point that was marked in a photo."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Control:
     """A control or check point in the map frame."""
@@ -103,6 +107,7 @@ def _alone(
         photo=row,
         px=px,
         sigma_px=np.ones(len(px)),
+        share=setup.share(row, px),
         X0=empty,
         sigma_X=np.ones_like(empty),
     )
@@ -135,9 +140,15 @@ def fit_similarity_3d(x: Array, y: Array) -> tuple[float, Array, Array]:
 
 def _moved(problem: Problem, state: State, s: float, R: Array, t: Array) -> tuple[Problem, State]:
     """State and positions under y = s R x + t."""
-    moved = State(R=state.R @ R.T, C=s * state.C @ R.T + t, K=state.K, X=s * state.X @ R.T + t)
-    C0 = s * problem.C0 @ R.T + t
-    return replace(problem, C0=C0, sigma_C=problem.sigma_C * s, R0=problem.R0 @ R.T), moved
+    moved = replace(state, R=state.R @ R.T, C=s * state.C @ R.T + t, X=s * state.X @ R.T + t)
+    there = replace(
+        problem,
+        C0=s * problem.C0 @ R.T + t,
+        sigma_C=problem.sigma_C * s,
+        R0=problem.R0 @ R.T,
+        velocity=s * problem.velocity @ R.T,
+    )
+    return there, moved
 
 
 def hold_to_control(
@@ -145,8 +156,7 @@ def hold_to_control(
 ) -> tuple[Problem, State, MapFrame, Sequence[Control]]:
     """Repeats the adjustment with control points as observations.
 
-    GPS positions share an offset (height datum, base station). It is estimated from the control
-    points and removed first.
+    GPS positions share an offset (height datum, base station), which is one of the unknowns.
 
     Raises:
         AlignmentError: no position and fewer than three usable control points.
@@ -174,14 +184,8 @@ def hold_to_control(
     problem, state = _with_points(problem, state, setup, fit)
     if not setup.georeferenced:
         problem = replace(problem, sigma_C=np.full_like(problem.sigma_C, 1e4))
-    state = adjust(problem, state, iterations=25, tolerance=1e-5).state
-    if setup.georeferenced and len(fit) >= 3:
-        # the common offset of the positions came from a solution that still depended on them;
-        # estimate it again from control points
-        for _ in range(3):
-            offset = np.nan_to_num(np.nanmedian(state.C - problem.C0, axis=0))
-            problem = replace(problem, C0=problem.C0 + offset)
-            state = adjust(problem, state, iterations=15, tolerance=1e-5, damping=1e-6).state
+    problem = replace(problem, offset=setup.georeferenced)
+    state = adjust(problem, state, iterations=40, tolerance=1e-5).state
     heights = np.isfinite(surveyed[:, 2]).any()
     return (
         problem,
@@ -204,7 +208,8 @@ def _with_points(
         point=np.concatenate([problem.point, P + point]),
         photo=np.concatenate([problem.photo, row]),
         px=np.concatenate([problem.px, px]),
-        sigma_px=np.concatenate([problem.sigma_px, np.full(len(px), 0.7)]),
+        sigma_px=np.concatenate([problem.sigma_px, np.full(len(px), MARKED_PX)]),
+        share=np.concatenate([problem.share, setup.share(row, px)]),
         X0=np.concatenate([problem.X0, surveyed]),
         sigma_X=np.concatenate([problem.sigma_X, np.array([[c.sigma_m] * 3 for c in fit])]),
     )

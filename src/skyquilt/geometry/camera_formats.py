@@ -19,15 +19,14 @@ keys they do not know.
 _LEAST_FOCAL = 0.02
 _MOST = {"width": 1e6, "height": 1e6, "focal": 100.0, "focal_x": 100.0, "focal_y": 100.0}
 """Largest plausible values; lengths in units of the longer side."""
-_NAMES = ("focal_x", "c_x", "c_y", "k1", "k2", "k3", "p1", "p2")
+_NAMES = ("focal_x", "c_x", "c_y", "k1", "k2", "k3", "p1", "p2", "aspect")
 
 
 def camera_from_opensfm(record: Mapping[str, Any]) -> Camera:
     """A `brown`, `perspective`, `simple_radial` or `radial` camera.
 
-    Raises `ValueError` for any other projection and for a broken record. `focal_x` and `focal_y`
-    become their mean: pixels are square here. Standard deviations are read from the key that
-    `camera_to_opensfm` writes.
+    Raises `ValueError` for any other projection and for a broken record. Standard deviations
+    are read from the key that `camera_to_opensfm` writes.
     """
     kind = str(record.get("projection_type", "perspective"))
     if kind not in ("brown", "perspective", "simple_radial", "radial"):
@@ -44,7 +43,7 @@ def camera_from_opensfm(record: Mapping[str, Any]) -> Camera:
     return Camera(
         width=width,
         height=height,
-        focal=sum(focals) / len(focals) * unit,
+        focal=focals[0] * unit,
         cx=_number(record, "c_x", 0.0) * unit + (width - 1) / 2,
         cy=_number(record, "c_y", 0.0) * unit + (height - 1) / 2,
         k1=_number(record, "k1", 0.0),
@@ -52,6 +51,7 @@ def camera_from_opensfm(record: Mapping[str, Any]) -> Camera:
         k3=_number(record, "k3", 0.0),
         p1=_number(record, "p1", 0.0),
         p2=_number(record, "p2", 0.0),
+        aspect=_number(record, "focal_y", focals[0]) / focals[0] if "focal_x" in record else 1.0,
         sigmas=_deviations(record, unit),
     )
 
@@ -65,7 +65,10 @@ def _deviations(record: Mapping[str, Any], unit: int) -> tuple[float, ...] | Non
         return None
     if not isinstance(stated, Mapping):
         raise ValueError(f"its '{DEVIATIONS}' are {stated!r}; expected numbers by name")
-    found = tuple(_number(stated, name) * (unit if k < 3 else 1) for k, name in enumerate(_NAMES))
+    found = tuple(
+        _number(stated, name, 0.0 if name == "aspect" else None) * (unit if k < 3 else 1)
+        for k, name in enumerate(_NAMES)
+    )
     if min(found) < 0 or not all(map(math.isfinite, found)):
         raise ValueError(f"its '{DEVIATIONS}' are {dict(stated)}; expected none below zero")
     return found
@@ -85,7 +88,7 @@ def camera_to_opensfm(camera: Camera) -> dict[str, Any]:
         "width": camera.width,
         "height": camera.height,
         "focal_x": camera.focal / unit,
-        "focal_y": camera.focal / unit,
+        "focal_y": camera.focal * camera.aspect / unit,
         "c_x": (camera.cx - (camera.width - 1) / 2) / unit,
         "c_y": (camera.cy - (camera.height - 1) / 2) / unit,
         **{k: getattr(camera, k) for k in ("k1", "k2", "p1", "p2", "k3")},

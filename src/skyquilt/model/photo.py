@@ -85,6 +85,23 @@ class Focal:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Shutter:
+    """How long a camera takes to read a photo out, row by row."""
+
+    readout_s: float
+    """Time in s from the first row to the last; 0 = all rows at once."""
+    sigma_s: float
+    """Standard deviation in s; 0 = known for sure."""
+    source: Literal["global", "option", "table", "guess", "unknown"]
+    """A shutter that exposes all rows at once; the user; the table of cameras; rolling, of unlisted
+    speed; unknown.
+    """
+
+
+UNKNOWN_SHUTTER = Shutter(readout_s=0.0, sigma_s=0.0, source="unknown")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Photo:
     """One photo: where its pixels are and what its metadata report."""
 
@@ -130,6 +147,10 @@ class Photo:
     """True for known electronic (rolling) shutters, False for known global/mechanical ones, None
     where unknown.
     """
+    shutter: Shutter = UNKNOWN_SHUTTER
+    """How its rows are read out."""
+    velocity_ned: tuple[float, float, float] | None = None
+    """Velocity of the aircraft as reported, north, east and down in m/s."""
     editor: str | None = None
     """Software that rewrote the file after the camera, where the metadata name one."""
     notes: tuple[str, ...] = ()

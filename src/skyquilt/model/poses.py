@@ -54,6 +54,20 @@ class Prior:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Motion:
+    """Movement of a camera from the exposure of its photo's first row to that of the last.
+
+    A point that has coordinates L in the camera of the middle row has, in that of row y,
+    L + s (turn x L - R shift), s = (y - (height - 1) / 2) / (height - 1).
+    """
+
+    shift_m: Array
+    """(3,) movement of the centre in m in the map frame."""
+    turn_rad: Array
+    """(3,) small rotation about the camera's axes in rad."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Pose:
     """Exterior orientation of one photo."""
 
@@ -66,10 +80,12 @@ class Pose:
     to the undistorted image plane, whatever the height; rotation and centre are then those of the
     nearest vertical view.
     """
+    motion: Motion | None = None
+    """How the camera moved while its rows were read out; None = not at all."""
 
     def to_camera(self, xyz_map: Array) -> Array:
         """Transforms points (..., 3) from the map frame to camera coordinates (for a photo placed
-        in the plane: up to scale).
+        in the plane: up to scale), those of the middle row where the camera moved.
         """
         if self.cam_H_map is not None:
             return np.asarray(xyz_map[..., :2] @ self.cam_H_map[:, :2].T + self.cam_H_map[:, 2])

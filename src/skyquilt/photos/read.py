@@ -31,8 +31,10 @@ from skyquilt.photos.metadata import (
     read_flight_yaw,
     read_position,
     read_time,
+    read_velocity,
 )
 from skyquilt.photos.pixels import read_tiff
+from skyquilt.photos.shutter import find_shutter
 from skyquilt.photos.thermal import (
     ThermalFrame,
     stated_unit,
@@ -85,6 +87,7 @@ class _Lens:
     thermal: bool
     calibration: Camera | None
     focal: Focal
+    captured_mp: float
     notes: tuple[str, ...]
 
 
@@ -108,6 +111,7 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
     time = _ignoring(
         lambda: read_time(header.exif, header.xmp), lambda: None, "capture time", strange
     )
+    rolling = _rolling(header, lens.sensor)
     seen = (*lens.notes, frame.note if frame else "", *place_notes, *angle_notes, *yaw_notes)
     more = _ignoring(lambda: _other_notes(header, lens), lambda: (), "editing", strange)
     return Photo(
@@ -129,7 +133,9 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         flight_yaw_deg=flight_yaw,
         time=time,
         orientation_tag=whole(header.exif.tags.get(tag.ORIENTATION), 1, 8) or 1,
-        rolling_shutter=_rolling(header, lens.sensor),
+        rolling_shutter=rolling,
+        shutter=find_shutter(header.exif.text(tag.MODEL), lens.captured_mp, rolling),
+        velocity_ned=read_velocity(header.xmp),
         editor=find_editor(header.exif, header.xmp),
         notes=tuple(n for n in (*_broken_notes(header), *strange, *seen, *more) if n),
     )
@@ -171,7 +177,14 @@ def _lens(header: Header, width: int, height: int, *, thermal: bool) -> _Lens:
         thermal=thermal,
     )
     notes = (note, *focal_notes(exif, sensor, width, height))
-    return _Lens(sensor=sensor, thermal=thermal, calibration=calibration, focal=focal, notes=notes)
+    return _Lens(
+        sensor=sensor,
+        thermal=thermal,
+        calibration=calibration,
+        focal=focal,
+        captured_mp=width * height / scale**2 / 1e6,
+        notes=notes,
+    )
 
 
 def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame | None:

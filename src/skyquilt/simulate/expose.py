@@ -49,7 +49,12 @@ class Exposer:
         """
         window = self.window(shot)
         corner = np.array([window.xs[0], window.ys[0]])
-        rays = rays_of(self.directions, shot.rotation, shot.place, corner, window.res)
+        rotation, centre = shot.rotation, shot.place
+        if shot.moves(self.lens):
+            share = np.arange(self.lens.height) / (self.lens.height - 1) - 0.5
+            rotation, centre = shot.exposed(self.lens, share)
+            rotation, centre = rotation[:, None], centre[:, None]
+        rays = rays_of(self.directions, rotation, centre, corner, window.res)
         hits, heights = first_hits(np.ascontiguousarray(self.scene.height[window.slices]), rays)
         return hits, heights, window
 
@@ -134,7 +139,7 @@ def footprint(lens: Lens, shot: Shot, level: float) -> Doubles:
     y = np.concatenate(
         [np.full(8, -0.5), -0.5 + side * (h + 0.5), np.full(8, h), h - side * (h + 0.5)]
     )
-    ix, iy = lens.undistort((x - lens.cx) / lens.focal, (y - lens.cy) / lens.focal)
+    ix, iy = lens.undistort((x - lens.cx) / lens.focal, (y - lens.cy) / (lens.focal * lens.aspect))
     rays = np.stack([ix, iy, np.ones_like(ix)], axis=1) @ shot.rotation
     return shot.place[:2] + rays[:, :2] * ((level - shot.centre[2]) / rays[:, 2])[:, None]
 

@@ -50,23 +50,26 @@ def rays_of(
 ) -> Rays:
     """Rays of undistorted image coordinates (h, w, 2) from a camera.
 
-    `origin` is the map position of raster pixel (0, 0).
+    `origin` is the map position of raster pixel (0, 0); rotation (3, 3) from map to camera and
+    centre (3,), or one for each row, (h, 1, 3, 3) and (h, 1, 3).
 
     Heights refer to the same zero as centre[2]. Raises ValueError where a ray does not point
     downwards.
     """
-    to_map = rotation.T.astype(np.float32)
+    to_map = rotation.astype(np.float32)
     x, y = directions[..., 0], directions[..., 1]
-    dx, dy, dz = (to_map[i, 0] * x + to_map[i, 1] * y + to_map[i, 2] for i in range(3))
+    dx, dy, dz = (
+        to_map[..., 0, i] * x + to_map[..., 1, i] * y + to_map[..., 2, i] for i in range(3)
+    )
     if dz.max() > -0.05:
         raise ValueError(
             "a ray of the photo does not meet the ground: tilt or field of view too large"
         )
     slope = np.stack([dx, -dy], axis=-1) / (-dz * np.float32(res))[..., None]
-    place = np.array(
-        [(centre[0] - origin[0]) / res, (origin[1] - centre[1]) / res], dtype=np.float32
-    )
-    return Rays(start=place + np.float32(centre[2]) * slope, slope=slope)
+    place = np.stack(
+        [(centre[..., 0] - origin[0]) / res, (origin[1] - centre[..., 1]) / res], axis=-1
+    ).astype(np.float32)
+    return Rays(start=place + centre[..., 2, None].astype(np.float32) * slope, slope=slope)
 
 
 def sample(

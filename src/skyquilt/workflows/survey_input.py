@@ -16,6 +16,7 @@ from skyquilt.model.photo import (
 from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.photos.sequence import sequence_of
+from skyquilt.photos.shutter import stated_shutter
 from skyquilt.photos.survey import read_survey
 from skyquilt.settings import InputSettings, MosaicSettings
 
@@ -83,6 +84,9 @@ def read_input(source: Source | str, settings: InputSettings) -> SurveyInput:
         thermal_unit=settings.thermal_unit,
         max_mp=settings.max_mp,
     )
+    shutter = stated_shutter(settings.shutter, settings.shutter_readout_ms)
+    if shutter is not None:
+        survey = replace(survey, photos=tuple(replace(p, shutter=shutter) for p in survey.photos))
     names = [p.name for p in survey.photos]
     gcp = settings.gcp
     if gcp is None and isinstance(source, Path) and (source / "gcp_list.txt").is_file():
