@@ -121,8 +121,7 @@ def _observations(
     x, y = finite(number(words[0])), finite(number(words[1]))
     if x is None or y is None or not words[2]:
         raise SideFileError(
-            f"{place}: there is no observation of point '{label}'; add columns px_{end}, py_{end},"
-            f" image_{end},"
-            " or name a point of gcp_list.txt"
+            f"{place}: there is no observation of point '{plain(label, 80)}'; add columns px_{end},"
+            f" py_{end}, image_{end}, or name a point of gcp_list.txt"
         )
     return (PointObservation(photo=words[2], x=x, y=y),)

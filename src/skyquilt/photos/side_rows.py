@@ -109,24 +109,24 @@ def apply_rows(
 
 def _check(rows: Sequence[SideRow], file: Path) -> None:
     for row in rows:
+        name = plain(row.name, 80)
         placed = row.latitude_deg is not None or row.longitude_deg is not None
         if placed and (reason := why_void(row.latitude_deg, row.longitude_deg)):
             raise SideFileError(
-                f"{file.name}: the position of {row.name} is invalid: {reason}. Correct that row."
+                f"{file.name}: the position of {name} is invalid: {reason}. Correct that row."
             )
         height = row.altitude_m
         if height is not None and not _ALTITUDE[0] <= height <= _ALTITUDE[1]:
             raise SideFileError(
-                f"{file.name}: the height {height:g} m of {row.name} is not possible. Correct that"
-                " row."
+                f"{file.name}: the height {height:g} m of {name} is not possible. Correct that row."
             )
         if any(abs(a) > _MOST_ANGLE for a in row.angles_deg or ()):
             raise SideFileError(
-                f"{file.name}: the angles {row.angles_deg} of {row.name} are not possible. Correct"
+                f"{file.name}: the angles {row.angles_deg} of {name} are not possible. Correct"
                 " that row."
             )
         for sigma in (row.sigma_xy_m, row.sigma_z_m):
-            accuracy(sigma, f"{file.name}, {row.name}")
+            accuracy(sigma, f"{file.name}, {name}")
 
 
 def _override(photo: Photo, rows: Mapping[str | None, SideRow], source: str) -> Photo:
