@@ -272,3 +272,9 @@ def test_names_with_odd_digits_are_sorted():
     names = ["²1.jpg", "b10.jpg", "b9.jpg", "b" + "9" * 5000 + ".jpg", "١.jpg"]
     order = [names[i] for i in sequence_of(names, "name")]
     assert order.index("b9.jpg") < order.index("b10.jpg") < order.index(names[3])
+
+
+def test_a_thin_picture_shrinks_to_no_less_than_a_pixel():
+    from skyquilt.imaging.grey import shrink
+
+    assert shrink(np.zeros((32, 20_000, 3), np.uint8), 256)[0].shape == (1, 256, 3)
