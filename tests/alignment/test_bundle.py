@@ -126,7 +126,7 @@ def test_a_block_is_found(plain):
     )  # noise of 0.3 px per axis: 0.376 less what the points absorb
     (camera,) = found.cameras.values()
     assert camera.focal == pytest.approx(flown.truth.K[0, 0], abs=12)
-    assert camera.sigmas is not None and 0.5 < camera.sigmas[0] < 10 and camera.sigmas[5] == 0.0
+    assert camera.sigmas is not None and 0.5 < camera.sigmas[0] < 10 and camera.sigmas[8] > 0
 
 
 def test_tie_points_project_where_they_were_seen(plain):

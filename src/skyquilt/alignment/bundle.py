@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from skyquilt.alignment.adjust import DENSE_LIMIT, adjust, covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
 from skyquilt.alignment.deviations import believed, observed_noise, robust_scale
+from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
+from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
 from skyquilt.alignment.problem import CAMERA, READOUT, Problem, State, residuals_px, swept
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
 from skyquilt.alignment.start import Start, find_start
@@ -50,7 +52,7 @@ class Bundle:
     """
     match_observations: LeastSquaresMatching | None = field(default_factory=LeastSquaresMatching)
     """Refinement of observations in larger images; None leaves keypoints unchanged."""
-    version: ClassVar[int] = 13
+    version: ClassVar[int] = 14
 
     def __call__(
         self,
@@ -68,6 +70,32 @@ class Bundle:
         Raises:
             AlignmentError: no two photos are linked.
         """
+        aside = reported_oblique(priors) if self.repair else frozenset[int]()
+
+        def block(aside: frozenset[int]) -> Alignment:
+            upright = [k for k in links if k.a not in aside and k.b not in aside]
+            return self._block(photos, frame, priors, features, upright, control, grey)
+
+        try:
+            found = block(aside)
+        except AlignmentError:
+            aside, found = frozenset(), block(frozenset())
+        if self.repair and (more := found_oblique(found, priors) - aside):
+            aside |= more
+            found = block(aside)
+        return hung(found, photos, priors, features, links, aside)
+
+    def _block(
+        self,
+        photos: Sequence[Photo],
+        frame: MapFrame,
+        priors: Sequence[Prior],
+        features: Sequence[Features],
+        links: Sequence[Link],
+        control: Sequence[Control],
+        grey: GreyPicture | None,
+    ) -> Alignment:
+        """Adjusts the photos that these links connect."""
         start = find_start(photos, priors, features, links)
         if not start.blocks:
             raise AlignmentError(f"none of {len(photos)} photos could be linked to another one")
@@ -90,7 +118,9 @@ class Bundle:
         if self.repair:
             problem, state = _believe_positions(problem, state, setup)
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
-        return _outcome(photos, frame, setup, start, used, problem, state, reports)
+        done = _outcome(photos, frame, setup, start, used, problem, state, reports)
+        held = setup.georeferenced or any(not c.check for c in reports)
+        return done if held or tilts_reported(priors) else levelled(done)
 
 
 def _sharpened(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from skyquilt.alignment.adjust import adjust
+from skyquilt.alignment.heights import control_height
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import Setup
 from skyquilt.alignment.triangulate import polish, triangulated
@@ -59,9 +60,9 @@ def control_in_frame(
         x, y = Transformer.from_crs(point.crs, frame.crs, always_xy=True).transform(
             point.x, point.y
         )
-        xyz = np.array(
-            [x - frame.origin[0], y - frame.origin[1], np.nan if point.z is None else point.z]
-        )
+        at = Transformer.from_crs(frame.crs, 4326, always_xy=True).transform(x, y)
+        z = control_height(point, frame.control_datum, *at)
+        xyz = np.array([x - frame.origin[0], y - frame.origin[1], z])
         photo, px = np.array([s[0] for s in seen]), np.array([s[1:] for s in seen], float)
         found.append(
             Control(
@@ -190,7 +191,7 @@ def hold_to_control(
     return (
         problem,
         state,
-        replace(frame, vertical_datum="control", metric=True) if heights else frame,
+        replace(frame, vertical_datum=frame.control_datum, metric=True) if heights else frame,
         usable,
     )
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.options import Features, Json, MaxMemory, MaxMp, Quiet, ThermalUnit
+from skyquilt.cli.options import Features, Json, MaxMemory, MaxMp, MaxViewAngle, Quiet, ThermalUnit
 from skyquilt.outside import MOST_MP
 
 Output = Annotated[
@@ -72,6 +72,7 @@ def command(
         ),
     ] = False,
     thermal_unit: ThermalUnit = None,
+    max_view_angle: MaxViewAngle = 70.0,
     base: Annotated[
         Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")
     ] = None,
@@ -107,6 +108,7 @@ def command(
         reposition=reposition,
         deterministic=deterministic,
         thermal_unit=thermal_unit,
+        max_view_angle=max_view_angle,
         features=features,
         most_bytes=int(max_mb * 1e6),
         most_mp=max_mp,

@@ -77,6 +77,14 @@ def command(
             " of names.",
         ),
     ] = "time",
+    lever_arm: Annotated[
+        str | None,
+        option(
+            INPUT,
+            "From the antenna to the camera: right,forward,up in m in the aircraft's body.",
+            default="positions are the camera's",
+        ),
+    ] = None,
     repair: Annotated[
         bool, option(INPUT, "Whether metadata may be wrong.", "--repair-metadata/--trust-metadata")
     ] = True,
@@ -135,6 +143,14 @@ def command(
         str,
         option(PICTURE, "Heights: ties (tie points alone) or sweep (refined from the pictures)."),
     ] = "sweep",
+    vertical_datum: Annotated[
+        str | None,
+        option(
+            PICTURE,
+            "Zero of heights: ellipsoid, egm96 (sea level), takeoff.",
+            default="what most photos state",
+        ),
+    ] = None,
     bounds: Annotated[
         str | None, option(PICTURE, "west,south,east,north in the output CRS.")
     ] = None,
@@ -146,6 +162,9 @@ def command(
         str, option(PICTURE, "Where photos meet: auto, feather, first, average, multiband.")
     ] = "auto",
     feather: Annotated[float, option(PICTURE, "Width of feathered seams in map pixels.")] = 6.0,
+    max_view_angle: Annotated[
+        float, option(PICTURE, "Largest angle from the vertical, in degrees, that photos show.")
+    ] = 70.0,
     balance: Annotated[
         bool, option(PICTURE, "Bring photos to one brightness.", "--balance/--no-balance")
     ] = True,
@@ -252,6 +271,7 @@ def command(
         cameras=cameras,
         distances=distances,
         sequence=sequence,
+        lever_arm=parse_lever_arm(lever_arm),
         repair=repair,
         detector=detector,
         matcher=matcher,
@@ -264,10 +284,12 @@ def command(
         surface=surface,
         gsd_cm=gsd,
         crs=crs,
+        vertical_datum=vertical_datum,
         bounds=parse_bounds(bounds),
         boundary=boundary,
         blend=blend,
         feather_px=feather,
+        max_view_angle=max_view_angle,
         balance=balance,
         balance_thermal=balance_thermal,
         thermal_unit=thermal_unit,
@@ -317,6 +339,23 @@ def with_thermal(result: "Result") -> str:
         f"{mosaic_summary(result)}\nthermal: {result.output / 'thermal.tif'} ({t['photos_used']} of"
         f" {t['photos_total']} photos, placed by {how})"
     )
+
+
+def parse_lever_arm(text: str | None) -> tuple[float, float, float] | None:
+    """Three numbers separated by commas.
+
+    Raises:
+        UsageError: they are not.
+    """
+    if text is None:
+        return None
+    try:
+        right, forward, up = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UsageError(
+            f"--lever-arm is right,forward,up, three numbers in m; got {text!r}"
+        ) from error
+    return right, forward, up
 
 
 def parse_bounds(text: str | None) -> tuple[float, float, float, float] | None:

@@ -21,6 +21,12 @@ class MapFrame:
     """Easting and northing in m of the frame's origin; heights are not shifted."""
     vertical_datum: Datum
     """What heights refer to."""
+    takeoff_m: float | None = None
+    """Height of the take-off point above `vertical_datum` in m, by which heights above take-off are
+    converted; None = they are not.
+    """
+    control_datum: Datum = "control"
+    """What heights refer to once control points with heights hold the map."""
     convergence_deg: float = 0.0
     """Meridian convergence: grid yaw = true yaw - convergence."""
     metric: bool = True

@@ -253,6 +253,12 @@ _FASTEST = 100.0
 """Greater speeds in m/s are no measurements."""
 
 
+def read_flight_tilt(xmp: Xmp) -> tuple[float, float]:
+    """Pitch and roll of the aircraft in degrees; 0 where they are absent or impossible."""
+    pitch, roll = (xmp.number(f"Flight{axis}Degree") or 0.0 for axis in ("Pitch", "Roll"))
+    return (pitch, roll) if max(abs(pitch), abs(roll)) <= _MOST_DEG else (0.0, 0.0)
+
+
 def _from_gimbal(
     yaw: float, pitch: float | None, roll: float | None, source: str
 ) -> tuple[Attitude, tuple[str, ...]]:
