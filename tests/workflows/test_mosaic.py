@@ -228,13 +228,6 @@ def test_the_camera_is_the_true_one(finished, truth):
     assert camera["focal_x"] * 800 == pytest.approx(true["focal"], rel=0.02)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="5.4 deviations off: with control points the measured heights are moved by an offset"
-    " found without them and"
-    " then pull with their full weight (tests/alignment/test_bundle.py measures it over twelve"
-    " blocks)",
-)
 def test_the_focal_length_errs_as_its_deviation_says(finished, truth):
     true = truth["cameras"]["visible"]
     (told,) = finished.metrics["cameras"].values()
