@@ -19,7 +19,7 @@ LINES = ("heading", "distance")
 TRANSFORMS = ("translation", "similarity", "affine", "homography")
 BLENDS = ("feather", "first", "average", "multiband")
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
-SURFACES = ("sweep", "ties")
+SURFACES = ("auto", "dense", "sweep", "ties")
 THERMAL_UNITS = ("auto", "celsius", "kelvin", "decikelvin", "centikelvin", "counts")
 DISTORTIONS = ("none", "2", "4", "6", "6t")
 
@@ -126,8 +126,10 @@ class CameraSettings:
 class GroundSettings:
     """The surface that photos are projected on."""
 
-    surface: str = "sweep"
-    """One of `SURFACES`: heights from tie points alone, or refined by a plane sweep."""
+    surface: str = "auto"
+    """One of `SURFACES`: dense heights by multi-view matching where the ground has relief (auto) or
+    everywhere and finer (dense), tie points refined by a plane sweep, or tie points alone.
+    """
 
     def __post_init__(self) -> None:
         one_of("--surface", self.surface, SURFACES)

@@ -124,8 +124,8 @@ def command(
     ] = None,
     surface: Annotated[
         str,
-        option(PICTURE, "Heights: ties (tie points alone) or sweep (refined from the pictures)."),
-    ] = "sweep",
+        option(PICTURE, "Heights: auto (dense where there is relief), dense (everywhere), sweep, ties."),
+    ] = "auto",
     bounds: Annotated[
         str | None, option(PICTURE, "west,south,east,north in the output CRS.")
     ] = None,

@@ -1,14 +1,23 @@
 """Composition of a window of the map from the photos that cover it."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import STEP, Nodes, View, cut, densify, inside_everywhere
+from skyquilt.imaging.views import (
+    STEP,
+    Nodes,
+    View,
+    cut,
+    densify,
+    inside_everywhere,
+    node_places,
+    project_nodes,
+)
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Blend, Layer
@@ -19,6 +28,12 @@ PhotoPixels = Callable[[int], NDArray[Any]]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""
 PIECE = 256
 """Pixels of a piece composed at a time."""
+FINE = 4
+"""Map pixels between nodes where heights bend between those of the plan."""
+BENT = 0.25
+"""Heights bend where straight lines between nodes would shift a photo by more than this number of
+map pixels.
+"""
 MOST_PADDED = 12
 """Largest number of values in a photo's cut-out per map pixel for which adding a fourth band saves
 time.
@@ -159,7 +174,7 @@ class Composer:
         if not chosen:
             return None
         alone = len(chosen) == 1
-        cuts = [cut(n, row, column, h, w) for n, _ in chosen]
+        cuts = self._cuts(plan, [n for n, _ in chosen], row, column, h, w)
         if alone and cuts[0].seen.all():  # nothing to blend, whatever the method
             pixels, _ = self._warped(cuts[0], h, w, alone=True)
             return pixels, np.full((h, w), cuts[0].view.photo, np.int32)
@@ -168,6 +183,29 @@ class Composer:
             for n, (_, here) in zip(cuts, chosen, strict=True)
         ]
         return self.blend.merge(layers, self.grid.gsd)
+
+    def _cuts(
+        self, plan: Plan, chosen: Sequence[Nodes], row: int, column: int, h: int, w: int
+    ) -> list[Nodes]:
+        """The nodes of photos over a piece (h, w); closer ones where heights bend between them."""
+        cuts = [cut(n, row, column, h, w) for n in chosen]
+        if self.surface.cell >= STEP * self.grid.gsd:
+            return cuts
+        place = Window(
+            row=plan.window.row - plan.margin + row,
+            column=plan.window.column - plan.margin + column,
+            height=h,
+            width=w,
+        )
+        x, y, z = node_places(self.grid, self.surface, place, FINE)
+        rows, columns = (slice(at // STEP, at // STEP - (-n // STEP) + 2) for at, n in ((row, h), (column, w)))
+        straight = np.asarray(plan.z[rows, columns], np.float32)
+        size = (FINE * (z.shape[0] - 2), FINE * (z.shape[1] - 2))
+        bent = np.abs(z[1:-1, 1:-1] - densify(straight, *size)[2::FINE, 2::FINE]).max()
+        aside = max(float(n.score.max()) for n in cuts)
+        if bent * np.sqrt(aside) <= BENT * self.grid.gsd:
+            return cuts
+        return [replace(project_nodes(n.view, x, y, z), step=FINE) for n in cuts]
 
     def _layer(self, n: Nodes, near: NDArray[np.bool_], h: int, w: int, *, alone: bool) -> Layer:
         """One photo over a piece; filled only within the bounding box of the cells where it can be
@@ -194,9 +232,10 @@ class Composer:
         image = self.pixels(n.view.photo)
         # cv2.remap uses 16-bit coordinates: a cut-out keeps them small
         x, y = _reach(n.u, image.shape[1]), _reach(n.v, image.shape[0])
-        u, v = densify(n.u - np.float32(x.start), h, w), densify(n.v - np.float32(y.start), h, w)
+        u = densify(n.u - np.float32(x.start), h, w, n.step)
+        v = densify(n.v - np.float32(y.start), h, w, n.step)
         warped = _remapped(image[y, x], u, v)
-        score = np.zeros((h, w), np.float32) if alone else densify(n.score, h, w)
+        score = np.zeros((h, w), np.float32) if alone else densify(n.score, h, w, n.step)
         if not n.seen.all():
             within = inside_everywhere(n, u + np.float32(x.start), v + np.float32(y.start))
             np.copyto(score, np.float32(np.inf), where=~within)
@@ -210,7 +249,7 @@ class Composer:
             return warped
         if self.exposure.uneven(photo):
             odds = self.exposure.odds(photo, *image_place(n.view, n.u, n.v))
-            return with_odds(warped, densify(odds, *warped.shape[:2]).reshape(warped.shape))
+            return with_odds(warped, densify(odds, *warped.shape[:2], n.step).reshape(warped.shape))
         table = self.exposure.table(photo)
         return warped if table is None else np.asarray(cv2.LUT(warped, table)).reshape(warped.shape)
 

@@ -26,6 +26,7 @@ from skyquilt.ortho.drift import Drift
 from skyquilt.ortho.exposure import Balance
 from skyquilt.ortho.ground import SurfaceFromPictures, SurfaceFromTies
 from skyquilt.ortho.radiometry import BalanceMethod, DriftMethod
+from skyquilt.ortho.stereo import Level, Stereo
 from skyquilt.ortho.sweep import Sweep
 from skyquilt.ortho.tie_surface import FromTiePoints
 from skyquilt.settings import MosaicSettings
@@ -136,11 +137,21 @@ def methods_for(settings: MosaicSettings) -> Methods:
         verify=Verify(epipolar=_epipolar(settings)),
         align=registry.load("alignment", settings.method)(settings),
         surface=FromTiePoints(),
-        sweep=Sweep() if settings.ground.surface == "sweep" else None,
+        sweep=heights_for(settings),
         balance=Balance(),
         drift=Drift(),
         blend=blend_for(settings),
     )
+
+
+def heights_for(settings: MosaicSettings) -> SurfaceFromPictures | None:
+    """The refinement of heights selected by the settings; None = tie points alone."""
+    chosen: dict[str, SurfaceFromPictures] = {
+        "auto": Stereo(),
+        "dense": Stereo(fine=Level(longest=1000, window=5, wanted=4), relief=0.0),
+        "sweep": Sweep(),
+    }
+    return chosen.get(settings.ground.surface)
 
 
 def detector_for(settings: MosaicSettings) -> Detector:
