@@ -25,7 +25,6 @@ import json
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -180,8 +179,9 @@ def on_grid(path: Path, truth: Truth) -> Floats:
     """(h, w) grey values of a map on the truth's grid, NaN where it shows nothing."""
     with (
         rasterio.open(path) as source,
-        WarpedVRT(source, resampling=Resampling.cubic, add_alpha=source.count == 3, **truth.profile)
-        as vrt,
+        WarpedVRT(
+            source, resampling=Resampling.cubic, add_alpha=source.count == 3, **truth.profile
+        ) as vrt,
     ):
         bands = vrt.read()
     grey = cv2.cvtColor(np.ascontiguousarray(np.moveaxis(bands[:3], 0, 2)), cv2.COLOR_RGB2GRAY)
@@ -257,8 +257,10 @@ def picture_figures(grey: Floats, truth: Truth) -> dict[str, float]:
     similar = ssim(picture, truth.grey)
     moved = displacements(picture, truth.grey, whole)
     length = np.hypot(*(moved - np.median(moved, axis=0)).T)
-    energy = [cv2.Sobel(g, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(g, cv2.CV_32F, 0, 1) ** 2
-              for g in (picture, truth.grey)]
+    energy = [
+        cv2.Sobel(g, cv2.CV_32F, 1, 0) ** 2 + cv2.Sobel(g, cv2.CV_32F, 0, 1) ** 2
+        for g in (picture, truth.grey)
+    ]
     open_ = whole & ~truth.near
     return {
         "near": float(similar[whole & truth.near].mean()),
@@ -325,7 +327,6 @@ def height_figures(path: Path, truth: Truth) -> dict[str, float]:
         "z_inner_gsd": nmad(truth.inner),
         "z_inner_bias_m": float(np.median(inner)) if inner.size else float("nan"),
     }
-
 
 
 if __name__ == "__main__":

@@ -124,7 +124,9 @@ def command(
     ] = None,
     surface: Annotated[
         str,
-        option(PICTURE, "Heights: auto (dense where there is relief), dense (everywhere), sweep, ties."),
+        option(
+            PICTURE, "Heights: auto (dense where there is relief), dense (everywhere), sweep, ties."
+        ),
     ] = "auto",
     bounds: Annotated[
         str | None, option(PICTURE, "west,south,east,north in the output CRS.")

@@ -218,7 +218,9 @@ def inside_everywhere(
     within = inside(nodes.view.camera, u, v)
     if nodes.real.all():
         return within
-    return within & (densify(nodes.real.astype(np.float32), *u.shape, nodes.step) > 0.999)
+    return within & (
+        densify(nodes.real.astype(np.float32), u.shape[0], u.shape[1], nodes.step) > 0.999
+    )
 
 
 def node_places(

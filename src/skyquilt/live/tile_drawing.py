@@ -34,6 +34,7 @@ class Newest:
     """The photo taken last is shown, with hard seams."""
 
     margin: ClassVar[int] = 0
+    seam_px: ClassVar[None] = None
     version: ClassVar[int] = 1
 
     def rank(self, order: Order, score: Float) -> Float:

@@ -22,6 +22,7 @@ from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Blend, Layer
 from skyquilt.ortho.exposure import NEUTRAL, Exposure, image_place, with_odds
+from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.plan import Plan, planned, stale
 
 PhotoPixels = Callable[[int], NDArray[Any]]
@@ -72,6 +73,8 @@ class Composer:
     """Type of the map's pixels."""
     exposure: Exposure = NEUTRAL
     """Brightness corrections of the photos."""
+    labels: Labels | None = None
+    """The photo of each place; None = by the blending method's own rule."""
 
     def __call__(self, window: Window) -> Composed:
         """Plans and composes a window."""
@@ -92,6 +95,7 @@ class Composer:
             self.blend,
             counted=counted,
             earlier=earlier,
+            labels=self.labels,
         )
 
     def drawn(self, plan: Plan) -> Composed:
@@ -178,8 +182,14 @@ class Composer:
         if alone and cuts[0].seen.all():  # nothing to blend, whatever the method
             pixels, _ = self._warped(cuts[0], h, w, alone=True)
             return pixels, np.full((h, w), cuts[0].view.photo, np.int32)
+        place = Window(
+            row=plan.window.row - plan.margin + row,
+            column=plan.window.column - plan.margin + column,
+            height=h,
+            width=w,
+        )
         layers = [
-            self._layer(n, here, h, w, alone=alone)
+            self._layer(n, here, place, alone=alone)
             for n, (_, here) in zip(cuts, chosen, strict=True)
         ]
         return self.blend.merge(layers, self.grid.gsd)
@@ -198,7 +208,9 @@ class Composer:
             width=w,
         )
         x, y, z = node_places(self.grid, self.surface, place, FINE)
-        rows, columns = (slice(at // STEP, at // STEP - (-n // STEP) + 2) for at, n in ((row, h), (column, w)))
+        rows, columns = (
+            slice(at // STEP, at // STEP - (-n // STEP) + 2) for at, n in ((row, h), (column, w))
+        )
         straight = np.asarray(plan.z[rows, columns], np.float32)
         size = (FINE * (z.shape[0] - 2), FINE * (z.shape[1] - 2))
         bent = np.abs(z[1:-1, 1:-1] - densify(straight, *size)[2::FINE, 2::FINE]).max()
@@ -207,20 +219,27 @@ class Composer:
             return cuts
         return [replace(project_nodes(n.view, x, y, z), step=FINE) for n in cuts]
 
-    def _layer(self, n: Nodes, near: NDArray[np.bool_], h: int, w: int, *, alone: bool) -> Layer:
-        """One photo over a piece; filled only within the bounding box of the cells where it can be
-        visible.
+    def _layer(self, n: Nodes, near: NDArray[np.bool_], place: Window, *, alone: bool) -> Layer:
+        """One photo over a piece at its place in the map; filled only within the bounding box of
+        the cells where it can be visible.
         """
+        h, w = place.height, place.width
         rows, columns = _extent(np.asarray(near.any(1)), h), _extent(np.asarray(near.any(0)), w)
         size = rows.stop - rows.start, columns.stop - columns.start
         pixels, score = self._warped(cut(n, rows.start, columns.start, *size), *size, alone=alone)
         if size != (h, w):
             pixels = _embedded(pixels, 0, rows, columns, h, w)
             score = _embedded(score, np.inf, rows, columns, h, w)
+        slope = None
+        if self.labels is not None and self.blend.seam_px is not None and not alone:
+            share = self.labels.share(n.view.photo, place, self.blend.seam_px)
+            score = np.where(np.isfinite(score), 1 - share, score)
+            slope = self.labels.slope(self.blend.seam_px)
         return Layer(
             photo=n.view.photo,
             pixels=pixels,
             score=score,
+            slope=slope,
             centre=(float(n.view.pose.map_C[0]), float(n.view.pose.map_C[1])),
             height=n.height,
         )
@@ -249,7 +268,10 @@ class Composer:
             return warped
         if self.exposure.uneven(photo):
             odds = self.exposure.odds(photo, *image_place(n.view, n.u, n.v))
-            return with_odds(warped, densify(odds, *warped.shape[:2], n.step).reshape(warped.shape))
+            return with_odds(
+                warped,
+                densify(odds, warped.shape[0], warped.shape[1], n.step).reshape(warped.shape),
+            )
         table = self.exposure.table(photo)
         return warped if table is None else np.asarray(cv2.LUT(warped, table)).reshape(warped.shape)
 

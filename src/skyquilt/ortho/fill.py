@@ -68,7 +68,9 @@ def _planes(z: Float, support: Mask) -> Float:
     factor = max(1.0, max(h, w) / COARSE)
     small: Any = (max(2, round(w / factor)), max(2, round(h / factor)))
     weight = cv2.resize(support.astype(np.float32), small, interpolation=cv2.INTER_AREA)
-    mean = cv2.resize(np.where(support, z, 0).astype(np.float32), small, interpolation=cv2.INTER_AREA)
+    mean = cv2.resize(
+        np.where(support, z, 0).astype(np.float32), small, interpolation=cv2.INTER_AREA
+    )
     base = float(mean.sum() / weight.sum())
     total = mean - base * weight
     y, x = np.mgrid[: small[1], : small[0]].astype(np.float32) / COARSE
@@ -76,7 +78,10 @@ def _planes(z: Float, support: Mask) -> Float:
     def spread(part: NDArray[Any]) -> NDArray[np.float64]:
         # a wide and a very wide surrounding: the second only counts where the first is empty
         return sum(
-            share * cv2.GaussianBlur(part.astype(np.float64), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+            share
+            * cv2.GaussianBlur(
+                part.astype(np.float64), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT
+            )
             for sigma, share in ((COARSE / 12, 1.0), (COARSE / 3, 1e-3))
         )
 
@@ -90,3 +95,24 @@ def _planes(z: Float, support: Mask) -> Float:
     sx, sy = (vyy * mx - vxy * my) / det, (vxx * my - vxy * mx) / det
     plane = base + m + sx * (x - cx) + sy * (y - cy)
     return np.asarray(cv2.resize(plane.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR))
+
+
+def nearest_known(z: Float, known: Mask) -> Float:
+    """Heights (h, w) with gaps filled by the nearest known one: they end in cliffs. A photo drawn
+    on a slope between a crown and the ground beside it would become a streak.
+    """
+    _, place = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    table = np.zeros(int(place.max()) + 1, np.float32)
+    table[place[known]] = z[known]
+    return np.asarray(table[place])
+
+
+def plateaus(z: Float, side: int) -> Float:
+    """Medians of heights (h, w) over windows of `side` cells, an odd number, to a 255th of their
+    range: crowns become level, and cliffs stay.
+    """
+    low, span = float(z.min()), max(float(np.ptp(z)), 1e-6)
+    levels = np.rint((z - low) * (255 / span)).astype(np.uint8)
+    return np.asarray(cv2.medianBlur(levels, side) * np.float32(span / 255) + low, np.float32)

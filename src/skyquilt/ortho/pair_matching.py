@@ -104,7 +104,12 @@ def pair_of(a: View, b: View, z: float, gsd: float) -> Pair | None:
 
 
 def matched_points(
-    pair: Pair, left: NDArray[np.uint8], right: NDArray[np.uint8], low: float, high: float, window: int
+    pair: Pair,
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    low: float,
+    high: float,
+    window: int,
 ) -> Float:
     """Points (n, 3) in m, relative to the pair's origin, between the heights low and high in m over
     the plane, from the grey images of a and b; windows of `window` px are compared.
@@ -113,16 +118,21 @@ def matched_points(
     rows, columns = np.nonzero(good)
     along = pair.gsd * d[rows, columns]
     share = (along / (np.float32(pair.base) + along)).astype(np.float32)  # of the way to a
-    at = (rows[:, None] * (pair.gsd * pair.down) + columns[:, None] * (pair.gsd * pair.along)).astype(
-        np.float32
-    )
+    at = (
+        rows[:, None] * (pair.gsd * pair.down) + columns[:, None] * (pair.gsd * pair.along)
+    ).astype(np.float32)
     centre = (pair.a.pose.map_C - pair.origin).astype(np.float32)
     at += (centre - at) * share[:, None]
     return at
 
 
 def _disparities(
-    pair: Pair, left: NDArray[np.uint8], right: NDArray[np.uint8], low: float, high: float, window: int
+    pair: Pair,
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    low: float,
+    high: float,
+    window: int,
 ) -> tuple[Float, Mask]:
     """Disparities (h, w) in px of picture a, and where they hold."""
     first = int(np.floor(pair.shift(low))) - 1
@@ -131,9 +141,7 @@ def _disparities(
     right, seen_b = _rectified(pair, pair.b, right)
     # the matcher leaves out columns whose counterparts may lie beyond the picture
     before, after = max(0, first + number), max(0, -first)
-    wide = [
-        cv2.copyMakeBorder(p, 0, 0, before, after, cv2.BORDER_REPLICATE) for p in (left, right)
-    ]
+    wide = [cv2.copyMakeBorder(p, 0, 0, before, after, cv2.BORDER_REPLICATE) for p in (left, right)]
     match = cv2.StereoSGBM.create(
         minDisparity=first,
         numDisparities=number,

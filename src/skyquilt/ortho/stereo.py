@@ -19,7 +19,7 @@ from skyquilt.engine.executor import in_order
 from skyquilt.imaging.views import View
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
-from skyquilt.ortho.fill import filled, settled
+from skyquilt.ortho.fill import nearest_known, plateaus, settled
 from skyquilt.ortho.pair_matching import Array, Float, Mask, Pair, matched_points, pair_of
 
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
@@ -30,6 +30,8 @@ MOST_CELLS = 2.4e7
 """Largest number of cells of a surface."""
 TILE = 512
 """Cells along a side of the pieces in which heights are fused."""
+FIRM = 0.75
+"""Share of the cells around with a fine height from which these are believed."""
 THREADS = 2
 """Pairs matched at a time."""
 
@@ -64,6 +66,8 @@ class _Round:
     """Highest height searched."""
     grey: GreyPicture
     """Source of the photos' grey images."""
+    agree: float
+    """Heights of different pairs that agree differ by less than this in m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,6 +86,8 @@ class Stereo:
     """Fine heights may leave the range of the coarse ones around them by this share of the flying
     height.
     """
+    whole: float = 0.05
+    """Size of crowns and of gaps between them, as a share of the flying height."""
     relief: float = 0.02
     """A pair with less relief than this share of the flying height is not matched finely; 0 = every
     pair is.
@@ -108,7 +114,9 @@ class Stereo:
         if not support.any():
             return surface
         gsd = max(extent / self.fine.longest, grid.gsd)
-        cells = grid.coarser(max(int(np.clip(round(2 * gsd / grid.gsd), *self.cell_px)), _least(grid)))
+        cells = grid.coarser(
+            max(int(np.clip(round(2 * gsd / grid.gsd), *self.cell_px)), _least(grid))
+        )
         step = self.agree * height
         given = _Round(
             level=self.fine,
@@ -118,13 +126,18 @@ class Stereo:
             low=_stretched(rough, 3 * gsd, cv2.MORPH_ERODE, -step),
             high=_stretched(rough, 3 * gsd, cv2.MORPH_DILATE, step),
             grey=grey,
+            agree=0.015 * height,
         )
         z = self._fused(given, views, height, self.relief * height, keep)
         known = _without_specks(z, 0.01 * height, 6)
         x, y = np.meshgrid(cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)))
-        former = rough.at(x, y)
-        z = former + filled(np.where(known, z - former, 0), known) if known.any() else former
-        return _surface(np.asarray(cv2.medianBlur(z.astype(np.float32), 3), np.float32), cells)
+        former = cv2.medianBlur(_stepwise(rough, x, y), 5)  # cliffs stay as steep as cells allow
+        if not known.any():
+            return _surface(former, cells)
+        side = 2 * round(self.whole * height / cells.gsd / 2) + 1
+        firm = cv2.boxFilter(known.astype(np.float32), -1, (side, side)) > FIRM
+        refined = cv2.medianBlur(nearest_known(z, known), 5)
+        return _surface(np.where(firm, refined, former).astype(np.float32), cells)
 
     def _coarse(
         self,
@@ -147,20 +160,25 @@ class Stereo:
             low=_stretched(surface, 0.2 * height, cv2.MORPH_ERODE, -self.below * height),
             high=replace(surface, z=surface.z + np.float32(self.above * height)),
             grey=grey,
+            agree=0.04 * height,
         )
         z = self._fused(given, views, height, 0.0, keep)
         known = _without_specks(z, 0.02 * height, 12)
-        whole = filled(z, known) if known.any() else z
-        whole = np.asarray(cv2.medianBlur(whole, 5), np.float32)
+        if not known.any():
+            return surface, known
+        # where only some places agree, as in leaves, heights are those of whole crowns
+        firm = cv2.boxFilter(known.astype(np.float32), -1, (5, 5)) > FIRM
+        whole = nearest_known(z, known)
+        side = 2 * round(self.whole * height / cells.gsd) + 1
+        closed = cv2.morphologyEx(whole, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))
+        whole = np.where(firm, cv2.medianBlur(whole, 5), plateaus(closed, side))
         around = cv2.morphologyEx(
             known.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8)
         )
-        whole = settled(whole, around > 0, 2.0, 0.15 * height / cells.gsd)
+        whole = settled(whole.astype(np.float32), around > 0, 2.0, 0.4 * height / cells.gsd)
         return _surface(whole, cells), known
 
-    def pairs(
-        self, views: Sequence[View], height: float, wanted: int
-    ) -> list[tuple[View, View]]:
+    def pairs(self, views: Sequence[View], height: float, wanted: int) -> list[tuple[View, View]]:
         """The pairs that are matched, of photos `height` m above ground: those with good baselines
         first, until every place is seen by `wanted` of them.
         """
@@ -226,10 +244,12 @@ def _tile(
         todo, in_order(lambda k: _points(pairs[k], given), todo, jobs=THREADS), strict=True
     ):
         held[k] = points
-    layers = [
-        layer for k in near if (layer := _splat(held[k], pairs[k].origin, part)) is not None
-    ]
-    return _median(layers) if layers else np.full((part.height, part.width), np.nan, np.float32)
+    layers = [layer for k in near if (layer := _splat(held[k], pairs[k].origin, part)) is not None]
+    return (
+        _agreed(layers, given.agree)
+        if layers
+        else np.full((part.height, part.width), np.nan, np.float32)
+    )
 
 
 def _over(a: View, b: View, given: _Round) -> Pair | None:
@@ -242,9 +262,7 @@ def _over(a: View, b: View, given: _Round) -> Pair | None:
 
 def _sampled(pair: Pair, surface: Surface) -> Float:
     """Heights (n, n) of a surface over the part that a pair shows."""
-    places = pair.places(
-        *np.meshgrid(*(np.linspace(0, n, 48) for n in pair.size), indexing="ij")
-    )
+    places = pair.places(*np.meshgrid(*(np.linspace(0, n, 48) for n in pair.size), indexing="ij"))
     return surface.at(places[..., 0], places[..., 1])
 
 
@@ -290,12 +308,27 @@ def _splat(points: Float, origin: Array, part: Grid) -> Float | None:
     return (mean + origin[2]).reshape(part.height, part.width).astype(np.float32)
 
 
-def _median(layers: Sequence[Float]) -> Float:
-    """Median (h, w) of layers, NaN ignored; of an even number the lower of the two in the middle."""
+def _agreed(layers: Sequence[Float], step: float) -> Float:
+    """Median (h, w) of layers, NaN ignored; of an even number the lower of the two in the middle.
+    NaN where of several heights none lies within `step` m of it.
+    """
     ordered = np.sort(np.stack(layers), axis=0)
     number = np.isfinite(ordered).sum(0)
     middle = np.maximum(number - 1, 0) // 2
-    return np.asarray(np.take_along_axis(ordered, middle[None], 0)[0])
+    z = np.take_along_axis(ordered, middle[None], 0)[0]
+    if len(layers) > 1:
+        with np.errstate(invalid="ignore"):
+            close = (np.abs(ordered - z) < step).sum(0)
+        z = np.where((number > 1) & (close < 2), np.float32(np.nan), z)
+    return np.asarray(z)
+
+
+def _stepwise(surface: Surface, x: NDArray[Any], y: NDArray[Any]) -> Float:
+    """Heights (h, w) of the nearest cells of a surface."""
+    column = np.rint((x[0] - surface.x0) / surface.cell).astype(np.int64)
+    row = np.rint((y[:, 0] - surface.y0) / surface.cell).astype(np.int64)
+    rows, columns = surface.z.shape
+    return surface.z[np.clip(row, 0, rows - 1)][:, np.clip(column, 0, columns - 1)]
 
 
 def _without_specks(z: Float, step: float, least: int) -> Mask:
@@ -353,9 +386,15 @@ def _covered(outline: Array, corner: Array, side: float, shape: Any) -> Covered:
 
 def _common(a: Covered, b: Covered) -> tuple[tuple[slice, slice], tuple[Mask, Mask]]:
     """The common rows and columns of two parts of a raster, and both masks there."""
-    inner = [slice(max(p.start, q.start), max(p.start, q.start, min(p.stop, q.stop))) for p, q in zip(a[:2], b[:2], strict=True)]
+    inner = [
+        slice(max(p.start, q.start), max(p.start, q.start, min(p.stop, q.stop)))
+        for p, q in zip(a[:2], b[:2], strict=True)
+    ]
     masks = [
-        m[inner[0].start - r.start : inner[0].stop - r.start, inner[1].start - c.start : inner[1].stop - c.start]
+        m[
+            inner[0].start - r.start : inner[0].stop - r.start,
+            inner[1].start - c.start : inner[1].stop - c.start,
+        ]
         for r, c, m in (a, b)
     ]
     return (inner[0], inner[1]), (masks[0], masks[1])

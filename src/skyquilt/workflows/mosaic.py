@@ -39,7 +39,18 @@ from skyquilt.workflows.methods import Methods, methods_for
 from skyquilt.workflows.run_report import finish_run
 from skyquilt.workflows.survey_input import Source, SurveyInput, check_input, read_input
 
-STAGES = ("read", "features", "links", "align", "surface", "balance", "mosaic", "measure", "report")
+STAGES = (
+    "read",
+    "features",
+    "links",
+    "align",
+    "surface",
+    "balance",
+    "seams",
+    "mosaic",
+    "measure",
+    "report",
+)
 """Stages in order."""
 ARTEFACTS = {
     "features": "features",
@@ -47,6 +58,7 @@ ARTEFACTS = {
     "links": "links",
     "align": "alignment",
     "surface": "surface",
+    "seams": "seams",
     "mosaic": "blocks",
 }
 """Stage -> folder in the store."""
