@@ -240,6 +240,7 @@ def oracle(flight: Path, truth: Truth, work: Path) -> Floats:
         pixels=pixels,
         bands=3,
         dtype=np.dtype(np.uint8),
+        detailed=True,
         exposure=Balance()(views, thumbnails, surface, grid.bounds),
     )
     height, width = truth.grey.shape

@@ -41,7 +41,7 @@ pytestmark = pytest.mark.filterwarnings(
         (("--seed", "-1"), ("--seed", "outside")),
         (("--blend", "soft"), ("--blend 'soft'", "feather", "multiband")),
         (("--compress", "zip"), ("--compress 'zip'", "jpeg", "zstd")),
-        (("--surface", "lidar"), ("--surface", "sweep, ties")),
+        (("--surface", "lidar"), ("--surface", "auto, dense, sweep, ties")),
         (("--distortion", "9"), ("--distortion", "6t")),
         (("--bounds", "1,2,3"), ("--bounds", "four numbers", "1,2,3")),
         (("--bounds", "a,b,c,d"), ("--bounds", "four numbers")),

@@ -25,6 +25,8 @@ from skyquilt.workflows.survey_input import SurveyInput
 
 WAYS = (
     MosaicSettings(),
+    MosaicSettings(surface="sweep"),
+    MosaicSettings(surface="dense"),
     MosaicSettings(method="image"),
     MosaicSettings(method="image", image_search="overview"),
     MosaicSettings(method="hybrid"),

@@ -179,7 +179,7 @@ def command(
         option(
             RUN,
             "Make everything anew from this stage on: features, links, align, surface, balance,"
-            " mosaic, measure, report.",
+            " seams, mosaic, measure, report.",
         ),
     ] = None,
     quiet: Annotated[bool, option(RUN, "Say nothing but errors.", "--quiet", "-q")] = False,

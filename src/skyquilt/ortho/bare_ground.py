@@ -60,7 +60,7 @@ def _plane(z: Float, known: Mask) -> Float:
     row, column = np.nonzero(known)
     terms = np.column_stack([np.ones(len(row)), row, column])
     height, weight = z[row, column].astype(np.float64), np.ones(len(row))
-    x = np.zeros(3)
+    x: NDArray[Any] = np.zeros(3)
     for _ in range(6):
         x = np.linalg.lstsq(terms * weight[:, None], height * weight, rcond=None)[0]
         # objects rise over the ground: what lies high counts little

@@ -75,6 +75,8 @@ class Composer:
     """Brightness corrections of the photos."""
     labels: Labels | None = None
     """The photo of each place; None = by the blending method's own rule."""
+    detailed: bool = False
+    """Whether heights may bend between the nodes of a plan; then nodes are set closer there."""
 
     def __call__(self, window: Window) -> Composed:
         """Plans and composes a window."""
@@ -199,7 +201,7 @@ class Composer:
     ) -> list[Nodes]:
         """The nodes of photos over a piece (h, w); closer ones where heights bend between them."""
         cuts = [cut(n, row, column, h, w) for n in chosen]
-        if self.surface.cell >= STEP * self.grid.gsd:
+        if not self.detailed or self.surface.cell >= STEP * self.grid.gsd:
             return cuts
         place = Window(
             row=plan.window.row - plan.margin + row,

@@ -55,11 +55,11 @@ class Exposure:
         field = np.exp(_basis(x, y) @ self.fields[photo])
         return (field[..., None] * np.exp(self.gains[photo])).astype(np.float32)
 
-    def grey(self, view: View, value: Float, u: Float, v: Float) -> Float:
+    def grey(self, view: View, value: NDArray[Any], u: NDArray[Any], v: NDArray[Any]) -> Float:
         """Corrected grey values (h, w) of a photo's pixels at columns u and rows v (h, w)."""
         photo = view.photo
         if photo not in self.gains:
-            return value.astype(np.float32)
+            return np.asarray(value, np.float32)
         field = _basis(*image_place(view, u, v)) @ self.fields[photo]
         g = np.exp(field + self.gains[photo].mean())
         return np.asarray(255 * g * value / (255 + (g - 1) * value), np.float32)

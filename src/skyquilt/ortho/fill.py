@@ -57,7 +57,7 @@ def settled(z: Float, support: Mask, reach: float, width: float) -> Float:
     away = cv2.distanceTransform((~support).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
     share = np.clip((away - reach) / max(width, 1e-6), 0, 1)
     share = share * share * (3 - 2 * share)
-    return ((1 - share) * z + share * _planes(z, support)).astype(np.float32)
+    return np.asarray((1 - share) * z + share * _planes(z, support), np.float32)
 
 
 def _planes(z: Float, support: Mask) -> Float:
@@ -77,13 +77,11 @@ def _planes(z: Float, support: Mask) -> Float:
 
     def spread(part: NDArray[Any]) -> NDArray[np.float64]:
         # a wide and a very wide surrounding: the second only counts where the first is empty
-        return sum(
-            share
-            * cv2.GaussianBlur(
-                part.astype(np.float64), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT
-            )
-            for sigma, share in ((COARSE / 12, 1.0), (COARSE / 3, 1e-3))
+        wide, widest = (
+            cv2.GaussianBlur(part.astype(np.float64), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+            for sigma in (COARSE / 12, COARSE / 3)
         )
+        return np.asarray(wide + 1e-3 * widest)
 
     mass = spread(weight)
     cx, cy, m = (spread(part) / mass for part in (weight * x, weight * y, total))

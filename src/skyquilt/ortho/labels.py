@@ -27,8 +27,8 @@ class Labels:
     """(rows, columns) whether no photo sees the place: then the most vertical one is shown."""
 
     def around(self, window: Window, ring: int) -> NDArray[np.int32]:
-        """Labels of the cells of a window of the map, which starts at a cell's corner, and of a ring
-        of cells around it; beyond the map those at its rim.
+        """Labels of the cells of a window of the map, which starts at a cell's corner, and of a
+        ring of cells around it; beyond the map those at its rim.
         """
         f, (rows, columns) = self.factor, self.photo.shape
         r, c = (
@@ -42,8 +42,8 @@ class Labels:
         return 1 + int(np.ceil(width_px / self.factor / 2))
 
     def near(self, window: Window, width_px: float) -> dict[int, Mask]:
-        """Photos that show in a window of the map, with ramps of a width in px, and where: (r + 2, c
-        + 2) for its cells of STEP px with one ring around them.
+        """Photos that show in a window of the map, with ramps of a width in px, and where: (r + 2,
+        c + 2) for its cells of STEP px with one ring around them.
         """
         # the ring of STEP cells in cells, and the reach of ramps beyond it
         more = max(STEP // self.factor, 1) + self.ring(width_px)

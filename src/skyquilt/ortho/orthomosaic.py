@@ -62,6 +62,7 @@ def composer(
         dtype=np.dtype(dtype),
         exposure=exposure,
         labels=labels,
+        detailed=True,
     )
 
 

@@ -21,7 +21,7 @@ Mask = NDArray[np.bool_]
 SUBPIXEL = 16
 """OpenCV gives disparities in sixteenths of a pixel."""
 SPECKLE = 60
-"""Patches of fewer pixels than this, apart from their surroundings by more than two, are dropped."""
+"""Patches of fewer pixels, apart from their surroundings by more than two, are dropped."""
 TALLEST = 0.7
 """Largest height over the plane that is searched, as a share of the cameras' height."""
 
@@ -156,11 +156,11 @@ def _disparities(
         mode=cv2.STEREO_SGBM_MODE_SGBM,
     )
     found = match.compute(*wide)[:, before : before + left.shape[1]]
-    d = found.astype(np.float32) / SUBPIXEL
+    d = np.asarray(found.astype(np.float32) / np.float32(SUBPIXEL), np.float32)
     there = np.arange(d.shape[1], dtype=np.float32) - d
     other = np.clip(np.rint(there), 0, d.shape[1] - 1).astype(np.intp)
     inside = (there > 0) & (there < d.shape[1] - 1) & np.take_along_axis(seen_b, other, 1)
-    return d, (d >= first) & seen & inside
+    return d, np.asarray((d >= first) & seen & inside)
 
 
 def _rectified(

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from skyquilt.imaging.views import View, densify, overlapping, project_all
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
+from skyquilt.ortho.bare_ground import bare_ground
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.labels import Labels
-from skyquilt.ortho.bare_ground import bare_ground
 from skyquilt.ortho.occlusion import STANDING_M, Shadow
 
 Float = NDArray[np.float32]
@@ -222,7 +222,6 @@ def flooded(label: NDArray[np.int32], sure: Mask, height: NDArray[np.uint8]) -> 
     if not len(names):
         return label
     marks = np.zeros(steps.shape, np.int32)
-    marks[::2, ::2] = len(names) + 1  # corners belong to nothing
     cells = np.zeros(label.shape, np.int32)
     cells[land & sure] = index + 1
     cells[~land] = len(names) + 1
@@ -294,9 +293,10 @@ class _Scene:
         for k, view in enumerate(views):
             shadow = self._shadow(view)
             if not shadow.empty:
-                behind = shadow.hides(fx, fy, self.z[part]) | self._grazing(view, part, fx, fy)
-                behind = behind.view(np.uint8)
-                behind = cv2.morphologyEx(behind, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+                lost = shadow.hides(fx, fy, self.z[part]) | self._grazing(view, part, fx, fy)
+                behind = cv2.morphologyEx(
+                    lost.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
+                )
                 score[k][behind > 0] += HIDDEN
         return views, score, nodes
 

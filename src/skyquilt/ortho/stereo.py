@@ -131,7 +131,8 @@ class Stereo:
         z = self._fused(given, views, height, self.relief * height, keep)
         known = _without_specks(z, 0.01 * height, 6)
         x, y = np.meshgrid(cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)))
-        former = cv2.medianBlur(_stepwise(rough, x, y), 5)  # cliffs stay as steep as cells allow
+        # cliffs stay as steep as the cells allow
+        former = np.asarray(cv2.medianBlur(_stepwise(rough, x, y), 5), np.float32)
         if not known.any():
             return _surface(former, cells)
         side = 2 * round(self.whole * height / cells.gsd / 2) + 1
@@ -170,7 +171,8 @@ class Stereo:
         firm = cv2.boxFilter(known.astype(np.float32), -1, (5, 5)) > FIRM
         whole = nearest_known(z, known)
         side = 2 * round(self.whole * height / cells.gsd) + 1
-        closed = cv2.morphologyEx(whole, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))
+        kernel = np.ones((side, side), np.uint8)
+        closed = np.asarray(cv2.morphologyEx(whole, cv2.MORPH_CLOSE, kernel), np.float32)
         whole = np.where(firm, cv2.medianBlur(whole, 5), plateaus(closed, side))
         around = cv2.morphologyEx(
             known.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8)
@@ -285,7 +287,7 @@ def _points(pair: Pair, given: _Round) -> Float:
     pictures = (given.grey(pair.a.photo, side), given.grey(pair.b.photo, side))
     at = matched_points(pair, *pictures, low, high, given.level.window)
     x, y, z = (at[:, k] + pair.origin[k] for k in range(3))
-    return at[(z > given.low.at(x, y)) & (z < given.high.at(x, y))]
+    return np.asarray(at[(z > given.low.at(x, y)) & (z < given.high.at(x, y))])
 
 
 def _splat(points: Float, origin: Array, part: Grid) -> Float | None:
@@ -305,7 +307,7 @@ def _splat(points: Float, origin: Array, part: Grid) -> Float | None:
     number = np.bincount(cell, minlength=len(top))
     with np.errstate(invalid="ignore"):
         mean = np.bincount(cell, z, minlength=len(top)) / number
-    return (mean + origin[2]).reshape(part.height, part.width).astype(np.float32)
+    return np.asarray((mean + origin[2]).reshape(part.height, part.width), np.float32)
 
 
 def _agreed(layers: Sequence[Float], step: float) -> Float:
