@@ -25,6 +25,8 @@ class Labels:
     """(rows, columns) index of the photo, -1 = none."""
     hidden: Mask
     """(rows, columns) whether no photo sees the place: then the most vertical one is shown."""
+    tall: Mask
+    """(rows, columns) whether the place stands up from the bare ground."""
 
     def around(self, window: Window, ring: int) -> NDArray[np.int32]:
         """Labels of the cells of a window of the map, which starts at a cell's corner, and of a

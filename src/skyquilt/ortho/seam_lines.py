@@ -108,7 +108,9 @@ class SeamLines:
         for row in range(0, cells.height, TILE):
             for column in range(0, cells.width, TILE):
                 self._tile(scene, photo, hidden, row, column)
-        return Labels(cells=cells, factor=factor, photo=photo, hidden=hidden)
+        return Labels(
+            cells=cells, factor=factor, photo=photo, hidden=hidden, tall=over > STANDING_M
+        )
 
     def _tile(
         self, scene: "_Scene", photo: NDArray[np.int32], hidden: Mask, row: int, column: int

@@ -23,6 +23,7 @@ from skyquilt.ortho.radiometry import value_figures
 from skyquilt.quality.placement import placement_quality
 from skyquilt.quality.run_metrics import figures
 from skyquilt.quality.seam_measurement import MeasuredSeams, measure_seams
+from skyquilt.quality.tone import tone_residual
 from skyquilt.settings import MosaicSettings
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
@@ -169,7 +170,9 @@ def make_map(
     measuring = _measured(aligned, ground, drawn, settings)
     seams, quality = yield from clock.stage("measure", measuring, keeps=False)
     metrics = _metrics(aligned, ground, drawn, seams, settings) | {"quality": quality}
-    finishing = finish_run(run.path, aligned, ground, drawn.drawn, seams, metrics, settings, clock)
+    finishing = finish_run(
+        run.path, aligned, ground, drawn.drawn, drawn.compose, seams, metrics, settings, clock
+    )
     metrics = yield from clock.stage("report", finishing)
     run.mark("done")
     result = Result(output=run.path, metrics=metrics)
@@ -227,9 +230,18 @@ def _metrics(
         ground=ground,
         drawn=map_.drawn,
         seams=seams.figures,
+        looks={**seams.looks, "tone_residual": _tone(aligned, ground, map_)},
         conflicts=conflicts(aligned.photos, aligned.priors, alignment),
         notes=[*survey.notes, *alignment.notes],
     ) | value_figures(aligned.photos, map_.exposure, settings.picture)
+
+
+def _tone(aligned: AlignedPhotos, ground: Ground, map_: DrawnMap) -> dict[str, Any] | None:
+    """How evenly the balanced photos show the same ground."""
+    thumbnails = aligned.found.thumbnails([v.photo for v in ground.views])
+    return tone_residual(
+        ground.views, thumbnails, ground.surface, ground.grid.bounds, map_.exposure
+    )
 
 
 def _forget(run: RunFolder, store: Store, rerun_from: str | None) -> None:
