@@ -297,7 +297,7 @@ class _Scene:
             if not shadow.empty:
                 lost = shadow.hides(fx, fy, self.z[part]) | self._grazing(view, part, fx, fy)
                 behind = cv2.morphologyEx(
-                    lost.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
+                    lost.view(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)
                 )
                 score[k][behind > 0] += HIDDEN
         return views, score, nodes

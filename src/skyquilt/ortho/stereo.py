@@ -28,8 +28,10 @@ Keep = Callable[[str, Callable[[], Float]], Float]
 """Gives a part of the result by its name: the one kept of an interrupted run, or made now."""
 MOST_CELLS = 2.4e7
 """Largest number of cells of a surface."""
-TILE = 512
+TILE = 256
 """Cells along a side of the pieces in which heights are fused."""
+NEW = 0.5
+"""Share of the ground of a pair that must still lack pairs for it to be matched."""
 FIRM = 0.75
 """Share of the cells around with a fine height from which these are believed."""
 THREADS = 2
@@ -200,7 +202,7 @@ class Stereo:
             both = mask_a & mask_b
             part = counts[rows, columns]
             new = both & (part < wanted)
-            if new.any() and new.sum() > 0.05 * both.sum():
+            if new.any() and new.sum() > NEW * both.sum():
                 part += both
                 chosen.append((views[a], views[b]))
         return chosen

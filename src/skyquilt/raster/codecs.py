@@ -109,25 +109,22 @@ def split_jpeg(stream: bytes) -> tuple[bytes, bytes]:
 
 
 def smooth_fill(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[Any]:
-    """Pixels (uint8) with every invalid one set to the mean of the valid ones in or around its JPEG
-    unit.
-
-    This keeps the colours at the border of the valid area. Units without valid neighbours become
-    black, for viewers that ignore masks.
+    """Pixels (uint8) with the invalid ones of every JPEG unit that has valid ones set to the nearest
+    of these, so that its border keeps its colours; all others are black, for programs that ignore
+    masks.
     """
-    pixels, small = pixels.copy(), (valid.shape[1] // MCU, valid.shape[0] // MCU)
-    units, inside = _units(pixels), _units(valid[..., None])
-    share = cv2.resize(valid.astype(np.uint8) * 255, small, interpolation=cv2.INTER_AREA)
-    mean = cv2.resize(pixels, small, interpolation=cv2.INTER_AREA).reshape((*units.shape[:2], -1))
-    mixed = np.nonzero((share > 0) & (share < 255))
-    colours, kept = units[mixed], inside[mixed]
-    mean[mixed] = (colours * kept).sum((1, 2), dtype=np.uint32) // kept.sum((1, 2), dtype=np.uint32)
-    units[mixed] = np.where(kept, colours, mean[mixed][:, None, None])
-    own, void = (share > 0).astype(np.float32)[..., None], share == 0
-    around = cv2.blur(mean * own, (3, 3), borderType=cv2.BORDER_CONSTANT).reshape(mean.shape)
-    weight = cv2.blur(own, (3, 3), borderType=cv2.BORDER_CONSTANT)[..., None]
-    units[void] = np.where(weight > 0.05, around / np.maximum(weight, 0.05), 0)[void][:, None, None]
-    return pixels
+    if valid.all() or not valid.any():
+        return pixels * valid[..., None]
+    _, place = cv2.distanceTransformWithLabels(
+        (~valid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    colours = np.zeros((int(place.max()) + 1, pixels.shape[2]), np.uint8)
+    colours[place[valid]] = pixels[valid]
+    mixed = _units(valid[..., None]).any((2, 3, 4)).repeat(MCU, 0).repeat(MCU, 1)
+    out = np.where(valid[..., None], pixels, 0)
+    fill = mixed & ~valid
+    out[fill] = colours[place[fill]]
+    return out
 
 
 def _units(array: NDArray[Any]) -> NDArray[Any]:
