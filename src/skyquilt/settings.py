@@ -177,10 +177,15 @@ class OutputSettings:
     """One of `COMPRESSIONS`; auto = JPEG for 8-bit pictures, zstd for measured values."""
     quality: int = 85
     """JPEG quality."""
+    dtm: bool = False
+    """Write dtm.tif as well: the bare ground, without what stands on it."""
+    contours_m: float | None = None
+    """Write contour lines of the bare ground, this many m apart; None = none."""
 
     def __post_init__(self) -> None:
         one_of("--compress", self.compress, COMPRESSIONS)
         within("--quality", self.quality, 1, 100)
+        within("--contours", self.contours_m, 0.05, 1000)
 
 
 @dataclass(frozen=True, kw_only=True)

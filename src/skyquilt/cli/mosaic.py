@@ -146,6 +146,12 @@ def command(
         str, option(FILES, "auto, jpeg, or lossless: deflate, zstd, lzw, none.")
     ] = "auto",
     quality: Annotated[int, option(FILES, "JPEG quality.")] = 85,
+    dtm: Annotated[
+        bool, option(FILES, "Write dtm.tif as well: the ground without what stands on it.", "--dtm")
+    ] = False,
+    contours: Annotated[
+        float | None, option(FILES, "Write contours.gpkg: lines of the ground, this many m apart.")
+    ] = None,
     thermal_route: Annotated[
         str,
         option(
@@ -252,6 +258,8 @@ def command(
         height_m=height,
         heading_deg=heading,
         surface=surface,
+        dtm=dtm,
+        contours_m=contours,
         gsd_cm=gsd,
         crs=crs,
         bounds=parse_bounds(bounds),

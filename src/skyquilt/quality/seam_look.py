@@ -112,18 +112,8 @@ def cut_objects(provenance: NDArray[Any], grid: Grid, labels: Labels) -> float |
     there are no seams. `provenance` (H, W): the photo of each pixel of a grid, 0 = none.
     """
     total = over = 0
-    cells = labels.cells
-    columns = np.clip(
-        cells.pixel(grid.x(np.arange(grid.width)), 0.0 * np.arange(grid.width))[0],
-        0,
-        cells.width - 1,
-    )
-    rows = np.clip(
-        cells.pixel(0.0 * np.arange(grid.height), grid.y(np.arange(grid.height)))[1],
-        0,
-        cells.height - 1,
-    )
-    tall = labels.tall[np.rint(rows).astype(int)][:, np.rint(columns).astype(int)]
+    row, column = labels.cells.nearest(grid)
+    tall = labels.tall[row][:, column]
     for a, b, ta, tb in (
         (provenance[1:], provenance[:-1], tall[1:], tall[:-1]),
         (provenance[:, 1:], provenance[:, :-1], tall[:, 1:], tall[:, :-1]),

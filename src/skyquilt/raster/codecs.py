@@ -109,7 +109,7 @@ def split_jpeg(stream: bytes) -> tuple[bytes, bytes]:
 
 
 def smooth_fill(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[Any]:
-    """Pixels (uint8) with the invalid ones of every JPEG unit that has valid ones set to the nearest
+    """Pixels (uint8) with the invalid ones of JPEG units that have valid ones set to the nearest
     of these, so that its border keeps its colours; all others are black, for programs that ignore
     masks.
     """

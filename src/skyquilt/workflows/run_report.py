@@ -15,6 +15,7 @@ from skyquilt.model.raster import Window
 from skyquilt.ortho.companions import PROVENANCE, Drawn
 from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.ground import Ground
+from skyquilt.ortho.height_files import write_heights
 from skyquilt.ortho.orthomosaic import used_photos, write_surface
 from skyquilt.quality.seam_measurement import MeasuredSeams
 from skyquilt.raster.atomic import write_text
@@ -48,6 +49,7 @@ def finish_run(
     yield 0, 3
     alignment, photos = aligned.alignment, aligned.photos
     write_surface(output, ground, alignment)
+    write_heights(output, ground, drawn, alignment, settings.output)
     run_files.write_cameras(output / "cameras.json", alignment)
     run_files.write_shots(output / "shots.geojson", photos, alignment, used_photos(ground.views))
     run_files.write_footprints(output / "footprints.geojson", photos, alignment, ground.views)
