@@ -29,8 +29,10 @@ PhotoPixels = Callable[[int], NDArray[Any]]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""
 PIECE = 256
 """Pixels of a piece composed at a time."""
-FINE = 4
-"""Map pixels between nodes where heights bend between those of the plan."""
+FINE = (4, 8)
+"""Map pixels between nodes where heights bend between those of the plan: for cells of heights of
+less than 8 px, and for others.
+"""
 BENT = 0.25
 """Heights bend where straight lines between nodes would shift a photo by more than this number of
 map pixels.
@@ -209,17 +211,19 @@ class Composer:
             height=h,
             width=w,
         )
-        x, y, z = node_places(self.grid, self.surface, place, FINE)
+        step = FINE[self.surface.cell >= FINE[1] * self.grid.gsd * 0.99]
+        x, y, z = node_places(self.grid, self.surface, place, step)
         rows, columns = (
             slice(at // STEP, at // STEP - (-n // STEP) + 2) for at, n in ((row, h), (column, w))
         )
         straight = np.asarray(plan.z[rows, columns], np.float32)
-        size = (FINE * (z.shape[0] - 2), FINE * (z.shape[1] - 2))
-        bent = np.abs(z[1:-1, 1:-1] - densify(straight, *size)[2::FINE, 2::FINE]).max()
+        size = (step * (z.shape[0] - 2), step * (z.shape[1] - 2))
+        middle = slice(step // 2, None, step)
+        bent = np.abs(z[1:-1, 1:-1] - densify(straight, *size)[middle, middle]).max()
         aside = max(float(n.score.max()) for n in cuts)
         if bent * np.sqrt(aside) <= BENT * self.grid.gsd:
             return cuts
-        return [replace(project_nodes(n.view, x, y, z), step=FINE) for n in cuts]
+        return [replace(project_nodes(n.view, x, y, z), step=step) for n in cuts]
 
     def _layer(self, n: Nodes, near: NDArray[np.bool_], place: Window, *, alone: bool) -> Layer:
         """One photo over a piece at its place in the map; filled only within the bounding box of

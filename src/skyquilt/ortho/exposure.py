@@ -111,8 +111,8 @@ class Balance:
     """Prior deviation of a term of the field in log odds."""
     sigma_radial: float = 1.0
     """Prior deviation of a term of a camera's radial fall of light."""
-    even: float = 0.05
-    """Fields smaller than this everywhere, in log odds (3 of 255 levels on middle grey), are not
+    even: float = 0.08
+    """Fields smaller than this everywhere, in log odds (5 of 255 levels on middle grey), are not
     applied, to save time.
     """
     version: ClassVar[int] = 3

@@ -10,7 +10,7 @@ Float = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 COARSE = 64
 """Cells along the longer side of the raster in which planes are fitted."""
-STIFF = 0.02
+STIFF = 0.002
 """Weight of a prior of zero for the slope of a plane."""
 
 

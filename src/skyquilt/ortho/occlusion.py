@@ -45,10 +45,16 @@ class Shadow:
         r, c = np.nonzero(tall[part])
         if not len(r):
             return
+        foot = cv2.erode(z[part], np.ones((3, 3), np.uint8))[r, c]
+        x, y = cells.x(c + self._column), cells.y(r + self._row)
         height = z[part][r, c]
-        pr, pc = self._seen_at(cells.x(c + self._column), cells.y(r + self._row), height)
-        inside = (pr >= 0) & (pc >= 0) & (pr < shape[0]) & (pc < shape[1])
-        np.maximum.at(self._buffer, (pr[inside], pc[inside]), height[inside])
+        while len(height):  # the cell, and below it the flank down to its lowest neighbour
+            pr, pc = self._seen_at(x, y, height)
+            inside = (pr >= 0) & (pc >= 0) & (pr < shape[0]) & (pc < shape[1])
+            np.maximum.at(self._buffer, (pr[inside], pc[inside]), height[inside])
+            height = height - np.float32(2 * cells.gsd)
+            left = height > foot
+            x, y, height, foot = x[left], y[left], height[left], foot[left]
         # towards the photo's rim cells lie further apart than in the raster: gaps are closed
         self._buffer = np.asarray(cv2.dilate(self._buffer, np.ones((3, 3), np.uint8)), np.float32)
         self.empty = False

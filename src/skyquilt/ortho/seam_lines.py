@@ -32,7 +32,9 @@ Mask = NDArray[np.bool_]
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
 CELL = 8
-"""Map pixels along a side of a cell; larger ones, by powers of two, for maps of very many."""
+"""Least number of map pixels along a side of a cell; it grows by powers of two."""
+LEAST_M = 0.2
+"""Least side of a cell in m."""
 MOST_CELLS = 2.4e7
 """Largest number of cells."""
 TILE = 1024
@@ -89,7 +91,7 @@ class SeamLines:
     ) -> Labels:
         """The photo of each cell of a map's grid."""
         factor = CELL
-        while grid.width * grid.height > MOST_CELLS * factor**2:
+        while factor * grid.gsd < LEAST_M or grid.width * grid.height > MOST_CELLS * factor**2:
             factor *= 2
         cells = grid.coarser(factor)
         z = _heights(surface, cells)

@@ -28,7 +28,7 @@ Keep = Callable[[str, Callable[[], Float]], Float]
 """Gives a part of the result by its name: the one kept of an interrupted run, or made now."""
 MOST_CELLS = 2.4e7
 """Largest number of cells of a surface."""
-TILE = 256
+TILE = 512
 """Cells along a side of the pieces in which heights are fused."""
 NEW = 0.5
 """Share of the ground of a pair that must still lack pairs for it to be matched."""
@@ -175,11 +175,14 @@ class Stereo:
         side = 2 * round(self.whole * height / cells.gsd) + 1
         kernel = np.ones((side, side), np.uint8)
         closed = np.asarray(cv2.morphologyEx(whole, cv2.MORPH_CLOSE, kernel), np.float32)
-        whole = np.where(firm, cv2.medianBlur(whole, 5), plateaus(closed, side))
+        level = cv2.bilateralFilter(plateaus(closed, side), 5, 0.02 * height, 2.0)
+        whole = np.where(firm, cv2.medianBlur(whole, 5), level)
         around = cv2.morphologyEx(
             known.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8)
         )
-        whole = settled(whole.astype(np.float32), around > 0, 2.0, 0.4 * height / cells.gsd)
+        soft = cv2.GaussianBlur(whole, (0, 0), 0.05 * height / cells.gsd)
+        whole = np.asarray(np.where(around > 0, whole, soft), np.float32)
+        whole = settled(whole, around > 0, 0.0, 0.2 * height / cells.gsd)
         return _surface(whole, cells), known
 
     def pairs(self, views: Sequence[View], height: float, wanted: int) -> list[tuple[View, View]]:

@@ -113,17 +113,23 @@ def smooth_fill(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[Any]:
     of these, so that its border keeps its colours; all others are black, for programs that ignore
     masks.
     """
-    if valid.all() or not valid.any():
-        return pixels * valid[..., None]
-    _, place = cv2.distanceTransformWithLabels(
-        (~valid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3, labelType=cv2.DIST_LABEL_PIXEL
-    )
-    colours = np.zeros((int(place.max()) + 1, pixels.shape[2]), np.uint8)
-    colours[place[valid]] = pixels[valid]
-    mixed = _units(valid[..., None]).any((2, 3, 4)).repeat(MCU, 0).repeat(MCU, 1)
-    out = np.where(valid[..., None], pixels, 0)
-    fill = mixed & ~valid
-    out[fill] = colours[place[fill]]
+    if not valid.any():
+        return np.zeros_like(pixels)
+    mask = valid.view(np.uint8)
+    out = np.zeros_like(pixels)
+    cv2.copyTo(pixels, mask, out)
+    small = (valid.shape[1] // MCU, valid.shape[0] // MCU)
+    share = cv2.resize(mask * np.uint8(255), small, interpolation=cv2.INTER_AREA)
+    mixed = ((share > 0) & (share < 255)).repeat(MCU, 0).repeat(MCU, 1)
+    fill = np.flatnonzero(mixed & ~valid)
+    if len(fill):
+        # each valid pixel is a label; they are counted from 1 in the order of rows
+        _, place = cv2.distanceTransformWithLabels(
+            1 - mask, cv2.DIST_L2, cv2.DIST_MASK_3, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        nearest = np.flatnonzero(valid)[place.ravel()[fill] - 1]
+        flat = out.reshape(-1, out.shape[2])
+        flat[fill] = flat[nearest]
     return out
 
 
