@@ -115,6 +115,8 @@ class Balance:
     """Fields smaller than this everywhere, in log odds (5 of 255 levels on middle grey), are not
     applied, to save time.
     """
+    gained: float = 0.1
+    """Least share of the differences between photos that fields must explain to be applied."""
     version: ClassVar[int] = 3
 
     def __call__(
@@ -153,6 +155,9 @@ class Balance:
         ]
         fields *= (np.array(largest) > self.even)[:, None]
         even = s.log + (basis * fields[s.row]).sum(1)[:, None]
+        bare = _apart(s.log.mean(1), s.row, point, self.sigma_gain, n)
+        if _apart(even.mean(1), s.row, point, self.sigma_gain, n) > (1 - self.gained) * bare:
+            fields, even = np.zeros_like(fields), s.log
         gains = _robust_differences(terms[:, :1], s.row, point, even, ridge[:1], n)[:, 0]
         gains = (gains - np.median(gains, axis=0)).astype(np.float32)
         return Exposure(
@@ -303,6 +308,19 @@ def _robust_differences(
         residual = level - (_sums(point, w[:, None] * level, len(mass)) / mass[:, None])[point]
         w = 1 / (1 + (residual**2).mean(1) / 0.25**2)
     return x
+
+
+def _apart(
+    y: NDArray[Any], row: NDArray[Any], point: NDArray[Any], sigma: float, count: int
+) -> float:
+    """Median difference from the mean of their point, in log odds, of samples (N,) after one gain
+    for each photo.
+    """
+    ridge, ones = np.array([1 / sigma**2]), np.ones((len(y), 1))
+    level = y + _robust_differences(ones, row, point, y[:, None], ridge, count)[row, 0, 0]
+    mean = np.bincount(point, level) / np.maximum(np.bincount(point), 1)
+    several = np.bincount(point)[point] > 1
+    return float(np.median(np.abs(level - mean[point])[several])) if several.any() else 0.0
 
 
 def _within_points(
