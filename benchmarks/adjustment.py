@@ -44,9 +44,9 @@ def problem_of(layout: dict[str, int]) -> tuple[Problem, State]:
         loss_px=2.0,
         loss_C=1e6,
         loss_R=1e6,
-        free=np.array([[1, 0, 0, 1, 1, 0, 0, 0]], bool),
+        free=np.array([[1, 0, 0, 1, 1, 0, 0, 0, 0, 0]], bool),
         sigma_R=np.full((n, 3), np.inf),
-        sigma_K=np.full((1, 8), np.inf),
+        sigma_K=np.full((1, 10), np.inf),
     )
     start = replace(
         block.start,

@@ -10,9 +10,9 @@ from skyquilt.alignment.problem import Problem, State
 from skyquilt.geometry.frames import cam_R_map_from_angles, rotation_from_vector
 
 WIDTH, HEIGHT, FOCAL, FLYING = 800, 600, 700.0, 60.0
-LENS = np.array([FOCAL, 402.0, 297.0, -0.06, 0.03, 0.0, 0.0, 0.0])
-FREE = np.array([1, 1, 1, 1, 1, 0, 0, 0], bool)
-SIGMA_K = np.array([10.0, 3.0, 3.0, 0.02, 0.02, 0.01, 1e-3, 1e-3])
+LENS = np.array([FOCAL, 402.0, 297.0, -0.06, 0.03, 0.0, 0.0, 0.0, 1.0, 0.0])
+FREE = np.array([1, 1, 1, 1, 1, 0, 0, 0, 0, 0], bool)
+SIGMA_K = np.array([10.0, 3.0, 3.0, 0.02, 0.02, 0.01, 1e-3, 1e-3, 3e-3, 1e-3])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,11 +31,11 @@ def seen_by(R, C, K, X):
     local = (X - C) @ R.T
     x, y = local[:, 0] / local[:, 2], local[:, 1] / local[:, 2]
     r2 = x * x + y * y
-    f, cx, cy, k1, k2, k3, p1, p2 = K
+    f, cx, cy, k1, k2, k3, p1, p2, aspect = K[:9]
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
     xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    return np.where(local[:, 2:] > 1, np.stack([f * xd + cx, f * yd + cy], 1), np.nan)
+    return np.where(local[:, 2:] > 1, np.stack([f * xd + cx, f * aspect * yd + cy], 1), np.nan)
 
 
 def ground(xy):
@@ -115,14 +115,18 @@ def make_block(
         sigma_C=sigma_C,
         R0=R0,
         sigma_R=sigma_R,
+        share=px[:, 1] / (HEIGHT - 1) - 0.5,
+        velocity=np.zeros((n, 3)),
         X0=np.full(X.shape, np.nan),
         sigma_X=np.ones(X.shape),
         loss_px=loss_px,
         loss_C=loss_prior,
         loss_R=loss_prior,
     )
-    start = State(R=R0, C=C0, K=K0.copy(), X=X + rng.normal(0, 2, X.shape))
-    return Block(problem=problem, start=start, truth=State(R=R, C=C, K=K, X=X), wrong=wrong)
+    still = np.zeros((n, 3))
+    start = State(R=R0, C=C0, K=K0.copy(), X=X + rng.normal(0, 2, X.shape), turn=still)
+    truth = State(R=R, C=C, K=K, X=X, turn=still)
+    return Block(problem=problem, start=start, truth=truth, wrong=wrong)
 
 
 def least_squares_only(problem):

@@ -22,7 +22,7 @@ from tests.alignment.blocks import FREE, least_squares_only, make_block
 
 
 def unknowns_error(block, state):
-    """(6n + 8m) errors in the order of the reduced system."""
+    """(6n + 10m) errors in the order of the reduced system."""
     rotation = attitude_error(state.R, block.truth.R)
     photos = np.concatenate([rotation, state.C - block.truth.C], 1)
     return np.concatenate([photos.ravel(), (state.K - block.truth.K).ravel()])
@@ -42,14 +42,14 @@ def dense_system(problem, state):
     n, m, P = len(state.C), len(state.K), len(state.X)
     lin = linearise(problem, state)
     N = len(lin.residual)
-    A = np.zeros((2 * N, 6 * n + 8 * m + 3 * P))
+    A = np.zeros((2 * N, 6 * n + 10 * m + 3 * P))
     for k in range(N):
         i, c, p = problem.photo[k], problem.camera[problem.photo[k]], problem.point[k]
         rows = slice(2 * k, 2 * k + 2)
         A[rows, 6 * i : 6 * i + 6] = lin.J_photo[k]
         if lin.J_camera.shape[2]:
-            A[rows, 6 * n + 8 * c : 6 * n + 8 * c + 8] = lin.J_camera[k]
-        A[rows, 6 * n + 8 * m + 3 * p : 6 * n + 8 * m + 3 * p + 3] = lin.J_point[k]
+            A[rows, 6 * n + 10 * c : 6 * n + 10 * c + 10] = lin.J_camera[k]
+        A[rows, 6 * n + 10 * m + 3 * p : 6 * n + 10 * m + 3 * p + 3] = lin.J_point[k]
     e = lin.residual.ravel()
     prior_e = np.concatenate(
         [
@@ -100,8 +100,8 @@ def test_a_step_is_that_of_the_dense_normal_equations(small):
     expected[used] = -np.linalg.solve(H[np.ix_(used, used)], g[used])
     photos, cameras, points = Reduced(problem, normal_equations(problem, state), 0.0).step()
     assert photos.ravel() == pytest.approx(expected[: 6 * n], abs=1e-6)
-    assert cameras.ravel() == pytest.approx(expected[6 * n : 6 * n + 8 * m], abs=1e-6)
-    assert points.ravel() == pytest.approx(expected[6 * n + 8 * m :], abs=1e-5)
+    assert cameras.ravel() == pytest.approx(expected[6 * n : 6 * n + 10 * m], abs=1e-6)
+    assert points.ravel() == pytest.approx(expected[6 * n + 10 * m :], abs=1e-5)
 
 
 def test_the_covariance_is_the_dense_inverse_s(small):
@@ -112,9 +112,9 @@ def test_the_covariance_is_the_dense_inverse_s(small):
         [np.ones(6 * n, bool), problem.free.ravel(), np.ones(3 * len(state.X), bool)]
     )
     whole = np.linalg.inv(H[np.ix_(used, used)])
-    u = int(used[: 6 * n + 8 * m].sum())
+    u = int(used[: 6 * n + 10 * m].sum())
     mine = covariance(problem, state)
-    keep = np.flatnonzero(used[: 6 * n + 8 * m])
+    keep = np.flatnonzero(used[: 6 * n + 10 * m])
     scale = np.sqrt(np.outer(np.diag(whole)[:u], np.diag(whole)[:u]))
     assert np.abs((mine[np.ix_(keep, keep)] - whole[:u, :u]) / scale).max() < 1e-5
 
@@ -251,7 +251,7 @@ def test_deviations_are_calibrated():
     (next test).
     """
     total, dof, per_axis = 0.0, 0, []
-    tight = np.array([2.0, 0.5, 0.5, 3e-3, 3e-3, 1e-3, 1e-4, 1e-4])
+    tight = np.array([2.0, 0.5, 0.5, 3e-3, 3e-3, 1e-3, 1e-4, 1e-4, 1e-3, 1e-3])
     for seed in range(24):
         block = make_block(
             100 + seed,
@@ -299,7 +299,7 @@ def test_the_cost_never_rises_and_convergence_is_told():
         adjust(block.problem, block.start, iterations=k, tolerance=0).cost for k in (1, 2, 3, 5, 8)
     ]
     start = robust_cost(block.problem, block.start)
-    assert costs[0] <= start and (np.diff(costs) <= 1e-9 * start).all()
+    assert costs[0] <= start * (1 + 1e-12) and (np.diff(costs) <= 1e-9 * start).all()
     assert not adjust(block.problem, block.start, iterations=1, tolerance=0).converged
     done = adjust(block.problem, block.start, iterations=80, tolerance=1e-9)
     assert done.converged
@@ -319,7 +319,7 @@ def test_polishing_moves_points_only_and_downhill():
 
 def test_fixed_intrinsics_stay_and_free_ones_move():
     block = make_block(2)
-    free = np.zeros((1, 8), bool)
+    free = np.zeros((1, 10), bool)
     found = adjust(replace(block.problem, free=free), block.start)
     assert (found.state.K == block.start.K).all()
     free[0, 0] = True
@@ -354,7 +354,7 @@ def strip(seed):
     """One line of 20 photos; observations with a bending systematic error of the lens that nobody
     models.
     """
-    lens = np.array([700.0, 399.5, 299.5, -0.006, 0.0, 0.0, 0.0, 0.0])
+    lens = np.array([700.0, 399.5, 299.5, -0.006, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
     block = make_block(
         seed,
         lines=1,
@@ -362,14 +362,14 @@ def strip(seed):
         points=500,
         gps=1.5,
         lens=lens,
-        free=np.zeros(8, bool),
+        free=np.zeros(10, bool),
         lens_errs=False,
         true_tilt_deg=0.0,
         tilt_deg=1.0,
     )
     wrong = replace(
         block.problem,
-        K0=np.array([[700.0, 399.5, 299.5, 0, 0, 0, 0, 0]]),
+        K0=np.array([[700.0, 399.5, 299.5, 0, 0, 0, 0, 0, 1, 0]]),
         R0=block.truth.R,
         trust=min(1.0, 40 * 20 / len(block.problem.px)),
     )

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from skyquilt.geometry.camera import (
     distort,
     monotone_radius,
+    pixels,
     project,
     project_with_derivatives,
     rays,
@@ -67,7 +68,7 @@ def test_derivatives_are_those_of_the_projection(camera, seed):
     assert exact.px == pytest.approx(project(camera, xyz), abs=1e-9 * camera.focal)
 
     def px(k, xyz):
-        return distort(xyz[:, :2] / xyz[:, 2:], k) * k[:, :1] + k[:, 1:3]
+        return pixels(xyz[:, :2] / xyz[:, 2:], k)
 
     for axis in range(3):
         h = 1e-6 * xyz[:, 2:]
@@ -76,9 +77,9 @@ def test_derivatives_are_those_of_the_projection(camera, seed):
         assert exact.d_point[:, :, axis] == pytest.approx(
             numeric, rel=1e-6, abs=2e-6 * camera.focal / 0.5
         )
-    for column in range(8):
+    for column in range(9):
         h = 1e-6 * (camera.focal if column < 3 else 1.0)
-        step = np.eye(8)[column] * h
+        step = np.eye(9)[column] * h
         numeric = (px(k + step, xyz) - px(k - step, xyz)) / (2 * h)
         scale = max(1.0, float(np.abs(numeric).max()))
         assert exact.d_intrinsics[:, :, column] == pytest.approx(numeric, abs=1e-7 * scale)
@@ -95,7 +96,7 @@ def test_undistortion_inverts_distortion(camera, seed):
     radius, angle = reach * np.sqrt(rng.random(60)), rng.uniform(0, 2 * np.pi, 60)
     xy = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
     jacobian = project_with_derivatives(
-        np.tile(np.r_[1, 0, 0, camera.vector[3:]], (60, 1)), np.c_[xy, np.ones(60)]
+        np.tile(np.r_[1, 0, 0, camera.vector[3:8], 1], (60, 1)), np.c_[xy, np.ones(60)]
     )
     assume(
         np.linalg.det(jacobian.d_point[:, :, :2]).min() > 0.02
@@ -125,7 +126,7 @@ def test_radius_of_the_fold_of_a_barrel(k1):
 def test_distortion_grows_up_to_that_radius_and_hardly_beyond(camera):
     limit = monotone_radius(camera)
     r = np.linspace(0, limit - 0.006, 500)
-    k = np.r_[camera.vector[:6], 0, 0]
+    k = np.r_[camera.vector[:6], 0, 0, 1]
     assert (np.diff(distort(np.c_[r, 0 * r], k)[:, 0]) > 0).all()
     if limit < 3:
         step = distort(np.array([[limit, 0.0], [limit + 1e-6, 0.0]]), k)[:, 0]

@@ -29,7 +29,7 @@ def test_round_trip(width, height, focal, k1, k2, p1, cx):
 
 
 def test_deviations_come_along_and_are_no_part_of_the_lens():
-    sigmas = (4.0, 2.0, 1.5, 0.01, 0.02, 0.03, 1e-4, 2e-4)
+    sigmas = (4.0, 2.0, 1.5, 0.01, 0.02, 0.03, 1e-4, 2e-4, 1e-3)
     camera = Camera(width=640, height=480, focal=660, cx=320, cy=240, k1=-0.3, sigmas=sigmas)
     record = camera_to_opensfm(camera)
     assert record["standard_deviations"]["focal_x"] == pytest.approx(4 / 640)

@@ -70,7 +70,7 @@ def test_position_noise(correlation):
     flown = shots(Route(photos=900))
     place = place_at(46.6, 14.3)
     reports = report_all(
-        flown, Reporting(gps_noise=2.0, gps_correlation=correlation), place, START, 1333.0, 7
+        flown, Reporting(gps_noise=2.0, gps_correlation=correlation), place, START, LENS, 7
     )
     to = Transformer.from_crs("EPSG:4326", place.crs, always_xy=True)
     east, north = to.transform([r.longitude for r in reports], [r.latitude for r in reports])
@@ -91,20 +91,20 @@ def test_lies():
     flown = shots(Route(photos=40))
     place = place_at(46.6, 14.3)
     noise = Reporting(angle_noise=0.0)
-    honest = report_all(flown, noise, place, START, 1333.0, 7)
-    lying = report_all(flown, replace(noise, yaw_lie="tag"), place, START, 1333.0, 7)
-    turned = report_all(flown, replace(noise, yaw_lie="turned"), place, START, 1333.0, 7)
+    honest = report_all(flown, noise, place, START, LENS, 7)
+    lying = report_all(flown, replace(noise, yaw_lie="tag"), place, START, LENS, 7)
+    turned = report_all(flown, replace(noise, yaw_lie="turned"), place, START, LENS, 7)
     liars = [r for r in lying if "yaw" in r.lies]
     assert len(liars) == 10 == sum(r.turned for r in turned)
     for a, b, c in zip(honest, lying, turned, strict=True):
         assert a.flight_yaw == c.flight_yaw
         apart = abs((a.flight_yaw - b.flight_yaw + 180) % 360 - 180)
         assert apart == pytest.approx(180 if b.lies else 0, abs=0.02)
-    drift = report_all(flown, replace(noise, altitude_drift=100.0), place, START, 1333.0, 7)
+    drift = report_all(flown, replace(noise, altitude_drift=100.0), place, START, LENS, 7)
     assert drift[-1].sea_level - honest[-1].sea_level == pytest.approx(100, abs=0.01)
     assert drift[0].lies == ("altitude",)
     silent = report_all(
-        flown, replace(noise, gps_missing=4, focal_missing=True), place, START, 1333.0, 7
+        flown, replace(noise, gps_missing=4, focal_missing=True), place, START, LENS, 7
     )
     assert sum(r.latitude is None for r in silent) == 4
     assert silent[0].focal is None

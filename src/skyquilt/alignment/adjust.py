@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.problem import (
+    CAMERA,
     Problem,
     State,
     attitude_error,
@@ -41,29 +42,31 @@ DENSE_LIMIT = 4000
 class Normal:
     """Normal equations split for the Schur complement: photos and cameras (u), points (v).
 
-    A camera has q = 8 unknowns, or none where all intrinsics are fixed.
+    A photo has p = 6 unknowns, or 9 with its turn; a camera q = 10, or none where all are fixed.
     """
 
     U: Array
-    """(n, 6, 6) photo blocks."""
+    """(n, p, p) photo blocks."""
     Uc: Array
     """(m, q, q) camera blocks."""
     Upc: Array
-    """(n, 6, q) photo-camera blocks."""
+    """(n, p, q) photo-camera blocks."""
     V: Array
     """(P, 3, 3) point blocks."""
     Wp: Array
-    """(N, 6, 3) photo-point block of each observation."""
+    """(N, p, 3) photo-point block of each observation."""
     Wc: Array
     """(N, q, 3) camera-point block of each observation."""
     gp: Array
-    """(n, 6) gradient."""
+    """(n, p) gradient."""
     gc: Array
     """(m, q) gradient."""
     gv: Array
     """(P, 3) gradient."""
     cost: float
     """Robust cost."""
+    shared: Array
+    """(n, 3) precisions of measured centres that share an unknown shift; (0, 3) for none."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -127,10 +130,10 @@ def _observation_weights(problem: Problem, residual: Array) -> tuple[Array, floa
 
 
 def _prior_terms(problem: Problem, state: State) -> tuple[list[tuple[Array, Array]], float]:
-    """(precision, residual*precision) of centres, attitudes, intrinsics, points; and their cost."""
-    e = np.nan_to_num((state.C - problem.C0) / problem.sigma_C)
-    wc, cost_c = _pseudo_huber((e**2).sum(1), problem.loss_C)
-    pc = np.where(np.isfinite(problem.C0), wc[:, None] / problem.sigma_C**2, 0.0)
+    """(precision, residual*precision) of centres, attitudes, intrinsics, points, turns; and their
+    cost.
+    """
+    dc, pc, cost_c = position_terms(problem, state)
     rotation = attitude_error(state.R, problem.R0)
     wr, cost_r = _pseudo_huber(((rotation / problem.sigma_R) ** 2).sum(1), problem.loss_R)
     pr = wr[:, None] / problem.sigma_R**2
@@ -138,9 +141,29 @@ def _prior_terms(problem: Problem, state: State) -> tuple[list[tuple[Array, Arra
     dk = state.K - problem.K0
     px = np.where(np.isfinite(problem.X0), 1 / problem.sigma_X**2, 0.0)
     dx = np.nan_to_num(state.X - problem.X0)
-    dc = np.nan_to_num(state.C - problem.C0)
+    pt = np.zeros_like(state.turn)
+    if problem.sigma_turn is not None:
+        pt += 1 / problem.sigma_turn[:, None] ** 2
     cost = float(cost_c.sum() + cost_r.sum() + (pk * dk**2).sum() + (px * dx**2).sum())
-    return [(pc, pc * dc), (pr, pr * rotation), (pk, pk * dk), (px, px * dx)], cost
+    cost += float((pt * state.turn**2).sum())
+    terms = [(pc, pc * dc), (pr, pr * rotation), (pk, pk * dk), (px, px * dx)]
+    return [*terms, (pt, pt * state.turn)], cost
+
+
+def position_terms(problem: Problem, state: State) -> tuple[Array, Array, Array]:
+    """Misfits (n, 3) in m of the measured centres less their common shift, their precisions (n, 3)
+    and costs (n,).
+    """
+    apart = np.nan_to_num(state.C - problem.C0)
+    precision = np.where(np.isfinite(problem.C0), 1 / problem.sigma_C**2, 0.0)
+    shift, pc = np.zeros(3), precision
+    for _ in range(4 if problem.offset else 1):
+        e = apart - shift
+        wc, cost = _pseudo_huber((e**2 * precision).sum(1), problem.loss_C)
+        pc = precision * wc[:, None]
+        if problem.offset:
+            shift = (pc * apart).sum(0) / np.maximum(pc.sum(0), 1e-300)
+    return np.where(precision > 0, apart - shift, 0.0), pc, cost
 
 
 def _add_diagonal(blocks: Array, offset: int, values: Array) -> None:
@@ -156,30 +179,34 @@ def normal_equations(problem: Problem, state: State) -> Normal:
     e, J_point = lin.residual[..., None] * root, lin.J_point * root
     rows = np.concatenate([lin.J_photo, lin.J_camera, lin.residual[..., None]], 2) * root
     n, m, count, q = len(state.C), len(state.K), len(state.X), lin.J_camera.shape[2]
+    k = problem.photo_unknowns
     by_photo = _by_photo(problem, rows, n)
     by_camera = np.zeros((m, q, q + 1))
-    np.add.at(by_camera, problem.camera, by_photo[:, 6 : 6 + q, 6:])
+    np.add.at(by_camera, problem.camera, by_photo[:, k : k + q, k:])
     point_rows = np.concatenate([J_point, e], 2)
     by_point = _by_point(problem, np.swapaxes(J_point, 1, 2) @ point_rows, count)
     W = np.swapaxes(rows[:, :, :-1], 1, 2) @ J_point
-    (pc, gc), (pr, gr), (pk, gk), (px, gx) = (terms := _prior_terms(problem, state))[0]
-    U, Uc, V = by_photo[:, :6, :6].copy(), by_camera[:, :, :q].copy(), by_point[:, :, :3].copy()
+    (pc, gc), (pr, gr), (pk, gk), (px, gx), (pt, gt) = (terms := _prior_terms(problem, state))[0]
+    U, Uc, V = by_photo[:, :k, :k].copy(), by_camera[:, :, :q].copy(), by_point[:, :, :3].copy()
     _add_diagonal(U, 0, pr)
     _add_diagonal(U, 3, pc)
     _add_diagonal(Uc, 0, np.where(problem.free, pk, 1.0)[:, :q])
     _add_diagonal(V, 0, px)
-    gp = by_photo[:, :6, -1] + np.concatenate([gr, gc], 1)
+    if k == 9:
+        _add_diagonal(U, 6, pt)
+    gp = by_photo[:, :k, -1] + np.concatenate([gr, gc, gt], 1)[:, :k]
     return Normal(
         U=U,
         Uc=Uc,
-        Upc=by_photo[:, :6, 6 : 6 + q],
+        Upc=by_photo[:, :k, k : k + q],
         V=V,
-        Wp=W[:, :6],
-        Wc=W[:, 6:],
+        Wp=W[:, :k],
+        Wc=W[:, k:],
         gp=gp,
         gc=by_camera[:, :, q] + gk[:, :q],
         gv=by_point[:, :, 3] + gx,
         cost=cost + terms[1],
+        shared=pc if problem.offset else np.zeros((0, 3)),
     )
 
 
@@ -224,25 +251,41 @@ class Reduced:
     def __init__(self, problem: Problem, normal: Normal, damping: float) -> None:
         self.problem, self.normal = problem, normal
         n, m, q = len(normal.U), len(normal.Uc), normal.Uc.shape[2]
-        self.n, self.m, self.q, self.size = n, m, q, 6 * n + q * m
+        self.p = normal.U.shape[1]
+        self.n, self.m, self.q, self.size = n, m, q, self.p * n + q * m
         V = normal.V.copy()
         k = np.arange(3)
         V[:, k, k] = V[:, k, k] * (1 + damping) + 1e-12
         self.L_inv = np.linalg.inv(np.linalg.cholesky(V))
         self.g = np.concatenate([normal.gp.ravel(), normal.gc.ravel()])
+        self._shared = self._shift_taken()
         self.S: Array | sparse.csc_matrix = self._assemble(damping)
 
+    def _shift_taken(self) -> Array:
+        """(size, 3): by the product of this with its transpose the system loses what a common shift
+        of all measured centres takes up (the Schur complement on that shift).
+        """
+        shared = self.normal.shared
+        out = np.zeros((self.size, 3))
+        for axis in range(3 if len(shared) else 0):
+            total = float(shared[:, axis].sum())
+            if total > 0:
+                at = self.p * np.arange(self.n) + 3 + axis
+                out[at, axis] = shared[:, axis] / np.sqrt(total)
+        return out
+
     def _diagonal_blocks(self, damping: float) -> "Array | sparse.lil_matrix":
-        n, m, q, N = self.n, self.m, self.q, self.normal
+        n, m, p, q, N = self.n, self.m, self.p, self.q, self.normal
         S = _zeros(self.size)
         for i in range(n):
             block = N.U[i] + np.diag(np.diag(N.U[i]) * damping + 1e-9)
-            S[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = block
-            c = 6 * n + q * int(self.problem.camera[i])
-            S[6 * i : 6 * i + 6, c : c + q] = N.Upc[i]
-            S[c : c + q, 6 * i : 6 * i + 6] = N.Upc[i].T
+            own = slice(p * i, p * i + p)
+            S[own, own] = block
+            c = p * n + q * int(self.problem.camera[i])
+            S[own, c : c + q] = N.Upc[i]
+            S[c : c + q, own] = N.Upc[i].T
         for j in range(m if q else 0):
-            c = 6 * n + q * j
+            c = p * n + q * j
             S[c : c + q, c : c + q] = N.Uc[j] + np.diag(np.diag(N.Uc[j]) * damping)
         return S
 
@@ -250,23 +293,23 @@ class Reduced:
         """Unknowns touched by observations [lo, hi), their rows of W L^-T (u, 3p), and the points'
         slice.
         """
-        p, N, q = self.problem, self.normal, self.q
+        p, N, k, q = self.problem, self.normal, self.p, self.q
         point, photo = p.point[lo:hi], p.photo[lo:hi]
         first, last = int(point[0]), int(point[-1]) + 1
         seen, local = np.unique(photo, return_inverse=True)
         cams, cam_local = np.unique(p.camera[photo], return_inverse=True)
         T = np.swapaxes(self.L_inv[point], 1, 2)
-        rows = np.zeros((6 * len(seen) + q * len(cams), last - first, 3))
-        view = rows[: 6 * len(seen)].reshape(len(seen), 6, last - first, 3)
+        rows = np.zeros((k * len(seen) + q * len(cams), last - first, 3))
+        view = rows[: k * len(seen)].reshape(len(seen), k, last - first, 3)
         view[local, :, point - first] = N.Wp[lo:hi] @ T
         if q:
-            cam_view = rows[6 * len(seen) :].reshape(len(cams), q, last - first, 3)
+            cam_view = rows[k * len(seen) :].reshape(len(cams), q, last - first, 3)
             place: Any = (cam_local, slice(None), point - first)
             np.add.at(cam_view, place, N.Wc[lo:hi] @ T)
         unknowns = np.concatenate(
             [
-                (6 * seen[:, None] + np.arange(6)).ravel(),
-                (6 * self.n + q * cams[:, None] + np.arange(q)).ravel(),
+                (k * seen[:, None] + np.arange(k)).ravel(),
+                (k * self.n + q * cams[:, None] + np.arange(q)).ravel(),
             ]
         )
         return unknowns, rows.reshape(len(rows), -1), slice(first, last)
@@ -286,7 +329,7 @@ class Reduced:
                 keep = product != 0
                 parts.append((i[keep], j[keep], -product[keep]))
         if isinstance(S, np.ndarray):
-            return S
+            return S - self._shared @ self._shared.T
         from scipy import sparse
 
         i, j, v = (np.concatenate(x) for x in zip(*parts, strict=True))
@@ -298,16 +341,24 @@ class Reduced:
             return _solve_positive(self.S, rhs)
         from scipy.sparse import linalg
 
-        return np.asarray(linalg.splu(self.S, permc_spec="MMD_AT_PLUS_A").solve(rhs))
+        factor = linalg.splu(self.S, permc_spec="MMD_AT_PLUS_A")
+        x = np.asarray(factor.solve(rhs))
+        taken = self._shared[:, self._shared.any(0)]
+        if not taken.shape[1]:
+            return x
+        y = factor.solve(taken)  # Woodbury: the shift makes the system dense
+        small = np.eye(taken.shape[1]) - taken.T @ y
+        return np.asarray(x + y @ np.linalg.solve(small, taken.T @ x))
 
     def step(self) -> tuple[Array, Array, Array]:
-        """The Gauss-Newton step of photos (n, 6), cameras (m, 8) and points (P, 3)."""
+        """The Gauss-Newton step of photos (n, p), cameras (m, 10) and points (P, 3)."""
         du = -self.solve(self.g)
-        photo_step, camera_step = du[: 6 * self.n].reshape(-1, 6), np.zeros((self.m, 8))
+        photos = self.p * self.n
+        photo_step, camera_step = du[:photos].reshape(-1, self.p), np.zeros((self.m, CAMERA))
         p, N = self.problem, self.normal
         coupled = np.einsum("nij,ni->nj", N.Wp, photo_step[p.photo])
         if self.q:
-            camera_step = du[6 * self.n :].reshape(-1, 8)
+            camera_step = du[photos:].reshape(-1, CAMERA)
             coupled += np.einsum("nij,ni->nj", N.Wc, camera_step[p.camera[p.photo]])
         rhs = N.gv + _by_point(p, coupled, len(N.V))
         half = np.einsum("pij,pj->pi", self.L_inv, rhs)
@@ -372,7 +423,7 @@ def adjust(
 
 
 def covariance(problem: Problem, state: State) -> Array | None:
-    """Covariance ((6n+8m), (6n+8m)) of photos and cameras at the minimum, points marginalised.
+    """Covariance ((pn+10m), (pn+10m)) of photos and cameras at the minimum, points marginalised.
 
     In units of the whitened residuals, scaled by their robust variance factor. None for more than
     `DENSE_LIMIT` unknowns, and if some unknowns are not determined.
@@ -390,5 +441,5 @@ def covariance(problem: Problem, state: State) -> Array | None:
         inverse = np.linalg.inv(S * scale) * scale
     except np.linalg.LinAlgError:
         return None
-    fixed = 8 * reduced.m if reduced.q == 0 else 0  # fixed intrinsics have no variance
+    fixed = CAMERA * reduced.m if reduced.q == 0 else 0  # fixed intrinsics have no variance
     return np.pad(inverse, (0, fixed)) if np.isfinite(inverse).all() else None

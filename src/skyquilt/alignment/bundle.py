@@ -7,10 +7,13 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.adjust import adjust, covariance
+from skyquilt.alignment.adjust import DENSE_LIMIT, adjust, covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
+from skyquilt.alignment.deviations import believed, observed_noise, point_deviations, robust_scale
+from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
-from skyquilt.alignment.problem import Problem, State, residuals_px
+from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
+from skyquilt.alignment.problem import CAMERA, READOUT, Problem, State, residuals_px, swept
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
 from skyquilt.alignment.start import Start, find_start
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
@@ -18,18 +21,30 @@ from skyquilt.alignment.triangulate import polish, triangulated
 from skyquilt.errors import AlignmentError
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
+from skyquilt.model.poses import Accuracy, Alignment, MapFrame, Prior, TiePoints
 
 Array = NDArray[np.float64]
+
+
+ROLLS_PX = 0.3
+"""Cameras that move by more than this in px of the photo while a photo is read out turn, too."""
+TURN_RAD_S = np.radians(1.5)
+"""Deviation of the rates at which they turn, in rad/s; it makes up for errors of velocities too."""
+SAMPLED = 400
+"""Ground points whose accuracy is predicted, about."""
+UNDETERMINED = 0.7
+"""A focal length whose deviation stays above this share of its prior's is not determined."""
+DOUBTED = 2.5
+"""Positions that a block misses by more than this many deviations are not what they claim."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bundle:
     """Bundle adjustment of all linked photos at once."""
 
-    distortion: str = "4"
-    """Distortion that self-calibration may change: `none`, `2`, `4`, `6` (radial order) or
-    `6t` (and tangential).
+    distortion: str = "full"
+    """What self-calibration may change of the lens: distortion `none`, `2`, `4`, `6` (radial
+    order), `6t` (and tangential) or `full` (and the aspect ratio).
     """
     per_photo: int = 400
     """Observations per photo in the adjustment; all other tie points are triangulated
@@ -41,7 +56,7 @@ class Bundle:
     """
     match_observations: LeastSquaresMatching | None = field(default_factory=LeastSquaresMatching)
     """Refinement of observations in larger images; None leaves keypoints unchanged."""
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 15
 
     def __call__(
         self,
@@ -59,6 +74,32 @@ class Bundle:
         Raises:
             AlignmentError: no two photos are linked.
         """
+        aside = reported_oblique(priors) if self.repair else frozenset[int]()
+
+        def block(aside: frozenset[int]) -> Alignment:
+            upright = [k for k in links if k.a not in aside and k.b not in aside]
+            return self._block(photos, frame, priors, features, upright, control, grey)
+
+        try:
+            found = block(aside)
+        except AlignmentError:
+            aside, found = frozenset(), block(frozenset())
+        if self.repair and (more := found_oblique(found, priors) - aside):
+            aside |= more
+            found = block(aside)
+        return hung(found, photos, priors, features, links, aside)
+
+    def _block(
+        self,
+        photos: Sequence[Photo],
+        frame: MapFrame,
+        priors: Sequence[Prior],
+        features: Sequence[Features],
+        links: Sequence[Link],
+        control: Sequence[Control],
+        grey: GreyPicture | None,
+    ) -> Alignment:
+        """Adjusts the photos that these links connect."""
         start = find_start(photos, priors, features, links)
         if not start.blocks:
             raise AlignmentError(f"none of {len(photos)} photos could be linked to another one")
@@ -68,15 +109,22 @@ class Bundle:
         used = setup.sensor_tracks(tracks)
         problem, state = setup.problem(thin(used, sizes, per_photo=self.per_photo))
         problem, state = _rough(problem, state)
+        setup = setup.moving_as(photos, state.C)
+        problem = replace(problem, velocity=setup.base.velocity)
         if grey is not None and self.match_observations is not None:
             used = _sharpened(used, photos, setup, problem, state, self.match_observations, grey)
             problem, _ = setup.problem(thin(used, sizes, per_photo=self.per_photo))
             state = triangulated(problem, state)
         problem, state = _fine(problem, state)
+        setup = setup.moving_as(photos, state.C)
+        problem = replace(problem, velocity=setup.base.velocity)
+        problem, state = _weighed(problem, state, setup)
         if self.repair:
-            problem, state = _believe_positions_less(problem, state, setup)
+            problem, state = _believe_positions(problem, state, setup)
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
-        return _outcome(photos, frame, setup, start, used, problem, state, reports)
+        done = _outcome(photos, frame, setup, start, used, problem, state, reports)
+        held = setup.georeferenced or any(not c.check for c in reports)
+        return done if held or tilts_reported(priors) else levelled(done)
 
 
 def _sharpened(
@@ -123,6 +171,30 @@ def _fine(problem: Problem, state: State) -> tuple[Problem, State]:
     ).state
 
 
+def _weighed(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
+    """The adjustment repeated with observations as sharp as their residuals show them to be, and
+    with the weight that those are worth; with turns of the cameras where rows were exposed one
+    after the other.
+    """
+    reach = np.linalg.norm(swept(problem, state), axis=1) / _heights(state)
+    rolls = bool((reach * state.K[problem.camera, 0] > ROLLS_PX).any())
+    if rolls and 9 * len(state.C) + CAMERA * len(state.K) <= DENSE_LIMIT:
+        readout = np.abs(state.K[problem.camera, READOUT])
+        problem = replace(problem, sigma_turn=np.maximum(TURN_RAD_S * readout, 1e-9))
+    for _ in range(2):
+        scale = robust_scale(problem, state)
+        problem = replace(problem, sigma_px=problem.sigma_px * scale)
+        noise = observed_noise(problem.with_loss(2.0), state, setup.size[setup.members])
+        problem = believed(problem.with_loss(2.0), noise)
+        state = adjust(problem, state, iterations=15, tolerance=3e-4, damping=1e-6).state
+    return problem, state
+
+
+def _heights(state: State) -> Array:
+    """Heights (n,) in m of the cameras above the points."""
+    return np.maximum(state.C[:, 2] - np.median(state.X[:, 2]), 1.0)
+
+
 def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]:
     """Removes observations with residuals above `limit` deviations and points left with one
     observation; control points are kept.
@@ -139,30 +211,44 @@ def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]
         photo=problem.photo[good],
         px=problem.px[good],
         sigma_px=problem.sigma_px[good],
+        share=problem.share[good],
         X0=problem.X0[points],
         sigma_X=problem.sigma_X[points],
     )
     return thinner, replace(state, X=state.X[points])
 
 
-def _believe_positions_less(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
-    """Replaces the stated horizontal accuracy of positions by their scatter between neighbours
-    where that is larger.
+def _believe_positions(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
+    """Positions believed as far as the photos confirm them.
 
-    Only differences from photo to photo count. A smooth misfit may be a deformation of the block,
-    and positions with less weight would permit it. (Heights are checked by image scale before the
-    adjustment.)
+    The start gave them deviations as wide as their scatter about it, which is coarse. Here they get
+    those that they state, or their scatter between neighbours where that is larger. Only
+    differences from photo to photo count: a smooth misfit may be a deformation of the block, and
+    positions with less weight would permit it. Where a block then still misses its positions by
+    more than these deviations allow, they are not what they claim (a drifting barometer, a plain
+    GPS that states centimetres), and what the start gave stays.
     """
-    for _ in range(2):
+    started = problem.sigma_C
+    doubted = np.zeros(started.shape, bool)
+    for _ in range(3):
         error = state.C - problem.C0
-        sigma = problem.sigma_C.copy()
+        sigma = started.copy()
         for block in setup.block_rows:
-            noise = position_noise(error[block][:, :2])
-            sigma[block, :2] = np.maximum(setup.stated_sigma_C[block][:, :2], noise)
+            for axes in (slice(0, 2), slice(2, 3)):
+                stated = setup.stated_sigma_C[block][:, axes]
+                wanted = np.maximum(stated, position_noise(error[block][:, axes]))
+                trusted = ~doubted[block][:, axes]
+                sigma[block, axes] = np.where(trusted, wanted, sigma[block, axes])
         if np.allclose(sigma, problem.sigma_C, rtol=0.15, equal_nan=True):
             break
         problem = replace(problem, sigma_C=sigma)
         state = adjust(problem.with_loss(2.0), state, iterations=10, tolerance=1e-4).state
+        misfit = np.abs(state.C - problem.C0) / problem.sigma_C
+        for block in setup.block_rows:
+            for axes in (slice(0, 2), slice(2, 3)):
+                known = misfit[block][:, axes][np.isfinite(misfit[block][:, axes])]
+                if len(known) and 1.48 * np.median(known) > DOUBTED:
+                    doubted[block, axes] = True
     return problem, state
 
 
@@ -197,7 +283,8 @@ def leave_one_out(
         precision = np.diag(1 / problem.sigma_C[i][axes] ** 2) / np.sqrt(
             1 + (white @ white) / problem.loss_C**2
         )
-        own = C_covariance[6 * i + 3 : 6 * i + 6, 6 * i + 3 : 6 * i + 6][np.ix_(axes, axes)]
+        at = problem.photo_unknowns * i + 3
+        own = C_covariance[at : at + 3, at : at + 3][np.ix_(axes, axes)]
         full = np.full(3, np.nan)
         full[axes] = np.linalg.solve(np.eye(len(e)) - own @ precision, e)
         out.append(full)
@@ -240,10 +327,7 @@ def _outcome(
     seen = np.bincount(ties.photo, minlength=len(photos))
     weak = {int(i): f"it has only {seen[i]} tie points" for i in setup.members if seen[i] < 8}
     full = covariance(problem, state)
-    variance = _variance_factor(problem, state)
-    cameras, camera_of = camera_records(
-        photos, setup, state, None if full is None else full * variance
-    )
+    cameras, camera_of = camera_records(photos, setup, state, full)
     poses = {i: p for i, p in pose_records(setup, state).items() if i not in weak}
     blocks = tuple(tuple(i for i in b if i not in weak) for b in start.blocks)
     metric = frame.metric and (start.metric or any(not c.check for c in control))
@@ -257,12 +341,53 @@ def _outcome(
         blocks=tuple(b for b in blocks if b),
         ties=ties,
         rejected=weak,
-        control=residuals_of_control(control, frame, setup, problem, state),
+        control=residuals_of_control(control, frame, setup, problem, state, full),
+        accuracy=None if full is None else _accuracy(setup, problem, state, full),
+        notes=_undetermined(setup, problem, state, full),
         loo_rms_m=leave_one_out(problem, state, full) if setup.georeferenced else None,
     )
 
 
-def _variance_factor(problem: Problem, state: State) -> float:
-    """Robust variance of the whitened observations."""
-    e = residuals_px(problem, state) / problem.sigma_px[:, None]
-    return float((1.48 * np.nanmedian(np.abs(e))) ** 2)
+def _accuracy(setup: Setup, problem: Problem, state: State, covariance: Array) -> Accuracy:
+    """Predicted deviations of a sample of ground points."""
+    seen = np.flatnonzero(np.bincount(problem.point, minlength=len(state.X)) >= 2)
+    sample = seen[:: max(1, len(seen) // SAMPLED)]
+    tied = bool(np.isfinite(problem.X0).any())
+    stated = np.median(setup.stated_sigma_C, axis=0)
+    return Accuracy(
+        xyz=state.X[sample],
+        sigma_m=point_deviations(problem, state, covariance, sample),
+        shared_m=(0.0, 0.0) if tied else (float(stated[0]), float(stated[2])),
+        focal_share=_focal_share(problem, covariance),
+        design_effect=problem.design_effect,
+    )
+
+
+def _focal_share(problem: Problem, covariance: Array) -> float:
+    """Largest ratio of a focal length's deviation after the adjustment to that before."""
+    m = len(problem.K0)
+    at = len(covariance) - CAMERA * m + CAMERA * np.arange(m)
+    after = np.sqrt(np.abs(covariance[at, at]))
+    return float(np.max(np.where(problem.free[:, 0], after / problem.sigma_K[:, 0], 0.0)))
+
+
+def _undetermined(
+    setup: Setup, problem: Problem, state: State, covariance: Array | None
+) -> tuple[str, ...]:
+    """Sentences about what the flight does not determine."""
+    if covariance is None:
+        return ()
+    notes = []
+    m, height = len(problem.K0), float(np.median(_heights(state)))
+    for row, key in enumerate(setup.camera_keys):
+        at = len(covariance) - CAMERA * m + CAMERA * row
+        share = float(np.sqrt(abs(covariance[at, at])) / state.K[row, 0])
+        told = float(problem.sigma_K[row, 0] / state.K[row, 0])
+        if problem.free[row, 0] and share > UNDETERMINED * told and share * height > 0.01:
+            notes.append(
+                f"This flight does not determine the focal length of {key}: it stays as uncertain"
+                f" as its metadata ({100 * share:.1f} %), and heights of the ground with it"
+                f" ({share * height:.2g} m, one standard deviation); control points, oblique photos"
+                " or lines at two heights would."
+            )
+    return tuple(notes)

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from skyquilt.alignment.adjust import adjust
+from skyquilt.alignment.deviations import point_deviations
+from skyquilt.alignment.heights import control_height
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import Setup
 from skyquilt.alignment.triangulate import polish, triangulated
@@ -18,6 +20,10 @@ from skyquilt.model.photo import ControlPoint, Photo
 from skyquilt.model.poses import ControlResidual, MapFrame
 
 Array = NDArray[np.float64]
+
+
+MARKED_PX = 0.5
+"""Deviation in px of a point that was marked in a photo."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,9 +61,9 @@ def control_in_frame(
         x, y = Transformer.from_crs(point.crs, frame.crs, always_xy=True).transform(
             point.x, point.y
         )
-        xyz = np.array(
-            [x - frame.origin[0], y - frame.origin[1], np.nan if point.z is None else point.z]
-        )
+        at = Transformer.from_crs(frame.crs, 4326, always_xy=True).transform(x, y)
+        z = control_height(point, frame.control_datum, *at)
+        xyz = np.array([x - frame.origin[0], y - frame.origin[1], z])
         photo, px = np.array([s[0] for s in seen]), np.array([s[1:] for s in seen], float)
         found.append(
             Control(
@@ -103,6 +109,7 @@ def _alone(
         photo=row,
         px=px,
         sigma_px=np.ones(len(px)),
+        share=setup.share(row, px),
         X0=empty,
         sigma_X=np.ones_like(empty),
     )
@@ -135,9 +142,15 @@ def fit_similarity_3d(x: Array, y: Array) -> tuple[float, Array, Array]:
 
 def _moved(problem: Problem, state: State, s: float, R: Array, t: Array) -> tuple[Problem, State]:
     """State and positions under y = s R x + t."""
-    moved = State(R=state.R @ R.T, C=s * state.C @ R.T + t, K=state.K, X=s * state.X @ R.T + t)
-    C0 = s * problem.C0 @ R.T + t
-    return replace(problem, C0=C0, sigma_C=problem.sigma_C * s, R0=problem.R0 @ R.T), moved
+    moved = replace(state, R=state.R @ R.T, C=s * state.C @ R.T + t, X=s * state.X @ R.T + t)
+    there = replace(
+        problem,
+        C0=s * problem.C0 @ R.T + t,
+        sigma_C=problem.sigma_C * s,
+        R0=problem.R0 @ R.T,
+        velocity=s * problem.velocity @ R.T,
+    )
+    return there, moved
 
 
 def hold_to_control(
@@ -145,8 +158,7 @@ def hold_to_control(
 ) -> tuple[Problem, State, MapFrame, Sequence[Control]]:
     """Repeats the adjustment with control points as observations.
 
-    GPS positions share an offset (height datum, base station). It is estimated from the control
-    points and removed first.
+    GPS positions share an offset (height datum, base station), which is one of the unknowns.
 
     Raises:
         AlignmentError: no position and fewer than three usable control points.
@@ -174,19 +186,13 @@ def hold_to_control(
     problem, state = _with_points(problem, state, setup, fit)
     if not setup.georeferenced:
         problem = replace(problem, sigma_C=np.full_like(problem.sigma_C, 1e4))
-    state = adjust(problem, state, iterations=25, tolerance=1e-5).state
-    if setup.georeferenced and len(fit) >= 3:
-        # the common offset of the positions came from a solution that still depended on them;
-        # estimate it again from control points
-        for _ in range(3):
-            offset = np.nan_to_num(np.nanmedian(state.C - problem.C0, axis=0))
-            problem = replace(problem, C0=problem.C0 + offset)
-            state = adjust(problem, state, iterations=15, tolerance=1e-5, damping=1e-6).state
+    problem = replace(problem, offset=setup.georeferenced)
+    state = adjust(problem, state, iterations=40, tolerance=1e-5).state
     heights = np.isfinite(surveyed[:, 2]).any()
     return (
         problem,
         state,
-        replace(frame, vertical_datum="control", metric=True) if heights else frame,
+        replace(frame, vertical_datum=frame.control_datum, metric=True) if heights else frame,
         usable,
     )
 
@@ -204,7 +210,8 @@ def _with_points(
         point=np.concatenate([problem.point, P + point]),
         photo=np.concatenate([problem.photo, row]),
         px=np.concatenate([problem.px, px]),
-        sigma_px=np.concatenate([problem.sigma_px, np.full(len(px), 0.7)]),
+        sigma_px=np.concatenate([problem.sigma_px, np.full(len(px), MARKED_PX)]),
+        share=np.concatenate([problem.share, setup.share(row, px)]),
         X0=np.concatenate([problem.X0, surveyed]),
         sigma_X=np.concatenate([problem.sigma_X, np.array([[c.sigma_m] * 3 for c in fit])]),
     )
@@ -212,7 +219,12 @@ def _with_points(
 
 
 def residuals_of_control(
-    control: Sequence[Control], frame: MapFrame, setup: Setup, problem: Problem, state: State
+    control: Sequence[Control],
+    frame: MapFrame,
+    setup: Setup,
+    problem: Problem,
+    state: State,
+    covariance: Array | None = None,
 ) -> tuple[ControlResidual, ...]:
     """Errors of all control and check points at the solution, intersected from the final poses
     alone.
@@ -220,6 +232,13 @@ def residuals_of_control(
     if not control or frame.crs is None:
         return ()
     X, rms = intersected(control, setup, problem, state)
+    sigma = np.full(X.shape, np.nan)
+    if covariance is not None:
+        own, solved = _alone(control, setup, problem, state)
+        own = replace(own, sigma_px=np.full(len(own.px), MARKED_PX))
+        seen = np.flatnonzero(np.bincount(own.point, minlength=len(X)) >= 2)
+        sigma[seen] = point_deviations(own, solved, covariance, seen)
+        sigma = np.hypot(sigma, [[c.sigma_m] for c in control])
     return tuple(
         ControlResidual(
             name=c.name,
@@ -227,6 +246,7 @@ def residuals_of_control(
             error_m=x - c.xyz,
             reprojection_px=float(r),
             observations=len(_placed(c, setup)[0]),
+            sigma_m=None if not c.check or np.isnan(s).any() else s,
         )
-        for c, x, r in zip(control, X, rms, strict=True)
+        for c, x, r, s in zip(control, X, rms, sigma, strict=True)
     )

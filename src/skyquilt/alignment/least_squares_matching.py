@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.tracks import Tracks
-from skyquilt.geometry.camera import distort
+from skyquilt.geometry.camera import pixels
 from skyquilt.imaging.align_patches import translate
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Pose
@@ -180,5 +180,4 @@ def _along(size: Array, axis: int) -> Array:
 
 def _pixel(camera: Camera, pose: Pose, X: Array) -> Array:
     local = pose.to_camera(X)
-    k = camera.vector
-    return np.asarray(distort(local[:, :2] / np.maximum(local[:, 2:], 1e-6), k) * k[0] + k[1:3])
+    return pixels(local[:, :2] / np.maximum(local[:, 2:], 1e-6), camera.vector)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import adjust
 from skyquilt.alignment.bundle import prune
+from skyquilt.alignment.motion import velocities
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import HALF_TURN, Setup, pose_records, set_up
 from skyquilt.alignment.start import Start, plane_link
@@ -265,7 +266,10 @@ def _setup(
     K0 = base.K0.copy()
     for row, key in enumerate(setup.camera_keys):
         if key in window.cameras:
-            K0[row] = window.cameras[key].vector
+            known = window.cameras[key]
+            K0[row] = np.r_[known.vector, known.readout_s]
+    placed = [window.photos[i] for i in setup.members.tolist()]
+    base = replace(base, velocity=velocities(placed, C))
     base = replace(
         base, R0=R0, C0=C0, sigma_R=sigma_R, sigma_C=sigma_C, K0=K0, free=np.zeros_like(base.free)
     )

@@ -5,11 +5,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.geometry.camera import distort, project_with_derivatives
+from skyquilt.geometry.camera import pixels, project_with_derivatives
 from skyquilt.geometry.frames import rotation_from_vector
+from skyquilt.model.camera import PARAMETERS
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+READOUT = len(PARAMETERS)
+"""Column of a camera's readout time in s, after the intrinsics."""
+CAMERA = READOUT + 1
+"""Unknowns of a camera."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -21,19 +26,25 @@ class State:
     C: Array
     """(n, 3) centres in m."""
     K: Array
-    """(m, 8) intrinsics in the order of `model.camera.PARAMETERS`."""
+    """(m, 10) intrinsics in the order of `model.camera.PARAMETERS`, then the readout time in s."""
     X: Array
     """(P, 3) points in m."""
+    turn: Array
+    """(n, 3) rotation of each camera while it is read out, first row to last, in rad about the
+    camera's axes; zero where the rows are exposed at once.
+    """
 
     def moved(self, photo_step: Array, camera_step: Array, point_step: Array) -> "State":
-        """The state after a step of the solver: photos (n, 6) = rotation vector then centre,
-        cameras (m, 8), points (P, 3).
+        """The state after a step of the solver: photos (n, 6) = rotation vector then centre, or
+        (n, 9) with the turn, cameras (m, 10), points (P, 3).
         """
+        turns = photo_step.shape[1] == 9
         return State(
             R=rotation_from_vector(photo_step[:, :3]) @ self.R,
-            C=self.C + photo_step[:, 3:],
+            C=self.C + photo_step[:, 3:6],
             K=self.K + camera_step,
             X=self.X + point_step,
+            turn=self.turn + photo_step[:, 6:] if turns else self.turn,
         )
 
 
@@ -52,11 +63,11 @@ class Problem:
     camera: Index
     """(n,) camera of each photo."""
     free: NDArray[np.bool_]
-    """(m, 8) which intrinsics are estimated."""
+    """(m, 10) which intrinsics, and whether the readout time, are estimated."""
     K0: Array
-    """(m, 8) prior of the intrinsics."""
+    """(m, 10) prior of the intrinsics and the readout time."""
     sigma_K: Array
-    """(m, 8) deviations of that prior."""
+    """(m, 10) deviations of that prior."""
     C0: Array
     """(n, 3) measured centres; NaN where unknown."""
     sigma_C: Array
@@ -77,11 +88,27 @@ class Problem:
     """
     loss_R: float = 2.0
     """Scale of the pseudo-Huber loss on attitudes, since gimbal angles may contain gross errors."""
+    design_effect: float = 1.0
+    """How many observations tell as much as one with errors independent of all others."""
     trust: float = 1.0
-    """Factor on the cost of observations. Errors of neighbouring observations are correlated (lens
-    model, rolling shutter, features of one kind); the hundreds of observations of a photo contain
-    as much information as some dozens of independent ones.
+    """Factor on the cost of observations: the reciprocal of their design effect and of their
+    variance over the assumed one (`alignment.deviations`).
     """
+    offset: bool = False
+    """Whether all measured centres share an unknown shift (height datum, base station), as where
+    control points tie the block to the ground. It is estimated along with the other unknowns.
+    """
+    share: Array
+    """(N,) place of each observation's row in the photo, -0.5 at the first and 0.5 at the last."""
+    velocity: Array
+    """(n, 3) velocity of each camera in m/s in the map frame; zero where unknown."""
+    sigma_turn: Array | None = None
+    """(n,) deviations of `State.turn` from zero in rad; None = turns are not estimated."""
+
+    @property
+    def photo_unknowns(self) -> int:
+        """Unknowns of a photo: 6, or 9 with its turn."""
+        return 6 if self.sigma_turn is None else 9
 
     def with_loss(self, loss_px: float) -> "Problem":
         """The same problem with another scale of the loss on observations."""
@@ -95,40 +122,63 @@ class Linearised:
     residual: Array
     """(N, 2) in units of the standard deviation."""
     J_photo: Array
-    """(N, 2, 6)."""
+    """(N, 2, 6), or (N, 2, 9) where turns are estimated."""
     J_camera: Array
-    """(N, 2, 8), fixed intrinsics zeroed; (N, 2, 0) where all are fixed."""
+    """(N, 2, 10), fixed intrinsics zeroed; (N, 2, 0) where all are fixed."""
     J_point: Array
     """(N, 2, 3)."""
     behind: NDArray[np.bool_]
     """(N,) observations whose point lies behind its camera: ignored."""
 
 
-def _local(problem: Problem, state: State) -> tuple[Array, NDArray[np.bool_]]:
-    """Points of all observations in camera coordinates (N, 3), and which lie behind."""
-    d = state.X[problem.point] - state.C[problem.photo]
-    local = np.einsum("nij,nj->ni", state.R[problem.photo], d)
+def _local(problem: Problem, state: State) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Points of all observations in coordinates of the camera as it stood when their row was
+    exposed (N, 3), the same for the middle row (N, 3), and which points lie behind.
+
+    A row is exposed from its own place: local(s) = L + s (turn x L - R velocity readout), where L
+    belongs to the middle row and s is the row's share of the photo. Linear in s: turns are some
+    hundredths of a radian at most.
+    """
+    photo = problem.photo
+    middle = np.einsum("nij,nj->ni", state.R[photo], state.X[problem.point] - state.C[photo])
+    local = middle.copy()
+    if (state.K[:, READOUT] != 0).any():
+        moved = swept(problem, state)
+        local -= problem.share[:, None] * moved[photo]
+    if state.turn.any():
+        local += problem.share[:, None] * np.cross(state.turn[photo], middle)
     behind = local[:, 2] < 1e-6
-    local[behind] = (0.0, 0.0, 1.0)
-    return local, behind
+    local[behind] = middle[behind] = (0.0, 0.0, 1.0)
+    return local, middle, behind
+
+
+def swept(problem: Problem, state: State) -> Array:
+    """How far each camera moves while it is read out: (n, 3) in m in the camera's axes."""
+    moved = problem.velocity * state.K[problem.camera, READOUT, None]
+    return np.asarray(np.einsum("nij,nj->ni", state.R, moved))
 
 
 def linearise(problem: Problem, state: State) -> Linearised:
     """Residuals and Jacobians at a state."""
-    local, behind = _local(problem, state)
+    local, middle, behind = _local(problem, state)
     cameras, some = problem.camera[problem.photo], bool(problem.free.any())
-    p = project_with_derivatives(state.K[cameras], local, intrinsics=some)
+    p = project_with_derivatives(state.K[cameras, :READOUT], local, intrinsics=some)
     w = (~behind / problem.sigma_px)[:, None]
     d_point = p.d_point * w[..., None]
-    J_photo = np.empty((len(local), 2, 6))
+    J_photo = np.empty((len(local), 2, problem.photo_unknowns))
     J_photo[:, :, :3] = np.cross(local[:, None, :], d_point)  # d . (w x local) = (local x d) . w
     J_point = d_point @ state.R[problem.photo]
-    J_photo[:, :, 3:] = -J_point
-    J_camera = (
-        p.d_intrinsics * w[..., None] * problem.free[cameras][:, None, :]
-        if some
-        else p.d_intrinsics
-    )
+    J_photo[:, :, 3:6] = -J_point
+    if problem.sigma_turn is not None:
+        turned = np.cross(middle[:, None, :], d_point)
+        J_photo[:, :, 6:] = problem.share[:, None, None] * turned
+    J_camera = p.d_intrinsics
+    if some:
+        pace = np.einsum("nki,ni->nk", J_point, problem.velocity[problem.photo])
+        J_camera = np.concatenate(
+            [p.d_intrinsics * w[..., None], -(problem.share[:, None] * pace)[..., None]], 2
+        )
+        J_camera *= problem.free[cameras][:, None, :]
     return Linearised(
         residual=(p.px - problem.px) * w,
         J_photo=J_photo,
@@ -140,8 +190,9 @@ def linearise(problem: Problem, state: State) -> Linearised:
 
 def linearised_points(problem: Problem, state: State) -> tuple[Array, Array]:
     """`residual` (N, 2) and `J_point` (N, 2, 3) of `linearise` alone."""
-    local, behind = _local(problem, state)
-    p = project_with_derivatives(state.K[problem.camera[problem.photo]], local, intrinsics=False)
+    local, _, behind = _local(problem, state)
+    k = state.K[problem.camera[problem.photo], :READOUT]
+    p = project_with_derivatives(k, local, intrinsics=False)
     w = (~behind / problem.sigma_px)[:, None]
     return (p.px - problem.px) * w, (p.d_point * w[..., None]) @ state.R[problem.photo]
 
@@ -150,9 +201,8 @@ def residuals_px(problem: Problem, state: State) -> Array:
     """Image residuals (N, 2) in px, projected minus observed; NaN for points behind their
     camera.
     """
-    local, behind = _local(problem, state)
-    k = state.K[problem.camera[problem.photo]]
-    px = distort(local[:, :2] / local[:, 2:], k) * k[:, :1] + k[:, 1:3]
+    local, _, behind = _local(problem, state)
+    px = pixels(local[:, :2] / local[:, 2:], state.K[problem.camera[problem.photo], :READOUT])
     return np.where(behind[:, None], np.nan, px - problem.px)
 
 

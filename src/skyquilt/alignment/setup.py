@@ -7,18 +7,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.problem import Problem, State
+from skyquilt.alignment.motion import velocities
+from skyquilt.alignment.problem import CAMERA, READOUT, Problem, State
 from skyquilt.alignment.start import Start
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.geometry.frames import angle_difference_deg, cam_R_map_from_angles
 from skyquilt.model.camera import PARAMETERS, Camera, order_named
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Pose, Prior
+from skyquilt.model.poses import Motion, Pose, Prior
 
 Array = NDArray[np.float64]
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 INDEPENDENT = 40
 """Independent observations that tell as much as a photo's many correlated ones."""
+SIGMA_ASPECT = 3e-3
+"""Deviation from 1 of the ratio of focal lengths along columns and rows, where no calibration gives
+it; factory calibrations of drones show 0.2 to 0.5 %.
+"""
 YAW_LIE_DEG = 20.0
 """A reported yaw further than this, in degrees, from that of the links is a gross error."""
 
@@ -64,6 +69,18 @@ class Setup:
         """
         return np.where(self.turned[photo][:, None], self.size[photo] - 1 - px, px)
 
+    def moving_as(self, photos: Sequence[Photo], C: Array) -> "Setup":
+        """The same with the velocities that centres (n, 3) and capture times tell."""
+        members = [photos[m] for m in self.members.tolist()]
+        return replace(self, base=replace(self.base, velocity=velocities(members, C)))
+
+    def share(self, row: NDArray[np.int64], px: Array) -> Array:
+        """Place (N,) of sensor pixels (N, 2) in the photos of these rows, along the readout: -0.5
+        at the first row, 0.5 at the last.
+        """
+        last = self.size[self.members[row], 1] - 1
+        return np.asarray(px[:, 1] / last - 0.5)
+
     def file_sign(self, photo: NDArray[np.int64]) -> Array:
         """(N, 1) factor that takes residuals from the sensor to the file."""
         return np.where(self.turned[photo][:, None], -1.0, 1.0)
@@ -93,11 +110,14 @@ class Setup:
             photo=row,
             px=tracks.px,
             sigma_px=tracks.sigma_px,
+            share=self.share(row, tracks.px),
             X0=np.full(X.shape, np.nan),
             sigma_X=np.ones(X.shape),
             trust=min(1.0, INDEPENDENT * len(self.members) / max(len(row), 1)),
         )
-        return problem, State(R=self.start_R, C=self.start_C, K=self.base.K0.copy(), X=X)
+        turn = np.zeros(self.start_C.shape)
+        K = self.base.K0.copy()
+        return problem, State(R=self.start_R, C=self.start_C, K=K, X=X, turn=turn)
 
 
 def set_up(
@@ -140,6 +160,8 @@ def set_up(
         sigma_R=sigma_R,
         X0=np.zeros((0, 3)),
         sigma_X=np.zeros((0, 3)),
+        share=np.zeros(0),
+        velocity=velocities([photos[m] for m in members.tolist()], start_C),
         loss_px=2.0,
         loss_C=3.0 if repair else 1e6,
         loss_R=2.0 if repair else 1e6,
@@ -243,15 +265,18 @@ def intrinsic_priors(
     for photo in photos:
         wide = max(photo.width, photo.height)
         if photo.calibration is not None:
-            K0.append(photo.calibration.vector)
-            sigma.append(_calibrated_sigma(photo.calibration, photo.focal.sigma_px))
+            known = photo.calibration.vector
+            deviation = _calibrated_sigma(photo.calibration, photo.focal.sigma_px)
         else:
             ideal = Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
-            K0.append(ideal.vector)
-            sigma.append(
-                [photo.focal.sigma_px, 0.01 * wide, 0.01 * wide, 0.1, 0.1, 0.05, 2e-3, 2e-3]
-            )
-    free = np.tile(np.array((True, True, True, *order_named(distortion).terms)), (len(photos), 1))
+            known = ideal.vector
+            lengths = [photo.focal.sigma_px, 0.01 * wide, 0.01 * wide]
+            deviation = np.array([*lengths, 0.1, 0.1, 0.05, 2e-3, 2e-3, SIGMA_ASPECT])
+        K0.append(np.r_[known, photo.shutter.readout_s])
+        sigma.append(np.r_[deviation, max(photo.shutter.sigma_s, 1e-9)])
+    order = order_named(distortion)
+    terms = (True, True, True, *order.terms, order.aspect)
+    free = np.array([(*terms, photo.shutter.sigma_s > 0) for photo in photos])
     return np.array(K0), np.array(sigma), free
 
 
@@ -260,34 +285,51 @@ def _calibrated_sigma(camera: Camera, sigma_focal: float) -> Array:
     which a lens changes in flight.
     """
     wide = max(camera.width, camera.height)
-    usual = [sigma_focal, 0.003 * wide, 0.003 * wide, 0.01, 0.01, 0.01, 1e-3, 1e-3]
-    least = [5e-4 * camera.focal, 5e-4 * wide, 5e-4 * wide, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4]
-    return np.maximum(camera.sigmas or usual, least)
+    usual = [sigma_focal, 0.003 * wide, 0.003 * wide, 0.01, 0.01, 0.01, 1e-3, 1e-3, SIGMA_ASPECT]
+    least = [5e-4 * camera.focal, 5e-4 * wide, 5e-4 * wide, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 5e-4]
+    stated = np.array(camera.sigmas or usual)
+    if stated[8] == 0:  # a calibration with square pixels says nothing about their shape
+        stated[8] = SIGMA_ASPECT
+    return np.asarray(np.maximum(stated, least))
 
 
 def pose_records(setup: Setup, state: State) -> dict[int, Pose]:
     """Poses of the files (for a turned file, the pose of the sensor turned by 180 degrees)."""
-    return {
-        m: Pose(cam_R_map=HALF_TURN @ R if setup.turned[m] else R, map_C=C)
-        for m, R, C in zip(setup.members.tolist(), state.R, state.C, strict=True)
-    }
+    shift = setup.base.velocity * state.K[setup.camera, READOUT, None]
+    poses = {}
+    for row, m in enumerate(setup.members.tolist()):
+        R, moves = state.R[row], bool(shift[row].any() or state.turn[row].any())
+        motion = Motion(shift_m=shift[row], turn_rad=state.turn[row]) if moves else None
+        if setup.turned[m]:  # the file's first row is the sensor's last
+            R = HALF_TURN @ R
+            motion = motion and Motion(
+                shift_m=-motion.shift_m, turn_rad=-HALF_TURN @ motion.turn_rad
+            )
+        poses[m] = Pose(cam_R_map=R, map_C=state.C[row], motion=motion)
+    return poses
 
 
 def camera_records(
     photos: Sequence[Photo], setup: Setup, state: State, covariance: Array | None
 ) -> tuple[dict[str, Camera], dict[int, str]]:
     """Calibrations with deviations, and the name of each photo's calibration."""
-    n = len(setup.members)
     cameras: dict[str, Camera] = {}
     for row, key in enumerate(setup.camera_keys):
         photo = next(p for p in photos if p.camera_key == key)
-        known = dict(zip(PARAMETERS, (float(v) for v in state.K[row]), strict=True))
-        sigmas = None
+        *lens, readout = (float(v) for v in state.K[row])
+        sigmas = sigma_readout = None
         if covariance is not None:
-            at = 6 * n + 8 * row + np.arange(8)
+            at = len(covariance) - len(state.K) * CAMERA + CAMERA * row + np.arange(CAMERA)
             spread = np.sqrt(np.abs(covariance[at, at])) * setup.base.free[row]
-            sigmas = tuple(float(s) for s in spread)
-        cameras[key] = Camera(width=photo.width, height=photo.height, sigmas=sigmas, **known)
+            sigmas, sigma_readout = tuple(spread[:-1].tolist()), float(spread[-1])
+        cameras[key] = Camera(
+            width=photo.width,
+            height=photo.height,
+            readout_s=readout,
+            sigma_readout_s=sigma_readout,
+            sigmas=sigmas,
+            **dict(zip(PARAMETERS, lens, strict=True)),
+        )
     camera_of = {}
     for m in setup.members.tolist():
         key = photos[m].camera_key

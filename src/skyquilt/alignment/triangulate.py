@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.problem import Problem, State, linearised_points
+from skyquilt.alignment.problem import READOUT, Problem, State, linearised_points
 from skyquilt.geometry.camera import undistort
 from skyquilt.model.camera import PARAMETERS, Camera
 
@@ -30,11 +30,17 @@ def triangulated(problem: Problem, state: State) -> State:
     xy = np.empty((len(problem.px), 2))
     for row, k in enumerate(state.K):
         own = problem.camera[problem.photo] == row
-        camera = Camera(width=1, height=1, **dict(zip(PARAMETERS, k, strict=True)))
+        camera = Camera(width=1, height=1, **dict(zip(PARAMETERS, k[:READOUT], strict=True)))
         xy[own] = undistort(camera, problem.px[own])
     local = np.column_stack([xy, np.ones(len(xy))])
-    direction = np.einsum("nji,nj->ni", state.R[problem.photo], local)
-    X = intersect(problem.point, state.C[problem.photo], direction, len(problem.X0))
+    origin, photo, share = state.C[problem.photo], problem.photo, problem.share[:, None]
+    if state.turn.any():
+        local -= share * np.cross(state.turn[photo], local)
+    if (state.K[:, READOUT] != 0).any():
+        moved = problem.velocity * state.K[problem.camera, READOUT, None]
+        origin = origin + share * moved[photo]
+    direction = np.einsum("nji,nj->ni", state.R[photo], local)
+    X = intersect(problem.point, origin, direction, len(problem.X0))
     return replace(state, X=X)
 
 
@@ -51,6 +57,6 @@ def polish(problem: Problem, state: State, *, iterations: int = 5) -> tuple[Stat
         np.add.at(g, problem.point, np.einsum("nki,nk->ni", J, residual) * w[:, None])
         H += np.eye(3) * 1e-9
         step = -np.linalg.solve(H, g[..., None])[..., 0]
-        state = State(R=state.R, C=state.C, K=state.K, X=state.X + step)
+        state = replace(state, X=state.X + step)
         sigma_z = np.sqrt(np.abs(np.linalg.inv(H)[:, 2, 2]))
     return state, sigma_z

@@ -14,7 +14,7 @@ from skyquilt.calibration.square_image import centroid_bias
 from skyquilt.calibration.start import start_camera, start_pose
 from skyquilt.model.board import Board, BoardView
 from skyquilt.model.calibration import BoardPose, Calibration, Marks, Observations, rms
-from skyquilt.model.camera import PARAMETERS, Camera
+from skyquilt.model.camera import PARAMETERS, SQUARE, Camera
 
 Array = NDArray[np.float64]
 _OPTIONAL = (("k3",), ("p1", "p2"), ("k2",), ("k1",))
@@ -78,7 +78,7 @@ class Calibrate:
 
     def _reduced(self, seen: Sequence[Observations], rough: Solution, board: Board) -> Calibration:
         """Fits all parameters, and again without those that are smaller than their tolerance."""
-        free, dropped = list(PARAMETERS), []
+        free, dropped = list(SQUARE), []
         solution, used = self._fit(seen, rough, free, board)
         full = solution.camera
         for names in _OPTIONAL:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from skyquilt.calibration.deviations import sigmas
 from skyquilt.geometry.camera import project
 from skyquilt.model.calibration import BoardPose, Observations
-from skyquilt.model.camera import PARAMETERS, Camera
+from skyquilt.model.camera import PARAMETERS, SQUARE, Camera
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def solve(
     views: Sequence[Observations],
     camera: Camera,
     poses: Sequence[BoardPose],
-    free: Sequence[str] = PARAMETERS,
+    free: Sequence[str] = SQUARE,
 ) -> Solution:
     """The intrinsics named in `free`, the focal length among them, and the pose of each view;
     starts from `camera` and `poses`. If nothing is free, only poses are fitted. If the views do not

@@ -28,6 +28,33 @@ def command(
     overlap: Annotated[float | None, typer.Option(help="forward overlap, percent")] = None,
     sidelap: Annotated[float | None, typer.Option(help="side overlap, percent")] = None,
     height: Annotated[float | None, typer.Option(help="above take-off, m")] = None,
+    speed: Annotated[float | None, typer.Option(help="over ground, m/s")] = None,
+    stops: Annotated[bool, typer.Option("--stops", help="the drone stops for each photo")] = False,
+    fixed_yaw: Annotated[
+        bool, typer.Option("--fixed-yaw", help="the camera does not turn with the lines")
+    ] = False,
+    turns: Annotated[
+        float | None, typer.Option(help="rate at which the camera turns, std. dev., degrees/s")
+    ] = None,
+    shutter_readout: Annotated[
+        float | None, typer.Option(help="of a rolling shutter, ms; 0 = all rows at once")
+    ] = None,
+    aspect: Annotated[
+        float | None, typer.Option(help="focal length along columns over that along rows")
+    ] = None,
+    dewarp: Annotated[
+        str | None,
+        typer.Option(help="a factory calibration in the files, with these P1,P2 in place of true"),
+    ] = None,
+    aspect_untold: Annotated[
+        bool, typer.Option("--aspect-untold", help="that calibration says fy = fx")
+    ] = False,
+    rtk: Annotated[
+        bool, typer.Option("--rtk", help="files state --gps-noise as the deviation of RTK")
+    ] = False,
+    gps_noise_z: Annotated[
+        float | None, typer.Option(help="of heights, m; 1.5 times --gps-noise if not given")
+    ] = None,
     heading: Annotated[
         float | None, typer.Option(help="of the first line, degrees from north")
     ] = None,
@@ -79,6 +106,10 @@ def command(
     ] = None,
     drones: Annotated[int | None, typer.Option(help="flying at once")] = None,
     lose: Annotated[int | None, typer.Option(help="photos lost on the way")] = None,
+    oblique: Annotated[
+        int | None,
+        typer.Option(help="photos added that look ahead, tilted by up to 80 degrees, with sky"),
+    ] = None,
     gcp: Annotated[int | None, typer.Option(help="control points")] = None,
     checks: Annotated[int | None, typer.Option(help="check points")] = None,
     seed: Annotated[int | None, typer.Option(help="equal seeds give equal files")] = None,
@@ -105,11 +136,20 @@ def command(
         tilt_noise=tilt_noise,
         drones=drones,
         lost=lose,
+        speed=speed,
+        stops=stops or None,
+        fixed_yaw=fixed_yaw or None,
+        turns=turns,
+        oblique=oblique,
     )
     base = _with(
         base,
         "reporting",
         gps_noise=gps_noise,
+        gps_noise_z=gps_noise_z,
+        dewarp=_pair("--dewarp", dewarp),
+        dewarp_aspect=False if aspect_untold else None,
+        rtk=rtk or None,
         gps_missing=gps_missing,
         yaw_lie=yaw_lie,
         altitude_drift=altitude_drift,
@@ -130,6 +170,8 @@ def command(
         base, thermal, Weather(season=thermal_season or "summer", hour=thermal_hour or 13.0)
     )
     base = replace(base, seed=base.seed if seed is None else seed, lens=_lens(base, size))
+    readout = None if shutter_readout is None else shutter_readout / 1000
+    base = _with(base, "lens", readout=readout, aspect=aspect)
     _show(sim.simulate(base, out, overwrite=overwrite), quiet)
     if not quiet:
         typer.echo(f"photos: {out / 'photos'}\ntruth:  {out / 'truth'}")
@@ -165,6 +207,17 @@ def _lens(settings: "FlightSettings", size: str | None) -> Any:
     if len(words) != 2 or not all(word.isdigit() and 64 <= int(word) <= 12000 for word in words):
         raise UsageError(f"--size must look like 1600x1200 (64 to 12000 px each), not '{size}'")
     return settings.lens.scaled(int(words[0]), int(words[1]))
+
+
+def _pair(option: str, text: str | None) -> tuple[float, float] | None:
+    """Two numbers with a comma between them."""
+    if text is None:
+        return None
+    try:
+        a, b = (float(word) for word in text.split(","))
+    except ValueError:
+        raise UsageError(f"{option} takes two numbers such as 0.004,0.004, not '{text}'") from None
+    return a, b
 
 
 def _show(events: "Iterable[sim.Progress]", quiet: bool) -> None:

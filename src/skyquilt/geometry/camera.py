@@ -24,7 +24,7 @@ class Projection(NamedTuple):
     d_point: Array
     """(N, 2, 3): with respect to the point in camera coordinates."""
     d_intrinsics: Array
-    """(N, 2, 8): with respect to the intrinsics in the order of `model.camera.PARAMETERS`; (N, 2,
+    """(N, 2, 9): with respect to the intrinsics in the order of `model.camera.PARAMETERS`; (N, 2,
     0) where they are fixed.
     """
 
@@ -32,13 +32,26 @@ class Projection(NamedTuple):
 def distort(xy: Array, k: Array) -> Array:
     """Distorted image-plane coordinates (N, 2), units of the focal length.
 
-    `k` is (..., 8) in the order of `PARAMETERS`, one row for all points or one row per point.
+    `k` is (..., 9) in the order of `PARAMETERS`, one row for all points or one row per point.
     """
     return np.stack(distort_planes(xy[..., 0], xy[..., 1], k), -1)
 
 
+def pixels(xy: Array, k: Array) -> Array:
+    """Pixels (N, 2) of undistorted image-plane coordinates (N, 2), units of the focal length;
+    `k` as for `distort`.
+    """
+    return np.stack(pixel_planes(xy[..., 0], xy[..., 1], k), -1)
+
+
+def pixel_planes(x: Array, y: Array, k: Array) -> tuple[Array, Array]:
+    """`pixels` for separate coordinate arrays: x and y (...), `k` (9,) or a row per point."""
+    u, v = distort_planes(x, y, k)
+    return k[..., 0] * u + k[..., 1], k[..., 0] * k[..., 8] * v + k[..., 2]
+
+
 def distort_planes(x: Array, y: Array, k: Array) -> tuple[Array, Array]:
-    """`distort` for separate coordinate arrays: x and y (...), `k` (8,) or a row per point."""
+    """`distort` for separate coordinate arrays: x and y (...), `k` (9,) or a row per point."""
     k1, k2, k3, p1, p2 = (k[..., i] for i in range(3, 8))
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -53,17 +66,17 @@ def project(camera: Camera, xyz_cam: Array) -> Array:
     z = xyz_cam[..., 2:3]
     with np.errstate(divide="ignore", invalid="ignore"):
         xy = np.where(z > 0, xyz_cam[..., :2] / z, np.nan)
-    k = camera.vector
-    return np.asarray(distort(xy, k) * k[0] + k[1:3])
+    return pixels(xy, camera.vector)
 
 
 def project_with_derivatives(k: Array, xyz_cam: Array, *, intrinsics: bool = True) -> Projection:
-    """Pixels and derivatives; `k` (N, 8) holds each point's intrinsics, `xyz_cam` is (N, 3) with z
+    """Pixels and derivatives; `k` (N, 9) holds each point's intrinsics, `xyz_cam` is (N, 3) with z
     > 0.
 
     `intrinsics`: False = they are fixed, and `d_intrinsics` is (N, 2, 0).
     """
-    f, cx, cy, k1, k2, k3, p1, p2 = k.T
+    f, cx, cy, k1, k2, k3, p1, p2, aspect = k.T
+    fy = f * aspect
     inv_z = 1.0 / xyz_cam[:, 2]
     x, y = xyz_cam[:, 0] * inv_z, xyz_cam[:, 1] * inv_z
     xx, yy, xy = x * x, y * y, x * y
@@ -77,21 +90,22 @@ def project_with_derivatives(k: Array, xyz_cam: Array, *, intrinsics: bool = Tru
     dyy = radial + slope * yy + 6 * p1 * y + 2 * p2 * x
     d_point = np.empty((len(x), 2, 3))
     d_point[:, 0, 0], d_point[:, 0, 1] = f * dxx * inv_z, f * dxy * inv_z
-    d_point[:, 1, 0], d_point[:, 1, 1] = f * dxy * inv_z, f * dyy * inv_z
+    d_point[:, 1, 0], d_point[:, 1, 1] = fy * dxy * inv_z, fy * dyy * inv_z
     d_point[:, 0, 2] = -f * (dxx * x + dxy * y) * inv_z
-    d_point[:, 1, 2] = -f * (dxy * x + dyy * y) * inv_z
-    px = np.stack([f * xd + cx, f * yd + cy], -1)
+    d_point[:, 1, 2] = -fy * (dxy * x + dyy * y) * inv_z
+    px = np.stack([f * xd + cx, fy * yd + cy], -1)
     if not intrinsics:
         return Projection(px, d_point, np.zeros((len(x), 2, 0)))
-    d_k = np.zeros((len(x), 2, 8))
-    d_k[:, 0, 0], d_k[:, 1, 0] = xd, yd
+    d_k = np.zeros((len(x), 2, 9))
+    d_k[:, 0, 0], d_k[:, 1, 0] = xd, aspect * yd
     d_k[:, 0, 1] = d_k[:, 1, 2] = 1
     power = r2.copy()
     for column in (3, 4, 5):
-        d_k[:, 0, column], d_k[:, 1, column] = f * x * power, f * y * power
+        d_k[:, 0, column], d_k[:, 1, column] = f * x * power, fy * y * power
         power = power * r2
-    d_k[:, 0, 6], d_k[:, 1, 6] = 2 * f * xy, f * (r2 + 2 * yy)
-    d_k[:, 0, 7], d_k[:, 1, 7] = f * (r2 + 2 * xx), 2 * f * xy
+    d_k[:, 0, 6], d_k[:, 1, 6] = 2 * f * xy, fy * (r2 + 2 * yy)
+    d_k[:, 0, 7], d_k[:, 1, 7] = f * (r2 + 2 * xx), 2 * fy * xy
+    d_k[:, 1, 8] = f * yd
     return Projection(px, d_point, d_k)
 
 
@@ -101,12 +115,12 @@ def undistort(camera: Camera, px: Array, *, iterations: int = 20) -> Array:
     Newton's method on the distortion; converges to below 1e-10 wherever the model is invertible.
     """
     k = camera.vector
-    target = (np.asarray(px, np.float64) - k[1:3]) / k[0]
-    if not k[3:].any():
+    target = (np.asarray(px, np.float64) - k[1:3]) / (k[0] * np.array([1.0, k[8]]))
+    if not k[3:8].any():
         return np.asarray(target)
     flat = target.reshape(-1, 2)
     ones = np.ones(len(flat))
-    unit = np.broadcast_to(np.r_[1.0, 0.0, 0.0, k[3:]], (len(flat), 8))
+    unit = np.broadcast_to(np.r_[1.0, 0.0, 0.0, k[3:8], 1.0], (len(flat), 9))
     guess = flat.copy()
     for _ in range(iterations):
         step = project_with_derivatives(unit, np.column_stack([guess, ones]), intrinsics=False)

@@ -15,15 +15,14 @@ DEVIATIONS = "standard_deviations"
 """Key of the standard deviations, in the units of the values; readers of OpenSfM's format ignore
 keys they do not know.
 """
-_NAMES = ("focal_x", "c_x", "c_y", "k1", "k2", "k3", "p1", "p2")
+_NAMES = ("focal_x", "c_x", "c_y", "k1", "k2", "k3", "p1", "p2", "aspect")
 
 
 def camera_from_opensfm(record: Mapping[str, Any]) -> Camera:
     """A `brown`, `perspective`, `simple_radial` or `radial` camera.
 
-    Raises `ValueError` for any other projection and for a broken record. `focal_x` and `focal_y`
-    become their mean: pixels are square here. Standard deviations are read from the key that
-    `camera_to_opensfm` writes.
+    Raises `ValueError` for any other projection and for a broken record. Standard deviations
+    are read from the key that `camera_to_opensfm` writes.
     """
     kind = str(record.get("projection_type", "perspective"))
     if kind not in ("brown", "perspective", "simple_radial", "radial"):
@@ -35,12 +34,12 @@ def camera_from_opensfm(record: Mapping[str, Any]) -> Camera:
         raise ValueError(f"its size is {width}x{height} px")
     unit = max(width, height)
     focals = [_number(record, k) for k in ("focal_x", "focal_y", "focal") if k in record]
-    if not focals or min(focals) <= 0:
+    if not focals or not min(focals) > 0:
         raise ValueError("it has no positive focal length (focal, or focal_x and focal_y)")
     return Camera(
         width=width,
         height=height,
-        focal=sum(focals) / len(focals) * unit,
+        focal=focals[0] * unit,
         cx=_number(record, "c_x", 0.0) * unit + (width - 1) / 2,
         cy=_number(record, "c_y", 0.0) * unit + (height - 1) / 2,
         k1=_number(record, "k1", 0.0),
@@ -48,6 +47,7 @@ def camera_from_opensfm(record: Mapping[str, Any]) -> Camera:
         k3=_number(record, "k3", 0.0),
         p1=_number(record, "p1", 0.0),
         p2=_number(record, "p2", 0.0),
+        aspect=_number(record, "focal_y", focals[0]) / focals[0] if "focal_x" in record else 1.0,
         sigmas=_deviations(record, unit),
     )
 
@@ -61,7 +61,10 @@ def _deviations(record: Mapping[str, Any], unit: int) -> tuple[float, ...] | Non
         return None
     if not isinstance(stated, Mapping):
         raise ValueError(f"its '{DEVIATIONS}' are {stated!r}; expected numbers by name")
-    found = tuple(_number(stated, name) * (unit if k < 3 else 1) for k, name in enumerate(_NAMES))
+    found = tuple(
+        _number(stated, name, 0.0 if name == "aspect" else None) * (unit if k < 3 else 1)
+        for k, name in enumerate(_NAMES)
+    )
     if min(found) < 0 or not all(map(math.isfinite, found)):
         raise ValueError(f"its '{DEVIATIONS}' are {dict(stated)}; expected none below zero")
     return found
@@ -81,7 +84,7 @@ def camera_to_opensfm(camera: Camera) -> dict[str, Any]:
         "width": camera.width,
         "height": camera.height,
         "focal_x": camera.focal / unit,
-        "focal_y": camera.focal / unit,
+        "focal_y": camera.focal * camera.aspect / unit,
         "c_x": (camera.cx - (camera.width - 1) / 2) / unit,
         "c_y": (camera.cy - (camera.height - 1) / 2) / unit,
         **{k: getattr(camera, k) for k in ("k1", "k2", "p1", "p2", "k3")},

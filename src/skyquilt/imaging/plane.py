@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.geometry.camera import distort, monotone_radius, rays
+from skyquilt.geometry.camera import monotone_radius, pixels, rays
 from skyquilt.imaging.views import View, project_nodes
 from skyquilt.model.camera import Camera
 from skyquilt.model.surface import Surface
@@ -57,8 +57,7 @@ def to_grid(
     c, r = np.meshgrid(np.arange(c0, c1 + 1.0), np.arange(r0, r1 + 1.0))
     local = np.stack([c, r, np.ones_like(c)], -1) @ cam_H_grid.T
     plane = local[..., :2] / np.where(np.abs(local[..., 2:]) < 1e-9, 1e-9, local[..., 2:])
-    k = camera.vector
-    px = distort(plane, k) * k[0] + k[1:3]
+    px = pixels(plane, camera.vector)
     real = (plane**2).sum(-1) < monotone_radius(camera) ** 2
     u, v = np.moveaxis(np.where(real[..., None], px, -1e4), -1, 0)
     return _seen(picture, camera, u, v, real, column=int(c0), row=int(r0))

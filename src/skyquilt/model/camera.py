@@ -5,8 +5,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-PARAMETERS = ("focal", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
+PARAMETERS = ("focal", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "aspect")
 """Order of the intrinsics in every parameter vector and covariance of the project."""
+SQUARE = PARAMETERS[:-1]
+"""The intrinsics of a camera with square pixels: what views of a board determine."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +24,7 @@ class Camera:
     height: int
     """Image height in px."""
     focal: float
-    """Focal length in px; pixels are square."""
+    """Focal length in px along the rows (fx)."""
     cx: float
     """Principal point, x, in px."""
     cy: float
@@ -37,6 +39,12 @@ class Camera:
     """Tangential coefficient, OpenCV's p1."""
     p2: float = 0.0
     """Tangential coefficient, OpenCV's p2."""
+    aspect: float = 1.0
+    """Focal length along the columns (fy) over that along the rows."""
+    readout_s: float = 0.0
+    """Time in s from the exposure of the first row to that of the last; 0 = all rows at once."""
+    sigma_readout_s: float | None = field(default=None, compare=False)
+    """Standard deviation of `readout_s` in s."""
     sigmas: tuple[float, ...] | None = field(default=None, compare=False)
     """Standard deviations of `PARAMETERS` in that order, where an adjustment or a source gives
     them.
@@ -44,14 +52,15 @@ class Camera:
 
     @property
     def vector(self) -> NDArray[np.float64]:
-        """The intrinsics as (8,), in the order of `PARAMETERS`."""
+        """The intrinsics as (9,), in the order of `PARAMETERS`."""
         return np.array([getattr(self, name) for name in PARAMETERS], dtype=np.float64)
 
     @property
     def matrix(self) -> NDArray[np.float64]:
         """The (3, 3) matrix K in px."""
         return np.array(
-            [[self.focal, 0, self.cx], [0, self.focal, self.cy], [0, 0, 1]], dtype=np.float64
+            [[self.focal, 0, self.cx], [0, self.focal * self.aspect, self.cy], [0, 0, 1]],
+            dtype=np.float64,
         )
 
     @classmethod
@@ -89,6 +98,8 @@ class Order:
     """Radial coefficients: terms up to r^(2 radial)."""
     tangential: bool
     """Whether it has tangential coefficients."""
+    aspect: bool = False
+    """Whether focal lengths along rows and columns may differ."""
 
     @property
     def terms(self) -> tuple[bool, bool, bool, bool, bool]:
@@ -103,8 +114,11 @@ ORDERS = {
     "4": Order(radial=2, tangential=False),
     "6": Order(radial=3, tangential=False),
     "6t": Order(radial=3, tangential=True),
+    "full": Order(radial=3, tangential=True, aspect=True),
 }
-"""By name: radial terms up to r^0, r^2, r^4, r^6, and r^6 with tangential terms."""
+"""By name: radial terms up to r^0, r^2, r^4, r^6, r^6 with tangential terms, and that with the
+aspect ratio.
+"""
 
 
 def order_named(name: str) -> Order:

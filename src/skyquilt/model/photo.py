@@ -7,8 +7,10 @@ from typing import Literal
 
 from skyquilt.model.camera import Camera
 
-Datum = Literal["takeoff", "sea_level", "ellipsoid", "control", "unknown"]
-"""What a height refers to; `control`: the same zero as the heights of the control points."""
+Datum = Literal["takeoff", "sea_level", "egm96", "ellipsoid", "control", "unknown"]
+"""What a height refers to; `egm96`: the geoid; `sea_level`: sea level as the device defines it;
+`control`: the same zero as the heights of the control points.
+"""
 
 
 Stored = Literal["", "celsius", "kelvin", "decikelvin", "centikelvin", "counts"]
@@ -85,6 +87,23 @@ class Focal:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Shutter:
+    """How long a camera takes to read a photo out, row by row."""
+
+    readout_s: float
+    """Time in s from the first row to the last; 0 = all rows at once."""
+    sigma_s: float
+    """Standard deviation in s; 0 = known for sure."""
+    source: Literal["global", "option", "table", "guess", "unknown"]
+    """A shutter that exposes all rows at once; the user; the table of cameras; rolling, of unlisted
+    speed; unknown.
+    """
+
+
+UNKNOWN_SHUTTER = Shutter(readout_s=0.0, sigma_s=0.0, source="unknown")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Photo:
     """One photo: where its pixels are and what its metadata report."""
 
@@ -122,6 +141,10 @@ class Photo:
     """Heading of the aircraft as reported, degrees clockwise from true north; an independent check
     of the yaw.
     """
+    flight_tilt_deg: tuple[float, float] = (0.0, 0.0)
+    """Pitch (positive: nose up) and roll (positive: right wing down) of the aircraft as reported,
+    degrees; 0 where they are not.
+    """
     time: datetime | None
     """Capture time with sub-seconds; naive local time unless the photo states an offset."""
     orientation_tag: int = 1
@@ -130,6 +153,10 @@ class Photo:
     """True for known electronic (rolling) shutters, False for known global/mechanical ones, None
     where unknown.
     """
+    shutter: Shutter = UNKNOWN_SHUTTER
+    """How its rows are read out."""
+    velocity_ned: tuple[float, float, float] | None = None
+    """Velocity of the aircraft as reported, north, east and down in m/s."""
     editor: str | None = None
     """Software that rewrote the file after the camera, where the metadata name one."""
     notes: tuple[str, ...] = ()
@@ -188,6 +215,8 @@ class ControlPoint:
     """Height in m; None where the file says NaN."""
     crs: str
     """As pyproj reads it, e.g. `EPSG:32615`."""
+    datum: Datum = "control"
+    """Zero of `z` as far as `crs` states it: `egm96`, `ellipsoid`, else `control`."""
     observations: tuple[PointObservation, ...]
     """Its observations in photos."""
     sigma_m: float = 0.02

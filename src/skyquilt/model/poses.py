@@ -21,6 +21,12 @@ class MapFrame:
     """Easting and northing in m of the frame's origin; heights are not shifted."""
     vertical_datum: Datum
     """What heights refer to."""
+    takeoff_m: float | None = None
+    """Height of the take-off point above `vertical_datum` in m, by which heights above take-off are
+    converted; None = they are not.
+    """
+    control_datum: Datum = "control"
+    """What heights refer to once control points with heights hold the map."""
     convergence_deg: float = 0.0
     """Meridian convergence: grid yaw = true yaw - convergence."""
     metric: bool = True
@@ -54,6 +60,20 @@ class Prior:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Motion:
+    """Movement of a camera from the exposure of its photo's first row to that of the last.
+
+    A point that has coordinates L in the camera of the middle row has, in that of row y,
+    L + s (turn x L - R shift), s = (y - (height - 1) / 2) / (height - 1).
+    """
+
+    shift_m: Array
+    """(3,) movement of the centre in m in the map frame."""
+    turn_rad: Array
+    """(3,) small rotation about the camera's axes in rad."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Pose:
     """Exterior orientation of one photo."""
 
@@ -66,10 +86,12 @@ class Pose:
     to the undistorted image plane, whatever the height; rotation and centre are then those of the
     nearest vertical view.
     """
+    motion: Motion | None = None
+    """How the camera moved while its rows were read out; None = not at all."""
 
     def to_camera(self, xyz_map: Array) -> Array:
         """Transforms points (..., 3) from the map frame to camera coordinates (for a photo placed
-        in the plane: up to scale).
+        in the plane: up to scale), those of the middle row where the camera moved.
         """
         if self.cam_H_map is not None:
             return np.asarray(xyz_map[..., :2] @ self.cam_H_map[:, :2].T + self.cam_H_map[:, 2])
@@ -117,6 +139,30 @@ class ControlResidual:
     """RMS over its observations in px."""
     observations: int
     """Number of photos in which it was observed."""
+    sigma_m: Array | None = None
+    """(3,) predicted deviation of `error_m` of a check point in m, the survey's included; None
+    where it is not known.
+    """
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Accuracy:
+    """How far ground points may be wrong, as the adjustment predicts."""
+
+    xyz: Array
+    """(k, 3) tie points in m, a sample spread over the map."""
+    sigma_m: Array
+    """(k, 3) deviations of their coordinates in m."""
+    shared_m: tuple[float, float]
+    """Horizontal and vertical deviation in m of a shift of the whole map that no photo shows: that
+    of the positions where no control point ties the map to the ground.
+    """
+    focal_share: float
+    """Deviation of the focal length after the adjustment over that before: 1 = the flight tells
+    nothing about it, and heights follow the metadata.
+    """
+    design_effect: float
+    """Observations that tell as much as an independent one (`alignment.deviations`)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -179,6 +225,8 @@ class Alignment:
     """Control and check points."""
     loo_rms_m: tuple[float, float, float] | None = None
     """RMS over photos of the position residual of each photo predicted from all the others."""
+    accuracy: Accuracy | None = None
+    """Predicted accuracy; None for methods that predict none."""
     notes: tuple[str, ...] = ()
     """Messages for the user."""
     joins: tuple[Join, ...] = ()

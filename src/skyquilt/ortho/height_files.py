@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.heights import VERTICAL_EPSG
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid
 from skyquilt.ortho.bare_ground import bare_ground
@@ -84,6 +85,7 @@ def _write(
         dtype="float32" if real else "uint8",
         transform=geotransform(cells, alignment),
         crs=alignment.frame.crs,
+        vertical=VERTICAL_EPSG.get(alignment.frame.vertical_datum) if real else None,
         compress="zstd" if real else "deflate",
         nodata=float("nan") if real else 0.0,
         tags={"SOFTWARE": "Skyquilt"} | tags,

@@ -19,13 +19,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import View, densify, overlapping, project_all
+from skyquilt.imaging.views import STEP, View, densify, overlapping, project_all
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.bare_ground import bare_ground
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.occlusion import STANDING_M, Shadow
+from skyquilt.ortho.smears import smeared
 
 Float = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -47,6 +48,8 @@ HIDDEN = np.float32(1e3)
 """Added to the score of a photo where something stands before the place."""
 GRAZING = 0.3
 """Length of a cell in a photo, over that on level ground, below which it counts as hidden."""
+SMEARED = np.float32(5e2)
+"""Added where its pixels are smeared over the ground."""
 KEPT = 64
 """Photos whose hidden places are kept in memory."""
 
@@ -291,6 +294,10 @@ class _Scene:
             ]
         )
         part = (slice(row, row + h), slice(column, column + w))
+        for k, n in enumerate(nodes):  # what lies flat yields to sharper photos
+            smear = smeared(n, 2 * self.cells.gsd / STEP)
+            if smear.any():
+                score[k][densify(smear.astype(np.float32), h, w, 2) > 0.5] += SMEARED
         fx, fy = np.meshgrid(
             self.cells.x(np.arange(column, column + w)), self.cells.y(np.arange(row, row + h))
         )

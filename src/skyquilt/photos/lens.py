@@ -3,10 +3,13 @@
 import csv
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from typing import Literal
+
+import numpy as np
 
 from skyquilt.model.camera import PARAMETERS, Camera
 from skyquilt.model.photo import Focal
@@ -188,15 +191,21 @@ def _from_35mm(exif: Exif, width: int, height: int) -> Focal | None:
     return Focal(px=px, sigma_px=0.05 * px, source="35mm")
 
 
-_SIGMA_SHARE = {"focal": 0.01, "centre": 0.003}
-_SIGMA_RADIAL, _SIGMA_TANGENTIAL = 0.01, 0.001
-"""Standard deviations assumed for a manufacturer's distortion coefficients."""
+_SIGMA_FOCAL, _SIGMA_CENTRE = 0.01, 0.005
+"""Deviations of a camera's own calibration: of the focal length, and of the principal point as a
+share of the long side. A calibration is a measurement that may be wrong: of another temperature,
+another setting of the focus, another camera of the model.
+"""
+_SIGMA_RADIAL, _SIGMA_TANGENTIAL, _SIGMA_ASPECT = 0.02, 0.004, 0.0015
+"""Deviations of its distortion coefficients and of its ratio of focal lengths."""
+_UNTOLD = (0.1, 0.1, 0.05, 0.002, 0.002, 0.003)
+"""Deviations of k1, k2, k3, p1, p2 and the ratio where a calibration gives only lengths."""
 
 
 def read_calibration(
     *, exif: Exif, xmp: Xmp, sensor: Sensor | None, width: int, height: int, scale: float
 ) -> Camera | None:
-    """The first of DJI's `DewarpData`, Pix4D's `Camera:Perspective*` and DJI's
+    """The first of DJI's `DewarpData` or `DewarpDataK6`, Pix4D's `Camera:Perspective*` and DJI's
     `CalibratedFocalLength`.
 
     `scale` is this file's px per px as captured (`lens.native_scale`): the calibration refers to
@@ -212,17 +221,43 @@ def read_calibration(
 
 
 def _dewarp(xmp: Xmp, size: tuple[int, int]) -> Camera | None:
-    """`date;fx,fy,cx,cy,k1,k2,p1,p2,k3`, cx and cy from the image centre; flag 1: already
-    undistorted.
+    """`DewarpData`: `date;fx,fy,cx,cy,k1,k2,p1,p2,k3`, cx and cy from the image centre;
+    `DewarpDataK6` has k4, k5, k6 besides. Flag 1: already undistorted.
     """
-    _, _, numbers = xmp.text("DewarpData").partition(";")
-    try:
-        fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(n) for n in numbers.split(","))
-    except ValueError:
+    for name, count in (("DewarpData", 9), ("DewarpDataK6", 12)):
+        _, _, text = xmp.text(name).partition(";")
+        try:
+            numbers = tuple(float(n) for n in text.split(","))
+        except ValueError:
+            continue
+        if len(numbers) == count and all(math.isfinite(n) for n in numbers):
+            break
+    else:
         return None
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, *rational = numbers
+    if not (fx > 0 and fy > 0):
+        return None
+    if any(rational):
+        k1, k2, k3 = _polynomial((k1, k2, k3), rational, math.hypot(*size) / 2 / fx)
     if xmp.number("DewarpFlag") == 1:
         k1 = k2 = k3 = p1 = p2 = 0.0
-    return _camera(size, (fx + fy) / 2, (cx + size[0] / 2, cy + size[1] / 2), (k1, k2, k3, p1, p2))
+    centre = (cx + size[0] / 2, cy + size[1] / 2)
+    return _camera(size, fx, centre, (k1, k2, k3, p1, p2), aspect=fy / fx)
+
+
+def _polynomial(
+    k: tuple[float, float, float], rational: Sequence[float], radius: float
+) -> tuple[float, float, float]:
+    """k1, k2, k3 that come closest to (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 +
+    k6 r^6) over a picture; `radius` of its corners in units of the focal length.
+    """
+    r = np.linspace(0, radius, 200)[1:]
+    powers = np.stack([r**2, r**4, r**6], axis=1)
+    wanted = (1 + powers @ np.array(k)) / (1 + powers @ np.array(rational)) - 1
+    if not np.isfinite(wanted).all():
+        return math.nan, math.nan, math.nan
+    found = np.linalg.lstsq(powers * r[:, None], wanted * r, rcond=None)[0]
+    return float(found[0]), float(found[1]), float(found[2])
 
 
 def _perspective(
@@ -268,6 +303,8 @@ def _camera(
     focal: float,
     centre: tuple[float, float],
     distortion: tuple[float, ...] | None,
+    *,
+    aspect: float = 1.0,
 ) -> Camera | None:
     """A camera from px counted from the corner; None where the numbers are not plausible for a
     lens.
@@ -275,16 +312,20 @@ def _camera(
     long = max(size)
     inside = all(0.25 * s < c < 0.75 * s for c, s in zip(centre, size, strict=True))
     if not (
-        0.2 * long < focal < 60 * long and inside and all(abs(k) < 10 for k in distortion or ())
+        0.2 * long < focal < 60 * long
+        and inside
+        and 0.9 < aspect < 1.1
+        and all(abs(k) < 10 for k in distortion or ())
     ):
         return None
     k1, k2, k3, p1, p2 = distortion or (0.0,) * 5
+    shape = _SIGMA_ASPECT if aspect != 1 else _UNTOLD[-1]
+    told = (*(_SIGMA_RADIAL,) * 3, *(_SIGMA_TANGENTIAL,) * 2, shape)
     sigmas = (
-        _SIGMA_SHARE["focal"] * focal,
-        *(_SIGMA_SHARE["centre"] * long,) * 2,
-        *(_SIGMA_RADIAL,) * 3,
-        *(_SIGMA_TANGENTIAL,) * 2,
+        _SIGMA_FOCAL * focal,
+        *(_SIGMA_CENTRE * long,) * 2,
+        *(_UNTOLD if distortion is None else told),
     )
-    values = (focal, centre[0] - 0.5, centre[1] - 0.5, k1, k2, k3, p1, p2)
+    values = (focal, centre[0] - 0.5, centre[1] - 0.5, k1, k2, k3, p1, p2, aspect)
     known = dict(zip(PARAMETERS, values, strict=True))
     return Camera(width=size[0], height=size[1], sigmas=sigmas, **known)

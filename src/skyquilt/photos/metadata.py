@@ -196,6 +196,27 @@ def read_flight_yaw(xmp: Xmp) -> float | None:
     return xmp.number("FlightYawDegree", "DroneYawDegree")
 
 
+def read_velocity(xmp: Xmp) -> tuple[float, float, float] | None:
+    """Velocity of the aircraft north, east and down in m/s, as DJI writes it; None where it is
+    absent or impossible.
+    """
+    said = [xmp.number(f"Flight{axis}Speed") for axis in "XYZ"]
+    north, east, down = said
+    if north is None or east is None or abs(north) > _FASTEST or abs(east) > _FASTEST:
+        return None
+    return north, east, down if down is not None and abs(down) < _FASTEST else 0.0
+
+
+_FASTEST = 100.0
+"""Greater speeds in m/s are no measurements."""
+
+
+def read_flight_tilt(xmp: Xmp) -> tuple[float, float]:
+    """Pitch and roll of the aircraft in degrees; 0 where they are absent."""
+    pitch, roll = (xmp.number(f"Flight{axis}Degree") for axis in ("Pitch", "Roll"))
+    return pitch or 0.0, roll or 0.0
+
+
 def _from_gimbal(
     yaw: float, pitch: float | None, roll: float | None, source: str
 ) -> tuple[Attitude, tuple[str, ...]]:

@@ -24,11 +24,14 @@ from skyquilt.photos.metadata import (
     find_editor,
     modified_time,
     read_attitude,
+    read_flight_tilt,
     read_flight_yaw,
     read_position,
     read_time,
+    read_velocity,
 )
 from skyquilt.photos.pixels import read_tiff
+from skyquilt.photos.shutter import find_shutter
 from skyquilt.photos.thermal import (
     ThermalFrame,
     stated_unit,
@@ -68,6 +71,7 @@ class _Lens:
     thermal: bool
     calibration: Camera | None
     focal: Focal
+    captured_mp: float
     notes: tuple[str, ...]
 
 
@@ -81,6 +85,7 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
     lens = _lens(header, width, height, thermal=frame is not None)
     position, place_notes = read_position(header.exif, header.xmp)
     attitude, angle_notes = read_attitude(header.xmp)
+    rolling = _rolling(header, lens.sensor)
     seen = (*lens.notes, frame.note if frame else "", *place_notes, *angle_notes)
     return Photo(
         name=name,
@@ -99,9 +104,12 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         position=position,
         attitude=attitude,
         flight_yaw_deg=read_flight_yaw(header.xmp),
+        flight_tilt_deg=read_flight_tilt(header.xmp),
         time=read_time(header.exif, header.xmp),
         orientation_tag=int(header.exif.number(tag.ORIENTATION) or 1),
-        rolling_shutter=_rolling(header, lens.sensor),
+        rolling_shutter=rolling,
+        shutter=find_shutter(header.exif.text(tag.MODEL), lens.captured_mp, rolling),
+        velocity_ned=read_velocity(header.xmp),
         editor=find_editor(header.exif, header.xmp),
         notes=tuple(n for n in (*_broken_notes(header), *seen, *_other_notes(header, lens)) if n),
     )
@@ -124,7 +132,14 @@ def _lens(header: Header, width: int, height: int, *, thermal: bool) -> _Lens:
         thermal=thermal,
     )
     notes = (note, *focal_notes(exif, sensor, width, height))
-    return _Lens(sensor=sensor, thermal=thermal, calibration=calibration, focal=focal, notes=notes)
+    return _Lens(
+        sensor=sensor,
+        thermal=thermal,
+        calibration=calibration,
+        focal=focal,
+        captured_mp=width * height / scale**2 / 1e6,
+        notes=notes,
+    )
 
 
 def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame | None:

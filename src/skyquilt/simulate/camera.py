@@ -72,6 +72,10 @@ class Lens:
     """Tangential."""
     p2: float = -0.0003
     """Tangential."""
+    aspect: float = 1.0
+    """Focal length along the columns over that along the rows."""
+    readout: float = 0.0
+    """Time in s from the exposure of the first row to that of the last."""
 
     @property
     def cx(self) -> float:
@@ -107,7 +111,7 @@ class Lens:
         camera = (np.asarray(points, dtype=np.float64) - centre) @ rotation.T
         depth = np.where(camera[:, 2] > 1e-6, camera[:, 2], np.nan)
         x, y = self.distort(camera[:, 0] / depth, camera[:, 1] / depth)
-        return np.stack([self.focal * x + self.cx, self.focal * y + self.cy], axis=1)
+        return np.stack([self.focal * x + self.cx, self.focal * self.aspect * y + self.cy], axis=1)
 
     def rays(self) -> Floats:
         """Ideal normalised coordinates (height, width, 2) of every pixel centre."""
@@ -115,7 +119,7 @@ class Lens:
         x = (np.arange(self.width, dtype=np.float64) - self.cx) / self.focal
         for row in range(0, self.height, 16):
             rows = np.arange(row, min(row + 16, self.height))
-            y = (rows - self.cy) / self.focal
+            y = (rows - self.cy) / (self.focal * self.aspect)
             xx, yy = np.meshgrid(x, y)
             out[rows, :, 0], out[rows, :, 1] = self.undistort(xx, yy)
         return out

@@ -89,7 +89,7 @@ def _views(lens: Lens, shots: Sequence[Shot], places: Doubles) -> NDArray[np.int
     size = np.array([lens.width, lens.height])
     count = np.zeros(len(places), dtype=np.int64)
     for shot in shots:
-        pixels = lens.project(points, shot.rotation, shot.place)
+        pixels = shot.project(lens, points)
         count += ((pixels > 0.04 * size) & (pixels < 0.96 * size)).all(axis=1)
     return count
 
@@ -148,7 +148,7 @@ def observations(
     points = np.array([[t.x, t.y, country.ground.at(t.x, t.y)] for t in country.targets])
     found = []
     for shot, report in zip(shots, reports, strict=True):
-        pixels = lens.project(points, shot.rotation, shot.place)
+        pixels = shot.project(lens, points)
         for target, point, pixel in zip(country.targets, points, pixels, strict=True):
             if _inside(lens, pixel) and _in_sight(scene, shot.place, point):
                 x, y = (

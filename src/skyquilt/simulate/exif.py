@@ -126,6 +126,14 @@ def _xmp(report: Report) -> bytes | None:
         values["GpsLatitude"] = f"{report.latitude:+.9f}"
         values["GpsLongitude"] = f"{report.longitude:+.9f}"
         values["AbsoluteAltitude"] = f"{report.sea_level:+.3f}"
+    if report.dewarp is not None:
+        numbers = ",".join(f"{v:.9f}" for v in report.dewarp)
+        values["DewarpData"] = f"2026-01-01;{numbers}"
+        values["DewarpFlag"] = "0"
+    if report.rtk is not None:
+        flat, up = report.rtk
+        values |= {"RtkFlag": "50", "RtkStdLon": f"{flat:.5f}", "RtkStdLat": f"{flat:.5f}"}
+        values["RtkStdHgt"] = f"{up:.5f}"
     attributes = "".join(f'\n   drone-dji:{key}="{value}"' for key, value in values.items())
     return (
         '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n'

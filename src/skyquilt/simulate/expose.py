@@ -13,7 +13,8 @@ from scipy.ndimage import gaussian_filter
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.flight import Shot
 from skyquilt.simulate.grid import Doubles, Floats, Grid
-from skyquilt.simulate.raycast import first_hits, rays_of, sample
+from skyquilt.simulate.horizon import with_horizon
+from skyquilt.simulate.raycast import FLATTEST, first_hits, rays_of, sample
 from skyquilt.simulate.scene import Scene
 from skyquilt.simulate.settings import Pictures
 from skyquilt.simulate.weather import Weather
@@ -50,7 +51,12 @@ class Exposer:
         """
         window = self.window(shot)
         corner = np.array([window.xs[0], window.ys[0]])
-        rays = rays_of(self.directions, shot.rotation, shot.place, corner, window.res)
+        rotation, centre = shot.rotation, shot.place
+        if shot.moves(self.lens):
+            share = np.arange(self.lens.height) / (self.lens.height - 1) - 0.5
+            rotation, centre = shot.exposed(self.lens, share)
+            rotation, centre = rotation[:, None], centre[:, None]
+        rays = rays_of(self.directions, rotation, centre, corner, window.res)
         hits, heights = first_hits(np.ascontiguousarray(self.scene.height[window.slices]), rays)
         return hits, heights, window
 
@@ -109,6 +115,7 @@ class Exposer:
         )
         seen = sample(np.ascontiguousarray(colours), hits).astype(np.float32)
         seen *= self._flanks(hits, heights, window)[..., None]
+        seen = with_horizon(seen, self.scene, self.directions, shot)
         seen = _blurred(seen, settings)
         seen *= (np.float32(gain) * falloff(self.lens, settings.vignetting))[..., None]
         if settings.noise > 0:
@@ -137,7 +144,7 @@ def exposer(scene: Scene, lens: Lens) -> Exposer:
 
 def footprint(lens: Lens, shot: Shot, level: float) -> Doubles:
     """Map positions (n, 2) where the rays of the image border meet a level height above the
-    base.
+    base; rays flatter than `FLATTEST` end at that slope.
     """
     w, h = lens.width - 0.5, lens.height - 0.5
     side = np.linspace(0, 1, 9)[:-1]
@@ -147,9 +154,10 @@ def footprint(lens: Lens, shot: Shot, level: float) -> Doubles:
     y = np.concatenate(
         [np.full(8, -0.5), -0.5 + side * (h + 0.5), np.full(8, h), h - side * (h + 0.5)]
     )
-    ix, iy = lens.undistort((x - lens.cx) / lens.focal, (y - lens.cy) / lens.focal)
+    ix, iy = lens.undistort((x - lens.cx) / lens.focal, (y - lens.cy) / (lens.focal * lens.aspect))
     rays = np.stack([ix, iy, np.ones_like(ix)], axis=1) @ shot.rotation
-    return shot.place[:2] + rays[:, :2] * ((level - shot.centre[2]) / rays[:, 2])[:, None]
+    down = np.maximum(-rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]) / FLATTEST)
+    return shot.place[:2] + rays[:, :2] * ((shot.centre[2] - level) / down)[:, None]
 
 
 def falloff(lens: Lens, share: float) -> Floats:

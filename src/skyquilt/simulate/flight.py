@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from skyquilt.simulate.camera import Lens, camera_rotation, wrap
 from skyquilt.simulate.grid import Doubles
@@ -24,6 +25,8 @@ class Waypoint:
     """Degrees clockwise from the map's north; the image top points there."""
     line: int
     """Index of the flight line."""
+    course: float | None = None
+    """Direction of flight in degrees from the map's north, where it is not the heading."""
     drone: int = 0
     """Index of the drone."""
     time: float = 0.0
@@ -46,6 +49,40 @@ class Shot:
     """Degrees, positive ahead."""
     roll: float
     """Degrees, positive right wing down."""
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of the camera in the map frame, m/s."""
+    spin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Rates of rotation about the camera's x, y and z axes, degrees per second."""
+
+    def moves(self, lens: Lens) -> bool:
+        """Whether the rows of the photo are exposed from different places."""
+        return lens.readout > 0 and bool(any(self.velocity) or any(self.spin))
+
+    def exposed(self, lens: Lens, share: Doubles) -> tuple[Doubles, Doubles]:
+        """Rotations (n, 3, 3) from map to camera and centres (n, 3) at the moments at which rows
+        are exposed; `share` (n,): -0.5 for the first row, 0.5 for the last.
+        """
+        seconds = share * lens.readout
+        turn = Rotation.from_rotvec(seconds[:, None] * np.radians(self.spin)).as_matrix()
+        return turn @ self.rotation, self.place + seconds[:, None] * np.array(self.velocity)
+
+    def project(self, lens: Lens, points: Doubles) -> Doubles:
+        """Pixels (n, 2) of map points (n, 3), each from where the camera was when it exposed their
+        row; NaN behind the camera.
+        """
+        pixels = lens.project(points, self.rotation, self.place)
+        if not self.moves(lens):
+            return pixels
+        for _ in range(4):  # each round is a hundred times as close as the one before
+            share = np.clip(pixels[:, 1] / (lens.height - 1) - 0.5, -2, 2)
+            rotation, centre = self.exposed(lens, np.nan_to_num(share))
+            pixels = np.array(
+                [
+                    lens.project(points[i : i + 1], rotation[i], centre[i])[0]
+                    for i in range(len(points))
+                ]
+            ).reshape(-1, 2)
+        return pixels
 
     @property
     def rotation(self) -> Doubles:
@@ -69,6 +106,8 @@ def plan(route: Route, lens: Lens) -> list[Waypoint]:
     else:
         counts = [route.photos] if route.pattern == "strip" else _counts(route, forward, sideways)
         points = _lines(counts, forward, sideways, route.heading)
+    if route.fixed_yaw:
+        points = [replace(p, heading=route.heading, course=p.heading) for p in points]
     return _timed(_shared(points, route.drones), forward / route.speed)
 
 
@@ -165,10 +204,14 @@ def fly(points: list[Waypoint], route: Route, takeoff: float, seed: int, prefix:
     """
     rng = np.random.default_rng([seed, 21, len(prefix)])
     lost = _losses(len(points), route.lost, rng)
+    shaken = np.random.default_rng([seed, 22, len(prefix)]).normal(0, 1, (len(points), 3))
+    spins = [(float(a), float(b), float(c)) for a, b, c in shaken * route.turns]
     shots = []
     for number, point in enumerate(points):
         dx, dy, dz = rng.normal(0, route.jitter, 3)
         yaw, pitch, roll = rng.normal(0, [route.yaw_noise, route.tilt_noise, route.tilt_noise])
+        course = np.radians(point.heading if point.course is None else point.course)
+        speed = 0.0 if route.stops else route.speed
         letter = f"{chr(ord('A') + point.drone % 26)}_" if route.drones > 1 else ""
         shot = Shot(
             name=f"{prefix}_{letter}{number + 1:04d}",
@@ -177,10 +220,39 @@ def fly(points: list[Waypoint], route: Route, takeoff: float, seed: int, prefix:
             yaw=wrap(point.heading + yaw),
             pitch=float(pitch),
             roll=float(roll),
+            velocity=(float(speed * np.sin(course)), float(speed * np.cos(course)), 0.0),
+            spin=spins[number],
         )
         if number not in lost:
             shots.append(shot)
-    return shots
+    return sorted([*shots, *_oblique(shots, route, seed)], key=lambda s: s.waypoint.time)
+
+
+def _oblique(shots: list[Shot], route: Route, seed: int) -> list[Shot]:
+    """Photos taken one second after some of the shots, looking ahead; the shots themselves are the
+    same with and without them.
+    """
+    rng = np.random.default_rng([seed, 22])
+    after = rng.choice(len(shots), route.oblique, replace=route.oblique > len(shots))
+    tilts = rng.permutation(np.linspace(*route.oblique_tilts, route.oblique))
+    taken = []
+    for number, (at, tilt) in enumerate(zip(after, tilts, strict=True)):
+        last = shots[at]
+        dx, dy, dz = rng.normal(0, route.jitter, 3)
+        yaw, roll = rng.normal(0, [route.yaw_noise, min(route.tilt_noise, 3.0)])
+        x, y, z = last.centre
+        taken.append(
+            replace(
+                last,
+                name=f"{last.name}_oblique{number + 1}",
+                waypoint=replace(last.waypoint, time=last.waypoint.time + 1.0),
+                centre=(x + dx, y + dy, z + 0.6 * dz),
+                yaw=wrap(last.waypoint.heading + yaw),
+                pitch=float(tilt),
+                roll=float(roll),
+            )
+        )
+    return taken
 
 
 def _losses(count: int, lost: int, rng: np.random.Generator) -> set[int]:

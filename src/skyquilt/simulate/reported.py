@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from pyproj import CRS, Proj, Transformer
 
-from skyquilt.simulate.camera import gimbal_angles, wrap
+from skyquilt.simulate.camera import Lens, gimbal_angles, wrap
 from skyquilt.simulate.flight import Shot
 from skyquilt.simulate.grid import Doubles
 from skyquilt.simulate.settings import Reporting
@@ -66,6 +66,10 @@ class Report:
     """Seconds since the survey's nominal start, according to the drone's clock."""
     focal: float | None
     """px."""
+    dewarp: tuple[float, ...] | None = None
+    """fx, fy, cx, cy (from the middle), k1, k2, p1, p2, k3 of a factory calibration."""
+    rtk: tuple[float, float] | None = None
+    """Deviations of an RTK position, horizontal and vertical, m."""
     turned: bool
     """The file's pixels were rotated by 180 degrees after the flight."""
     lies: tuple[str, ...]
@@ -83,7 +87,7 @@ class Start:
 
 
 def report_all(
-    shots: list[Shot], settings: Reporting, place: Place, start: Start, focal: float, seed: int
+    shots: list[Shot], settings: Reporting, place: Place, start: Start, lens: Lens, seed: int
 ) -> list[Report]:
     """The metadata of a flight's photos, in order."""
     rng = np.random.default_rng([seed, 31, len(shots)])
@@ -97,7 +101,7 @@ def report_all(
             settings,
             place,
             start,
-            focal=focal,
+            lens=lens,
             error=errors[i],
             drift=settings.altitude_drift * shot.waypoint.time / last,
             lying=i in liars,
@@ -137,13 +141,23 @@ def _liars(shots: list[Shot]) -> set[int]:
     return {i for i, shot in enumerate(shots) if shot.waypoint.line == lines[len(lines) // 2]}
 
 
+def _dewarp(lens: Lens, settings: Reporting) -> tuple[float, ...] | None:
+    """The factory calibration that files carry."""
+    if settings.dewarp is None:
+        return None
+    focal = lens.focal * (1 + settings.focal_error)
+    aspect = lens.aspect if settings.dewarp_aspect else 1.0
+    lengths = (focal, focal * aspect, lens.offset_x, lens.offset_y)
+    return (*lengths, lens.k1, lens.k2, *settings.dewarp, lens.k3)
+
+
 def _report(
     shot: Shot,
     settings: Reporting,
     place: Place,
     start: Start,
     *,
-    focal: float,
+    lens: Lens,
     error: Doubles,
     drift: float,
     lying: bool,
@@ -174,7 +188,11 @@ def _report(
         if with_angles
         else None,
         clock=round(shot.waypoint.time + offsets[shot.waypoint.drone % len(offsets)], 3),
-        focal=None if settings.focal_missing else focal * (1 + settings.focal_error),
+        focal=None if settings.focal_missing else lens.focal * (1 + settings.focal_error),
+        dewarp=_dewarp(lens, settings),
+        rtk=(settings.gps_noise, settings.gps_noise_z or 1.5 * settings.gps_noise)
+        if settings.rtk
+        else None,
         turned=lying and settings.yaw_lie == "turned",
         lies=tuple(lies),
     )

@@ -79,9 +79,7 @@ def prepare(settings: FlightSettings, waypoints: list[Waypoint] | None = None) -
     hills = Ground(noise=Noise(seed=settings.seed), relief=settings.scene.relief)
     start = Start(base=settings.scene.base, takeoff=hills.at(points[0].x, points[0].y))
     shots = fly(points, settings.route, start.takeoff, settings.seed, "SIM")
-    reports = report_all(
-        shots, settings.reporting, place, start, settings.lens.focal, settings.seed
-    )
+    reports = report_all(shots, settings.reporting, place, start, settings.lens, settings.seed)
     visible = Flight(lens=settings.lens, shots=shots, reports=reports)
     thermal = (
         _thermal_flight(settings, settings.thermal, points, place, start)
@@ -126,9 +124,8 @@ def _thermal_flight(
         forward = (1 - route.overlap) * route.height * thermal.lens.height / thermal.lens.focal
         route = replace(route, photos=int(np.ceil((route.site or (0, 0))[0] / forward)) + 1)
     shots = fly(plan(route, thermal.lens), route, start.takeoff, settings.seed, "THM_T")
-    reports = report_all(
-        shots, settings.reporting, place, start, thermal.lens.focal, settings.seed + 1
-    )
+    reporting = replace(settings.reporting, dewarp=None)
+    reports = report_all(shots, reporting, place, start, thermal.lens, settings.seed + 1)
     return Flight(lens=thermal.lens, shots=shots, reports=reports)
 
 

@@ -34,6 +34,12 @@ class Route:
     """Direction of the first line, degrees from the map's north."""
     speed: float = 6.0
     """Ground speed, m/s."""
+    stops: bool = False
+    """The drone stops for each photo."""
+    fixed_yaw: bool = False
+    """The image top points along the heading on all lines; otherwise the drone turns with them."""
+    turns: float = 0.0
+    """Standard deviation of the rates at which the camera turns about its axes, degrees/s."""
     jitter: float = 0.5
     """Standard deviation of the true position around the plan, each axis, m."""
     yaw_noise: float = 2.0
@@ -44,6 +50,10 @@ class Route:
     """Drones that fly at the same time, each on its share of the lines."""
     lost: int = 0
     """Photos planned but not delivered, never two neighbours."""
+    oblique: int = 0
+    """Photos taken besides the planned ones, looking ahead, some with the sky."""
+    oblique_tilts: tuple[float, float] = (57.0, 80.0)
+    """Least and largest tilt of these from the vertical, degrees; they are spread evenly."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +99,16 @@ class Reporting:
     """
     focal_error: float = 0.01
     """Relative error of the focal length in the EXIF."""
+    dewarp: tuple[float, float] | None = None
+    """A factory calibration (DJI's `DewarpData`) in every file: the true lens but for its focal
+    length, which errs by `focal_error`, and these values of p1 and p2.
+    """
+    dewarp_aspect: bool = True
+    """Whether that calibration gives the true ratio of focal lengths (otherwise 1)."""
+    rtk: bool = False
+    """Files say that positions come from RTK, with `gps_noise` as their deviation; heights are
+    then those of the camera without drift.
+    """
     focal_missing: bool = False
     """No focal length at all."""
     attitude_missing: bool = False
@@ -202,11 +222,29 @@ def _route_rules(settings: FlightSettings) -> _Rules:
             f"height must be at least 25 m (trees, houses), not {route.height:g} m",
         ),
         (route.height > 2 * relief, low),
+        (0 < route.speed <= 60, f"speed must be above 0 and at most 60 m/s, not {route.speed:g}"),
+        (
+            0 <= settings.lens.readout <= 1,
+            f"a readout takes 0 to 1000 ms, not {1000 * settings.lens.readout:g}",
+        ),
+        (
+            0.9 <= settings.lens.aspect <= 1.1,
+            f"aspect must be 0.9 to 1.1, not {settings.lens.aspect:g}",
+        ),
+        (0 <= route.turns <= 30, f"turns must be 0 to 30 degrees/s, not {route.turns:g}"),
         (route.drones >= 1, f"drones must be at least 1, not {route.drones}"),
         (0 <= 2 * route.lost < route.photos, lost),
         (
-            0 <= route.tilt_noise <= 8,
-            f"tilt noise must be 0 to 8 degrees, not {route.tilt_noise:g}",
+            0 <= route.tilt_noise <= 30,
+            f"tilt noise must be 0 to 30 degrees, not {route.tilt_noise:g}",
+        ),
+        (
+            0 <= route.oblique <= 1000,
+            f"the number of oblique photos must be 0 to 1000, not {route.oblique}",
+        ),
+        (
+            0 <= route.oblique_tilts[0] <= route.oblique_tilts[1] <= 80,
+            "oblique photos are tilted by 0 to 80 degrees, the least tilt first",
         ),
     ]
 

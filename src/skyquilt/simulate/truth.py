@@ -78,7 +78,8 @@ def write_truth(
 
 
 def _camera(lens: Lens) -> dict[str, float]:
-    names = ("width", "height", "focal", "cx", "cy", "k1", "k2", "k3", "p1", "p2")
+    lengths = ("width", "height", "focal", "cx", "cy", "aspect")
+    names = (*lengths, "k1", "k2", "k3", "p1", "p2", "readout")
     return {name: getattr(lens, name) for name in names}
 
 
@@ -99,6 +100,8 @@ def _photo(taken: Taken, place: Place, start: Start) -> dict[str, Any]:
         "yaw_deg": shot.yaw,
         "pitch_deg": shot.pitch,
         "roll_deg": shot.roll,
+        "velocity_ms": list(shot.velocity),
+        "spin_deg_s": list(shot.spin),
         "turned": report.turned,
         "exposure": taken.exposure,
         "lies": list(report.lies),

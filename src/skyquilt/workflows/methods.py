@@ -219,7 +219,7 @@ def blend_for(settings: MosaicSettings) -> Blend:
 def bundle(settings: MosaicSettings) -> ByLinks:
     """Method `bundle`."""
     repair = settings.input.repair
-    return ByLinks(bundle=Bundle(distortion=settings.camera.distortion or "4", repair=repair))
+    return ByLinks(bundle=Bundle(distortion=settings.camera.distortion or "full", repair=repair))
 
 
 def pose(settings: MosaicSettings) -> ByReport:

@@ -9,7 +9,9 @@ from skyquilt.errors import UsageError
 from skyquilt.model.photo import ControlPoint, KnownDistance, Survey
 from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import read_gcp_list
+from skyquilt.photos.lever_arm import with_lever_arm
 from skyquilt.photos.sequence import sequence_of
+from skyquilt.photos.shutter import stated_shutter
 from skyquilt.photos.survey import read_survey
 from skyquilt.settings import InputSettings, MosaicSettings
 
@@ -48,6 +50,12 @@ def read_input(source: Source | str, settings: InputSettings) -> SurveyInput:
     survey = read_survey(
         source, geo=settings.geo, cameras=settings.cameras, thermal_unit=settings.thermal_unit
     )
+    shutter = stated_shutter(settings.shutter, settings.shutter_readout_ms)
+    if shutter is not None:
+        survey = replace(survey, photos=tuple(replace(p, shutter=shutter) for p in survey.photos))
+    if settings.lever_arm is not None:
+        photos, notes = with_lever_arm(survey.photos, settings.lever_arm)
+        survey = replace(survey, photos=photos, notes=(*survey.notes, *notes))
     names = [p.name for p in survey.photos]
     gcp = settings.gcp
     if gcp is None and isinstance(source, Path) and (source / "gcp_list.txt").is_file():
@@ -79,7 +87,9 @@ def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> N
             f"{output} contains the photos; choose another folder for the results, such as"
             f" {output / 'map'}"
         )
-    frame = choose_frame(given.survey.photos, settings.picture.crs, given.control)
+    frame = choose_frame(
+        given.survey.photos, settings.picture.crs, given.control, settings.picture.vertical_datum
+    )
     if settings.picture.boundary is not None:
         if frame.crs is None:
             raise UsageError(

@@ -1,0 +1,116 @@
+"""How far the results of an adjustment may be wrong, from what its residuals show.
+
+Two figures describe the observations. The *variance factor*: how much larger their errors are than
+was assumed. The *design effect* (Kish 1965): how many observations with correlated errors tell as
+much as one independent one. Errors of neighbouring observations in a photo are correlated, since
+the model is incomplete in the same way for them (lens, air, leaves, relief within a patch).
+Residuals of neighbours show how strongly; over larger parts of a photo they do not, since its pose
+takes such errors up. On simulated flights, where errors are known, that correlation hardly falls
+with distance up to a third of a photo. So it is measured in small cells and taken to reach over a
+quarter.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.adjust import normal_equations
+from skyquilt.alignment.problem import CAMERA, Problem, State, residuals_px
+
+Array = NDArray[np.float64]
+CELLS = 8
+"""Cells of a photo along each side in which residuals of neighbours are compared."""
+REACH = 2
+"""Parts of a photo along each side over which a correlation is taken to reach."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noise:
+    """What residuals show of the observations."""
+
+    variance: float
+    """Variance of the observations over the assumed one."""
+    design_effect: float
+    """Observations that tell as much as an independent one."""
+
+
+def robust_scale(problem: Problem, state: State) -> float:
+    """Deviation of the bulk of the observations over the assumed one, from the median residual.
+
+    Residuals of a few observations per point are smaller than the errors; the share of the
+    equations that is left after the unknowns accounts for that.
+    """
+    e = residuals_px(problem, state) / problem.sigma_px[:, None]
+    unknowns = 6 * len(state.C) + int(problem.free.sum()) + 3 * len(state.X)
+    left = max(1 - unknowns / (2 * len(e)), 0.05)
+    return float(1.48 * np.nanmedian(np.abs(e)) / np.sqrt(left))
+
+
+def observed_noise(problem: Problem, state: State, size: Array) -> Noise:
+    """The noise of the observations at a minimum; `size` (n, 2): each photo's in px."""
+    e = np.nan_to_num(residuals_px(problem, state)) / problem.sigma_px[:, None]
+    u = (e**2).sum(1) / problem.loss_px**2
+    w = 1 / (1 + u)
+    psi = e * w[:, None]
+    unknowns = 6 * len(state.C) + int(problem.free.sum()) + 3 * len(state.X)
+    spare = max(2 * len(e) - unknowns, 1)
+    # the weights enter the normal equations; their variance and slope tell what these are worth
+    variance = float((psi**2).sum()) / spare * float(w.mean()) / float((w**2).mean()) ** 2
+    near = _alike(problem, psi, size)
+    part = _part(problem, size, REACH)
+    crowd = np.bincount(part).astype(float)
+    together = float((crowd**2).sum() / crowd.sum())  # in the part of an observation, on average
+    return Noise(variance=variance, design_effect=1 + max(near, 0.0) * (together - 1))
+
+
+def _part(problem: Problem, size: Array, parts: int) -> NDArray[np.int64]:
+    """Number (N,) of the cell of its photo in which each observation lies."""
+    cell = np.clip((problem.px + 0.5) / size[problem.photo] * parts, 0, parts - 1).astype(int)
+    return np.asarray((problem.photo * parts + cell[:, 1]) * parts + cell[:, 0])
+
+
+def _alike(problem: Problem, psi: Array, size: Array) -> float:
+    """Correlation of residuals (N, 2) of different points in the same cell of a photo."""
+    part = _part(problem, size, CELLS)
+    count = np.bincount(part).astype(float)
+    pairs = float((count * (count - 1)).sum())
+    sums = np.stack([np.bincount(part, psi[:, k]) for k in range(2)], 1)
+    own = float((psi**2).sum())
+    if pairs == 0 or own == 0:
+        return 0.0
+    return (float((sums**2).sum()) - own) / pairs / (own / len(psi))
+
+
+def point_deviations(
+    problem: Problem, state: State, covariance: Array, points: NDArray[np.int64]
+) -> Array:
+    """Standard deviations (k, 3) in m of points of a problem.
+
+    Args:
+        problem: their observations; each point's own are taken to be independent of one another.
+        state: the minimum.
+        covariance: of photos and cameras, as from `adjust.covariance`.
+        points: (k,) which points.
+    """
+    normal = normal_equations(replace(problem, trust=1.0), state)
+    p, q = normal.Wp.shape[1], normal.Wc.shape[1]
+    n, first = len(state.C), np.searchsorted(problem.point, np.arange(len(state.X) + 1))
+    out = np.full((len(points), 3), np.nan)
+    for k, point in enumerate(points.tolist()):
+        own = slice(first[point], first[point + 1])
+        photo = problem.photo[own]
+        camera = p * n + CAMERA * problem.camera[photo][:, None] + np.arange(q)
+        at = np.concatenate([(p * photo[:, None] + np.arange(p)).ravel(), camera.ravel()])
+        W = np.concatenate([normal.Wp[own].reshape(-1, 3), normal.Wc[own].reshape(-1, 3)])
+        V = normal.V[point] + 1e-9 * np.eye(3)
+        moved = np.linalg.solve(V, W.T)
+        total = np.linalg.inv(V) + moved @ covariance[np.ix_(at, at)] @ moved.T
+        out[k] = np.sqrt(np.maximum(np.diag(total), 0.0))
+    return out
+
+
+def believed(problem: Problem, noise: Noise) -> Problem:
+    """The problem whose observations weigh what the noise says that they tell."""
+    effect = noise.design_effect
+    return replace(problem, design_effect=effect, trust=1 / (effect * noise.variance))

@@ -1,0 +1,122 @@
+"""How cameras move while their photos are taken: velocities from neighbours' positions and times.
+
+A rolling shutter exposes the rows of a photo one after the other while the camera flies on.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.model.photo import Photo
+
+Array = NDArray[np.float64]
+FASTEST_MS = 70.0
+"""Greater speeds in m/s come from wrong times."""
+STRAIGHT_DEG = 30.0
+"""A flight that turns by more than this in degrees from one leg to the next is on another line."""
+LONGEST_GAP_S = 60.0
+"""Photos further apart than this in s do not tell the speed in between."""
+HOVERS = 0.3
+"""A drone that reports less than this share of its mean speed slows down for its photos."""
+REACH = 3
+"""Neighbours before and after a photo that tell its velocity; twice as many tell its climb, and
+where times are given in whole seconds only.
+"""
+
+
+def seconds(photos: Sequence[Photo]) -> Array:
+    """Capture times (n,) in s since the first one; NaN for photos without time."""
+    plain = [None if p.time is None else p.time.replace(tzinfo=None) for p in photos]
+    first = min((t for t in plain if t is not None), default=None)
+    return np.array(
+        [np.nan if t is None or first is None else (t - first).total_seconds() for t in plain]
+    )
+
+
+def velocities(photos: Sequence[Photo], C: Array) -> Array:
+    """Velocities (n, 3) in m/s in the map frame of cameras at C (n, 3); zero where unknown.
+
+    Each is the slope of positions over times along the straight part of the flight around a photo.
+    Where a photo reports a speed far below that, its drone slows down for its photos, and the
+    reported velocity is taken.
+    """
+    out = np.zeros((len(photos), 3))
+    time = seconds(photos)
+    keys: dict[str, list[int]] = {}
+    for i, photo in enumerate(photos):
+        if np.isfinite(time[i]):
+            keys.setdefault(photo.camera_key, []).append(i)
+    for group in keys.values():
+        order = np.array(sorted(group, key=lambda i: (time[i], photos[i].name)))
+        out[order] = _along(time[order], C[order])
+    for i, photo in enumerate(photos):
+        said = photo.velocity_ned
+        if said is None:
+            continue
+        reported = np.array([said[1], said[0], -said[2]])
+        speed = float(np.linalg.norm(out[i]))
+        if speed == 0 or np.linalg.norm(reported) < HOVERS * speed:
+            out[i] = reported
+    return out
+
+
+def _along(time: Array, C: Array) -> Array:
+    """Velocities (n, 3) of one camera's photos in order of time."""
+    n = len(time)
+    out = np.zeros((n, 3))
+    if n < 2:
+        return out
+    gap, step = np.diff(time), np.diff(C, axis=0)
+    leg = np.full((n - 1, 3), np.nan)
+    timed = (gap > 0.05) & (gap < LONGEST_GAP_S)
+    leg[timed] = step[timed] / gap[timed, None]
+    leg[np.linalg.norm(np.nan_to_num(leg), axis=1) > FASTEST_MS] = np.nan
+    whole = bool((np.abs(time - np.round(time)) < 1e-6).all())
+    reach = 2 * REACH if whole else REACH
+    for i in range(n):
+        for axes, far in ((slice(0, 2), reach), (slice(2, 3), 2 * reach)):
+            line = _line(leg, i, far)
+            if len(line) >= 2:
+                t = time[line] - time[line].mean()
+                out[i, axes] = t @ (C[line] - C[line].mean(0))[:, axes] / (t @ t)
+    return out
+
+
+def _line(leg: Array, i: int, reach: int) -> NDArray[np.int64]:
+    """The photos around photo i on the same straight part of the flight, at most `reach` on each
+    side; only i itself where no leg is known.
+    """
+    before = _run(leg, i - 1, -1, reach)
+    after = _run(leg, i, 1, reach)
+    if before and after and not _agree(leg[i - 1], leg[i]):
+        # a turn: the photo belongs to the longer part; the leg between two lines is a part of one
+        if len(before) == len(after):
+            slow = np.linalg.norm(leg[i - 1]) < np.linalg.norm(leg[i])
+            before, after = ([], after) if slow else (before, [])
+        elif len(before) > len(after):
+            after = []
+        else:
+            before = []
+    return np.array(sorted({i, *(k for k in before), *(k + 1 for k in after)}))
+
+
+def _run(leg: Array, first: int, step: int, reach: int) -> list[int]:
+    """Legs from `first` on that keep their direction and speed."""
+    found: list[int] = []
+    k = first
+    while 0 <= k < len(leg) and len(found) < reach and np.isfinite(leg[k]).all():
+        if found and not _agree(leg[found[-1]], leg[k]):
+            break
+        found.append(k)
+        k += step
+    return found
+
+
+def _agree(a: Array, b: Array) -> bool:
+    """Whether two velocities are those of one straight flight."""
+    la, lb = float(np.linalg.norm(a)), float(np.linalg.norm(b))
+    if min(la, lb) < 1e-6:
+        return max(la, lb) < 0.2
+    alike = float(a @ b) > np.cos(np.radians(STRAIGHT_DEG)) * la * lb
+    return alike and max(la, lb) < 2.5 * min(la, lb)
