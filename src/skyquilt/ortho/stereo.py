@@ -180,9 +180,9 @@ class Stereo:
         around = cv2.morphologyEx(
             known.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8)
         )
-        soft = cv2.GaussianBlur(whole, (0, 0), 0.05 * height / cells.gsd)
-        whole = np.asarray(np.where(around > 0, whole, soft), np.float32)
-        whole = settled(whole, around > 0, 0.0, 0.2 * height / cells.gsd)
+        beyond = plateaus(np.asarray(whole, np.float32), 4 * side + 1)
+        whole = np.asarray(np.where(around > 0, whole, beyond), np.float32)
+        whole = settled(whole, around > 0, 0.0, 0.4 * height / cells.gsd)
         return _surface(whole, cells), known
 
     def pairs(self, views: Sequence[View], height: float, wanted: int) -> list[tuple[View, View]]:
