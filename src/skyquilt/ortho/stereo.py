@@ -30,9 +30,9 @@ MOST_CELLS = 2.4e7
 """Largest number of cells of a surface."""
 TILE = 512
 """Cells along a side of the pieces in which heights are fused."""
-NEW = 0.5
+NEW = 0.25
 """Share of the ground of a pair that must still lack pairs for it to be matched."""
-FIRM = 0.75
+FIRM = 0.45
 """Share of the cells around with a fine height from which these are believed."""
 THREADS = 2
 """Pairs matched at a time."""
@@ -180,9 +180,8 @@ class Stereo:
         around = cv2.morphologyEx(
             known.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8)
         )
-        beyond = plateaus(np.asarray(whole, np.float32), 4 * side + 1)
-        whole = np.asarray(np.where(around > 0, whole, beyond), np.float32)
-        whole = settled(whole, around > 0, 0.0, 0.4 * height / cells.gsd)
+        # at once: photos drawn on a slope between crowns and the plane would become streaks
+        whole = settled(np.asarray(whole, np.float32), around > 0, 0.0, 1.0)
         return _surface(whole, cells), known
 
     def pairs(self, views: Sequence[View], height: float, wanted: int) -> list[tuple[View, View]]:
