@@ -47,6 +47,10 @@ IN_NO_KEY = {
         + ("APART", "MAX_RATIO", "SIDE", "COARSE"),
         "seams are measured anew by every run",
     ),
+    **dict.fromkeys(
+        ("SIDES", "SHORTEST", "AZIMUTH_DEG", "ELEVATION_DEG", "CONTOUR_CELL_M"),
+        "files of heights are written anew by every run",
+    ),
 }
 """Constants of the stages that no method's key holds, and why that is right."""
 

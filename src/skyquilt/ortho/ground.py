@@ -127,6 +127,7 @@ def find_ground(
             refined,
             lambda: sweep(known, [v for v in views if v.photo in held], grid, grey, keep),
         )
+        views = tuple(make_views(alignment, surface, limits))
     yield 1, 1
     return Ground(surface=surface, views=views, grid=grid, native_gsd=native, limits=limits)
 

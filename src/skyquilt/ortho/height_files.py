@@ -11,10 +11,8 @@ from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid
 from skyquilt.ortho.bare_ground import bare_ground
 from skyquilt.ortho.companions import Drawn, geotransform
-from skyquilt.ortho.contours import contour_lines
 from skyquilt.ortho.ground import Ground
 from skyquilt.raster import RasterSpec, write_array
-from skyquilt.raster.geopackage import write_lines
 from skyquilt.settings import OutputSettings
 
 Float = NDArray[np.float32]
@@ -95,6 +93,10 @@ def _write(
 
 
 def _contours(path: Path, z: Float, cells: Grid, alignment: Alignment, step: float) -> None:
+    # imported only where contours are wanted: both need Shapely
+    from skyquilt.ortho.contours import contour_lines
+    from skyquilt.raster.geopackage import write_lines
+
     factor = max(1, round(CONTOUR_CELL_M / cells.gsd))
     known = np.isfinite(z).astype(np.float32)
     h, w = z.shape[0] // factor * factor, z.shape[1] // factor * factor

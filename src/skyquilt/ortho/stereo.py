@@ -178,7 +178,9 @@ class Stereo:
         level = cv2.bilateralFilter(plateaus(closed, side), 5, 0.02 * height, 2.0)
         whole = np.where(firm, cv2.medianBlur(whole, 5), level)
         around = cv2.morphologyEx(
-            known.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((15, 15), np.uint8)
+            known.astype(np.uint8),
+            cv2.MORPH_CLOSE,
+            cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (15, 15)),
         )
         # at once: photos drawn on a slope between crowns and the plane would become streaks
         whole = settled(np.asarray(whole, np.float32), around > 0, 0.0, 1.0)
