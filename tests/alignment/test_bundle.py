@@ -29,9 +29,8 @@ class Flown:
 
     def __init__(self, seed=0, *, turned=(), yaw_lies=(), gps=1.0, **options):
         sigma_k = np.array([4.0, 2.0, 2.0, 0.01, 0.01, 0.01, 1e-3, 1e-3, 3e-3, 1e-3])
-        self.block = b = make_block(
-            seed, points=500, gps=gps, tilt_deg=0.5, sigma_k=sigma_k, **options
-        )
+        options = {"points": 500, "tilt_deg": 0.5, "sigma_k": sigma_k} | options
+        self.block = b = make_block(seed, gps=gps, **options)
         n = len(b.truth.C)
         self.truth, self.turned = b.truth, set(turned)
         self.photos = [

@@ -328,7 +328,8 @@ def _outcome(
     weak = {int(i): f"it has only {seen[i]} tie points" for i in setup.members if seen[i] < 8}
     full = covariance(problem, state)
     cameras, camera_of = camera_records(photos, setup, state, full)
-    poses = {i: p for i, p in pose_records(setup, state).items() if i not in weak}
+    placed = pose_records(setup, state, full, problem.photo_unknowns)
+    poses = {i: p for i, p in placed.items() if i not in weak}
     blocks = tuple(tuple(i for i in b if i not in weak) for b in start.blocks)
     metric = frame.metric and (start.metric or any(not c.check for c in control))
     return Alignment(

@@ -86,6 +86,8 @@ class Pose:
     to the undistorted image plane, whatever the height; rotation and centre are then those of the
     nearest vertical view.
     """
+    sigma_m: Array | None = None
+    """(3,) deviation of the centre in m; None where it is not known."""
     motion: Motion | None = None
     """How the camera moved while its rows were read out; None = not at all."""
 
