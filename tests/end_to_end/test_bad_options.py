@@ -243,6 +243,7 @@ def test_json_is_one_object_per_line(mosaic, flight):
         "align",
         "surface",
         "balance",
+        "seams",
         "mosaic",
         "measure",
         "report",

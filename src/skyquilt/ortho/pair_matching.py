@@ -22,6 +22,8 @@ SUBPIXEL = 16
 """OpenCV gives disparities in sixteenths of a pixel."""
 SPECKLE = 60
 """Patches of fewer pixels, apart from their surroundings by more than two, are dropped."""
+TEXTURE = 1.5
+"""Least standard deviation of grey values in a window that is compared: more than noise."""
 TALLEST = 0.7
 """Largest height over the plane that is searched, as a share of the cameras' height."""
 
@@ -160,7 +162,14 @@ def _disparities(
     there = np.arange(d.shape[1], dtype=np.float32) - d
     other = np.clip(np.rint(there), 0, d.shape[1] - 1).astype(np.intp)
     inside = (there > 0) & (there < d.shape[1] - 1) & np.take_along_axis(seen_b, other, 1)
-    return d, np.asarray((d >= first) & seen & inside)
+    return d, np.asarray((d >= first) & seen & inside & _textured(left, 2 * window + 1))
+
+
+def _textured(picture: NDArray[np.uint8], side: int) -> Mask:
+    """Where the window of a side in px around a pixel holds something to compare: (h, w)."""
+    grey = picture.astype(np.float32)
+    mean = cv2.blur(grey, (side, side))
+    return np.asarray(cv2.blur(grey * grey, (side, side)) - mean * mean > TEXTURE**2)
 
 
 def _rectified(
