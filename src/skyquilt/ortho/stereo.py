@@ -292,6 +292,8 @@ def _points(pair: Pair, given: _Round) -> Float:
     high = float(_sampled(pair, given.high).max()) - over + tilt
     pictures = (given.grey(pair.a.photo, side), given.grey(pair.b.photo, side))
     at = matched_points(pair, *pictures, low, high, given.level.window)
+    if not len(at):
+        return at
     x, y, z = (at[:, k] + pair.origin[k] for k in range(3))
     return np.asarray(at[(z > given.low.at(x, y)) & (z < given.high.at(x, y))])
 
