@@ -12,6 +12,7 @@ from typing import Any
 
 from skyquilt import registry
 from skyquilt.errors import UsageError
+from skyquilt.outside import MOST_MP
 
 IMAGE_SEARCHES = ("chain", "overview")
 OPTIMISERS = ("anneal", "surfaces")
@@ -71,12 +72,15 @@ class InputSettings:
     """
     repair: bool = True
     """Treat metadata as measurements that may be wrong."""
+    max_mp: float = MOST_MP
+    """Largest area of a photo in megapixels; larger ones are left out before they are decoded."""
     shutter: str | None = None
     """One of `SHUTTERS`: how the cameras expose; None = as metadata and table of cameras say."""
     shutter_readout_ms: float | None = None
     """Time in ms in which a rolling shutter reads a photo out; None = as the table says."""
 
     def __post_init__(self) -> None:
+        within("--max-mp", self.max_mp, 0.01, 10_000)
         if self.thermal_unit is not None:
             one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
         if self.shutter is not None:

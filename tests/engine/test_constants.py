@@ -43,6 +43,9 @@ IN_NO_KEY = {
     "SIGMA_HEIGHT": "the same",
     "YAW_DEG": "conflicts are told in the report and shape nothing",
     **dict.fromkeys(
+        ("_LEAST_FOCAL", "_MOST"), "limits of files that are refused: they shape no result"
+    ),
+    **dict.fromkeys(
         ("NOISE", "TEXTURE", "RIM", "_DERIVE", "_SMOOTH", "RADIUS", "MIN_PEAK", "BROAD_PEAK")
         + ("APART", "MAX_RATIO", "SIDE", "COARSE"),
         "seams are measured anew by every run",

@@ -6,8 +6,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.options import THERMAL_UNITS, UNIT_UNSAID, Photos, mode_of
+from skyquilt.cli.options import (
+    MAX_MEMORY,
+    MAX_MEMORY_UNSAID,
+    MAX_MP,
+    THERMAL_UNITS,
+    UNIT_UNSAID,
+    Photos,
+    mode_of,
+)
 from skyquilt.errors import UsageError
+from skyquilt.outside import MOST_MP
 
 if TYPE_CHECKING:
     from skyquilt.model.event import Result
@@ -214,6 +223,8 @@ def command(
     memory: Annotated[
         float | None, option(RUN, "Memory to stay within, in GB.", default="1.2")
     ] = None,
+    max_mp: Annotated[float, option(RUN, MAX_MP)] = MOST_MP,
+    max_memory: Annotated[float | None, option(RUN, MAX_MEMORY, default=MAX_MEMORY_UNSAID)] = None,
     seed: Annotated[int, option(RUN, "Of everything random; equal seeds give equal maps.")] = 0,
     rerun_from: Annotated[
         str | None,
@@ -270,6 +281,7 @@ def command(
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
+        from skyquilt.engine.memory_watch import ends_run, limit_bytes
         from skyquilt.settings import MosaicSettings
         from skyquilt.workflows.mosaic import STAGES, iter_mosaic
 
@@ -313,6 +325,7 @@ def command(
         quality=quality,
         jobs=jobs,
         memory_gb=memory,
+        max_mp=max_mp,
         seed=seed,
         levelled=levelled,
         image_search=image_search,
@@ -335,7 +348,9 @@ def command(
             overwrite=overwrite,
             rerun_from=rerun_from,
         )
-    show(events, mode=mode, summary=None if thermal is None else with_thermal)
+    advice = "the same command resumes, with --memory smaller or --max-memory larger"
+    with ends_run(limit_bytes(max_memory), advice):
+        show(events, mode=mode, summary=None if thermal is None else with_thermal)
 
 
 def with_thermal(result: "Result") -> str:

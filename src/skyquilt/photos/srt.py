@@ -16,10 +16,13 @@ from skyquilt.model.photo import Photo
 from skyquilt.photos.metadata import parse_moment
 from skyquilt.photos.side_rows import SideRow, read_lines
 
-_NUMBER = r"([-+]?\d+(?:\.\d+)?)"
+_NUMBER = r"([-+]?[0-9]{1,15}(?:\.[0-9]{1,20})?)"
 _OLD = re.compile(rf"(?<!\w)GPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}", re.IGNORECASE)
-_CLOCK = re.compile(r"\d{4}[-.]\d\d[-.]\d\d \d\d:\d\d:\d\d(?:[.,]\d+)?")
-_FRAME = re.compile(r"(?:^|frame|[_-])(\d+)$", re.IGNORECASE)
+_CLOCK = re.compile(r"\d{4}[-.]\d\d[-.]\d\d \d\d:\d\d:\d\d(?:[.,]\d{1,9})?", re.ASCII)
+_MOST_BLOCK = 4000
+"""Characters of one subtitle that are searched."""
+_FRAME = re.compile(r"(?:^|frame|[_-])([0-9]{1,18})$", re.IGNORECASE)
+_INDEX = re.compile(r"[0-9]{1,18}")
 _NEAR_S = 0.5
 
 
@@ -59,12 +62,14 @@ def _samples(path: Path) -> list[_Sample]:
     """
     lines = [line for _, line in read_lines(path)]
     starts = [
-        i for i, line in enumerate(lines) if "-->" in line and i > 0 and lines[i - 1].isdigit()
+        i
+        for i, line in enumerate(lines)
+        if "-->" in line and i > 0 and _INDEX.fullmatch(lines[i - 1])
     ]
     ends = [*(s - 1 for s in starts[1:]), len(lines)]
     samples = []
     for start, end in zip(starts, ends, strict=False):
-        text = " ".join(lines[start + 1 : end])
+        text = " ".join(lines[start + 1 : min(end, start + 40)])[:_MOST_BLOCK]
         row = _row(text)
         if row:
             clock = _CLOCK.search(text)

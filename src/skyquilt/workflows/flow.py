@@ -19,7 +19,7 @@ from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.pixel_cache import PixelCache, pixel_budget
 from skyquilt.engine.store import Store, digest
-from skyquilt.errors import SkyquiltError, UnreadablePhotoError
+from skyquilt.errors import PhotoFailedError
 from skyquilt.model.event import Event, Note
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import Alignment, MapFrame, Prior
@@ -30,6 +30,7 @@ from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.radiometry import balanced
 from skyquilt.photos.pixels import read_color
+from skyquilt.photos.read import rejected
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.links import Links, link_photos
 from skyquilt.workflows.methods import Methods
@@ -262,17 +263,21 @@ def scene_of(
 def _pixels_of(
     photos: Sequence[Photo], all_photos: Sequence[Photo], cache: PixelCache
 ) -> PhotoPixels:
-    """Pixels of the photos in use, by their indices; an error names one that is lost."""
+    """Pixels of the photos in use, by their indices.
+
+    Raises:
+        PhotoFailedError: a photo that could be read before is lost.
+    """
     where = {p.name: i for i, p in enumerate(all_photos)}
     index = [where[p.name] for p in photos]
 
     def pixels(photo: int) -> NDArray[Any]:
         try:
             return cache(index[photo])
-        except UnreadablePhotoError as error:
-            raise SkyquiltError(
-                f"{photos[photo].path} could be read before, but now {error}; check its disk and"
-                " run the same command again to resume"
+        except Exception as error:  # whatever it is, it concerns this photo alone
+            reason = rejected(photos[photo].name, error).reason
+            raise PhotoFailedError(
+                photos[photo].name, f"could be read before, but now {reason}"
             ) from error
 
     return pixels

@@ -7,7 +7,7 @@ Start reading at `make_map`. Its steps are those of `skyquilt.workflows.flow`.
 
 import json
 import shutil
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,12 @@ from typing import Any
 from skyquilt.alignment.conflicts import conflicts
 from skyquilt.alignment.heights import height_figures
 from skyquilt.engine.clock import Clock, Steps, result_of
+from skyquilt.engine.error_log import log_error
 from skyquilt.engine.folder import STATE, RunFolder, open_run
 from skyquilt.engine.store import Store, digest
+from skyquilt.errors import PhotoFailedError, SkyquiltError
 from skyquilt.model.event import Event, Note, Result
+from skyquilt.model.photo import RejectedPhoto
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.orthomosaic import SPOOL
 from skyquilt.ortho.radiometry import value_figures
@@ -165,26 +168,86 @@ def make_map(
     clock = Clock(store=store, began=began)
     clock.lap("read", began)
     yield from (Note(text=n) for n in given.survey.notes)
+    _log(run.path, given.survey.rejected)
+    metrics, given = yield from _without_bad(given, run.path, key, settings, methods, clock)
+    run.mark("done")
+    result = Result(output=run.path, metrics=metrics)
+    return FinishedMap(result=result, given=given, methods=methods, settings=settings)
+
+
+def _without_bad(
+    given: SurveyInput,
+    output: Path,
+    key: str,
+    settings: MosaicSettings,
+    methods: Methods,
+    clock: Clock,
+) -> Generator[Event, None, tuple[dict[str, Any], SurveyInput]]:
+    """Metrics of the map, and the survey that it shows: a photo on which a step fails, or whose
+    file disappears, is left out, and the steps are repeated without it; results that do not depend
+    on it are in the store.
+
+    Raises:
+        SkyquiltError: more than half of the photos, so it is not the photos that are bad.
+    """
+    most = max(1, len(given.survey.photos) // 2)
+    for _ in range(most):
+        try:
+            metrics = yield from _made(given, output, key, settings, methods, clock)
+            return metrics, given
+        except PhotoFailedError as error:
+            failed = RejectedPhoto(name=error.photo, reason=error.reason)
+            log_error(output, str(error), error)
+        gone = [p for p in given.survey.photos if p.name != failed.name and not p.path.is_file()]
+        lost = [failed, *(RejectedPhoto(name=p.name, reason="its file is gone") for p in gone)]
+        if len(lost) > most:
+            break
+        yield Note(text=f"{failed.name} is left out: it {failed.reason}", warning=True)
+        for photo in lost[1:]:
+            yield Note(text=f"{photo.name} is left out: {photo.reason}", warning=True)
+        given = given.without(lost)
+    raise SkyquiltError(
+        f"{failed.name} and others could be read before, but now {failed.reason.split('now ')[-1]};"
+        " check their disk and run the same command again to resume"
+    )
+
+
+def _made(
+    given: SurveyInput,
+    output: Path,
+    key: str,
+    settings: MosaicSettings,
+    methods: Methods,
+    clock: Clock,
+) -> Generator[Event, None, dict[str, Any]]:
+    """Makes the map and its files; returns the metrics."""
     aligned = yield from align_photos(given, methods, settings, clock)
+    _log(output, aligned.found.rejected)
     ground = yield from find_ground(aligned, methods, settings, clock)
-    drawn = yield from draw_map(aligned, ground, methods, settings, clock, run.path, key)
+    drawn = yield from draw_map(aligned, ground, methods, settings, clock, output, key)
     measuring = _measured(aligned, ground, drawn, settings)
     seams, quality = yield from clock.stage("measure", measuring, keeps=False)
     metrics = _metrics(aligned, ground, drawn, seams, settings) | {"quality": quality}
     finishing = finish_run(
-        run.path, aligned, ground, drawn.drawn, drawn.compose, seams, metrics, settings, clock
+        output, aligned, ground, drawn.drawn, drawn.compose, seams, metrics, settings, clock
     )
-    metrics = yield from clock.stage("report", finishing)
-    run.mark("done")
-    result = Result(output=run.path, metrics=metrics)
-    return FinishedMap(result=result, given=given, methods=methods, settings=settings)
+    return (yield from clock.stage("report", finishing))
+
+
+def _log(output: Path, rejected: Sequence[RejectedPhoto]) -> None:
+    """Writes the tracebacks of photos on which the program failed to the log of errors."""
+    for photo in rejected:
+        if photo.trace:
+            log_error(output, f"{photo.name}: {photo.reason}", photo.trace)
 
 
 def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> str:
     """Key of a run: content and metadata of its photos, side files, settings that affect results,
     the methods, and the constants of all code used.
     """
-    shaping = {k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb")}
+    shaping = {
+        k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb", "max_mp")
+    }
     files = (settings.picture.boundary, settings.input.distances, Path(settings.input.sequence))
     side = [p.read_bytes().hex() for p in files if p is not None and p.is_file()]
     photos = [
