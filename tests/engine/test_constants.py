@@ -25,6 +25,8 @@ from skyquilt.workflows.survey_input import SurveyInput
 
 WAYS = (
     MosaicSettings(),
+    MosaicSettings(surface="sweep"),
+    MosaicSettings(surface="dense"),
     MosaicSettings(method="image"),
     MosaicSettings(method="image", image_search="overview"),
     MosaicSettings(method="hybrid"),
@@ -47,6 +49,10 @@ IN_NO_KEY = {
         ("NOISE", "TEXTURE", "RIM", "_DERIVE", "_SMOOTH", "RADIUS", "MIN_PEAK", "BROAD_PEAK")
         + ("APART", "MAX_RATIO", "SIDE", "COARSE"),
         "seams are measured anew by every run",
+    ),
+    **dict.fromkeys(
+        ("SIDES", "SHORTEST", "AZIMUTH_DEG", "ELEVATION_DEG", "CONTOUR_CELL_M"),
+        "files of heights are written anew by every run",
     ),
 }
 """Constants of the stages that no method's key holds, and why that is right."""

@@ -157,8 +157,10 @@ def command(
     ] = None,
     surface: Annotated[
         str,
-        option(PICTURE, "Heights: ties (tie points alone) or sweep (refined from the pictures)."),
-    ] = "sweep",
+        option(
+            PICTURE, "Heights: auto (dense where there is relief), dense (everywhere), sweep, ties."
+        ),
+    ] = "auto",
     vertical_datum: Annotated[
         str | None,
         option(
@@ -188,6 +190,12 @@ def command(
         str, option(FILES, "auto, jpeg, or lossless: deflate, zstd, lzw, none.")
     ] = "auto",
     quality: Annotated[int, option(FILES, "JPEG quality.")] = 85,
+    dtm: Annotated[
+        bool, option(FILES, "Write dtm.tif as well: the ground without what stands on it.", "--dtm")
+    ] = False,
+    contours: Annotated[
+        float | None, option(FILES, "Write contours.gpkg: lines of the ground, this many m apart.")
+    ] = None,
     thermal_route: Annotated[
         str,
         option(
@@ -223,7 +231,7 @@ def command(
         option(
             RUN,
             "Make everything anew from this stage on: features, links, align, surface, balance,"
-            " mosaic, measure, report.",
+            " seams, mosaic, measure, report.",
         ),
     ] = None,
     quiet: Annotated[bool, option(RUN, "Say nothing but errors.", "--quiet", "-q")] = False,
@@ -300,6 +308,8 @@ def command(
         height_m=height,
         heading_deg=heading,
         surface=surface,
+        dtm=dtm,
+        contours_m=contours,
         gsd_cm=gsd,
         crs=crs,
         vertical_datum=vertical_datum,

@@ -20,6 +20,7 @@ from skyquilt.live.failures import concerning
 from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member
 from skyquilt.live.reduced_pictures import SmallPictures, measured
+from skyquilt.live.tone import Tone
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Pose
 from skyquilt.model.raster import Window
@@ -36,6 +37,7 @@ class Newest:
     """The photo taken last is shown, with hard seams."""
 
     margin: ClassVar[int] = 0
+    seam_px: ClassVar[None] = None
     version: ClassVar[int] = 1
 
     def rank(self, order: Order, score: Float) -> Float:
@@ -123,6 +125,7 @@ class Canvas:
         self._kept: OrderedDict[Address, Drawing] = OrderedDict()
         self._by_tile: dict[Address, set[int]] = defaultdict(set)
         self._pictures = SmallPictures(full, members, store)
+        self._tone = Tone(self._pictures)
 
     def place(self, member: Member, camera: Camera) -> set[Address]:
         """Records the pose of a photo; returns the tiles that may look different."""
@@ -141,7 +144,21 @@ class Canvas:
         for address in now:
             self._by_tile[address].add(member.id)
         self._views[member.id], self._seen[member.id] = view, now
+        self._settle(member, view, now)
         return set(old) | set(now)
+
+    def _settle(self, member: Member, view: View, tiles: Iterable[Address]) -> None:
+        """Brings a photo to the brightness of those that it overlaps."""
+        near = {i for address in tiles for i in self._by_tile.get(address, ())} - {member.id}
+        others = [v for i in sorted(near) if (v := self._views.get(i)) is not None]
+        low, high = view.footprint.min(0), view.footprint.max(0)
+        self._tone.settle(
+            view,
+            others,
+            self.surface((low[0], low[1], high[0], high[1])),
+            measured=measured(member),
+            drift=member.photo.unit == "celsius",
+        )
 
     def remove(self, number: int) -> set[Address]:
         """Removes a photo; returns the tiles that may look different."""
@@ -149,6 +166,7 @@ class Canvas:
         for address in old:
             self._by_tile[address].discard(number)
         self._views.pop(number, None)
+        self._tone.forget(number)
         return set(old)
 
     def _view(self, member: Member, camera: Camera, pose: Pose) -> View | None:
@@ -329,6 +347,7 @@ class Canvas:
             pixels=self._pictures,
             bands=1 if values else 3,
             dtype=np.dtype(np.float32 if values else np.uint8),
+            exposure=self._tone.exposure,
         )
 
     @staticmethod

@@ -19,6 +19,7 @@ from skyquilt.simulate.reported import Place, Report, Start, place_at, report_al
 from skyquilt.simulate.scene import Country, Scene, empty_scene
 from skyquilt.simulate.settings import FlightSettings, Thermal
 from skyquilt.simulate.truth import Taken, covered, write_rasters, write_thermal, write_truth
+from skyquilt.simulate.weather import Weather
 
 _OURS = ("photos", "thermal", "truth", "gcp_list.txt")
 
@@ -208,7 +209,12 @@ def _drawn(
     """Draws the terrain; returns the scene."""
     thermal = world.settings.thermal
     weather = thermal.weather if heat and thermal is not None else world.settings.weather
-    scene = empty_scene(world.country.grid(res), thermal=heat, scratch=output / ".scratch" / stage)
+    scene = empty_scene(
+        world.country.grid(res),
+        thermal=heat,
+        scratch=output / ".scratch" / stage,
+        hours=not heat and world.settings.pictures.sun_hours > 0,
+    )
     for done, total in world.country.draw(scene, weather, scratch=output / ".scratch" / stage):
         yield Progress(stage=stage, done=done, total=total)
     return scene
@@ -224,7 +230,7 @@ def _photograph(world: World, scene: Scene, output: Path) -> Generator[Progress,
     for number, (shot, report) in enumerate(zip(flight.shots, flight.reports, strict=True)):
         rng = np.random.default_rng([world.settings.seed, 51, number])
         gain = float(np.exp(rng.normal(0, pictures.exposure_noise)))
-        pixels = camera.visible(shot, pictures, gain, rng)
+        pixels = camera.visible(shot, pictures, gain, rng, _moment(world, shot))
         if report.turned:
             pixels = np.ascontiguousarray(pixels[::-1, ::-1])
         name = f"{shot.name}.jpg"
@@ -239,6 +245,16 @@ def _photograph(world: World, scene: Scene, output: Path) -> Generator[Progress,
         )
         yield Progress(stage="photos", done=number + 1, total=len(flight.shots), name=name)
     return taken
+
+
+def _moment(world: World, shot: Shot) -> Weather | None:
+    """The sunlight of a photo; None where the sun stands still."""
+    hours, weather = world.settings.pictures.sun_hours, world.settings.weather
+    if not hours:
+        return None
+    last = max(s.waypoint.time for s in world.visible.shots)
+    share = shot.waypoint.time / last if last > 0 else 0.0
+    return replace(weather, hour=min(weather.hour + hours * share, 23.99))
 
 
 def _film(

@@ -27,6 +27,7 @@ from skyquilt.ortho import companions, ground, orthomosaic
 from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground
+from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.radiometry import balanced
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import rejected
@@ -208,8 +209,11 @@ def draw_map(
             )
         ),
     )
+    labels = yield from clock.stage(
+        "seams", _at_once(lambda: _labels(aligned, on, exposure, methods, clock.store))
+    )
     compose = orthomosaic.composer(
-        first.channels, first.dtype, on, exposure, methods.blend, aligned.pixels
+        first.channels, first.dtype, on, exposure, labels, methods.blend, aligned.pixels
     )
     steps = orthomosaic.draw(
         output,
@@ -218,12 +222,33 @@ def draw_map(
         settings.output,
         settings.picture.boundary,
         clock.store,
-        orthomosaic.map_key(key, alignment, on, exposure),
+        orthomosaic.map_key(key, alignment, on, exposure, labels),
         first.unit,
         settings.running.threads,
     )
     drawn = yield from clock.stage("mosaic", steps)
     return DrawnMap(exposure=exposure, compose=compose, drawn=drawn)
+
+
+def _labels(
+    aligned: AlignedPhotos, on: Ground, exposure: Exposure, methods: Methods, store: Store
+) -> Labels | None:
+    """Which photo is shown where; None for blending methods with a rule of their own."""
+    if methods.blend.seam_px is None:
+        return None
+    key = digest(
+        ground.poses_digest(aligned.alignment),
+        on.surface.z,
+        on.grid,
+        dict(exposure.gains),
+        dict(exposure.fields),
+        methods.seams,
+        picture_recipe(),
+        [p.digest for p in aligned.photos],
+    )
+    return store.get_or(
+        "seams", key, lambda: methods.seams(on.views, on.surface, on.grid, aligned.grey, exposure)
+    )
 
 
 def scene_of(

@@ -27,6 +27,7 @@ from skyquilt.ortho.radiometry import value_figures
 from skyquilt.quality.placement import placement_quality
 from skyquilt.quality.run_metrics import figures
 from skyquilt.quality.seam_measurement import MeasuredSeams, measure_seams
+from skyquilt.quality.tone import tone_residual
 from skyquilt.settings import MosaicSettings
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
@@ -43,7 +44,18 @@ from skyquilt.workflows.methods import Methods, methods_for
 from skyquilt.workflows.run_report import finish_run
 from skyquilt.workflows.survey_input import Source, SurveyInput, check_input, read_input
 
-STAGES = ("read", "features", "links", "align", "surface", "balance", "mosaic", "measure", "report")
+STAGES = (
+    "read",
+    "features",
+    "links",
+    "align",
+    "surface",
+    "balance",
+    "seams",
+    "mosaic",
+    "measure",
+    "report",
+)
 """Stages in order."""
 ARTEFACTS = {
     "features": "features",
@@ -51,6 +63,7 @@ ARTEFACTS = {
     "links": "links",
     "align": "alignment",
     "surface": "surface",
+    "seams": "seams",
     "mosaic": "blocks",
 }
 """Stage -> folder in the store."""
@@ -215,7 +228,9 @@ def _made(
     measuring = _measured(aligned, ground, drawn, settings)
     seams, quality = yield from clock.stage("measure", measuring, keeps=False)
     metrics = _metrics(aligned, ground, drawn, seams, settings) | {"quality": quality}
-    finishing = finish_run(output, aligned, ground, drawn.drawn, seams, metrics, settings, clock)
+    finishing = finish_run(
+        output, aligned, ground, drawn.drawn, drawn.compose, seams, metrics, settings, clock
+    )
     return (yield from clock.stage("report", finishing))
 
 
@@ -280,6 +295,7 @@ def _metrics(
             ground=ground,
             drawn=map_.drawn,
             seams=seams.figures,
+            looks={**seams.looks, "tone_residual": _tone(aligned, ground, map_)},
             conflicts=conflicts(aligned.photos, aligned.priors, alignment),
             notes=[*survey.notes, *alignment.notes],
         )
@@ -289,6 +305,14 @@ def _metrics(
             )
         }
         | value_figures(aligned.photos, map_.exposure, settings.picture)
+    )
+
+
+def _tone(aligned: AlignedPhotos, ground: Ground, map_: DrawnMap) -> dict[str, Any] | None:
+    """How evenly the balanced photos show the same ground."""
+    thumbnails = aligned.found.thumbnails([v.photo for v in ground.views])
+    return tone_residual(
+        ground.views, thumbnails, ground.surface, ground.grid.bounds, map_.exposure
     )
 
 
