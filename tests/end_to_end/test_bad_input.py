@@ -462,7 +462,7 @@ def test_camera_aimed_at_the_horizon_by_pose(mosaic, photos):
             )
         )
     mosaic(photos, "--method", "pose", "--max-view-angle", "20").refused(2, "no photo shows")
-    told = mosaic(photos, "--method", "pose").made()
+    told = mosaic(photos, "--method", "pose", "--overwrite").made()
     low, high = 50.0, 80.0  # flown about 60 m above the ground
     reach = high * np.tan(np.radians(70))
     width, height = (n * told.metrics["gsd_m"] for n in told.metrics["size_px"])
