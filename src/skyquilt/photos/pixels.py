@@ -21,6 +21,7 @@ from skyquilt.model.photo import Photo
 from skyquilt.photos.headers import read_header
 from skyquilt.photos.tags import MAKE
 from skyquilt.photos.thermal import thermal_frame_of_jpeg, thermal_frame_of_values
+from skyquilt.video.decoder import frame_of
 
 Pixels = NDArray[Any]
 Reduction = Literal[1, 2, 4, 8]
@@ -95,6 +96,9 @@ def _read(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
 
 
 def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
+    if photo.frame_s is not None:
+        pixels = frame_of(photo.path, photo.frame_s)
+        return reduce_pixels(to_gray(pixels) if gray else pixels, reduction)
     data = photo.path.read_bytes()
     if data[:2] == b"\xff\xd8" and not photo.unit:
         return decode_jpeg(data, gray=gray or photo.channels == 1, reduction=reduction)

@@ -30,6 +30,7 @@ from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.radiometry import balanced
 from skyquilt.photos.pixels import read_color
 from skyquilt.settings import MosaicSettings
+from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.links import Links, link_photos
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import (
@@ -118,6 +119,8 @@ def align_photos(
         AlignmentError: the method cannot place the photos.
     """
     store, jobs = clock.store, settings.running.threads
+    if given.survey.clips:
+        given = yield from clock.stage("frames", with_frames(given, settings.input, store))
     photos = given.survey.photos
     cache = PixelCache(
         read=lambda i: read_color(photos[i]), budget_bytes=pixel_budget(settings.running.memory_gb)

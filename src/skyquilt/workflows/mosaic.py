@@ -2,6 +2,8 @@
 
     read -> features -> links -> align -> surface -> balance -> mosaic -> measure -> report
 
+with `frames` after `read` where there are clips.
+
 Start reading at `make_map`. Its steps are those of `skyquilt.workflows.flow`.
 """
 
@@ -26,6 +28,7 @@ from skyquilt.quality.seam_measurement import MeasuredSeams, measure_seams
 from skyquilt.settings import MosaicSettings
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
+from skyquilt.workflows.clip_frames import frame_methods
 from skyquilt.workflows.flow import (
     AlignedPhotos,
     DrawnMap,
@@ -39,9 +42,21 @@ from skyquilt.workflows.methods import Methods, methods_for
 from skyquilt.workflows.run_report import finish_run
 from skyquilt.workflows.survey_input import Source, SurveyInput, check_input, read_input
 
-STAGES = ("read", "features", "links", "align", "surface", "balance", "mosaic", "measure", "report")
+STAGES = (
+    "read",
+    "frames",
+    "features",
+    "links",
+    "align",
+    "surface",
+    "balance",
+    "mosaic",
+    "measure",
+    "report",
+)
 """Stages in order."""
 ARTEFACTS = {
+    "frames": "looks",
     "features": "features",
     "read": "pictures",
     "links": "links",
@@ -175,7 +190,15 @@ def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> s
         (p.name, p.digest, p.position, p.attitude, p.focal, p.calibration)
         for p in given.survey.photos
     ]
-    return digest(photos, list(given.control), shaping, side, methods, make_map, __version__)
+    films = [
+        (c.name, c.digest, c.track and c.track.digest, c.start and c.start.isoformat(), c.focal)
+        for c in given.survey.clips
+    ]
+    if films:  # control points are read when the frames are known
+        gcp = settings.input.gcp or Path(str(given.source)) / "gcp_list.txt"
+        side += [gcp.read_bytes().hex()] if gcp.is_file() else []
+        films.append(frame_methods(settings.input))  # type: ignore[arg-type]
+    return digest(photos, films, list(given.control), shaping, side, methods, make_map, __version__)
 
 
 def _measured(
