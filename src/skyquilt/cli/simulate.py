@@ -124,7 +124,7 @@ def command(
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar")] = False,
 ) -> None:
-    """Simulate a drone survey: photos with metadata, a clip with telemetry, control points, and the truth."""
+    """Simulate a drone survey: photos or a clip with metadata, control points, and the truth."""
     from skyquilt import simulate as sim
     from skyquilt.simulate.weather import Weather
 

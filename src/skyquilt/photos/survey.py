@@ -132,8 +132,9 @@ def read_survey(
     `geo` is a side file of positions (`geo.txt`, CSV, `.SRT`, `.MRK`); without one, a `geo.txt` at
     the top of the folder is used. `cameras` is a `cameras.json`, `thermal_unit` as in `read_photo`.
     With `clips`, video clips are read too, and timed positions in `geo` (or a folder of such files)
-    are those of the clips. A bad photo becomes a `RejectedPhoto`. Raises `UsageError` for a folder that does not exist,
-    `NoPhotosError` where no photo can be read, `SideFileError` for a bad side file.
+    are those of the clips. A bad photo becomes a `RejectedPhoto`. Raises `UsageError` for a folder
+    that does not exist, `NoPhotosError` where no photo can be read, `SideFileError` for a bad side
+    file.
     """
     found = find_files(folder)
     read = [read_photo(path, name=name, thermal_unit=thermal_unit) for name, path in found.photos]

@@ -180,17 +180,14 @@ def telemetry(
     for number, at in enumerate(shown, 1):
         fixed = np.floor(at * rate + 1e-6) / rate
         # the fix shown is of the moment at which it was taken
-        report = reports[min(int(round(fixed * video.fps)), len(reports) - 1)]
-        here = reports[min(int(round(at * video.fps)), len(reports) - 1)]
-        clock = start + timedelta(seconds=float(at) + report.clock - _time(reports, report, times))
+        report = reports[min(round(fixed * video.fps), len(reports) - 1)]
+        index = min(round(at * video.fps), len(reports) - 1)
+        here = reports[index]
+        clock = start + timedelta(seconds=float(at - times[index]) + here.clock)
         body = layout.text(report, here, clock, mm, number, each)
         when = float(at) + video.shift
         rows.append(f"{number}\n{_span(when, when + each)}\n{body}\n")
     return "\n".join(rows) + "\n"
-
-
-def _time(reports: list[Report], report: Report, times: Doubles) -> float:
-    return float(times[reports.index(report)])
 
 
 def _span(a: float, b: float) -> str:
@@ -198,7 +195,7 @@ def _span(a: float, b: float) -> str:
 
 
 def _stamp(seconds: float) -> str:
-    ms = int(round(1000 * max(seconds, 0.0)))
+    ms = round(1000 * max(seconds, 0.0))
     return f"{ms // 3600000:02d}:{ms // 60000 % 60:02d}:{ms // 1000 % 60:02d},{ms % 1000:03d}"
 
 
@@ -239,7 +236,8 @@ def _bracketed(
         moment += f",{milli:03d},{clock.microsecond % 1000:03d}" if tenths else f".{milli:03d}"
         return (
             f'<font size="28">FrameCnt: {number}, DiffTime: {1000 * each:.0f}ms\n{moment}\n'
-            f"[iso: 100] [shutter: 1/1000.0] [fnum: 2.8] [ev: 0] {lens}{place}{up}{angles} </font>\n"
+            f"[iso: 100] [shutter: 1/1000.0] [fnum: 2.8] [ev: 0] {lens}{place}{up}{angles}"
+            " </font>\n"
         )
 
     return text
@@ -271,7 +269,8 @@ def _written(
     yaw, pitch, roll = here.gimbal or (0.0, -90.0, 0.0)
     nose = here.flight_yaw or 0.0
     return (
-        f"F/5.6, SS 400, ISO 100, EV 0, GPS ({fix.longitude or 0:.6f}, {fix.latitude or 0:.6f}, 15),"
+        f"F/5.6, SS 400, ISO 100, EV 0,"
+        f" GPS ({fix.longitude or 0:.6f}, {fix.latitude or 0:.6f}, 15),"
         f" D 150.00m, H {here.takeoff or 0:.2f}m, H.S 6.00m/s, V.S 0.00m/s,"
         f" F.PRY (0.0°, 0.0°, {nose:.1f}°), G.PRY ({pitch:.1f}°, {roll:.1f}°, {yaw:.1f}°)\n"
     )

@@ -163,8 +163,8 @@ def _timed(
             chosen,
             False,
             [
-                f"When the clip begins on the clock of {track.file} is not known, and the flight does"
-                " not show it: its positions were not used. State --clock-offset."
+                f"When the clip begins on the clock of {track.file} is not known, and the flight"
+                " does not show it: its positions were not used. State --clock-offset."
             ],
         )
     return replace(chosen, offset_source="clock"), True, []
