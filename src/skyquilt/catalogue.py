@@ -52,8 +52,8 @@ _LINKS = {
 geometry.
 """
 ALIGNMENTS: dict[str, tuple[str, dict[str, tuple[str, ...]]]] = {
-    "auto": ("skyquilt.workflows.methods:auto", _LINKS),
-    "bundle": ("skyquilt.workflows.methods:bundle", _LINKS),
+    "auto": ("skyquilt.workflows.methods:auto", {**_LINKS, "vertical-datum": ()}),
+    "bundle": ("skyquilt.workflows.methods:bundle", {**_LINKS, "vertical-datum": ()}),
     "position": ("skyquilt.workflows.methods:position", {**_LINKS, "heading": ()}),
     "pose": ("skyquilt.workflows.methods:pose", _LINKS),
     "image": (

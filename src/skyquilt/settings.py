@@ -21,6 +21,7 @@ BLENDS = ("feather", "first", "average", "multiband")
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
 SURFACES = ("sweep", "ties")
 THERMAL_UNITS = ("auto", "celsius", "kelvin", "decikelvin", "centikelvin", "counts")
+VERTICAL_DATUMS = ("ellipsoid", "egm96", "takeoff")
 DISTORTIONS = ("none", "2", "4", "6", "6t", "full")
 SHUTTERS = ("global", "rolling")
 
@@ -64,6 +65,10 @@ class InputSettings:
     """One of `THERMAL_UNITS`: what values of single-band TIFFs mean; None = found from the file, as
     is whether they are thermal.
     """
+    lever_arm: tuple[float, float, float] | None = None
+    """From the antenna, to which reported positions refer, to the camera: right, forward, up in m
+    in the aircraft's body; None = positions are those of the camera.
+    """
     repair: bool = True
     """Treat metadata as measurements that may be wrong."""
     shutter: str | None = None
@@ -93,6 +98,8 @@ class InputSettings:
         within("--clock-offset", self.clock_offset, -1e8, 1e8)
         if self.shutter == "global" and self.shutter_readout_ms is not None:
             raise UsageError("--shutter global has no readout; leave --shutter-readout out")
+        for value in self.lever_arm or ():
+            within("--lever-arm", value, -20, 20)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,6 +172,8 @@ class PictureSettings:
     """Ground size of a map pixel in cm; None = the photos' own."""
     crs: str | None = None
     """Output CRS as PROJ knows it; None = the local UTM zone."""
+    vertical_datum: str | None = None
+    """One of `VERTICAL_DATUMS`: zero of the map's heights; None = what most photos state."""
     bounds: tuple[float, float, float, float] | None = None
     """West, south, east, north in the output CRS."""
     boundary: Path | None = None
@@ -173,6 +182,8 @@ class PictureSettings:
     """One of `BLENDS`; auto = feather, and average for method `flightline`, whose blend it is."""
     feather_px: float = 6.0
     """Width of feathered seams in map pixels."""
+    max_view_angle: float = 70.0
+    """Largest angle from the vertical in degrees at which a photo is shown."""
     balance: bool = True
     """Bring photos to one brightness: 8-bit pictures; for measured values see `balance_thermal`."""
     balance_thermal: bool | None = None
@@ -182,8 +193,11 @@ class PictureSettings:
 
     def __post_init__(self) -> None:
         one_of("--blend", self.blend, ("auto", *BLENDS))
+        if self.vertical_datum is not None:
+            one_of("--vertical-datum", self.vertical_datum, VERTICAL_DATUMS)
         within("--gsd", self.gsd_cm, 0.05, 10000)
         within("--feather", self.feather_px, 0, 10000)
+        within("--max-view-angle", self.max_view_angle, 0, 90)
         b = self.bounds
         if b and not (all(isfinite(v) for v in b) and b[0] < b[2] and b[1] < b[3]):
             raise UsageError(
@@ -294,6 +308,7 @@ _ASKED = {
     "optimiser": ("optimiser", "surfaces"),
     "lines": ("lines", "heading"),
     "heading": ("heading_deg", None),
+    "vertical-datum": ("vertical_datum", None),
 }
 """Options of some methods only: the setting, and its value if the option is not given."""
 OPTION_OF = {setting: option for option, (setting, _) in _ASKED.items()}

@@ -64,6 +64,7 @@ def make_block(
     loss_prior=1e6,
     true_tilt_deg=1.5,
     cameras=1,
+    heights=(FLYING,),
 ):
     """A block of serpentine lines; priors are the truth plus noise of their stated deviations."""
     rng = np.random.default_rng(seed)
@@ -71,9 +72,8 @@ def make_block(
     n = lines * per_line
     column, row = np.divmod(np.arange(n), per_line)
     row = np.where(column % 2 == 1, per_line - 1 - row, row)
-    C = np.column_stack([column * across, row * along, np.full(n, FLYING)]) + rng.normal(
-        0, 0.5, (n, 3)
-    )
+    flying = np.array(heights)[column % len(heights)]
+    C = np.column_stack([column * across, row * along, flying]) + rng.normal(0, 0.5, (n, 3))
     yaw = np.where(column % 2 == 1, 180.0, 0.0) + rng.normal(0, 2, n)
     tilts = rng.normal(0, true_tilt_deg, (n, 2))
     R = np.array([cam_R_map_from_angles(y, *t) for y, t in zip(yaw, tilts, strict=True)])

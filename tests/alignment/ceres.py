@@ -99,4 +99,5 @@ def solve(
         K[j, :5] = f, cx - CORNER, cy - CORNER, k1, k2
         K[j, 8] = 1.0
     C = np.array([-p.rotation.matrix().T @ p.translation for p in poses])
-    return State(R=R, C=C, K=K, X=np.array([made.points3D[p + 1].xyz for p in range(len(state.X))]))
+    X = np.array([made.points3D[p + 1].xyz for p in range(len(state.X))])
+    return State(R=R, C=C, K=K, X=X, turn=np.zeros_like(C))

@@ -251,7 +251,7 @@ def test_deviations_are_calibrated():
     (next test).
     """
     total, dof, per_axis = 0.0, 0, []
-    tight = np.array([2.0, 0.5, 0.5, 3e-3, 3e-3, 1e-3, 1e-4, 1e-4])
+    tight = np.array([2.0, 0.5, 0.5, 3e-3, 3e-3, 1e-3, 1e-4, 1e-4, 1e-3, 1e-3])
     for seed in range(24):
         block = make_block(
             100 + seed,
@@ -299,7 +299,7 @@ def test_the_cost_never_rises_and_convergence_is_told():
         adjust(block.problem, block.start, iterations=k, tolerance=0).cost for k in (1, 2, 3, 5, 8)
     ]
     start = robust_cost(block.problem, block.start)
-    assert costs[0] <= start and (np.diff(costs) <= 1e-9 * start).all()
+    assert costs[0] <= start * (1 + 1e-12) and (np.diff(costs) <= 1e-9 * start).all()
     assert not adjust(block.problem, block.start, iterations=1, tolerance=0).converged
     done = adjust(block.problem, block.start, iterations=80, tolerance=1e-9)
     assert done.converged
@@ -354,7 +354,7 @@ def strip(seed):
     """One line of 20 photos; observations with a bending systematic error of the lens that nobody
     models.
     """
-    lens = np.array([700.0, 399.5, 299.5, -0.006, 0.0, 0.0, 0.0, 0.0])
+    lens = np.array([700.0, 399.5, 299.5, -0.006, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0])
     block = make_block(
         seed,
         lines=1,
@@ -369,7 +369,7 @@ def strip(seed):
     )
     wrong = replace(
         block.problem,
-        K0=np.array([[700.0, 399.5, 299.5, 0, 0, 0, 0, 0]]),
+        K0=np.array([[700.0, 399.5, 299.5, 0, 0, 0, 0, 0, 1, 0]]),
         R0=block.truth.R,
         trust=min(1.0, 40 * 20 / len(block.problem.px)),
     )

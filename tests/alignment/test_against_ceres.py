@@ -15,6 +15,7 @@ pytest.importorskip("pycolmap")
 from tests.alignment import ceres
 
 NOTHING = np.inf
+FIXED = (0,) * 10
 
 
 def both(seed, *, free, cauchy=None, lies=0.0, **ceres_options):
@@ -36,11 +37,11 @@ def both(seed, *, free, cauchy=None, lies=0.0, **ceres_options):
 @pytest.mark.parametrize(
     ("free", "options", "cauchy", "lies"),
     [
-        ((0, 0, 0, 0, 0, 0, 0, 0), {"focal": False}, None, 0.0),
-        ((1, 0, 0, 0, 0, 0, 0, 0), {"focal": True}, None, 0.0),
-        ((1, 0, 0, 1, 1, 0, 0, 0), {"focal": True, "lens": True}, None, 0.0),
-        ((0, 0, 0, 0, 0, 0, 0, 0), {"focal": False}, 2.0, 0.03),
-        ((1, 0, 0, 1, 1, 0, 0, 0), {"focal": True, "lens": True}, 2.0, 0.03),
+        (FIXED, {"focal": False}, None, 0.0),
+        ((1, *FIXED[1:]), {"focal": True}, None, 0.0),
+        ((1, 0, 0, 1, 1, *FIXED[5:]), {"focal": True, "lens": True}, None, 0.0),
+        (FIXED, {"focal": False}, 2.0, 0.03),
+        ((1, 0, 0, 1, 1, *FIXED[5:]), {"focal": True, "lens": True}, 2.0, 0.03),
     ],
     ids=["fixed", "focal", "focal and lens", "fixed, Cauchy", "focal and lens, Cauchy"],
 )

@@ -29,9 +29,8 @@ class Flown:
 
     def __init__(self, seed=0, *, turned=(), yaw_lies=(), gps=1.0, **options):
         sigma_k = np.array([4.0, 2.0, 2.0, 0.01, 0.01, 0.01, 1e-3, 1e-3, 3e-3, 1e-3])
-        self.block = b = make_block(
-            seed, points=500, gps=gps, tilt_deg=0.5, sigma_k=sigma_k, **options
-        )
+        options = {"points": 500, "tilt_deg": 0.5, "sigma_k": sigma_k} | options
+        self.block = b = make_block(seed, gps=gps, **options)
         n = len(b.truth.C)
         self.truth, self.turned = b.truth, set(turned)
         self.photos = [
@@ -126,7 +125,7 @@ def test_a_block_is_found(plain):
     )  # noise of 0.3 px per axis: 0.376 less what the points absorb
     (camera,) = found.cameras.values()
     assert camera.focal == pytest.approx(flown.truth.K[0, 0], abs=12)
-    assert camera.sigmas is not None and 0.5 < camera.sigmas[0] < 10 and camera.sigmas[5] == 0.0
+    assert camera.sigmas is not None and 0.5 < camera.sigmas[0] < 10 and camera.sigmas[8] > 0
 
 
 def test_tie_points_project_where_they_were_seen(plain):

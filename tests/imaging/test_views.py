@@ -50,8 +50,8 @@ def test_a_footprint_climbs_a_slope():
     assert rim.max() < 0.6  # six rounds towards the slope
 
 
-def test_a_photo_of_the_horizon_has_no_footprint():
-    assert len(view(0, 0, 0, pitch=75).footprint) == 0
+def test_a_photo_above_the_horizon_has_no_footprint():
+    assert len(view(0, 0, 0, pitch=100).footprint) == 0
 
 
 def test_nodes_are_exact_projections_and_in_between_nearly():

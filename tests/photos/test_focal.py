@@ -70,7 +70,7 @@ def test_dewarp_data(make_jpeg):
         )
     )
     camera = photo.calibration
-    assert camera.focal == pytest.approx(100.2)
+    assert camera.focal == pytest.approx(100.0) and camera.aspect == pytest.approx(1.004)
     assert (camera.cx, camera.cy) == (pytest.approx(61.5), pytest.approx(43.5))
     assert (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2) == (
         -0.26,

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import control_in_frame
 from skyquilt.alignment.inputs import AlignmentInputs
+from skyquilt.alignment.oblique import tilted
 from skyquilt.alignment.pose import ByMetadata, ByPose, reported_camera
 from skyquilt.alignment.repair import Repaired, repair
 from skyquilt.errors import AlignmentError
@@ -161,6 +162,8 @@ def with_loose_photos(
         if i in poses:
             continue
         C = priors[i].map_C + offset
+        if i in alignment.rejected and tilted(priors[i]):
+            continue  # a tilt turns errors of metadata into large displacements
         if alignment.frame.crs is None or _lacking(C, priors[i]):
             lacking = _lacking(C, priors[i]) or "no heading"
             reason = "it could not be linked to the other photos, and it has"

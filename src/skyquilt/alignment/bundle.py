@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import DENSE_LIMIT, adjust, covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
-from skyquilt.alignment.deviations import believed, observed_noise, robust_scale
+from skyquilt.alignment.deviations import believed, observed_noise, point_deviations, robust_scale
+from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
+from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
 from skyquilt.alignment.problem import CAMERA, READOUT, Problem, State, residuals_px, swept
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
 from skyquilt.alignment.start import Start, find_start
@@ -19,7 +21,7 @@ from skyquilt.alignment.triangulate import polish, triangulated
 from skyquilt.errors import AlignmentError
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
+from skyquilt.model.poses import Accuracy, Alignment, MapFrame, Prior, TiePoints
 
 Array = NDArray[np.float64]
 
@@ -28,6 +30,10 @@ ROLLS_PX = 0.3
 """Cameras that move by more than this in px of the photo while a photo is read out turn, too."""
 TURN_RAD_S = np.radians(1.5)
 """Deviation of the rates at which they turn, in rad/s; it makes up for errors of velocities too."""
+SAMPLED = 400
+"""Ground points whose accuracy is predicted, about."""
+UNDETERMINED = 0.7
+"""A focal length whose deviation stays above this share of its prior's is not determined."""
 DOUBTED = 2.5
 """Positions that a block misses by more than this many deviations are not what they claim."""
 
@@ -50,7 +56,7 @@ class Bundle:
     """
     match_observations: LeastSquaresMatching | None = field(default_factory=LeastSquaresMatching)
     """Refinement of observations in larger images; None leaves keypoints unchanged."""
-    version: ClassVar[int] = 13
+    version: ClassVar[int] = 15
 
     def __call__(
         self,
@@ -68,6 +74,32 @@ class Bundle:
         Raises:
             AlignmentError: no two photos are linked.
         """
+        aside = reported_oblique(priors) if self.repair else frozenset[int]()
+
+        def block(aside: frozenset[int]) -> Alignment:
+            upright = [k for k in links if k.a not in aside and k.b not in aside]
+            return self._block(photos, frame, priors, features, upright, control, grey)
+
+        try:
+            found = block(aside)
+        except AlignmentError:
+            aside, found = frozenset(), block(frozenset())
+        if self.repair and (more := found_oblique(found, priors) - aside):
+            aside |= more
+            found = block(aside)
+        return hung(found, photos, priors, features, links, aside)
+
+    def _block(
+        self,
+        photos: Sequence[Photo],
+        frame: MapFrame,
+        priors: Sequence[Prior],
+        features: Sequence[Features],
+        links: Sequence[Link],
+        control: Sequence[Control],
+        grey: GreyPicture | None,
+    ) -> Alignment:
+        """Adjusts the photos that these links connect."""
         start = find_start(photos, priors, features, links)
         if not start.blocks:
             raise AlignmentError(f"none of {len(photos)} photos could be linked to another one")
@@ -90,7 +122,9 @@ class Bundle:
         if self.repair:
             problem, state = _believe_positions(problem, state, setup)
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
-        return _outcome(photos, frame, setup, start, used, problem, state, reports)
+        done = _outcome(photos, frame, setup, start, used, problem, state, reports)
+        held = setup.georeferenced or any(not c.check for c in reports)
+        return done if held or tilts_reported(priors) else levelled(done)
 
 
 def _sharpened(
@@ -294,7 +328,8 @@ def _outcome(
     weak = {int(i): f"it has only {seen[i]} tie points" for i in setup.members if seen[i] < 8}
     full = covariance(problem, state)
     cameras, camera_of = camera_records(photos, setup, state, full)
-    poses = {i: p for i, p in pose_records(setup, state).items() if i not in weak}
+    placed = pose_records(setup, state, full, problem.photo_unknowns)
+    poses = {i: p for i, p in placed.items() if i not in weak}
     blocks = tuple(tuple(i for i in b if i not in weak) for b in start.blocks)
     metric = frame.metric and (start.metric or any(not c.check for c in control))
     return Alignment(
@@ -307,6 +342,53 @@ def _outcome(
         blocks=tuple(b for b in blocks if b),
         ties=ties,
         rejected=weak,
-        control=residuals_of_control(control, frame, setup, problem, state),
+        control=residuals_of_control(control, frame, setup, problem, state, full),
+        accuracy=None if full is None else _accuracy(setup, problem, state, full),
+        notes=_undetermined(setup, problem, state, full),
         loo_rms_m=leave_one_out(problem, state, full) if setup.georeferenced else None,
     )
+
+
+def _accuracy(setup: Setup, problem: Problem, state: State, covariance: Array) -> Accuracy:
+    """Predicted deviations of a sample of ground points."""
+    seen = np.flatnonzero(np.bincount(problem.point, minlength=len(state.X)) >= 2)
+    sample = seen[:: max(1, len(seen) // SAMPLED)]
+    tied = bool(np.isfinite(problem.X0).any())
+    stated = np.median(setup.stated_sigma_C, axis=0)
+    return Accuracy(
+        xyz=state.X[sample],
+        sigma_m=point_deviations(problem, state, covariance, sample),
+        shared_m=(0.0, 0.0) if tied else (float(stated[0]), float(stated[2])),
+        focal_share=_focal_share(problem, covariance),
+        design_effect=problem.design_effect,
+    )
+
+
+def _focal_share(problem: Problem, covariance: Array) -> float:
+    """Largest ratio of a focal length's deviation after the adjustment to that before."""
+    m = len(problem.K0)
+    at = len(covariance) - CAMERA * m + CAMERA * np.arange(m)
+    after = np.sqrt(np.abs(covariance[at, at]))
+    return float(np.max(np.where(problem.free[:, 0], after / problem.sigma_K[:, 0], 0.0)))
+
+
+def _undetermined(
+    setup: Setup, problem: Problem, state: State, covariance: Array | None
+) -> tuple[str, ...]:
+    """Sentences about what the flight does not determine."""
+    if covariance is None:
+        return ()
+    notes = []
+    m, height = len(problem.K0), float(np.median(_heights(state)))
+    for row, key in enumerate(setup.camera_keys):
+        at = len(covariance) - CAMERA * m + CAMERA * row
+        share = float(np.sqrt(abs(covariance[at, at])) / state.K[row, 0])
+        told = float(problem.sigma_K[row, 0] / state.K[row, 0])
+        if problem.free[row, 0] and share > UNDETERMINED * told and share * height > 0.01:
+            notes.append(
+                f"This flight does not determine the focal length of {key}: it stays as uncertain"
+                f" as its metadata ({100 * share:.1f} %), and heights of the ground with it"
+                f" ({share * height:.2g} m, one standard deviation); control points, oblique photos"
+                " or lines at two heights would."
+            )
+    return tuple(notes)

@@ -4,11 +4,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from skyquilt.geometry.camera import distort
 from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
+from skyquilt.model.camera import Camera
 from skyquilt.model.event import MetadataConflict
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Prior
 
+CERTAIN = 5.0
+"""Deviations, as the flight determines them, by which a calibration's values must be missed, and"""
+CONTRADICTED_PX = 2.0
+"""the px in the photo by which they must differ, for it to be contradicted."""
 YAW_DEG = 15.0
 """Yaw angles in degrees that differ by more than this contradict each other."""
 
@@ -23,7 +29,7 @@ def conflicts(
         found += _altitudes(photos, priors, alignment, held) + _positions(
             photos, priors, alignment, held
         )
-    return found + _focals(photos, alignment, held)
+    return found + _focals(photos, alignment, held) + _lenses(photos, alignment, held)
 
 
 def _yaw(photo: Photo, prior: Prior, alignment: Alignment, i: int) -> list[MetadataConflict]:
@@ -120,3 +126,51 @@ def _focals(
                 )
             )
     return out
+
+
+def _lenses(
+    photos: Sequence[Photo], alignment: Alignment, held: Sequence[int]
+) -> list[MetadataConflict]:
+    """Calibrations that came with the photos and that the flight contradicts: by several of the
+    deviations that the flight determines them with, and by some pixels in the photo.
+    """
+    out, seen = [], set()
+    for i in held:
+        photo, camera, told = photos[i], alignment.camera(i), photos[i].calibration
+        if told is None or photo.camera_key in seen or camera.sigmas is None:
+            continue
+        seen.add(photo.camera_key)
+        if alignment.camera_of[i] != photo.camera_key:  # a file saved upside down
+            told = told.mirrored()
+        sigma = np.maximum(camera.sigmas, 1e-12)
+        apart = np.abs(camera.vector - told.vector)
+        certain = apart > CERTAIN * sigma
+        off = float(np.hypot(*apart[1:3]))
+        if off > CONTRADICTED_PX and certain[1:3].any():
+            meaning = (
+                f"self-calibration puts the principal point of {photo.camera_key} {off:.1f} px from"
+                " that of its calibration"
+            )
+            out.append(_lens_conflict(photo, "principal_point", off, meaning))
+        off = _distortion_px(camera, told)
+        if off > CONTRADICTED_PX and certain[3:8].any() and told.vector[3:8].any():
+            meaning = (
+                f"the distortion of {photo.camera_key} differs from its calibration by {off:.1f} px"
+                " in the corners"
+            )
+            out.append(_lens_conflict(photo, "lens", off, meaning))
+    return out
+
+
+def _lens_conflict(photo: Photo, field: str, off_px: float, meaning: str) -> MetadataConflict:
+    return MetadataConflict(
+        photo=photo.name, field=field, reported=0.0, estimated=round(off_px, 1), meaning=meaning
+    )
+
+
+def _distortion_px(camera: Camera, told: Camera) -> float:
+    """Largest difference of two lenses' distortion in the corners in px."""
+    w, h = camera.width / 2 / camera.focal, camera.height / 2 / camera.focal
+    corners = np.array([[w, h], [-w, h], [w, -h], [-w, -h]])
+    bent = distort(corners, camera.vector) - distort(corners, told.vector)
+    return camera.focal * float(np.linalg.norm(bent, axis=1).max())

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from skyquilt.alignment.adjust import adjust
+from skyquilt.alignment.deviations import point_deviations
+from skyquilt.alignment.heights import control_height
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import Setup
 from skyquilt.alignment.triangulate import polish, triangulated
@@ -59,9 +61,9 @@ def control_in_frame(
         x, y = Transformer.from_crs(point.crs, frame.crs, always_xy=True).transform(
             point.x, point.y
         )
-        xyz = np.array(
-            [x - frame.origin[0], y - frame.origin[1], np.nan if point.z is None else point.z]
-        )
+        at = Transformer.from_crs(frame.crs, 4326, always_xy=True).transform(x, y)
+        z = control_height(point, frame.control_datum, *at)
+        xyz = np.array([x - frame.origin[0], y - frame.origin[1], z])
         photo, px = np.array([s[0] for s in seen]), np.array([s[1:] for s in seen], float)
         found.append(
             Control(
@@ -190,7 +192,7 @@ def hold_to_control(
     return (
         problem,
         state,
-        replace(frame, vertical_datum="control", metric=True) if heights else frame,
+        replace(frame, vertical_datum=frame.control_datum, metric=True) if heights else frame,
         usable,
     )
 
@@ -217,7 +219,12 @@ def _with_points(
 
 
 def residuals_of_control(
-    control: Sequence[Control], frame: MapFrame, setup: Setup, problem: Problem, state: State
+    control: Sequence[Control],
+    frame: MapFrame,
+    setup: Setup,
+    problem: Problem,
+    state: State,
+    covariance: Array | None = None,
 ) -> tuple[ControlResidual, ...]:
     """Errors of all control and check points at the solution, intersected from the final poses
     alone.
@@ -225,6 +232,13 @@ def residuals_of_control(
     if not control or frame.crs is None:
         return ()
     X, rms = intersected(control, setup, problem, state)
+    sigma = np.full(X.shape, np.nan)
+    if covariance is not None:
+        own, solved = _alone(control, setup, problem, state)
+        own = replace(own, sigma_px=np.full(len(own.px), MARKED_PX))
+        seen = np.flatnonzero(np.bincount(own.point, minlength=len(X)) >= 2)
+        sigma[seen] = point_deviations(own, solved, covariance, seen)
+        sigma = np.hypot(sigma, [[c.sigma_m] for c in control])
     return tuple(
         ControlResidual(
             name=c.name,
@@ -232,6 +246,7 @@ def residuals_of_control(
             error_m=x - c.xyz,
             reprojection_px=float(r),
             observations=len(_placed(c, setup)[0]),
+            sigma_m=None if not c.check or np.isnan(s).any() else s,
         )
-        for c, x, r in zip(control, X, rms, strict=True)
+        for c, x, r, s in zip(control, X, rms, sigma, strict=True)
     )

@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.problem import Problem, State, residuals_px
+from skyquilt.alignment.adjust import normal_equations
+from skyquilt.alignment.problem import CAMERA, Problem, State, residuals_px
 
 Array = NDArray[np.float64]
 CELLS = 8
@@ -81,6 +82,35 @@ def _alike(problem: Problem, psi: Array, size: Array) -> float:
     return (float((sums**2).sum()) - own) / pairs / (own / len(psi))
 
 
+def point_deviations(
+    problem: Problem, state: State, covariance: Array, points: NDArray[np.int64]
+) -> Array:
+    """Standard deviations (k, 3) in m of points of a problem.
+
+    Args:
+        problem: their observations; each point's own are taken to be independent of one another.
+        state: the minimum.
+        covariance: of photos and cameras, as from `adjust.covariance`.
+        points: (k,) which points.
+    """
+    normal = normal_equations(replace(problem, trust=1.0), state)
+    p, q = normal.Wp.shape[1], normal.Wc.shape[1]
+    n, first = len(state.C), np.searchsorted(problem.point, np.arange(len(state.X) + 1))
+    out = np.full((len(points), 3), np.nan)
+    for k, point in enumerate(points.tolist()):
+        own = slice(first[point], first[point + 1])
+        photo = problem.photo[own]
+        camera = p * n + CAMERA * problem.camera[photo][:, None] + np.arange(q)
+        at = np.concatenate([(p * photo[:, None] + np.arange(p)).ravel(), camera.ravel()])
+        W = np.concatenate([normal.Wp[own].reshape(-1, 3), normal.Wc[own].reshape(-1, 3)])
+        V = normal.V[point] + 1e-9 * np.eye(3)
+        moved = np.linalg.solve(V, W.T)
+        total = np.linalg.inv(V) + moved @ covariance[np.ix_(at, at)] @ moved.T
+        out[k] = np.sqrt(np.maximum(np.diag(total), 0.0))
+    return out
+
+
 def believed(problem: Problem, noise: Noise) -> Problem:
     """The problem whose observations weigh what the noise says that they tell."""
-    return replace(problem, trust=1 / (noise.design_effect * noise.variance))
+    effect = noise.design_effect
+    return replace(problem, design_effect=effect, trust=1 / (effect * noise.variance))

@@ -1,15 +1,15 @@
 """Chooses the map frame and converts the metadata of photos to priors in it."""
 
-from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 from pyproj import CRS, Proj, Transformer
 from pyproj.exceptions import CRSError
 
+from skyquilt.alignment.heights import chosen_datum, control_datum, height_above
 from skyquilt.errors import UsageError
 from skyquilt.geometry.frames import angle_difference_deg
-from skyquilt.model.photo import ControlPoint, Datum, Photo
+from skyquilt.model.photo import ControlPoint, Photo
 from skyquilt.model.poses import MapFrame, Prior
 
 
@@ -20,15 +20,20 @@ def utm_epsg(latitude_deg: float, longitude_deg: float) -> str:
 
 
 def choose_frame(
-    photos: Sequence[Photo], crs: str | None, control: Sequence[ControlPoint] = ()
+    photos: Sequence[Photo],
+    crs: str | None,
+    control: Sequence[ControlPoint] = (),
+    vertical_datum: str | None = None,
 ) -> MapFrame:
-    """The frame of a survey: `crs` if given, otherwise the UTM zone of the median position.
+    """The frame of a survey: `crs` if given, otherwise the UTM zone of the median position; heights
+    above `vertical_datum` if given, otherwise above what most photos state.
 
     Without photo positions, the UTM zone of the control points; without these, the survey is not
     georeferenced.
 
     Raises:
-        UsageError: `crs` is unknown, or not projected in metres.
+        UsageError: `crs` is unknown, or not projected in metres; or heights cannot be converted to
+            `vertical_datum`.
     """
     places = [(p.position.latitude_deg, p.position.longitude_deg) for p in photos if p.position]
     if not places and control:
@@ -38,14 +43,25 @@ def choose_frame(
     name = _checked_crs(crs) if crs else ""
     if not places:
         metric = any(p.position and p.position.takeoff_m for p in photos)
+        if vertical_datum is not None:
+            raise UsageError(
+                f"--vertical-datum {vertical_datum} needs positions, and the photos have none; give"
+                " them with --geo"
+            )
         return MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="unknown", metric=metric)
     latitude, longitude = np.median(np.array(places), axis=0)
     name = name or utm_epsg(latitude, longitude)
     x, y = Transformer.from_crs(4326, name, always_xy=True).transform(longitude, latitude)
     origin = (float(np.round(x, -2)), float(np.round(y, -2)))
     convergence = Proj(name).get_factors(longitude, latitude).meridian_convergence
+    datum, takeoff = chosen_datum(photos, control, vertical_datum)
     return MapFrame(
-        crs=name, origin=origin, vertical_datum=_datum(photos), convergence_deg=float(convergence)
+        crs=name,
+        origin=origin,
+        vertical_datum=datum,
+        takeoff_m=takeoff,
+        control_datum=control_datum(control, vertical_datum, datum),
+        convergence_deg=float(convergence),
     )
 
 
@@ -63,28 +79,6 @@ def _checked_crs(crs: str) -> str:
             f"--crs {crs!r} ({parsed.name}) is not projected in metres; a mosaic needs one that is"
         )
     return crs
-
-
-def _datum(photos: Sequence[Photo]) -> Datum:
-    """The height datum that most positions state."""
-    count = Counter(
-        p.position.datum for p in photos if p.position and p.position.altitude_m is not None
-    )
-    return count.most_common(1)[0][0] if count else "unknown"
-
-
-def _altitude(photo: Photo, datum: Datum) -> float:
-    """The photo's height above the frame's datum in m; NaN if it contains none."""
-    position = photo.position
-    if position is None:
-        return np.nan
-    by_datum = {
-        "takeoff": position.takeoff_m,
-        "sea_level": position.sea_level_m,
-        "ellipsoid": position.ellipsoid_m,
-    }
-    height = position.altitude_m if position.datum == datum else by_datum.get(datum)
-    return np.nan if height is None else float(height)
 
 
 def empty_prior() -> Prior:
@@ -108,7 +102,7 @@ def photo_prior(photo: Photo, frame: MapFrame, to_map: Transformer | None) -> Pr
         C[:2] = x - frame.origin[0], y - frame.origin[1]
         sigma[:2] = photo.position.sigma_xy_m
     if photo.position:
-        C[2] = _altitude(photo, frame.vertical_datum)
+        C[2] = height_above(photo.position, frame.vertical_datum, frame.takeoff_m)
         sigma[2] = photo.position.sigma_z_m
     attitude = photo.attitude
     yaw = attitude.yaw_deg if attitude else photo.flight_yaw_deg

@@ -88,10 +88,11 @@ class Problem:
     """
     loss_R: float = 2.0
     """Scale of the pseudo-Huber loss on attitudes, since gimbal angles may contain gross errors."""
+    design_effect: float = 1.0
+    """How many observations tell as much as one with errors independent of all others."""
     trust: float = 1.0
-    """Factor on the cost of observations, the reciprocal of their design effect: how many
-    observations with correlated errors tell as much as one independent one
-    (`alignment.deviations`).
+    """Factor on the cost of observations: the reciprocal of their design effect and of their
+    variance over the assumed one (`alignment.deviations`).
     """
     offset: bool = False
     """Whether all measured centres share an unknown shift (height datum, base station), as where

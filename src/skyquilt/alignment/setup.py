@@ -293,8 +293,12 @@ def _calibrated_sigma(camera: Camera, sigma_focal: float) -> Array:
     return np.asarray(np.maximum(stated, least))
 
 
-def pose_records(setup: Setup, state: State) -> dict[int, Pose]:
-    """Poses of the files (for a turned file, the pose of the sensor turned by 180 degrees)."""
+def pose_records(
+    setup: Setup, state: State, covariance: Array | None = None, unknowns: int = 6
+) -> dict[int, Pose]:
+    """Poses of the files (for a turned file, the pose of the sensor turned by 180 degrees);
+    `unknowns` of a photo in the covariance.
+    """
     shift = setup.base.velocity * state.K[setup.camera, READOUT, None]
     poses = {}
     for row, m in enumerate(setup.members.tolist()):
@@ -305,7 +309,11 @@ def pose_records(setup: Setup, state: State) -> dict[int, Pose]:
             motion = motion and Motion(
                 shift_m=-motion.shift_m, turn_rad=-HALF_TURN @ motion.turn_rad
             )
-        poses[m] = Pose(cam_R_map=R, map_C=state.C[row], motion=motion)
+        sigma = None
+        if covariance is not None:
+            at = unknowns * row + 3 + np.arange(3)
+            sigma = np.sqrt(np.abs(covariance[at, at]))
+        poses[m] = Pose(cam_R_map=R, map_C=state.C[row], motion=motion, sigma_m=sigma)
     return poses
 
 

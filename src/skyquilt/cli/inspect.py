@@ -18,6 +18,7 @@ _SHUTTERS = {True: "rolling (not modelled)", False: "global or mechanical", None
 _DATUMS = {
     "takeoff": "take-off",
     "sea_level": "sea level",
+    "egm96": "EGM96",
     "ellipsoid": "ellipsoid",
     "unknown": "?",
 }

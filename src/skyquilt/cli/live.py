@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.options import Features, Json, Quiet, ThermalUnit
+from skyquilt.cli.options import Features, Json, MaxViewAngle, Quiet, ThermalUnit
 
 Output = Annotated[
     Path,
@@ -62,6 +62,7 @@ def command(
         ),
     ] = False,
     thermal_unit: ThermalUnit = None,
+    max_view_angle: MaxViewAngle = 70.0,
     base: Annotated[
         Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")
     ] = None,
@@ -88,6 +89,7 @@ def command(
         reposition=reposition,
         deterministic=deterministic,
         thermal_unit=thermal_unit,
+        max_view_angle=max_view_angle,
         features=features,
         most_bytes=int(max_mb * 1e6),
         most_photos=max_photos,

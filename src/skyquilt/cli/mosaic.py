@@ -68,6 +68,14 @@ def command(
             " of names.",
         ),
     ] = "time",
+    lever_arm: Annotated[
+        str | None,
+        option(
+            INPUT,
+            "From the antenna to the camera: right,forward,up in m in the aircraft's body.",
+            default="positions are the camera's",
+        ),
+    ] = None,
     repair: Annotated[
         bool, option(INPUT, "Whether metadata may be wrong.", "--repair-metadata/--trust-metadata")
     ] = True,
@@ -115,8 +123,24 @@ def command(
         option(
             CAMERA,
             "Lens terms to calibrate, or, for methods that do not, to keep of a known calibration:"
-            " none, 2, 4, 6 (radial order), 6t (and tangential).",
-            default="4 to calibrate, 6t to keep",
+            " none, 2, 4, 6 (radial order), 6t (and tangential), full (and the aspect ratio).",
+            default="full to calibrate, 6t to keep",
+        ),
+    ] = None,
+    shutter: Annotated[
+        str | None,
+        option(
+            CAMERA,
+            "How photos are exposed: global (all rows at once) or rolling (one after the other).",
+            default="as metadata and the table of cameras say",
+        ),
+    ] = None,
+    shutter_readout: Annotated[
+        float | None,
+        option(
+            CAMERA,
+            "Time in ms in which a rolling shutter reads a photo out.",
+            default="as the table says",
         ),
     ] = None,
     height: Annotated[
@@ -126,6 +150,14 @@ def command(
         str,
         option(PICTURE, "Heights: ties (tie points alone) or sweep (refined from the pictures)."),
     ] = "sweep",
+    vertical_datum: Annotated[
+        str | None,
+        option(
+            PICTURE,
+            "Zero of heights: ellipsoid, egm96 (sea level), takeoff.",
+            default="what most photos state",
+        ),
+    ] = None,
     bounds: Annotated[
         str | None, option(PICTURE, "west,south,east,north in the output CRS.")
     ] = None,
@@ -137,6 +169,9 @@ def command(
         str, option(PICTURE, "Where photos meet: auto, feather, first, average, multiband.")
     ] = "auto",
     feather: Annotated[float, option(PICTURE, "Width of feathered seams in map pixels.")] = 6.0,
+    max_view_angle: Annotated[
+        float, option(PICTURE, "Largest angle from the vertical, in degrees, that photos show.")
+    ] = 70.0,
     balance: Annotated[
         bool, option(PICTURE, "Bring photos to one brightness.", "--balance/--no-balance")
     ] = True,
@@ -240,6 +275,7 @@ def command(
         cameras=cameras,
         distances=distances,
         sequence=sequence,
+        lever_arm=parse_lever_arm(lever_arm),
         repair=repair,
         detector=detector,
         matcher=matcher,
@@ -247,15 +283,19 @@ def command(
         transform=transform,
         features=features,
         distortion=distortion,
+        shutter=shutter,
+        shutter_readout_ms=shutter_readout,
         height_m=height,
         heading_deg=heading,
         surface=surface,
         gsd_cm=gsd,
         crs=crs,
+        vertical_datum=vertical_datum,
         bounds=parse_bounds(bounds),
         boundary=boundary,
         blend=blend,
         feather_px=feather,
+        max_view_angle=max_view_angle,
         balance=balance,
         balance_thermal=balance_thermal,
         thermal_unit=thermal_unit,
@@ -302,6 +342,23 @@ def with_thermal(result: "Result") -> str:
         f"{mosaic_summary(result)}\nthermal: {result.output / 'thermal.tif'} ({t['photos_used']} of"
         f" {t['photos_total']} photos, placed by {how})"
     )
+
+
+def parse_lever_arm(text: str | None) -> tuple[float, float, float] | None:
+    """Three numbers separated by commas.
+
+    Raises:
+        UsageError: they are not.
+    """
+    if text is None:
+        return None
+    try:
+        right, forward, up = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UsageError(
+            f"--lever-arm is right,forward,up, three numbers in m; got {text!r}"
+        ) from error
+    return right, forward, up
 
 
 def parse_bounds(text: str | None) -> tuple[float, float, float, float] | None:

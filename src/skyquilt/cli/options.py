@@ -25,6 +25,9 @@ Repair = Annotated[
     bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")
 ]
 Features = Annotated[int, typer.Option(help="Features per photo.")]
+MaxViewAngle = Annotated[
+    float, typer.Option(help="Largest angle from the vertical, in degrees, that photos show.")
+]
 Jobs = Annotated[int, typer.Option(help="Threads; 0 = all processors.")]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace the results of another run in OUTPUT.")

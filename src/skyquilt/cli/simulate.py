@@ -116,6 +116,10 @@ def command(
     ] = None,
     drones: Annotated[int | None, typer.Option(help="flying at once")] = None,
     lose: Annotated[int | None, typer.Option(help="photos lost on the way")] = None,
+    oblique: Annotated[
+        int | None,
+        typer.Option(help="photos added that look ahead, tilted by up to 80 degrees, with sky"),
+    ] = None,
     gcp: Annotated[int | None, typer.Option(help="control points")] = None,
     checks: Annotated[int | None, typer.Option(help="check points")] = None,
     seed: Annotated[int | None, typer.Option(help="equal seeds give equal files")] = None,
@@ -146,6 +150,7 @@ def command(
         stops=stops or None,
         fixed_yaw=fixed_yaw or None,
         turns=turns,
+        oblique=oblique,
     )
     base = _with(
         base,

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.heights import VERTICAL_EPSG
 from skyquilt.depth.pairs import PairField
 from skyquilt.imaging.views import View
 from skyquilt.matching.levelled import depth_map
@@ -61,6 +62,7 @@ def write_depth(
         dtype="float32",
         transform=geotransform(grid, alignment),
         crs=alignment.frame.crs,
+        vertical=VERTICAL_EPSG.get(tags["VERTICAL_DATUM"]),
         compress="zstd",
         nodata=float("nan"),
         tags={"SOFTWARE": "Skyquilt"} | tags,

@@ -46,6 +46,13 @@ def cam_R_map_from_angles(yaw_deg: float, pitch_deg: float = 0.0, roll_deg: floa
     return np.asarray(CAM_R_BODY @ ned_R_body.T @ MAP_R_NED.T)
 
 
+def ned_from_body(yaw_deg: float, pitch_deg: float = 0.0, roll_deg: float = 0.0) -> Matrix:
+    """Rotation (3, 3) from an aircraft's body (nose, right, down) to north, east, down; degrees,
+    pitch positive = nose up, roll positive = right wing down.
+    """
+    return _euler_zyx(yaw_deg, pitch_deg, roll_deg)
+
+
 def angles_from_cam_R_map(cam_R_map: Matrix) -> tuple[float, float, float]:
     """Belly angles (yaw, pitch, roll) in degrees of a map-to-camera rotation; inverse of the
     above.

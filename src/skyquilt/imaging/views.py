@@ -3,7 +3,7 @@ points.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.geometry.camera import monotone_radius, pixel_planes, rays
+from skyquilt.imaging.view_limits import USUAL, ViewLimits
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Alignment, Pose
 from skyquilt.model.raster import Grid, Window
@@ -23,6 +24,8 @@ interpolated.
 Nodes are the centres of STEP x STEP cells, with one ring of cells around a window: then OpenCV's
 resize, ten times as fast as a general warp, interpolates them exactly.
 """
+CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+"""Corners of a square about its centre."""
 BORDER_PX = 2.0
 """Width in photo pixels of the border that is not used."""
 
@@ -39,6 +42,8 @@ class View:
     """Its exterior orientation."""
     footprint: NDArray[np.float64]
     """(k, 2) outline on the ground in m (map frame)."""
+    limits: ViewLimits = USUAL
+    """What it may show."""
 
     def overlaps(self, bounds: tuple[float, float, float, float]) -> bool:
         """Whether the footprint's bounding box intersects bounds (west, south, east, north)."""
@@ -63,8 +68,10 @@ class Nodes:
     """(r, c) photo rows in px."""
     score: NDArray[np.float32]
     """(r, c) squared tangent of the angle off the vertical: small is better."""
+    room: NDArray[np.float32]
+    """(r, c) share left of what the photo may show; negative beyond its limits."""
     seen: NDArray[np.bool_]
-    """(r, c) whether the node lies in the photo."""
+    """(r, c) whether the node lies in the photo and within its limits."""
     real: NDArray[np.bool_]
     """(r, c) whether the projection is valid: in front of the camera, and where distortion does not
     fold back.
@@ -74,10 +81,10 @@ class Nodes:
 
 
 def footprint(
-    camera: Camera, pose: Pose, surface: Surface, *, per_side: int = 8
+    camera: Camera, pose: Pose, surface: Surface, *, per_side: int = 8, limits: ViewLimits = USUAL
 ) -> NDArray[np.float64]:
-    """Outline (4 * per_side, 2) in m of the image border on the surface; empty if the border sees
-    the horizon.
+    """Outline (k, 2) in m of the image on the surface, (4 * per_side, 2) where its limits cut
+    nothing off; empty if nothing is left.
     """
     s = np.linspace(0, 1, per_side, endpoint=False)
     w, h = camera.width - 1.0, camera.height - 1.0
@@ -93,9 +100,12 @@ def footprint(
         return _planar_footprint(rays(camera, rim), pose.cam_H_map)
     centre, ray = _exposed(pose, rays(camera, rim), rim[:, 1] / (camera.height - 1) - 0.5)
     direction = ray @ pose.cam_R_map
-    if (direction[:, 2] > -0.1).any():
-        return np.zeros((0, 2))
-    return _meet(centre, direction, surface)
+    if (np.hypot(*direction[:, :2].T) > -direction[:, 2] * limits.tangent).any():
+        direction = limits.below(direction)
+        if not len(direction):
+            return np.zeros((0, 2))
+        centre = np.broadcast_to(pose.map_C, direction.shape)
+    return limits.supported(_meet(centre, direction, surface))
 
 
 def _planar_footprint(rim: NDArray[Any], cam_H_map: NDArray[Any]) -> NDArray[np.float64]:
@@ -108,16 +118,35 @@ def _planar_footprint(rim: NDArray[Any], cam_H_map: NDArray[Any]) -> NDArray[np.
     return np.asarray(xyw[:, :2] / xyw[:, 2:])
 
 
-def make_views(alignment: Alignment, surface: Surface) -> list[View]:
-    """Views of all placed photos, in order of the photos."""
+def make_views(alignment: Alignment, surface: Surface, limits: ViewLimits = USUAL) -> list[View]:
+    """Views of all placed photos that show anything within the limits, in order of the photos."""
     views = []
     for photo, pose in sorted(alignment.poses.items()):
-        outline = footprint(alignment.camera(photo), pose, surface)
-        if len(outline):
-            views.append(
-                View(photo=photo, camera=alignment.camera(photo), pose=pose, footprint=outline)
-            )
+        camera = alignment.camera(photo)
+        outline = footprint(camera, pose, surface, limits=limits)
+        view = View(photo=photo, camera=camera, pose=pose, footprint=outline, limits=limits)
+        if len(outline) and limits.cuts(pose.map_C, outline, surface.at(*outline.T)):
+            view = replace(view, footprint=_shown_outline(view, surface))
+        if len(view.footprint):
+            views.append(view)
     return views
+
+
+def _shown_outline(view: View, surface: Surface) -> NDArray[np.float64]:
+    """Convex outline (k, 2) in m of what a view shows within its limits, to a hundredth of its
+    extent; empty if it shows nothing.
+    """
+    low, high = view.footprint.min(0), view.footprint.max(0)
+    step = (high - low) / 100
+    x, y = np.meshgrid(*(np.linspace(low[k], high[k], 101) for k in (0, 1)))
+    seen = project_nodes(view, x, y, surface.at(x, y)).seen
+    if not seen.any():
+        return np.zeros((0, 2))
+    shown = np.column_stack([x[seen], y[seen]])
+    corners = (shown[:, None] + step * CORNERS).reshape(-1, 2)
+    middle = corners.mean(0)  # cv2 works in single precision
+    hull = cv2.convexHull((corners - middle).astype(np.float32))[:, 0]
+    return np.asarray(hull + middle, np.float64)
 
 
 def project_nodes(view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> Nodes:
@@ -131,13 +160,16 @@ def project_nodes(view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any])
     u, v, real = _photo_pixels(planes, camera.vector, monotone_radius(camera))
     real = np.broadcast_to(real, np.broadcast_shapes(x.shape, z.shape))
     drop = z - C[2]
+    score = _scores(x - C[0], y - C[1], drop)
+    room = view.limits.room(score, drop, x, y)
     return Nodes(
         view=view,
         u=u,
         v=v,
-        seen=inside(camera, u, v),
+        room=room,
+        seen=inside(camera, u, v) & (room >= 0),
         real=real,
-        score=_scores(x - C[0], y - C[1], drop),
+        score=score,
         height=float(np.median(-drop)),
     )
 
@@ -162,10 +194,22 @@ def project_all(
         across, down, depth = _at_their_rows((across, down, depth), swept, k, height)
     u, v, real = _photo_pixels((across, down, depth), k, limit)
     seen, score = _within(u, v, width, height), _scores(dx, dy, dz)
+    room = np.empty_like(score)
+    for limits in {id(v.limits): v.limits for v in views}.values():
+        mine = [n for n, v in enumerate(views) if v.limits is limits]
+        room[mine] = limits.room(score[mine], dz[mine], x, y)
+    seen &= room >= 0
     above = np.median(-dz.reshape(len(views), -1), axis=1).tolist()
     return [
         Nodes(
-            view=view, u=u[n], v=v[n], score=score[n], seen=seen[n], real=real[n], height=above[n]
+            view=view,
+            u=u[n],
+            v=v[n],
+            score=score[n],
+            room=room[n],
+            seen=seen[n],
+            real=real[n],
+            height=above[n],
         )
         for n, view in enumerate(views)
     ]
@@ -246,12 +290,15 @@ def _within(
 def inside_everywhere(
     nodes: Nodes, u: NDArray[np.float32], v: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
-    """Whether each pixel lies in the photo, from dense photo pixels u, v (h, w) of these nodes.
+    """Whether each pixel lies in the photo and within its limits, from dense photo pixels u, v (h,
+    w) of these nodes.
 
     Next to a node without a real projection the interpolated u and v can fall anywhere in the
     photo: those pixels are False.
     """
     within = inside(nodes.view.camera, u, v)
+    if (nodes.room < 0).any():
+        within &= densify(nodes.room, *u.shape) >= 0
     if nodes.real.all():
         return within
     return within & (densify(nodes.real.astype(np.float32), *u.shape) > 0.999)
@@ -297,6 +344,7 @@ def cut(nodes: Nodes, row: int, column: int, height: int, width: int) -> Nodes:
         u=nodes.u[rows, columns],
         v=nodes.v[rows, columns],
         score=nodes.score[rows, columns],
+        room=nodes.room[rows, columns],
         seen=nodes.seen[rows, columns],
         real=nodes.real[rows, columns],
         height=nodes.height,

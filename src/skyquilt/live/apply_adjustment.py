@@ -1,5 +1,7 @@
 """Applies the result of a block adjustment to the map."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,7 +11,6 @@ from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member, about_record
 from skyquilt.live.refinement import Refinement
 from skyquilt.live.settings import CLOSING
-from skyquilt.model.poses import Pose
 
 
 class ApplyAdjustment:
@@ -76,7 +77,7 @@ class ApplyAdjustment:
         if member.pose is None or not near:
             return
         step = np.median(np.array(near), axis=0)
-        pose = Pose(cam_R_map=member.pose.cam_R_map, map_C=member.pose.map_C + step)
+        pose = replace(member.pose, map_C=member.pose.map_C + step)
         self.refinement.move({member.id: pose}, {member.id: member.camera})
         if member not in self.queues.untried:
             member.tried = 0

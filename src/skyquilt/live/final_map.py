@@ -38,7 +38,10 @@ def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
         raise NoPhotosError(f"{folder} holds no accepted photo; there is nothing to finish")
     paths = named(folder, [(int(i), str(n), str(f)) for i, n, f in rows])
     wanted = MosaicSettings(
-        features=settings.features, crs=settings.crs, thermal_unit=settings.thermal_unit
+        features=settings.features,
+        crs=settings.crs,
+        thermal_unit=settings.thermal_unit,
+        max_view_angle=settings.max_view_angle,
     )
     # if the final map is requested again after more photos have arrived, it is made anew; results
     # computed before are reused from the store

@@ -89,7 +89,7 @@ class LiveMap:
         known, asked = self.ledger.meta("settings"), self.settings.shaping()
         if known is None:
             self.ledger.put_meta("settings", asked)
-        elif differing := ", ".join(k for k in asked if known.get(k) != asked[k]):
+        elif differing := ", ".join(k for k in asked if known.get(k, asked[k]) != asked[k]):
             raise UsageError(
                 f"{self.folder} was started with other settings ({differing}); use the same, or"
                 " another folder"
@@ -110,7 +110,14 @@ class LiveMap:
         neighbours = Neighbours(self.members, metadata)
         self.live_links = LiveLinks(self.members, self.methods, self.store, self.full)
         local_pose = LocalPose(self.members, metadata, neighbours, self.live_links, self.settings)
-        self.canvas = Canvas(self.tiles, self.heights, self.full, self.members.by_id, self.store)
+        self.canvas = Canvas(
+            self.tiles,
+            self.heights,
+            self.full,
+            self.members.by_id,
+            self.store,
+            self.settings.max_view_angle,
+        )
         self.canvas.gsd = float(self.ledger.meta("gsd", 0.0))
         self.canvas.ground = float(self.ledger.meta("ground", 0.0))
         map_events = MapEvents(self.members, self.canvas)

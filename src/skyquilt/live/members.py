@@ -14,7 +14,7 @@ from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import Ledger
 from skyquilt.model.camera import PARAMETERS, Camera
 from skyquilt.model.photo import Photo, RejectedPhoto
-from skyquilt.model.poses import MapFrame, Pose, Prior
+from skyquilt.model.poses import MapFrame, Motion, Pose, Prior
 from skyquilt.photos.read import read_photo
 
 ON_MAP = ("placed", "refined")
@@ -186,6 +186,7 @@ class Members:
         with self.ledger.change() as db:
             for key, camera in cameras.items():
                 body = {n: float(getattr(camera, n)) for n in PARAMETERS}
+                body["readout_s"] = camera.readout_s
                 body |= {"width": camera.width, "height": camera.height}
                 db.execute("insert or replace into camera values (?, ?)", (key, json.dumps(body)))
 
@@ -220,9 +221,17 @@ def about_record(member: Member, why: str) -> dict[str, Any]:
 
 def pose_record(pose: Pose) -> dict[str, list[float]]:
     """A pose as JSON record; floats are preserved exactly."""
-    return {"R": pose.cam_R_map.ravel().tolist(), "C": pose.map_C.tolist()}
+    record = {"R": pose.cam_R_map.ravel().tolist(), "C": pose.map_C.tolist()}
+    if pose.motion is not None:
+        moved = pose.motion
+        record |= {"shift": moved.shift_m.tolist(), "turn": moved.turn_rad.tolist()}
+    return record
 
 
 def pose_from(record: dict[str, list[float]]) -> Pose:
     """Reads a pose from its JSON record."""
-    return Pose(cam_R_map=np.array(record["R"]).reshape(3, 3), map_C=np.array(record["C"]))
+    motion = None
+    if "shift" in record:
+        motion = Motion(shift_m=np.array(record["shift"]), turn_rad=np.array(record["turn"]))
+    R, C = np.array(record["R"]).reshape(3, 3), np.array(record["C"])
+    return Pose(cam_R_map=R, map_C=C, motion=motion)

@@ -46,6 +46,8 @@ class LiveSettings:
     """One of `THERMAL_UNITS`: the unit of values in single-band TIFFs. None = detected, together
     with whether they are thermal.
     """
+    max_view_angle: float = 70.0
+    """Largest angle from the vertical in degrees at which a photo is shown."""
     features: int = 1200
     """Features per photo, as in the batch workflow."""
     most_bytes: int = 500_000_000
@@ -59,6 +61,7 @@ class LiveSettings:
         for name, value, low, high in (
             ("--gsd", self.gsd_cm, 0.05, 10000),
             ("--features", self.features, 100, 50000),
+            ("--max-view-angle", self.max_view_angle, 0, 90),
             ("--max-photos", self.most_photos, 1, 10**7),
             ("--max-mb", self.most_bytes / 1e6, 0.01, 1e5),
         ):
@@ -72,4 +75,5 @@ class LiveSettings:
             "features": self.features,
             "deterministic": self.deterministic,
             "thermal_unit": self.thermal_unit,
+            "max_view_angle": self.max_view_angle,
         }

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from skyquilt.engine.executor import in_order
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
+from skyquilt.imaging.view_limits import COARSEST, ViewLimits, limits_for
 from skyquilt.imaging.views import View, footprint
 from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member
@@ -59,6 +60,8 @@ DRAWINGS = 96
 """Number of tiles kept in memory with their composition, so that only the parts of changed photos
 are redrawn.
 """
+RECENT = 200
+"""Number of photos from which the median ground size of a pixel is taken."""
 THREADS = min(2, os.cpu_count() or 1)
 """Number of tiles drawn in parallel."""
 WHOLE = Window(row=0, column=0, height=SIDE, width=SIDE)
@@ -90,10 +93,13 @@ class Canvas:
         full: PixelCache,
         members: dict[int, Member],
         store: Store,
+        max_view_angle: float,
     ) -> None:
         self.tiles, self.heights, self.members = tiles, heights, members
         self.gsd = 0.0
         self.ground = 0.0
+        self.max_view_angle = max_view_angle
+        self._sizes: dict[int, float] = {}
         self._views: dict[int, View] = {}
         self._seen: dict[int, tuple[Address, ...]] = {}
         self._raised: set[Address] = set()
@@ -148,11 +154,35 @@ class Canvas:
         )
         x, y, z = pose.map_C.tolist()
         reach = 1.5 * abs(z - self.ground)
-        outline = footprint(small, pose, self.surface((x - reach, y - reach, x + reach, y + reach)))
+        surface = self.surface((x - reach, y - reach, x + reach, y + reach))
+        self._sizes[member.id] = abs(z - self.ground) / camera.focal
+        limits = self._limits(small, pose, surface)
+        outline = footprint(small, pose, surface, limits=limits)
         return (
-            View(photo=member.id, camera=small, pose=pose, footprint=outline)
+            View(photo=member.id, camera=small, pose=pose, footprint=outline, limits=limits)
             if len(outline)
             else None
+        )
+
+    def _limits(self, camera: Camera, pose: Pose, surface: Surface) -> ViewLimits:
+        """What a photo may show: no more than near the heights known now, and near its nadir."""
+        native = float(np.median(list(self._sizes.values())[-RECENT:]))
+        angle = ViewLimits(angle_deg=self.max_view_angle, coarsest_m=COARSEST * native)
+        outline = footprint(camera, pose, surface, limits=angle)
+        above = max(float(pose.map_C[2]) - self.ground, 1.0)
+        near = limits_for(
+            pose.map_C[None], np.zeros((0, 2)), np.array([above]), self.max_view_angle, native
+        )
+        if not len(outline) or not near.cuts(pose.map_C, outline, surface.at(*outline.T)):
+            return angle  # most photos: what they show lies near their nadir
+        low, high = outline.min(0) - above, outline.max(0) + above
+        known = self.heights.places((low[0], low[1], high[0], high[1]))
+        return limits_for(
+            np.concatenate([known, pose.map_C[None, :2]]),
+            np.zeros((0, 2)),
+            np.array([above]),
+            self.max_view_angle,
+            native,
         )
 
     def surface(self, bounds: Iterable[float]) -> Surface:

@@ -74,7 +74,7 @@ class MetadataConflict:
     photo: str
     """Photo.name."""
     field: str
-    """`yaw`, `altitude`, `position` or `focal`."""
+    """`yaw`, `altitude`, `position`, `focal`, `lens` or `principal_point`."""
     reported: float
     """Value in the metadata: degrees, m above the datum, m off, px."""
     estimated: float

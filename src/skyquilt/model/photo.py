@@ -7,11 +7,18 @@ from typing import TYPE_CHECKING, Literal
 
 from skyquilt.model.camera import Camera
 
+<<<<<<< HEAD
 if TYPE_CHECKING:
     from skyquilt.model.clip import Clip
 
 Datum = Literal["takeoff", "sea_level", "ellipsoid", "control", "unknown"]
 """What a height refers to; `control`: the same zero as the heights of the control points."""
+=======
+Datum = Literal["takeoff", "sea_level", "egm96", "ellipsoid", "control", "unknown"]
+"""What a height refers to; `egm96`: the geoid; `sea_level`: sea level as the device defines it;
+`control`: the same zero as the heights of the control points.
+"""
+>>>>>>> main
 
 
 Stored = Literal["", "celsius", "kelvin", "decikelvin", "centikelvin", "counts"]
@@ -142,6 +149,10 @@ class Photo:
     """Heading of the aircraft as reported, degrees clockwise from true north; an independent check
     of the yaw.
     """
+    flight_tilt_deg: tuple[float, float] = (0.0, 0.0)
+    """Pitch (positive: nose up) and roll (positive: right wing down) of the aircraft as reported,
+    degrees; 0 where they are not.
+    """
     time: datetime | None
     """Capture time with sub-seconds; naive local time unless the photo states an offset."""
     orientation_tag: int = 1
@@ -216,6 +227,8 @@ class ControlPoint:
     """Height in m; None where the file says NaN."""
     crs: str
     """As pyproj reads it, e.g. `EPSG:32615`."""
+    datum: Datum = "control"
+    """Zero of `z` as far as `crs` states it: `egm96`, `ellipsoid`, else `control`."""
     observations: tuple[PointObservation, ...]
     """Its observations in photos."""
     sigma_m: float = 0.02

@@ -21,6 +21,12 @@ class MapFrame:
     """Easting and northing in m of the frame's origin; heights are not shifted."""
     vertical_datum: Datum
     """What heights refer to."""
+    takeoff_m: float | None = None
+    """Height of the take-off point above `vertical_datum` in m, by which heights above take-off are
+    converted; None = they are not.
+    """
+    control_datum: Datum = "control"
+    """What heights refer to once control points with heights hold the map."""
     convergence_deg: float = 0.0
     """Meridian convergence: grid yaw = true yaw - convergence."""
     metric: bool = True
@@ -80,6 +86,8 @@ class Pose:
     to the undistorted image plane, whatever the height; rotation and centre are then those of the
     nearest vertical view.
     """
+    sigma_m: Array | None = None
+    """(3,) deviation of the centre in m; None where it is not known."""
     motion: Motion | None = None
     """How the camera moved while its rows were read out; None = not at all."""
 
@@ -133,6 +141,30 @@ class ControlResidual:
     """RMS over its observations in px."""
     observations: int
     """Number of photos in which it was observed."""
+    sigma_m: Array | None = None
+    """(3,) predicted deviation of `error_m` of a check point in m, the survey's included; None
+    where it is not known.
+    """
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Accuracy:
+    """How far ground points may be wrong, as the adjustment predicts."""
+
+    xyz: Array
+    """(k, 3) tie points in m, a sample spread over the map."""
+    sigma_m: Array
+    """(k, 3) deviations of their coordinates in m."""
+    shared_m: tuple[float, float]
+    """Horizontal and vertical deviation in m of a shift of the whole map that no photo shows: that
+    of the positions where no control point ties the map to the ground.
+    """
+    focal_share: float
+    """Deviation of the focal length after the adjustment over that before: 1 = the flight tells
+    nothing about it, and heights follow the metadata.
+    """
+    design_effect: float
+    """Observations that tell as much as an independent one (`alignment.deviations`)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -195,6 +227,8 @@ class Alignment:
     """Control and check points."""
     loo_rms_m: tuple[float, float, float] | None = None
     """RMS over photos of the position residual of each photo predicted from all the others."""
+    accuracy: Accuracy | None = None
+    """Predicted accuracy; None for methods that predict none."""
     notes: tuple[str, ...] = ()
     """Messages for the user."""
     joins: tuple[Join, ...] = ()

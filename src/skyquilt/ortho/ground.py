@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import SideFileError, UsageError
+from skyquilt.imaging.view_limits import USUAL, ViewLimits, limits_for
 from skyquilt.imaging.views import View, grid_of, make_views, native_gsd
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid
@@ -58,6 +59,8 @@ class Ground:
     """The map's pixels."""
     native_gsd: float
     """Median ground size of a photo pixel in m."""
+    limits: ViewLimits = USUAL
+    """What the photos may show."""
 
 
 def find_ground(
@@ -80,9 +83,13 @@ def find_ground(
     yield 0, 1
     xyz = alignment.ties.xyz
     flat = level(float(np.median(xyz[:, 2])) if len(xyz) else 0.0)
-    rough = make_views(alignment, flat)
+    limits = view_limits(alignment, flat, picture.max_view_angle)
+    rough = make_views(alignment, flat, limits)
     if not rough:
-        raise UsageError("no photo looks down at the ground: all contain the horizon")
+        raise UsageError(
+            "no photo shows ground that is seen at less than"
+            f" {picture.max_view_angle:g} degrees from the vertical (--max-view-angle)"
+        )
     native = native_gsd(rough, flat)
     gsd = picture.gsd_cm / 100 if picture.gsd_cm else round_gsd(native)
     bounds = _local_bounds(picture, alignment)
@@ -92,17 +99,38 @@ def find_ground(
     area = _widened(wide.bounds, 0.05 * max(wide.width, wide.height) * gsd)
     key = digest(xyz, area, ties)
     surface = store.get_or("surface", key, lambda: ties(xyz, area) if len(xyz) > 3 else flat)
-    views = tuple(make_views(alignment, surface))
+    views = tuple(make_views(alignment, surface, limits))
     grid = grid_of(views, gsd, bounds)
     if sweep is not None and len(xyz) > 3:
         held, known = set(alignment.held), surface
         surface = store.get_or(
             "surface",
-            digest(key, poses_digest(alignment), grid, sweep, sorted(held), pictures),
+            digest(
+                key,
+                poses_digest(alignment),
+                grid,
+                sweep,
+                sorted(held),
+                pictures,
+                picture.max_view_angle,
+                limits_for,
+            ),
             lambda: sweep(known, [v for v in views if v.photo in held], grid, grey),
         )
     yield 1, 1
-    return Ground(surface=surface, views=views, grid=grid, native_gsd=native)
+    return Ground(surface=surface, views=views, grid=grid, native_gsd=native, limits=limits)
+
+
+def view_limits(alignment: Alignment, flat: Surface, angle_deg: float) -> ViewLimits:
+    """What the photos of an alignment may show; photos without tie points support heights below
+    themselves.
+    """
+    C = np.array([p.map_C for p in alignment.poses.values()]).reshape(-1, 3)
+    above = C[:, 2] - flat.at(C[:, 0], C[:, 1])
+    focal = np.array([alignment.camera(i).focal for i in alignment.poses])
+    loose = [alignment.poses[i].map_C[:2] for i in set(alignment.poses) - set(alignment.held)]
+    gsd = float(np.median(above / focal)) if len(C) else np.inf
+    return limits_for(alignment.ties.xyz, np.array(loose), above, angle_deg, gsd)
 
 
 def _widened(

@@ -67,6 +67,12 @@ class HeightCells:
         found = z[np.isfinite(z)]
         return float(np.median(found)) if len(found) else None
 
+    def places(self, bounds: Iterable[float]) -> NDArray[np.float64]:
+        """Centres (k, 2) in m of the cells with a height inside bounds (m, map frame)."""
+        c0, r0, c1, r1 = self._reach(bounds)
+        row, column = np.nonzero(np.isfinite(self._part(c0, r0, c1, r1)))
+        return np.asarray((np.column_stack([column + c0, row + r0]) + 0.5) * self.cell, np.float64)
+
     def _reach(self, bounds: Iterable[float]) -> tuple[int, int, int, int]:
         c0, r0, c1, r1 = (int(np.floor(b / self.cell)) for b in bounds)
         return c0, r0, c1, r1

@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.heights import VERTICAL_EPSG
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.executor import in_order
 from skyquilt.engine.folder import STATE
@@ -250,6 +251,7 @@ def write_surface(output: Path, ground: Ground, alignment: Alignment) -> None:
         dtype="float32",
         transform=geotransform(coarse, alignment),
         crs=alignment.frame.crs,
+        vertical=VERTICAL_EPSG.get(alignment.frame.vertical_datum),
         compress="zstd",
         nodata=float("nan"),
         tags={"SOFTWARE": "Skyquilt"} | about,

@@ -20,6 +20,7 @@ from skyquilt.imaging.views import (
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Blend
+from skyquilt.ortho.smears import smeared, yielding
 
 TOGETHER = 6
 """Number of photos projected at a time."""
@@ -79,6 +80,7 @@ def planned(
     # highest rank of another cannot be visible there
     around, best = np.ones((3, 3), np.uint8), np.full(x.shape, np.float32(np.inf))
     found: dict[int, tuple[Nodes, NDArray[Any]]] = {}
+    smears: dict[int, NDArray[np.bool_]] = {}
     ready = {
         k: n for k, v in enumerate(views) if (n := known.get(v.photo)) is not None and n.view is v
     }
@@ -92,8 +94,17 @@ def planned(
         nodes = ready[k]
         if nodes.seen.any():
             rank = blend.rank(k, np.where(nodes.seen, nodes.score, np.float32(np.inf)))
-            best = np.minimum(best, cv2.dilate(rank, around))
             found[k] = nodes, cv2.erode(rank, around)
+            if (smear := smeared(nodes, grid.gsd)).any():
+                smears[k] = smear
+                rank = np.where(smear, np.float32(np.inf), rank)  # it hides no other photo there
+            best = np.minimum(best, cv2.dilate(rank, around))
+    whole = {k: nodes for k, (nodes, _) in found.items()}
+    for k, smear in smears.items():
+        others = [(nodes, smears.get(j)) for j, nodes in whole.items() if j != k]
+        nodes = yielding(whole[k], smear, others)
+        rank = blend.rank(k, np.where(nodes.seen, nodes.score, np.float32(np.inf)))
+        found[k] = nodes, cv2.erode(rank, around)
     kept = [found[k] for k in sorted(found)]
     return Plan(
         window=window,

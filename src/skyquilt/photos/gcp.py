@@ -1,18 +1,22 @@
 """OpenDroneMap's `gcp_list.txt`: a coordinate system, then `x y z px py image [name] [check]`.
 
 Rows with the same name, or without names the same x, y and z, are observations of one point. z may
-be NaN. Pixels have their centres at integers. A check point, which is not used in the adjustment,
-has a name that starts with `check` or the word `check` in the eighth column: OpenDroneMap ignores
-both extensions.
+be NaN; a compound or three-dimensional coordinate system states its zero. Pixels have their centres
+at integers. A check point, which is not used in the adjustment, has a name that starts with `check`
+or the word `check` in the eighth column: OpenDroneMap ignores both extensions.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from skyquilt.errors import SideFileError
-from skyquilt.model.photo import ControlPoint, PointObservation
+from skyquilt.model.photo import ControlPoint, Datum, PointObservation
 from skyquilt.photos.side_rows import PhotoNames, finite, number, read_crs, read_lines, sentence_of
+
+if TYPE_CHECKING:
+    from pyproj import CRS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,8 +64,19 @@ def read_gcp_list(
     for observation in observations:
         groups.setdefault(observation.key, []).append(observation)
     system = f"EPSG:{epsg}" if epsg else crs.to_string()
-    points = [_point(i, group, system, names, path) for i, group in enumerate(groups.values(), 1)]
+    zero = datum_of(crs)
+    points = [
+        _point(i, group, system, zero, names, path) for i, group in enumerate(groups.values(), 1)
+    ]
     return tuple(p for p in points if p.observations), _notes(path, strangers, points)
+
+
+def datum_of(crs: "CRS") -> Datum:
+    """The zero of heights that a coordinate system states: `egm96`, `ellipsoid`, else `control`."""
+    if crs.is_compound:
+        vertical = crs.sub_crs_list[-1]
+        return "egm96" if "egm96" in vertical.name.lower() else "control"
+    return "ellipsoid" if len(crs.axis_info) == 3 else "control"
 
 
 def _notes(path: Path, strangers: list[str], points: list[ControlPoint]) -> tuple[str, ...]:
@@ -105,7 +120,7 @@ def _observation(line: str, place: str) -> _Observation:
 
 
 def _point(
-    i: int, group: list[_Observation], crs: str, names: PhotoNames, path: Path
+    i: int, group: list[_Observation], crs: str, zero: Datum, names: PhotoNames, path: Path
 ) -> ControlPoint:
     first = group[0]
     label = first.name or f"point {i}"
@@ -120,6 +135,7 @@ def _point(
         y=first.y,
         z=first.z,
         crs=crs,
+        datum=zero,
         observations=tuple(PointObservation(photo=n, x=s.column, y=s.row) for n, s in seen if n),
         check=any(s.check for s in group),
     )

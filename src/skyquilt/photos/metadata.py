@@ -211,6 +211,12 @@ _FASTEST = 100.0
 """Greater speeds in m/s are no measurements."""
 
 
+def read_flight_tilt(xmp: Xmp) -> tuple[float, float]:
+    """Pitch and roll of the aircraft in degrees; 0 where they are absent."""
+    pitch, roll = (xmp.number(f"Flight{axis}Degree") for axis in ("Pitch", "Roll"))
+    return pitch or 0.0, roll or 0.0
+
+
 def _from_gimbal(
     yaw: float, pitch: float | None, roll: float | None, source: str
 ) -> tuple[Attitude, tuple[str, ...]]:

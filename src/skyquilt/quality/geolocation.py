@@ -52,7 +52,8 @@ def gps_residuals(alignment: Alignment, priors: Sequence[Prior]) -> Array:
     residual = np.array(
         [alignment.poses[i].map_C - priors[i].map_C for i in alignment.held]
     ).reshape(-1, 3)
-    if alignment.frame.vertical_datum == "control" and np.isfinite(residual[:, 2]).any():
+    held = any(not c.check and np.isfinite(c.error_m[2]) for c in alignment.control)
+    if (held or alignment.frame.vertical_datum == "control") and np.isfinite(residual[:, 2]).any():
         residual[:, 2] -= np.nanmedian(residual[:, 2])
     return residual
 

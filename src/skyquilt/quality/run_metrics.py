@@ -12,7 +12,7 @@ from skyquilt.model.camera import PARAMETERS
 from skyquilt.model.event import MetadataConflict
 from skyquilt.model.features import Link, RejectedLink
 from skyquilt.model.photo import Photo, RejectedPhoto
-from skyquilt.model.poses import Alignment, Prior
+from skyquilt.model.poses import Accuracy, Alignment, Prior
 from skyquilt.ortho.companions import Drawn
 from skyquilt.ortho.ground import Ground
 from skyquilt.quality.geolocation import gps_residuals
@@ -78,6 +78,7 @@ def control_figures(alignment: Alignment) -> dict[str, Any]:
             "dz_m": _round(z - offset),
             "reprojection_px": _round(c.reprojection_px),
             "sightings": c.observations,
+            "sigma_m": None if c.sigma_m is None else [_round(s, 4) for s in c.sigma_m],
         }
         for c, z in zip(points, dz, strict=True)
     ]
@@ -103,6 +104,48 @@ def camera_figures(photos: Sequence[Photo], alignment: Alignment) -> dict[str, A
             "source": focal.source,
         }
     return out
+
+
+def shutter_figures(photos: Sequence[Photo], alignment: Alignment) -> dict[str, Any]:
+    """How the rows of each camera's photos were exposed, and by how much that shifts them."""
+    out: dict[str, Any] = {}
+    for i in sorted(alignment.poses):
+        key, pose, camera = photos[i].camera_key, alignment.poses[i], alignment.camera(i)
+        moved = pose.motion
+        px = 0.0
+        if moved is not None and len(alignment.ties.xyz):
+            above = max(float(pose.map_C[2] - np.median(alignment.ties.xyz[:, 2])), 1.0)
+            px = camera.focal * float(np.linalg.norm(moved.shift_m)) / above
+        entry = out.setdefault(
+            key,
+            {
+                "source": photos[i].shutter.source,
+                "readout_ms": _round(1000 * camera.readout_s, 3),
+                "sigma_ms": _round(1000 * (camera.sigma_readout_s or 0.0), 3),
+                "prior_ms": _round(1000 * photos[i].shutter.readout_s, 3),
+                "largest_displacement_px": 0.0,
+            },
+        )
+        entry["largest_displacement_px"] = max(entry["largest_displacement_px"], _round(px, 2))
+    return out
+
+
+def accuracy_figures(accuracy: Accuracy | None) -> dict[str, Any] | None:
+    """Predicted deviations of the map's ground points in m, in the median and at the worst place;
+    what the positions' common error adds is given apart.
+    """
+    if accuracy is None or not len(accuracy.sigma_m):
+        return None
+    flat = np.sqrt((accuracy.sigma_m[:, :2] ** 2).mean(1))
+    up = accuracy.sigma_m[:, 2]
+    return {
+        "horizontal_m": {"median": _round(np.median(flat), 4), "worst": _round(flat.max(), 4)},
+        "vertical_m": {"median": _round(np.median(up), 4), "worst": _round(up.max(), 4)},
+        "shared_horizontal_m": _round(accuracy.shared_m[0], 4),
+        "shared_vertical_m": _round(accuracy.shared_m[1], 4),
+        "focal_sigma_after_over_before": _round(accuracy.focal_share, 4),
+        "design_effect": _round(accuracy.design_effect, 2),
+    }
 
 
 def figures(
@@ -144,6 +187,8 @@ def figures(
         "seam_disparity_px": seams,
         "metadata_conflicts": [asdict(c) for c in conflicts],
         "cameras": camera_figures(photos, alignment),
+        "shutter": shutter_figures(photos, alignment),
+        "accuracy": accuracy_figures(alignment.accuracy),
         "notes": list(notes),
     }
 

@@ -29,6 +29,10 @@ class RasterSpec:
     """
     crs: str | None = None
     """As pyproj reads it (`EPSG:32615`, WKT); None = ungeoreferenced."""
+    vertical: int | None = None
+    """EPSG code of the heights' reference: a vertical CRS, or a three-dimensional geographic one
+    for heights above its ellipsoid; None = none.
+    """
     nodata: float | None = None
     """Value of pixels without data; NaN for radiometric rasters."""
     compress: Compression = "deflate"

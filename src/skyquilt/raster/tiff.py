@@ -84,12 +84,13 @@ def place_tags(spec: RasterSpec) -> list[Tag]:
         tags = [Tag(PIXEL_SCALE, DOUBLE, (a, -e, 0)), Tag(TIE_POINT, DOUBLE, (0, 0, 0, c, f, 0))]
     else:
         tags = [Tag(TRANSFORMATION, DOUBLE, (a, b, 0, c, d, e, 0, f, 0, 0, 0, 0, 0, 0, 0, 1))]
-    return tags + (list(crs_tags(spec.crs)) if spec.crs else [])
+    return tags + (list(crs_tags(spec.crs, spec.vertical)) if spec.crs else [])
 
 
 @lru_cache(maxsize=16)
-def crs_tags(crs: str) -> tuple[Tag, ...]:
-    """GeoKeyDirectory, doubles and text of a CRS; pixels are areas.
+def crs_tags(crs: str, vertical: int | None = None) -> tuple[Tag, ...]:
+    """GeoKeyDirectory, doubles and text of a CRS and the EPSG code of a vertical one; pixels are
+    areas.
 
     A plain EPSG code is three keys; for any other CRS, GDAL writes a 1 x 1 file and its tags are
     copied.
@@ -102,8 +103,19 @@ def crs_tags(crs: str) -> tuple[Tag, ...]:
     if plain and authority and authority[0] == "EPSG" and int(authority[1]) < 32767:
         model, key = (1, 3072) if parsed.is_projected else (2, 2048)
         keys = (1, 1, 0, 3, 1024, 0, 1, model, 1025, 0, 1, 1, key, 0, 1, int(authority[1]))
-        return (Tag(GEO_KEYS, SHORT, keys),)
-    return _tags_by_gdal(parsed.to_wkt())
+        tags: tuple[Tag, ...] = (Tag(GEO_KEYS, SHORT, keys),)
+    else:
+        tags = _tags_by_gdal(parsed.to_wkt())
+    return tags if vertical is None else tuple(_with_vertical(t, vertical) for t in tags)
+
+
+def _with_vertical(tag: Tag, vertical: int) -> Tag:
+    """The key directory with a vertical CRS in metres, as GeoTIFF 1.1 defines it (OGC 19-008r4)."""
+    if tag.code != GEO_KEYS:
+        return tag
+    version, revision, _, count, *keys = tag.values
+    added = (4096, 0, 1, vertical, 4099, 0, 1, 9001)
+    return Tag(GEO_KEYS, SHORT, (version, revision, 1, count + 2, *keys, *added))
 
 
 def _tags_by_gdal(wkt: str) -> tuple[Tag, ...]:

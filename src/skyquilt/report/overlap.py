@@ -13,6 +13,7 @@ from skyquilt.report.svg import bars, colour_bar, columns
 DATUMS = {
     "takeoff": "above the take-off point",
     "sea_level": "above sea level",
+    "egm96": "above sea level (EGM96)",
     "ellipsoid": "above the WGS\u202f84 ellipsoid",
     "control": "in the height system of the control points",
     "unknown": "above an unknown zero",
@@ -115,6 +116,8 @@ def surface_section(data: ReportInput, ground: Ground | None, layers: dict[str, 
             f"Heights from {fixed(z.min(), 1)} to {fixed(z.max(), 1)} {unit}, shaded from the "
             "north-west. Height errors displace the map horizontally, most near photo edges."
         )
+        heights = data.metrics.get("heights", {})
+        caption = " ".join([caption, *heights.get("trust", ())])
         blocks = (Figure(svg=svg + bar, title=title, caption=caption), _heights(z, low, high, unit))
         if z.max() - z.min() < 1e-3:
             blocks = (

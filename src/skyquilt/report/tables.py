@@ -31,6 +31,7 @@ MEANINGS = {
     "k3": "radial distortion, r\u2076",
     "p1": "tangential distortion",
     "p2": "tangential distortion",
+    "aspect": "focal length along columns over rows",
 }
 FAR = 3.0
 """Number of standard deviations of the prior from which a parameter counts as far from it."""
@@ -45,12 +46,22 @@ CONFLICTS = {
     ),
     "position": "The GPS position is far from the position estimated from the images; it was given"
     " little weight.",
+    "lens": (
+        "The flight shows another lens distortion than the calibration in the files: they may be of"
+        " another camera or temperature. The flight's is used."
+    ),
+    "principal_point": (
+        "The flight shows another principal point than the calibration in the files. The flight's"
+        " is used."
+    ),
     "focal": (
         "The estimated focal length differs from the reported one: check the camera, a zoom or a"
         " resized file."
     ),
 }
-UNITS = {"yaw": "\u00b0", "altitude": " m", "position": " m", "focal": " px"}
+UNITS = {"yaw": "\u00b0", "altitude": " m", "position": " m", "focal": " px"} | dict.fromkeys(
+    ("lens", "principal_point"), " px"
+)
 
 
 def calibration_section(data: ReportInput) -> Section:

@@ -13,7 +13,8 @@ from scipy.ndimage import gaussian_filter
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.flight import Shot
 from skyquilt.simulate.grid import Doubles, Floats, Grid
-from skyquilt.simulate.raycast import first_hits, rays_of, sample
+from skyquilt.simulate.horizon import with_horizon
+from skyquilt.simulate.raycast import FLATTEST, first_hits, rays_of, sample
 from skyquilt.simulate.scene import Scene
 from skyquilt.simulate.settings import Pictures
 
@@ -101,6 +102,7 @@ class Exposer:
         hits, heights, window = self.pixels(shot)
         seen = sample(np.ascontiguousarray(self.scene.rgb[window.slices]), hits).astype(np.float32)
         seen *= self._flanks(hits, heights, window)[..., None]
+        seen = with_horizon(seen, self.scene, self.directions, shot)
         seen = _blurred(seen, settings)
         seen *= (np.float32(gain) * falloff(self.lens, settings.vignetting))[..., None]
         if settings.noise > 0:
@@ -129,7 +131,7 @@ def exposer(scene: Scene, lens: Lens) -> Exposer:
 
 def footprint(lens: Lens, shot: Shot, level: float) -> Doubles:
     """Map positions (n, 2) where the rays of the image border meet a level height above the
-    base.
+    base; rays flatter than `FLATTEST` end at that slope.
     """
     w, h = lens.width - 0.5, lens.height - 0.5
     side = np.linspace(0, 1, 9)[:-1]
@@ -141,7 +143,8 @@ def footprint(lens: Lens, shot: Shot, level: float) -> Doubles:
     )
     ix, iy = lens.undistort((x - lens.cx) / lens.focal, (y - lens.cy) / (lens.focal * lens.aspect))
     rays = np.stack([ix, iy, np.ones_like(ix)], axis=1) @ shot.rotation
-    return shot.place[:2] + rays[:, :2] * ((level - shot.centre[2]) / rays[:, 2])[:, None]
+    down = np.maximum(-rays[:, 2], np.hypot(rays[:, 0], rays[:, 1]) / FLATTEST)
+    return shot.place[:2] + rays[:, :2] * ((shot.centre[2] - level) / down)[:, None]
 
 
 def falloff(lens: Lens, share: float) -> Floats:

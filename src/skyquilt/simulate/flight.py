@@ -225,7 +225,34 @@ def fly(points: list[Waypoint], route: Route, takeoff: float, seed: int, prefix:
         )
         if number not in lost:
             shots.append(shot)
-    return shots
+    return sorted([*shots, *_oblique(shots, route, seed)], key=lambda s: s.waypoint.time)
+
+
+def _oblique(shots: list[Shot], route: Route, seed: int) -> list[Shot]:
+    """Photos taken one second after some of the shots, looking ahead; the shots themselves are the
+    same with and without them.
+    """
+    rng = np.random.default_rng([seed, 22])
+    after = rng.choice(len(shots), route.oblique, replace=route.oblique > len(shots))
+    tilts = rng.permutation(np.linspace(*route.oblique_tilts, route.oblique))
+    taken = []
+    for number, (at, tilt) in enumerate(zip(after, tilts, strict=True)):
+        last = shots[at]
+        dx, dy, dz = rng.normal(0, route.jitter, 3)
+        yaw, roll = rng.normal(0, [route.yaw_noise, min(route.tilt_noise, 3.0)])
+        x, y, z = last.centre
+        taken.append(
+            replace(
+                last,
+                name=f"{last.name}_oblique{number + 1}",
+                waypoint=replace(last.waypoint, time=last.waypoint.time + 1.0),
+                centre=(x + dx, y + dy, z + 0.6 * dz),
+                yaw=wrap(last.waypoint.heading + yaw),
+                pitch=float(tilt),
+                roll=float(roll),
+            )
+        )
+    return taken
 
 
 def _losses(count: int, lost: int, rng: np.random.Generator) -> set[int]:

@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 
 from skyquilt.simulate.grid import Doubles, Floats
 
+FLATTEST = 3.7
+"""Horizontal over vertical part of the flattest rays that are intersected with the raster: 75
+degrees from the vertical.
+"""
 # px: side of the cells in which hits are first bracketed, in the photo and in the raster
 _CELL = 16
 _LEVEL_M = 0.35  # height between two levels of the bracketing march
@@ -53,19 +57,16 @@ def rays_of(
     `origin` is the map position of raster pixel (0, 0); rotation (3, 3) from map to camera and
     centre (3,), or one for each row, (h, 1, 3, 3) and (h, 1, 3).
 
-    Heights refer to the same zero as centre[2]. Raises ValueError where a ray does not point
-    downwards.
+    Heights refer to the same zero as centre[2]. Rays flatter than `FLATTEST`, and those to the sky,
+    are steepened to it: what they show is no matter of the raster (`simulate.horizon`).
     """
     to_map = rotation.astype(np.float32)
     x, y = directions[..., 0], directions[..., 1]
     dx, dy, dz = (
         to_map[..., 0, i] * x + to_map[..., 1, i] * y + to_map[..., 2, i] for i in range(3)
     )
-    if dz.max() > -0.05:
-        raise ValueError(
-            "a ray of the photo does not meet the ground: tilt or field of view too large"
-        )
-    slope = np.stack([dx, -dy], axis=-1) / (-dz * np.float32(res))[..., None]
+    down = np.maximum(-dz, np.hypot(dx, dy) / np.float32(FLATTEST))
+    slope = np.stack([dx, -dy], axis=-1) / (down * np.float32(res))[..., None]
     place = np.stack(
         [(centre[..., 0] - origin[0]) / res, (origin[1] - centre[..., 1]) / res], axis=-1
     ).astype(np.float32)
@@ -105,7 +106,7 @@ def _cells(raster: Floats, reach: int) -> tuple[Floats, Floats]:
 
 def _bracket(raster: Floats, rays: Rays) -> tuple[Floats, Floats]:
     """Heights (cells) above and below all first hits of a cell's rays."""
-    low, high = _cells(raster, 2)
+    low, high = _cells(raster, _reach(rays))
     top, bottom = float(high.max()) + 0.05, float(low.min()) - 0.05
     levels = np.linspace(top, bottom, int(np.ceil((top - bottom) / _LEVEL_M)) + 2, dtype=np.float32)
     above = np.full(rays.start.shape[:2], np.nan, dtype=np.float32)
@@ -119,6 +120,14 @@ def _bracket(raster: Floats, rays: Rays) -> tuple[Floats, Floats]:
         above = np.where(np.isnan(above) & (highest >= lower), upper, above)
         below = np.where(np.isnan(below) & (lowest >= lower), lower - np.float32(0.02), below)
     return np.where(np.isnan(above), top, above), np.where(np.isnan(below), bottom, below)
+
+
+def _reach(rays: Rays) -> int:
+    """Cells of the raster that the rays around a cell's own lie away at most: more in oblique
+    photos.
+    """
+    apart = [np.abs(np.diff(rays.start, axis=a)).max(initial=0.0) for a in (0, 1)]
+    return int(np.clip(np.ceil(0.6 * float(max(apart)) / _CELL) + 1, 2, 40))
 
 
 def _march(raster: Floats, rays: Rays, above: Floats, below: Floats, steps: int) -> Floats:

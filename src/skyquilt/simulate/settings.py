@@ -50,6 +50,10 @@ class Route:
     """Drones that fly at the same time, each on its share of the lines."""
     lost: int = 0
     """Photos planned but not delivered, never two neighbours."""
+    oblique: int = 0
+    """Photos taken besides the planned ones, looking ahead, some with the sky."""
+    oblique_tilts: tuple[float, float] = (57.0, 80.0)
+    """Least and largest tilt of these from the vertical, degrees; they are spread evenly."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -258,8 +262,16 @@ def _route_rules(settings: FlightSettings) -> _Rules:
         (route.drones >= 1, f"drones must be at least 1, not {route.drones}"),
         (0 <= 2 * route.lost < route.photos, lost),
         (
-            0 <= route.tilt_noise <= 8,
-            f"tilt noise must be 0 to 8 degrees, not {route.tilt_noise:g}",
+            0 <= route.tilt_noise <= 30,
+            f"tilt noise must be 0 to 30 degrees, not {route.tilt_noise:g}",
+        ),
+        (
+            0 <= route.oblique <= 1000,
+            f"the number of oblique photos must be 0 to 1000, not {route.oblique}",
+        ),
+        (
+            0 <= route.oblique_tilts[0] <= route.oblique_tilts[1] <= 80,
+            "oblique photos are tilted by 0 to 80 degrees, the least tilt first",
         ),
     ]
 

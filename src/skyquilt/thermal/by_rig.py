@@ -130,7 +130,7 @@ def drift_of_rigged(
     unit, ground = found.photos[0].unit, scene.ground
     if not balances_drift(settings, unit):
         return NEUTRAL
-    views = make_views(found.alignment, ground.surface)
+    views = make_views(found.alignment, ground.surface, ground.limits)
     frames = {v.photo: shrink(read_color(found.photos[v.photo]), THUMBNAIL)[0] for v in views}
     return drift_of(views, frames, ground.surface, ground.grid.bounds, unit, drift, settings)
 
@@ -145,7 +145,7 @@ def draw_rigged(
     kind, real = np.dtype(first.dtype), np.dtype(first.dtype).kind == "f"
     compose = Composer(
         grid=grid,
-        views=make_views(found.alignment, scene.ground.surface),
+        views=make_views(found.alignment, scene.ground.surface, scene.ground.limits),
         surface=scene.ground.surface,
         blend=blend,
         pixels=lambda i: read_color(found.photos[i]),

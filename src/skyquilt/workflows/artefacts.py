@@ -18,6 +18,8 @@ REGISTRY = {
         poses.Alignment,
         poses.MapFrame,
         poses.Pose,
+        poses.Motion,
+        poses.Accuracy,
         poses.TiePoints,
         poses.ControlResidual,
         poses.Join,

@@ -131,7 +131,8 @@ def align_photos(
     found = of_one_kind(found)
     pixels = _pixels_of(found.photos, photos, cache)
     grey = GreyPictures(found.photos, pixels, store)
-    frame = choose_frame(found.photos, settings.picture.crs, given.control)
+    picture = settings.picture
+    frame = choose_frame(found.photos, picture.crs, given.control, picture.vertical_datum)
     reported = priors(found.photos, frame)
     linking = _links(found, frame, reported, methods, store, jobs)
     links = yield from clock.stage("links", linking)

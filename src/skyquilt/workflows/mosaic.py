@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from skyquilt.alignment.conflicts import conflicts
+from skyquilt.alignment.heights import height_figures
 from skyquilt.engine.clock import Clock, Steps, result_of
 from skyquilt.engine.folder import STATE, RunFolder, open_run
 from skyquilt.engine.store import Store, digest
@@ -227,20 +228,28 @@ def _metrics(
     settings: MosaicSettings,
 ) -> dict[str, Any]:
     survey, alignment = aligned.given.survey, aligned.alignment
-    return figures(
-        photos=aligned.photos,
-        total=len(survey.photos) + len(survey.rejected),
-        rejected=aligned.rejected,
-        priors=aligned.priors,
-        links=aligned.links.links,
-        refused=aligned.links.rejected,
-        alignment=alignment,
-        ground=ground,
-        drawn=map_.drawn,
-        seams=seams.figures,
-        conflicts=conflicts(aligned.photos, aligned.priors, alignment),
-        notes=[*survey.notes, *alignment.notes],
-    ) | value_figures(aligned.photos, map_.exposure, settings.picture)
+    return (
+        figures(
+            photos=aligned.photos,
+            total=len(survey.photos) + len(survey.rejected),
+            rejected=aligned.rejected,
+            priors=aligned.priors,
+            links=aligned.links.links,
+            refused=aligned.links.rejected,
+            alignment=alignment,
+            ground=ground,
+            drawn=map_.drawn,
+            seams=seams.figures,
+            conflicts=conflicts(aligned.photos, aligned.priors, alignment),
+            notes=[*survey.notes, *alignment.notes],
+        )
+        | {
+            "heights": height_figures(
+                aligned.photos, aligned.given.control, alignment.frame.vertical_datum
+            )
+        }
+        | value_figures(aligned.photos, map_.exposure, settings.picture)
+    )
 
 
 def _forget(run: RunFolder, store: Store, rerun_from: str | None) -> None:

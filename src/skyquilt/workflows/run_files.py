@@ -124,6 +124,7 @@ def write_reconstruction(
         "shots": shots,
         "points": points,
         "reference_lla": enu.reference,
+        "vertical_datum": alignment.frame.vertical_datum,
         "biases": {},
         "rig_cameras": {},
         "rig_instances": {},

@@ -10,6 +10,7 @@ from skyquilt.model.clip import ChosenFrames
 from skyquilt.model.photo import ControlPoint, KnownDistance, Survey
 from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import read_gcp_list
+from skyquilt.photos.lever_arm import with_lever_arm
 from skyquilt.photos.sequence import sequence_of
 from skyquilt.photos.shutter import stated_shutter
 from skyquilt.photos.survey import read_survey
@@ -74,6 +75,9 @@ def completed(given: SurveyInput, settings: InputSettings) -> SurveyInput:
         SideFileError: a side file is malformed.
     """
     survey, source = given.survey, given.source
+    if settings.lever_arm is not None:
+        photos, notes = with_lever_arm(survey.photos, settings.lever_arm)
+        survey = replace(survey, photos=photos, notes=(*survey.notes, *notes))
     names = [p.name for p in survey.photos]
     gcp = settings.gcp
     if gcp is None and isinstance(source, Path) and (source / "gcp_list.txt").is_file():
@@ -105,7 +109,9 @@ def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> N
             f"{output} contains the photos; choose another folder for the results, such as"
             f" {output / 'map'}"
         )
-    frame = choose_frame(given.survey.photos, settings.picture.crs, given.control)
+    frame = choose_frame(
+        given.survey.photos, settings.picture.crs, given.control, settings.picture.vertical_datum
+    )
     if settings.picture.boundary is not None and not given.survey.clips:
         if frame.crs is None:
             raise UsageError(

@@ -1,0 +1,213 @@
+"""How well a photo's observations determine its pose: photos that hang on a block by too little."""
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.geometry.camera import project_with_derivatives, rays
+from skyquilt.model.camera import Camera
+from skyquilt.model.poses import Alignment, Pose, Prior, TiePoints
+
+Array = NDArray[np.float64]
+FEWEST = 8
+"""Fewest tie points of a photo in the map."""
+LOOSEST = 0.007
+"""Largest deviation of a photo's picture on the ground, as a share of its longer side, where tie
+points alone determine it.
+"""
+LOOSEST_TOLD = 0.02
+"""The same where its position and its heading are reported: that of a usual drone's metadata."""
+LEAST_COVERED = 0.04
+"""Least share of the picture that such tie points cover; smaller groups of wrong matches agree by
+chance.
+"""
+AGAIN = 1.2
+"""A photo is looked at again when it has this many times as many points as before."""
+INDEPENDENT = 40
+"""Independent observations that tell as much as a photo's many correlated ones."""
+GRID = np.stack(np.meshgrid(*2 * [np.linspace(0.02, 0.98, 5)]), -1).reshape(-1, 2)
+"""Places in the picture, as shares of its width and height, where the deviation is predicted."""
+STEEPEST = np.tan(np.radians(70.0))
+"""Places seen flatter than this are left out: they are not shown."""
+
+
+def weak_photos(alignment: Alignment, priors: Sequence[Prior]) -> dict[int, str]:
+    """Connected photos whose pose is not determined by tie points and metadata together, with
+    reasons that give the figures.
+
+    Each block grows photo by photo from the one with most tie points: a photo joins by the points
+    that photos of the block show already. So photos that are linked with each other, but as a group
+    with few others, do not support each other: the largest group is the block.
+    """
+    found: dict[int, str] = {}
+    for block in alignment.blocks:
+        if len(block) > 1:
+            found |= _left_out(alignment, block, priors)
+    return found
+
+
+def _left_out(
+    alignment: Alignment, block: Sequence[int], priors: Sequence[Prior]
+) -> dict[int, str]:
+    """The photos outside the largest group of a block, with reasons."""
+    whole = _Growth(alignment, block, priors)
+    groups, rest = list[set[int]](), set(block)
+    while rest:
+        groups.append(rest - whole.grown(rest).keys())
+        rest -= groups[-1]
+        if len(rest) <= max(map(len, groups)):
+            break
+    return whole.grown(set(block), max(groups, key=len))
+
+
+class _Growth:
+    """The growth of groups in one block."""
+
+    def __init__(self, alignment: Alignment, block: Sequence[int], priors: Sequence[Prior]) -> None:
+        self.alignment, self.priors = alignment, priors
+        ties = alignment.ties
+        order = np.argsort(ties.photo, kind="stable")
+        cuts = np.searchsorted(ties.photo[order], [[i, i + 1] for i in block])
+        self.own = {i: order[a:b] for i, (a, b) in zip(block, cuts.tolist(), strict=True)}
+        self.first = np.searchsorted(ties.point, np.arange(len(ties.xyz) + 1))
+        self.last = max(block)
+
+    def grown(self, photos: set[int], among: set[int] | None = None) -> dict[int, str]:
+        """Those of these photos that never join a group, with reasons; it starts with the photo
+        that has most tie points, of those `among` which it shall.
+        """
+        ties = self.alignment.ties
+        self.shown = np.zeros(len(ties.xyz), np.bool_)
+        self.number = np.zeros(max(self.last, int(ties.photo.max(initial=0))) + 1, np.int64)
+        start = max(sorted(among or photos), key=lambda i: len(self.own[i]))
+        left, reasons = photos - {start}, dict[int, str]()
+        self._join(start)
+        tried = np.zeros(len(self.number), np.int64)
+        while ready := [i for i in left if self.number[i] > AGAIN * tried[i]]:
+            photo = max(ready, key=lambda i: (self.number[i], -i))
+            tried[photo] = self.number[photo]
+            why = self._why_weak(photo)
+            if why:
+                reasons[photo] = why
+                continue
+            reasons.pop(photo, None)
+            left.remove(photo)
+            self._join(photo)
+        return {i: reasons.get(i) or self._why_weak(i) for i in sorted(left)}
+
+    def _join(self, photo: int) -> None:
+        points = self.alignment.ties.point[self.own[photo]]
+        new = np.unique(points[~self.shown[points]])
+        self.shown[new] = True
+        for a, b in zip(self.first[new].tolist(), self.first[new + 1].tolist(), strict=True):
+            self.number[self.alignment.ties.photo[a:b]] += 1
+
+    def _why_weak(self, photo: int) -> str:
+        ties, own = self.alignment.ties, self.own[photo]
+        own = own[self.shown[ties.point[own]]]
+        return why_weak(
+            self.alignment.poses[photo],
+            self.alignment.camera(photo),
+            ties.xyz[ties.point[own]],
+            ties.px[own],
+            ties.residual_px[own],
+            self.priors[photo],
+        )
+
+
+def why_weak(
+    pose: Pose, camera: Camera, xyz: Array, px: Array, residual_px: Array, prior: Prior | None
+) -> str:
+    """Why tie points (n, 3) observed at px (n, 2) do not determine a pose, alone or with metadata;
+    empty if they do.
+    """
+    if len(px) < FEWEST:
+        return f"it has only {len(px)} tie points"
+    wide, share = max(camera.width, camera.height), covered(px, camera)
+    alone = deviation_px(pose, camera, xyz, residual_px, None)
+    if alone <= LOOSEST * wide and share >= LEAST_COVERED:
+        return ""
+    if prior is not None and np.isfinite([*prior.map_C[:2], prior.yaw_deg]).all():
+        told = deviation_px(pose, camera, xyz, residual_px, prior)
+        if told <= LOOSEST_TOLD * wide:
+            return ""
+    return (
+        f"it hangs on the other photos by too little: {len(px)} tie points in common cover"
+        f" {share:.1%} of its picture ({LEAST_COVERED:.0%} are needed) and leave its place"
+        f" uncertain by {alone:.1f} px (at most {LOOSEST * wide:.1f})"
+    )
+
+
+def covered(px: Array, camera: Camera) -> float:
+    """Share of the picture inside the convex hull of observations (n, 2)."""
+    hull = cv2.convexHull(px.astype(np.float32))
+    return float(cv2.contourArea(hull)) / (camera.width * camera.height)
+
+
+def deviation_px(
+    pose: Pose, camera: Camera, xyz: Array, residual_px: Array, prior: Prior | None
+) -> float:
+    """Predicted standard deviation in px of the picture on the ground, at the worst place shown,
+    from the covariance of the pose with all points held.
+    """
+    spread = max(0.5, float(np.median(np.linalg.norm(residual_px, axis=1))) / 1.18)
+    weight = min(1.0, INDEPENDENT / len(xyz)) / spread**2
+    J = pose_derivatives(pose, camera, xyz)
+    normal = weight * np.einsum("nki,nkj->ij", J, J)
+    if prior is not None:
+        normal += _known(prior)
+    places = _ground_places(pose, camera, float(np.median(xyz[:, 2])))
+    if not len(places):
+        return 0.0
+    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-12))  # metres and radians
+    values, vectors = np.linalg.eigh(normal * scale[:, None] * scale)
+    half = vectors / np.sqrt(np.maximum(values, 1e-12)) * scale[:, None]
+    at = pose_derivatives(pose, camera, places) @ half
+    return float(np.sqrt((at**2).sum((1, 2)).max()))
+
+
+def pose_derivatives(pose: Pose, camera: Camera, xyz: Array) -> Array:
+    """(n, 2, 6) derivatives of the pixels of points (n, 3) by rotation vector and centre."""
+    local = pose.to_camera(xyz)
+    k = np.broadcast_to(camera.vector, (len(local), len(camera.vector)))
+    d_point = project_with_derivatives(k, local, intrinsics=False).d_point
+    J = np.empty((len(local), 2, 6))
+    J[:, :, :3] = np.cross(local[:, None, :], d_point)
+    J[:, :, 3:] = -d_point @ pose.cam_R_map
+    return J
+
+
+def _known(prior: Prior) -> Array:
+    """(6, 6) information of a photo's metadata about its rotation (camera axes) and centre."""
+    out = np.zeros(6)
+    if np.isfinite(prior.yaw_deg):
+        tilt, yaw = np.radians([prior.sigma_tilt_deg, prior.sigma_yaw_deg])
+        out[:3] = 1 / tilt**2, 1 / tilt**2, 1 / yaw**2
+    known = np.isfinite(prior.map_C) & np.isfinite(prior.sigma_C)
+    out[3:][known] = 1 / prior.sigma_C[known] ** 2
+    return np.diag(out)
+
+
+def _ground_places(pose: Pose, camera: Camera, z: float) -> Array:
+    """(k, 3) places at height z that the picture shows, those seen too flatly left out."""
+    px = GRID * [camera.width - 1, camera.height - 1]
+    ray = rays(camera, px) @ pose.cam_R_map
+    steep = np.hypot(ray[:, 0], ray[:, 1]) < -ray[:, 2] * STEEPEST
+    ray = ray[steep]
+    return np.asarray(pose.map_C + ray * ((z - pose.map_C[2]) / ray[:, 2])[:, None])
+
+
+def without(ties: TiePoints, gone: Mapping[int, str]) -> TiePoints:
+    """Tie points without the observations of photos, and without points seen only once then."""
+    keep = ~np.isin(ties.photo, list(gone))
+    keep &= (np.bincount(ties.point[keep], minlength=len(ties.xyz)) >= 2)[ties.point]
+    points, renumbered = np.unique(ties.point[keep], return_inverse=True)
+    return TiePoints(
+        xyz=ties.xyz[points],
+        point=renumbered.astype(np.int64),
+        photo=ties.photo[keep],
+        px=ties.px[keep],
+        residual_px=ties.residual_px[keep],
+    )

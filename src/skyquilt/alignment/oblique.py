@@ -1,0 +1,236 @@
+"""Oblique photos among vertical ones: they are kept out of the block and hung on it afterwards.
+
+The start of an adjustment takes every photo for a similarity of the ground plane, and a link of an
+oblique photo with a vertical one is a similarity in a small part of both only: such photos would
+bend the block. They are placed by resection on its tie points instead: three points and a check by
+all others (Fischler and Bolles 1981), refined by least squares, the block held.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.determined import weak_photos, why_weak, without
+from skyquilt.alignment.pose import reported_camera
+from skyquilt.geometry.camera import project, undistort
+from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.geometry.neighbours import nearest
+from skyquilt.model.camera import Camera
+from skyquilt.model.features import Features, Link
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Alignment, Pose, Prior, TiePoints
+
+Array = NDArray[np.float64]
+OBLIQUE_DEG = 35.0
+"""Photos tilted by more than this from the vertical are oblique."""
+STATED_DEG = 5.0
+"""Tilts with a larger standard deviation than this are guesses, not reports."""
+MOST_OBLIQUE = 0.4
+"""With a larger share of oblique photos than this the survey itself is oblique, and they are not
+told apart.
+"""
+SAME_PX = 3.0
+"""Distance in px of the image searched for features up to which a keypoint is that of a tie
+point.
+"""
+FEWEST = 12
+"""Fewest tie points that must agree on the pose of a photo."""
+AGREE_PX = 4.0
+"""Largest residual of such a point, in px of the image searched for features."""
+
+
+def tilt_deg(cam_R_map: Array) -> float:
+    """Angle of a photo's axis from the vertical, in degrees."""
+    return float(np.degrees(np.arccos(np.clip(-cam_R_map[2, 2], -1, 1))))
+
+
+def reported_oblique(priors: Sequence[Prior]) -> frozenset[int]:
+    """Photos whose metadata report a large tilt; none if most of them do."""
+    found = [i for i, p in enumerate(priors) if tilted(p)]
+    return frozenset(found if len(found) <= MOST_OBLIQUE * len(priors) else ())
+
+
+def tilted(prior: Prior) -> bool:
+    """Whether a photo's metadata report a large tilt."""
+    R = cam_R_map_from_angles(0.0, prior.pitch_deg, prior.roll_deg)
+    return prior.sigma_tilt_deg <= STATED_DEG and tilt_deg(R) > OBLIQUE_DEG
+
+
+def tilts_reported(priors: Sequence[Prior]) -> bool:
+    """Whether any photo reports its tilt."""
+    return any(p.sigma_tilt_deg <= STATED_DEG for p in priors)
+
+
+def found_oblique(alignment: Alignment, priors: Sequence[Prior]) -> frozenset[int]:
+    """Photos without reported tilt that the adjustment turned far from the vertical, and those that
+    it could not hold; none if most are.
+    """
+    linked = [*alignment.held, *alignment.rejected]
+    found = {i for i in alignment.held if tilt_deg(alignment.poses[i].cam_R_map) > OBLIQUE_DEG}
+    found |= alignment.rejected.keys() | weak_photos(alignment, priors).keys()
+    guessed = {i for i in found if priors[i].sigma_tilt_deg > STATED_DEG}
+    return frozenset(guessed if len(guessed) <= MOST_OBLIQUE * len(linked) else ())
+
+
+def hung(
+    alignment: Alignment,
+    photos: Sequence[Photo],
+    priors: Sequence[Prior],
+    features: Sequence[Features],
+    links: Sequence[Link],
+    aside: frozenset[int],
+) -> Alignment:
+    """The alignment with the photos kept aside placed by its tie points, the best linked first, and
+    without those that hang on it by too little.
+    """
+    weak = weak_photos(alignment, priors)
+    alignment = _without(alignment, weak)
+    left = set(aside)
+    while left:
+        counted = {i: _points_of(i, alignment, features, links) for i in sorted(left)}
+        best = max(sorted(left), key=lambda i: len(counted[i][0]))
+        left.remove(best)
+        alignment = _placed(alignment, best, photos[best], *counted[best], features[best].scale)
+    return alignment
+
+
+def _without(alignment: Alignment, gone: dict[int, str]) -> Alignment:
+    if not gone:
+        return alignment
+    return replace(
+        alignment,
+        poses={i: p for i, p in alignment.poses.items() if i not in gone},
+        blocks=tuple(
+            b for old in alignment.blocks if (b := tuple(i for i in old if i not in gone))
+        ),
+        ties=without(alignment.ties, gone),
+        rejected=alignment.rejected | gone,
+    )
+
+
+def _points_of(
+    photo: int, alignment: Alignment, features: Sequence[Features], links: Sequence[Link]
+) -> tuple[NDArray[np.int64], Array]:
+    """Tie points that a photo's links show it, each once, and their pixels (n, 2) in it."""
+    ties, found = alignment.ties, dict[int, Array]()
+    for link in links:
+        if photo not in (link.a, link.b):
+            continue
+        mine, theirs, other = (
+            (link.index_a, link.index_b, link.b)
+            if link.a == photo
+            else (link.index_b, link.index_a, link.a)
+        )
+        own = np.flatnonzero(ties.photo == other)
+        if not len(own):
+            continue
+        away, at = nearest(ties.px[own], features[other].px[theirs], 1)
+        same = away[:, 0] < SAME_PX * features[other].scale
+        for k in np.flatnonzero(same):
+            found.setdefault(int(ties.point[own[at[k, 0]]]), features[photo].px[mine[k]])
+    return np.array(list(found), np.int64), np.array(list(found.values())).reshape(-1, 2)
+
+
+def _placed(
+    alignment: Alignment,
+    photo: int,
+    about: Photo,
+    point: NDArray[np.int64],
+    px: Array,
+    scale: float,
+) -> Alignment:
+    """The alignment with one more photo, or with the reason why it is left out."""
+    camera = alignment.cameras.get(about.camera_key, reported_camera(about))
+    xyz = alignment.ties.xyz[point]
+    pose, good = resected(camera, xyz, px, AGREE_PX * scale)
+    if pose is None:
+        why = (
+            f"it hangs on the other photos by too little: {int(good.sum())} of {len(px)} tie points"
+            f" agree on its place ({FEWEST} are needed)"
+        )
+        return replace(alignment, rejected=alignment.rejected | {photo: why})
+    error = project(camera, pose.to_camera(xyz)) - px
+    why = why_weak(pose, camera, xyz[good], px[good], error[good], None)
+    if why:
+        return replace(alignment, rejected=alignment.rejected | {photo: why})
+    key = about.camera_key
+    block = int(
+        np.bincount(
+            [
+                next(n for n, b in enumerate(alignment.blocks) if i in b)
+                for i in alignment.ties.photo[np.isin(alignment.ties.point, point[good])]
+            ]
+        ).argmax()
+    )
+    blocks = list(alignment.blocks)
+    blocks[block] = (*blocks[block], photo)
+    return replace(
+        alignment,
+        poses=alignment.poses | {photo: pose},
+        cameras=alignment.cameras | {key: camera},
+        camera_of=alignment.camera_of | {photo: key},
+        blocks=tuple(blocks),
+        ties=_with_observations(alignment.ties, photo, point[good], px[good], error[good]),
+        rejected={i: w for i, w in alignment.rejected.items() if i != photo},
+    )
+
+
+def _with_observations(
+    ties: TiePoints, photo: int, point: NDArray[np.int64], px: Array, error: Array
+) -> TiePoints:
+    points = np.concatenate([ties.point, point])
+    order = np.argsort(points, kind="stable")
+    photos = np.concatenate([ties.photo, np.full(len(point), photo)])
+    return replace(
+        ties,
+        point=points[order],
+        photo=photos[order],
+        px=np.concatenate([ties.px, px])[order],
+        residual_px=np.concatenate([ties.residual_px, error])[order],
+    )
+
+
+def resected(
+    camera: Camera, xyz: Array, px: Array, tolerance_px: float
+) -> tuple[Pose | None, NDArray[np.bool_]]:
+    """The pose of a photo from points (n, 3) in m and their pixels (n, 2), and which of them agree
+    with it; None if too few do.
+    """
+    good = np.zeros(len(px), np.bool_)
+    if len(px) < FEWEST:
+        return None, good
+    middle, flat = xyz.mean(0), undistort(camera, px)
+    cv2.setRNGSeed(0)
+    found, turn, shift, inliers = cv2.solvePnPRansac(
+        (xyz - middle)[:, None],
+        flat[:, None],
+        np.eye(3),
+        None,
+        iterationsCount=3000,
+        reprojectionError=tolerance_px / camera.focal,
+        confidence=0.9999,
+        flags=cv2.SOLVEPNP_SQPNP,
+    )
+    if not found or inliers is None:
+        return None, good
+    for _ in range(3):
+        good = np.zeros(len(px), np.bool_) if inliers is None else good
+        good[inliers.ravel()] = True
+        if good.sum() < FEWEST:
+            return None, good
+        turn, shift = cv2.solvePnPRefineLM(
+            (xyz - middle)[good][:, None], flat[good][:, None], np.eye(3), None, turn, shift
+        )
+        R = np.asarray(cv2.Rodrigues(turn)[0], np.float64)
+        pose = Pose(cam_R_map=R, map_C=middle - R.T @ shift.ravel())
+        error = np.linalg.norm(project(camera, pose.to_camera(xyz)) - px, axis=1)
+        now = np.flatnonzero(error < tolerance_px)
+        good = np.zeros(len(px), np.bool_)
+        inliers = now
+    good[inliers] = True
+    if good.sum() < FEWEST or pose.map_C[2] < np.median(xyz[good, 2]):
+        return None, good
+    return pose, good

@@ -1,0 +1,166 @@
+"""Weak and oblique photos, resection and levelling, on points with known poses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skyquilt.alignment.determined import deviation_px, weak_photos
+from skyquilt.alignment.dominant_plane import dominant_normal, levelled
+from skyquilt.alignment.oblique import reported_oblique, resected, tilt_deg
+from skyquilt.geometry.camera import project, rays
+from skyquilt.geometry.frames import cam_R_map_from_angles, rotation_from_vector
+from skyquilt.model.camera import Camera
+from skyquilt.model.poses import Alignment, MapFrame, Pose, TiePoints
+from tests.alignment.surveys import prior
+
+CAMERA = Camera(width=1000, height=750, focal=830.0, cx=505.0, cy=371.0, k1=-0.08, k2=0.03)
+LOCAL = MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="unknown")
+
+
+def pose(x, y, *, z=60.0, yaw=0.0, pitch=0.0, roll=0.0):
+    return Pose(cam_R_map=cam_R_map_from_angles(yaw, pitch, roll), map_C=np.array([x, y, z]))
+
+
+def hills(count, seed=0, wide=80.0):
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(-wide, wide, (count, 2)), rng.normal(0, 2, count)])
+
+
+def seen(where, xyz):
+    local = where.to_camera(xyz)
+    px = project(CAMERA, np.where(local[:, 2:] > 1, local, [0, 0, -1]))
+    good = ((px > 5) & (px < [994, 744])).all(1)
+    return px, good
+
+
+def block(poses, xyz, *, shows=None):
+    """An alignment in which every photo sees the points that fall into it (`shows` may forbid)."""
+    rows = []
+    for i, where in enumerate(poses):
+        px, good = seen(where, xyz)
+        if shows and i in shows:
+            good &= shows[i](px, xyz)
+        rows += [(p, i, *px[p]) for p in np.flatnonzero(good)]
+    rows.sort()
+    point, photo, u, v = np.array(rows).T
+    often = np.bincount(point.astype(int), minlength=len(xyz)) >= 2
+    keep = often[point.astype(int)]
+    noise = np.random.default_rng(1).normal(0, 0.3, (keep.sum(), 2))
+    ties = TiePoints(
+        xyz=xyz,
+        point=point[keep].astype(np.int64),
+        photo=photo[keep].astype(np.int64),
+        px=np.column_stack([u, v])[keep],
+        residual_px=noise,
+    )
+    return Alignment(
+        method="bundle",
+        why="",
+        frame=LOCAL,
+        poses=dict(enumerate(poses)),
+        cameras={"c": CAMERA},
+        camera_of=dict.fromkeys(range(len(poses)), "c"),
+        blocks=(tuple(range(len(poses))),),
+        ties=ties,
+    )
+
+
+LAWN = [pose(x, y) for y in (-30, 0, 30) for x in (-40, -20, 0, 20, 40)]
+NOTHING = replace(prior((np.nan,) * 3), yaw_deg=np.nan)
+
+
+def test_a_sound_block_has_no_weak_photo():
+    assert weak_photos(block(LAWN, hills(3000)), [NOTHING] * 15) == {}
+
+
+def test_a_photo_held_by_a_small_corner_is_named_with_figures():
+    corner = {14: lambda px, xyz: (px < 160).all(1)}
+    found = weak_photos(block(LAWN, hills(6000), shows=corner), [NOTHING] * 15)
+    assert list(found) == [14]
+    assert "hangs on the other photos by too little" in found[14]
+    assert "% of its picture" in found[14]
+    told = [prior((np.nan,) * 3)] * 14 + [prior((40, 30, 60.0), sigma=0.1, sigma_z=0.1)]
+    assert weak_photos(block(LAWN, hills(6000), shows=corner), told) == {}
+
+
+def test_photos_that_only_hold_each_other_are_weak_together():
+    """Three photos with hundreds of points in common, one of which shares a corner with the rest:
+    however well they agree with one another, nothing holds them.
+    """
+    apart = [pose(130 + 8 * k, 60) for k in range(3)]
+    xyz = np.concatenate([hills(3000), hills(2000, 3, 40.0) + [135, 60, 0]])
+    first = len(LAWN)
+    own = {k: lambda px, xyz: xyz[:, 0] > 90 for k in (first + 1, first + 2)}
+    own[first] = lambda px, xyz: (xyz[:, 0] > 90) | (np.arange(len(xyz)) % 400 == 0)
+    found = weak_photos(block([*LAWN, *apart], xyz, shows=own), [NOTHING] * (first + 3))
+    assert sorted(found) == [first, first + 1, first + 2]
+
+
+@pytest.mark.parametrize("wide", [1.0, 0.15])
+def test_the_deviation_is_the_scatter_of_resections(wide):
+    where, xyz = pose(0, 0, pitch=12, roll=-5), hills(5000)
+    px, good = seen(where, xyz)
+    good &= (np.abs(px - [500, 375]) < wide * np.array([500, 375])).all(1)
+    xyz, px = xyz[good][:40], px[good][:40]
+    rng = np.random.default_rng(4)
+    sigma = 0.8
+    rim = np.array([[20.0, 15], [980, 15], [980, 735], [20, 735]])
+    ray = rays(CAMERA, rim) @ where.cam_R_map
+    far = where.map_C - ray * (60 / ray[:, 2])[:, None]
+    there = project(CAMERA, where.to_camera(far))
+    moved = []
+    for _ in range(150):
+        again, _ = resected(CAMERA, xyz, px + rng.normal(0, sigma, px.shape), 20.0)
+        moved.append(np.linalg.norm(project(CAMERA, again.to_camera(far)) - there, axis=1))
+    real = np.sqrt((np.array(moved) ** 2).mean(0)).max()
+    told = deviation_px(where, CAMERA, xyz, rng.normal(0, sigma, px.shape), None)
+    assert real / 1.5 < told < 1.5 * real
+
+
+@pytest.mark.parametrize("pitch", [0.0, 45.0, 72.0])
+def test_resection_finds_the_pose_among_wrong_points(pitch):
+    where, xyz = pose(3, -20, yaw=33, pitch=pitch, roll=4), hills(4000, wide=200)
+    px, good = seen(where, xyz)
+    xyz, px = xyz[good][:300], px[good][:300]
+    rng = np.random.default_rng(7)
+    px = px + rng.normal(0, 0.5, px.shape)
+    wrong = rng.random(len(px)) < 0.4
+    px[wrong] = rng.uniform(0, 700, (wrong.sum(), 2))
+    found, agreed = resected(CAMERA, xyz, px, 4.0)
+    assert np.linalg.norm(found.map_C - where.map_C) < 0.6
+    assert agreed[~wrong].mean() > 0.98
+    assert agreed[wrong].mean() < 0.05
+    none, _ = resected(CAMERA, xyz, rng.uniform(0, 700, px.shape), 4.0)
+    assert none is None
+
+
+def test_reported_tilts():
+    level, slanting = prior((0, 0, 60.0)), prior((0, 0, 60.0), pitch=60)
+    assert reported_oblique([level] * 8 + [slanting] * 3) == {8, 9, 10}
+    assert reported_oblique([level] * 3 + [slanting] * 8) == frozenset()  # an oblique survey
+    assert tilt_deg(cam_R_map_from_angles(80, 30, 40)) == pytest.approx(
+        np.degrees(np.arccos(np.cos(np.radians(30)) * np.cos(np.radians(40))))
+    )
+
+
+def test_the_dominant_plane_levels_the_map_whatever_stands_on_it():
+    xyz = hills(2000)
+    xyz[:, 2] *= 0.3
+    xyz[:700, 2] += np.random.default_rng(3).uniform(4, 15, 700)  # trees
+    done = block(LAWN, xyz)
+    Q = rotation_from_vector(np.array([0.2, -0.15, 0.0]))
+    tilted = replace(
+        done,
+        poses={
+            i: Pose(cam_R_map=p.cam_R_map @ Q.T, map_C=Q @ p.map_C) for i, p in done.poses.items()
+        },
+        ties=replace(done.ties, xyz=xyz @ Q.T),
+    )
+    again = levelled(tilted)
+    assert np.degrees(np.arccos(dominant_normal(again.ties.xyz, 1.8)[2])) < 0.05
+    assert max(tilt_deg(p.cam_R_map) for p in again.poses.values()) < 0.4
+    for i, where in again.poses.items():  # nothing in the pictures changes
+        before = project(CAMERA, tilted.poses[i].to_camera(tilted.ties.xyz[:50]))
+        after = project(CAMERA, where.to_camera(again.ties.xyz[:50]))
+        np.testing.assert_allclose(after, before, atol=1e-6)

@@ -1,0 +1,211 @@
+"""Rolling shutters: rows that are exposed from different places. The oracle is the simulator's own
+projection, which finds each row's moment by iteration and shares no code with the adjustment.
+"""
+
+from dataclasses import replace
+from datetime import datetime, timedelta
+
+import numpy as np
+import pytest
+
+from skyquilt.alignment.adjust import adjust, covariance
+from skyquilt.alignment.motion import velocities
+from skyquilt.alignment.problem import READOUT, Problem, State, residuals_px
+from skyquilt.alignment.triangulate import polish, triangulated
+from skyquilt.imaging.views import View, on_ground, project_all, project_nodes
+from skyquilt.model.camera import Camera
+from skyquilt.model.poses import Motion, Pose
+from skyquilt.model.surface import Surface
+from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.flight import Shot, Waypoint, fly, plan
+from skyquilt.simulate.settings import Route
+from tests.alignment.surveys import photo
+
+LENS = Lens(width=1600, height=1200, aspect=1.002, readout=0.030)
+SPEED = 10.0
+
+
+def shots(seed=0, *, fixed_yaw=True, turns=0.0, photos=24, lens=LENS):
+    route = Route(
+        photos=photos, height=40.0, speed=SPEED, fixed_yaw=fixed_yaw, turns=turns, tilt_noise=1.0
+    )
+    return fly(plan(route, lens), route, 0.0, seed, "T")
+
+
+def vector(lens):
+    terms = (lens.k1, lens.k2, lens.k3, lens.p1, lens.p2, lens.aspect, lens.readout)
+    return np.array([lens.focal, lens.cx, lens.cy, *terms])
+
+
+def block(seed=0, *, noise=0.1, lens=LENS, **options):
+    """Problem and truth of a flight seen through the simulator's camera."""
+    rng = np.random.default_rng(seed)
+    flown = shots(seed, lens=lens, **options)
+    C = np.array([s.centre for s in flown])
+    xy = rng.uniform(C[:, :2].min(0) - 15, C[:, :2].max(0) + 15, (900, 2))
+    X = np.column_stack([xy, 2 * np.sin(xy[:, 0] / 9) + rng.uniform(0, 3, len(xy))])
+    rows = []
+    for i, shot in enumerate(flown):
+        px = shot.project(lens, X)
+        inside = (px > 3).all(1) & (px[:, 0] < lens.width - 4) & (px[:, 1] < lens.height - 4)
+        rows += [(p, i, *px[p]) for p in np.flatnonzero(inside)]
+    table = np.array(sorted(rows))
+    point, photos, px = table[:, 0].astype(int), table[:, 1].astype(int), table[:, 2:]
+    keep = np.bincount(point, minlength=len(X))[point] >= 2
+    used, point = np.unique(point[keep], return_inverse=True)
+    photos, px = photos[keep], px[keep] + rng.normal(0, noise, (int(keep.sum()), 2))
+    n, sigma_K = len(flown), [13.0, 8, 8, 0.02, 0.02, 0.01, 2e-3, 2e-3, 3e-3, 0.015]
+    spins = np.radians([s.spin for s in flown]) * lens.readout
+    R = np.array([s.rotation for s in flown])
+    truth = State(R=R, C=C, K=vector(lens)[None], X=X[used], turn=spins)
+    problem = Problem(
+        point=point,
+        photo=photos,
+        px=px,
+        sigma_px=np.full(len(px), max(noise, 0.05)),
+        camera=np.zeros(n, int),
+        free=np.ones((1, 10), bool),
+        K0=vector(lens)[None] + rng.normal(0, sigma_K) * (noise > 0),
+        sigma_K=np.array([sigma_K]),
+        C0=C + rng.normal(0, 1.0, C.shape) * (noise > 0),
+        sigma_C=np.full(C.shape, 1.0),
+        R0=R,
+        sigma_R=np.full(C.shape, np.radians(1.0)),
+        X0=np.full((len(used), 3), np.nan),
+        sigma_X=np.ones((len(used), 3)),
+        share=px[:, 1] / (lens.height - 1) - 0.5,
+        velocity=np.array([s.velocity for s in flown]),
+        loss_px=1e6,
+        loss_C=1e6,
+        loss_R=1e6,
+    )
+    return problem, truth, flown
+
+
+@pytest.mark.parametrize("turns", [0.0, 5.0])
+def test_residuals_are_those_of_a_camera_that_moves_while_it_reads(turns):
+    problem, truth, _ = block(noise=0.0, turns=turns)
+    off = np.abs(residuals_px(problem, truth)).max()
+    assert off < (1e-6 if turns == 0 else 0.02)  # turns enter linearly
+    still = replace(truth, K=np.where(np.arange(10) == READOUT, 0.0, truth.K))
+    assert np.abs(residuals_px(problem, still)).max() > 4.0  # the readout shifts rows by 5 px
+
+
+def test_points_are_found_from_moving_cameras():
+    problem, truth, _ = block(noise=0.0, turns=5.0)
+    found, _ = polish(problem, triangulated(problem, truth))
+    assert np.abs(found.X - truth.X).max() < 0.01
+    first = np.linalg.norm(triangulated(problem, truth).X - truth.X, axis=1)
+    assert np.median(first) < 0.01
+
+
+def test_the_readout_is_determined_where_lines_go_both_ways_without_turning():
+    errors = []
+    for seed in range(4):
+        problem, truth, _ = block(seed)
+        start = replace(truth, C=problem.C0, K=problem.K0.copy())
+        found = adjust(problem, start, iterations=40, tolerance=1e-9).state
+        sigma = float(np.sqrt(covariance(problem, found)[-1, -1]))
+        assert sigma < 0.1 * LENS.readout  # far below its prior of half the readout
+        errors.append((found.K[0, READOUT] - LENS.readout) / sigma)
+    assert np.sqrt(np.mean(np.square(errors))) < 2.2
+
+
+def test_a_drone_that_turns_with_its_lines_leaves_readout_and_aspect_to_their_priors():
+    problem, truth, _ = block(fixed_yaw=False)
+    start = replace(truth, C=problem.C0, K=problem.K0.copy())
+    found = adjust(problem, start, iterations=40, tolerance=1e-9).state
+    full = covariance(problem, found)
+    sigma, shape = np.sqrt(full[-1, -1]), np.sqrt(full[-2, -2])
+    assert full[-1, -2] / sigma / shape < -0.6  # one makes up for the other
+    other, truth, _ = block(fixed_yaw=True)
+    start = replace(truth, C=other.C0, K=other.K0.copy())
+    found = adjust(other, start, iterations=40, tolerance=1e-9).state
+    assert sigma > 3 * np.sqrt(covariance(other, found)[-1, -1])
+
+
+def test_turns_are_found_beside_readout():
+    problem, truth, _ = block(turns=5.0, noise=0.05)
+    spread = np.full(len(truth.C), np.radians(5.0) * LENS.readout)
+    start = replace(truth, C=problem.C0, K=problem.K0.copy(), turn=np.zeros_like(truth.turn))
+    found = adjust(replace(problem, sigma_turn=spread), start, iterations=40, tolerance=1e-9).state
+    missed = found.turn - truth.turn
+    assert np.sqrt((missed**2).mean()) < 0.35 * np.sqrt((truth.turn**2).mean())
+
+
+@pytest.mark.parametrize("turns", [0.0, 4.0])
+def test_pictures_are_drawn_and_read_where_their_rows_saw_the_ground(turns):
+    flown = shots(2, turns=turns)
+    z = np.zeros((3, 3), np.float32)
+    level = Surface(z=z, x0=-500.0, y0=-500.0, cell=500.0, source="plane")
+    camera = Camera(
+        width=LENS.width,
+        height=LENS.height,
+        **dict(zip(("focal", "cx", "cy"), vector(LENS)[:3], strict=True)),
+        k1=LENS.k1,
+        k2=LENS.k2,
+        p1=LENS.p1,
+        p2=LENS.p2,
+        aspect=LENS.aspect,
+        readout_s=LENS.readout,
+    )
+    views, truth = [], []
+    for shot in flown[:3]:
+        motion = Motion(
+            shift_m=np.array(shot.velocity) * LENS.readout,
+            turn_rad=np.radians(shot.spin) * LENS.readout,
+        )
+        pose = Pose(cam_R_map=shot.rotation, map_C=shot.place, motion=motion)
+        views.append(View(photo=0, camera=camera, pose=pose, footprint=np.zeros((4, 2))))
+    x, y = np.meshgrid(np.linspace(-12, 12, 9), np.linspace(10, -10, 7))
+    x, y = x + flown[1].centre[0], y + flown[1].centre[1]
+    z = np.zeros_like(x)
+    ground = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+    together = project_all(views, x, y, z)
+    for view, shot, nodes in zip(views, flown, together, strict=False):
+        truth = shot.project(LENS, ground)
+        inside = ((truth > 0) & (truth < [LENS.width - 1, LENS.height - 1])).all(1)
+        assert inside.sum() > 10
+        for found in (nodes, project_nodes(view, x, y, z)):
+            px = np.column_stack([found.u.ravel(), found.v.ravel()])
+            assert np.abs(px - truth)[inside].max() < 0.02
+        back = on_ground(view, truth[inside], level)
+        assert np.abs(back - ground[inside]).max() < 0.002
+
+
+def test_velocities_follow_from_positions_and_times():
+    flown = shots(3, fixed_yaw=False, photos=40)
+    began = datetime(2026, 5, 1, 12)
+    named = [replace(photo(s.name), time=began + timedelta(seconds=s.waypoint.time)) for s in flown]
+    C = np.array([s.centre for s in flown])
+    true = np.array([s.velocity for s in flown])
+    found = velocities(named, C)
+    off = np.linalg.norm(found - true, axis=1) / SPEED
+    assert np.median(off) < 0.04 and off.max() < 0.15  # positions stray by half a metre from a line
+    stopping = [replace(p, velocity_ned=(0.0, 0.1, 0.0)) for p in named]
+    assert np.abs(velocities(stopping, C)).max() <= 0.1  # it slows down for its photos
+    assert not velocities([replace(p, time=None) for p in named], C).any()
+
+
+def test_whole_seconds_still_tell_the_speed():
+    flown = shots(3, fixed_yaw=True, photos=40)
+    began = datetime(2026, 5, 1, 12)
+    named = [
+        replace(photo(s.name), time=began + timedelta(seconds=int(s.waypoint.time))) for s in flown
+    ]
+    true = np.array([s.velocity for s in flown])
+    found = velocities(named, np.array([s.centre for s in flown]))
+    assert np.median(np.linalg.norm(found - true, axis=1)) < 0.15 * SPEED
+
+
+def test_a_shot_that_stands_still_is_projected_as_ever():
+    shot = Shot(
+        name="a",
+        waypoint=Waypoint(x=0, y=0, heading=0, line=0),
+        centre=(0.0, 0.0, 50.0),
+        yaw=10.0,
+        pitch=1.0,
+        roll=2.0,
+    )
+    X = np.array([[3.0, 4.0, 0.0]])
+    assert (shot.project(LENS, X) == LENS.project(X, shot.rotation, shot.place)).all()
