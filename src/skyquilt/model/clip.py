@@ -139,6 +139,8 @@ class ChosenFrames:
 
     clip: str
     """Clip.name."""
+    fps: float
+    """Clip.fps."""
     looked: int
     """Frames looked at."""
     chosen: tuple[ChosenFrame, ...]
@@ -157,3 +159,7 @@ class ChosenFrames:
     """`turns`, `option`, `clock` or `none`."""
     placed: int = 0
     """Chosen frames that got a position."""
+
+    def name(self, frame: ChosenFrame) -> str:
+        """The name of a frame in the survey: the clip's, and the number of the frame."""
+        return f"{self.clip}.{round(frame.time_s * self.fps):06d}"

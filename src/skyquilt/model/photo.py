@@ -7,18 +7,13 @@ from typing import TYPE_CHECKING, Literal
 
 from skyquilt.model.camera import Camera
 
-<<<<<<< HEAD
 if TYPE_CHECKING:
     from skyquilt.model.clip import Clip
 
-Datum = Literal["takeoff", "sea_level", "ellipsoid", "control", "unknown"]
-"""What a height refers to; `control`: the same zero as the heights of the control points."""
-=======
 Datum = Literal["takeoff", "sea_level", "egm96", "ellipsoid", "control", "unknown"]
 """What a height refers to; `egm96`: the geoid; `sea_level`: sea level as the device defines it;
 `control`: the same zero as the heights of the control points.
 """
->>>>>>> main
 
 
 Stored = Literal["", "celsius", "kelvin", "decikelvin", "centikelvin", "counts"]

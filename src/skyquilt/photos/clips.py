@@ -130,11 +130,10 @@ def frames_of(clip: Clip, chosen: ChosenFrames, *, number: int, use_track: bool)
     photos = []
     for i, frame in enumerate(chosen.chosen):
         when = float(there[i])
-        index = round(frame.time_s * clip.fps)
         key = f"{clip.digest}|{frame.time_s:.6f}"
         photos.append(
             Photo(
-                name=f"{clip.name}.{index:06d}",
+                name=chosen.name(frame),
                 path=clip.path,
                 frame_s=frame.time_s,
                 digest=hashlib.blake2b(key.encode(), digest_size=16).hexdigest(),

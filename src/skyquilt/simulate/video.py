@@ -221,7 +221,8 @@ def _bracketed(
         lens = ""
         if mm is not None:
             lens = f"[focal_len : {10 * mm:.0f}] " if tenths else f"[focal_len: {mm:.2f}] "
-        place = f"[latitude{spelt}{fix.latitude or 0:.6f}] [{longitude}{spelt}{fix.longitude or 0:.6f}] "
+        place = f"[latitude{spelt}{fix.latitude or 0:.6f}]"
+        place += f" [{longitude}{spelt}{fix.longitude or 0:.6f}] "
         up = {
             "both": f"[rel_alt: {here.takeoff or 0:.3f} abs_alt: {here.sea_level or 0:.3f}]",
             "sea": f"[altitude: {here.sea_level or 0:.6f}]",

@@ -52,6 +52,7 @@ class FrameChoice:
         still = looks.linked & (np.maximum(moved, turned) < STILL_PX)
         return ChosenFrames(
             clip=clip.name,
+            fps=clip.fps,
             looked=len(looks.time_s),
             chosen=tuple(chosen),
             blurred=int((sharp < -self.blur).sum()),

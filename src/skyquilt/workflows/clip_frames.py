@@ -2,8 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import simplejpeg
 
 from skyquilt.engine.clock import Steps
+from skyquilt.engine.folder import refusal
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import NoPhotosError, UnreadablePhotoError
 from skyquilt.model.clip import ChosenFrames, Clip, Looks
@@ -17,6 +21,7 @@ from skyquilt.video.clock import Offset, OffsetSearch
 from skyquilt.video.decoder import Decoder
 from skyquilt.video.looks import Looker, joined
 from skyquilt.video.positions import clip_zero
+from skyquilt.workflows.photo_features import PhotoPixels
 from skyquilt.workflows.survey_input import SurveyInput, completed
 
 _REACH_S = 60.0
@@ -89,6 +94,25 @@ def with_frames(given: SurveyInput, settings: InputSettings, store: Store) -> St
     )
     yield from (Note(text=n) for n in (*notes, *more))
     return completed(replace(given, survey=survey, clips=tuple(told)), settings)
+
+
+def write_frames(output: Path, photos: Sequence[Photo], pixels: PhotoPixels) -> Steps[None]:
+    """Writes the frames among the photos to `output/frames`, as JPEG without metadata.
+
+    Raises:
+        OutputError: the disk is full or read-only.
+    """
+    frames = [(i, p) for i, p in enumerate(photos) if p.frame_s is not None]
+    folder = output / "frames"
+    for done, (index, photo) in enumerate(frames, 1):
+        path = folder / f"{photo.name}.jpg"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            data = simplejpeg.encode_jpeg(pixels(index), quality=95, colorsubsampling="444")
+            path.write_bytes(data)
+        except OSError as error:
+            raise refusal(folder, error) from error
+        yield done, len(frames)
 
 
 def _looks_in(clip: Clip, look: Looker) -> int:

@@ -23,13 +23,14 @@ from skyquilt.model.event import Event, Note, Result
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.orthomosaic import SPOOL
 from skyquilt.ortho.radiometry import value_figures
+from skyquilt.quality.clip_figures import clip_figures
 from skyquilt.quality.placement import placement_quality
 from skyquilt.quality.run_metrics import figures
 from skyquilt.quality.seam_measurement import MeasuredSeams, measure_seams
 from skyquilt.settings import MosaicSettings
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
-from skyquilt.workflows.clip_frames import frame_methods
+from skyquilt.workflows.clip_frames import frame_methods, write_frames
 from skyquilt.workflows.flow import (
     AlignedPhotos,
     DrawnMap,
@@ -171,13 +172,17 @@ def make_map(
     ground = yield from find_ground(aligned, methods, settings, clock)
     drawn = yield from draw_map(aligned, ground, methods, settings, clock, run.path, key)
     measuring = _measured(aligned, ground, drawn, settings)
+    if settings.input.write_frames:
+        yield from clock.stage(
+            "write frames", write_frames(run.path, aligned.photos, aligned.pixels), keeps=False
+        )
     seams, quality = yield from clock.stage("measure", measuring, keeps=False)
     metrics = _metrics(aligned, ground, drawn, seams, settings) | {"quality": quality}
     finishing = finish_run(run.path, aligned, ground, drawn.drawn, seams, metrics, settings, clock)
     metrics = yield from clock.stage("report", finishing)
     run.mark("done")
     result = Result(output=run.path, metrics=metrics)
-    return FinishedMap(result=result, given=given, methods=methods, settings=settings)
+    return FinishedMap(result=result, given=aligned.given, methods=methods, settings=settings)
 
 
 def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> str:
@@ -248,6 +253,7 @@ def _metrics(
                 aligned.photos, aligned.given.control, alignment.frame.vertical_datum
             )
         }
+        | clip_figures(aligned.given.clips)
         | value_figures(aligned.photos, map_.exposure, settings.picture)
     )
 
