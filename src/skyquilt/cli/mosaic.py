@@ -226,8 +226,8 @@ def command(
         str | None,
         option(
             RUN,
-            "Make everything anew from this stage on: features, links, align, surface, balance,"
-            " mosaic, measure, report.",
+            "Make everything anew from this stage on: frames (of videos), features, links, align,"
+            " surface, balance, mosaic, measure, report.",
         ),
     ] = None,
     quiet: Annotated[bool, option(RUN, "Say nothing but errors.", "--quiet", "-q")] = False,

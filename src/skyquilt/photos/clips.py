@@ -17,7 +17,6 @@ from skyquilt.video.read import read_clip
 from skyquilt.video.tracks import TRACK_ENDINGS, Fix, is_timed_csv, merged, read_track, track_of
 
 _PHOTOS = frozenset({".jpg", ".jpeg", ".tif", ".tiff", ".png"})
-_UNKNOWN = datetime(1970, 1, 1)
 
 
 def is_timed(side: Path) -> bool:
@@ -126,7 +125,8 @@ def frames_of(clip: Clip, chosen: ChosenFrames, *, number: int, use_track: bool)
     if track is not None:
         there = times + clip_zero(track, clip) + chosen.offset_s
         places = places_at(track, there)
-    start = clip.start.replace(tzinfo=None) if clip.start else _UNKNOWN + timedelta(days=number)
+    unknown = datetime(1970, 1, 1) + timedelta(days=number)
+    start = clip.start.replace(tzinfo=None) if clip.start else unknown
     photos = []
     for i, frame in enumerate(chosen.chosen):
         when = float(there[i])

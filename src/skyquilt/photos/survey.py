@@ -155,7 +155,9 @@ def read_survey(
     return Survey(
         photos=photos,
         rejected=tuple(sorted((*rejected, *copies), key=lambda r: r.name)),
-        ignored=found.ignored if clips else (*found.ignored, *(n for n, _ in found.clips)),
+        ignored=found.ignored
+        if clips
+        else tuple(sorted((*found.ignored, *(n for n, _ in found.clips)))),
         clips=films,
         notes=(*notes, *_run_notes(found), *implausible, *survey_notes(photos, len(copies))),
     )

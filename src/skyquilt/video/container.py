@@ -9,7 +9,6 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import BinaryIO
 
-_EPOCH = datetime(1904, 1, 1, tzinfo=UTC)
 _INSIDE = (b"moov", b"trak", b"mdia", b"udta", b"meta", b"ilst")
 _MOST_BOXES = 4000
 _MODEL = re.compile(rb"(?:DJI|FC|Hasselblad|Autel|Parrot|GoPro|HERO)[ -~]{0,30}")
@@ -79,7 +78,7 @@ def _created(data: bytes) -> datetime | None:
     long_ = data[0] == 1 and len(data) >= 20
     seconds = struct.unpack(">Q", data[4:12])[0] if long_ else struct.unpack(">I", data[4:8])[0]
     # cameras whose clock is not set write 0 or dates of the eighties
-    moment = _EPOCH + timedelta(seconds=min(seconds, 2**33))
+    moment = datetime(1904, 1, 1, tzinfo=UTC) + timedelta(seconds=min(seconds, 2**33))
     return moment if moment.year >= 2000 else None
 
 
