@@ -108,7 +108,7 @@ class Looks:
     time_s: Doubles
     """(n,) times in s from the first frame."""
     sharp: Doubles
-    """(n,) logarithm of the finest detail against detail of twice the size; greater is sharper."""
+    """(n,) logarithm of fine detail against detail of four times the size; greater is sharper."""
     turn: Doubles
     """(n,) complex: rotation and scale from this look to the one before."""
     shift: Doubles

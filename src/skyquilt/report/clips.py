@@ -53,7 +53,7 @@ def clips_section(data: ReportInput) -> tuple[Section, ...]:
         head=("Frame", "Time, s", "Overlap with the one before", "Sharpness", "Why"),
         rows=tuple(_frame(f) for f in frames[:MOST_ROWS]),
         numeric="cnnnt",
-        note="Sharpness: logarithm of fine detail against that of the looks around; below -0.25"
+        note="Sharpness: logarithm of fine detail against that of the looks around; below -0.3"
         " counts as blurred."
         + (
             f" {count(len(frames) - MOST_ROWS, 'frame')} more in metrics.json."

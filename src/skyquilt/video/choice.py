@@ -30,9 +30,9 @@ class FrameChoice:
     """As share of the wanted advance."""
     latest: float = 1.35
     """As share of the wanted advance."""
-    blur: float = 0.25
+    blur: float = 0.3
     """Logarithm of the sharpness."""
-    around: int = 100
+    around: int = 50
     """Looks on each side."""
     version: int = 1
     """Changes when the results do."""

@@ -37,20 +37,21 @@ class OffsetSearch:
     """Compares displacements over a few seconds at all offsets.
 
     At each offset the displacements of the track, as complex numbers, are fitted by those of the
-    pictures times one complex factor (rotation and scale): 1 - |<w, v>|^2 / (<w, w> <v, v>) is the
-    share that is left. With n independent displacements, n ln(share) is twice the negative
-    logarithm of the likelihood.
+    pictures times one complex factor (rotation and scale), and by those of a point fixed to the
+    drone: the middle of a picture is not the point below the drone where the camera is tilted. The
+    share of the track's motion that is left, with n independent displacements, gives n ln(share)
+    as twice the negative logarithm of the likelihood.
     """
 
     grid_s: float = 0.2
     """Step of the search."""
-    half_s: float = 1.5
+    half_s: float = 3.0
     """Displacements are taken from so long before to so long after."""
     inside: float = 0.6
     """Share of the clip that positions must cover."""
     apart_s: float = 2.0
     """Offsets further apart than this are different answers."""
-    certain: float = 9.0
+    certain: float = 18.0
     """Least difference of twice the log-likelihood to any different answer."""
     version: int = 1
     """Changes when the results do."""
@@ -60,8 +61,11 @@ class OffsetSearch:
         too little moves or overlaps.
         """
         t = np.arange(0, float(looks.time_s[-1]) + 1e-9, self.grid_s)
-        image = _displacements(*_image_path(looks), t, self.half_s)
-        if np.isfinite(image).sum() < 20:
+        path, heading = _image_path(looks)
+        image = np.stack(
+            [_displacements(looks.time_s, p, t, self.half_s) for p in (path, heading)], axis=1
+        )
+        if np.isfinite(image[:, 0]).sum() < 20:
             return None
         low, high = float(track.height_time_s[0]), float(track.height_time_s[-1])
         first = max(zero_s - reach_s, low - t[-1])
@@ -86,7 +90,7 @@ class OffsetSearch:
         return self._judged(offsets[: len(share)], share, image, moved)
 
     def _judged(self, offsets: Array, share: Array, image: Complex, moved: Complex) -> Offset:
-        n = max(np.isfinite(image).sum() * self.grid_s / (2 * self.half_s), 1.0)
+        n = max(np.isfinite(image[:, 0]).sum() * self.grid_s / self.half_s * 2, 1.0)
         best = int(np.nanargmin(share))
         fit = n * np.log(np.maximum(share, 1e-6))
         near, sigma = _parabola(offsets, fit, best)
@@ -109,11 +113,16 @@ class OffsetSearch:
         )
 
 
-def _image_path(looks: Looks) -> tuple[Array, Complex]:
-    """Times and path (n,) of the middle of the picture on the ground, in px of the first picture;
-    x to the right and y up. NaN starts a new path.
+def _image_path(looks: Looks) -> tuple[Complex, Complex]:
+    """Path (n,) of the middle of the picture on the ground, in px of the first picture, x to the
+    right and y up; and the direction of the picture there, of length 1. NaN outside the longest
+    unbroken run of looks.
+
+    Changes of scale are not accumulated: flights that map keep their height, and the small errors
+    of many looks would add up.
     """
     path = np.zeros(len(looks.time_s), np.complex128)
+    heading = np.ones(len(path), np.complex128)
     run = np.zeros(len(path), np.int64)
     turn, at = 1 + 0j, 0j
     for i in range(1, len(path)):
@@ -121,10 +130,11 @@ def _image_path(looks: Looks) -> tuple[Array, Complex]:
             turn, at = 1 + 0j, 0j
             run[i:] += 1
         at += turn * looks.shift[i]
-        turn *= looks.turn[i]
-        path[i] = at
+        turn *= looks.turn[i] / abs(looks.turn[i])
+        path[i], heading[i] = at, turn
     longest = np.bincount(run).argmax() if len(run) else 0
-    return looks.time_s, np.where(run == longest, path.conj(), np.nan)
+    known = run == longest
+    return np.where(known, path.conj(), np.nan), np.where(known, heading.conj(), np.nan)
 
 
 def _displacements(time: Array, path: Complex, t: Array, half: float) -> Complex:
@@ -152,12 +162,20 @@ def _track_displacements(track: Track, t: Array, half: float) -> Complex:
 
 
 def _misfit(image: Complex, moved: Complex, inside: float) -> float:
-    known = np.isfinite(image) & np.isfinite(moved)
-    if known.sum() < max(inside * np.isfinite(image).sum(), 15):
+    """Share of the motion v (n,) that is not explained by columns of `image` (n, 2)."""
+    known = np.isfinite(image[:, 0]) & np.isfinite(moved)
+    if known.sum() < max(inside * np.isfinite(image[:, 0]).sum(), 15):
         return float("nan")
     w, v = image[known], moved[known]
-    power = float(np.vdot(w, w).real * np.vdot(v, v).real)
-    return 1.0 - float(abs(np.vdot(w, v))) ** 2 / power if power > 0 else float("nan")
+    power = float(np.vdot(v, v).real)
+    if power <= 0:
+        return float("nan")
+    gram, both = w.conj().T @ w, w.conj().T @ v
+    # a hair of ridge: a flight without a turn tells nothing of the second column
+    gram += 1e-6 * np.trace(gram).real * np.diag([0.0, 1.0])
+    if abs(gram[0, 0]) <= 0:
+        return float("nan")
+    return 1.0 - float(np.vdot(both, np.linalg.solve(gram, both)).real) / power
 
 
 def _parabola(x: Array, y: Array, best: int) -> tuple[float, float]:

@@ -1,7 +1,7 @@
 """Looks through a clip: how sharp its frames are and how far the ground moved between them.
 
 Each look costs, beside its decoding, a reduced grey picture, the finest detail of a few patches at
-full size, and some 150 corners that are tracked from look to look (Lucas and Kanade 1981, in
+full size, and some 300 corners that are tracked from look to look (Lucas and Kanade 1981, in
 pyramids as Bouguet 2001), to which a similarity is fitted.
 """
 
@@ -19,6 +19,9 @@ from skyquilt.video.decoder import Decoder, Frame
 Grey = NDArray[np.uint8]
 _PATCHES_X, _PATCHES_Y, _PATCH = 4, 3, 192
 _RENEWED = 70
+_APART = 25
+"""Corners are spread: where they crowd on what stands out, the rotation drifts."""
+_AGREE_PX = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +32,7 @@ class Looker:
     """Looks per second of the clip, at most."""
     longest: int = 640
     """Longest side in px of the pictures on which corners are tracked."""
-    corners: int = 150
+    corners: int = 300
     """Corners that are tracked."""
     fewest: int = 12
     """Corners that must agree for a motion to count."""
@@ -87,22 +90,24 @@ def joined(parts: list[Looks]) -> Looks:
 
 
 def sharpness(pixels: Frame) -> float:
-    """Logarithm of the variance of second differences at full size over those at half size, along
+    """Logarithm of the variance of second differences at half size over those at an eighth, along
     the axis on which it is less.
 
-    Of a blurred picture the finest detail is gone before detail of twice the size. The ratio
-    depends much less on what is seen than the detail itself, and the lesser of both axes shows a
-    blur of any direction. Measured on patches spread over the frame.
+    Of a blurred picture fine detail is gone before coarse detail. The ratio depends much less on
+    what is seen than the detail itself, and the lesser of both axes shows a blur of any direction;
+    at full size there are the artefacts of compression. Measured on patches spread over the frame.
     """
     height, width = pixels.shape[:2]
-    size = min(_PATCH, height // _PATCHES_Y, width // _PATCHES_X) // 2 * 2
+    size = min(_PATCH, height // _PATCHES_Y, width // _PATCHES_X) // 8 * 8
     fine, coarse = np.zeros(2), np.zeros(2)
     for y in np.linspace(0, height - size, _PATCHES_Y).astype(int):
         for x in np.linspace(0, width - size, _PATCHES_X).astype(int):
             grey = cv2.cvtColor(pixels[y : y + size, x : x + size], cv2.COLOR_RGB2GRAY)
             half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-            fine += _second(grey)
-            coarse += _second(half)
+            fine += _second(half)
+            coarse += _second(
+                cv2.resize(half, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+            )
     return float(np.log((fine + 1e-3) / (coarse + 1e-3)).min())
 
 
@@ -144,7 +149,7 @@ class _Tracker:
         return turn, (turn * middle + move - middle) * shrink, True
 
     def _corners(self, grey: Grey) -> NDArray[np.float32] | None:
-        found = cv2.goodFeaturesToTrack(grey, self.looker.corners, 0.01, 10)
+        found = cv2.goodFeaturesToTrack(grey, self.looker.corners, 0.003, _APART)
         return None if found is None else np.asarray(found, np.float32).reshape(-1, 2)
 
     def _follow(self, grey: Grey) -> tuple[complex, complex] | None:
@@ -164,7 +169,11 @@ class _Tracker:
         if kept.sum() < self.looker.fewest:
             return None
         matrix, agree = cv2.estimateAffinePartial2D(
-            new[kept], points[kept], method=cv2.RANSAC, ransacReprojThreshold=1.5, maxIters=500
+            new[kept],
+            points[kept],
+            method=cv2.RANSAC,
+            ransacReprojThreshold=_AGREE_PX,
+            maxIters=500,
         )
         if matrix is None or agree.sum() < max(self.looker.fewest, 0.4 * kept.sum()):
             return None

@@ -47,8 +47,10 @@ def places_at(track: Track, times_s: Array) -> Places:
     inside = (t >= low - _OUTSIDE_S) & (t <= high + _OUTSIDE_S)
     rounding = track.step_deg * METRES_PER_DEGREE / np.sqrt(12)
     if track.step_deg > _COARSE_DEG:
-        latitude = _rounded(track.time_s, track.latitude_deg, track.step_deg, t)
-        longitude = _rounded(track.time_s, track.longitude_deg, track.step_deg, t)
+        # a change is seen in the first row after it
+        knots = track.time_s - 0.5 * _row_s(track)
+        latitude = _rounded(knots, track.latitude_deg, track.step_deg, t)
+        longitude = _rounded(knots, track.longitude_deg, track.step_deg, t)
         bend = np.zeros(len(t))
     else:
         latitude = np.interp(t, track.time_s, track.latitude_deg)
@@ -61,6 +63,11 @@ def places_at(track: Track, times_s: Array) -> Places:
         longitude_deg=np.where(inside, longitude, np.nan),
         sigma_m=np.where(inside, sigma, np.nan),
     )
+
+
+def _row_s(track: Track) -> float:
+    """Time between rows in s."""
+    return float(np.median(np.diff(track.height_time_s))) if len(track.height_time_s) > 1 else 0.0
 
 
 def _bend(knots: Array, t: Array) -> Array:
