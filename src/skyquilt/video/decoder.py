@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from skyquilt.errors import UnreadablePhotoError
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its complaints would go to the terminal
-_OPEN = 4
+_OPEN, _ERRORS = 4, 2
 _AHEAD_S = 3.0
 _TOLERANCE = 0.4
 Frame = NDArray[np.uint8]
@@ -32,6 +32,7 @@ class Decoder:
         self._open()
 
     def _open(self) -> None:
+        cv2.utils.logging.setLogLevel(_ERRORS)  # its warnings would go to the terminal too
         cap = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
         if not cap.isOpened():
             cap.release()

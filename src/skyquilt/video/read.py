@@ -41,13 +41,13 @@ def _clip(path: Path, name: str, track: Track | None) -> Clip:
     _check(path, box)
     decoder = Decoder(path)
     try:
+        if decoder.at(0.0) is None:
+            raise UnreadablePhotoError("it is a video without a frame that can be decoded")
         if min(decoder.width, decoder.height) < _SMALLEST:
             raise UnreadablePhotoError(
                 f"its frames have only {decoder.width}x{decoder.height} px; at least {_SMALLEST} a"
                 " side are needed"
             )
-        if decoder.at(0.0) is None:
-            raise UnreadablePhotoError("it is a video without a frame that can be decoded")
     finally:
         decoder.close()
     notes: tuple[str, ...] = ()
