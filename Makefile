@@ -6,7 +6,7 @@ USE := .venv/installed
 DEVELOP := .venv/installed-for-tests
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --quiet --constraint constraints.txt
 
-.PHONY: demo test test-all check format clean
+.PHONY: demo test test-all check format fuzz fuzz-quick sbom locked clean
 
 # A simulated flight, its map, and how far the map lies from the simulator's truth.
 demo: $(USE)
@@ -34,6 +34,33 @@ format: $(DEVELOP)
 	@$(BIN)/ruff check --fix .
 	@$(BIN)/ruff format .
 
+# Fuzzes every reader, MINUTES in all. `fuzz-quick` is CI's part: every seed, and 10 s of each target.
+MINUTES ?= 5
+FUZZ := .venv/installed-for-fuzz
+
+fuzz: $(FUZZ)
+	@$(BIN)/python -m fuzz.run --seeds
+	@$(BIN)/python -m fuzz.run --minutes $(MINUTES)
+
+fuzz-quick: $(FUZZ)
+	@$(BIN)/python -m fuzz.run --seeds
+	@$(BIN)/python -m fuzz.run --seconds 10
+
+$(FUZZ): $(DEVELOP)
+	@$(PIP) --no-build-isolation --editable '.[fuzz]'
+	@touch $@
+
+# A bill of materials (CycloneDX) of the installed program: its packages, versions and licences.
+sbom: $(USE)
+	@$(BIN)/python .ci/sbom.py > sbom.cdx.json
+	@echo "sbom.cdx.json"
+
+# As CI installs: exactly the files whose hashes are known.
+locked: .venv/pyvenv.cfg
+	@$(BIN)/python -m pip --disable-pip-version-check install --quiet --require-hashes -r requirements-ci.txt
+	@$(BIN)/python -m pip --disable-pip-version-check install --quiet --no-deps --no-build-isolation --editable .
+	@touch $(USE) $(DEVELOP) $(FUZZ)
+
 .venv/pyvenv.cfg:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	    echo "Skyquilt needs Python 3.11 or newer, and $(PYTHON) is: $$($(PYTHON) --version 2>&1)."; \
@@ -55,6 +82,6 @@ $(DEVELOP): $(USE)
 	@touch $@
 
 clean:
-	rm -rf .venv demo build dist .pytest_cache .hypothesis .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf .venv demo build dist sbom.cdx.json fuzz/found .pytest_cache .hypothesis .mypy_cache .ruff_cache .import_linter_cache
 	rm -rf src/*.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -45,6 +45,18 @@ class RefusedError(SkyquiltError):
     exit_code = 7
 
 
+class PhotoFailedError(SkyquiltError):
+    """One photo made a step fail that works for the others; `photo` is its name, and the cause is
+    in `__cause__`.
+
+    Whoever runs the step leaves the photo out and repeats it, so a bad photo never stops a run.
+    """
+
+    def __init__(self, photo: str, reason: str) -> None:
+        super().__init__(f"{photo} {reason}")
+        self.photo, self.reason = photo, reason
+
+
 class UnreadablePhotoError(SkyquiltError):
     """One file cannot be used; the message finishes the sentence 'X was left out: ...'.
 

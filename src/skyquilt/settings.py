@@ -12,6 +12,7 @@ from typing import Any
 
 from skyquilt import registry
 from skyquilt.errors import UsageError
+from skyquilt.outside import MOST_MP
 
 IMAGE_SEARCHES = ("chain", "overview")
 OPTIMISERS = ("anneal", "surfaces")
@@ -19,7 +20,7 @@ LINES = ("heading", "distance")
 TRANSFORMS = ("translation", "similarity", "affine", "homography")
 BLENDS = ("feather", "first", "average", "multiband")
 COMPRESSIONS = ("auto", "jpeg", "deflate", "zstd", "lzw", "none")
-SURFACES = ("sweep", "ties")
+SURFACES = ("auto", "dense", "sweep", "ties")
 THERMAL_UNITS = ("auto", "celsius", "kelvin", "decikelvin", "centikelvin", "counts")
 VERTICAL_DATUMS = ("ellipsoid", "egm96", "takeoff")
 DISTORTIONS = ("none", "2", "4", "6", "6t", "full")
@@ -71,6 +72,8 @@ class InputSettings:
     """
     repair: bool = True
     """Treat metadata as measurements that may be wrong."""
+    max_mp: float = MOST_MP
+    """Largest area of a photo in megapixels; larger ones are left out before they are decoded."""
     shutter: str | None = None
     """One of `SHUTTERS`: how the cameras expose; None = as metadata and table of cameras say."""
     shutter_readout_ms: float | None = None
@@ -85,6 +88,7 @@ class InputSettings:
     """Write the chosen frames of clips as JPEG files."""
 
     def __post_init__(self) -> None:
+        within("--max-mp", self.max_mp, 0.01, 10_000)
         if self.thermal_unit is not None:
             one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
         if self.shutter is not None:
@@ -157,8 +161,10 @@ class CameraSettings:
 class GroundSettings:
     """The surface that photos are projected on."""
 
-    surface: str = "sweep"
-    """One of `SURFACES`: heights from tie points alone, or refined by a plane sweep."""
+    surface: str = "auto"
+    """One of `SURFACES`: dense heights by multi-view matching where the ground has relief (auto) or
+    everywhere and finer (dense), tie points refined by a plane sweep, or tie points alone.
+    """
 
     def __post_init__(self) -> None:
         one_of("--surface", self.surface, SURFACES)
@@ -213,10 +219,15 @@ class OutputSettings:
     """One of `COMPRESSIONS`; auto = JPEG for 8-bit pictures, zstd for measured values."""
     quality: int = 85
     """JPEG quality."""
+    dtm: bool = False
+    """Write dtm.tif as well: the bare ground, without what stands on it."""
+    contours_m: float | None = None
+    """Write contour lines of the bare ground, this many m apart; None = none."""
 
     def __post_init__(self) -> None:
         one_of("--compress", self.compress, COMPRESSIONS)
         within("--quality", self.quality, 1, 100)
+        within("--contours", self.contours_m, 0.05, 1000)
 
 
 @dataclass(frozen=True, kw_only=True)

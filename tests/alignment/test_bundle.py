@@ -376,12 +376,6 @@ def test_the_deviations_of_a_calibration_are_as_large_as_its_errors(noise):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    reason="the offset between control points and measured positions is taken from the solution"
-    " without control and then believed: a common offset among the unknowns would be honest. Errors"
-    " are 2.2 of the stated deviations (RMS), 5.2 in the worst block",
-)
 def test_the_focal_length_s_deviation_is_honest_with_control_points():
     assert 0.3 < rms(lens_errors(noise=0.15, control=True)[:, 0]) < 1.4
 

@@ -68,6 +68,7 @@ def test_defaults_on_the_command_line_are_those_of_the_settings():
         "heading": "heading_deg",
         "memory": "memory_gb",
         "relief": "relief_m",
+        "contours": "contours_m",
     }
     defaults = dict(settings.MosaicSettings())
     named = {other_names.get(name, name): p.default for name, p in parameters.items()}

@@ -435,11 +435,13 @@ def test_focal_length_missing(mosaic, photos):
 
 
 @pytest.mark.slow
-def test_rolling_shutter_is_named_as_not_modelled(mosaic, photos):
+def test_rolling_shutter_is_named_and_modelled(mosaic, photos):
     for path in named(photos):
         relabel(path, xmp={"ShutterType": "Electronic"})
     told = mosaic(photos).made()
-    assert "shutter, not modelled" in told.notes
+    assert "Rolling (electronic) shutter" in told.notes
+    (shutter,) = told.metrics["shutter"].values()
+    assert shutter["source"] == "guess" and shutter["prior_ms"] == 30
     assert "shutter" in (told.output / "report.html").read_text()
 
 

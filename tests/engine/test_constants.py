@@ -25,6 +25,8 @@ from skyquilt.workflows.survey_input import SurveyInput
 
 WAYS = (
     MosaicSettings(),
+    MosaicSettings(surface="sweep"),
+    MosaicSettings(surface="dense"),
     MosaicSettings(method="image"),
     MosaicSettings(method="image", image_search="overview"),
     MosaicSettings(method="hybrid"),
@@ -41,9 +43,16 @@ IN_NO_KEY = {
     "SIGMA_HEIGHT": "the same",
     "YAW_DEG": "conflicts are told in the report and shape nothing",
     **dict.fromkeys(
+        ("_LEAST_FOCAL", "_MOST"), "limits of files that are refused: they shape no result"
+    ),
+    **dict.fromkeys(
         ("NOISE", "TEXTURE", "RIM", "_DERIVE", "_SMOOTH", "RADIUS", "MIN_PEAK", "BROAD_PEAK")
         + ("APART", "MAX_RATIO", "SIDE", "COARSE"),
         "seams are measured anew by every run",
+    ),
+    **dict.fromkeys(
+        ("SIDES", "SHORTEST", "AZIMUTH_DEG", "ELEVATION_DEG", "CONTOUR_CELL_M"),
+        "files of heights are written anew by every run",
     ),
 }
 """Constants of the stages that no method's key holds, and why that is right."""

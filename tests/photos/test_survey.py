@@ -129,7 +129,7 @@ def test_two_cameras_and_mixed_clocks_are_named(make_jpeg):
     )
     notes = " ".join(read_survey(folder).notes)
     assert "There are 2 cameras" in notes
-    assert "Rolling (electronic) shutter, not modelled: dji fc300s" in notes
+    assert "Rolling (electronic) shutter: dji fc300s" in notes
     assert "focal length is guessed for x y 80x60" in notes
 
 

@@ -152,6 +152,7 @@ def test_command_with_every_option(tmp_path):
     words = """--preset demo --photos 6 --overlap 70 --sidelap 50 --height 70 --heading 75
     --size 240x180 --gps-noise 1 --gps-missing 1 --yaw-lie tag --altitude-drift 20 --focal-error 2
     --tilt-noise 0.5 --relief 3 --season winter --hour 12 --exposure-noise 0.1 --motion-blur 2
+    --vignetting 30 --sun-hours 1
     --no-thermal --drones 2 --lose 1 --gcp 2 --checks 1 --seed 4"""
     result = CliRunner().invoke(app, ["simulate", str(tmp_path / "out"), *words.split()])
     assert result.exit_code == 0, result.output

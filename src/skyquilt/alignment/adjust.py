@@ -126,7 +126,7 @@ def _by_photo(problem: Problem, rows: Array, count: int) -> Array:
 
 def _observation_weights(problem: Problem, residual: Array) -> tuple[Array, float]:
     weight, cost = _cauchy((residual**2).sum(1), problem.loss_px)
-    return weight * problem.trust, float(cost.sum()) * problem.trust
+    return np.asarray(weight * problem.trust), float((cost * problem.trust).sum())
 
 
 def _prior_terms(problem: Problem, state: State) -> tuple[list[tuple[Array, Array]], float]:

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.adjust import DENSE_LIMIT, adjust, covariance
+from skyquilt.alignment.adjust import DENSE_LIMIT, adjust, covariance, robust_cost
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
 from skyquilt.alignment.deviations import believed, observed_noise, point_deviations, robust_scale
 from skyquilt.alignment.dominant_plane import levelled
@@ -56,7 +56,7 @@ class Bundle:
     """
     match_observations: LeastSquaresMatching | None = field(default_factory=LeastSquaresMatching)
     """Refinement of observations in larger images; None leaves keypoints unchanged."""
-    version: ClassVar[int] = 15
+    version: ClassVar[int] = 17
 
     def __call__(
         self,
@@ -119,6 +119,7 @@ class Bundle:
         setup = setup.moving_as(photos, state.C)
         problem = replace(problem, velocity=setup.base.velocity)
         problem, state = _weighed(problem, state, setup)
+        setup = replace(setup, base=replace(setup.base, velocity=problem.velocity))
         if self.repair:
             problem, state = _believe_positions(problem, state, setup)
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
@@ -181,12 +182,31 @@ def _weighed(problem: Problem, state: State, setup: Setup) -> tuple[Problem, Sta
     if rolls and 9 * len(state.C) + CAMERA * len(state.K) <= DENSE_LIMIT:
         readout = np.abs(state.K[problem.camera, READOUT])
         problem = replace(problem, sigma_turn=np.maximum(TURN_RAD_S * readout, 1e-9))
+        state = adjust(problem, state, iterations=15, tolerance=1e-3, damping=1e-6).state
     for _ in range(2):
         scale = robust_scale(problem, state)
         problem = replace(problem, sigma_px=problem.sigma_px * scale)
         noise = observed_noise(problem.with_loss(2.0), state, setup.size[setup.members])
         problem = believed(problem.with_loss(2.0), noise)
         state = adjust(problem, state, iterations=15, tolerance=3e-4, damping=1e-6).state
+    return _standing(problem, state) if rolls else (problem, state)
+
+
+def _standing(problem: Problem, state: State) -> tuple[Problem, State]:
+    """The adjustment as if cameras stood still while they expose, where that explains the photos
+    better: drones that stop for each photo have positions and times as if they flew on.
+    """
+    still = problem.velocity * 0.0
+    free = problem.free.copy()
+    free[:, READOUT] = False
+    other = replace(problem, velocity=still, free=free)
+    K = state.K.copy()
+    K[:, READOUT] = problem.K0[:, READOUT]
+    begin = replace(state, K=K, turn=np.zeros_like(state.turn))
+    stood = adjust(other, begin, iterations=40, tolerance=2e-5, damping=1e-6)
+    state = adjust(problem, state, iterations=20, tolerance=2e-5, damping=1e-6).state
+    if stood.cost < robust_cost(problem, state):
+        return other, stood.state
     return problem, state
 
 

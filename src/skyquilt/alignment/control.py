@@ -212,6 +212,8 @@ def _with_points(
         px=np.concatenate([problem.px, px]),
         sigma_px=np.concatenate([problem.sigma_px, np.full(len(px), MARKED_PX)]),
         share=np.concatenate([problem.share, setup.share(row, px)]),
+        # what was marked in photos by hand errs independently of the tie points
+        trust=np.concatenate([np.broadcast_to(problem.trust, len(problem.px)), np.ones(len(px))]),
         X0=np.concatenate([problem.X0, surveyed]),
         sigma_X=np.concatenate([problem.sigma_X, np.array([[c.sigma_m] * 3 for c in fit])]),
     )

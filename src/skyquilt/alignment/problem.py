@@ -90,9 +90,9 @@ class Problem:
     """Scale of the pseudo-Huber loss on attitudes, since gimbal angles may contain gross errors."""
     design_effect: float = 1.0
     """How many observations tell as much as one with errors independent of all others."""
-    trust: float = 1.0
-    """Factor on the cost of observations: the reciprocal of their design effect and of their
-    variance over the assumed one (`alignment.deviations`).
+    trust: Array | float = 1.0
+    """Factor on the cost of observations, of all or of each (N,): the reciprocal of their design
+    effect and of their variance over the assumed one (`alignment.deviations`).
     """
     offset: bool = False
     """Whether all measured centres share an unknown shift (height datum, base station), as where

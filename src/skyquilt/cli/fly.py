@@ -7,6 +7,7 @@ import typer
 
 from skyquilt.cli.interrupt import ends_at_once
 from skyquilt.cli.options import Quiet
+from skyquilt.outside import plain
 
 
 def command(
@@ -51,6 +52,7 @@ def command(
     for sent in fly(flight, to, settings, token):
         count += 1
         if not quiet:
-            typer.echo(f"{sent.at_s:8.1f} s  drone {sent.drone}  {sent.name}  {sent.answer}")
+            said = plain(f"{sent.name}  {sent.answer}")
+            typer.echo(f"{sent.at_s:8.1f} s  drone {sent.drone}  {said}")
     if not quiet:
         typer.echo(f"{count} files sent")

@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from skyquilt.cli.options import MaxMp
+from skyquilt.outside import MOST_MP, plain, shown
+
 if TYPE_CHECKING:
     from rich.table import Table
 
     from skyquilt.model.photo import GeoPosition, Photo, Survey
 
-_SHUTTERS = {True: "rolling (not modelled)", False: "global or mechanical", None: "unknown"}
+_SHUTTERS = {True: "rolling", False: "global or mechanical", None: "unknown"}
 _DATUMS = {
     "takeoff": "take-off",
     "sea_level": "sea level",
@@ -27,13 +30,14 @@ _DATUMS = {
 def camera_table(survey: "Survey") -> "Table":
     """One row per camera."""
     from rich.table import Table
+    from rich.text import Text
 
     table = Table("camera", "photos", "size", "type", "focal length", "shutter", title="Cameras")
     for key in dict.fromkeys(p.camera_key for p in survey.photos):
         group = [p for p in survey.photos if p.camera_key == key]
         one = group[0]
         kind = f"{one.band} {one.channels} x {one.dtype} {one.unit}".strip()
-        table.add_row(
+        cells = (
             key,
             str(len(group)),
             f"{one.width}x{one.height}",
@@ -41,6 +45,7 @@ def camera_table(survey: "Survey") -> "Table":
             _focal(one),
             _SHUTTERS[one.rolling_shutter],
         )
+        table.add_row(*(Text(plain(c)) for c in cells))  # names may look like markup
     return table
 
 
@@ -49,6 +54,7 @@ def photo_table(survey: "Survey") -> "Table":
     instead.
     """
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(title="Photos, in order of capture")
     for heading in ("photo", "time", "focal px", "latitude, longitude"):
@@ -59,7 +65,7 @@ def photo_table(survey: "Survey") -> "Table":
     shared = set(shared_notes(survey))
     for photo in survey.photos:
         notes = " ".join(n for n in photo.notes if n not in shared)
-        table.add_row(photo.name, *_cells(photo), notes)
+        table.add_row(*(Text(plain(c)) for c in (photo.name, *_cells(photo), notes)))
     return table
 
 
@@ -161,16 +167,19 @@ def command(
     cameras: Annotated[
         Path | None, typer.Option(help="Calibrations: cameras.json of OpenDroneMap.")
     ] = None,
+    max_mp: MaxMp = MOST_MP,
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
     """Report the metadata of photos and videos, and what is missing or contradictory."""
     from skyquilt.photos.contradictions import contradictions
     from skyquilt.photos.survey import read_survey
 
-    survey = read_survey(photos, geo=geo, cameras=cameras, clips=True)
+    survey = read_survey(photos, geo=geo, cameras=cameras, max_mp=max_mp, clips=True)
     findings = contradictions(survey.photos)
     if json:
         record = {**asdict(survey), "contradictions": findings}
+        for photo in record["rejected"]:
+            photo.pop("trace")
         for clip in record["clips"]:
             clip["track"] = clip["track"] and _summary(clip["track"])
         sys.stdout.write(json_module.dumps(record, default=str, indent=1, allow_nan=False) + "\n")
@@ -189,7 +198,7 @@ def _show(survey: "Survey", findings: tuple[str, ...]) -> None:
     if survey.clips:
         console.print(clip_table(survey))
     for line in sentences(survey, findings):
-        console.print(line, markup=False, highlight=False)
+        console.print(shown(line), markup=False, highlight=False)
 
 
 def _summary(track: dict[str, object]) -> dict[str, object]:

@@ -6,7 +6,8 @@ from typing import Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.options import Features, Json, MaxViewAngle, Quiet, ThermalUnit
+from skyquilt.cli.options import Features, Json, MaxMemory, MaxMp, MaxViewAngle, Quiet, ThermalUnit
+from skyquilt.outside import MOST_MP
 
 Output = Annotated[
     Path,
@@ -16,6 +17,15 @@ Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the viewer; 0
 Host = Annotated[
     str, typer.Option(help="Address to listen on; other than local ones need --token.")
 ]
+
+AllowHost = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="A further name under which browsers may address the server (repeatable).",
+        show_default="the address, the machine's name",
+    ),
+]
+MaxConnections = Annotated[int, typer.Option(min=4, max=900, help="Connections from one address.")]
 
 
 def command(
@@ -68,7 +78,15 @@ def command(
     ] = None,
     features: Features = 1200,
     max_mb: Annotated[float, typer.Option(help="Largest photo file in MB.")] = 500,
+    max_mp: MaxMp = MOST_MP,
     max_photos: Annotated[int, typer.Option(help="Largest number of photos accepted.")] = 100_000,
+    max_connections: MaxConnections = 200,
+    max_memory: MaxMemory = None,
+    viewer_memory: Annotated[
+        float,
+        typer.Option(min=0.3, help="Resident memory in GB at which the viewer is started anew."),
+    ] = 1.5,
+    allow_host: AllowHost = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -78,6 +96,7 @@ def command(
     """
     with ends_at_once():
         from skyquilt.cli.progress import show_live
+        from skyquilt.engine.memory_watch import ends_run, limit_bytes
         from skyquilt.live.live_map import LiveMap
         from skyquilt.live.settings import LiveSettings
         from skyquilt.live.workflow import iter_live
@@ -92,13 +111,30 @@ def command(
         max_view_angle=max_view_angle,
         features=features,
         most_bytes=int(max_mb * 1e6),
+        most_mp=max_mp,
         most_photos=max_photos,
     )
-    guard = Guard(host=host, token=token)
+    guard = Guard(
+        host=host,
+        token=token,
+        allow_hosts=tuple(allow_host or ()),
+        most_connections=max_connections,
+    )
     live = LiveMap(output, settings)
     try:
-        asked = ServerConfig(folder=output, settings=settings, guard=guard, base=base)
-        with ServerProcess(asked=asked, port=port) as serving:
+        asked = ServerConfig(
+            folder=output,
+            settings=settings,
+            guard=guard,
+            base=base,
+            most_memory=int(viewer_memory * 1e9),
+        )
+        advice = "no accepted photo is lost: the same command continues"
+        with (
+            ends_run(limit_bytes(max_memory), advice),
+            ServerProcess(asked=asked, port=port) as serving,
+        ):
+            live.lock.tell(serving.url)
             events = iter_live(inbox, live, finish=finish)
             show_live(events, serving.url, mode="quiet" if quiet else "json" if json else "normal")
     finally:

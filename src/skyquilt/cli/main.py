@@ -7,6 +7,7 @@ from typing import Any
 
 from skyquilt.cli import interrupt
 from skyquilt.errors import SkyquiltError
+from skyquilt.outside import shown
 
 
 def run() -> None:
@@ -19,14 +20,15 @@ def run() -> None:
     # threads work on different photos; threads within one matrix product would only wait
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # names may hold characters that a terminal cannot show
-    if isinstance(sys.stdout, TextIOWrapper):
-        sys.stdout.reconfigure(errors="backslashreplace")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         with interrupt.ends_at_once():
             from skyquilt.cli.app import app
         app()
     except SkyquiltError as error:
-        sys.stderr.write(f"skyquilt: {error}\n")
+        sys.stderr.write(f"skyquilt: {shown(error)}\n")
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
         interrupt.leave()

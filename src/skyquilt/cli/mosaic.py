@@ -6,8 +6,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.options import THERMAL_UNITS, UNIT_UNSAID, Photos, mode_of
+from skyquilt.cli.options import (
+    MAX_MEMORY,
+    MAX_MEMORY_UNSAID,
+    MAX_MP,
+    THERMAL_UNITS,
+    UNIT_UNSAID,
+    Photos,
+    mode_of,
+)
 from skyquilt.errors import UsageError
+from skyquilt.outside import MOST_MP
 
 if TYPE_CHECKING:
     from skyquilt.model.event import Result
@@ -160,8 +169,10 @@ def command(
     ] = None,
     surface: Annotated[
         str,
-        option(PICTURE, "Heights: ties (tie points alone) or sweep (refined from the pictures)."),
-    ] = "sweep",
+        option(
+            PICTURE, "Heights: auto (dense where there is relief), dense (everywhere), sweep, ties."
+        ),
+    ] = "auto",
     vertical_datum: Annotated[
         str | None,
         option(
@@ -191,6 +202,12 @@ def command(
         str, option(FILES, "auto, jpeg, or lossless: deflate, zstd, lzw, none.")
     ] = "auto",
     quality: Annotated[int, option(FILES, "JPEG quality.")] = 85,
+    dtm: Annotated[
+        bool, option(FILES, "Write dtm.tif as well: the ground without what stands on it.", "--dtm")
+    ] = False,
+    contours: Annotated[
+        float | None, option(FILES, "Write contours.gpkg: lines of the ground, this many m apart.")
+    ] = None,
     thermal_route: Annotated[
         str,
         option(
@@ -221,13 +238,15 @@ def command(
     memory: Annotated[
         float | None, option(RUN, "Memory to stay within, in GB.", default="1.2")
     ] = None,
+    max_mp: Annotated[float, option(RUN, MAX_MP)] = MOST_MP,
+    max_memory: Annotated[float | None, option(RUN, MAX_MEMORY, default=MAX_MEMORY_UNSAID)] = None,
     seed: Annotated[int, option(RUN, "Of everything random; equal seeds give equal maps.")] = 0,
     rerun_from: Annotated[
         str | None,
         option(
             RUN,
             "Make everything anew from this stage on: frames (of videos), features, links, align,"
-            " surface, balance, mosaic, measure, report.",
+            " surface, balance, seams, mosaic, measure, report.",
         ),
     ] = None,
     quiet: Annotated[bool, option(RUN, "Say nothing but errors.", "--quiet", "-q")] = False,
@@ -277,6 +296,7 @@ def command(
     """
     with ends_at_once():
         from skyquilt.cli.progress import show
+        from skyquilt.engine.memory_watch import ends_run, limit_bytes
         from skyquilt.settings import MosaicSettings
         from skyquilt.workflows.mosaic import STAGES, iter_mosaic
 
@@ -306,6 +326,8 @@ def command(
         height_m=height,
         heading_deg=heading,
         surface=surface,
+        dtm=dtm,
+        contours_m=contours,
         gsd_cm=gsd,
         crs=crs,
         vertical_datum=vertical_datum,
@@ -321,6 +343,7 @@ def command(
         quality=quality,
         jobs=jobs,
         memory_gb=memory,
+        max_mp=max_mp,
         seed=seed,
         levelled=levelled,
         image_search=image_search,
@@ -343,7 +366,9 @@ def command(
             overwrite=overwrite,
             rerun_from=rerun_from,
         )
-    show(events, mode=mode, summary=None if thermal is None else with_thermal)
+    advice = "the same command resumes, with --memory smaller or --max-memory larger"
+    with ends_run(limit_bytes(max_memory), advice):
+        show(events, mode=mode, summary=None if thermal is None else with_thermal)
 
 
 def with_thermal(result: "Result") -> str:

@@ -38,6 +38,14 @@ Verbose = Annotated[
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object per event.")]
 
+MAX_MP = "Largest area of a photo in megapixels; larger ones are left out."
+MaxMp = Annotated[float, typer.Option(help=MAX_MP)]
+MAX_MEMORY = "Resident memory in GB at which the program ends with a sentence."
+MAX_MEMORY_UNSAID = "nine tenths of the machine's"
+MaxMemory = Annotated[
+    float | None, typer.Option(min=0.1, help=MAX_MEMORY, show_default=MAX_MEMORY_UNSAID)
+]
+
 THERMAL_UNITS = (
     "Unit of single-band TIFFs: auto (they are thermal; the unit is read from the file or derived"
     " from the values), celsius, kelvin, decikelvin, centikelvin, counts."

@@ -8,6 +8,7 @@ from typing import Any
 
 from skyquilt.live.events import Update
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
+from skyquilt.outside import shown
 
 
 def show_live(events: Iterable[Event | Update], url: str, *, mode: str) -> None:
@@ -24,7 +25,7 @@ def show_live(events: Iterable[Event | Update], url: str, *, mode: str) -> None:
                 else as_record(happened)
             )
         elif mode == "normal" and (text := sentence(happened)):
-            sys.stdout.write(text + "\n")
+            sys.stdout.write(shown(text) + "\n")
         sys.stdout.flush()
 
 
@@ -122,7 +123,7 @@ def _bars(events: Iterable[Event], summary: Callable[[Result], str], *, verbose:
                     progress.console.print(times(happened))
             elif isinstance(happened, Note):
                 progress.console.print(
-                    happened.text,
+                    shown(happened.text),
                     style="yellow" if happened.warning else None,
                     markup=False,
                     highlight=False,
@@ -130,7 +131,7 @@ def _bars(events: Iterable[Event], summary: Callable[[Result], str], *, verbose:
                 )
             elif isinstance(happened, Result):
                 result = happened
-    Console().print(summary(result), markup=False, highlight=False, soft_wrap=True)
+    Console().print(shown(summary(result)), markup=False, highlight=False, soft_wrap=True)
 
 
 def times(happened: StageFinished) -> str:

@@ -88,6 +88,12 @@ def command(
     exposure_noise: Annotated[
         float | None, typer.Option(help="relative change from photo to photo")
     ] = None,
+    vignetting: Annotated[
+        float | None, typer.Option(help="loss of light in the corners, percent")
+    ] = None,
+    sun_hours: Annotated[
+        float | None, typer.Option(help="hours by which the sun moves on over the flight")
+    ] = None,
     motion_blur: Annotated[float | None, typer.Option(help="length, px")] = None,
     thermal: Annotated[
         bool | None, typer.Option("--thermal/--no-thermal", help="a thermal flight as well")
@@ -167,7 +173,14 @@ def command(
     )
     base = _with(base, "scene", relief=relief, kind=terrain)
     base = _with(base, "weather", season=season, hour=hour)
-    base = _with(base, "pictures", exposure_noise=exposure_noise, motion_blur=motion_blur)
+    base = _with(
+        base,
+        "pictures",
+        exposure_noise=exposure_noise,
+        vignetting=_share(vignetting),
+        sun_hours=sun_hours,
+        motion_blur=motion_blur,
+    )
     base = _with(base, "control", points=gcp, checks=checks)
     base = _thermal(
         base, thermal, Weather(season=thermal_season or "summer", hour=thermal_hour or 13.0)

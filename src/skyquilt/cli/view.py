@@ -9,7 +9,9 @@ from typing import Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.live import Host, Port
+from skyquilt.cli.live import AllowHost, Host, MaxConnections, Port
+from skyquilt.cli.options import MaxMemory
+from skyquilt.outside import plain
 
 
 def command(
@@ -21,15 +23,32 @@ def command(
     base: Annotated[
         Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")
     ] = None,
+    photos: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the photos of a finished run, where they have moved.",
+            show_default="where they were",
+        ),
+    ] = None,
+    allow_host: AllowHost = None,
+    max_connections: MaxConnections = 200,
+    max_memory: MaxMemory = None,
 ) -> None:
     """Show a map in a browser, with all photos that cover any point. The files are not changed."""
     with ends_at_once():
+        from skyquilt.engine.memory_watch import ends_run, limit_bytes
         from skyquilt.server.access import Guard
         from skyquilt.server.server_thread import ServerThread
         from skyquilt.server.survey import open_survey
-    survey = open_survey(folder, base=base)
+    survey = open_survey(folder, base=base, photos=photos)
     # read-only: there is no writer that could need the token
-    guard = Guard(host=host, token="looking-only")
-    with ServerThread(survey=survey, guard=guard, folder=folder, port=port) as serving:
-        typer.echo(f"{serving.url} shows {folder}; Ctrl-C ends")
+    guard = Guard(
+        host=host,
+        token="looking-only",
+        allow_hosts=tuple(allow_host or ()),
+        most_connections=max_connections,
+    )
+    watch = ends_run(limit_bytes(max_memory), "start it again with a larger --max-memory")
+    with watch, ServerThread(survey=survey, guard=guard, folder=folder, port=port) as serving:
+        typer.echo(f"{serving.url} shows {plain(str(folder))}; Ctrl-C ends")
         threading.Event().wait()

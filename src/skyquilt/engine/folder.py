@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from skyquilt.engine import error_log
 from skyquilt.errors import OutputError
 
 CONTRACT = (
@@ -88,7 +89,7 @@ def open_run(path: Path, key: str, *, overwrite: bool, again: bool = False) -> R
                 " or choose another folder"
             )
         if taken:
-            for name in CONTRACT:
+            for name in (*CONTRACT, error_log.NAME):
                 (path / name).unlink(missing_ok=True)
         (path / STATE).mkdir(parents=True, exist_ok=True)
         probe = path / STATE / "probe"

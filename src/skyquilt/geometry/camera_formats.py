@@ -10,11 +10,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from skyquilt.model.camera import Camera
+from skyquilt.outside import plain, real
 
 DEVIATIONS = "standard_deviations"
 """Key of the standard deviations, in the units of the values; readers of OpenSfM's format ignore
 keys they do not know.
 """
+_LEAST_FOCAL = 0.02
+_MOST = {"width": 1e6, "height": 1e6, "focal": 100.0, "focal_x": 100.0, "focal_y": 100.0}
+"""Largest plausible values; lengths in units of the longer side."""
 _NAMES = ("focal_x", "c_x", "c_y", "k1", "k2", "k3", "p1", "p2", "aspect")
 
 
@@ -34,7 +38,7 @@ def camera_from_opensfm(record: Mapping[str, Any]) -> Camera:
         raise ValueError(f"its size is {width}x{height} px")
     unit = max(width, height)
     focals = [_number(record, k) for k in ("focal_x", "focal_y", "focal") if k in record]
-    if not focals or not min(focals) > 0:
+    if not focals or min(focals) < _LEAST_FOCAL:
         raise ValueError("it has no positive focal length (focal, or focal_x and focal_y)")
     return Camera(
         width=width,
@@ -94,6 +98,10 @@ def camera_to_opensfm(camera: Camera) -> dict[str, Any]:
 
 def _number(record: Mapping[str, Any], key: str, otherwise: float | None = None) -> float:
     value = record.get(key, otherwise)
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ValueError(f"its '{key}' is {value!r}; expected a number")
-    return float(value)
+    most = _MOST.get(key, 1e3)
+    number = None if isinstance(value, str) else real(value, -most, most)
+    if number is None:
+        raise ValueError(
+            f"its '{key}' is {plain(repr(value), 60)}; expected a number of at most {most:g}"
+        )
+    return number

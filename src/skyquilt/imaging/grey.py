@@ -32,7 +32,7 @@ def _fitting(image: NDArray[Any], longest: int) -> tuple[int, int] | None:
     """
     height, width = image.shape[:2]
     scale = max(width, height) / longest
-    return (round(width / scale), round(height / scale)) if scale > 1 else None
+    return (max(1, round(width / scale)), max(1, round(height / scale))) if scale > 1 else None
 
 
 def averaged(image: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:

@@ -78,6 +78,8 @@ class Nodes:
     """
     height: float
     """Median height of the camera above the window's ground in m."""
+    step: int = STEP
+    """Map pixels between neighbouring nodes."""
 
 
 def footprint(
@@ -298,18 +300,20 @@ def inside_everywhere(
     """
     within = inside(nodes.view.camera, u, v)
     if (nodes.room < 0).any():
-        within &= densify(nodes.room, *u.shape) >= 0
+        within &= densify(nodes.room, u.shape[0], u.shape[1], nodes.step) >= 0
     if nodes.real.all():
         return within
-    return within & (densify(nodes.real.astype(np.float32), *u.shape) > 0.999)
+    return within & (
+        densify(nodes.real.astype(np.float32), u.shape[0], u.shape[1], nodes.step) > 0.999
+    )
 
 
 def node_places(
-    grid: Grid, surface: Surface, window: Window
+    grid: Grid, surface: Surface, window: Window, step: int = STEP
 ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """x, y, z in m, each (r + 2, c + 2), of the nodes of a window of r x c cells."""
-    columns = window.column + STEP * (np.arange(-1, -(-window.width // STEP) + 1) + 0.5) - 0.5
-    rows = window.row + STEP * (np.arange(-1, -(-window.height // STEP) + 1) + 0.5) - 0.5
+    """x, y, z in m, each (r + 2, c + 2), of the nodes of a window of r x c cells of `step` px."""
+    columns = window.column + step * (np.arange(-1, -(-window.width // step) + 1) + 0.5) - 0.5
+    rows = window.row + step * (np.arange(-1, -(-window.height // step) + 1) + 0.5) - 0.5
     x, y = np.meshgrid(grid.x(columns), grid.y(rows))
     return x, y, surface.at(x, y)
 
@@ -337,8 +341,9 @@ def least_scores(
 
 def cut(nodes: Nodes, row: int, column: int, height: int, width: int) -> Nodes:
     """The nodes of a sub-window that starts at a multiple of STEP px from the window's corner."""
-    rows = slice(row // STEP, row // STEP - (-height // STEP) + 2)
-    columns = slice(column // STEP, column // STEP - (-width // STEP) + 2)
+    step = nodes.step
+    rows = slice(row // step, row // step - (-height // step) + 2)
+    columns = slice(column // step, column // step - (-width // step) + 2)
     return Nodes(
         view=nodes.view,
         u=nodes.u[rows, columns],
@@ -348,14 +353,19 @@ def cut(nodes: Nodes, row: int, column: int, height: int, width: int) -> Nodes:
         seen=nodes.seen[rows, columns],
         real=nodes.real[rows, columns],
         height=nodes.height,
+        step=step,
     )
 
 
-def densify(values: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
-    """Node values (r + 2, c + 2[, k]) interpolated linearly at every pixel (height, width[, k])."""
+def densify(
+    values: NDArray[np.float32], height: int, width: int, step: int = STEP
+) -> NDArray[np.float32]:
+    """Node values (r + 2, c + 2[, k]), `step` px apart, interpolated linearly at every pixel
+    (height, width[, k]).
+    """
     r, c = values.shape[:2]
-    whole = cv2.resize(values, (c * STEP, r * STEP), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(whole[STEP : STEP + height, STEP : STEP + width])
+    whole = cv2.resize(values, (c * step, r * step), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(whole[step : step + height, step : step + width])
 
 
 def on_ground(view: View, px: NDArray[Any], surface: Surface) -> NDArray[np.float64]:

@@ -8,7 +8,10 @@ import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from skyquilt.outside import walk
+
 CLOSE_WRITE, MOVED_TO, CREATE, IS_DIR, OVERFLOW = 0x8, 0x80, 0x100, 0x40000000, 0x4000
+IGNORED = 0x8000
 _HEAD = struct.Struct("iIII")
 
 
@@ -21,6 +24,7 @@ class ClosedFiles:
     told: bool = False
     """Whether this system reports closed files."""
     _handle: int = -1
+    _lost: bool = False
     _folders: dict[int, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -32,21 +36,20 @@ class ClosedFiles:
         self.told = self._handle >= 0 and self._watch(str(self.folder))
 
     def _watch(self, folder: str) -> bool:
-        """Watches a folder and its subfolders; False if the system refuses more watches."""
-        number = self._libc.inotify_add_watch(
-            self._handle, os.fsencode(folder), CLOSE_WRITE | MOVED_TO | CREATE
-        )
-        if number < 0:
-            return False
-        self._folders[number] = folder
-        try:
-            below = [
-                e.path for e in os.scandir(folder) if e.is_dir() and not e.name.startswith(".")
-            ]
-        except OSError:
-            return True
-        watched = [self._watch(path) for path in below]
-        return all(watched)
+        """Watches a folder and its subfolders, not following links; False if the system refuses
+        more watches.
+        """
+        every = True
+        for here, folders, _ in walk(Path(folder)):
+            folders[:] = [f for f in folders if not f.startswith(".")]
+            number = self._libc.inotify_add_watch(
+                self._handle, os.fsencode(here), CLOSE_WRITE | MOVED_TO | CREATE
+            )
+            every &= number >= 0
+            if number < 0:
+                break
+            self._folders[number] = str(here)
+        return every
 
     def look(self) -> tuple[set[str], bool]:
         """Paths closed since the last call, and whether the whole folder must be scanned as well.
@@ -56,6 +59,8 @@ class ClosedFiles:
         """
         closed: set[str] = set()
         everything = False
+        if self._lost and self.folder.is_dir():
+            self._lost, everything = not self._watch(str(self.folder)), True
         while data := self._read():
             at = 0
             while at < len(data):
@@ -63,6 +68,8 @@ class ClosedFiles:
                 name = os.fsdecode(data[at + _HEAD.size : at + _HEAD.size + size].rstrip(b"\0"))
                 at += _HEAD.size + size
                 path = str(Path(self._folders.get(number, "")) / name)
+                if mask & IGNORED and self._folders.pop(number, "") == str(self.folder):
+                    self._lost = True  # the folder was removed, or its disk
                 if mask & IS_DIR:
                     self.told &= self._watch(path) or not Path(path).is_dir()
                 everything |= bool(mask & (IS_DIR | OVERFLOW))

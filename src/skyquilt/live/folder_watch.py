@@ -12,6 +12,7 @@ from skyquilt.live.inbox import ending_of
 from skyquilt.live.ledger import hit
 from skyquilt.live.photo_intake import Accepted, Intake, Refused
 from skyquilt.model.photo import RejectedPhoto
+from skyquilt.outside import open_regular, walk
 from skyquilt.photos.read import read_photo
 
 ENDINGS = (".jpg", ".jpeg", ".tif", ".tiff", ".png")
@@ -85,17 +86,20 @@ class Watch:
             known = self.growing[key]
             if not known.closed and now - known.since < QUIET_S:
                 continue
-            reason = self._unfinished(Path(key))
-            if reason and now - known.since < PATIENCE_S:
-                continue
-            yield self._take(Path(key), key, known, reason)
+            try:
+                reason = self._unfinished(Path(key))
+                if reason and now - known.since < PATIENCE_S:
+                    continue
+                yield self._take(Path(key), key, known, reason)
+            except FileNotFoundError:  # removed since it was seen
+                self.growing.pop(key, None)
 
     def _note(self, now: float) -> None:
         """Records files that are new or have grown, and files that were closed after writing."""
         closed, everything = self._closed.look()
         for path, stamp in self._candidates(closed, everything=everything, now=now):
             key = str(path)
-            if stamp is None or self._seen.get(key) == stamp:
+            if stamp is None or self._seen.get(_stored(key)) == stamp:
                 self.growing.pop(key, None)
                 continue
             known = self.growing.get(key)
@@ -111,9 +115,10 @@ class Watch:
         else:
             done = self.intake.take_file(path, source)
         self.growing.pop(key, None)
-        self._seen[key] = known.stamp
+        self._seen[_stored(key)] = known.stamp
         with self.intake.ledger.change() as db:
-            db.execute("insert or replace into seen values (?, ?, ?)", (key, *known.stamp))
+            row = (_stored(key), *known.stamp)
+            db.execute("insert or replace into seen values (?, ?, ?)", row)
         hit("folder seen")
         return done
 
@@ -129,24 +134,33 @@ class Watch:
         return [(path, _stamp(path)) for path in known]
 
     def _files(self) -> Iterator[Path]:
-        for top, folders, names in os.walk(self.folder):
+        for here, folders, names in walk(self.folder):
             folders[:] = [f for f in folders if not f.startswith(".")]
-            yield from (Path(top) / name for name in names if _photo_name(name))
+            yield from (here / name for name in names if _photo_name(name))
 
-    @staticmethod
-    def _unfinished(path: Path) -> str:
-        """Why a file cannot be taken (yet); empty where it can."""
+    def _unfinished(self, path: Path) -> str:
+        """Why a file cannot be taken (yet); empty where it can. Raises `FileNotFoundError`."""
+        most = self.intake.settings.most_bytes
         try:
-            with path.open("rb") as file:
+            with open_regular(path) as file:
+                if os.fstat(file.fileno()).st_size > most:
+                    return f"it has more than {most / 1e6:g} MB (--max-mb)"
                 head = file.read(8)
+        except FileNotFoundError:
+            raise
         except OSError as error:
             return f"it cannot be read ({error.strerror or error})"
         if not head:
             return "it is empty (0 bytes)"
         if ending_of(head) is None:
             return "its content is neither JPEG, TIFF nor PNG"
-        photo = read_photo(path)
+        photo = read_photo(path, most_mp=self.intake.settings.most_mp)
         return photo.reason if isinstance(photo, RejectedPhoto) else ""
+
+
+def _stored(key: str) -> str:
+    """A path as the ledger stores it: names may hold bytes that are no valid text."""
+    return os.fsencode(key).decode("utf-8", "backslashreplace")
 
 
 def _photo_name(name: str) -> bool:

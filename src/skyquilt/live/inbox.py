@@ -9,13 +9,13 @@ import errno
 import hashlib
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
-from skyquilt.errors import OutputError
+from skyquilt.errors import OutputError, UnreadablePhotoError
 from skyquilt.live.ledger import Ledger, hit
 
 ENDINGS = {
@@ -26,7 +26,6 @@ ENDINGS = {
     b"\x89PNG": ".png",
 }
 """First bytes of the supported file formats, with the file extension."""
-BLOCK = 1 << 20
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,10 +66,11 @@ class Inbox:
         """Writes a file's bytes durably under the hash of its content; None if it is not a photo.
 
         Raises:
-            OutputError: the disk is full, or the file is larger than allowed.
+            OutputError: the disk is full.
+            UnreadablePhotoError: the file is larger than allowed, or reading it fails.
         """
         rest = iter(blocks)
-        first = next(rest, b"")
+        first = next(_read(rest), b"")
         ending = ending_of(first)
         if ending is None:
             return None
@@ -78,11 +78,11 @@ class Inbox:
         digest, size = hashlib.blake2b(digest_size=16), 0
         try:
             with partial.open("wb") as file:
-                for block in chain((first,), rest):
+                for block in chain((first,), _read(rest)):
                     size += len(block)
                     if size > self.most_bytes:
-                        raise OutputError(
-                            f"a photo may have {self.most_bytes} bytes, this one has more"
+                        raise UnreadablePhotoError(
+                            f"it has more than {self.most_bytes / 1e6:g} MB (--max-mb)"
                         )
                     digest.update(block)
                     file.write(block)
@@ -101,17 +101,13 @@ class Inbox:
             raise
         return Arrived(path=path, digest=digest.hexdigest(), size=size)
 
-    def copy(self, source: Path) -> Arrived | None:
-        """Brings a file from elsewhere."""
-        with source.open("rb") as file:
-            first = file.read(BLOCK)
-            return self.bring(_blocks(first, file)) if first else None
 
-
-def _blocks(first: bytes, file: object) -> Iterable[bytes]:
-    yield first
-    while block := file.read(BLOCK):  # type: ignore[attr-defined]
-        yield block
+def _read(blocks: Iterable[bytes]) -> Iterator[bytes]:
+    """The blocks; an error of reading is told from one of writing."""
+    try:
+        yield from blocks
+    except OSError as error:
+        raise UnreadablePhotoError(f"it cannot be read ({error.strerror or error})") from error
 
 
 def synced(folder: Path) -> None:

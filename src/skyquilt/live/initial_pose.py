@@ -6,7 +6,6 @@ from dataclasses import asdict
 import numpy as np
 
 from skyquilt.engine.pixel_cache import PixelCache
-from skyquilt.errors import UnreadablePhotoError
 from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.ledger import hit
@@ -41,10 +40,7 @@ class InitialPose:
         preview = self._preview(member)
         known = preview.pose if preview is not None else None
         pose = known if known is not None else self.metadata.first(member)
-        try:
-            self.pixels(member.id)
-        except UnreadablePhotoError as error:
-            return self._unreadable(member, str(error))
+        self.pixels(member.id)
         with self.ledger.change():
             member.pose, member.state = pose, "waiting" if pose is None else "placed"
             self.members.save(member)
@@ -88,11 +84,3 @@ class InitialPose:
             self.ledger.put_meta("cell", cell)
             self.ledger.put_meta("ground", ground)
             self.ledger.tell("map", {"crs": frame.crs, "gsd": gsd})
-
-    def _unreadable(self, member: Member, reason: str) -> Update:
-        with self.ledger.change():
-            member.state, member.pose = "refused", None
-            self.ledger.set_photo(member.id, state="refused", reason=reason, pose=None)
-            self.map_events.photo(member, reason=reason)
-        self.queues.received.popleft()
-        return Update(what="refused", photo=member.id, text=f"{member.photo.name}: {reason}")

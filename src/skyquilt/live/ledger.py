@@ -93,6 +93,8 @@ def connected(path: Path, *, write: bool) -> sqlite3.Connection:
         if write:
             db.execute("pragma journal_mode=wal")
             db.execute("pragma synchronous=full")
+            db.execute("begin immediate")  # fails where the file is read-only
+            db.execute("rollback")
         db.execute("select count(*) from sqlite_master").fetchone()
     except sqlite3.Error as error:
         raise OutputError(

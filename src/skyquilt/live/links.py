@@ -9,6 +9,7 @@ import numpy as np
 from skyquilt.engine.codec import decode, encode
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
+from skyquilt.live.failures import concerning
 from skyquilt.live.members import Member, Members
 from skyquilt.model.features import Features, Link
 from skyquilt.workflows.links import link_pair
@@ -42,7 +43,8 @@ class LiveLinks:
             self._features.move_to_end(number)
             return self._features[number]
         photo, pixels = self.members.by_id[number].photo, self.pixels
-        look = photo_features(photo, lambda: pixels(number), self.methods.detector, self.store)
+        with concerning(number):
+            look = photo_features(photo, lambda: pixels(number), self.methods.detector, self.store)
         self._features[number] = look.features
         while len(self._features) > FEATURES_KEPT:
             self._features.popitem(last=False)

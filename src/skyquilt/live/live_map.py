@@ -6,6 +6,7 @@ of photos. A restart reads these and continues.
 """
 
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -14,20 +15,24 @@ from typing import Any
 import cv2
 import numpy as np
 
+from skyquilt.engine.error_log import NAME as ERRORS
+from skyquilt.engine.error_log import log_error
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
-from skyquilt.errors import OutputError, UsageError
+from skyquilt.errors import OutputError, UnreadablePhotoError, UsageError
 from skyquilt.live.adjustment_schedule import Blocks, Schedule
 from skyquilt.live.apply_adjustment import ApplyAdjustment
 from skyquilt.live.background_adjustment import BackgroundAdjustment, adjust_block
 from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.events import MapEvents, Update
+from skyquilt.live.failures import MemberFailedError, concerning, of_the_system
 from skyquilt.live.free_memory import give_back
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.initial_pose import InitialPose
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.links import LiveLinks
 from skyquilt.live.local_pose import LocalPose
+from skyquilt.live.lock import FolderLock
 from skyquilt.live.members import Members, Queues
 from skyquilt.live.neighbours import Neighbours
 from skyquilt.live.photo_intake import Intake, Refused
@@ -38,6 +43,7 @@ from skyquilt.live.tile_drawing import Canvas
 from skyquilt.model import features, poses
 from skyquilt.ortho.height_cells import HeightCells
 from skyquilt.photos.pixels import read_color
+from skyquilt.photos.read import rejected
 from skyquilt.raster.tile_store import TileStore
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.methods import methods_for
@@ -52,6 +58,8 @@ TOGETHER = 4
 """Number of waiting photos that are placed before they are drawn. Drawing them together is faster,
 since they share tiles.
 """
+MOST_FAILURES = 5
+"""Number of failures in a row, of steps that concern no single photo, after which the map ends."""
 TIDY = 4
 """Freed memory is returned to the system after this number of photos."""
 
@@ -65,7 +73,8 @@ class LiveMap:
         """Opens the folder, or continues an earlier run.
 
         Raises:
-            OutputError: it cannot be written. UsageError: it was started with other settings.
+            OutputError: it cannot be written, or another live map works there. UsageError: it was
+                started with other settings.
         """
         cv2.setNumThreads(1)
         self.folder, self.settings = Path(folder), settings or LiveSettings()
@@ -73,6 +82,7 @@ class LiveMap:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
+        self.lock = FolderLock(self.folder)
         self.ledger = Ledger(self.folder, write=True)
         self._same_settings()
         self.inbox = Inbox(self.ledger, self.folder / PHOTOS, most_bytes=self.settings.most_bytes)
@@ -83,7 +93,8 @@ class LiveMap:
         self.store = Store(folder=self.folder / STORE, registry=registry)
         self.background = BackgroundAdjustment()
         self._room = TOGETHER
-        self._load()
+        self._failures = 0
+        self._reload()
 
     def _same_settings(self) -> None:
         known, asked = self.ledger.meta("settings"), self.settings.shaping()
@@ -95,11 +106,21 @@ class LiveMap:
                 " another folder"
             )
 
+    def _reload(self) -> None:
+        """`_load`, without photos on which it fails."""
+        while True:
+            try:
+                return self._load()
+            except MemberFailedError as error:
+                self._refuse(error)
+
     def _load(self) -> None:
         """Rebuilds the state in memory from the durable files, at start and after a failed
         write.
         """
-        self.members = Members(self.ledger, self.inbox, self.settings.thermal_unit)
+        self.members = Members(
+            self.ledger, self.inbox, self.settings.thermal_unit, self.settings.most_mp
+        )
         self.queues = Queues(self.members.by_id.values())
         self.schedule = Schedule.read(self.ledger)
         self.full = PixelCache(read=self._pixels, budget_bytes=FULL_BYTES)
@@ -133,7 +154,8 @@ class LiveMap:
         )
 
     def _pixels(self, number: int) -> Any:
-        return read_color(self.members.by_id[number].photo)
+        with concerning(number):
+            return read_color(self.members.by_id[number].photo)
 
     # -- adding
 
@@ -176,13 +198,71 @@ class LiveMap:
         try:
             self.queues.received.extend(self.members.take_up())
             update = self._next()
-        except OutputError:
+            self._failures = 0
+        except MemberFailedError as error:
+            update = self._set_aside(error)
+        except Exception as error:
             self.background.stop()
-            self._load()
-            raise
+            self._reload()
+            if isinstance(error, OutputError):
+                raise
+            if system := of_the_system(error):
+                raise system from error
+            update = self._unexplained(error)
         if update is None:
             return None
         return Update(**{**asdict(update), "seconds": time.perf_counter() - began})
+
+    def _set_aside(self, failed: MemberFailedError) -> Update:
+        """Leaves a photo out on which a step failed, whatever the error: it is refused with the
+        reason, the traceback goes to the log of errors, and the work continues without it.
+        """
+        member = self.members.by_id.get(failed.number)
+        tiles = self.canvas.tiles_of(failed.number)
+        text = self._refuse(failed)
+        foreseen = isinstance(failed.__cause__, UnreadablePhotoError)
+        if foreseen and member is not None and member.state == "received":
+            member.state = "refused"  # nothing depends on it yet
+            self.queues.received = deque(m for m in self.queues.received if m is not member)
+        else:
+            self.background.stop()
+            self._reload()
+            self.redraw.dirty |= {a: {failed.number} for a in tiles}
+        return Update(what="refused", photo=failed.number, text=text)
+
+    def _refuse(self, failed: MemberFailedError) -> str:
+        """Stores that a photo is refused; returns its name and the reason."""
+        cause = failed.__cause__ if isinstance(failed.__cause__, Exception) else failed
+        row = self.ledger.row("select name, source from photo where id = ?", failed.number)
+        name, source = row if row is not None else (f"photo {failed.number}", "")
+        reason = rejected(name, cause).reason
+        if not isinstance(cause, UnreadablePhotoError):
+            log_error(self.folder, f"photo {failed.number}, {name}: {reason}", cause)
+        with self.ledger.change() as db:
+            self.ledger.set_photo(
+                failed.number, state="refused", reason=reason, pose=None, footprint=""
+            )
+            db.execute(
+                "update link set body = null where a = ? or b = ?", (failed.number, failed.number)
+            )
+            said = {"id": failed.number, "name": name, "source": source, "state": "refused"}
+            self.ledger.tell("photo", {**said, "time": None, "reason": reason})
+        return f"{name}: {reason}"
+
+    def _unexplained(self, error: Exception) -> Update:
+        """Reports an error that concerns no single photo; raises it where it comes again and
+        again.
+        """
+        self._failures += 1
+        if self._failures > MOST_FAILURES:
+            raise error
+        log_error(self.folder, "a step of the live map", error)
+        if self._failures > 1:  # perhaps an adjustment, which is due again with the next photo
+            self.schedule.since, self.schedule.loop = 0, None
+            self.schedule.write(self.ledger)
+        text = f"a step failed ({type(error).__name__}) and is repeated; see {ERRORS}"
+        self.ledger.tell("note", {"text": text})
+        return Update(what="noted", text=text)
 
     def _next(self) -> Update | None:
         if self.settings.deterministic:
@@ -216,7 +296,8 @@ class LiveMap:
         first = self.queues.received[0]
         if first.id % TIDY == 0:
             give_back()
-        return self.initial_pose.place(first)
+        with concerning(first.id):
+            return self.initial_pose.place(first)
 
     def _refined(self) -> Update | None:
         """Refines a photo in two units of work, so that a photo that arrives in between need not
@@ -225,10 +306,11 @@ class LiveMap:
         if not self.queues.untried or self.members.frame is None:
             return None
         member = self.queues.untried[0]
-        if member.state != "superseded" and not self.live_links.has_features(member.id):
-            self.live_links.features(member.id)
-            return Update(what="noted", photo=member.id)
-        return self.refinement.refine(member)
+        with concerning(member.id):
+            if member.state != "superseded" and not self.live_links.has_features(member.id):
+                self.live_links.features(member.id)
+                return Update(what="noted", photo=member.id)
+            return self.refinement.refine(member)
 
     def _drawn_first(self) -> Update | None:
         """Draws photos in order of arrival: a photo that arrives while others wait to be drawn is
@@ -266,3 +348,4 @@ class LiveMap:
         self.background.stop()
         self.tiles.close()
         self.ledger.close()
+        self.lock.close()

@@ -10,11 +10,13 @@ import numpy as np
 from pyproj import Transformer
 
 from skyquilt.alignment.priors import empty_prior, photo_prior
+from skyquilt.live.failures import concerning
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import Ledger
 from skyquilt.model.camera import PARAMETERS, Camera
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import MapFrame, Motion, Pose, Prior
+from skyquilt.outside import MOST_MP
 from skyquilt.photos.read import read_photo
 
 ON_MAP = ("placed", "refined")
@@ -76,9 +78,18 @@ class Members:
     changes.
     """
 
-    def __init__(self, ledger: Ledger, inbox: Inbox, thermal_unit: str | None = None) -> None:
-        """Reads the ledger; `thermal_unit`: the unit with which the photos were accepted."""
+    def __init__(
+        self,
+        ledger: Ledger,
+        inbox: Inbox,
+        thermal_unit: str | None = None,
+        most_mp: float = MOST_MP,
+    ) -> None:
+        """Reads the ledger; `thermal_unit`: the unit with which the photos were accepted;
+        `most_mp`: the largest area of a photo in megapixels.
+        """
         self.ledger, self.inbox, self.thermal_unit = ledger, inbox, thermal_unit
+        self.most_mp = most_mp
         self.by_id: dict[int, Member] = {}
         self.block_of: dict[int, int] = {}
         self.blocks: dict[int, set[int]] = {}
@@ -114,7 +125,12 @@ class Members:
             query, self._last
         ):
             self._last = int(number)
-            photo = read_photo(self.inbox.folder / file, name=name, thermal_unit=self.thermal_unit)
+            photo = read_photo(
+                self.inbox.folder / file,
+                name=name,
+                thermal_unit=self.thermal_unit,
+                most_mp=self.most_mp,
+            )
             if isinstance(photo, RejectedPhoto):
                 self.ledger.set_photo(number, state="refused", reason=photo.reason)
                 continue
@@ -127,8 +143,9 @@ class Members:
                 pose=pose_from(json.loads(pose)) if pose else None,
                 **_about(json.loads(about) if about else {}),
             )
-            if self.frame is not None:
-                member.prior = photo_prior(photo, self.frame, self._to_map)
+            if self.frame is not None and state != "refused":
+                with concerning(member.id):
+                    member.prior = photo_prior(photo, self.frame, self._to_map)
             self.by_id[member.id] = member
             self.block_of[member.id] = member.id
             self.blocks[member.id] = {member.id}

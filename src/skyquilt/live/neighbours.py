@@ -77,6 +77,9 @@ class Neighbours:
         """
         rings = int(np.ceil(reach / CELL_M))
         c, r = np.floor(at / CELL_M).astype(int).tolist()
+        if (2 * rings + 1) ** 2 > len(self._grid):  # an absurd height must not cost absurd time
+            near = (k for k in self._grid if max(abs(k[0] - c), abs(k[1] - r)) <= rings)
+            return [i for k in sorted(near) for i in self._grid[k]]
         return [
             i
             for dc in range(-rings, rings + 1)

@@ -9,15 +9,16 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from skyquilt.errors import OutputError
+from skyquilt.engine.error_log import log_error
+from skyquilt.errors import OutputError, UnreadablePhotoError
+from skyquilt.live.failures import of_the_system
 from skyquilt.live.inbox import Arrived, Inbox
 from skyquilt.live.ledger import Ledger, hit
 from skyquilt.live.settings import LiveSettings
 from skyquilt.model.photo import Photo, RejectedPhoto
-from skyquilt.photos.read import read_photo
+from skyquilt.outside import open_regular, plain
+from skyquilt.photos.read import read_photo, rejected
 
-MOST_PIXELS = 400_000_000
-"""Images with more pixels are refused before they are decoded."""
 NAME = 200
 """Largest number of characters of a name that are kept."""
 
@@ -74,15 +75,37 @@ class Intake:
             return self.refuse(
                 name, source, f"this map takes {self.settings.most_photos} photos at most"
             )
-        arrived = self.inbox.bring(blocks)
+        try:
+            arrived = self.inbox.bring(blocks)
+        except UnreadablePhotoError as error:
+            return self.refuse(name, source, str(error))
         if arrived is None:
             return self.refuse(name, source, "its content is neither JPEG, TIFF nor PNG")
-        return self._enter(arrived, name, source)
+        try:
+            return self._enter(arrived, name, source)
+        except OutputError:
+            raise
+        except Exception as error:  # whatever it is, it concerns this photo alone
+            if system := of_the_system(error):
+                raise system from error
+            _gone(arrived.path)
+            log_error(self.ledger.path.parent, name, error)
+            return self.refuse(name, source, rejected(name, error).reason)
 
     def take_file(self, path: Path, source: str) -> Accepted | Refused:
-        """Accepts a copy of a file that is complete."""
-        with path.open("rb") as file:
-            return self.take(iter(lambda: file.read(1 << 20), b""), path.name, source)
+        """Accepts a copy of a file that is complete.
+
+        Raises:
+            FileNotFoundError: it is gone. OutputError: as `take`.
+        """
+        try:
+            with open_regular(path) as file:
+                return self.take(iter(lambda: file.read(1 << 20), b""), path.name, source)
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            reason = f"it cannot be read ({error.strerror or error})"
+            return self.refuse(path.name, source, reason)
 
     def _full(self) -> bool:
         found = self.ledger.row("select count(*) from photo")
@@ -90,6 +113,7 @@ class Intake:
 
     def refuse(self, name: str, source: str, reason: str) -> Refused:
         """Records a refused file and reports it."""
+        name, source, reason = shown_name(name), shown_name(source), plain(reason, 500)
         self.ledger.refuse(name, source, reason)
         return Refused(name=name, reason=reason)
 
@@ -97,11 +121,17 @@ class Intake:
         known = self.ledger.row("select id, name from photo where digest = ?", arrived.digest)
         if known is not None:
             return Accepted(id=int(known[0]), name=str(known[1]), duplicate=True)
-        photo = read_photo(arrived.path, name=name, thermal_unit=self.settings.thermal_unit)
-        reason = photo.reason if isinstance(photo, RejectedPhoto) else _too_large(photo)
-        if isinstance(photo, RejectedPhoto) or reason:
+        photo = read_photo(
+            arrived.path,
+            name=name,
+            thermal_unit=self.settings.thermal_unit,
+            most_mp=self.settings.most_mp,
+        )
+        if isinstance(photo, RejectedPhoto):
             _gone(arrived.path)
-            return self.refuse(name, source, reason)
+            if photo.trace:
+                log_error(self.ledger.path.parent, f"{name}: {photo.reason}", photo.trace)
+            return self.refuse(name, source, photo.reason)
         try:
             return self._row(arrived, photo, name, source)
         except OutputError:
@@ -161,15 +191,6 @@ def shot_of(photo: Photo) -> str:
     shape = round(photo.width / photo.height, 1)
     place = f"{photo.position.latitude_deg:.7f} {photo.position.longitude_deg:.7f}"
     return f"{camera}|{photo.band}|{shape}|{photo.time.isoformat()}|{place}"
-
-
-def _too_large(photo: Photo) -> str:
-    if photo.width * photo.height <= MOST_PIXELS:
-        return ""
-    return (
-        f"it has {photo.width} x {photo.height} px, and {MOST_PIXELS // 10**6} megapixels are"
-        " the most"
-    )
 
 
 def _gone(path: Path) -> None:

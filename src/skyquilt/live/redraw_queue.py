@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.live.events import MapEvents, Update
+from skyquilt.live.failures import concerning
 from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member, Members, pose_from, pose_record
 from skyquilt.live.tile_drawing import LEAST_MOVE, NEWEST, Canvas
@@ -46,7 +47,8 @@ class RedrawQueue:
         rows = self.ledger.rows("select id, footprint from photo where footprint != ''")
         drawn = {int(i): json.loads(d)["pose"] for i, d in rows}
         for member in self.members.on_map():
-            addresses = self.canvas.place(member, self.members.camera(member))
+            with concerning(member.id):
+                addresses = self.canvas.place(member, self.members.camera(member))
             pose = pose_from(drawn[member.id]) if member.id in drawn else None
             rim = self.canvas.outline(member.id)
             if pose is not None and rim is not None and not self.canvas.moved(member, pose):

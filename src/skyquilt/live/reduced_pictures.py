@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store, digest
 from skyquilt.imaging.grey import shrink, to_grey8
+from skyquilt.live.failures import concerning
 from skyquilt.live.members import Member
 from skyquilt.photos.pixels import Reduction, read_color
 
@@ -64,6 +65,10 @@ class SmallPictures:
         return self._longest[member.id]
 
     def _read(self, number: int) -> NDArray[Any]:
+        with concerning(number):
+            return self._reduced(number)
+
+    def _reduced(self, number: int) -> NDArray[Any]:
         member = self.members[number]
         if measured(member):
             small = self._shrunken(member)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from skyquilt.errors import UsageError
+from skyquilt.outside import MOST_MP
 from skyquilt.settings import THERMAL_UNITS, one_of
 
 NEIGHBOURS = 8
@@ -52,6 +53,8 @@ class LiveSettings:
     """Features per photo, as in the batch workflow."""
     most_bytes: int = 500_000_000
     """Largest photo file in bytes."""
+    most_mp: float = MOST_MP
+    """Largest area of a photo in megapixels."""
     most_photos: int = 100_000
     """Largest number of photos accepted."""
 
@@ -64,6 +67,7 @@ class LiveSettings:
             ("--max-view-angle", self.max_view_angle, 0, 90),
             ("--max-photos", self.most_photos, 1, 10**7),
             ("--max-mb", self.most_bytes / 1e6, 0.01, 1e5),
+            ("--max-mp", self.most_mp, 0.01, 1e4),
         ):
             if value is not None and not low <= value <= high:
                 raise UsageError(f"{name} {value} lies outside {low} to {high}")

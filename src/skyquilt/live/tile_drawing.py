@@ -16,9 +16,11 @@ from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
 from skyquilt.imaging.view_limits import COARSEST, ViewLimits, limits_for
 from skyquilt.imaging.views import View, footprint
+from skyquilt.live.failures import concerning
 from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member
 from skyquilt.live.reduced_pictures import SmallPictures, measured
+from skyquilt.live.tone import Tone
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Pose
 from skyquilt.model.raster import Window
@@ -35,6 +37,7 @@ class Newest:
     """The photo taken last is shown, with hard seams."""
 
     margin: ClassVar[int] = 0
+    seam_px: ClassVar[None] = None
     version: ClassVar[int] = 1
 
     def rank(self, order: Order, score: Float) -> Float:
@@ -50,6 +53,14 @@ class Newest:
         return First().merge(list(reversed(layers)), gsd)
 
 
+MOST_TILES = 4000
+"""Largest number of tiles that a photo may cover; the footprint of one that sees the horizon is
+larger.
+"""
+TILES_PER_MP = 512
+"""The same per megapixel of the photo: it need not be drawn much larger than it is."""
+MOST_CELLS = 1000
+"""Largest number of height cells along a side of the surface below a photo."""
 NEWEST = "-newest"
 """Suffix of the names of layers that show the newest photo instead of the most vertical view."""
 MOST_VIEWS = 24
@@ -83,6 +94,12 @@ def layer_of(member: Member) -> str:
     return member.photo.band
 
 
+def _most_tiles(member: Member) -> float:
+    """Largest number of tiles on which a photo is drawn."""
+    size = member.photo.width * member.photo.height / 1e6
+    return min(MOST_TILES, max(64, TILES_PER_MP * size))
+
+
 class Canvas:
     """The tiles of the map, and which photos cover which tile."""
 
@@ -108,6 +125,7 @@ class Canvas:
         self._kept: OrderedDict[Address, Drawing] = OrderedDict()
         self._by_tile: dict[Address, set[int]] = defaultdict(set)
         self._pictures = SmallPictures(full, members, store)
+        self._tone = Tone(self._pictures)
 
     def place(self, member: Member, camera: Camera) -> set[Address]:
         """Records the pose of a photo; returns the tiles that may look different."""
@@ -117,15 +135,30 @@ class Canvas:
         if view is None:
             return self.remove(member.id)
         low, high = view.footprint.min(0), view.footprint.max(0)
-        now = tuple(covering(layer_of(member), 0, self.gsd, (low[0], low[1], high[0], high[1])))
-        if len(now) > 4000:  # the photo contains the horizon
+        across, along = (high - low) / (SIDE * self.gsd)
+        if not across * along < _most_tiles(member):  # the horizon, or an absurd height
             return self.remove(member.id)
+        now = tuple(covering(layer_of(member), 0, self.gsd, (low[0], low[1], high[0], high[1])))
         for address in old:
             self._by_tile[address].discard(member.id)
         for address in now:
             self._by_tile[address].add(member.id)
         self._views[member.id], self._seen[member.id] = view, now
+        self._settle(member, view, now)
         return set(old) | set(now)
+
+    def _settle(self, member: Member, view: View, tiles: Iterable[Address]) -> None:
+        """Brings a photo to the brightness of those that it overlaps."""
+        near = {i for address in tiles for i in self._by_tile.get(address, ())} - {member.id}
+        others = [v for i in sorted(near) if (v := self._views.get(i)) is not None]
+        low, high = view.footprint.min(0), view.footprint.max(0)
+        self._tone.settle(
+            view,
+            others,
+            self.surface((low[0], low[1], high[0], high[1])),
+            measured=measured(member),
+            drift=member.photo.unit == "celsius",
+        )
 
     def remove(self, number: int) -> set[Address]:
         """Removes a photo; returns the tiles that may look different."""
@@ -133,6 +166,7 @@ class Canvas:
         for address in old:
             self._by_tile[address].discard(number)
         self._views.pop(number, None)
+        self._tone.forget(number)
         return set(old)
 
     def _view(self, member: Member, camera: Camera, pose: Pose) -> View | None:
@@ -153,7 +187,7 @@ class Canvas:
             cy=(camera.cy + 0.5) * scale - 0.5,
         )
         x, y, z = pose.map_C.tolist()
-        reach = 1.5 * abs(z - self.ground)
+        reach = min(1.5 * abs(z - self.ground), MOST_CELLS / 2 * self.heights.cell)
         surface = self.surface((x - reach, y - reach, x + reach, y + reach))
         self._sizes[member.id] = abs(z - self.ground) / camera.focal
         limits = self._limits(small, pose, surface)
@@ -244,6 +278,13 @@ class Canvas:
         self, address: Address, changed: Collection[int], rule: str
     ) -> tuple[Address, "Drawing | None", Tile | None]:
         """The tile's address in its own layer, its composition and its pixels; None = unchanged."""
+        # an error of drawing is blamed on the newest of the photos that made it necessary
+        with concerning(max(changed or self._by_tile.get(address) or {0})):
+            return self._composed(address, changed, rule)
+
+    def _composed(
+        self, address: Address, changed: Collection[int], rule: str
+    ) -> tuple[Address, "Drawing | None", Tile | None]:
         at = replace(address, layer=address.layer + rule)
         compose, kept = self._composer(address, RULES[rule]), self._kept.get(at)
         plan = compose.plan(WHOLE, earlier=kept.plan if kept else None) if compose else None
@@ -306,6 +347,7 @@ class Canvas:
             pixels=self._pictures,
             bands=1 if values else 3,
             dtype=np.dtype(np.float32 if values else np.uint8),
+            exposure=self._tone.exposure,
         )
 
     @staticmethod

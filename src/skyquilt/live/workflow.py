@@ -2,11 +2,14 @@
 request.
 """
 
+import sqlite3
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from skyquilt.engine.error_log import NAME as ERRORS
+from skyquilt.engine.error_log import log_error
 from skyquilt.errors import OutputError, SkyquiltError
 from skyquilt.live.events import Update
 from skyquilt.live.final_map import iter_finish
@@ -46,7 +49,7 @@ def iter_live(
         try:
             yield from _taken(watches)
             update = live.work()
-        except OutputError as error:
+        except (OutputError, sqlite3.Error) as error:
             yield Note(text=str(error), warning=True)
             stop.wait(FULL_S)
             continue
@@ -83,7 +86,10 @@ def _finished(live: LiveMap, settings: LiveSettings) -> Iterator[Event]:
                     "finish",
                     {"state": "done", "text": "the final map is ready, beside the live one"},
                 )
-    except SkyquiltError as error:
+    except Exception as error:  # the live map goes on, whatever happens to the final one
+        if not isinstance(error, SkyquiltError):
+            log_error(live.folder, "the final map", error)
+            error = SkyquiltError(f"{type(error).__name__}, see {ERRORS}")
         live.ledger.put_meta("finish", "failed")
         live.ledger.tell("finish", {"state": "failed", "text": f"no final map: {error}"})
         yield Note(text=f"no final map: {error}", warning=True)

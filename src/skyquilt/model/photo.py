@@ -1,6 +1,6 @@
 """One photo as its metadata describe it: measurements with standard deviations, not facts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -176,6 +176,8 @@ class RejectedPhoto:
     """As in `Photo.name`."""
     reason: str
     """A plain sentence."""
+    trace: str = field(default="", repr=False)
+    """Where the program failed on it, for the log of errors; empty where the file itself is bad."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -38,6 +38,16 @@ class Grid:
             self.north - np.asarray(y)
         ) / self.gsd - 0.5
 
+    def nearest(self, other: "Grid") -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns of this grid nearest to the rows and columns of another."""
+        columns, rows = np.arange(other.width), np.arange(other.height)
+        c, _ = self.pixel(other.x(columns), np.zeros(other.width))
+        _, r = self.pixel(np.zeros(other.height), other.y(rows))
+        return (
+            np.clip(np.rint(r), 0, self.height - 1).astype(np.int64),
+            np.clip(np.rint(c), 0, self.width - 1).astype(np.int64),
+        )
+
     def coarser(self, factor: int) -> "Grid":
         """The same area in pixels `factor` times as large; the last row and column may reach beyond
         it.

@@ -31,6 +31,10 @@ class Layer:
     """Camera's plan position in m."""
     height: float
     """Camera above ground in m."""
+    slope: float | None = None
+    """Where seams are given: change per px, across a seam, of the difference of two scores, which
+    are then the share of the place that does not belong to the photo.
+    """
 
 
 class Blend(Protocol):
@@ -39,6 +43,12 @@ class Blend(Protocol):
     @property
     def margin(self) -> int:
         """Pixels beyond the window that the method needs."""
+
+    @property
+    def seam_px(self) -> float | None:
+        """Width in px of ramps across seam lines; None for methods that show every place by a rule
+        of their own.
+        """
 
     def rank(self, order: Order, score: Float) -> Float:
         """The rank of photos: the photo with the lowest rank is shown. `order`: position in order
@@ -89,9 +99,14 @@ class Feather:
     """Shows the most vertical view; seams are blended over a few pixels."""
 
     width_px: float = 6.0
-    """Width of the blend in map pixels; 0 = hard seams."""
+    """Width of the blend in map pixels; 0 = hard seams. Measured values are never mixed."""
     margin: ClassVar[int] = 0
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
+
+    @property
+    def seam_px(self) -> float:
+        """The width of the blend."""
+        return self.width_px
 
     def rank(self, order: Order, score: Float) -> Float:
         """The angle off the vertical."""
@@ -109,7 +124,7 @@ class Feather:
         """
         lead = leader(layers, [layer.score for layer in layers])
         hard = _picked(layers, lead)
-        if self.width_px > 0 and len(layers) > 1:
+        if self.width_px > 0 and len(layers) > 1 and hard.dtype.kind != "f":
             self._soften(hard, layers, lead, gsd)
         return hard, _photos(lead, layers)
 
@@ -118,6 +133,8 @@ class Feather:
     ) -> None:
         """Blends, in place, the pixels within half a width of a seam."""
         slopes = _slopes(layers, gsd)
+        if layers[0].slope is not None:
+            slopes = np.full_like(slopes, layers[0].slope)
         steepest = slopes.max()
         best, second = layers[0].score, np.full_like(layers[0].score, np.inf)
         for layer in layers[1:]:
@@ -179,6 +196,7 @@ class First:
     """
 
     margin: ClassVar[int] = 0
+    seam_px: ClassVar[None] = None
     version: ClassVar[int] = 1
 
     def rank(self, order: Order, score: Float) -> Float:
@@ -201,6 +219,7 @@ class Average:
     """The mean of all photos that cover the pixel, as in Arteaga et al. 2019."""
 
     margin: ClassVar[int] = 0
+    seam_px: ClassVar[None] = None
     version: ClassVar[int] = 1
 
     def rank(self, order: Order, score: Float) -> Float:
@@ -230,7 +249,8 @@ class Multiband:
 
     levels: int = 5
     """Levels of the Laplacian pyramid; the widest blend is about 2 ** levels px."""
-    version: ClassVar[int] = 1
+    seam_px: ClassVar[float] = 0.0
+    version: ClassVar[int] = 2
 
     @property
     def margin(self) -> int:
@@ -251,7 +271,7 @@ class Multiband:
         """
         lead = leader(layers, [layer.score for layer in layers])
         hard = _picked(layers, lead)
-        if len(layers) == 1:
+        if len(layers) == 1 or hard.dtype.kind == "f":  # measured values are cut, not mixed
             return hard, _photos(lead, layers)
         total: list[NDArray[Any]] = []
         mass: list[NDArray[Any]] = []

@@ -1,24 +1,42 @@
 """Composition of a window of the map from the photos that cover it."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import STEP, Nodes, View, cut, densify, inside_everywhere
+from skyquilt.imaging.views import (
+    STEP,
+    Nodes,
+    View,
+    cut,
+    densify,
+    inside_everywhere,
+    node_places,
+    project_nodes,
+)
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Blend, Layer
 from skyquilt.ortho.exposure import NEUTRAL, Exposure, image_place, with_odds
+from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.plan import Plan, planned, stale
 
 PhotoPixels = Callable[[int], NDArray[Any]]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""
 PIECE = 256
 """Pixels of a piece composed at a time."""
+FINE = (4, 8)
+"""Map pixels between nodes where heights bend between those of the plan: for cells of heights of
+less than 8 px, and for others.
+"""
+BENT = 0.25
+"""Heights bend where straight lines between nodes would shift a photo by more than this number of
+map pixels.
+"""
 MOST_PADDED = 12
 """Largest number of values in a photo's cut-out per map pixel for which adding a fourth band saves
 time.
@@ -57,6 +75,10 @@ class Composer:
     """Type of the map's pixels."""
     exposure: Exposure = NEUTRAL
     """Brightness corrections of the photos."""
+    labels: Labels | None = None
+    """The photo of each place; None = by the blending method's own rule."""
+    detailed: bool = False
+    """Whether heights may bend between the nodes of a plan; then nodes are set closer there."""
 
     def __call__(self, window: Window) -> Composed:
         """Plans and composes a window."""
@@ -77,6 +99,7 @@ class Composer:
             self.blend,
             counted=counted,
             earlier=earlier,
+            labels=self.labels,
         )
 
     def drawn(self, plan: Plan) -> Composed:
@@ -159,30 +182,70 @@ class Composer:
         if not chosen:
             return None
         alone = len(chosen) == 1
-        cuts = [cut(n, row, column, h, w) for n, _ in chosen]
+        cuts = self._cuts(plan, [n for n, _ in chosen], row, column, h, w)
         if alone and cuts[0].seen.all():  # nothing to blend, whatever the method
             pixels, _ = self._warped(cuts[0], h, w, alone=True)
             return pixels, np.full((h, w), cuts[0].view.photo, np.int32)
+        place = Window(
+            row=plan.window.row - plan.margin + row,
+            column=plan.window.column - plan.margin + column,
+            height=h,
+            width=w,
+        )
         layers = [
-            self._layer(n, here, h, w, alone=alone)
+            self._layer(n, here, place, alone=alone)
             for n, (_, here) in zip(cuts, chosen, strict=True)
         ]
         return self.blend.merge(layers, self.grid.gsd)
 
-    def _layer(self, n: Nodes, near: NDArray[np.bool_], h: int, w: int, *, alone: bool) -> Layer:
-        """One photo over a piece; filled only within the bounding box of the cells where it can be
-        visible.
+    def _cuts(
+        self, plan: Plan, chosen: Sequence[Nodes], row: int, column: int, h: int, w: int
+    ) -> list[Nodes]:
+        """The nodes of photos over a piece (h, w); closer ones where heights bend between them."""
+        cuts = [cut(n, row, column, h, w) for n in chosen]
+        if not self.detailed or self.surface.cell >= STEP * self.grid.gsd:
+            return cuts
+        place = Window(
+            row=plan.window.row - plan.margin + row,
+            column=plan.window.column - plan.margin + column,
+            height=h,
+            width=w,
+        )
+        step = FINE[self.surface.cell >= FINE[1] * self.grid.gsd * 0.99]
+        x, y, z = node_places(self.grid, self.surface, place, step)
+        rows, columns = (
+            slice(at // STEP, at // STEP - (-n // STEP) + 2) for at, n in ((row, h), (column, w))
+        )
+        straight = np.asarray(plan.z[rows, columns], np.float32)
+        size = (step * (z.shape[0] - 2), step * (z.shape[1] - 2))
+        middle = slice(step // 2, None, step)
+        bent = np.abs(z[1:-1, 1:-1] - densify(straight, *size)[middle, middle]).max()
+        aside = max(float(n.score.max()) for n in cuts)
+        if bent * np.sqrt(aside) <= BENT * self.grid.gsd:
+            return cuts
+        return [replace(project_nodes(n.view, x, y, z), step=step) for n in cuts]
+
+    def _layer(self, n: Nodes, near: NDArray[np.bool_], place: Window, *, alone: bool) -> Layer:
+        """One photo over a piece at its place in the map; filled only within the bounding box of
+        the cells where it can be visible.
         """
+        h, w = place.height, place.width
         rows, columns = _extent(np.asarray(near.any(1)), h), _extent(np.asarray(near.any(0)), w)
         size = rows.stop - rows.start, columns.stop - columns.start
         pixels, score = self._warped(cut(n, rows.start, columns.start, *size), *size, alone=alone)
         if size != (h, w):
             pixels = _embedded(pixels, 0, rows, columns, h, w)
             score = _embedded(score, np.inf, rows, columns, h, w)
+        slope = None
+        if self.labels is not None and self.blend.seam_px is not None and not alone:
+            share = self.labels.share(n.view.photo, place, self.blend.seam_px)
+            score = np.where(np.isfinite(score), 1 - share, score)
+            slope = self.labels.slope(self.blend.seam_px)
         return Layer(
             photo=n.view.photo,
             pixels=pixels,
             score=score,
+            slope=slope,
             centre=(float(n.view.pose.map_C[0]), float(n.view.pose.map_C[1])),
             height=n.height,
         )
@@ -194,9 +257,10 @@ class Composer:
         image = self.pixels(n.view.photo)
         # cv2.remap uses 16-bit coordinates: a cut-out keeps them small
         x, y = _reach(n.u, image.shape[1]), _reach(n.v, image.shape[0])
-        u, v = densify(n.u - np.float32(x.start), h, w), densify(n.v - np.float32(y.start), h, w)
+        u = densify(n.u - np.float32(x.start), h, w, n.step)
+        v = densify(n.v - np.float32(y.start), h, w, n.step)
         warped = _remapped(image[y, x], u, v)
-        score = np.zeros((h, w), np.float32) if alone else densify(n.score, h, w)
+        score = np.zeros((h, w), np.float32) if alone else densify(n.score, h, w, n.step)
         if not n.seen.all():
             within = inside_everywhere(n, u + np.float32(x.start), v + np.float32(y.start))
             np.copyto(score, np.float32(np.inf), where=~within)
@@ -210,7 +274,10 @@ class Composer:
             return warped
         if self.exposure.uneven(photo):
             odds = self.exposure.odds(photo, *image_place(n.view, n.u, n.v))
-            return with_odds(warped, densify(odds, *warped.shape[:2]).reshape(warped.shape))
+            return with_odds(
+                warped,
+                densify(odds, warped.shape[0], warped.shape[1], n.step).reshape(warped.shape),
+            )
         table = self.exposure.table(photo)
         return warped if table is None else np.asarray(cv2.LUT(warped, table)).reshape(warped.shape)
 

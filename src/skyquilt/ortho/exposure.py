@@ -1,7 +1,8 @@
 """Exposure: brings overlapping photos to a common brightness, from the ground that they share.
 
-Per photo a gain for each band and a smooth field over the image (vignetting, a cloud's shadow, the
-sun's glare). Gains act on the odds x / (1 - x) of a pixel value x in (0, 1), not on the value:
+Per camera a radial fall of light (vignetting, in even powers of the radius, as Goldman 2010 and
+others), per photo a gain for each band and a smooth field over the image (a cloud's shadow, the
+sun's hot spot). Gains act on the odds x / (1 - x) of a pixel value x in (0, 1), not on the value:
 black stays black and white stays white, so nothing clips or turns purple, and two gains in a row
 are one gain.
 """
@@ -29,6 +30,8 @@ CORRELATED = 30.0
 """Errors of neighbouring samples are correlated: this number of samples counts as one independent
 sample.
 """
+ROUNDS = 8
+"""Rounds in which photos' gains and cameras' radial terms are solved for in turn, at most."""
 DENSE = 1000
 """Largest number of unknowns for which the normal equations are solved as a full matrix."""
 
@@ -36,13 +39,13 @@ DENSE = 1000
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Exposure:
     """Correction of each photo to a common brightness: log odds + gain[band] + field . (x, y, x^2,
-    y^2, x y).
+    y^2, x y, r^4).
     """
 
     gains: Mapping[int, Float]
     """Photo -> (bands,) in log odds."""
     fields: Mapping[int, Float]
-    """Photo -> (5,) in log odds, for x and y from -1 to 1 over the image."""
+    """Photo -> (6,) in log odds, for x, y and r from the image's centre, 1 in its corners."""
     offsets: Mapping[int, float] = field(default_factory=dict)
     """Photo -> offset added to measured values, in their unit."""
 
@@ -51,9 +54,18 @@ class Exposure:
         return bool(np.abs(self.fields[photo]).max() > 0)
 
     def odds(self, photo: int, x: Float, y: Float) -> Float:
-        """Factors (h, w, bands) on the odds at image positions x, y (h, w), -1 to 1."""
+        """Factors (h, w, bands) on the odds at image positions x, y (h, w), see `image_place`."""
         field = np.exp(_basis(x, y) @ self.fields[photo])
         return (field[..., None] * np.exp(self.gains[photo])).astype(np.float32)
+
+    def grey(self, view: View, value: NDArray[Any], u: NDArray[Any], v: NDArray[Any]) -> Float:
+        """Corrected grey values (h, w) of a photo's pixels at columns u and rows v (h, w)."""
+        photo = view.photo
+        if photo not in self.gains:
+            return np.asarray(value, np.float32)
+        field = _basis(*image_place(view, u, v)) @ self.fields[photo]
+        g = np.exp(field + self.gains[photo].mean())
+        return np.asarray(255 * g * value / (255 + (g - 1) * value), np.float32)
 
     def table(self, photo: int) -> NDArray[np.uint8] | None:
         """Lookup table (1, 256, bands) of a photo with gains only; None if nothing changes."""
@@ -72,8 +84,8 @@ def with_odds(pixels: NDArray[np.uint8], odds: Float) -> NDArray[np.uint8]:
 
 
 def _basis(x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
-    """(..., 5) terms of the field."""
-    return np.stack([x, y, x * x, y * y, x * y], -1)
+    """(..., 6) terms of the field."""
+    return np.stack([x, y, x * x, y * y, x * y, (x * x + y * y) ** 2], -1)
 
 
 def odds_table(gains: Float) -> NDArray[np.uint8]:
@@ -97,11 +109,15 @@ class Balance:
     """Prior deviation of a gain in log odds."""
     sigma_field: float = 0.15
     """Prior deviation of a term of the field in log odds."""
-    even: float = 0.1
-    """Fields smaller than this everywhere, in log odds (6 of 255 levels on middle grey), are not
+    sigma_radial: float = 1.0
+    """Prior deviation of a term of a camera's radial fall of light."""
+    even: float = 0.08
+    """Fields smaller than this everywhere, in log odds (5 of 255 levels on middle grey), are not
     applied, to save time.
     """
-    version: ClassVar[int] = 2
+    gained: float = 0.1
+    """Least share of the differences between photos that fields must explain to be applied."""
+    version: ClassVar[int] = 3
 
     def __call__(
         self,
@@ -117,26 +133,65 @@ class Balance:
         samples = self._samples(usable, thumbnails, surface, bounds)
         if not len(samples.point):
             return NEUTRAL
-        return self._solve(samples, [v.photo for v in usable])
+        return self._solve(samples, usable)
 
-    def _solve(self, s: "Samples", photos: Sequence[int]) -> Exposure:
-        """Condition: log odds + gain + field is the same in all photos of a ground point, so
-        differences from the point's mean are zero.
+    def _solve(self, s: "Samples", views: Sequence[View]) -> Exposure:
+        """Condition: log odds + gain + radial + field is the same in all photos of a ground point,
+        so differences from the point's mean are zero.
         """
-        n, N = len(photos), len(s.point)
+        photos, n, N = [v.photo for v in views], len(views), len(s.point)
         _, point = np.unique(s.point, return_inverse=True)
-        terms = np.concatenate([np.ones((N, 1)), _basis(s.place[:, 0], s.place[:, 1])], 1)
+        basis = _basis(s.place[:, 0], s.place[:, 1])
+        radial = self._radial(s, views, point)
+        grey = s.log.mean(1, keepdims=True) + (basis * radial[s.row]).sum(1)[:, None]
+        terms = np.concatenate([np.ones((N, 1)), basis[:, :5]], 1)
         ridge = 1 / np.array([self.sigma_gain] + 5 * [self.sigma_field]) ** 2
-        x = _robust_differences(terms, s.row, point, s.log.mean(1, keepdims=True), ridge, n)[..., 0]
-        largest = np.abs(_basis(*np.meshgrid([-1, 0, 1], [-1, 0, 1])) @ x[:, 1:].T).max((0, 1))
-        fields = x[:, 1:] * (largest > self.even)[:, None]
-        even = s.log + (terms[:, 1:] * fields[s.row]).sum(1)[:, None]
+        x = _robust_differences(terms, s.row, point, grey, ridge, n)[..., 0]
+        fields = radial.copy()
+        fields[:, :5] += x[:, 1:]
+        largest = [
+            np.abs(_basis(*_corners(v)) @ field).max()
+            for v, field in zip(views, fields, strict=True)
+        ]
+        fields *= (np.array(largest) > self.even)[:, None]
+        even = s.log + (basis * fields[s.row]).sum(1)[:, None]
+        bare = _apart(s.log.mean(1), s.row, point, self.sigma_gain, n)
+        if _apart(even.mean(1), s.row, point, self.sigma_gain, n) > (1 - self.gained) * bare:
+            fields, even = np.zeros_like(fields), s.log
         gains = _robust_differences(terms[:, :1], s.row, point, even, ridge[:1], n)[:, 0]
         gains = (gains - np.median(gains, axis=0)).astype(np.float32)
         return Exposure(
             gains=dict(zip(photos, gains, strict=True)),
             fields=dict(zip(photos, fields.astype(np.float32), strict=True)),
         )
+
+    def _radial(
+        self, s: "Samples", views: Sequence[View], point: NDArray[Any]
+    ) -> NDArray[np.float64]:
+        """(n, 6) the radial fall of light of each view's camera, as a field; photos' gains and
+        cameras' terms are solved for in turn.
+        """
+        names = {c: k for k, c in enumerate(dict.fromkeys(v.camera for v in views))}
+        camera = np.array([names[v.camera] for v in views])[s.row]
+        r2 = (s.place**2).sum(1)
+        apart = np.zeros((len(r2), len(names), 2))
+        apart[np.arange(len(r2)), camera] = np.stack([r2, r2 * r2], 1)
+        columns = apart.reshape(len(r2), -1)
+        grey = s.log.mean(1)
+        found: NDArray[np.float64] = np.zeros(columns.shape[1])
+        ones, ridge = np.ones((len(r2), 1)), np.array([1 / self.sigma_gain**2])
+        pull = np.eye(len(found)) * SIGMA_LEVEL**2 * CORRELATED / self.sigma_radial**2
+        for _ in range(ROUNDS):
+            level = (grey + columns @ found)[:, None]
+            gain = _robust_differences(ones, s.row, point, level, ridge, len(views))[:, 0, 0]
+            before, found = found, _within_points(columns, grey + gain[s.row], point, pull)
+            if np.abs(found - before).max() < SETTLED:
+                break
+        fields = np.zeros((len(views), 6))
+        mine = found.reshape(-1, 2)[[names[v.camera] for v in views]]
+        fields[:, 2] = fields[:, 3] = mine[:, 0]
+        fields[:, 5] = mine[:, 1]
+        return fields
 
     def _samples(
         self,
@@ -188,15 +243,25 @@ class Samples:
     row: NDArray[np.int64]
     """(N,) view."""
     place: NDArray[np.float64]
-    """(N, 2) x and y in the photo, -1 to 1."""
+    """(N, 2) x and y in the photo, see `image_place`."""
     log: NDArray[np.float64]
     """(N, bands) log odds of the brightness."""
 
 
 def image_place(view: View, u: NDArray[Any], v: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """x and y from -1 to 1 over the image, of photo pixels."""
+    """x and y of photo pixels from the image's centre, in half diagonals of the image."""
     w, h = view.camera.width - 1.0, view.camera.height - 1.0
-    return np.clip(2 * u / w - 1, -1.1, 1.1), np.clip(2 * v / h - 1, -1.1, 1.1)
+    half = np.hypot(w, h) / 2
+    x, y = (
+        np.clip((p - n / 2) / half, -0.55 * n / half, 0.55 * n / half) for p, n in ((u, w), (v, h))
+    )
+    return x, y
+
+
+def _corners(view: View) -> tuple[NDArray[Any], NDArray[Any]]:
+    """x and y (3, 3) of the image's corners, the middles of its sides and its centre."""
+    w, h = view.camera.width - 1.0, view.camera.height - 1.0
+    return image_place(view, *np.meshgrid([0, w / 2, w], [0, h / 2, h]))
 
 
 def _sampled(
@@ -243,6 +308,36 @@ def _robust_differences(
         residual = level - (_sums(point, w[:, None] * level, len(mass)) / mass[:, None])[point]
         w = 1 / (1 + (residual**2).mean(1) / 0.25**2)
     return x
+
+
+def _apart(
+    y: NDArray[Any], row: NDArray[Any], point: NDArray[Any], sigma: float, count: int
+) -> float:
+    """Median difference from the mean of their point, in log odds, of samples (N,) after one gain
+    for each photo.
+    """
+    ridge, ones = np.array([1 / sigma**2]), np.ones((len(y), 1))
+    level = y + _robust_differences(ones, row, point, y[:, None], ridge, count)[row, 0, 0]
+    mean = np.bincount(point, level) / np.maximum(np.bincount(point), 1)
+    several = np.bincount(point)[point] > 1
+    return float(np.median(np.abs(level - mean[point])[several])) if several.any() else 0.0
+
+
+def _within_points(
+    terms: NDArray[Any], y: NDArray[Any], point: NDArray[Any], pull: NDArray[Any]
+) -> NDArray[np.float64]:
+    """x (k,) that makes y + terms . x equal within each point, y (N,) and terms (N, k), with robust
+    weights; `pull` (k, k): weight of the prior of zero.
+    """
+    w, x = np.ones(len(y)), np.zeros(terms.shape[1])
+    count = int(point.max()) + 1
+    for _ in range(5):
+        mass = np.maximum(np.bincount(point, w, count), 1e-9)
+        apart = terms - (_sums(point, w[:, None] * terms, count) / mass[:, None])[point]
+        off = y - (np.bincount(point, w * y, count) / mass)[point]
+        x = -np.linalg.solve(apart.T @ (w[:, None] * apart) + pull, apart.T @ (w * off))
+        w = 1 / (1 + ((off + apart @ x) / SIGMA_LEVEL) ** 2)
+    return np.asarray(x)
 
 
 def _sums(group: NDArray[Any], values: NDArray[Any], count: int) -> NDArray[np.float64]:

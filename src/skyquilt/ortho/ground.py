@@ -18,6 +18,9 @@ from skyquilt.model.surface import Surface
 from skyquilt.ortho.tie_surface import level
 from skyquilt.settings import PictureSettings
 
+Heights = NDArray[np.float32]
+Keep = Callable[[str, Callable[[], Heights]], Heights]
+"""Gives a part of a result by its name: the one kept of an interrupted run, or made now."""
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image of a photo (index), with at most the given px on its longest side."""
 
@@ -41,9 +44,11 @@ class SurfaceFromPictures(Protocol):
     """Heights refined by image matching."""
 
     def __call__(
-        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, /
+        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep, /
     ) -> Surface:
-        """The surface with refined heights where images determine them."""
+        """The surface with refined heights where images determine them; `keep`: for methods that
+        resume at a part of their result.
+        """
         ...
 
 
@@ -103,20 +108,26 @@ def find_ground(
     grid = grid_of(views, gsd, bounds)
     if sweep is not None and len(xyz) > 3:
         held, known = set(alignment.held), surface
+        refined = digest(
+            key,
+            poses_digest(alignment),
+            grid,
+            sweep,
+            sorted(held),
+            pictures,
+            picture.max_view_angle,
+            limits_for,
+        )
+
+        def keep(part: str, make: Callable[[], Heights]) -> Heights:
+            return store.get_or("surface", digest(refined, part), make)
+
         surface = store.get_or(
             "surface",
-            digest(
-                key,
-                poses_digest(alignment),
-                grid,
-                sweep,
-                sorted(held),
-                pictures,
-                picture.max_view_angle,
-                limits_for,
-            ),
-            lambda: sweep(known, [v for v in views if v.photo in held], grid, grey),
+            refined,
+            lambda: sweep(known, [v for v in views if v.photo in held], grid, grey, keep),
         )
+        views = tuple(make_views(alignment, surface, limits))
     yield 1, 1
     return Ground(surface=surface, views=views, grid=grid, native_gsd=native, limits=limits)
 

@@ -31,6 +31,7 @@ from skyquilt.ortho.companions import (
 from skyquilt.ortho.compose import Composer, PhotoPixels
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground, poses_digest
+from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.radiometry import value_tags
 from skyquilt.raster import Block, CogWriter, RasterSpec, write_array
 from skyquilt.raster.spec import Compression
@@ -43,7 +44,13 @@ SPOOL = "mosaic.spool"
 
 
 def composer(
-    bands: int, dtype: str, ground: Ground, exposure: Exposure, blend: Blend, pixels: PhotoPixels
+    bands: int,
+    dtype: str,
+    ground: Ground,
+    exposure: Exposure,
+    labels: Labels | None,
+    blend: Blend,
+    pixels: PhotoPixels,
 ) -> Composer:
     """The composer of a survey's map; all photos have pixels of one kind."""
     return Composer(
@@ -55,6 +62,8 @@ def composer(
         bands=bands,
         dtype=np.dtype(dtype),
         exposure=exposure,
+        labels=labels,
+        detailed=True,
     )
 
 
@@ -89,7 +98,9 @@ def mosaic_spec(
     )
 
 
-def map_key(run_key: str, alignment: Alignment, ground: Ground, exposure: Exposure) -> str:
+def map_key(
+    run_key: str, alignment: Alignment, ground: Ground, exposure: Exposure, labels: Labels | None
+) -> str:
     """What a drawn map depends on."""
     return digest(
         run_key,
@@ -98,6 +109,7 @@ def map_key(run_key: str, alignment: Alignment, ground: Ground, exposure: Exposu
         dict(exposure.gains),
         dict(exposure.fields),
         dict(exposure.offsets),
+        None if labels is None else labels.photo,
     )
 
 

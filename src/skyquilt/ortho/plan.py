@@ -20,6 +20,7 @@ from skyquilt.imaging.views import (
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Blend
+from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.smears import smeared, yielding
 
 TOGETHER = 6
@@ -64,8 +65,11 @@ def planned(
     *,
     counted: bool,
     earlier: Plan | None,
+    labels: Labels | None = None,
 ) -> Plan:
-    """A plan of a window of a grid; `counted` and `earlier` as for `Composer.plan`."""
+    """A plan of a window of a grid; `counted` and `earlier` as for `Composer.plan`. `labels`: the
+    photo of each place, where it is not the one of the lowest rank.
+    """
     margin = -(-blend.margin // STEP) * STEP
     x, y, z = node_places(grid, surface, window.grown(margin))
     known: Mapping[int, Nodes] = {}
@@ -73,6 +77,19 @@ def planned(
         z, same = _kept_heights(z, earlier, grid.gsd)
         known = earlier.projected if same else known
     views = overlapping(views, x, y)
+    if labels is not None:
+        shown = labels.near(window.grown(margin), blend.seam_px or 0.0)
+        asked = views if counted else [v for v in views if v.photo in shown]
+        seen = [n for n in project_all(asked, x, y, z) if n.seen.any()]
+        nowhere = np.zeros(x.shape, np.bool_)
+        return Plan(
+            window=window,
+            margin=margin,
+            nodes=seen,
+            near=[shown.get(n.view.photo, nowhere) for n in seen],
+            z=z,
+            projected={n.view.photo: n for n in seen},
+        )
     low = blend.rank(np.arange(len(views)), least_scores(views, x, y, z))
     height = min((float(v.pose.map_C[2]) for v in views), default=1.0) - float(np.median(z))
     slack = blend.reach(grid.gsd) / max(height, 1e-3)

@@ -47,9 +47,16 @@ class Sweep:
     version: ClassVar[int] = 3
 
     def __call__(
-        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture
+        self,
+        surface: Surface,
+        views: Sequence[View],
+        grid: Grid,
+        grey: GreyPicture,
+        keep: object = None,
     ) -> Surface:
-        """The surface with the heights found; unchanged where the images do not agree."""
+        """The surface with the heights found; unchanged where the images do not agree. `keep` is
+        not used: a sweep is made in one go.
+        """
         height = float(np.median([v.pose.map_C[2] for v in views]) - np.median(surface.z))
         if len(views) < 2 or height <= 0:
             return surface

@@ -2,7 +2,6 @@
 their overlap.
 """
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,8 @@ from numpy.typing import NDArray
 
 from skyquilt.errors import SideFileError
 from skyquilt.model.registration import Matrix
+from skyquilt.outside import real
+from skyquilt.photos.side_rows import read_lines, read_table
 
 _ACROSS = 64
 """Number of points along the longer side of the reference at which both are compared."""
@@ -75,31 +76,30 @@ def read_pairs(path: Path) -> tuple[Pair, ...]:
     Raises:
         SideFileError: it cannot be read, lacks columns, or contains an invalid number.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise SideFileError(f"{path} cannot be read as a list of pairs: {error}") from error
-    reader = csv.DictReader(text.splitlines())
-    missing = [name for name in COLUMNS if name not in (reader.fieldnames or ())]
+    table = read_table([line for _, line in read_lines(path)], file=path.name)
+    header = [cell.strip() for cell in table[0]] if table else []
+    missing = [name for name in COLUMNS if name not in header]
     if missing:
         raise SideFileError(
             f"{path.name} lacks the columns {', '.join(missing)}; see docs/methods.md"
         )
-    pairs = tuple(_pair(row, number, path) for number, row in enumerate(reader, 2))
+    rows = (dict(zip(header, [*row, *[""] * len(header)], strict=False)) for row in table[1:])
+    pairs = tuple(_pair(row, number, path) for number, row in enumerate(rows, 2))
     if not pairs:
         raise SideFileError(f"{path.name} names no pairs; one line each is expected below the head")
     return pairs
 
 
 def _pair(row: dict[str, str], number: int, path: Path) -> Pair:
-    try:
-        matrix = np.array([[float(row[f"h{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)])
-        tolerance = float(row["tolerance_px"])
-    except (TypeError, ValueError) as error:
+    names = [f"h{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)]
+    numbers = [real(row[name], -1e12, 1e12) for name in (*names, "tolerance_px")]
+    if None in numbers or not row["a"].strip() or not row["b"].strip():
         raise SideFileError(
-            f"{path.name}, line {number}: a number is expected ({error})"
-        ) from error
-    if not (np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 1e-12 and tolerance > 0):
+            f"{path.name}, line {number}: a number is expected in each of {len(numbers)} cells,"
+            " and two images"
+        )
+    matrix, tolerance = np.array(numbers[:9], np.float64).reshape(3, 3), numbers[9] or 0.0
+    if not (abs(np.linalg.det(matrix)) > 1e-12 and tolerance > 0):
         raise SideFileError(
             f"{path.name}, line {number}: h11 to h33 are no transform, or the tolerance is not > 0"
         )

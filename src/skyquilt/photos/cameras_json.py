@@ -10,6 +10,8 @@ from skyquilt.errors import SideFileError
 from skyquilt.geometry.camera_formats import camera_from_opensfm
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Focal, Photo
+from skyquilt.outside import plain
+from skyquilt.photos.side_rows import read_text, sentence_of
 
 _SIGMA_SHARE = 0.01
 
@@ -17,14 +19,10 @@ _SIGMA_SHARE = 0.01
 def read_cameras_json(path: Path) -> dict[str, Camera]:
     """Cameras by the file's own keys; raises `SideFileError`."""
     try:
-        records = json.loads(path.read_text("utf-8-sig"))
-    except OSError as error:
+        records = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
         raise SideFileError(
-            f"{path} cannot be read ({error.strerror or error}); check the path."
-        ) from error
-    except ValueError as error:
-        raise SideFileError(
-            f"{path.name} is not JSON ({error}). Use the file as it was written."
+            f"{path.name} is not JSON ({plain(str(error), 200)}). Use the file as it was written."
         ) from error
     if (
         not isinstance(records, dict)
@@ -34,8 +32,10 @@ def read_cameras_json(path: Path) -> dict[str, Camera]:
         raise SideFileError(f"{path.name} should hold cameras by name, as OpenDroneMap writes it.")
     try:
         return {key: camera_from_opensfm(record) for key, record in records.items()}
-    except ValueError as error:
-        raise SideFileError(f"{path.name}: a camera cannot be used: {error}.") from error
+    except (ValueError, TypeError) as error:
+        raise SideFileError(
+            f"{path.name}: a camera cannot be used: {plain(str(error), 200)}."
+        ) from error
 
 
 def apply_cameras(
@@ -47,7 +47,8 @@ def apply_cameras(
     fitting = {p.camera_key: _fitting(p, cameras) for p in photos}
     if not any(fitting.values()):
         raise SideFileError(
-            f"{file.name} has cameras {', '.join(cameras)}; the photos are by {', '.join(fitting)}."
+            f"{file.name} has cameras {plain(sentence_of(list(cameras)), 400)}; the photos are by"
+            f" {sentence_of(list(fitting))}."
             " "
             "Rename a camera to 'all', or provide a calibration of this camera."
         )

@@ -6,14 +6,21 @@ The observations of the points are given in one of three ways: by further column
 in gcp_list.txt.
 """
 
-import csv
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from skyquilt.errors import SideFileError
 from skyquilt.model.photo import ControlPoint, KnownDistance, PointObservation
-from skyquilt.photos.side_rows import PhotoNames, finite, number, read_lines, sentence_of
+from skyquilt.outside import plain
+from skyquilt.photos.side_rows import (
+    PhotoNames,
+    finite,
+    number,
+    read_lines,
+    read_table,
+    sentence_of,
+)
 
 _ENDS = ("a", "b")
 _NEEDED = ("point_a", "point_b", "metres")
@@ -36,10 +43,10 @@ def read_distances(
     for place, row in rows:
         ends = tuple(_label(row[f"point_{e}"]) for e in _ENDS)
         metres = finite(number(row["metres"]))
-        if metres is None or metres <= 0:
+        if metres is None or not 0 < metres <= 1e6:
             raise SideFileError(
-                f"{place}: expected a length in m above 0, found '{row['metres']}'. Correct that"
-                " cell."
+                f"{place}: expected a length in m above 0, found '{plain(row['metres'], 60)}'."
+                " Correct that cell."
             )
         if lengths.setdefault((ends[0], ends[1]), metres) != metres:
             raise SideFileError(
@@ -76,13 +83,13 @@ def read_distances(
 def _rows(path: Path) -> list[tuple[str, Mapping[str, str]]]:
     """Rows by column name, each with its position in the file for messages."""
     lines = read_lines(path)
-    table = list(csv.reader([line for _, line in lines], skipinitialspace=True))
+    table = read_table([line for _, line in lines], file=path.name)
     header = [re.sub(r"[\s(\[].*", "", cell.strip().lower()) for cell in table[0]] if table else []
     missing = [c for c in _NEEDED if c not in header]
     if missing or len(table) < 2:
         raise SideFileError(
             f"{path.name}: expected a header with {', '.join(_NEEDED)} and one line per distance,"
-            f" found '{', '.join(header)}' and {max(0, len(table) - 1)} lines. See the"
+            f" found '{plain(', '.join(header), 200)}' and {max(0, len(table) - 1)} lines. See the"
             " documentation of --distances."
         )
     cells = (
@@ -114,8 +121,7 @@ def _observations(
     x, y = finite(number(words[0])), finite(number(words[1]))
     if x is None or y is None or not words[2]:
         raise SideFileError(
-            f"{place}: there is no observation of point '{label}'; add columns px_{end}, py_{end},"
-            f" image_{end},"
-            " or name a point of gcp_list.txt"
+            f"{place}: there is no observation of point '{plain(label, 80)}'; add columns px_{end},"
+            f" py_{end}, image_{end}, or name a point of gcp_list.txt"
         )
     return (PointObservation(photo=words[2], x=x, y=y),)

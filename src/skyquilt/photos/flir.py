@@ -12,13 +12,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
+from skyquilt.errors import UnreadablePhotoError
+from skyquilt.outside import check_picture
 from skyquilt.photos.headers import APP1, JpegHeader
 
 _PREFIX = b"FLIR\x00"
 _RAW_IMAGE, _CAMERA = 1, 0x20
 _ZERO_CELSIUS = 273.15
+MOST_THERMAL_MP = 16.0
+"""Largest area of a radiometric frame in megapixels; thermal sensors have 3 at most."""
+_ROWS = 256
+"""Rows converted at a time, since the formula needs many times the memory of the counts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +70,12 @@ class FlirCamera:
         """Object temperature in deg C, shape as given; NaN where the counts correspond to no
         radiance.
         """
+        out = np.empty(counts.shape, np.float32)
+        for row in range(0, len(counts), _ROWS):
+            out[row : row + _ROWS] = self._celsius(counts[row : row + _ROWS])
+        return out
+
+    def _celsius(self, counts: NDArray[np.generic]) -> NDArray[np.float32]:
         tau, e, w = self.transmission, self.emissivity, self.window_transmission
         seen = (counts.astype(np.float64) - (1 - w) * self.signal(self.window_k)) / w
         seen -= (1 - tau) * self.signal(self.atmosphere_k) + (1 - e) * tau * self.signal(
@@ -91,7 +102,11 @@ class FlirFrame:
 
 
 def read_flir(jpeg: JpegHeader) -> FlirFrame | None:
-    """The raw frame of a FLIR JPEG; None where there is none or it is broken."""
+    """The raw frame of a FLIR JPEG; None where there is none or it is broken.
+
+    Raises:
+        UnreadablePhotoError: the frame declares a size that is refused.
+    """
     parts = [p for m, p in jpeg.segments if m == APP1 and p.startswith(_PREFIX) and len(p) > 8]
     block = b"".join(p[8:] for p in sorted(parts, key=lambda p: p[6]))
     if block[:4] not in (b"FFF\x00", b"AFF\x00"):
@@ -100,6 +115,8 @@ def read_flir(jpeg: JpegHeader) -> FlirFrame | None:
         records = _records(block)
         counts = _counts(records[_RAW_IMAGE])
         return FlirFrame(counts=counts, camera=_camera(records.get(_CAMERA, b"")))
+    except UnreadablePhotoError:  # its declared size is refused
+        raise
     except (
         Exception
     ):  # struct, Pillow and numpy raise many exceptions on bad data; all mean: no frame
@@ -126,9 +143,12 @@ def _order(record: bytes) -> str:
 def _counts(record: bytes) -> NDArray[np.uint16]:
     order = _order(record)
     width, height = struct.unpack_from(order + "HH", record, 2)
+    check_picture(width, height, 2, most_mp=MOST_THERMAL_MP, option="")
     body = record[32:]
     if body.startswith(b"\x89PNG"):
-        with Image.open(io.BytesIO(body)) as image:
+        from PIL.PngImagePlugin import PngImageFile
+
+        with PngImageFile(io.BytesIO(body)) as image:
             if image.size != (width, height) or not image.mode.startswith("I"):
                 raise ValueError("its raw PNG is not a 16-bit image of the size in the record")
             swapped = np.asarray(image, dtype=np.uint16)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from skyquilt.errors import SideFileError
 from skyquilt.model.photo import ControlPoint, Datum, PointObservation
+from skyquilt.outside import plain
 from skyquilt.photos.side_rows import PhotoNames, finite, number, read_crs, read_lines, sentence_of
 
 if TYPE_CHECKING:
@@ -102,8 +103,8 @@ def _observation(line: str, place: str) -> _Observation:
     wanted = (finite(v) for v in (x, y, column, row))
     if len(words) < 6 or z is None or any(v is None for v in wanted):
         raise SideFileError(
-            f"{place}: expected 'x y z px py image [name] [check]', found '{line}'. Correct that"
-            " line."
+            f"{place}: expected 'x y z px py image [name] [check]', found '{plain(line, 200)}'."
+            " Correct that line."
         )
     name = words[6] if len(words) > 6 else ""
     check = name.lower().startswith("check") or (len(words) > 7 and words[7].lower() == "check")

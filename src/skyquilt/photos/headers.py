@@ -7,10 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Literal
 
 import numpy as np
-from PIL import Image
 
 from skyquilt.errors import UnreadablePhotoError
-from skyquilt.photos.tags import Exif, Xmp, parse_exif, parse_xmp, read_tiff_tags
+from skyquilt.outside import MOST_MP, check_picture, open_regular
+from skyquilt.photos.tags import (
+    MOST_XMP,
+    Directories,
+    Exif,
+    Xmp,
+    parse_exif,
+    parse_xmp,
+    read_tiff_tags,
+)
 
 if TYPE_CHECKING:
     import tifffile
@@ -24,6 +32,13 @@ _FLIR = b"FLIR\x00"
 _EXIF = b"Exif\x00"
 _XMP = b"http://ns.adobe.com/xap/1.0/\x00"
 _XMP_MORE = b"http://ns.adobe.com/xmp/extension/\x00"
+_SEVERAL_SCANS = frozenset({0xC2, 0xC6, 0xCA, 0xCE})
+MOST_SCANS = 64
+"""Largest number of scans of a JPEG: each is decoded over the whole picture."""
+MOST_SEGMENTS, MOST_HEADER_BYTES, MOST_FILL = 5000, 64_000_000, 4096
+"""Largest number of segments before a JPEG's pixels, of their bytes, and of bytes between them."""
+MOST_CHUNKS = 100_000
+"""Largest number of chunks of a PNG."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,6 +55,10 @@ class JpegHeader:
     """Marker and payload of every APP segment, in the order of the file."""
     scan_offset: int
     """Byte at which the first scan begins."""
+    several_scans: bool = False
+    """Whether the pixels come in several scans (progressive, or a band at a time), so that decoding
+    keeps all coefficients in memory.
+    """
 
     @property
     def radiometric(self) -> bool:
@@ -74,11 +93,13 @@ def _next_marker(file: BinaryIO) -> int:
     byte = file.read(1)
     if byte != b"\xff":
         raise UnreadablePhotoError("its JPEG header is broken or truncated")
-    while byte == b"\xff":  # fill bytes may precede a marker
+    for _ in range(MOST_FILL):
         byte = file.read(1)
-    if not byte:
-        raise UnreadablePhotoError("its JPEG header is truncated")
-    return byte[0]
+        if not byte:
+            raise UnreadablePhotoError("its JPEG header is truncated")
+        if byte != b"\xff":  # fill bytes may precede a marker
+            return byte[0]
+    raise UnreadablePhotoError("its JPEG header is broken or truncated")
 
 
 def _payload(file: BinaryIO) -> bytes:
@@ -97,7 +118,11 @@ def read_jpeg_header(file: BinaryIO) -> JpegHeader:
     file.seek(2)
     segments: list[tuple[int, bytes]] = []
     frame: tuple[int, int, int] | None = None
-    while (marker := _next_marker(file)) != SOS:
+    several = False
+    for _ in range(MOST_SEGMENTS):
+        marker = _next_marker(file)
+        if marker == SOS:
+            break
         if marker in _BARE:
             continue
         if marker == EOI:
@@ -105,18 +130,49 @@ def read_jpeg_header(file: BinaryIO) -> JpegHeader:
         payload = _payload(file)
         if marker in _FRAMES and len(payload) >= 6:
             height, width = (int.from_bytes(payload[k : k + 2], "big") for k in (1, 3))
-            frame = width, height, payload[5]
+            frame, several = (width, height, payload[5]), marker in _SEVERAL_SCANS
         elif 0xE0 <= marker <= 0xEF:
             segments.append((marker, payload))
+        if file.tell() > MOST_HEADER_BYTES:
+            break
+    else:
+        marker = 0
+    if marker != SOS:
+        raise UnreadablePhotoError(
+            f"its JPEG header has more than {MOST_SEGMENTS} segments or"
+            f" {MOST_HEADER_BYTES // 10**6} MB"
+        )
     if frame is None or 0 in frame:
         raise UnreadablePhotoError("it is a JPEG that declares no image size")
+    offset = file.tell()
+    bands = file.read(3)[2:]
     return JpegHeader(
         width=frame[0],
         height=frame[1],
         channels=frame[2],
         segments=tuple(segments),
-        scan_offset=file.tell(),
+        scan_offset=offset,
+        several_scans=several or (bool(bands) and bands[0] < frame[2]),
     )
+
+
+def check_jpeg(head: JpegHeader, file: BinaryIO, most_mp: float = MOST_MP) -> None:
+    """Refuses a JPEG by its declared size, or by its number of scans.
+
+    A decoder keeps three bytes per pixel; of pictures in several scans also all coefficients.
+    """
+    size = file.seek(0, io.SEEK_END)
+    bytes_per_px = 3 + 2 * head.channels if head.several_scans else 3
+    check_picture(head.width, head.height, bytes_per_px, file_bytes=size, most_mp=most_mp)
+    if not head.several_scans:
+        return
+    file.seek(head.scan_offset)
+    scans, last = 1, b""
+    while block := file.read(1 << 20):
+        scans += (last + block).count(b"\xff\xda")
+        last = block[-1:]
+        if scans > MOST_SCANS:
+            raise UnreadablePhotoError(f"its JPEG data have more than {MOST_SCANS} scans")
 
 
 def has_end(file: BinaryIO, scan_offset: int) -> bool:
@@ -168,14 +224,14 @@ class Header:
     """The segments, of a JPEG."""
 
 
-def read_header(path: Path) -> Header:
+def read_header(path: Path, *, most_mp: float = MOST_MP) -> Header:
     """Reads the header of an image; raises `UnreadablePhotoError` with the reason, and no other
-    exception.
+    exception. `most_mp`: largest area in megapixels.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             kind = _kind(file)
-            return {"jpeg": _jpeg, "tiff": _tiff, "png": _png}[kind](file)
+            return {"jpeg": _jpeg, "tiff": _tiff, "png": _png}[kind](file, most_mp)
     except UnreadablePhotoError:
         raise
     except OSError as error:
@@ -192,7 +248,7 @@ def content_digest(path: Path) -> str:
     formats are hashed completely.
     """
     digest = hashlib.blake2b(digest_size=16)
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         size = file.seek(0, io.SEEK_END)
         file.seek(0)
         if size > _WHOLE and file.read(2) == b"\xff\xd8":
@@ -219,8 +275,9 @@ def _kind(file: BinaryIO) -> Kind:
     raise UnreadablePhotoError("its content is neither JPEG, TIFF nor PNG, whatever its name")
 
 
-def _jpeg(file: BinaryIO) -> Header:
+def _jpeg(file: BinaryIO, most_mp: float) -> Header:
     head = read_jpeg_header(file)
+    check_jpeg(head, file, most_mp)
     if not has_end(file, head.scan_offset):
         raise UnreadablePhotoError("it is truncated: its JPEG data never end")
     return Header(
@@ -235,9 +292,49 @@ def _jpeg(file: BinaryIO) -> Header:
     )
 
 
-def _tiff(file: BinaryIO) -> Header:
+_WIDTH, _HEIGHT, _BITS, _CODEC, _SAMPLES = 256, 257, 258, 259, 277
+_STRIPS, _TILES, _XMP_TAG = 273, 324, 700
+_CODECS = frozenset({1, 5, 7, 8, 32773, 32946, 34925, 50000})
+"""None, LZW, JPEG, Deflate, PackBits, Deflate (old), LZMA, Zstandard."""
+MOST_STRIPS = 1_000_000
+"""Largest number of strips or tiles of a TIFF."""
+
+
+def check_tiff(file: BinaryIO, most_mp: float = MOST_MP) -> None:
+    """Refuses a TIFF by what its first directory declares, before anything else is read."""
+    try:
+        directories = Directories(file)
+        found = directories.read(
+            directories.first, {_WIDTH, _HEIGHT, _BITS, _CODEC, _SAMPLES, _XMP_TAG}
+        )
+    except ValueError as error:
+        raise UnreadablePhotoError(f"its header is broken ({error})") from error
+    width, height, samples, codec = (
+        int(found.get(tag, otherwise))
+        for tag, otherwise in ((_WIDTH, 0), (_HEIGHT, 0), (_SAMPLES, 1), (_CODEC, 1))
+    )
+    bits = found.get(_BITS, 8)
+    deep = max(bits) if isinstance(bits, tuple) else bits
+    kept = samples * (deep + 7) // 8
+    # values other than 8 and 16 bits become 32; one more copy is made where bands are interleaved
+    check_picture(
+        width,
+        height,
+        kept if deep <= 16 else kept + 4 * samples,
+        file_bytes=file.seek(0, io.SEEK_END),
+        most_mp=most_mp,
+    )
+    if codec not in _CODECS:
+        raise UnreadablePhotoError(f"its TIFF compression {codec} is not one that is read")
+    pieces = max(directories.counts.get(_STRIPS, 0), directories.counts.get(_TILES, 0))
+    if pieces > MOST_STRIPS:
+        raise UnreadablePhotoError(f"its pixels are in more than {MOST_STRIPS} pieces")
+
+
+def _tiff(file: BinaryIO, most_mp: float) -> Header:
     import tifffile  # imported here because most photos are JPEGs
 
+    check_tiff(file, most_mp)
     exif = read_tiff_tags(file)
     file.seek(0)
     with tifffile.TiffFile(file) as tiff:
@@ -245,7 +342,11 @@ def _tiff(file: BinaryIO) -> Header:
         if not isinstance(page, tifffile.TiffPage) or page.dtype is None:
             raise UnreadablePhotoError("its kind of TIFF cannot be decoded")
         _check_extent(page, file)
-        packet = page.tags[700].value if 700 in page.tags else b""
+        packet = (
+            page.tags[_XMP_TAG].value
+            if _XMP_TAG in page.tags and page.tags[_XMP_TAG].count <= MOST_XMP
+            else b""
+        )
         alpha = sum(int(e) in (1, 2) for e in page.extrasamples)
         return Header(
             kind="tiff",
@@ -279,12 +380,34 @@ def _stored_as(dtype: "np.dtype[np.generic]") -> Dtype:
     raise UnreadablePhotoError(f"its pixels are {dtype}; integers or real numbers are needed")
 
 
-def _png(file: BinaryIO) -> Header:
-    file.seek(-12, io.SEEK_END)
-    if b"IEND" not in file.read(12):
-        raise UnreadablePhotoError("it is truncated: its PNG data never end")
+def check_png(file: BinaryIO, most_mp: float = MOST_MP) -> None:
+    """Refuses a PNG by its declared size, its number of chunks, or a missing end."""
+    size = file.seek(0, io.SEEK_END)
+    file.seek(8)
+    head = file.read(21)
+    if len(head) < 21 or head[4:8] != b"IHDR":
+        raise UnreadablePhotoError("its PNG header is broken or truncated")
+    width, height = (int.from_bytes(head[k : k + 4], "big") for k in (8, 12))
+    # Pillow keeps four bytes for a pixel that is not grey, and the result is a copy
+    bytes_per_px = {0: 4.0, 4: 6.0, 2: 7.0, 3: 5.0}.get(head[17], 11.0)
+    check_picture(width, height, bytes_per_px, file_bytes=size, most_mp=most_mp)
+    file.seek(8)
+    for _ in range(MOST_CHUNKS):
+        chunk = file.read(8)
+        if len(chunk) < 8:
+            raise UnreadablePhotoError("it is truncated: its PNG data never end")
+        if chunk[4:] == b"IEND":
+            return
+        file.seek(int.from_bytes(chunk[:4], "big") + 4, io.SEEK_CUR)
+    raise UnreadablePhotoError(f"it has more than {MOST_CHUNKS} PNG chunks")
+
+
+def _png(file: BinaryIO, most_mp: float) -> Header:
+    from PIL.PngImagePlugin import PngImageFile  # most photos are JPEGs
+
+    check_png(file, most_mp)
     file.seek(0)
-    with Image.open(file) as image:
+    with PngImageFile(file) as image:
         packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
         packet = packet.encode() if isinstance(packet, str) else packet
         block = image.info.get("exif") or b""

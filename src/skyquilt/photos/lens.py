@@ -92,7 +92,7 @@ def native_scale(exif: Exif, width: int, height: int) -> tuple[float, str]:
     EXIF keeps the size that the camera wrote, also in a reduced copy. 1.0 where EXIF has no size.
     """
     x, y = exif.number(tag.PIXELS_X), exif.number(tag.PIXELS_Y)
-    if not x or not y or x < 1 or y < 1:
+    if not x or not y or not (1 <= x <= 1e6 and 1 <= y <= 1e6):
         return 1.0, ""
     long, short = max(x, y), min(x, y)
     scale = max(width, height) / long

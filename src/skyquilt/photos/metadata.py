@@ -14,6 +14,14 @@ from skyquilt.photos import tags as tag
 from skyquilt.photos.tags import Exif, Xmp, as_number, as_text
 
 _HEIGHTS = (-500.0, 9500.0)
+_ABOVE_TAKEOFF = (-1500.0, 3000.0)
+"""Plausible heights in m above sea level or the ellipsoid, and above take-off: no drone climbs
+higher than 3 km in a flight."""
+_FAR_NORTH_DEG = 85.0
+"""Latitude beyond which a position is implausible: no UTM zone reaches there."""
+_SIGMA = (0.001, 1000.0)
+"""Plausible standard deviations of positions in m."""
+_YEARS = (1980, 2100)
 _RTK_FLOAT, _RTK_FIXED = 34, 50
 _DRONE_SIGMA = (1.5, 3.0)
 _CAMERA_SIGMA = (5.0, 15.0)
@@ -32,7 +40,7 @@ def read_position(exif: Exif, xmp: Xmp) -> tuple[GeoPosition | None, tuple[str, 
     if found is None:
         return None, tuple(notes or ["It has no GPS position."])
     takeoff, sea, ellipsoid = _heights(exif, xmp, notes)
-    sigma_xy, sigma_z = _sigmas(exif, xmp, drone=_flown(xmp))
+    sigma_xy, sigma_z = _sigmas(exif, xmp, notes, drone=_flown(xmp))
     altitude, datum = _best_height(takeoff, sea, ellipsoid)
     position = GeoPosition(
         latitude_deg=found[0],
@@ -57,6 +65,8 @@ def why_void(latitude: float | None, longitude: float | None) -> str:
         return "it is (0, 0), which receivers write without a satellite fix"
     if not (abs(latitude) <= 90 and abs(longitude) <= 180):
         return f"({latitude:g}, {longitude:g}) is outside the valid range"
+    if abs(latitude) > _FAR_NORTH_DEG:
+        return f"({latitude:g}, {longitude:g}) is at a pole, where no map projection fits"
     return ""
 
 
@@ -110,14 +120,16 @@ def _heights(
         written = -written
     absolute = xmp.number("AbsoluteAltitude")
     absolute = _sane(absolute if absolute is not None else written, "altitude", notes)
-    takeoff = _sane(xmp.number("RelativeAltitude"), "height above take-off", notes)
+    takeoff = _sane(xmp.number("RelativeAltitude"), "height above take-off", notes, _ABOVE_TAKEOFF)
     if _is_rtk(xmp):
         return takeoff, None, absolute
     return takeoff, absolute, None
 
 
-def _sane(height: float | None, what: str, notes: list[str]) -> float | None:
-    if height is None or _HEIGHTS[0] <= height <= _HEIGHTS[1]:
+def _sane(
+    height: float | None, what: str, notes: list[str], limits: tuple[float, float] = _HEIGHTS
+) -> float | None:
+    if height is None or limits[0] <= height <= limits[1]:
         return height
     notes.append(f"The {what} of {height:g} m is not a possible flying height and was ignored.")
     return None
@@ -146,16 +158,26 @@ def _best_height(
     return sea, "sea_level" if sea is not None else "unknown"
 
 
-def _sigmas(exif: Exif, xmp: Xmp, *, drone: bool) -> tuple[float, float]:
+def _sigmas(exif: Exif, xmp: Xmp, notes: list[str], *, drone: bool) -> tuple[float, float]:
     """Horizontal and vertical standard deviation in m: RTK's own, an accuracy tag, or a typical
     value.
     """
     xy, z = _DRONE_SIGMA if drone else _CAMERA_SIGMA
-    error = as_number(exif.gps.get(tag.GPS_ERROR))
-    xy = xmp.number("Camera:GPSXYAccuracy", "GPSXYAccuracy") or error or xy
-    z = xmp.number("Camera:GPSZAccuracy", "GPSZAccuracy") or z
+
+    def said(value: float | None) -> float | None:
+        """A stated accuracy; zero means that it is not known."""
+        if not value or _SIGMA[0] <= value <= _SIGMA[1]:
+            return value
+        if 0 < value < _SIGMA[0]:
+            return _SIGMA[0]
+        notes.append(f"The accuracy of {value:g} m of its position is not possible; it is ignored.")
+        return None
+
+    error = said(as_number(exif.gps.get(tag.GPS_ERROR)))
+    xy = said(xmp.number("Camera:GPSXYAccuracy", "GPSXYAccuracy")) or error or xy
+    z = said(xmp.number("Camera:GPSZAccuracy", "GPSZAccuracy")) or z
     if xmp.number("RtkFlag") in (_RTK_FLOAT, _RTK_FIXED):
-        east, north, up = (xmp.number(f"RtkStd{axis}") for axis in ("Lon", "Lat", "Hgt"))
+        east, north, up = (said(xmp.number(f"RtkStd{axis}")) for axis in ("Lon", "Lat", "Hgt"))
         xy = max(east or 0.0, north or 0.0) or xy
         z = up or z
     return max(xy, 0.01), max(z, 0.01)
@@ -166,6 +188,7 @@ _GIMBAL = (
     ("CameraYawDegree", "CameraPitchDegree", "CameraRollDegree"),
 )
 _LOOKS_DOWN_AT_MINUS_90 = -45.0
+_MOST_DEG = 720.0
 
 
 def read_attitude(xmp: Xmp) -> tuple[Attitude | None, tuple[str, ...]]:
@@ -179,8 +202,10 @@ def read_attitude(xmp: Xmp) -> tuple[Attitude | None, tuple[str, ...]]:
     for names in _GIMBAL:
         yaw, pitch, roll = (xmp.number(name) for name in names)
         if yaw is not None:
-            return _from_gimbal(yaw, pitch, roll, "xmp-gimbal")
+            return _impossible(yaw, pitch, roll) or _from_gimbal(yaw, pitch, roll, "xmp-gimbal")
     yaw, pitch, roll = (xmp.number(f"Camera:{a}") for a in ("Yaw", "Pitch", "Roll"))
+    if yaw is not None and (refused := _impossible(yaw, pitch, roll)):
+        return refused
     if yaw is None:
         return None, ("It has no camera angles.",)
     if pitch is not None and pitch < _LOOKS_DOWN_AT_MINUS_90:
@@ -191,9 +216,26 @@ def read_attitude(xmp: Xmp) -> tuple[Attitude | None, tuple[str, ...]]:
     return attitude, ()
 
 
-def read_flight_yaw(xmp: Xmp) -> float | None:
-    """Heading of the aircraft in degrees clockwise from north; None where it is absent."""
-    return xmp.number("FlightYawDegree", "DroneYawDegree")
+def _impossible(*angles: float | None) -> tuple[None, tuple[str, ...]] | None:
+    """What is reported of angles of which one is more than two turns; None where all are
+    possible.
+    """
+    bad = [a for a in angles if a is not None and abs(a) > _MOST_DEG]
+    return (
+        (None, (f"Camera angles of {bad[0]:g} degrees are not possible; they are ignored.",))
+        if (bad)
+        else None
+    )
+
+
+def read_flight_yaw(xmp: Xmp) -> tuple[float | None, tuple[str, ...]]:
+    """Heading of the aircraft in degrees clockwise from north, or None, with a sentence where it is
+    implausible.
+    """
+    yaw = xmp.number("FlightYawDegree", "DroneYawDegree")
+    if yaw is None or abs(yaw) <= _MOST_DEG:
+        return yaw, ()
+    return None, (f"A flight yaw of {yaw:g} degrees is not possible; it is ignored.",)
 
 
 def read_velocity(xmp: Xmp) -> tuple[float, float, float] | None:
@@ -212,9 +254,9 @@ _FASTEST = 100.0
 
 
 def read_flight_tilt(xmp: Xmp) -> tuple[float, float]:
-    """Pitch and roll of the aircraft in degrees; 0 where they are absent."""
-    pitch, roll = (xmp.number(f"Flight{axis}Degree") for axis in ("Pitch", "Roll"))
-    return pitch or 0.0, roll or 0.0
+    """Pitch and roll of the aircraft in degrees; 0 where they are absent or impossible."""
+    pitch, roll = (xmp.number(f"Flight{axis}Degree") or 0.0 for axis in ("Pitch", "Roll"))
+    return (pitch, roll) if max(abs(pitch), abs(roll)) <= _MOST_DEG else (0.0, 0.0)
 
 
 def _from_gimbal(
@@ -231,7 +273,8 @@ def _from_gimbal(
 
 
 _MOMENT = re.compile(
-    r"(\d{4})[:\-/.](\d\d)[:\-/.](\d\d)[ T](\d\d):(\d\d):(\d\d)(\.\d+)?\s*(Z|[+-]\d\d:?\d\d)?"
+    r"(\d{4})[:\-/.](\d\d)[:\-/.](\d\d)[ T](\d\d):(\d\d):(\d\d)(\.\d+)?\s*(Z|[+-]\d\d:?\d\d)?",
+    re.ASCII,
 )
 
 
@@ -261,9 +304,12 @@ def parse_moment(text: str, subseconds: str = "", offset: str = "") -> datetime 
     found = _MOMENT.match(text.strip())
     if not found:
         return None
-    fraction = found[7] or (f".{subseconds}" if subseconds.isdigit() else "")
+    digits = re.fullmatch(r"[0-9]{1,9}", subseconds)
+    fraction = (found[7] or "")[:10] or (f".{subseconds}" if digits else "")
     try:
         moment = datetime(*(int(found[i]) for i in range(1, 7)))  # type: ignore[arg-type]
+        if not _YEARS[0] <= moment.year < _YEARS[1]:
+            return None
         moment += timedelta(seconds=float(fraction or 0))
         return moment.replace(tzinfo=_zone(found[8] or offset))
     except (ValueError, OverflowError):
@@ -285,6 +331,8 @@ def _gps_time(exif: Exif) -> datetime | None:
     if day is None or len(parts) != 3 or None in parts:
         return None
     hours, minutes, seconds = (p or 0.0 for p in parts)
+    if not 0 <= hours * 3600 + minutes * 60 + seconds <= 2 * 86400:
+        return None
     try:
         return (day + timedelta(hours=hours, minutes=minutes, seconds=seconds)).replace(tzinfo=UTC)
     except OverflowError:

@@ -5,19 +5,18 @@ the reduced image has its centre at (r * i + (r - 1) / 2, r * j + (r - 1) / 2) o
 Reduced JPEGs are decoded directly at that scale.
 """
 
-import io
 import re
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 import cv2
 import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
-from PIL import Image
 
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.photo import Photo
+from skyquilt.outside import open_regular
 from skyquilt.photos.headers import read_header
 from skyquilt.photos.tags import MAKE
 from skyquilt.photos.thermal import thermal_frame_of_jpeg, thermal_frame_of_values
@@ -96,21 +95,36 @@ def _read(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
 
 
 def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
+    """Decodes the file. Its size was checked when its header was read, and is compared with that
+    before anything is allocated: the file may have been replaced.
+    """
     if photo.frame_s is not None:
         pixels = frame_of(photo.path, photo.frame_s)
         return reduce_pixels(to_gray(pixels) if gray else pixels, reduction)
-    data = photo.path.read_bytes()
-    if data[:2] == b"\xff\xd8" and not photo.unit:
-        return decode_jpeg(data, gray=gray or photo.channels == 1, reduction=reduction)
-    if data[:2] == b"\xff\xd8":
-        return reduce_pixels(_thermal_jpeg(photo.path), reduction)
-    if data[:4] == b"\x89PNG":
-        return reduce_pixels(_png(data, photo.channels), reduction)
-    pixels = read_tiff(photo.path)[..., : photo.channels]
+    size = (photo.width, photo.height)
+    with open_regular(photo.path) as file:
+        head = file.read(4)
+        file.seek(0)
+        if head[:2] == b"\xff\xd8" and photo.unit:
+            return reduce_pixels(_thermal_jpeg(photo.path), reduction)
+        if head[:2] == b"\xff\xd8":
+            data = file.read()
+            _same_size(simplejpeg.decode_jpeg_header(data)[1::-1], size)
+            return decode_jpeg(data, gray=gray or photo.channels == 1, reduction=reduction)
+        if head == b"\x89PNG":
+            return reduce_pixels(_png(file, photo), reduction)
+        pixels = read_tiff(file, size)[..., : photo.channels]
     pixels = pixels[..., 0] if photo.channels == 1 else pixels
     return reduce_pixels(
         thermal_frame_of_values(pixels, photo.stored).values if photo.unit else pixels, reduction
     )
+
+
+def _same_size(found: tuple[int, ...], stated: tuple[int, int]) -> None:
+    if tuple(found) != stated:
+        raise UnreadablePhotoError(
+            f"its pixels are {found[0]}x{found[1]} but its header states {stated[0]}x{stated[1]}"
+        )
 
 
 def decode_jpeg(data: bytes, *, gray: bool = False, reduction: Reduction = 1) -> NDArray[np.uint8]:
@@ -142,21 +156,27 @@ def _thermal_jpeg(path: Path) -> Pixels:
     return frame.values
 
 
-def _png(data: bytes, channels: int) -> Pixels:
-    with Image.open(io.BytesIO(data)) as image:
+def _png(file: BinaryIO, photo: Photo) -> Pixels:
+    from PIL.PngImagePlugin import PngImageFile  # most photos are JPEGs
+
+    with PngImageFile(file) as image:
+        _same_size(image.size, (photo.width, photo.height))
         if image.mode.startswith("I"):
             return np.asarray(image, dtype=np.uint16)
-        return np.asarray(image.convert("L" if channels == 1 else "RGB"))
+        return np.asarray(image.convert("L" if photo.channels == 1 else "RGB"))
 
 
-def read_tiff(path: Path) -> Pixels:
-    """The first page of a TIFF as (height, width, bands), signed and wide types as float32."""
+def read_tiff(file: BinaryIO, size: tuple[int, int]) -> Pixels:
+    """The first page of a TIFF as (height, width, bands), signed and wide types as float32; `size`:
+    the width and height that were checked.
+    """
     import tifffile  # imported here because most photos are JPEGs
 
-    with tifffile.TiffFile(path) as tiff:
-        page = tiff.pages[0]
-        pixels = np.asarray(page.asarray())
-        planar = isinstance(page, tifffile.TiffPage) and page.planarconfig == 2 and pixels.ndim == 3
+    with tifffile.TiffFile(file) as tiff:
+        page = tiff.pages.first
+        _same_size((int(page.imagewidth), int(page.imagelength)), size)
+        pixels = np.asarray(page.asarray(maxworkers=1))
+        planar = page.planarconfig == 2 and pixels.ndim == 3
     if planar:
         pixels = np.moveaxis(pixels, 0, -1)
     if pixels.dtype not in (np.uint8, np.uint16):

@@ -1,16 +1,20 @@
 """Reads one file as a `Photo`."""
 
-from dataclasses import dataclass
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
-from typing import cast
+from typing import TypeVar, cast
 
 import numpy as np
 
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Stored
+from skyquilt.outside import MOST_MP, check_picture, open_regular, plain, whole
 from skyquilt.photos import tags as tag
+from skyquilt.photos.flir import MOST_THERMAL_MP
 from skyquilt.photos.headers import Header, content_digest, read_header
 from skyquilt.photos.lens import (
     Sensor,
@@ -39,30 +43,43 @@ from skyquilt.photos.thermal import (
     thermal_frame_of_values,
 )
 
-_SMALLEST = 32
-_STRANGE = "its metadata are of an unknown kind"
+T = TypeVar("T")
 _LARGEST_THERMAL = 1280
 
 
 def read_photo(
-    path: Path, *, name: str | None = None, thermal_unit: str | None = None
+    path: Path,
+    *,
+    name: str | None = None,
+    thermal_unit: str | None = None,
+    most_mp: float = MOST_MP,
 ) -> Photo | RejectedPhoto:
     """The metadata of a file, without decoding its pixels; a bad file is a `RejectedPhoto`.
 
     `thermal_unit`: meaning of the values of a single-band TIFF (`model.photo.Stored`); `auto` = it
     is thermal, and its unit is read from the file or derived from its values; None = whether it is
-    thermal is determined too.
+    thermal is determined too. `most_mp`: largest area in megapixels.
     """
-    name = name or path.name
+    name = name or plain(path.name)
     try:
-        header = read_header(path)
+        header = read_header(path, most_mp=most_mp)
         return _photo(path, name, header, thermal_unit)
-    except UnreadablePhotoError as error:
-        return RejectedPhoto(name=name, reason=str(error))
-    except OSError as error:
-        return RejectedPhoto(name=name, reason=f"it cannot be read ({error.strerror or error})")
     except Exception as error:  # one unexpected file must not stop a survey of thousands
-        return RejectedPhoto(name=name, reason=f"{_STRANGE} ({type(error).__name__}: {error})")
+        return rejected(name, error)
+
+
+def rejected(name: str, error: Exception) -> RejectedPhoto:
+    """What an error of one photo, whatever it is, means for that photo: its name, a reason, and,
+    where the error was not foreseen, the place in the program for the log of errors.
+    """
+    if isinstance(error, UnreadablePhotoError):
+        return RejectedPhoto(name=name, reason=plain(str(error)))
+    if isinstance(error, OSError):
+        return RejectedPhoto(name=name, reason=f"it cannot be read ({error.strerror or error})")
+    words = plain(f"it is of an unknown kind ({type(error).__name__}: {error})", 300)
+    return RejectedPhoto(
+        name=name, reason=words, trace="".join(traceback.format_exception(error))[-20_000:]
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,15 +95,26 @@ class _Lens:
 def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> Photo:
     frame = _thermal_frame(path, header, thermal_unit)
     height, width = frame.values.shape if frame else (header.height, header.width)
-    if min(width, height) < _SMALLEST:
-        raise UnreadablePhotoError(
-            f"it has only {width}x{height} px; at least {_SMALLEST} a side are needed"
-        )
-    lens = _lens(header, width, height, thermal=frame is not None)
-    position, place_notes = read_position(header.exif, header.xmp)
-    attitude, angle_notes = read_attitude(header.xmp)
+    strange: list[str] = []
+    lens = _ignoring(
+        lambda: _lens(header, width, height, thermal=frame is not None),
+        lambda: _lens(_bare(header), width, height, thermal=frame is not None),
+        "lens",
+        strange,
+    )
+    position, place_notes = _ignoring(
+        lambda: read_position(header.exif, header.xmp), lambda: (None, ()), "position", strange
+    )
+    attitude, angle_notes = _ignoring(
+        lambda: read_attitude(header.xmp), lambda: (None, ()), "camera angles", strange
+    )
+    flight_yaw, yaw_notes = read_flight_yaw(header.xmp)
+    time = _ignoring(
+        lambda: read_time(header.exif, header.xmp), lambda: None, "capture time", strange
+    )
     rolling = _rolling(header, lens.sensor)
-    seen = (*lens.notes, frame.note if frame else "", *place_notes, *angle_notes)
+    seen = (*lens.notes, frame.note if frame else "", *place_notes, *angle_notes, *yaw_notes)
+    more = _ignoring(lambda: _other_notes(header, lens), lambda: (), "editing", strange)
     return Photo(
         name=name,
         path=path,
@@ -103,16 +131,35 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         focal=lens.focal,
         position=position,
         attitude=attitude,
-        flight_yaw_deg=read_flight_yaw(header.xmp),
+        flight_yaw_deg=flight_yaw,
         flight_tilt_deg=read_flight_tilt(header.xmp),
-        time=read_time(header.exif, header.xmp),
-        orientation_tag=int(header.exif.number(tag.ORIENTATION) or 1),
+        time=time,
+        orientation_tag=whole(header.exif.tags.get(tag.ORIENTATION), 1, 8) or 1,
         rolling_shutter=rolling,
         shutter=find_shutter(header.exif.text(tag.MODEL), lens.captured_mp, rolling),
         velocity_ned=read_velocity(header.xmp),
         editor=find_editor(header.exif, header.xmp),
-        notes=tuple(n for n in (*_broken_notes(header), *seen, *_other_notes(header, lens)) if n),
+        notes=tuple(n for n in (*_broken_notes(header), *strange, *seen, *more) if n),
     )
+
+
+def _ignoring(read: Callable[[], T], otherwise: Callable[[], T], what: str, notes: list[str]) -> T:
+    """What a reader of metadata finds; where it fails on values that nobody foresaw, they are
+    ignored and named, since the pixels are good.
+    """
+    try:
+        return read()
+    except (ArithmeticError, ValueError, TypeError, LookupError) as error:
+        notes.append(
+            f"Its {what} in the metadata cannot be used and was ignored"
+            f" ({type(error).__name__}: {plain(str(error), 100)})."
+        )
+        return otherwise()
+
+
+def _bare(header: Header) -> Header:
+    """The header without metadata."""
+    return replace(header, exif=tag.Exif(), xmp=tag.Xmp())
 
 
 def _lens(header: Header, width: int, height: int, *, thermal: bool) -> _Lens:
@@ -150,7 +197,7 @@ def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame
     if (
         header.kind != "tiff"
         or header.channels != 1
-        or (said is None and header.width > _LARGEST_THERMAL)
+        or (said is None and max(header.width, header.height) > _LARGEST_THERMAL)
     ):
         return None
     stored = cast(Stored, said) if said not in (None, "auto") else _stated(header)
@@ -161,8 +208,11 @@ def _thermal_frame(path: Path, header: Header, said: str | None) -> ThermalFrame
     known = known or (sensor is not None and sensor.band == "thermal")
     if not known and header.dtype != "float32":
         return None
+    check_picture(header.width, header.height, 4, most_mp=MOST_THERMAL_MP, option="")
     try:
-        frame = thermal_frame_of_values(np.asarray(read_tiff(path)[..., 0]), stored)
+        with open_regular(path) as file:
+            values = read_tiff(file, (header.width, header.height))[..., 0]
+        frame = thermal_frame_of_values(np.asarray(values), stored)
     except Exception as error:  # tifffile raises many exceptions; all mean: no pixels
         raise UnreadablePhotoError(f"its pixels cannot be decoded ({error})") from error
     return frame if known or frame.unit == "celsius" else None

@@ -1,6 +1,7 @@
 """The order in which photos are joined: by time, by name, or from a file."""
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -35,7 +36,7 @@ def sequence_of(names: Sequence[str], how: str) -> list[int]:
         raise SideFileError(f"{path.name} {what}; expected one photo name per line.")
     order = [index[f] for f in found if f is not None]
     if len(set(order)) < len(order):
-        twice = sorted({names[i] for i in order if order.count(i) > 1})
+        twice = sorted(names[i] for i, n in Counter(order).items() if n > 1)
         raise SideFileError(
             f"{path.name} names {sentence_of(twice)} more than once. Remove one of the lines."
         )
@@ -44,5 +45,8 @@ def sequence_of(names: Sequence[str], how: str) -> list[int]:
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
     """Sort key for the natural order of names: 2 before 10."""
-    parts = re.split(r"(\d+)", name.lower())
-    return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts if p]
+    parts = re.split(r"([0-9]+)", name.lower())
+    # leading zeros do not count, and numbers may be too long for an integer
+    return [
+        (0, len(n := p.lstrip("0")), n) if "0" <= p[0] <= "9" else (1, 0, p) for p in parts if p
+    ]

@@ -1,6 +1,5 @@
 """Positions from side files: CSV, OpenDroneMap's geo.txt, DJI's MRK; SRT has its own module."""
 
-import csv
 import math
 import re
 from collections.abc import Sequence
@@ -9,7 +8,17 @@ from typing import TYPE_CHECKING
 
 from skyquilt.errors import SideFileError
 from skyquilt.model.photo import Datum, Photo
-from skyquilt.photos.side_rows import SideRow, apply_rows, finite, number, read_crs, read_lines
+from skyquilt.outside import plain
+from skyquilt.photos.side_rows import (
+    SideRow,
+    accuracy,
+    apply_rows,
+    finite,
+    number,
+    read_crs,
+    read_lines,
+    read_table,
+)
 from skyquilt.photos.srt import read_srt
 
 
@@ -66,7 +75,7 @@ def read_positions_csv(path: Path) -> tuple[SideRow, ...]:
     if not lines:
         raise SideFileError(f"{path.name} is empty; expected a header and one line per photo.")
     delimiter = max(",;\t", key=lines[0].count)
-    table = list(csv.reader(lines, delimiter=delimiter))
+    table = read_table(lines, file=path.name, delimiter=delimiter)
     columns = _columns(table[0], path)
     return tuple(
         _csv_row(cells, columns, f"{path.name}, row {i}") for i, cells in enumerate(table[1:], 1)
@@ -74,17 +83,16 @@ def read_positions_csv(path: Path) -> tuple[SideRow, ...]:
 
 
 def _columns(header: list[str], path: Path) -> dict[str, int]:
-    plain = [re.sub(r"[^a-z]", "", re.sub(r"[\[(].*", "", cell.lower())) for cell in header]
+    words = [re.sub(r"[^a-z]", "", re.sub(r"[\[(].*", "", cell.lower())) for cell in header]
     found = {
-        field: next(plain.index(alias) for alias in aliases if alias in plain)
+        field: next(words.index(alias) for alias in aliases if alias in words)
         for field, aliases in _COLUMNS.items()
-        if set(aliases) & set(plain)
+        if set(aliases) & set(words)
     }
     if "name" not in found or ("latitude" in found) != ("longitude" in found) or len(found) < 2:
         raise SideFileError(
-            f"{path.name}: its header is '{', '.join(header)}'; expected at least 'name' with 'lat'"
-            " and "
-            "'lon', or 'name' with 'yaw'. Add a header line."
+            f"{path.name}: its header is '{plain(', '.join(header), 200)}'; expected at least"
+            " 'name' with 'lat' and 'lon', or 'name' with 'yaw'. Add a header line."
         )
     return found
 
@@ -102,8 +110,8 @@ def _csv_row(cells: list[str], columns: dict[str, int], place: str) -> SideRow:
         angles_deg=None
         if yaw is None
         else (yaw, values.get("pitch") or 0.0, values.get("roll") or 0.0),
-        sigma_xy_m=values.get("sigma_xy"),
-        sigma_z_m=values.get("sigma_z") or values.get("sigma_xy"),
+        sigma_xy_m=accuracy(values.get("sigma_xy"), place),
+        sigma_z_m=accuracy(values.get("sigma_z"), place) or accuracy(values.get("sigma_xy"), place),
     )
 
 
@@ -112,7 +120,7 @@ def _cell(cells: list[str], column: int, field: str, place: str) -> float | None
     value = number(text)
     if text and value is None:
         raise SideFileError(
-            f"{place}: expected a number for {field}, found '{text}'. Correct that cell."
+            f"{place}: expected a number for {field}, found '{plain(text, 60)}'. Correct that cell."
         )
     return finite(value)
 
@@ -147,8 +155,8 @@ def _geo_txt_row(line: str, place: str, to_degrees: "Transformer", datum: Datum)
     name, numbers = _split(line)
     if not name or len(numbers) not in (2, 3, 6, 7, 8):
         raise SideFileError(
-            f"{place}: expected 'name x y [z] [yaw pitch roll [hacc vacc]]', found '{line}'. "
-            "Correct that line."
+            f"{place}: expected 'name x y [z] [yaw pitch roll [hacc vacc]]', found"
+            f" '{plain(line, 200)}'. Correct that line."
         )
     longitude, latitude = to_degrees.transform(numbers[0], numbers[1])
     values = [finite(v) for v in numbers[2:]] + [None] * 6
@@ -162,8 +170,8 @@ def _geo_txt_row(line: str, place: str, to_degrees: "Transformer", datum: Datum)
         angles_deg=(angles[0], angles[1], angles[2])
         if angles[0] is not None and angles[1] is not None and angles[2] is not None
         else None,
-        sigma_xy_m=values[4],
-        sigma_z_m=values[5] or values[4],
+        sigma_xy_m=accuracy(values[4], place),
+        sigma_z_m=accuracy(values[5], place) or accuracy(values[4], place),
     )
 
 
@@ -171,18 +179,19 @@ def _split(line: str) -> tuple[str, list[float]]:
     """The name (which may contain spaces) and the numbers after it."""
     words = line.replace(",", " ").split()
     numbers: list[float] = []
-    while words and (value := number(words[-1])) is not None:
-        numbers.insert(0, value)
+    while len(numbers) < _MOST_NUMBERS and words and (value := number(words[-1])) is not None:
+        numbers.append(value)
         words.pop()
-    return " ".join(words), numbers
+    return " ".join(words), numbers[::-1]
 
 
-_NUMBER = r"\s*([-+]?\d+(?:\.\d+)?)\s*"
+_MOST_NUMBERS = 12
+_NUMBER = r"\s*+([-+]?[0-9]{1,15}(?:\.[0-9]{1,20}+)?)\s*+"
 _LINE = re.compile(
-    rf"^(\d+)\s+\S+\s+\[\d+\]{_NUMBER},\s*N{_NUMBER},\s*E{_NUMBER},\s*V"
+    rf"^([0-9]{{1,9}})\s++\S++\s++\[[0-9]++\]{_NUMBER},\s*N{_NUMBER},\s*E{_NUMBER},\s*V"
     rf"{_NUMBER},\s*Lat{_NUMBER},\s*Lon{_NUMBER},\s*Ellh(?:{_NUMBER},{_NUMBER},{_NUMBER})?"
 )
-_SHOT = re.compile(r"_(\d{4,})(?:_[A-Za-z]+)?$")
+_SHOT = re.compile(r"_([0-9]{4,18})(?:_[A-Za-z]+)?$")
 _METRES_PER_DEGREE = 111_320.0
 
 
@@ -195,9 +204,12 @@ def read_mrk(path: Path, photo_names: Sequence[str]) -> tuple[SideRow, ...]:
             raise SideFileError(
                 f"{path.name}, line {i}: expected a DJI shot record (index, time, [week], N, E, V,"
                 " Lat, Lon, "
-                f"Ellh ...), found '{line[:60]}'. Use the file as the drone wrote it."
+                f"Ellh ...), found '{plain(line, 60)}'. Use the file as the drone wrote it."
             )
-        shots[int(found[1])] = [float(v) if v else None for v in found.groups()[1:]]
+        values = [float(v) if v else None for v in found.groups()[1:]]
+        for value in values[6:]:
+            accuracy(value, f"{path.name}, line {i}")
+        shots[int(found[1])] = values
     pairs = ((name, shots.get(_index(name))) for name in photo_names)
     rows = tuple(_mrk_row(name, shot) for name, shot in pairs if shot)
     if not rows:

@@ -1,5 +1,6 @@
 """Rows of side files: how their text is read, and how they override the photos' metadata."""
 
+import csv
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -10,10 +11,17 @@ from typing import TYPE_CHECKING
 from skyquilt.errors import SideFileError
 from skyquilt.geometry.frames import belly_from_gimbal
 from skyquilt.model.photo import Attitude, Datum, GeoPosition, Photo
+from skyquilt.outside import plain, read_bounded, real
 from skyquilt.photos.metadata import why_void
 
 _LOOKS_DOWN_AT_MINUS_90 = -45.0
 _SHOWN = 8
+_ACCURACY = (0.0001, 10_000.0)
+"""Standard deviations in m that are taken; 0 means that it is not known."""
+_ALTITUDE = (-12_000.0, 100_000.0)
+"""Heights in m that are taken."""
+_MOST_ANGLE = 100_000.0
+_MOST_CRS = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +70,7 @@ class PhotoNames:
 
 def sentence_of(names: Sequence[str]) -> str:
     """`a, b, c and 7 more`."""
-    head = ", ".join(names[:_SHOWN])
+    head = ", ".join(plain(name, 80) for name in names[:_SHOWN])
     return f"{head} and {len(names) - _SHOWN} more" if len(names) > _SHOWN else head
 
 
@@ -101,11 +109,24 @@ def apply_rows(
 
 def _check(rows: Sequence[SideRow], file: Path) -> None:
     for row in rows:
+        name = plain(row.name, 80)
         placed = row.latitude_deg is not None or row.longitude_deg is not None
         if placed and (reason := why_void(row.latitude_deg, row.longitude_deg)):
             raise SideFileError(
-                f"{file.name}: the position of {row.name} is invalid: {reason}. Correct that row."
+                f"{file.name}: the position of {name} is invalid: {reason}. Correct that row."
             )
+        height = row.altitude_m
+        if height is not None and not _ALTITUDE[0] <= height <= _ALTITUDE[1]:
+            raise SideFileError(
+                f"{file.name}: the height {height:g} m of {name} is not possible. Correct that row."
+            )
+        if any(abs(a) > _MOST_ANGLE for a in row.angles_deg or ()):
+            raise SideFileError(
+                f"{file.name}: the angles {row.angles_deg} of {name} are not possible. Correct"
+                " that row."
+            )
+        for sigma in (row.sigma_xy_m, row.sigma_z_m):
+            accuracy(sigma, f"{file.name}, {name}")
 
 
 def _override(photo: Photo, rows: Mapping[str | None, SideRow], source: str) -> Photo:
@@ -160,25 +181,59 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
 
     Raises `SideFileError` where the file cannot be read as text.
     """
+    text = read_text(path)
+    if "\x00" in text:
+        raise SideFileError(f"{path.name} is not a text file; expected lines of words and numbers.")
+    lines = ((i, _clean(line.strip())) for i, line in enumerate(text.splitlines(), 1))
+    return [(i, line) for i, line in lines if line and not line.startswith("#")]
+
+
+def _clean(line: str) -> str:
+    """A line without control characters other than tabs: parts of it are shown in messages."""
+    return line if line.isprintable() else "\t".join(map(plain, line.split("\t")))
+
+
+def read_text(path: Path) -> str:
+    """A side file as text; raises `SideFileError` where it cannot be read, or is too large."""
     try:
-        text = path.read_bytes().decode("utf-8-sig", "replace")
+        return read_bounded(path).decode("utf-8-sig", "replace")
     except OSError as error:
         raise SideFileError(
             f"{path} cannot be read ({error.strerror or error}); check the path and its"
             " permissions."
         ) from error
-    if "\x00" in text:
-        raise SideFileError(f"{path.name} is not a text file; expected lines of words and numbers.")
-    lines = ((i, line.strip()) for i, line in enumerate(text.splitlines(), 1))
-    return [(i, line) for i, line in lines if line and not line.startswith("#")]
+
+
+def read_table(lines: Sequence[str], *, file: str, delimiter: str = ",") -> list[list[str]]:
+    """The cells of lines of a CSV file; raises `SideFileError` where a quote stays open, or a cell
+    is too long.
+    """
+    try:
+        table = list(csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True))
+    except csv.Error as error:
+        raise SideFileError(f"{file} is not a table ({error}). Correct the file.") from error
+    if len(table) != len(lines):
+        raise SideFileError(f"{file}: a quote is opened and not closed in its line. Correct it.")
+    return table
 
 
 def number(text: str) -> float | None:
     """A number, including NaN; None for other text."""
-    try:
-        return float(text)
-    except ValueError:
-        return None
+    return math.nan if text.strip().lower() == "nan" else real(text)
+
+
+def accuracy(value: float | None, place: str) -> float | None:
+    """A standard deviation in m, or None; 0 means that it is not known.
+
+    Raises:
+        SideFileError: it is negative or absurd.
+    """
+    if value is None or value == 0 or _ACCURACY[0] <= value <= _ACCURACY[1]:
+        return value or None
+    raise SideFileError(
+        f"{place}: an accuracy of {value:g} m is not possible; expected {_ACCURACY[0]:g} to"
+        f" {_ACCURACY[1]:g}. Correct that line."
+    )
 
 
 def finite(value: float | None) -> float | None:
@@ -190,18 +245,23 @@ def read_crs(text: str, *, file: str) -> "CRS":
     """`EPSG:32615`, a PROJ string, WKT, or OpenDroneMap's `WGS84 UTM 15N`; raises
     `SideFileError`.
     """
-    from pyproj import CRS
-    from pyproj.exceptions import CRSError
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import CRSError, ProjError
 
     found = _UTM.fullmatch(text.strip())
     if found:
         zone, south = int(found[1]), (found[2] or "N").upper() == "S"
         text = f"EPSG:{(32700 if south else 32600) + zone}"
     try:
-        return CRS.from_user_input(text)
-    except CRSError as error:
+        if len(text) > _MOST_CRS:
+            raise CRSError(f"it has {len(text)} characters")
+        crs = CRS.from_user_input(text)
+        # one that cannot be placed on the Earth (LOCAL_CS) is none
+        Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+        return crs
+    except (ProjError, RecursionError, ValueError) as error:
         raise SideFileError(
             f"{file}: the first line must name a coordinate system such as 'EPSG:4326' or 'WGS84"
             " UTM 15N', "
-            f"but it is '{text}'. Add one."
+            f"but it is '{plain(text, 100)}'. Add one."
         ) from error

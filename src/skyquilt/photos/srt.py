@@ -16,7 +16,7 @@ from skyquilt.model.photo import Photo
 from skyquilt.photos.side_rows import SideRow
 from skyquilt.video.srt import Sample, read_samples
 
-_FRAME = re.compile(r"(?:^|frame|[_-])(\d+)$", re.IGNORECASE)
+_FRAME = re.compile(r"(?:^|frame|[_-])([0-9]{1,18})$", re.IGNORECASE)
 _NEAR_S = 0.5
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from skyquilt.errors import NoPhotosError, UsageError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
+from skyquilt.outside import MOST_MP, plain, walk
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
 from skyquilt.photos.clips import is_timed, read_clips
 from skyquilt.photos.implausible_positions import (
@@ -68,13 +69,12 @@ def _in_folder(folder: Path) -> FoundFiles:
 
 
 def _walk(folder: Path, runs: list[str], top: Path) -> Iterator[Path]:
-    for where, folders, files in os.walk(folder):
-        here = Path(where)
+    for here, folders, files in walk(folder):
         if here != top and (_RUN_MARK in files or _RUN_STATE in folders):
             runs.append(_text(here.relative_to(top).as_posix()))
             folders.clear()
             continue
-        folders[:] = sorted(f for f in folders if not f.startswith("."))
+        folders[:] = [f for f in folders if not f.startswith(".")]
         yield from (here / f for f in files if not f.startswith("."))
 
 
@@ -95,10 +95,10 @@ def _listed(paths: Sequence[Path]) -> FoundFiles:
 
 
 def _text(name: str) -> str:
-    """A name that can be written to any text file: Linux allows bytes in file names that are no
-    valid text.
+    """A name that can be written to any text file and terminal: Linux allows bytes in file names
+    that are no valid text, and control characters.
     """
-    return name.encode("utf-8", "backslashreplace").decode()
+    return plain(name)
 
 
 def _sorted(
@@ -125,19 +125,24 @@ def read_survey(
     cameras: Path | None = None,
     thermal_unit: str | None = None,
     clips: bool = False,
+    max_mp: float = MOST_MP,
 ) -> Survey:
     """All photos below a folder (or those given) in order of capture, without decoding their
     pixels.
 
     `geo` is a side file of positions (`geo.txt`, CSV, `.SRT`, `.MRK`); without one, a `geo.txt` at
-    the top of the folder is used. `cameras` is a `cameras.json`, `thermal_unit` as in `read_photo`.
+    the top of the folder is used. `cameras` is a `cameras.json`, `thermal_unit` as in `read_photo`,
+    `max_mp` the largest area of a photo in megapixels.
     With `clips`, video clips are read too, and timed positions in `geo` (or a folder of such files)
     are those of the clips. A bad photo becomes a `RejectedPhoto`. Raises `UsageError` for a folder
     that does not exist, `NoPhotosError` where no photo can be read, `SideFileError` for a bad side
     file.
     """
     found = find_files(folder)
-    read = [read_photo(path, name=name, thermal_unit=thermal_unit) for name, path in found.photos]
+    read = [
+        read_photo(path, name=name, thermal_unit=thermal_unit, most_mp=max_mp)
+        for name, path in found.photos
+    ]
     rejected = [p for p in read if isinstance(p, RejectedPhoto)]
     films, more_rejected = read_clips(found.clips, geo) if clips else ((), ())
     rejected += more_rejected
@@ -242,7 +247,7 @@ def _cameras(photos: Sequence[Photo]) -> Iterator[str]:
         yield f"Different spectra are mixed: {counts} photos."
     rolling = sorted({p.camera_key for p in photos if p.rolling_shutter})
     if rolling:
-        yield f"Rolling (electronic) shutter, not modelled: {sentence_of(rolling)}."
+        yield f"Rolling (electronic) shutter: {sentence_of(rolling)}."
 
 
 def _thermal_units(photos: Sequence[Photo]) -> Iterator[str]:

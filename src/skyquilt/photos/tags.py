@@ -3,13 +3,15 @@
 import io
 import math
 import re
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+import struct
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any, BinaryIO
 
 from defusedxml import ElementTree
-from PIL import Image
+
+from skyquilt.outside import plain, real
 
 EXIF_IFD, GPS_IFD = 0x8769, 0x8825
 
@@ -47,10 +49,12 @@ class Exif:
 
 
 def as_text(value: Any) -> str:
-    """Text up to the first NUL, stripped; empty for other types."""
+    """Text up to the first NUL, stripped, in one line without control characters; empty for other
+    types.
+    """
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
-    return value.split("\x00")[0].strip() if isinstance(value, str) else ""
+    return plain(value.split("\x00")[0].strip(), MOST_TEXT) if isinstance(value, str) else ""
 
 
 def as_number(value: Any) -> float | None:
@@ -59,11 +63,7 @@ def as_number(value: Any) -> float | None:
         value = value[0] if len(value) == 1 else None
     if isinstance(value, bytes):
         value = value[0] if len(value) == 1 else None
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
-        return None
-    return number if math.isfinite(number) else None
+    return real(value)
 
 
 def parse_exif(block: bytes) -> Exif:
@@ -71,28 +71,119 @@ def parse_exif(block: bytes) -> Exif:
     return read_tiff_tags(io.BytesIO(block)) if block else Exif()
 
 
+MOST_VALUE = 1 << 16
+"""Largest value of a tag in bytes."""
+MOST_TEXT = 4000
+"""Largest number of characters of a text."""
+MOST_ENTRIES = 4096
+"""Largest number of tags of a directory."""
+_IMAGE_TAGS = frozenset(
+    {MAKE, MODEL, SOFTWARE, ORIENTATION, MODIFIED, DESCRIPTION, GDAL_METADATA, EXIF_IFD, GPS_IFD}
+)
+_EXIF_TAGS = frozenset(
+    {TAKEN, SUBSEC, OFFSET, FOCAL_MM, FOCAL_35MM, ZOOM, PLANE_X, PLANE_UNIT, PIXELS_X, PIXELS_Y}
+    | {SERIAL, LENS}
+)
+_GPS_TAGS = frozenset(
+    {GPS_LAT_REF, GPS_LAT, GPS_LON_REF, GPS_LON, GPS_ALT_REF, GPS_ALT, GPS_TIME, GPS_ERROR}
+    | {GPS_DATE}
+)
+_FORMS = {1: "B", 2: "s", 3: "H", 4: "I", 5: "II", 6: "b", 7: "s", 8: "h", 9: "i", 10: "ii"} | {
+    11: "f",
+    12: "d",
+    13: "I",
+    16: "Q",
+    17: "q",
+    18: "Q",
+}
+"""Type of a value in a directory -> format of `struct`."""
+
+
+class Directories:
+    """The directories of a TIFF file or EXIF block (TIFF 6.0; BigTIFF). Only tags that are asked
+    for are read, and only values of limited size, so the work does not depend on what a file
+    claims.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        """Reads the header; raises `ValueError` where there is none."""
+        self.file = file
+        file.seek(0)
+        head = file.read(16)
+        self.order = {b"II": "<", b"MM": ">"}.get(head[:2], "")
+        magic = struct.unpack(self.order + "H", head[2:4])[0] if len(head) >= 8 else 0
+        if not self.order or magic not in (42, 43):
+            raise ValueError("it has no TIFF header")
+        self.big = magic == 43
+        form, at = ("Q", 8) if self.big else ("I", 4)
+        self.first = int(struct.unpack_from(self.order + form, head.ljust(16, b"\0"), at)[0])
+        self.counts: dict[int, int] = {}
+        """Number of values of each tag met in the directory read last."""
+
+    def read(self, offset: int, wanted: Collection[int]) -> dict[int, Any]:
+        """The wanted tags of a directory; numbers as numbers or tuples, rationals as real numbers.
+
+        Raises `ValueError` where the directory lies outside the file; broken values are absent.
+        """
+        number, entry, inline, field_ = (8, 20, 8, "HHQ") if self.big else (2, 12, 4, "HHI")
+        self.file.seek(offset)
+        head = self.file.read(number)
+        if len(head) < number:
+            raise ValueError("a directory lies outside the file")
+        entries = int.from_bytes(head, "little" if self.order == "<" else "big")
+        body = self.file.read(min(entries, MOST_ENTRIES) * entry)
+        found: dict[int, Any] = {}
+        self.counts = {}
+        for at in range(0, len(body) - entry + 1, entry):
+            tag, kind, count = struct.unpack_from(self.order + field_, body, at)
+            self.counts[tag] = count
+            if tag not in wanted or kind not in _FORMS:
+                continue
+            size = struct.calcsize("<" + _FORMS[kind]) * count
+            raw = body[at + entry - inline : at + entry]
+            if size > MOST_VALUE:
+                continue
+            if size > inline:
+                self.file.seek(struct.unpack(self.order + ("Q" if self.big else "I"), raw)[0])
+                raw = self.file.read(size)
+            if len(raw) >= size and count:
+                found.setdefault(tag, self._value(kind, count, raw[:size]))
+        return found
+
+    def _value(self, kind: int, count: int, raw: bytes) -> Any:
+        if kind in (1, 7):
+            return raw
+        if kind == 2:
+            return raw.removesuffix(b"\0").decode("latin-1")
+        numbers = struct.unpack(f"{self.order}{count * len(_FORMS[kind])}{_FORMS[kind][0]}", raw)
+        if kind in (5, 10):
+            pairs = zip(numbers[::2], numbers[1::2], strict=True)
+            numbers = tuple(a / b if b else math.nan for a, b in pairs)
+        return numbers[0] if count == 1 else numbers
+
+
 def read_tiff_tags(file: BinaryIO) -> Exif:
     """Tags of a TIFF file or block, read from its directories only; never raises."""
-    exif = Image.Exif()
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            file.seek(0)
-            exif.load_from_fp(file)
-            tags = {**dict(exif), **_directory(exif, EXIF_IFD)}
-            return Exif(tags=tags, gps=_directory(exif, GPS_IFD))
-    except (
-        Exception
-    ):  # Pillow raises many exceptions on invalid data, and a broken block must not stop a survey
+        directories = Directories(file)
+        tags = directories.read(directories.first, _IMAGE_TAGS)
+    except (ValueError, OSError, struct.error, OverflowError):
         return Exif(broken=True)
+    exif = _below(directories, tags, EXIF_IFD, _EXIF_TAGS)
+    return Exif(tags={**tags, **exif}, gps=_below(directories, tags, GPS_IFD, _GPS_TAGS))
 
 
-def _directory(exif: Image.Exif, which: int) -> dict[int, Any]:
+def _below(
+    directories: Directories, tags: Mapping[int, Any], which: int, wanted: Collection[int]
+) -> dict[int, Any]:
+    """The directory to which a tag points; empty where it is broken: one broken directory does not
+    affect the others.
+    """
+    at = tags.get(which)
     try:
-        found = exif.get_ifd(which)
-    except Exception:  # as above: one broken directory does not affect the others
+        return directories.read(at, wanted) if isinstance(at, int) else {}
+    except (ValueError, OSError, struct.error, OverflowError):
         return {}
-    return {k: v for k, v in found.items() if isinstance(k, int)}
 
 
 _KNOWN = {
@@ -105,11 +196,21 @@ _KNOWN = {
     "http://ns.adobe.com/tiff/1.0": "tiff",
     "http://www.w3.org/1999/02/22-rdf-syntax-ns#": "rdf",
 }
-_PACKET = re.compile(
-    rb"<(?:\w+:)?xmpmeta\b.*?</(?:\w+:)?xmpmeta\s*>|<rdf:RDF\b.*?</rdf:RDF\s*>", re.DOTALL
+MOST_XMP = 1 << 20
+"""Largest XMP packet in bytes that is parsed."""
+MOST_NODES = 200_000
+"""Largest number of XML elements of one packet that are visited."""
+_ENVELOPES = tuple(
+    (re.compile(begin), re.compile(end))
+    for begin, end in (
+        (rb"<(?:\w{1,30}+:)?xmpmeta\b", rb"</(?:\w{1,30}+:)?xmpmeta\s{0,9}+>"),
+        (rb"<rdf:RDF\b", rb"</rdf:RDF\s{0,9}+>"),
+    )
 )
-_ATTRIBUTE = re.compile(r"([\w-]+:[\w-]+)\s*=\s*(?:\"([^\"<]*)\"|'([^'<]*)')")
-_ELEMENT = re.compile(r"<([\w-]+:[\w-]+)[^<>]*>([^<>]*)</\1\s*>")
+# possessive (++) and looking behind: each character is read a fixed number of times
+_NAMED = r"(?<![\w-])([\w-]++:[\w-]++)"
+_ATTRIBUTE = re.compile(_NAMED + r"\s*+=\s*+(?:\"([^\"<]*+)\"|'([^'<]*+)')")
+_ELEMENT = re.compile(r"<([\w-]++:[\w-]++)[^<>]*+>([^<>]*+)</([\w-]++:[\w-]++)\s*+>")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -147,12 +248,9 @@ class Xmp:
 
 def parse_number(text: str) -> float | None:
     """A finite number from `+39.80`, `-1`, `3/4`; None for anything else."""
-    top, _, bottom = text.strip().partition("/")
-    try:
-        number = float(top) / float(bottom) if bottom else float(top)
-    except (ValueError, ZeroDivisionError, OverflowError):
-        return None
-    return number if math.isfinite(number) else None
+    top, slash, bottom = text.partition("/")
+    above, below = real(top), real(bottom) if slash else 1.0
+    return real(above / below) if above is not None and below else None
 
 
 def parse_xmp(packets: Sequence[bytes]) -> Xmp:
@@ -160,6 +258,9 @@ def parse_xmp(packets: Sequence[bytes]) -> Xmp:
     values: dict[str, str] = {}
     broken = False
     for packet in packets:
+        if len(packet) > MOST_XMP:
+            broken = True
+            continue
         try:
             found = dict(_properties(ElementTree.fromstring(_body(packet))))
         except (
@@ -167,12 +268,17 @@ def parse_xmp(packets: Sequence[bytes]) -> Xmp:
         ):  # not XML, or forbidden XML: a text search still finds plain name="value" pairs
             found, broken = _searched(packet), True
         values = {**found, **values}
-    return Xmp(values=values, broken=broken)
+    return Xmp(values={k: plain(v, MOST_TEXT) for k, v in values.items()}, broken=broken)
 
 
 def _body(packet: bytes) -> bytes:
-    found = _PACKET.search(packet)
-    return found.group() if found else packet
+    """The first complete envelope in a packet; the packet where there is none."""
+    for begin, end in _ENVELOPES:
+        first = begin.search(packet)
+        last = end.search(packet, first.end()) if first else None
+        if first and last:
+            return packet[first.start() : last.end()]
+    return packet
 
 
 def _name(tag: str) -> str:
@@ -183,19 +289,24 @@ def _name(tag: str) -> str:
 
 def _properties(root: Any) -> Iterator[tuple[str, str]]:
     """Attributes and elements of every rdf:Description, outermost last so that it wins."""
-    for node in reversed(list(root.iter())):
-        if _name(node.tag) == "rdf:Description":
-            yield from ((_name(k), v) for k, v in node.attrib.items())
-            for child in node:
-                yield _name(child.tag), _value(child)
+    visits = iter(range(MOST_NODES))
+    nodes = list(islice(root.iter(), MOST_NODES))
+    for node in reversed([n for n in nodes if _name(n.tag) == "rdf:Description"]):
+        yield from ((_name(k), v) for k, v in node.attrib.items())
+        for child in node:
+            yield _name(child.tag), _value(child, visits)
 
 
-def _value(node: Any) -> str:
-    items = [i.text.strip() for i in node.iter() if _name(i.tag) == "rdf:li" and i.text]
+def _value(node: Any, visits: Iterator[int]) -> str:
+    """Text of an element, or the items of its list; `visits` counts how many elements may still be
+    visited, since nested elements are visited once for each level.
+    """
+    inside = (i for i, _ in zip(node.iter(), visits, strict=False))
+    items = [i.text.strip() for i in inside if _name(i.tag) == "rdf:li" and i.text]
     return ",".join(items) if items else (node.text or "").strip()
 
 
 def _searched(packet: bytes) -> dict[str, str]:
     text = packet.decode("utf-8", "replace")
     pairs = [(m[1], m[2] or m[3] or "") for m in _ATTRIBUTE.finditer(text)]
-    return dict(pairs + [(m[1], m[2]) for m in _ELEMENT.finditer(text)])
+    return dict(pairs + [(m[1], m[2]) for m in _ELEMENT.finditer(text) if m[1] == m[3]])

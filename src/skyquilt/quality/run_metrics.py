@@ -160,6 +160,7 @@ def figures(
     ground: Ground,
     drawn: Drawn,
     seams: Mapping[str, Any],
+    looks: Mapping[str, Any],
     conflicts: Sequence[MetadataConflict],
     notes: Sequence[str],
 ) -> dict[str, Any]:
@@ -185,6 +186,7 @@ def figures(
         "links": len(links),
         "pairs_rejected": _reasons([r.reason for r in refused]),
         "seam_disparity_px": seams,
+        **looks,
         "metadata_conflicts": [asdict(c) for c in conflicts],
         "cameras": camera_figures(photos, alignment),
         "shutter": shutter_figures(photos, alignment),

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Steps
 from skyquilt.ortho.companions import Drawn
@@ -12,9 +13,12 @@ from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.orthomosaic import used_photos
 from skyquilt.ortho.patches import grey_pairs
+from skyquilt.quality.seam_look import cut_objects, seam_colours
 from skyquilt.quality.seam_points import SeamPoint, seam_points
 from skyquilt.quality.seams import PatchPairs, SeamReport, seam_disparity
 
+SHOWN, APART = 3, 100
+"""Number of the worst places that are shown, and their least distance in px of the provenance."""
 SEAM_POINTS = 300
 """Points at which seams are measured."""
 
@@ -27,6 +31,10 @@ class MeasuredSeams:
     """All samples."""
     figures: Mapping[str, Any]
     """What metrics.json says."""
+    looks: Mapping[str, Any]
+    """What it says about colours and objects at the seams."""
+    worst: Sequence[SeamPoint] = ()
+    """Points with the largest steps of colour, the worst first."""
 
 
 def measure_seams(compose: Composer, drawn: Drawn, ground: Ground) -> Steps[MeasuredSeams]:
@@ -50,8 +58,32 @@ def measure_seams(compose: Composer, drawn: Drawn, ground: Ground) -> Steps[Meas
         return PatchPairs(a=a, b=b, seen=seen)
 
     report = seam_disparity(points, patches, gsd_m=ground.native_gsd)
+    looks: dict[str, Any] = {"seam_colour_step": None, "seam_cut_objects": None, "hidden_m2": None}
+    worst: list[SeamPoint] = []
+    if compose.dtype == np.uint8 and points:
+        colours = seam_colours(
+            points, grid, views, ground.surface, compose.exposure, compose.pixels, ground.grid.gsd
+        )
+        looks["seam_colour_step"] = colours.figures
+        worst = _apart(points, colours.at)
+    if (labels := compose.labels) is not None:
+        share = cut_objects(drawn.provenance, grid, labels)
+        looks["seam_cut_objects"] = None if share is None else round(share, 4)
+        looks["hidden_m2"] = round(float(labels.hidden.sum()) * labels.cells.gsd**2, 1)
     yield 1, 1
-    return MeasuredSeams(report=report, figures=_figures(report))
+    return MeasuredSeams(report=report, figures=_figures(report), looks=looks, worst=tuple(worst))
+
+
+def _apart(points: Sequence[SeamPoint], step: NDArray[Any]) -> list[SeamPoint]:
+    """The points with the largest steps (n,), apart from each other."""
+    chosen: list[SeamPoint] = []
+    for k in np.argsort(-np.nan_to_num(step, nan=-1.0), kind="stable").tolist():
+        p = points[k]
+        if all(np.hypot(p.row - q.row, p.column - q.column) > APART for q in chosen):
+            chosen.append(p)
+        if len(chosen) == SHOWN or not np.isfinite(step[k]):
+            break
+    return chosen
 
 
 def _figures(report: SeamReport) -> dict[str, Any]:

@@ -23,6 +23,8 @@ from shapely import (
     force_2d,
     from_wkb,
     from_wkt,
+    get_coordinates,
+    get_num_coordinates,
     make_valid,
     segmentize,
     transform,
@@ -33,7 +35,16 @@ from shapely.geometry.base import BaseGeometry
 from shapely.prepared import prep
 
 from skyquilt.errors import SideFileError
+from skyquilt.outside import MOST_TEXT_BYTES, open_regular, plain, read_bounded
 
+MOST_VERTICES = 200_000
+"""Largest number of vertices of a boundary."""
+MOST_RINGS = 2000
+"""Largest number of rings of one record of a Shapefile."""
+MOST_COORDINATE = 1e8
+"""Largest coordinate, in degrees or m."""
+MOST_STEPS, MOST_PRJ = 20_000, 100_000
+"""Thousands of steps that SQLite may take with a GeoPackage; bytes of a .prj file."""
 SEGMENTS = 100
 """An outline is divided into segments of at most its extent over this number before it is
 projected, because straight lines become curved.
@@ -54,19 +65,37 @@ def read_boundary(path: Path, crs: str | None) -> Polygon | MultiPolygon:
         )
     try:
         shapes, source = reader(path)
+        _check_size(shapes)
+        areas = [area for shape in shapes for area in _areas(make_valid(shape))]
+        if not areas:
+            kinds = sorted({shape.geom_type for shape in shapes}) or ["nothing"]
+            raise SideFileError(
+                f"{path.name}: a boundary needs at least one polygon, found {', '.join(kinds)}"
+            )
+        outline = _polygonal(_projected(union_all(areas), path, source, crs))
+        if outline.is_empty or not np.isfinite(outline.bounds).all():
+            raise SideFileError(f"{path.name}: nothing is left of its outline in {crs}")
+        return outline
+    except SideFileError:
+        raise
     except OSError as error:
         raise SideFileError(f"{path} cannot be read: {error.strerror or error}") from error
-    except Exception as error:
+    except Exception as error:  # GEOS, PROJ and the parsers raise many exceptions
         raise SideFileError(
-            f"{path.name} is not a readable {path.suffix[1:]} file: {error}"
+            f"{path.name} is not a readable {path.suffix[1:]} file:"
+            f" {plain(str(error), 200) or type(error).__name__}"
         ) from error
-    areas = [area for shape in shapes for area in _areas(make_valid(shape))]
-    if not areas:
-        kinds = sorted({shape.geom_type for shape in shapes}) or ["nothing"]
-        raise SideFileError(
-            f"{path.name}: a boundary needs at least one polygon, found {', '.join(kinds)}"
-        )
-    return _polygonal(_projected(union_all(areas), path, source, crs))
+
+
+def _check_size(shapes: Sequence[BaseGeometry]) -> None:
+    """Refuses outlines that would take minutes, and numbers that are no places."""
+    count = sum(int(get_num_coordinates(shape)) for shape in shapes)
+    if count > MOST_VERTICES:
+        raise ValueError(f"it has {count} vertices, and {MOST_VERTICES} are the most")
+    for shape in shapes:
+        places = get_coordinates(shape)
+        if not np.isfinite(places).all() or (np.abs(places) > MOST_COORDINATE).any():
+            raise ValueError(f"a coordinate is no number or beyond {MOST_COORDINATE:g}")
 
 
 def inside(
@@ -121,14 +150,19 @@ def _projected(
         transformer = pyproj.Transformer.from_crs(source, pyproj.CRS(crs).to_2d(), always_xy=True)
     except pyproj.exceptions.CRSError as error:
         raise SideFileError(
-            f"{path.name}: the CRS '{source[:60]}' is not known: {error}"
+            f"{path.name}: the CRS '{plain(source, 60)}' is not known: {plain(str(error), 200)}"
         ) from error
     west, south, east, north = shape.bounds
+    if (
+        len(get_coordinates(shape)) * 2 + shape.length / max(east - west, north - south) * SEGMENTS
+        > MOST_VERTICES
+    ):
+        raise SideFileError(f"{path.name}: its outline is too long for its extent")
     fine = segmentize(shape, max(east - west, north - south) / SEGMENTS)
     placed = transform(fine, lambda xy: np.column_stack(transformer.transform(xy[:, 0], xy[:, 1])))
     if not np.isfinite(placed.bounds).all():
         raise SideFileError(
-            f"{path.name}: its coordinates {shape.bounds} do not fit its CRS ({source[:60]})"
+            f"{path.name}: its coordinates {shape.bounds} do not fit its CRS ({plain(source, 60)})"
         )
     return placed
 
@@ -141,7 +175,7 @@ WGS84 = "EPSG:4326"
 
 def read_geojson(path: Path) -> Shapes:
     """RFC 7946, or the older form with a `crs` member that GIS programs still write."""
-    content = json.loads(path.read_text(encoding="utf-8-sig"))
+    content = json.loads(_text(path))
     named = content.get("crs") or {}
     crs = named.get("properties", {}).get("name", WGS84)
     return [force_2d(from_geojson(geometry)) for geometry in _geometries(content)], str(crs)
@@ -157,14 +191,26 @@ def _geometries(content: dict[str, Any]) -> list[dict[str, Any]]:
 
 def read_kml(path: Path) -> Shapes:
     """All polygons of a KML file; a path whose last point equals its first counts as a polygon."""
-    return _kml_shapes(path.read_bytes()), WGS84
+    return _kml_shapes(read_bounded(path)), WGS84
 
 
 def read_kmz(path: Path) -> Shapes:
     """All polygons of every KML file inside the archive."""
-    with zipfile.ZipFile(path) as archive:
-        names = [name for name in archive.namelist() if name.lower().endswith(".kml")]
-        return [shape for name in names for shape in _kml_shapes(archive.read(name))], WGS84
+    shapes: list[BaseGeometry] = []
+    left = MOST_TEXT_BYTES
+    with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+        for name in [n for n in archive.namelist() if n.lower().endswith(".kml")]:
+            with archive.open(name) as member:  # what it declares may be wrong
+                text = member.read(left + 1)
+            left -= len(text)
+            if left < 0:
+                raise ValueError(f"it unpacks to more than {MOST_TEXT_BYTES // 10**6} MB")
+            shapes += _kml_shapes(text)
+    return shapes, WGS84
+
+
+def _text(path: Path) -> str:
+    return read_bounded(path).decode("utf-8-sig")
 
 
 def _kml_shapes(text: bytes) -> list[BaseGeometry]:
@@ -194,15 +240,15 @@ def read_wkt(path: Path) -> Shapes:
     """One geometry as well-known text, in the output's CRS; `SRID=32615;POLYGON ...` states
     another.
     """
-    text = path.read_text(encoding="utf-8-sig").strip()
+    text = _text(path).strip()
     srid, _, rest = text.partition(";") if text.upper().startswith("SRID=") else ("", "", text)
     return [force_2d(from_wkt(rest))], f"EPSG:{int(srid[5:])}" if srid else None
 
 
 def read_geopackage(path: Path) -> Shapes:
     """The first feature table of a GeoPackage (OGC 12-128r18)."""
-    if not path.is_file():
-        raise FileNotFoundError(2, "No such file or directory")
+    with open_regular(path):
+        pass  # it exists, and is a file
     with closing(sqlite3.connect(path.absolute().as_uri() + "?mode=ro", uri=True)) as base:
         found = "SELECT table_name, column_name, srs_id FROM gpkg_geometry_columns LIMIT 1"
         table, column, srs = base.execute(found).fetchone()
@@ -210,7 +256,17 @@ def read_geopackage(path: Path) -> Shapes:
         naming = f"SELECT {columns} FROM gpkg_spatial_ref_sys WHERE srs_id = ?"
         authority, code, definition = base.execute(naming, (srs,)).fetchone()
         table, column = (name.replace('"', '""') for name in (table, column))
-        blobs = [row[0] for row in base.execute(f'SELECT "{column}" FROM "{table}"') if row[0]]
+        steps = iter(range(MOST_STEPS))
+        # a view in the file may be any query: it is ended after so many steps
+        base.set_progress_handler(lambda: next(steps, None) is None, 1000)
+        rows = base.execute(f'SELECT "{column}" FROM "{table}" LIMIT {MOST_VERTICES}')
+        blobs, size = [], 0
+        for (blob,) in rows:
+            if isinstance(blob, bytes):
+                blobs.append(blob)
+                size += len(blob)
+            if size > MOST_TEXT_BYTES:
+                raise ValueError(f"its shapes have more than {MOST_TEXT_BYTES // 10**6} MB")
     crs = f"{authority}:{code}" if authority.upper() == "EPSG" else definition
     return [force_2d(from_wkb(blob[_gpkg_header(blob) :])) for blob in blobs], crs
 
@@ -224,7 +280,8 @@ def read_shapefile(path: Path) -> Shapes:
     """Polygons (types 5, 15, 25) of a Shapefile with its `.prj` beside it (ESRI white paper,
     1998).
     """
-    data, at, shapes = path.read_bytes(), 100, []
+    data, at = read_bounded(path), 100
+    shapes: list[BaseGeometry] = []
     if data[:4] != b"\0\0\x27\x0a":
         raise ValueError("the file code is not 9994")
     while at < len(data):
@@ -232,7 +289,9 @@ def read_shapefile(path: Path) -> Shapes:
         shapes += _shp_polygon(data[at + 8 : at + 8 + size])
         at += 8 + size
     projection = path.with_suffix(".prj")
-    return shapes, projection.read_text() if projection.exists() else WGS84
+    if not projection.exists():
+        return shapes, WGS84
+    return shapes, read_bounded(projection, MOST_PRJ).decode("utf-8", "replace")
 
 
 def _shp_polygon(record: bytes) -> list[BaseGeometry]:
@@ -240,6 +299,8 @@ def _shp_polygon(record: bytes) -> list[BaseGeometry]:
     if kind not in (5, 15, 25):
         return []
     parts, count = struct.unpack_from("<ii", record, 36)
+    if not (0 < parts <= MOST_RINGS and 0 < count <= MOST_VERTICES):
+        raise ValueError(f"a record has {parts} rings with {count} vertices")
     starts = [*struct.unpack_from(f"<{parts}i", record, 44), count]
     places = np.frombuffer(record, "<f8", 2 * count, 44 + 4 * parts).reshape(count, 2)
     rings = [Polygon(places[start:end]) for start, end in pairwise(starts)]

@@ -109,25 +109,28 @@ def split_jpeg(stream: bytes) -> tuple[bytes, bytes]:
 
 
 def smooth_fill(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[Any]:
-    """Pixels (uint8) with every invalid one set to the mean of the valid ones in or around its JPEG
-    unit.
-
-    This keeps the colours at the border of the valid area. Units without valid neighbours become
-    black, for viewers that ignore masks.
+    """Pixels (uint8) with the invalid ones of JPEG units that have valid ones set to the nearest
+    of these, so that its border keeps its colours; all others are black, for programs that ignore
+    masks.
     """
-    pixels, small = pixels.copy(), (valid.shape[1] // MCU, valid.shape[0] // MCU)
-    units, inside = _units(pixels), _units(valid[..., None])
-    share = cv2.resize(valid.astype(np.uint8) * 255, small, interpolation=cv2.INTER_AREA)
-    mean = cv2.resize(pixels, small, interpolation=cv2.INTER_AREA).reshape((*units.shape[:2], -1))
-    mixed = np.nonzero((share > 0) & (share < 255))
-    colours, kept = units[mixed], inside[mixed]
-    mean[mixed] = (colours * kept).sum((1, 2), dtype=np.uint32) // kept.sum((1, 2), dtype=np.uint32)
-    units[mixed] = np.where(kept, colours, mean[mixed][:, None, None])
-    own, void = (share > 0).astype(np.float32)[..., None], share == 0
-    around = cv2.blur(mean * own, (3, 3), borderType=cv2.BORDER_CONSTANT).reshape(mean.shape)
-    weight = cv2.blur(own, (3, 3), borderType=cv2.BORDER_CONSTANT)[..., None]
-    units[void] = np.where(weight > 0.05, around / np.maximum(weight, 0.05), 0)[void][:, None, None]
-    return pixels
+    if not valid.any():
+        return np.zeros_like(pixels)
+    mask = valid.view(np.uint8)
+    out = np.zeros_like(pixels)
+    cv2.copyTo(pixels, mask, out)
+    small = (valid.shape[1] // MCU, valid.shape[0] // MCU)
+    share = cv2.resize(mask * np.uint8(255), small, interpolation=cv2.INTER_AREA)
+    mixed = ((share > 0) & (share < 255)).repeat(MCU, 0).repeat(MCU, 1)
+    fill = np.flatnonzero(mixed & ~valid)
+    if len(fill):
+        # each valid pixel is a label; they are counted from 1 in the order of rows
+        _, place = cv2.distanceTransformWithLabels(
+            1 - mask, cv2.DIST_L2, cv2.DIST_MASK_3, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        nearest = np.flatnonzero(valid)[place.ravel()[fill] - 1]
+        flat = out.reshape(-1, out.shape[2])
+        flat[fill] = flat[nearest]
+    return out
 
 
 def _units(array: NDArray[Any]) -> NDArray[Any]:

@@ -17,6 +17,8 @@ MERCATOR = 20037508.342789244
 """Half the width of the Web Mercator square in m."""
 NODES = 16
 """Spacing in px of the points that are transformed exactly."""
+ROWS = 256
+"""Rows of an image that are computed at a time."""
 MOST_TILES = 320
 """Largest number of tiles read for one image."""
 Bounds = tuple[float, float, float, float]
@@ -217,20 +219,26 @@ def picture(
         return None
     u = ((mx - part.west) / part.gsd - 0.5).astype(np.float32)
     v = ((part.north - my) / part.gsd - 0.5).astype(np.float32)
-    u, v = (_dense(m, height, width) for m in (u, v))
-    colour = coloured(part.pixels, scale)
-    warped = cv2.remap(colour, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    alpha = cv2.remap(
-        part.shown.astype(np.uint8) * 255, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+    colour, shown = coloured(part.pixels, scale), part.shown.astype(np.uint8) * 255
+    out = np.empty((height, width, 4), np.uint8)
+    for r0 in range(0, height, ROWS):  # the coordinates of all pixels would need most memory
+        band = slice(r0, min(r0 + ROWS, height))
+        ui, vi = (_dense(m, band, width) for m in (u, v))
+        warped = cv2.remap(colour, ui, vi, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        out[band, :, :3] = warped.reshape(-1, width, 3)
+        out[band, :, 3] = cv2.remap(
+            shown, ui, vi, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+        )
+    return out if out[..., 3].any() else None
+
+
+def _dense(nodes: NDArray[np.float32], rows: slice, width: int) -> NDArray[np.float32]:
+    """Values at every NODES-th pixel, the first one at -NODES, interpolated to all pixels of these
+    rows.
+    """
+    c, r = np.meshgrid(
+        np.arange(width, dtype=np.float32), np.arange(rows.start, rows.stop, dtype=np.float32)
     )
-    if not alpha.any():
-        return None
-    return np.dstack([warped.reshape(height, width, 3), alpha])
-
-
-def _dense(nodes: NDArray[np.float32], height: int, width: int) -> NDArray[np.float32]:
-    """Values at every NODES-th pixel, the first one at -NODES, interpolated to all pixels."""
-    c, r = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     return np.asarray(cv2.remap(nodes, c / NODES + 1, r / NODES + 1, cv2.INTER_LINEAR), np.float32)
 
 

@@ -108,6 +108,8 @@ class ReportInput:
     """Reprojection residuals by camera."""
     seams: Sequence[SeamMark] = ()
     """Samples along the seams."""
+    worst_seams: Sequence[NDArray[Any]] = ()
+    """(h, w, 3) uint8 crops of the map around the largest steps of colour, the worst first."""
     depths: Sequence[DepthPicture] = ()
     """Depth maps of a few registrations, for methods that compute them."""
     settings: Mapping[str, Any] = field(default_factory=dict)

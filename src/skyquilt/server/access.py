@@ -1,16 +1,25 @@
 """Who may do what: tokens, hosts, limits, headers; and what all addresses share."""
 
+import asyncio
 import hmac
 import ipaddress
+import socket
+import sqlite3
+import time
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Protocol
 
 from fastapi import HTTPException, Request
 from fastapi.responses import JSONResponse
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from skyquilt.errors import UsageError
+from skyquilt.engine.error_log import log_error
+from skyquilt.errors import OutputError, UsageError
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.photo_intake import Intake
 from skyquilt.server.survey import Survey
@@ -20,6 +29,8 @@ RESUMABLE = "/photos/uploads"
 TUS = {"Tus-Resumable": "1.0.0"}
 """Sent with every answer from there."""
 
+SLOWEST, GRACE_S = 200.0, 60.0
+"""Slowest rate of a body in bytes/s, and the time in s after which it counts."""
 HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob: https:;"
     " style-src 'self' 'unsafe-inline'; script-src 'self'; connect-src 'self'; object-src 'none';"
@@ -50,9 +61,17 @@ class Guard:
     """Largest number of layers."""
     most_uploads: int = 200
     """Largest number of uploads at a time."""
+    most_uploads_each: int = 60
+    """Largest number of uploads at a time from one address."""
+    most_connections: int = 200
+    """Largest number of connections from one address."""
+    allow_hosts: tuple[str, ...] = ()
+    """Further names under which clients may address the server."""
     upload_stall_s: float = 10.0
     """If no data arrive for this time in s, the connection of an upload counts as lost."""
-    upload_idle_s: float = 600.0
+    upload_empty_s: float = 600.0
+    """An upload that was announced, and of which no byte arrived for this time in s, is deleted."""
+    upload_idle_s: float = 30.0
     """An upload that was not continued for this time in s no longer counts as active."""
     upload_keep_s: float = 24 * 3600.0
     """An upload that was not continued for this time in s is deleted."""
@@ -80,11 +99,26 @@ class Guard:
         """Whether the host name of a request is a name of this server. Other names that resolve to
         it are refused (protection against DNS rebinding).
         """
-        if self.token is not None or not local(self.host):
+        name = host_header.rsplit(":", 1)[0] if not host_header.endswith("]") else host_header
+        name = name.strip("[]").rstrip(".").lower()
+        if local(name) or name in {n.lower() for n in self.allow_hosts}:
             return True
-        return local(
-            host_header.rsplit(":", 1)[0] if not host_header.endswith("]") else host_header
-        )
+        if local(self.host):
+            return False
+        if name == self.host.strip("[]").lower() or name in _machine():
+            return True
+        try:  # an address is no name that could be made to point elsewhere
+            ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return self.host in ("0.0.0.0", "::", "")
+
+
+@cache
+def _machine() -> frozenset[str]:
+    """Names of this machine."""
+    name = socket.gethostname().lower()
+    return frozenset({name, f"{name}.local", socket.getfqdn().lower()})
 
 
 def local(host: str) -> bool:
@@ -103,8 +137,33 @@ class Guarded:
     response.
     """
 
-    def __init__(self, app: ASGIApp, guard: Guard) -> None:
-        self.app, self.guard = app, guard
+    def __init__(self, app: ASGIApp, guard: Guard, log: Path | None = None) -> None:
+        """`log`: folder of the log of errors."""
+        self.app, self.guard, self.log = app, guard, log
+
+    async def _answered(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answers a request; errors that no endpoint foresaw are answered in one place."""
+        started = False
+
+        async def sending(message: Message) -> None:
+            nonlocal started
+            started = True
+            await send(message)
+
+        try:
+            await self.app(scope, receive, sending)
+        except Exception as error:
+            code, text = 500, "the server failed; its log tells more"
+            if isinstance(error, OutputError):
+                code, text = 507, str(error)
+            elif isinstance(error, sqlite3.Error):
+                code, text = 503, f"the survey cannot be read now ({error})"
+            elif isinstance(error, ClientDisconnect):
+                return
+            elif self.log is not None:
+                log_error(self.log, f"{scope['method']} {scope['path']}", error)
+            if not started:
+                await JSONResponse({"detail": text}, code)(scope, receive, send)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles one request."""
@@ -126,10 +185,35 @@ class Guarded:
             await send(message)
 
         if self.guard.knows(asked.get("host", "")):
-            await self.app(scope, receive, with_headers)
+            await self._answered(scope, receive, with_headers)
             return
-        refused = JSONResponse({"detail": "this server answers requests to localhost only"}, 421)
+        names = "localhost only" if local(self.guard.host) else "its own names (--allow-host)"
+        refused = JSONResponse({"detail": f"this server answers requests to {names}"}, 421)
         await refused(scope, receive, with_headers)
+
+
+def client_of(request: Request) -> str:
+    """The address of a client, for limits."""
+    return request.client.host if request.client else ""
+
+
+async def blocks_of(request: Request, patience_s: float) -> AsyncIterator[bytes]:
+    """The blocks of a body as they arrive.
+
+    Raises:
+        TimeoutError: no data arrived for `patience_s`, or they arrive too slowly to be of use.
+        ClientDisconnect: the connection was lost.
+    """
+    stream, began, size = request.stream(), time.monotonic(), 0
+    while True:
+        async with asyncio.timeout(patience_s):
+            block = await anext(stream, None)
+        if block is None:
+            return
+        size += len(block)
+        if size < SLOWEST * (time.monotonic() - began - GRACE_S):
+            raise TimeoutError
+        yield block
 
 
 class Writer(Protocol):

@@ -77,5 +77,5 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
     ):
         app.add_api_route(path, work, **options)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
-    app.add_middleware(Guarded, guard=guard)
+    app.add_middleware(Guarded, guard=guard, log=None if writer is None else folder)
     return app

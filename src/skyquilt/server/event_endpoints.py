@@ -3,10 +3,12 @@
 import asyncio
 import threading
 from collections.abc import AsyncIterator
+from typing import Annotated
 
-from fastapi import Request
+from fastapi import Query, Request
 from fastapi.responses import StreamingResponse
 
+from skyquilt.outside import whole
 from skyquilt.server.access import Context
 from skyquilt.server.survey import LiveSurvey
 from skyquilt.version import __version__
@@ -28,18 +30,15 @@ class EventEndpoints:
         self.context = context
         self.ending = threading.Event()
 
-    async def events(self, request: Request, after: int | None = None) -> StreamingResponse:
+    async def events(
+        self, request: Request, after: Annotated[int | None, Query(ge=0, le=2**53)] = None
+    ) -> StreamingResponse:
         """Server-sent events: photo, tiles, layer, note, refused, finish; `Last-Event-ID` or
         `after` continue after that event.
         """
-        said = request.headers.get("last-event-id", "")
-        start = (
-            int(said)
-            if said.isdigit()
-            else after
-            if after is not None
-            else self.context.survey.version()
-        )
+        said = whole(request.headers.get("last-event-id", ""), 0, 2**53)
+        known = after if said is None else said
+        start = self.context.survey.version() if known is None else known
         return StreamingResponse(
             self._news(request, start),
             media_type="text/event-stream",

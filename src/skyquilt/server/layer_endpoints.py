@@ -4,14 +4,17 @@ import json
 import time
 from typing import Any
 
+from anyio import CapacityLimiter, to_thread
 from fastapi import HTTPException, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse
+from starlette.requests import ClientDisconnect
 
 from skyquilt.errors import OutputError
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.photo_intake import shown_name
-from skyquilt.server.access import Context
+from skyquilt.outside import MOST_DIGITS, real
+from skyquilt.server.access import Context, blocks_of
 from skyquilt.server.survey import LiveSurvey
 
 GEOMETRIES = ("Point", "MultiPoint", "LineString", "MultiLineString", "Polygon", "MultiPolygon")
@@ -30,8 +33,12 @@ def checked(data: bytes) -> dict[str, Any]:
     """
     try:
         found = json.loads(
-            data, parse_constant=lambda name: _no(f"it contains {name}, which is not a number")
+            data,
+            parse_constant=lambda name: _no(f"it contains {name}, which is not a number"),
+            parse_float=_number,
+            parse_int=_number,
         )
+        json.dumps(found)  # what is served later: it may be nested too deeply for that
     except LayerError:
         raise
     except (ValueError, RecursionError) as error:
@@ -53,6 +60,14 @@ def checked(data: bytes) -> dict[str, Any]:
         "type": "FeatureCollection",
         "features": [_feature(f, k) for k, f in enumerate(features)],
     }
+
+
+def _number(text: str) -> float | int:
+    """A number that other programs can read too."""
+    number = real(text) if len(text) <= MOST_DIGITS else None
+    if number is None:
+        raise LayerError(f"it contains {text[:40]}, which is not a number in use")
+    return int(text) if text.lstrip("-").isdigit() else number
 
 
 def _no(text: str) -> None:
@@ -112,6 +127,7 @@ class LayerEndpoints:
 
     def __init__(self, context: Context) -> None:
         self.context = context
+        self._one = CapacityLimiter(1)  # reading a layer takes many times its size
 
     def layer_list(self) -> dict[str, Any]:
         """Lists the layers over the map."""
@@ -133,16 +149,17 @@ class LayerEndpoints:
         """Adds GeoJSON (the request's body) as a layer over the map, or replaces the layer of that
         name.
         """
-        writer = self.context.writing(request)
-        data = b""
-        async for block in request.stream():
-            data += block
-            if len(data) > self.context.guard.most_layer_bytes:
-                raise HTTPException(
-                    413, f"a layer may have {self.context.guard.most_layer_bytes} bytes"
-                )
+        writer, guard = self.context.writing(request), self.context.guard
+        data = bytearray()
         try:
-            layer = await run_in_threadpool(checked, data)
+            async for block in blocks_of(request, guard.upload_stall_s):
+                data += block
+                if len(data) > guard.most_layer_bytes:
+                    raise HTTPException(413, f"a layer may have {guard.most_layer_bytes} bytes")
+        except (ClientDisconnect, TimeoutError) as error:
+            raise HTTPException(408, "the connection was lost; send the layer again") from error
+        try:
+            layer = await to_thread.run_sync(checked, bytes(data), limiter=self._one)
             stored = await run_in_threadpool(
                 put_layer, writer.ledger, shown_name(name), layer, self.context.guard.most_layers
             )

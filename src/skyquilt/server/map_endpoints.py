@@ -10,6 +10,8 @@ from fastapi import HTTPException, Request, Response
 from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
+from skyquilt.live.free_memory import give_back
+from skyquilt.outside import real
 from skyquilt.raster.map_source import between
 from skyquilt.server.access import Context
 from skyquilt.server.images import Images, write_cog
@@ -27,6 +29,7 @@ class MapEndpoints:
     def __init__(self, context: Context, images: Images) -> None:
         self.context, self.images = context, images
         self._drawing = CapacityLimiter(DRAWN_AT_ONCE)
+        self._writing = CapacityLimiter(1)
 
     def page(self) -> FileResponse:
         """The page of the viewer."""
@@ -104,16 +107,19 @@ class MapEndpoints:
             **({"bounds": box} if box else {}),
         }
 
-    def export(self, bbox: str, layer: str | None = None) -> FileResponse:
+    async def export(self, bbox: str, layer: str | None = None) -> FileResponse:
         """A part of a layer as Cloud Optimized GeoTIFF; `bbox`: west,south,east,north in
         degrees.
         """
+        return await to_thread.run_sync(self._exported, bbox, layer, limiter=self._writing)
+
+    def _exported(self, bbox: str, layer: str | None) -> FileResponse:
         name = self.context.layer(layer)
         source = self.context.survey.layers()[name]
-        try:
-            west, south, east, north = (float(v) for v in bbox.split(","))
-        except ValueError as error:
-            raise HTTPException(400, "bbox is west,south,east,north in degrees") from error
+        numbers = [real(v, -180, 180) for v in bbox.split(",", 4)]
+        if len(numbers) != 4 or None in numbers:
+            raise HTTPException(400, "bbox is west,south,east,north in degrees")
+        west, south, east, north = (v for v in numbers if v is not None)
         if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
             raise HTTPException(400, "bbox has no area; it is west,south,east,north in degrees")
         bounds = between("EPSG:4326", source.crs).transform_bounds(west, south, east, north)
@@ -134,6 +140,7 @@ class MapEndpoints:
             if bounds[0] >= bounds[2] or bounds[1] >= bounds[3]
             else write_cog(source, bounds, Path(path), 0.0)
         )
+        give_back()
         if done is None:
             Path(path).unlink(missing_ok=True)
             raise HTTPException(404, "the map is empty there")

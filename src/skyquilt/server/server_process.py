@@ -2,18 +2,23 @@
 mapping.
 """
 
+import ctypes
 import multiprocessing
 import os
 import signal
 import socket
+import sys
 import threading
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from skyquilt.engine.error_log import log_error
+from skyquilt.engine.memory_watch import MemoryWatch
 from skyquilt.errors import SkyquiltError, UsageError
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import Ledger
@@ -27,6 +32,8 @@ from skyquilt.server.survey import LiveSurvey
 
 PATIENCE_S = 60.0
 """Longest time in s that the process may take to start."""
+RESTART_S = 10.0
+"""Pause in s before another attempt to start the process."""
 NICE = 5
 """Niceness of the server process: the mapping has priority."""
 
@@ -50,6 +57,10 @@ class ServerConfig:
     """Settings of the live map, for its limits."""
     guard: Guard
     """Access rules."""
+    parent: int = field(default_factory=os.getpid)
+    """The process that starts it, with which it ends."""
+    most_memory: int = 1_500_000_000
+    """Resident memory in bytes at which it is ended and started anew; 0 = no limit."""
     base: Path | None = None
     """An older orthophoto as a further layer; None = none."""
 
@@ -107,8 +118,13 @@ class ServerProcess:
     def _keep(self) -> None:
         while True:
             self._parts["process"].join()
-            if self._ending.wait(1.0) or self._start():
+            if self._ending.wait(1.0):
                 return
+            log_error(self.asked.folder, "the viewer's process ended and is started anew", "")
+            while problem := self._start():
+                log_error(self.asked.folder, f"it does not start: {problem}", "")
+                if self._ending.wait(RESTART_S):
+                    return
 
     def __exit__(
         self,
@@ -130,12 +146,40 @@ class ServerProcess:
         return address(self.asked.guard.host, self.port)
 
 
+def _end_with_parent(parent: int) -> None:
+    """On Linux, the system ends this process when the one that started it is killed."""
+    with suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
+    if os.getppid() != parent:
+        os._exit(0)
+
+
+def _more_files() -> None:
+    """As many open files as the system allows, since each connection is one."""
+    with suppress(ImportError, ValueError, OSError):
+        import resource
+
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, 8192)), hard))
+
+
+def _too_large(asked: ServerConfig, taken: int) -> None:
+    """Ends the process; its parent starts another one on the same socket."""
+    text = f"the viewer took {taken / 1e9:.1f} of {asked.most_memory / 1e9:.1f} GB and is restarted"
+    log_error(asked.folder, text, "")
+    sys.stderr.write(f"skyquilt: {text}\n")
+    sys.stderr.flush()
+    os._exit(3)
+
+
 def _serve(
     listening: socket.socket, asked: ServerConfig, wire: Connection, other: Connection
 ) -> None:
     """Main function of the process: serves until its parent closes the pipe or ends."""
     other.close()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl+C
+    _end_with_parent(asked.parent)
+    _more_files()
     with suppress(OSError, AttributeError):
         os.nice(NICE)
     try:
@@ -152,8 +196,12 @@ def _serve(
             PublishedFiles(LiveSurvey(asked.folder), asked.folder),
         ):
             wire.send("")
-            with suppress(EOFError, OSError):
-                wire.recv()
+            with MemoryWatch(limit=asked.most_memory, end=partial(_too_large, asked)):
+                try:
+                    wire.recv()
+                except (EOFError, OSError):
+                    if os.getppid() != asked.parent:
+                        os._exit(0)  # the parent was killed: the port must be free at once
     except SkyquiltError as error:
         with suppress(OSError):
             wire.send(str(error))

@@ -1,7 +1,9 @@
 """Runs the server in a separate thread, on a socket that is bound before anything else starts."""
 
+import errno
 import socket
 import threading
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -11,6 +13,8 @@ from skyquilt.errors import UsageError
 from skyquilt.server.access import Guard
 from skyquilt.server.survey import Survey
 
+RETRY_S = 2.0
+"""If the port is in use, it is tried again for this time in s."""
 NEEDED = "the live map and its viewer need some more packages: pip install 'skyquilt[live]'"
 
 
@@ -24,13 +28,23 @@ def bound(host: str, port: int) -> socket.socket:
     # TCP given explicitly, so that responses are sent at once (no delay by Nagle's algorithm)
     listening = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listening.bind((host, port))
-    except OSError as error:
-        listening.close()
-        raise UsageError(
-            f"cannot listen on {host}:{port} ({error.strerror}); choose another --port or --host"
-        ) from error
+    until = time.monotonic() + RETRY_S
+    while True:
+        try:
+            listening.bind((host, port))
+            break
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE and time.monotonic() < until:
+                time.sleep(0.1)  # a former run may be ending
+                continue
+            listening.close()
+            raise UsageError(
+                f"cannot listen on {host}:{port} ({error.strerror or error}); choose another --port"
+                " or --host"
+            ) from error
+        except (UnicodeError, ValueError) as error:
+            listening.close()
+            raise UsageError(f"--host {host!r} is not an address of this machine") from error
     listening.listen(512)  # connections made before the server is ready wait in a queue
     return listening
 
@@ -63,6 +77,7 @@ class ServerThread:
             import uvicorn
 
             from skyquilt.server.app import make_app
+            from skyquilt.server.connections import limited
         except ImportError as error:
             raise UsageError(NEEDED) from error
         listening = self.listening or bound(self.guard.host, self.port)
@@ -73,6 +88,8 @@ class ServerThread:
             log_level="error",
             timeout_graceful_shutdown=1,
             limit_concurrency=1000,
+            http=limited(self.guard.most_connections),
+            ws="none",
             server_header=False,
         )
         server = uvicorn.Server(config)

@@ -1,6 +1,7 @@
 """The data that the server shows: a growing survey or a finished run, with the same interface."""
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,8 +9,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from skyquilt.errors import UsageError
+from skyquilt.errors import SideFileError, UsageError
 from skyquilt.live.ledger import NAME, Ledger
+from skyquilt.outside import open_regular, plain, read_bounded, real
 from skyquilt.raster.map_source import FileSource, MapSource, TileSource, between
 from skyquilt.raster.read_map import open_map
 from skyquilt.raster.tile_store import TileStore
@@ -33,6 +35,8 @@ class Shown:
     """Footprint: longitude and latitude of its vertices in degrees."""
     path: Path | None
     """Its file; None if it no longer exists."""
+    digest: str
+    """Hash of the content that its file must have to be shown."""
 
 
 class Survey(Protocol):
@@ -57,20 +61,35 @@ class Survey(Protocol):
         """A number that differs if something may have changed; fast to read."""
 
 
-def open_survey(folder: Path, base: Path | None = None) -> "LiveSurvey | FinishedSurvey":
-    """Opens the survey in a folder.
+def open_survey(
+    folder: Path, base: Path | None = None, photos: Path | None = None
+) -> "LiveSurvey | FinishedSurvey":
+    """Opens the survey in a folder; `photos`: where the photos of a finished run are now.
 
     Raises:
-        UsageError: it contains none.
+        UsageError: it contains none. SideFileError: a file of the run is damaged.
     """
+    if photos is not None and not photos.is_dir():
+        raise UsageError(f"--photos {photos} is not a folder")
     if (folder / NAME).is_file():
         return LiveSurvey(folder, base=base)
-    if (folder / "mosaic.tif").is_file():
-        return FinishedSurvey(folder, base=base)
+    if _is_tiff(folder / "mosaic.tif"):
+        return FinishedSurvey(folder, base=base, photos=photos)
     raise UsageError(
         f"{folder} contains neither a live survey ({NAME}) nor a finished run (mosaic.tif); name"
         " the folder given to -o"
     )
+
+
+def _is_tiff(path: Path) -> bool:
+    """Whether a map is a TIFF by its content. GDAL would also read text that names other files and
+    addresses.
+    """
+    try:
+        with open_regular(path) as file:
+            return file.read(4) in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+    except OSError:
+        return False
 
 
 def base_map(path: Path | None) -> dict[str, MapSource]:
@@ -114,29 +133,29 @@ class LiveSurvey:
                     tiles=self.tiles, layer=layer, crs=frame["crs"], origin=(x, y), gsd=gsd
                 )
         final = self.folder / FINISHED / "mosaic.tif"
-        if final.is_file():
+        if _is_tiff(final):
             found["finished"] = FileSource(path=final)
         return found | self.base
 
     def photos(self) -> list[Shown]:
         """All accepted photos."""
         query = (
-            "select id, name, source, state, reason, footprint, file, received from photo order"
-            " by id"
+            "select id, name, source, state, reason, footprint, file, received, digest from photo"
+            " order by id"
         )
         return [self._shown(row) for row in self.ledger.rows(query)]
 
     def photo(self, number: int) -> Shown | None:
         """One accepted photo."""
         query = (
-            "select id, name, source, state, reason, footprint, file, received from photo where"
-            " id = ?"
+            "select id, name, source, state, reason, footprint, file, received, digest from photo"
+            " where id = ?"
         )
         row = self.ledger.row(query, number)
         return None if row is None else self._shown(row)
 
     def _shown(self, row: tuple[Any, ...]) -> Shown:
-        number, name, source, state, reason, place, file, received = row
+        number, name, source, state, reason, place, file, received, digest = row
         held = json.loads(place) if place else {}
         ring = tuple((float(a), float(b)) for a, b in held.get("ring", ()))
         record = {
@@ -149,8 +168,17 @@ class LiveSurvey:
             "ring": [list(p) for p in ring],
             "received": received,
         }
-        path = self.folder / PHOTOS / file
-        return Shown(id=int(number), name=name, state=state, record=record, ring=ring, path=path)
+        # the file's name is the digest, whatever a folder of unknown origin says
+        path = self.folder / PHOTOS / Path(str(file)).name
+        return Shown(
+            id=int(number),
+            name=name,
+            state=state,
+            record=record,
+            ring=ring,
+            path=path,
+            digest=str(digest),
+        )
 
     def refused(self) -> list[dict[str, Any]]:
         """Files that were refused, the latest first."""
@@ -176,11 +204,14 @@ class FinishedSurvey:
 
     growing = False
 
-    def __init__(self, folder: Path, *, base: Path | None = None) -> None:
-        """Reads the files of the run.
+    def __init__(
+        self, folder: Path, *, base: Path | None = None, photos: Path | None = None
+    ) -> None:
+        """Reads the files of the run; `photos`: where its photos are, if not where they were.
 
         Raises:
-            UsageError: it is not georeferenced, or `base` is not a map.
+            UsageError: it is not georeferenced, or `base` is not a map. SideFileError: a file of
+                the run is damaged.
         """
         self.folder, self.base = folder, base_map(base)
         self._photos: list[Shown] = []
@@ -189,23 +220,39 @@ class FinishedSurvey:
             raise UsageError(
                 f"{folder / 'mosaic.tif'} is not georeferenced; open report.html instead"
             )
-        home = _photo_folder(folder)
-        shots = json.loads((folder / "shots.geojson").read_text(encoding="utf-8"))["features"]
-        prints = json.loads((folder / "footprints.geojson").read_text(encoding="utf-8"))
-        rings = {
-            f["properties"]["filename"]: f["geometry"]["coordinates"][0] for f in prints["features"]
-        }
-        for k, shot in enumerate(shots, 1):
-            name = shot["properties"]["filename"]
-            self._photos.append(self._shown(k, name, shot, rings.get(name, []), home))
+        home = photos or _photo_folder(folder)
+        try:
+            shots = json.loads(read_bounded(folder / "shots.geojson"))["features"]
+            prints = json.loads(read_bounded(folder / "footprints.geojson"))
+            rings = {
+                f["properties"]["filename"]: f["geometry"]["coordinates"][0]
+                for f in prints["features"]
+            }
+            for k, shot in enumerate(shots, 1):
+                name = str(shot["properties"]["filename"])
+                self._photos.append(self._shown(k, name, shot, rings.get(name, []), home))
+        except OSError as error:
+            raise SideFileError(
+                f"{folder} is not a whole run: {Path(str(error.filename)).name} cannot be read"
+                f" ({error.strerror or error}). Make the map again."
+            ) from error
+        except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
+            raise SideFileError(
+                f"shots.geojson or footprints.geojson in {folder} is damaged"
+                f" ({type(error).__name__}: {plain(str(error), 100)}). Make the map again."
+            ) from error
 
     def _shown(
         self, k: int, name: str, shot: dict[str, Any], ring: list[Any], home: Path | None
     ) -> Shown:
-        x, y = shot["properties"]["translation"][:2]
+        x, y = (real(v) for v in shot["properties"]["translation"][:2])
+        if x is None or y is None:
+            raise ValueError("a position is not a number")
         lon, lat = between(self._source.crs, "EPSG:4326").transform(x, y)
-        corners = np.array(_flat(ring))
-        path = home / name if home is not None else None
+        corners = np.array(_flat(ring), float)
+        if not (np.isfinite(corners).all() and math.isfinite(lon) and math.isfinite(lat)):
+            raise ValueError("a place is not on Earth")
+        path = home / name if home is not None and "\0" not in name else None
         inside = (
             path is not None and home is not None and path.resolve().is_relative_to(home.resolve())
         )
@@ -225,6 +272,7 @@ class FinishedSurvey:
             },
             ring=ring_ll,
             path=path if inside and path is not None and path.is_file() else None,
+            digest=str(shot["properties"].get("digest", "")),
         )
 
     def layers(self) -> dict[str, MapSource]:
@@ -242,13 +290,13 @@ class FinishedSurvey:
     def refused(self) -> list[dict[str, Any]]:
         """Photos that were left out."""
         try:
-            metrics = json.loads((self.folder / "metrics.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            metrics = json.loads(read_bounded(self.folder / "metrics.json"))
+            return [
+                {"name": str(n), "reason": str(r), "state": "refused"}
+                for n, r in metrics.get("photos_rejected", {}).items()
+            ]
+        except (OSError, ValueError, AttributeError, RecursionError):
             return []
-        return [
-            {"name": n, "reason": r, "state": "refused"}
-            for n, r in metrics.get("photos_rejected", {}).items()
-        ]
 
     def version(self) -> int:
         """Constant, since a finished run does not change."""
@@ -272,8 +320,8 @@ def _photo_folder(folder: Path) -> Path | None:
     import tomllib
 
     try:
-        said = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8")).get("photos")
-    except (OSError, ValueError):
+        said = tomllib.loads(read_bounded(folder / "run.toml").decode()).get("photos")
+    except (OSError, ValueError, RecursionError):
         return None
     beside = folder.parent / NAMED
     places = [Path(str(said))] if said else []

@@ -6,11 +6,10 @@ creation, expiration and termination. Beyond the protocol, the response to the l
 result: the headers `Photo-Id` and `Photo-State`, or 422 with the reason if the photo is refused.
 """
 
-import asyncio
 import base64
 import os
 import re
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from email.utils import formatdate
 from pathlib import Path
@@ -23,7 +22,7 @@ from starlette.requests import ClientDisconnect
 
 from skyquilt.errors import OutputError
 from skyquilt.live.photo_intake import Accepted, Intake, Refused, shown_name
-from skyquilt.server.access import RESUMABLE, TUS, Context
+from skyquilt.server.access import RESUMABLE, TUS, Context, blocks_of, client_of
 from skyquilt.server.uploads import Upload, Uploads
 
 VERSIONS = {"Tus-Version": "1.0.0"}
@@ -48,7 +47,8 @@ class UploadEndpoints:
         intake = self.context.writing(request).intake
         most = intake.inbox.most_bytes
         _check_size(_length(request), most, f"a photo may have {most} bytes")
-        upload = await run_in_threadpool(self._begun, name, source, most)
+        client = client_of(request)
+        upload = await run_in_threadpool(self._begun, name, source, most, client)
         with self.uploads.writing(upload.id):
             try:
                 await self._append(request, upload, f"a photo may have {most} bytes")
@@ -83,7 +83,7 @@ class UploadEndpoints:
         about = metadata_of(metadata)
         name = about.get("filename") or about.get("name") or "photo"
         source = about.get("source") or "upload"
-        upload = self._begun(name, source, size, metadata)
+        upload = self._begun(name, source, size, client_of(request), metadata)
         told = {"Location": f"{RESUMABLE}/{upload.id}", **self._progress(upload)}
         return Response(status_code=201, headers=told)
 
@@ -148,7 +148,7 @@ class UploadEndpoints:
         """Locks an upload while one request writes to it."""
         with self.uploads.writing(number) as mine:
             if not mine:
-                raise HTTPException(423, "another request is writing this upload; try again later")
+                raise HTTPException(409, "another request is writing this upload; try again later")
             yield
 
     def _progress(self, upload: Upload) -> dict[str, str]:
@@ -170,9 +170,11 @@ class UploadEndpoints:
 
     # -- both
 
-    def _begun(self, name: str, source: str, size: int, metadata: str = "") -> Upload:
+    def _begun(self, name: str, source: str, size: int, client: str, metadata: str = "") -> Upload:
         try:
-            upload = self.uploads.begin(shown_name(name), shown_name(source), size, metadata)
+            upload = self.uploads.begin(
+                shown_name(name), shown_name(source), size, client, metadata
+            )
         except OSError as error:
             raise _no_room(error) from error
         if upload is None:
@@ -208,7 +210,7 @@ class UploadEndpoints:
         """Writes the body to a file; False if the connection was lost before its end."""
         size = file.tell()
         try:
-            async for block in _blocks(request, self.context.guard.upload_stall_s):
+            async for block in blocks_of(request, self.context.guard.upload_stall_s):
                 size += len(block)
                 _check_size(size, most, limit)
                 file.write(block)
@@ -243,22 +245,6 @@ def metadata_of(header: str) -> dict[str, str]:
             raise HTTPException(400, "Upload-Metadata: each value needs a key of its own")
         found[key] = text
     return found
-
-
-async def _blocks(request: Request, patience_s: float) -> AsyncIterator[bytes]:
-    """The blocks of the body as they arrive.
-
-    Raises:
-        TimeoutError: no data arrived for `patience_s`.
-        ClientDisconnect: the connection was lost.
-    """
-    stream = request.stream()
-    while True:
-        async with asyncio.timeout(patience_s):
-            block = await anext(stream, None)
-        if block is None:
-            return
-        yield block
 
 
 def _length(request: Request) -> int:

@@ -4,6 +4,7 @@ import asyncio
 import json
 import re
 import secrets
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -29,6 +30,8 @@ class Upload:
     """The sender."""
     size: int
     """Size of the complete file in bytes."""
+    client: str = ""
+    """The address that began it."""
     metadata: str = ""
     """`Upload-Metadata` as the client sent it."""
     outcome: dict[str, str] = field(default_factory=dict)
@@ -44,22 +47,49 @@ class Uploads:
         """Uploads are stored in `folder`."""
         self.folder, self.guard = folder, guard
         self._written: set[str] = set()
+        self._clients: dict[str, str] = {}
+        self._lock = threading.Lock()
         self.sweep()
 
-    def begin(self, name: str, source: str, size: int, metadata: str = "") -> Upload | None:
-        """Creates an upload; None if there are too many."""
+    def begin(
+        self, name: str, source: str, size: int, client: str = "", metadata: str = ""
+    ) -> Upload | None:
+        """Creates an upload; None if this client has too many, or all clients together."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        idle = time.time() - self.guard.upload_idle_s
-        if sum(_changed(path) > idle for path in self.folder.glob("*.part")) >= (
-            self.guard.most_uploads
-        ):
-            return None
-        upload = Upload(
-            id=secrets.token_hex(16), name=name, source=source, size=size, metadata=metadata
-        )
-        self.path(upload).touch()
-        self._record(upload)
+        with self._lock:
+            active = self._active()
+            if len(active) >= self.guard.most_uploads or (
+                active.count(client) >= self.guard.most_uploads_each
+            ):
+                return None
+            upload = Upload(
+                id=secrets.token_hex(16),
+                name=name,
+                source=source,
+                size=size,
+                client=client,
+                metadata=metadata,
+            )
+            self._clients[upload.id] = client
+            self.path(upload).touch()
+            self._record(upload)
         return upload
+
+    def _active(self) -> list[str]:
+        """Clients of the uploads that are in progress: those that are written, and those begun or
+        continued a short time ago.
+        """
+        now, found = time.time(), {}
+        for path in self.folder.glob("*.part"):
+            if path.stem in self._written or (
+                now - self.guard.upload_idle_s < _changed(path) <= now + 1
+            ):
+                if path.stem not in self._clients:
+                    known = self.get(path.stem)
+                    self._clients[path.stem] = known.client if known else ""
+                found[path.stem] = self._clients[path.stem]
+        self._clients = found
+        return list(found.values())
 
     def get(self, number: str) -> Upload | None:
         """An upload by its id; None if it does not exist or has expired."""
@@ -67,7 +97,13 @@ class Uploads:
             return None
         try:
             upload = Upload(**json.loads((self.folder / f"{number}.json").read_bytes()))
+            if not upload.outcome and self.path(upload).stat().st_size > upload.size:
+                raise ValueError("it has more bytes than were announced")
+        except FileNotFoundError:
+            return None
         except (OSError, ValueError, TypeError):
+            if number not in self._written:
+                self.drop(number)
             return None
         if self.expires(upload) < time.time() and number not in self._written:
             self.drop(number)
@@ -114,14 +150,25 @@ class Uploads:
     def sweep(self) -> None:
         """Deletes expired uploads, and files that a crash left while an upload was created."""
         old = time.time() - self.guard.upload_keep_s
+        empty = time.time() - self.guard.upload_empty_s
         for number in {path.stem for path in self.folder.glob("*.*")} - self._written:
-            if self._last(number) < old:
+            last = self._last(number)
+            if last < old or (last < empty and self._bytes(number) == 0):
                 self.drop(number)
+
+    def _bytes(self, number: str) -> int:
+        """Number of bytes of an upload; -1 if it has no file, since its photo was accepted."""
+        try:
+            return (self.folder / f"{number}.part").stat().st_size
+        except OSError:
+            return -1
 
     async def sweeping(self) -> None:
         """Calls `sweep` at intervals until it is cancelled."""
         while True:
-            await asyncio.sleep(min(SWEEP_S, self.guard.upload_keep_s / 4))
+            await asyncio.sleep(
+                min(SWEEP_S, self.guard.upload_keep_s / 4, self.guard.upload_empty_s / 4)
+            )
             self.sweep()
 
     def _last(self, number: str) -> float:

@@ -2,16 +2,20 @@
 Planner are clients.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from xml.sax.saxutils import escape
 
 import numpy as np
-from fastapi import Request, Response
+from anyio import CapacityLimiter, to_thread
+from fastapi import HTTPException, Request, Response
 from fastapi.responses import JSONResponse
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
+from skyquilt.live.free_memory import give_back
+from skyquilt.outside import real, whole
 from skyquilt.raster.map_source import Bounds, MapSource, between, picture
 from skyquilt.server.access import Context
 from skyquilt.server.images import Images, image_bytes
@@ -23,9 +27,15 @@ class WmsEndpoints:
 
     def __init__(self, context: Context, images: Images) -> None:
         self.context, self.images = context, images
+        self._drawing = CapacityLimiter(DRAWN_AT_ONCE)
 
-    def wms(self, request: Request) -> Response:
+    async def wms(self, request: Request) -> Response:
         """WMS 1.1.1 and 1.3.0."""
+        if self._drawing.statistics().tasks_waiting >= MOST_WAITING:
+            raise HTTPException(503, "too many images are being drawn", {"Retry-After": "5"})
+        return await to_thread.run_sync(self._answer, request, limiter=self._drawing)
+
+    def _answer(self, request: Request) -> Response:
         query = asked(request.query_params)
         version = query.get("VERSION", query.get("WMTVER", "1.3.0"))
         known = self.context.survey.layers()
@@ -52,24 +62,28 @@ class WmsEndpoints:
         known = self.context.survey.layers()
         want = map_request(query, known)
         out = None
-        for name in want.layers:
+        for name in dict.fromkeys(reversed(want.layers)):  # the topmost first
+            if out is not None and out[..., 3].all():
+                break
             scale = self.images.scale(name, known[name])
             rgba = picture(known[name], want.crs, want.bounds, want.width, want.height, scale)
             if rgba is not None and out is not None:
-                rgba[rgba[..., 3] == 0] = out[rgba[..., 3] == 0]
-            out = rgba if rgba is not None else out
+                np.copyto(out, rgba, where=(out[..., 3] == 0)[..., None])
+            out = rgba if out is None else out
         if out is None:
             out = np.zeros((want.height, want.width, 4), np.uint8)
-        return Response(
-            image_bytes(out, want.format, transparent=want.transparent), media_type=want.format
-        )
+        data = image_bytes(out, want.format, transparent=want.transparent)
+        if want.width * want.height > LARGE:
+            del out
+            give_back()
+        return Response(data, media_type=want.format)
 
     def _feature_info(self, query: dict[str, str]) -> Response:
         want = map_request(query, self.context.survey.layers())
-        try:
-            i, j = int(query.get("I", query.get("X", ""))), int(query.get("J", query.get("Y", "")))
-        except ValueError as error:
-            raise WmsError("I and J are whole numbers", "InvalidPoint") from error
+        i = whole(query.get("I", query.get("X", "")), 0, want.width - 1)
+        j = whole(query.get("J", query.get("Y", "")), 0, want.height - 1)
+        if i is None or j is None:
+            raise WmsError("I and J are whole numbers, those of a pixel", "InvalidPoint")
         west, south, east, north = want.bounds
         x, y = (
             west + (i + 0.5) / want.width * (east - west),
@@ -78,12 +92,23 @@ class WmsEndpoints:
         lon, lat = (
             between(want.crs, "EPSG:4326").transform(x, y) if want.crs != "EPSG:4326" else (x, y)
         )
+        if not (math.isfinite(lon) and math.isfinite(lat)):
+            raise WmsError("there is no place on Earth at this pixel", "InvalidPoint")
         found = [p.record for p in covering(self.context.survey.photos(), lon, lat)]
         return JSONResponse({"lon": lon, "lat": lat, "photos": found})
 
 
-LARGEST = 4096
-"""Largest width and height of an image in px."""
+LARGEST, MOST_PIXELS = 4096, 2048 * 2048
+"""Largest width and height of an image in px, and its largest area."""
+MOST_LAYERS = 10
+"""Largest number of layers of an image; their areas together may be `MOST_LAYERED` times that of
+the largest image.
+"""
+MOST_LAYERED = 2
+DRAWN_AT_ONCE, MOST_WAITING = 2, 100
+"""Number of images drawn at a time, and of requests that wait for it."""
+LARGE = 500_000
+"""Pixels of an image after which freed memory is given back to the system."""
 FORMATS = ("image/png", "image/jpeg", "image/webp")
 
 
@@ -131,25 +156,34 @@ def map_request(query: Mapping[str, str], known: Mapping[str, MapSource]) -> Map
     version = (
         "1.1.1" if query.get("VERSION", query.get("WMTVER", "1.3.0")).startswith("1.1") else "1.3.0"
     )
-    layers = tuple(n for n in query.get("LAYERS", "").split(",") if n)
+    layers = tuple(n for n in query.get("LAYERS", "").split(",", MOST_LAYERS + 1) if n)
     if not layers:
         raise WmsError("LAYERS is missing", "LayerNotDefined")
+    if len(layers) > MOST_LAYERS:
+        raise WmsError(f"LAYERS are {MOST_LAYERS} at most")
     for name in layers:
         if name not in known:
             raise WmsError(
-                f"there is no layer {name!r}; there are {', '.join(known) or 'none yet'}",
+                f"there is no layer {name[:60]!r}; there are {', '.join(known) or 'none yet'}",
                 "LayerNotDefined",
             )
     crs = query.get("CRS") or query.get("SRS") or ""
     if crs not in supported(known):
         raise WmsError(
-            f"CRS {crs!r} is none of {', '.join(supported(known))}",
+            f"CRS {crs[:60]!r} is none of {', '.join(supported(known))}",
             "InvalidCRS" if version == "1.3.0" else "InvalidSRS",
         )
     width, height = (_whole(query, n) for n in ("WIDTH", "HEIGHT"))
+    if width * height > MOST_PIXELS or (
+        width * height * len(set(layers)) > MOST_LAYERED * MOST_PIXELS
+    ):
+        raise WmsError(
+            f"an image has {MOST_PIXELS} px at most, and {MOST_LAYERED * MOST_PIXELS} px in all"
+            f" layers together; got {width} x {height} px in {len(set(layers))} layers"
+        )
     form = query.get("FORMAT", "image/png").split(";")[0]
     if form not in FORMATS:
-        raise WmsError(f"FORMAT {form!r} is none of {', '.join(FORMATS)}", "InvalidFormat")
+        raise WmsError(f"FORMAT {form[:60]!r} is none of {', '.join(FORMATS)}", "InvalidFormat")
     return MapRequest(
         version=version,
         layers=layers,
@@ -164,19 +198,20 @@ def map_request(query: Mapping[str, str], known: Mapping[str, MapSource]) -> Map
 
 def _whole(query: Mapping[str, str], name: str) -> int:
     text = query.get(name, "")
-    if not text.isascii() or not text.isdigit() or not 1 <= int(text[:9]) <= LARGEST:
+    found = whole(text, 1, LARGEST)
+    if found is None:
         raise WmsError(f"{name} is a whole number from 1 to {LARGEST}, got {text[:20]!r}")
-    return int(text)
+    return found
 
 
 def _bounds(text: str, crs: str, version: str) -> Bounds:
-    try:
-        a, b, c, d = (float(v) for v in text.split(","))
-    except ValueError as error:
-        raise WmsError(f"BBOX is four numbers, got {text[:80]!r}") from error
+    numbers = [real(v, -1e9, 1e9) for v in text.split(",", 4)]
+    if len(numbers) != 4 or None in numbers:
+        raise WmsError(f"BBOX is four numbers, got {text[:80]!r}")
+    a, b, c, d = (v for v in numbers if v is not None)
     if version == "1.3.0" and crs != "CRS:84" and northing_first(crs):
         a, b, c, d = b, a, d, c
-    if not (a < c and b < d and all(abs(v) < 1e9 for v in (a, b, c, d))):
+    if not (a < c and b < d):
         raise WmsError(f"BBOX has no area: {text[:80]!r}")
     return a, b, c, d
 
@@ -220,10 +255,19 @@ def capabilities(known: Mapping[str, MapSource], url: str, version: str) -> str:
         )
     )
     service, problem = ("OGC:WMS", "application/vnd.ogc.se_xml") if old else ("WMS", "XML")
+    side = math.isqrt(MOST_PIXELS)
+    limits = (
+        ""
+        if old
+        else (
+            f"<LayerLimit>{MOST_LAYERS}</LayerLimit><MaxWidth>{side}</MaxWidth>"
+            f"<MaxHeight>{side}</MaxHeight>"
+        )
+    )
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         + root
-        + f"<Service><Name>{service}</Name><Title>Skyquilt</Title>{online}</Service>"
+        + f"<Service><Name>{service}</Name><Title>Skyquilt</Title>{online}{limits}</Service>"
         + f"<Capability><Request><GetCapabilities><Format>{kind}</Format>{get}</GetCapabilities>"
         + f"<GetMap>{formats}{get}</GetMap>"
         + f"<GetFeatureInfo><Format>application/json</Format>{get}</GetFeatureInfo></Request>"

@@ -126,6 +126,9 @@ def _xmp(report: Report) -> bytes | None:
         values["GpsLatitude"] = f"{report.latitude:+.9f}"
         values["GpsLongitude"] = f"{report.longitude:+.9f}"
         values["AbsoluteAltitude"] = f"{report.sea_level:+.3f}"
+    if report.velocity is not None:
+        for axis, speed in zip("XYZ", report.velocity, strict=True):
+            values[f"Flight{axis}Speed"] = f"{speed:+.1f}"
     if report.dewarp is not None:
         numbers = ",".join(f"{v:.9f}" for v in report.dewarp)
         values["DewarpData"] = f"2026-01-01;{numbers}"

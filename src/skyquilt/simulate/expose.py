@@ -17,6 +17,7 @@ from skyquilt.simulate.horizon import with_horizon
 from skyquilt.simulate.raycast import FLATTEST, first_hits, rays_of, sample
 from skyquilt.simulate.scene import Scene
 from skyquilt.simulate.settings import Pictures
+from skyquilt.simulate.weather import Weather
 
 _TEXTURE_PX = 1024
 
@@ -96,11 +97,23 @@ class Exposer:
         return grid.window(low[1], low[0], high[1] - low[1], high[0] - low[0])
 
     def visible(
-        self, shot: Shot, settings: Pictures, gain: float, rng: np.random.Generator
+        self,
+        shot: Shot,
+        settings: Pictures,
+        gain: float,
+        rng: np.random.Generator,
+        weather: Weather | None = None,
     ) -> NDArray[np.uint8]:
-        """The visible image (h, w, 3) as the camera stores it."""
+        """The visible image (h, w, 3) as the camera stores it; `weather`: another moment than that
+        of the scene.
+        """
         hits, heights, window = self.pixels(shot)
-        seen = sample(np.ascontiguousarray(self.scene.rgb[window.slices]), hits).astype(np.float32)
+        colours = (
+            self.scene.rgb[window.slices]
+            if weather is None
+            else self.scene.at_hour(window, weather)
+        )
+        seen = sample(np.ascontiguousarray(colours), hits).astype(np.float32)
         seen *= self._flanks(hits, heights, window)[..., None]
         seen = with_horizon(seen, self.scene, self.directions, shot)
         seen = _blurred(seen, settings)

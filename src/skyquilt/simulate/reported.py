@@ -66,6 +66,8 @@ class Report:
     """Seconds since the survey's nominal start, according to the drone's clock."""
     focal: float | None
     """px."""
+    velocity: tuple[float, float, float] | None = None
+    """Of the aircraft, north, east, down, m/s."""
     dewarp: tuple[float, ...] | None = None
     """fx, fy, cx, cy (from the middle), k1, k2, p1, p2, k3 of a factory calibration."""
     rtk: tuple[float, float] | None = None
@@ -141,6 +143,17 @@ def _liars(shots: list[Shot]) -> set[int]:
     return {i for i, shot in enumerate(shots) if shot.waypoint.line == lines[len(lines) // 2]}
 
 
+def _ned(shot: Shot, convergence: float) -> tuple[float, float, float]:
+    """The velocity as drones report it: from true north, in tenths of m/s."""
+    east, north, up = shot.velocity
+    s, c = np.sin(np.radians(convergence)), np.cos(np.radians(convergence))
+    return (
+        round(float(c * north - s * east), 1),
+        round(float(s * north + c * east), 1),
+        round(-up, 1),
+    )
+
+
 def _dewarp(lens: Lens, settings: Reporting) -> tuple[float, ...] | None:
     """The factory calibration that files carry."""
     if settings.dewarp is None:
@@ -189,6 +202,7 @@ def _report(
         else None,
         clock=round(shot.waypoint.time + offsets[shot.waypoint.drone % len(offsets)], 3),
         focal=None if settings.focal_missing else lens.focal * (1 + settings.focal_error),
+        velocity=_ned(shot, north) if with_angles else None,
         dewarp=_dewarp(lens, settings),
         rtk=(settings.gps_noise, settings.gps_noise_z or 1.5 * settings.gps_noise)
         if settings.rtk

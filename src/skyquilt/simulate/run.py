@@ -27,6 +27,7 @@ from skyquilt.simulate.truth import (
     write_truth,
 )
 from skyquilt.simulate.video import ClipWriter, film, gusts, pictures_of, telemetry
+from skyquilt.simulate.weather import Weather
 
 _SMOOTH_S = 30.0
 _OURS = ("photos", "thermal", "video", "truth", "gcp_list.txt")
@@ -252,7 +253,12 @@ def _drawn(
     """Draws the terrain; returns the scene."""
     thermal = world.settings.thermal
     weather = thermal.weather if heat and thermal is not None else world.settings.weather
-    scene = empty_scene(world.country.grid(res), thermal=heat, scratch=output / ".scratch" / stage)
+    scene = empty_scene(
+        world.country.grid(res),
+        thermal=heat,
+        scratch=output / ".scratch" / stage,
+        hours=not heat and world.settings.pictures.sun_hours > 0,
+    )
     for done, total in world.country.draw(scene, weather, scratch=output / ".scratch" / stage):
         yield Progress(stage=stage, done=done, total=total)
     return scene
@@ -268,7 +274,7 @@ def _photograph(world: World, scene: Scene, output: Path) -> Generator[Progress,
     for number, (shot, report) in enumerate(zip(flight.shots, flight.reports, strict=True)):
         rng = np.random.default_rng([world.settings.seed, 51, number])
         gain = float(np.exp(rng.normal(0, pictures.exposure_noise)))
-        pixels = camera.visible(shot, pictures, gain, rng)
+        pixels = camera.visible(shot, pictures, gain, rng, _moment(world, shot))
         if report.turned:
             pixels = np.ascontiguousarray(pixels[::-1, ::-1])
         name = f"{shot.name}.jpg"
@@ -313,6 +319,16 @@ def _roll(
         for s, r in zip(flight.shots, flight.reports, strict=True)
     ]
     return TakenClip(file="video/FLIGHT.MP4", fps=video.fps, frames=frames, blurred=windy.tolist())
+
+
+def _moment(world: World, shot: Shot) -> Weather | None:
+    """The sunlight of a photo; None where the sun stands still."""
+    hours, weather = world.settings.pictures.sun_hours, world.settings.weather
+    if not hours:
+        return None
+    last = max(s.waypoint.time for s in world.visible.shots)
+    share = shot.waypoint.time / last if last > 0 else 0.0
+    return replace(weather, hour=min(weather.hour + hours * share, 23.99))
 
 
 def _film(

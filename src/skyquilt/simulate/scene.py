@@ -56,6 +56,18 @@ class Scene:
     """(h, w, 3) the true orthophoto."""
     thermal: NDArray[np.uint16] | None
     """(h, w) apparent temperature in hundredths of a kelvin."""
+    look: NDArray[np.float16] | None = None
+    """(h, w, 4) colours and temperatures without sunlight, where other hours will be wanted."""
+
+    def at_hour(self, part: Grid, weather: Weather) -> NDArray[np.uint8]:
+        """Colours (h, w, 3) of a part under the sunlight of another moment.
+
+        Raises ValueError where the scene was drawn without `look`.
+        """
+        if self.look is None:
+            raise ValueError("the scene was drawn for one moment only")
+        lighted = _lighted(self, self.look, part, weather, flat=False)
+        return np.asarray(np.clip(lighted[..., :3] + 0.5, 0, 255), np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -123,7 +135,9 @@ class Country:
         """Fills a scene, first its surfaces, then their light, block by block; yields (done,
         total).
         """
-        looks = _room(scene.grid, (4,), np.float16, scratch / "look")
+        looks = scene.look
+        if looks is None:
+            looks = _room(scene.grid, (4,), np.float16, scratch / "look")
         blocks = scene.grid.blocks(_BLOCK)
         for number, block in enumerate(blocks):
             canvas = self.paint(block, weather)
@@ -134,20 +148,34 @@ class Country:
             yield len(blocks) + number + 1, 2 * len(blocks)
 
 
-def empty_scene(grid: Grid, *, thermal: bool, scratch: Path) -> Scene:
-    """Allocates a scene, in memory or in files below `scratch`."""
+def empty_scene(grid: Grid, *, thermal: bool, scratch: Path, hours: bool = False) -> Scene:
+    """Allocates a scene, in memory or in files below `scratch`; `hours`: for several moments."""
     return Scene(
         grid=grid,
         height=_room(grid, (), np.float32, scratch / "height"),
         rgb=_room(grid, (3,), np.uint8, scratch / "rgb"),
         thermal=_room(grid, (), np.uint16, scratch / "thermal") if thermal else None,
+        look=_room(grid, (4,), np.float16, scratch / "look") if hours else None,
     )
 
 
 def _light(
     scene: Scene, looks: NDArray[np.float16], block: Grid, weather: Weather, *, flat: bool
 ) -> None:
-    """Computes the light of one block, including shadows from neighbouring blocks."""
+    """Computes the light of one block."""
+    out = _lighted(scene, looks, block, weather, flat=flat)
+    scene.rgb[block.slices] = np.clip(out[..., :3] + 0.5, 0, 255).astype(np.uint8)
+    if scene.thermal is not None:
+        kelvin = cv2.GaussianBlur(out[..., 3], (0, 0), 0.12 / scene.grid.res) + 273.15
+        scene.thermal[block.slices] = np.clip(kelvin * 100 + 0.5, 0, 65535).astype(np.uint16)
+
+
+def _lighted(
+    scene: Scene, looks: NDArray[np.float16], block: Grid, weather: Weather, *, flat: bool
+) -> Floats:
+    """(h, w, 4) colours and temperatures of one block under sunlight, shadows from outside
+    included.
+    """
     margin = int(np.ceil(shadow_reach(weather) / scene.grid.res)) + 4
     wide = scene.grid.window(
         block.row - margin, block.col - margin, block.height + 2 * margin, block.width + 2 * margin
@@ -157,11 +185,7 @@ def _light(
         direct = np.ones(look.shape[:2], dtype=np.float32)
     else:
         direct = lit(scene.height[wide.slices], scene.grid.res, weather)[wide.inside(block)]
-    out = shine(look, direct, weather)
-    scene.rgb[block.slices] = np.clip(out[..., :3] + 0.5, 0, 255).astype(np.uint8)
-    if scene.thermal is not None:
-        kelvin = cv2.GaussianBlur(out[..., 3], (0, 0), 0.12 / scene.grid.res) + 273.15
-        scene.thermal[block.slices] = np.clip(kelvin * 100 + 0.5, 0, 65535).astype(np.uint16)
+    return shine(look, direct, weather)
 
 
 def _paint_squares(canvas: Canvas, square: float) -> None:

@@ -64,6 +64,8 @@ class Pictures:
     """Standard deviation of the logarithm of each photo's exposure."""
     vignetting: float = 0.15
     """Loss of light in the corners, share."""
+    sun_hours: float = 0.0
+    """Hours by which the sun moves on over the flight; 0 = it stands still."""
     blur: float = 0.45
     """Standard deviation of the lens's blur, px."""
     motion_blur: float = 0.0
@@ -297,6 +299,11 @@ def _other_rules(settings: FlightSettings) -> _Rules:
         (reporting.gps_missing >= 0, "the number of photos without position must not be negative"),
         (reporting.focal_error > -0.9, "the error of the focal length must be above -90 %"),
         (pictures.exposure_noise >= 0, "exposure noise must not be negative"),
+        (
+            0 <= pictures.vignetting <= 0.9,
+            f"vignetting must be 0 to 90 %, not {100 * pictures.vignetting:.0f} %",
+        ),
+        (0 <= pictures.sun_hours <= 12, "the sun must move by 0 to 12 hours"),
         (0 <= pictures.motion_blur <= 100, "motion blur must be 0 to 100 px"),
         (
             settings.video is None or 0.2 <= settings.video.fps <= 120,

@@ -9,6 +9,8 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import BinaryIO
 
+from skyquilt.outside import open_regular
+
 _INSIDE = (b"moov", b"trak", b"mdia", b"udta", b"meta", b"ilst")
 _MOST_BOXES = 4000
 _MODEL = re.compile(rb"(?:DJI|FC|Hasselblad|Autel|Parrot|GoPro|HERO)[ -~]{0,30}")
@@ -31,7 +33,7 @@ class Container:
 
 def read_container(path: Path) -> Container | None:
     """The header of a clip; None where the file is no MP4 or MOV. Raises `OSError`."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         if file.read(12)[4:8] not in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip"):
             return None
         size = file.seek(0, io.SEEK_END)

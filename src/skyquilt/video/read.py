@@ -11,6 +11,7 @@ import cv2
 from skyquilt.errors import SideFileError, UnreadablePhotoError
 from skyquilt.model.clip import Clip, Track
 from skyquilt.model.photo import RejectedPhoto
+from skyquilt.outside import open_regular
 from skyquilt.video.container import Container, read_container
 from skyquilt.video.decoder import Decoder
 from skyquilt.video.lens import video_focal, video_shutter
@@ -93,7 +94,7 @@ def _check(path: Path, box: Container | None) -> None:
 def _digest(path: Path) -> str:
     """BLAKE2b of the size, the ends and 64 pieces between them: an hour of 4K has 30 GB."""
     digest = hashlib.blake2b(digest_size=16)
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         size = file.seek(0, io.SEEK_END)
         digest.update(str(size).encode())
         last = max(size - _PIECE, 0)

@@ -14,26 +14,29 @@ from datetime import datetime
 from pathlib import Path
 
 from skyquilt.errors import SideFileError
+from skyquilt.outside import read_bounded
 
+MOST_TELEMETRY_BYTES = 300_000_000
+"""Largest file of positions: an hour at 60 frames per second has 100 MB."""
 _END = r"(?=\s*[°a-zA-Z%,;\])<\s])"
 """What must follow a number: at the very end of a torn file it may lack digits."""
-_NUMBER = rf"([-+]?\d+(?:\.\d+)?){_END}"
-_FIELD = re.compile(rf"([A-Za-z_][\w.]*)\s*[:(\s]\s*{_NUMBER}")
-_GPS = re.compile(
-    r"(?<![\w.])GPS\s*\(\s*([-+]?\d+(?:\.\d+)?)\s*,\s*([-+]?\d+(?:\.\d+)?)"
-    r"(?:\s*,\s*([-+]?\d+(?:\.\d+)?)\s*([mM]?))?\s*\)"
-)
+_BARE = r"([-+]?[0-9]{1,15}(?:\.[0-9]{1,20})?)"
+_NUMBER = _BARE + _END
+_FIELD = re.compile(r"([A-Za-z_][\w.]{0,40})\s*[:(\s]\s*" + _NUMBER)
+_GPS = re.compile(rf"(?<![\w.])GPS\s*\(\s*{_BARE}\s*,\s*{_BARE}(?:\s*,\s*{_BARE}\s*([mM]?))?\s*\)")
+_ANGLE = _BARE + r"[^\d,]{0,4}"
 _ANGLES = {
-    which: re.compile(
-        rf"{which}\.PRY\s*\(\s*([-+]?[\d.]+)[^\d,]*,\s*([-+]?[\d.]+)[^\d,]*,\s*([-+]?[\d.]+)[^\d,]*\)"
-    )
-    for which in "GF"
+    which: re.compile(rf"{which}\.PRY\s*\(\s*{_ANGLE},\s*{_ANGLE},\s*{_ANGLE}\)") for which in "GF"
 }
 _CLOCK = re.compile(
-    r"(\d{4})[-./](\d{1,2})[-./](\d{1,2})[ T](\d{1,2}):(\d\d):(\d\d)(?:[.,](\d{1,6}))?(?![\d:])"
+    r"(\d{4})[-./](\d{1,2})[-./](\d{1,2})[ T](\d{1,2}):(\d\d):(\d\d)(?:[.,](\d{1,6}))?(?![\d:])",
+    re.ASCII,
 )
-_SPAN = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
+_SPAN = re.compile(r"(\d{1,3}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->", re.ASCII)
 _FOCAL_MM = (5.0, 2000.0)
+_INDEX = re.compile(r"[0-9]{1,18}")
+_MOST_BLOCK = 4000
+"""Characters of one subtitle that are searched."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,13 +74,7 @@ def read_samples(path: Path) -> tuple[Sample, ...]:
 
     Raises `SideFileError` where the file cannot be read or holds no subtitles.
     """
-    try:
-        text = path.read_bytes().decode("utf-8-sig", "replace")
-    except OSError as error:
-        raise SideFileError(
-            f"{path} cannot be read ({error.strerror or error}); check the path and its"
-            " permissions."
-        ) from error
+    text = side_text(path)
     if "\x00" in text:
         raise SideFileError(f"{path.name} is not a text file; expected DJI's telemetry subtitles.")
     samples = tuple(_sample(index, block) for index, block in _blocks(text))
@@ -89,6 +86,17 @@ def read_samples(path: Path) -> tuple[Sample, ...]:
     return samples
 
 
+def side_text(path: Path) -> str:
+    """A side file as text; raises `SideFileError` where it cannot be read, or is too large."""
+    try:
+        return read_bounded(path, MOST_TELEMETRY_BYTES).decode("utf-8-sig", "replace")
+    except OSError as error:
+        raise SideFileError(
+            f"{path} cannot be read ({error.strerror or error}); check the path and its"
+            " permissions."
+        ) from error
+
+
 def _blocks(text: str) -> Iterator[tuple[int, str]]:
     """Numbers and texts of the subtitles.
 
@@ -98,11 +106,11 @@ def _blocks(text: str) -> Iterator[tuple[int, str]]:
     starts = [
         i
         for i in range(len(lines) - 1)
-        if lines[i].strip().isdigit()
+        if _INDEX.fullmatch(lines[i].strip())
         and ("-->" in lines[i + 1] or _CLOCK.match(lines[i + 1].strip() + " "))
     ]
     for start, end in zip(starts, [*starts[1:], len(lines)], strict=False):
-        yield int(lines[start]), "".join(lines[start + 1 : end])
+        yield int(lines[start]), "".join(lines[start + 1 : min(end, start + 40)])[:_MOST_BLOCK]
 
 
 def _sample(index: int, text: str) -> Sample:

@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import io
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,8 @@ from numpy.typing import NDArray
 
 from skyquilt.errors import SideFileError
 from skyquilt.model.clip import Track
-from skyquilt.video.srt import Sample, read_samples
+from skyquilt.outside import open_regular, real
+from skyquilt.video.srt import Sample, read_samples, side_text
 
 Array = NDArray[np.float64]
 TRACK_ENDINGS = (".srt", ".gpx", ".csv")
@@ -176,7 +178,7 @@ def _read_gpx(path: Path) -> Track:
     fixes: list[Fix] = []
     decimals = 0
     try:
-        for _, node in ElementTree.iterparse(path):
+        for _, node in ElementTree.iterparse(io.StringIO(side_text(path))):
             if node.tag.rpartition("}")[2] != "trkpt":
                 continue
             inside = {c.tag.rpartition("}")[2]: (c.text or "").strip() for c in node}
@@ -197,8 +199,6 @@ def _read_gpx(path: Path) -> Track:
     except ElementTree.ParseError as error:
         if not fixes:
             raise SideFileError(f"{path.name} is no GPX file ({error}).") from error
-    except OSError as error:
-        raise SideFileError(f"{path} cannot be read ({error.strerror or error}).") from error
     if not fixes:
         raise SideFileError(
             f"{path.name} holds no track points with times; expected <trkpt> with <time>."
@@ -227,10 +227,11 @@ _COLUMNS = {
 def is_timed_csv(path: Path) -> bool:
     """Whether a CSV has a column of times and positions, but none that names photos."""
     try:
-        with path.open(encoding="utf-8-sig", errors="replace") as file:
-            heads = [_plain(h)[0] for h in re.split(r"[,;\t]", file.readline())]
+        with open_regular(path) as file:
+            first = file.readline(10_000).decode("utf-8-sig", "replace")
     except OSError:
         return False
+    heads = [_plain(h)[0] for h in re.split(r"[,;\t]", first.strip())]
     named = {"name", "filename", "file", "image", "imagename", "photo", "label"} & set(heads)
     return not named and bool(set(_TIMES) & set(heads)) and "latitude_deg" in _where(heads)
 
@@ -257,13 +258,13 @@ def _read_csv(path: Path) -> Track:
     `time(millisecond)`), latitude, longitude, and altitude, height_above_takeoff, heading where
     there are any; `(feet)` after a name is understood.
     """
-    try:
-        text = path.read_bytes().decode("utf-8-sig", "replace")
-    except OSError as error:
-        raise SideFileError(f"{path} cannot be read ({error.strerror or error}).") from error
+    text = side_text(path)
     lines = [line for line in text.splitlines() if line.strip()]
     delimiter = max(",;\t", key=lines[0].count) if lines else ","
-    table = list(csv.reader(lines, delimiter=delimiter))
+    try:
+        table = list(csv.reader(lines, delimiter=delimiter))
+    except csv.Error as error:
+        raise SideFileError(f"{path.name} is not a table ({error}).") from error
     heads = [_plain(h) for h in table[0]] if table else []
     words = [h[0] for h in heads]
     columns = _where(words)
@@ -314,10 +315,8 @@ def _parsed_time(text: str) -> float | None:
 
 
 def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return float("nan")
+    value = real(text)
+    return float("nan") if value is None else value
 
 
 def merged(tracks: Iterable[Track], *, file: str) -> Track:

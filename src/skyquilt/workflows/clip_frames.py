@@ -26,7 +26,7 @@ from skyquilt.workflows.survey_input import SurveyInput, completed
 
 _REACH_S = 60.0
 _ALL_S = 1e7
-_UNLIKE = 0.5
+_UNLIKE = 0.35
 _MOVES_MS = 3.0
 
 

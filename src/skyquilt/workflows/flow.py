@@ -19,7 +19,7 @@ from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.pixel_cache import PixelCache, pixel_budget
 from skyquilt.engine.store import Store, digest
-from skyquilt.errors import SkyquiltError, UnreadablePhotoError
+from skyquilt.errors import PhotoFailedError
 from skyquilt.model.event import Event, Note
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import Alignment, MapFrame, Prior
@@ -27,8 +27,10 @@ from skyquilt.ortho import companions, ground, orthomosaic
 from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground
+from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.radiometry import balanced
 from skyquilt.photos.pixels import read_color
+from skyquilt.photos.read import rejected
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.links import Links, link_photos
@@ -109,6 +111,20 @@ class DrawnMap:
     """The additional rasters: provenance, views, preview."""
 
 
+def frames_added(
+    given: SurveyInput, settings: MosaicSettings, clock: Clock
+) -> Generator[Event, None, SurveyInput]:
+    """The survey with frames of its clips among its photos; unchanged if there are no clips.
+
+    Raises:
+        NoPhotosError: no clip has a frame, and there are no photos.
+    """
+    if not given.survey.clips:
+        return given
+    steps = with_frames(given, settings.input, clock.store)
+    return (yield from clock.stage("frames", steps))
+
+
 def align_photos(
     given: SurveyInput, methods: Methods, settings: MosaicSettings, clock: Clock
 ) -> Generator[Event, None, AlignedPhotos]:
@@ -119,8 +135,7 @@ def align_photos(
         AlignmentError: the method cannot place the photos.
     """
     store, jobs = clock.store, settings.running.threads
-    if given.survey.clips:
-        given = yield from clock.stage("frames", with_frames(given, settings.input, store))
+    given = yield from frames_added(given, settings, clock)
     photos = given.survey.photos
     cache = PixelCache(
         read=lambda i: read_color(photos[i]), budget_bytes=pixel_budget(settings.running.memory_gb)
@@ -210,8 +225,11 @@ def draw_map(
             )
         ),
     )
+    labels = yield from clock.stage(
+        "seams", _at_once(lambda: _labels(aligned, on, exposure, methods, clock.store))
+    )
     compose = orthomosaic.composer(
-        first.channels, first.dtype, on, exposure, methods.blend, aligned.pixels
+        first.channels, first.dtype, on, exposure, labels, methods.blend, aligned.pixels
     )
     steps = orthomosaic.draw(
         output,
@@ -220,12 +238,33 @@ def draw_map(
         settings.output,
         settings.picture.boundary,
         clock.store,
-        orthomosaic.map_key(key, alignment, on, exposure),
+        orthomosaic.map_key(key, alignment, on, exposure, labels),
         first.unit,
         settings.running.threads,
     )
     drawn = yield from clock.stage("mosaic", steps)
     return DrawnMap(exposure=exposure, compose=compose, drawn=drawn)
+
+
+def _labels(
+    aligned: AlignedPhotos, on: Ground, exposure: Exposure, methods: Methods, store: Store
+) -> Labels | None:
+    """Which photo is shown where; None for blending methods with a rule of their own."""
+    if methods.blend.seam_px is None:
+        return None
+    key = digest(
+        ground.poses_digest(aligned.alignment),
+        on.surface.z,
+        on.grid,
+        dict(exposure.gains),
+        dict(exposure.fields),
+        methods.seams,
+        picture_recipe(),
+        [p.digest for p in aligned.photos],
+    )
+    return store.get_or(
+        "seams", key, lambda: methods.seams(on.views, on.surface, on.grid, aligned.grey, exposure)
+    )
 
 
 def scene_of(
@@ -240,17 +279,21 @@ def scene_of(
 def _pixels_of(
     photos: Sequence[Photo], all_photos: Sequence[Photo], cache: PixelCache
 ) -> PhotoPixels:
-    """Pixels of the photos in use, by their indices; an error names one that is lost."""
+    """Pixels of the photos in use, by their indices.
+
+    Raises:
+        PhotoFailedError: a photo that could be read before is lost.
+    """
     where = {p.name: i for i, p in enumerate(all_photos)}
     index = [where[p.name] for p in photos]
 
     def pixels(photo: int) -> NDArray[Any]:
         try:
             return cache(index[photo])
-        except UnreadablePhotoError as error:
-            raise SkyquiltError(
-                f"{photos[photo].path} could be read before, but now {error}; check its disk and"
-                " run the same command again to resume"
+        except Exception as error:  # whatever it is, it concerns this photo alone
+            reason = rejected(photos[photo].name, error).reason
+            raise PhotoFailedError(
+                photos[photo].name, f"could be read before, but now {reason}"
             ) from error
 
     return pixels

@@ -7,6 +7,7 @@ interface:
     settings, methods=methods)
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -17,15 +18,21 @@ from skyquilt.alignment.aligners import Auto, ByLinks, ByReport, by_pose
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.inputs import Aligner
 from skyquilt.alignment.pose import ByPosition
+from skyquilt.imaging.views import View
 from skyquilt.matching.candidates import Nearest, Pair, Retrieval
 from skyquilt.matching.matchers import Guided
 from skyquilt.matching.verify import Verify
 from skyquilt.model.features import Features, Link, Matches, RejectedLink
+from skyquilt.model.raster import Grid
+from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Average, Blend, Feather, First, Multiband
 from skyquilt.ortho.drift import Drift
-from skyquilt.ortho.exposure import Balance
-from skyquilt.ortho.ground import SurfaceFromPictures, SurfaceFromTies
+from skyquilt.ortho.exposure import Balance, Exposure
+from skyquilt.ortho.ground import GreyPicture, SurfaceFromPictures, SurfaceFromTies
+from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.radiometry import BalanceMethod, DriftMethod
+from skyquilt.ortho.seam_lines import SeamLines
+from skyquilt.ortho.stereo import Level, Stereo
 from skyquilt.ortho.sweep import Sweep
 from skyquilt.ortho.tie_surface import FromTiePoints
 from skyquilt.settings import MosaicSettings
@@ -91,6 +98,22 @@ class LookAlikes(Protocol):
         ...
 
 
+class SeamMethod(Protocol):
+    """Interface: decides which photo is shown where."""
+
+    def __call__(
+        self,
+        views: Sequence[View],
+        surface: Surface,
+        grid: Grid,
+        grey: GreyPicture,
+        exposure: Exposure,
+        /,
+    ) -> Labels:
+        """The photo of each cell of a map's grid, from grey images of the photos."""
+        ...
+
+
 @dataclass(frozen=True, kw_only=True)
 class Methods:
     """The methods of a mosaic, in the order of their use."""
@@ -115,6 +138,8 @@ class Methods:
     """Exposure."""
     drift: DriftMethod
     """Offsets of thermal frames."""
+    seams: SeamMethod
+    """Which photo is shown where."""
     blend: Blend
     """Blending."""
 
@@ -136,11 +161,22 @@ def methods_for(settings: MosaicSettings) -> Methods:
         verify=Verify(epipolar=_epipolar(settings)),
         align=registry.load("alignment", settings.method)(settings),
         surface=FromTiePoints(),
-        sweep=Sweep() if settings.ground.surface == "sweep" else None,
+        sweep=heights_for(settings),
         balance=Balance(),
         drift=Drift(),
+        seams=SeamLines(),
         blend=blend_for(settings),
     )
+
+
+def heights_for(settings: MosaicSettings) -> SurfaceFromPictures | None:
+    """The refinement of heights selected by the settings; None = tie points alone."""
+    chosen: dict[str, SurfaceFromPictures] = {
+        "auto": Stereo(),
+        "dense": Stereo(fine=Level(longest=1000, window=5, wanted=4), relief=0.0),
+        "sweep": Sweep(),
+    }
+    return chosen.get(settings.ground.surface)
 
 
 def detector_for(settings: MosaicSettings) -> Detector:

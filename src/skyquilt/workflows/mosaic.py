@@ -9,7 +9,7 @@ Start reading at `make_map`. Its steps are those of `skyquilt.workflows.flow`.
 
 import json
 import shutil
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,12 @@ from typing import Any
 from skyquilt.alignment.conflicts import conflicts
 from skyquilt.alignment.heights import height_figures
 from skyquilt.engine.clock import Clock, Steps, result_of
+from skyquilt.engine.error_log import log_error
 from skyquilt.engine.folder import STATE, RunFolder, open_run
 from skyquilt.engine.store import Store, digest
+from skyquilt.errors import PhotoFailedError, SkyquiltError
 from skyquilt.model.event import Event, Note, Result
+from skyquilt.model.photo import RejectedPhoto
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.orthomosaic import SPOOL
 from skyquilt.ortho.radiometry import value_figures
@@ -27,6 +30,7 @@ from skyquilt.quality.clip_figures import clip_figures
 from skyquilt.quality.placement import placement_quality
 from skyquilt.quality.run_metrics import figures
 from skyquilt.quality.seam_measurement import MeasuredSeams, measure_seams
+from skyquilt.quality.tone import tone_residual
 from skyquilt.settings import MosaicSettings
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
@@ -38,6 +42,7 @@ from skyquilt.workflows.flow import (
     align_photos,
     draw_map,
     find_ground,
+    frames_added,
     scene_of,
 )
 from skyquilt.workflows.methods import Methods, methods_for
@@ -52,6 +57,7 @@ STAGES = (
     "align",
     "surface",
     "balance",
+    "seams",
     "mosaic",
     "measure",
     "report",
@@ -64,6 +70,7 @@ ARTEFACTS = {
     "links": "links",
     "align": "alignment",
     "surface": "surface",
+    "seams": "seams",
     "mosaic": "blocks",
 }
 """Stage -> folder in the store."""
@@ -168,28 +175,90 @@ def make_map(
     clock = Clock(store=store, began=began)
     clock.lap("read", began)
     yield from (Note(text=n) for n in given.survey.notes)
-    aligned = yield from align_photos(given, methods, settings, clock)
-    ground = yield from find_ground(aligned, methods, settings, clock)
-    drawn = yield from draw_map(aligned, ground, methods, settings, clock, run.path, key)
-    measuring = _measured(aligned, ground, drawn, settings)
-    if settings.input.write_frames:
-        yield from clock.stage(
-            "write frames", write_frames(run.path, aligned.photos, aligned.pixels), keeps=False
-        )
-    seams, quality = yield from clock.stage("measure", measuring, keeps=False)
-    metrics = _metrics(aligned, ground, drawn, seams, settings) | {"quality": quality}
-    finishing = finish_run(run.path, aligned, ground, drawn.drawn, seams, metrics, settings, clock)
-    metrics = yield from clock.stage("report", finishing)
+    given = yield from frames_added(given, settings, clock)
+    _log(run.path, given.survey.rejected)
+    metrics, given = yield from _without_bad(given, run.path, key, settings, methods, clock)
     run.mark("done")
     result = Result(output=run.path, metrics=metrics)
-    return FinishedMap(result=result, given=aligned.given, methods=methods, settings=settings)
+    return FinishedMap(result=result, given=given, methods=methods, settings=settings)
+
+
+def _without_bad(
+    given: SurveyInput,
+    output: Path,
+    key: str,
+    settings: MosaicSettings,
+    methods: Methods,
+    clock: Clock,
+) -> Generator[Event, None, tuple[dict[str, Any], SurveyInput]]:
+    """Metrics of the map, and the survey that it shows: a photo on which a step fails, or whose
+    file disappears, is left out, and the steps are repeated without it; results that do not depend
+    on it are in the store.
+
+    Raises:
+        SkyquiltError: more than half of the photos, so it is not the photos that are bad.
+    """
+    most = max(1, len(given.survey.photos) // 2)
+    for _ in range(most):
+        try:
+            metrics = yield from _made(given, output, key, settings, methods, clock)
+            return metrics, given
+        except PhotoFailedError as error:
+            failed = RejectedPhoto(name=error.photo, reason=error.reason)
+            log_error(output, str(error), error)
+        gone = [p for p in given.survey.photos if p.name != failed.name and not p.path.is_file()]
+        lost = [failed, *(RejectedPhoto(name=p.name, reason="its file is gone") for p in gone)]
+        if len(lost) > most:
+            break
+        yield Note(text=f"{failed.name} is left out: it {failed.reason}", warning=True)
+        for photo in lost[1:]:
+            yield Note(text=f"{photo.name} is left out: {photo.reason}", warning=True)
+        given = given.without(lost)
+    raise SkyquiltError(
+        f"{failed.name} and others could be read before, but now {failed.reason.split('now ')[-1]};"
+        " check their disk and run the same command again to resume"
+    )
+
+
+def _made(
+    given: SurveyInput,
+    output: Path,
+    key: str,
+    settings: MosaicSettings,
+    methods: Methods,
+    clock: Clock,
+) -> Generator[Event, None, dict[str, Any]]:
+    """Makes the map and its files; returns the metrics."""
+    aligned = yield from align_photos(given, methods, settings, clock)
+    _log(output, aligned.found.rejected)
+    ground = yield from find_ground(aligned, methods, settings, clock)
+    drawn = yield from draw_map(aligned, ground, methods, settings, clock, output, key)
+    if settings.input.write_frames:
+        writing = write_frames(output, aligned.photos, aligned.pixels)
+        yield from clock.stage("write frames", writing, keeps=False)
+    measuring = _measured(aligned, ground, drawn, settings)
+    seams, quality = yield from clock.stage("measure", measuring, keeps=False)
+    metrics = _metrics(aligned, ground, drawn, seams, settings) | {"quality": quality}
+    finishing = finish_run(
+        output, aligned, ground, drawn.drawn, drawn.compose, seams, metrics, settings, clock
+    )
+    return (yield from clock.stage("report", finishing))
+
+
+def _log(output: Path, rejected: Sequence[RejectedPhoto]) -> None:
+    """Writes the tracebacks of photos on which the program failed to the log of errors."""
+    for photo in rejected:
+        if photo.trace:
+            log_error(output, f"{photo.name}: {photo.reason}", photo.trace)
 
 
 def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> str:
     """Key of a run: content and metadata of its photos, side files, settings that affect results,
     the methods, and the constants of all code used.
     """
-    shaping = {k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb")}
+    shaping = {
+        k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb", "max_mp")
+    }
     files = (settings.picture.boundary, settings.input.distances, Path(settings.input.sequence))
     side = [p.read_bytes().hex() for p in files if p is not None and p.is_file()]
     photos = [
@@ -245,6 +314,7 @@ def _metrics(
             ground=ground,
             drawn=map_.drawn,
             seams=seams.figures,
+            looks={**seams.looks, "tone_residual": _tone(aligned, ground, map_)},
             conflicts=conflicts(aligned.photos, aligned.priors, alignment),
             notes=[*survey.notes, *alignment.notes],
         )
@@ -255,6 +325,14 @@ def _metrics(
         }
         | clip_figures(aligned.given.clips)
         | value_figures(aligned.photos, map_.exposure, settings.picture)
+    )
+
+
+def _tone(aligned: AlignedPhotos, ground: Ground, map_: DrawnMap) -> dict[str, Any] | None:
+    """How evenly the balanced photos show the same ground."""
+    thumbnails = aligned.found.thumbnails([v.photo for v in ground.views])
+    return tone_residual(
+        ground.views, thumbnails, ground.surface, ground.grid.bounds, map_.exposure
     )
 
 

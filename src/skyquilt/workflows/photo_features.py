@@ -15,10 +15,11 @@ from skyquilt.engine.clock import Steps
 from skyquilt.engine.executor import in_order
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store, digest
-from skyquilt.errors import NoPhotosError, UnreadablePhotoError
+from skyquilt.errors import NoPhotosError
 from skyquilt.imaging.grey import halved, shrink, to_grey8
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.photos.read import rejected
 from skyquilt.workflows.methods import Detector
 
 PICTURE = 1000
@@ -173,8 +174,8 @@ def find_features(
         photo = photos[index]
         try:
             return photo_features(photo, lambda: pixels(index), detector, store)
-        except UnreadablePhotoError as error:
-            return RejectedPhoto(name=photo.name, reason=str(error))
+        except Exception as error:  # whatever it is, it concerns this photo alone
+            return rejected(photo.name, error)
 
     results = []
     for result in in_order(one, range(len(photos)), jobs=jobs):

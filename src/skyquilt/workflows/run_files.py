@@ -50,6 +50,7 @@ def shot_properties(photo: Photo, alignment: Alignment, i: int) -> dict[str, Any
     block = next((k for k, b in enumerate(alignment.blocks) if i in b), -1)
     return {
         "filename": photo.name,
+        "digest": photo.digest,
         "camera": alignment.camera_of[i],
         "focal": camera.focal / max(photo.width, photo.height),
         "width": photo.width,

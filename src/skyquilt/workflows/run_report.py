@@ -6,11 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Clock, Steps, peak_memory_mb
+from skyquilt.imaging.views import STEP
 from skyquilt.model.event import Note
-from skyquilt.ortho.companions import Drawn
+from skyquilt.model.raster import Window
+from skyquilt.ortho.companions import PROVENANCE, Drawn
+from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.ground import Ground
+from skyquilt.ortho.height_files import write_heights
 from skyquilt.ortho.orthomosaic import used_photos, write_surface
 from skyquilt.quality.seam_measurement import MeasuredSeams
 from skyquilt.raster.atomic import write_text
@@ -23,6 +28,8 @@ from skyquilt.workflows.flow import AlignedPhotos
 
 DEPTHS, DEPTH_WIDTH = 4, 420
 """Depth maps shown, and their width in px."""
+CROP = 320
+"""Side in map px of the crops of the worst places of the seams."""
 LEAST_DISPARITIES = 12
 """Fewest disparities for a depth map."""
 
@@ -32,6 +39,7 @@ def finish_run(
     aligned: AlignedPhotos,
     ground: Ground,
     drawn: Drawn,
+    compose: Composer,
     seams: MeasuredSeams,
     metrics: dict[str, Any],
     settings: MosaicSettings,
@@ -41,6 +49,7 @@ def finish_run(
     yield 0, 3
     alignment, photos = aligned.alignment, aligned.photos
     write_surface(output, ground, alignment)
+    write_heights(output, ground, drawn, alignment, settings.output)
     run_files.write_cameras(output / "cameras.json", alignment)
     run_files.write_shots(output / "shots.geojson", photos, alignment, used_photos(ground.views))
     run_files.write_footprints(output / "footprints.geojson", photos, alignment, ground.views)
@@ -54,7 +63,7 @@ def finish_run(
     )
     yield 1, 3
     metrics = metrics | _times(clock)
-    page = report_input(aligned, ground, drawn, seams, metrics, settings)
+    page = report_input(aligned, ground, drawn, compose, seams, metrics, settings)
     write_report(output / "report.html", page)
     yield 2, 3
     metrics |= _times(clock)
@@ -71,6 +80,7 @@ def report_input(
     aligned: AlignedPhotos,
     ground: Ground,
     drawn: Drawn,
+    compose: Composer,
     seams: MeasuredSeams,
     metrics: Mapping[str, Any],
     settings: MosaicSettings,
@@ -94,6 +104,7 @@ def report_input(
         shots=_shots(aligned, ground),
         residuals=_residuals(aligned),
         seams=_seam_marks(seams, drawn),
+        worst_seams=_crops(compose, seams, drawn),
         depths=_depths(aligned),
         settings=settings.as_table(),
         title=Path(aligned.given.title).name,
@@ -111,6 +122,19 @@ def _seam_marks(seams: MeasuredSeams, drawn: Drawn) -> list[SeamMark]:
         )
         for s in seams.report.samples
     ]
+
+
+def _crops(compose: Composer, seams: MeasuredSeams, drawn: Drawn) -> list[NDArray[np.uint8]]:
+    """The map around the worst places of the seams."""
+    crops = []
+    for point in seams.worst:
+        row, column = (
+            int(np.clip(at * PROVENANCE - CROP // 2, 0, max(size - CROP, 0))) // STEP * STEP
+            for at, size in ((point.row, compose.grid.height), (point.column, compose.grid.width))
+        )
+        pixels = compose(Window(row=row, column=column, height=CROP, width=CROP)).pixels
+        crops.append(np.ascontiguousarray(np.broadcast_to(pixels[..., :3], (CROP, CROP, 3))))
+    return crops
 
 
 def _depths(aligned: AlignedPhotos) -> list[DepthPicture]:

@@ -7,7 +7,13 @@ from pathlib import Path
 from skyquilt.alignment.priors import choose_frame
 from skyquilt.errors import UsageError
 from skyquilt.model.clip import ChosenFrames
-from skyquilt.model.photo import ControlPoint, KnownDistance, Survey
+from skyquilt.model.photo import (
+    ControlPoint,
+    KnownDistance,
+    PointObservation,
+    RejectedPhoto,
+    Survey,
+)
 from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.photos.lever_arm import with_lever_arm
@@ -42,6 +48,31 @@ class SurveyInput:
         """The name of the folder, or the number of files."""
         return str(self.source) if isinstance(self.source, Path) else f"{len(self.source)} files"
 
+    def without(self, lost: Sequence[RejectedPhoto]) -> "SurveyInput":
+        """The survey without some of its photos, which become rejected ones."""
+        names = {p.name for p in lost}
+
+        def kept(points: Sequence[PointObservation]) -> tuple[PointObservation, ...]:
+            return tuple(o for o in points if o.photo not in names)
+
+        survey = replace(
+            self.survey,
+            photos=tuple(p for p in self.survey.photos if p.name not in names),
+            rejected=(*self.survey.rejected, *lost),
+        )
+        control = [replace(c, observations=kept(c.observations)) for c in self.control]
+        distances = [
+            replace(d, observations_a=kept(d.observations_a), observations_b=kept(d.observations_b))
+            for d in self.distances
+        ]
+        return replace(
+            self,
+            survey=survey,
+            control=tuple(c for c in control if c.observations),
+            distances=tuple(d for d in distances if d.observations_a and d.observations_b),
+            rank={name: k for name, k in self.rank.items() if name not in names},
+        )
+
 
 def read_input(source: Source | str, settings: InputSettings) -> SurveyInput:
     """Reads metadata and side files; a gcp_list.txt beside the photos is used automatically.
@@ -55,6 +86,7 @@ def read_input(source: Source | str, settings: InputSettings) -> SurveyInput:
         geo=settings.geo,
         cameras=settings.cameras,
         thermal_unit=settings.thermal_unit,
+        max_mp=settings.max_mp,
         clips=True,
     )
     shutter = stated_shutter(settings.shutter, settings.shutter_readout_ms)

@@ -1,0 +1,87 @@
+"""Watches the resident memory of a process, and ends it with a sentence before the system kills it.
+
+The limit is on resident memory: mapped files and the allocator's arenas make the address space far
+larger than the memory in use, so a limit on addresses would end healthy runs.
+"""
+
+import os
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+CHECK_S = 0.25
+"""Time in s between checks."""
+SHARE = 0.9
+"""Share of the machine's memory, or of that of its container, that a run may take by default."""
+EXIT_CODE = 1
+_CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+
+
+def resident_bytes() -> int:
+    """Resident memory of this process; 0 on systems that do not report it."""
+    with suppress(OSError, ValueError, IndexError):
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE")
+    return 0
+
+
+def machine_bytes() -> int:
+    """Memory of the machine, or of the container in which this process runs; 0 where it is not
+    known.
+    """
+    found = []
+    with suppress(OSError, ValueError, AttributeError):
+        found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    for name in _CGROUPS:
+        with suppress(OSError, ValueError):
+            found.append(int(Path(name).read_text()))
+    return min(found, default=0)
+
+
+def limit_bytes(asked_gb: float | None) -> int:
+    """The limit in bytes: as asked, or a share of the machine's memory; 0 = none."""
+    return int(asked_gb * 1e9) if asked_gb is not None else int(SHARE * machine_bytes())
+
+
+@dataclass(kw_only=True)
+class MemoryWatch:
+    """Checks the memory in a thread. As a context manager it stops at the end of its block."""
+
+    limit: int
+    """Largest resident memory in bytes; 0 = no limit."""
+    end: Callable[[int], None]
+    """Called once, in the thread, with the resident memory in bytes, when the limit is exceeded."""
+    _stop: threading.Event = field(default_factory=threading.Event)
+
+    def __enter__(self) -> "MemoryWatch":
+        if self.limit > 0 and resident_bytes() > 0:
+            threading.Thread(target=self._run, daemon=True, name="memory").start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stop.set()
+
+    def _run(self) -> None:
+        while not self._stop.wait(CHECK_S):
+            if (taken := resident_bytes()) > self.limit:
+                self.end(taken)
+                return
+
+
+def ends_run(limit: int, advice: str) -> MemoryWatch:
+    """A watch that ends the program with one sentence. Nothing that was stored is lost: a run can
+    be ended at any moment.
+    """
+
+    def end(taken: int) -> None:
+        sys.stderr.write(
+            f"skyquilt: it needs more memory than it may take ({taken / 1e9:.1f} of"
+            f" {limit / 1e9:.1f} GB) and was ended; {advice}\n"
+        )
+        sys.stderr.flush()
+        os._exit(EXIT_CODE)
+
+    return MemoryWatch(limit=limit, end=end)

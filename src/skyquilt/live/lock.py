@@ -1,0 +1,75 @@
+"""One live map writes to a survey's folder at a time."""
+
+import json
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from skyquilt.errors import OutputError
+from skyquilt.outside import plain, read_bounded
+
+try:
+    import fcntl
+except ImportError:  # Windows: there is no lock there
+    fcntl = None  # type: ignore[assignment]
+
+NAME = "live.lock"
+"""Name of the file in the survey's folder. The system releases the lock when its process ends,
+however it ends.
+"""
+
+
+class FolderLock:
+    """Holds a survey's folder against other processes, and tells them who holds it."""
+
+    def __init__(self, folder: Path) -> None:
+        """Takes the lock.
+
+        Raises:
+            OutputError: the folder cannot be written, or another live map works there.
+        """
+        self.path = folder / NAME
+        try:
+            self._handle = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        except OSError as error:
+            raise OutputError(
+                f"cannot write to {folder}: {error.strerror or error}; choose another output folder"
+            ) from error
+        try:
+            if fcntl is not None:
+                fcntl.lockf(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self.tell("")
+        except (BlockingIOError, PermissionError) as error:
+            os.close(self._handle)
+            raise OutputError(
+                f"another live map works in {folder}{self._other()}; end that one, or choose"
+                " another folder"
+            ) from error
+        except OSError as error:
+            os.close(self._handle)
+            raise OutputError(
+                f"cannot write to {folder}: {error.strerror or error}; choose another output folder"
+            ) from error
+
+    def tell(self, url: str) -> None:
+        """Writes the process and the URL of its viewer into the file."""
+        said = json.dumps({"process": os.getpid(), "url": url}).encode()
+        os.ftruncate(self._handle, 0)
+        os.pwrite(self._handle, said, 0)
+
+    def _other(self) -> str:
+        with suppress(OSError, ValueError, LookupError, TypeError):
+            said = json.loads(read_bounded(self.path, 10_000))
+            url = f", {plain(str(said['url']), 200)}" if said["url"] else ""
+            return f" (process {int(said['process'])}{url})"
+        return ""
+
+    def close(self) -> None:
+        """Releases the lock."""
+        if self._handle >= 0:
+            os.close(self._handle)
+            self._handle = -1
+
+    def __del__(self) -> None:
+        if getattr(self, "_handle", -1) >= 0:
+            self.close()

@@ -1,0 +1,116 @@
+"""Heights where none were measured: gaps are filled, and the rim goes over to a plane."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+COARSE = 64
+"""Cells along the longer side of the raster in which planes are fitted."""
+STIFF = 0.002
+"""Weight of a prior of zero for the slope of a plane."""
+
+
+def filled(z: Float, known: Mask) -> Float:
+    """Heights (h, w) with gaps filled by averages of what is known nearby (pull-push: Gortler et
+    al. 1996): next to known cells from these, further away from wider surroundings.
+    """
+    levels = [(np.where(known, z, 0).astype(np.float32), known.astype(np.float32))]
+    while min(levels[-1][1].shape) > 1 and levels[-1][1].min() == 0:
+        levels.append(_pulled(*levels[-1]))
+    value = _mean(*levels[-1])
+    for total, weight in reversed(levels[:-1]):
+        wide: Any = (total.shape[1], total.shape[0])
+        above = np.asarray(cv2.resize(value, wide, interpolation=cv2.INTER_LINEAR))
+        value = np.where(weight > 0, _mean(total, weight), above).astype(np.float32)
+    return value
+
+
+def _pulled(total: Float, weight: Float) -> tuple[Float, Float]:
+    """Sums and weights over blocks of 2 x 2; a block counts once at most."""
+    pad = ((0, total.shape[0] % 2), (0, total.shape[1] % 2))
+    sums = []
+    for part in (total, weight):
+        p = np.pad(part, pad)
+        sums.append(p[::2, ::2] + p[1::2, ::2] + p[::2, 1::2] + p[1::2, 1::2])
+    scale = 1 / np.maximum(sums[1], 1)
+    return (sums[0] * scale).astype(np.float32), (sums[1] * scale).astype(np.float32)
+
+
+def _mean(total: Float, weight: Float) -> Float:
+    return np.asarray(total / np.maximum(weight, 1e-6), np.float32)
+
+
+def settled(z: Float, support: Mask, reach: float, width: float) -> Float:
+    """Heights (h, w) that go over to the local plane beyond their support.
+
+    Up to `reach` cells from the support they are kept; over the next `width` cells they become the
+    plane fitted to the supported heights around, whose slope is drawn towards zero where few
+    determine it. So what a rim shows is a photo on a plane, not on heights continued from a few
+    points.
+    """
+    if support.all() or not support.any():
+        return z
+    away = cv2.distanceTransform((~support).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    share = np.clip((away - reach) / max(width, 1e-6), 0, 1)
+    share = share * share * (3 - 2 * share)
+    return np.asarray((1 - share) * z + share * _planes(z, support), np.float32)
+
+
+def _planes(z: Float, support: Mask) -> Float:
+    """(h, w) at each cell the height of a plane fitted to the supported heights around it, by
+    weighted least squares.
+    """
+    h, w = z.shape
+    factor = max(1.0, max(h, w) / COARSE)
+    small: Any = (max(2, round(w / factor)), max(2, round(h / factor)))
+    weight = cv2.resize(support.astype(np.float32), small, interpolation=cv2.INTER_AREA)
+    mean = cv2.resize(
+        np.where(support, z, 0).astype(np.float32), small, interpolation=cv2.INTER_AREA
+    )
+    base = float(mean.sum() / weight.sum())
+    total = mean - base * weight
+    y, x = np.mgrid[: small[1], : small[0]].astype(np.float32) / COARSE
+
+    def spread(part: NDArray[Any]) -> NDArray[np.float64]:
+        # a wide and a very wide surrounding: the second only counts where the first is empty
+        wide, widest = (
+            cv2.GaussianBlur(part.astype(np.float64), (0, 0), sigma, borderType=cv2.BORDER_CONSTANT)
+            for sigma in (COARSE / 12, COARSE / 3)
+        )
+        return np.asarray(wide + 1e-3 * widest)
+
+    mass = spread(weight)
+    cx, cy, m = (spread(part) / mass for part in (weight * x, weight * y, total))
+    vxx = spread(weight * x * x) / mass - cx * cx + STIFF
+    vyy = spread(weight * y * y) / mass - cy * cy + STIFF
+    vxy = spread(weight * x * y) / mass - cx * cy
+    mx, my = spread(total * x) / mass - cx * m, spread(total * y) / mass - cy * m
+    det = vxx * vyy - vxy * vxy
+    sx, sy = (vyy * mx - vxy * my) / det, (vxx * my - vxy * mx) / det
+    plane = base + m + sx * (x - cx) + sy * (y - cy)
+    return np.asarray(cv2.resize(plane.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR))
+
+
+def nearest_known(z: Float, known: Mask) -> Float:
+    """Heights (h, w) with gaps filled by the nearest known one: they end in cliffs. A photo drawn
+    on a slope between a crown and the ground beside it would become a streak.
+    """
+    _, place = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    table = np.zeros(int(place.max()) + 1, np.float32)
+    table[place[known]] = z[known]
+    return np.asarray(table[place])
+
+
+def plateaus(z: Float, side: int) -> Float:
+    """Medians of heights (h, w) over windows of `side` cells, an odd number, to a 255th of their
+    range: crowns become level, and cliffs stay.
+    """
+    low, span = float(z.min()), max(float(np.ptp(z)), 1e-6)
+    levels = np.rint((z - low) * (255 / span)).astype(np.uint8)
+    return np.asarray(cv2.medianBlur(levels, side) * np.float32(span / 255) + low, np.float32)

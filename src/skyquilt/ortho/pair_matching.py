@@ -1,0 +1,188 @@
+"""Heights from two photos: both are resampled on one plane and matched along its rows.
+
+The plane lies in the ground and contains the direction of the line between the photos' centres. A
+point at the height h over it then lies in one row of both pictures, shifted by h / (H - h) times
+the baseline, H being the height of the centres over the plane. Semi-global matching (Hirschmueller
+2008, in OpenCV's variant) finds the shift of every pixel.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.imaging.views import STEP, View, densify, inside_everywhere, project_nodes
+
+Float = NDArray[np.float32]
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+SUBPIXEL = 16
+"""OpenCV gives disparities in sixteenths of a pixel."""
+SPECKLE = 60
+"""Patches of fewer pixels, apart from their surroundings by more than two, are dropped."""
+TEXTURE = 1.5
+"""Least standard deviation of grey values in a window that is compared: more than noise."""
+TALLEST = 0.7
+"""Largest height over the plane that is searched, as a share of the cameras' height."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pair:
+    """Two photos that are matched, and the plane on which they are resampled."""
+
+    a: View
+    """The left picture."""
+    b: View
+    """The right one."""
+    origin: Array
+    """(3,) place of pixel (0, 0) in m (map frame)."""
+    along: Array
+    """(3,) unit vector from a to b: the direction of rows."""
+    down: Array
+    """(3,) horizontal unit vector across it: the direction of columns."""
+    size: tuple[int, int]
+    """Height and width of the rectified pictures in px."""
+    gsd: float
+    """Side of a rectified pixel in m."""
+
+    @property
+    def base(self) -> float:
+        """Distance of the centres in m."""
+        return float(np.linalg.norm(self.b.pose.map_C - self.a.pose.map_C))
+
+    @property
+    def height(self) -> float:
+        """Height of both centres over the plane in m."""
+        normal = np.cross(self.down, self.along)
+        return abs(float((self.a.pose.map_C - self.origin) @ normal))
+
+    def shift(self, h: float) -> float:
+        """Disparity in px of a point at the height h in m over the plane."""
+        return h / (self.height - h) * self.base / self.gsd
+
+    def places(self, rows: NDArray[Any], columns: NDArray[Any]) -> Array:
+        """(..., 3) places in m of pixels on the plane."""
+        return np.asarray(
+            self.origin
+            + rows[..., None] * (self.gsd * self.down)
+            + columns[..., None] * (self.gsd * self.along)
+        )
+
+    @property
+    def outline(self) -> Array:
+        """(4, 3) corners of the plane's part in m."""
+        h, w = self.size
+        return self.places(np.array([0, 0, h, h]), np.array([0, w, 0, w]))
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """West, south, east, north in m of the places that the pair can show."""
+        # points above the plane lie closer to the centre: within the hull of corners and centre
+        both = np.concatenate([self.outline, self.a.pose.map_C[None]])[:, :2]
+        (west, south), (east, north) = both.min(0), both.max(0)
+        return float(west), float(south), float(east), float(north)
+
+
+def pair_of(a: View, b: View, z: float, gsd: float) -> Pair | None:
+    """The pair of two photos over ground at about z in m; None if they hardly overlap."""
+    along = b.pose.map_C - a.pose.map_C
+    along = along / np.linalg.norm(along)
+    down = np.array([along[1], -along[0], 0.0])
+    down /= np.linalg.norm(down)
+    middle = np.array([*((a.pose.map_C + b.pose.map_C) / 2)[:2], z])
+    spans = []
+    for view in (a, b):
+        rim = np.column_stack([view.footprint, np.full(len(view.footprint), z)]) - middle
+        spans.append([(p.min(), p.max()) for p in (rim @ down, rim @ along)])
+    low = [max(s[k][0] for s in spans) for k in (0, 1)]
+    high = [min(s[k][1] for s in spans) for k in (0, 1)]
+    height, width = (int((top - least) / gsd) for least, top in zip(low, high, strict=True))
+    if min(height, width) < 2 * STEP:
+        return None
+    origin = middle + low[0] * down + low[1] * along
+    return Pair(a=a, b=b, origin=origin, along=along, down=down, size=(height, width), gsd=gsd)
+
+
+def matched_points(
+    pair: Pair,
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    low: float,
+    high: float,
+    window: int,
+) -> Float:
+    """Points (n, 3) in m, relative to the pair's origin, between the heights low and high in m over
+    the plane, from the grey images of a and b; windows of `window` px are compared.
+    """
+    d, good = _disparities(pair, left, right, low, min(high, TALLEST * pair.height), window)
+    rows, columns = np.nonzero(good)
+    along = pair.gsd * d[rows, columns]
+    share = (along / (np.float32(pair.base) + along)).astype(np.float32)  # of the way to a
+    at = (
+        rows[:, None] * (pair.gsd * pair.down) + columns[:, None] * (pair.gsd * pair.along)
+    ).astype(np.float32)
+    centre = (pair.a.pose.map_C - pair.origin).astype(np.float32)
+    at += (centre - at) * share[:, None]
+    return at
+
+
+def _disparities(
+    pair: Pair,
+    left: NDArray[np.uint8],
+    right: NDArray[np.uint8],
+    low: float,
+    high: float,
+    window: int,
+) -> tuple[Float, Mask]:
+    """Disparities (h, w) in px of picture a, and where they hold."""
+    first = int(np.floor(pair.shift(low))) - 1
+    number = -(-(int(np.ceil(pair.shift(high))) + 2 - first) // 16) * 16
+    left, seen = _rectified(pair, pair.a, left)
+    right, seen_b = _rectified(pair, pair.b, right)
+    # the matcher leaves out columns whose counterparts may lie beyond the picture
+    before, after = max(0, first + number), max(0, -first)
+    wide = [cv2.copyMakeBorder(p, 0, 0, before, after, cv2.BORDER_REPLICATE) for p in (left, right)]
+    match = cv2.StereoSGBM.create(
+        minDisparity=first,
+        numDisparities=number,
+        blockSize=window,
+        P1=8 * window**2,
+        P2=32 * window**2,
+        disp12MaxDiff=1,
+        preFilterCap=31,
+        uniquenessRatio=0,
+        speckleWindowSize=SPECKLE,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM,
+    )
+    found = match.compute(*wide)[:, before : before + left.shape[1]]
+    d = np.asarray(found.astype(np.float32) / np.float32(SUBPIXEL), np.float32)
+    there = np.arange(d.shape[1], dtype=np.float32) - d
+    other = np.clip(np.rint(there), 0, d.shape[1] - 1).astype(np.intp)
+    inside = (there > 0) & (there < d.shape[1] - 1) & np.take_along_axis(seen_b, other, 1)
+    return d, np.asarray((d >= first) & seen & inside & _textured(left, 2 * window + 1))
+
+
+def _textured(picture: NDArray[np.uint8], side: int) -> Mask:
+    """Where the window of a side in px around a pixel holds something to compare: (h, w)."""
+    grey = picture.astype(np.float32)
+    mean = cv2.blur(grey, (side, side))
+    return np.asarray(cv2.blur(grey * grey, (side, side)) - mean * mean > TEXTURE**2)
+
+
+def _rectified(
+    pair: Pair, view: View, picture: NDArray[np.uint8]
+) -> tuple[NDArray[np.uint8], Mask]:
+    """A photo (h, w) resampled on the pair's plane, and where it covers it."""
+    h, w = pair.size
+    rows, columns = ((np.arange(-1, -(-n // STEP) + 1) + 0.5) * STEP - 0.5 for n in (h, w))
+    at = pair.places(*np.meshgrid(rows, columns, indexing="ij"))
+    nodes = project_nodes(view, at[..., 0], at[..., 1], at[..., 2])
+    u, v = densify(nodes.u, h, w), densify(nodes.v, h, w)
+    seen = inside_everywhere(nodes, u, v)
+    scale, half = np.float32(picture.shape[1] / view.camera.width), np.float32(0.5)
+    u, v = (u + half) * scale - half, (v + half) * scale - half
+    warped = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(warped, np.uint8), seen

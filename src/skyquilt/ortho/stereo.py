@@ -1,0 +1,410 @@
+"""Dense heights by multi-view matching: pairs of photos, fused on cells of the map.
+
+Several pairs see every place; the median of their heights is kept, as Hirschmueller and Bucher
+(2010) do. The search is coarse to fine: small pictures over the whole range of heights find crowns
+and roofs as wholes; larger ones are matched where that shows relief, and believed where they agree
+with it. Where no pair gives a height, the coarser one stays; where none has any, heights go over to
+the plane through what is around.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.engine.executor import in_order
+from skyquilt.imaging.views import View
+from skyquilt.model.raster import Grid
+from skyquilt.model.surface import Surface
+from skyquilt.ortho.fill import nearest_known, plateaus, settled
+from skyquilt.ortho.pair_matching import Array, Float, Mask, Pair, matched_points, pair_of
+
+GreyPicture = Callable[[int, int], NDArray[np.uint8]]
+"""Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
+Keep = Callable[[str, Callable[[], Float]], Float]
+"""Gives a part of the result by its name: the one kept of an interrupted run, or made now."""
+MOST_CELLS = 2.4e7
+"""Largest number of cells of a surface."""
+TILE = 512
+"""Cells along a side of the pieces in which heights are fused."""
+NEW = 0.25
+"""Share of the ground of a pair that must still lack pairs for it to be matched."""
+FIRM = 0.45
+"""Share of the cells around with a fine height from which these are believed."""
+THREADS = 2
+"""Pairs matched at a time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """One round of matching."""
+
+    longest: int
+    """Longest side in px of the photos' images."""
+    window: int
+    """Side in px of the window that is compared."""
+    wanted: int
+    """Number of pairs that should see a place."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Round:
+    """What a round of matching works with."""
+
+    level: Level
+    """Its level."""
+    gsd: float
+    """Side in m of a rectified pixel."""
+    cells: Grid
+    """Cells of its heights."""
+    known: Surface
+    """Heights so far."""
+    low: Surface
+    """Lowest height searched, by place."""
+    high: Surface
+    """Highest height searched."""
+    grey: GreyPicture
+    """Source of the photos' grey images."""
+    agree: float
+    """Heights of different pairs that agree differ by less than this in m."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stereo:
+    """Coarse-to-fine semi-global matching of pairs, fused by medians."""
+
+    coarse: Level = Level(longest=250, window=9, wanted=6)
+    """Finds objects over the whole range of heights."""
+    fine: Level = Level(longest=500, window=5, wanted=3)
+    """Refines them."""
+    below: float = 0.03
+    """Search range below the lowest tie points around, as a share of the flying height."""
+    above: float = 0.4
+    """Search range above the tie points, as a share of the flying height."""
+    agree: float = 0.03
+    """Fine heights may leave the range of the coarse ones around them by this share of the flying
+    height.
+    """
+    whole: float = 0.05
+    """Size of crowns and of gaps between them, as a share of the flying height."""
+    relief: float = 0.02
+    """A pair with less relief than this share of the flying height is not matched finely; 0 = every
+    pair is.
+    """
+    base: tuple[float, float] = (0.08, 0.65)
+    """Least and greatest ratio of baseline to height of a pair."""
+    best_base: float = 0.25
+    """The ratio that is preferred."""
+    cell_px: tuple[int, int] = (4, 8)
+    """Least and greatest side of a cell in map pixels."""
+    version: ClassVar[int] = 1
+
+    def __call__(
+        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep
+    ) -> Surface:
+        """The surface with the heights found; the former one where the photos give none."""
+        views = [v for v in views if v.pose.cam_H_map is None]
+        height = float(np.median([v.pose.map_C[2] for v in views] or [0.0]) - np.median(surface.z))
+        if len(views) < 2 or height <= 0:
+            return surface
+        cameras = [v.camera for v in views]
+        extent = height * float(np.median([max(c.width, c.height) / c.focal for c in cameras]))
+        rough, support = self._coarse(surface, views, grid, grey, keep, height, extent)
+        if not support.any():
+            return surface
+        gsd = max(extent / self.fine.longest, grid.gsd)
+        cells = grid.coarser(
+            max(int(np.clip(round(2 * gsd / grid.gsd), *self.cell_px)), _least(grid))
+        )
+        step = self.agree * height
+        given = _Round(
+            level=self.fine,
+            gsd=gsd,
+            cells=cells,
+            known=rough,
+            low=_stretched(rough, 3 * gsd, cv2.MORPH_ERODE, -step),
+            high=_stretched(rough, 3 * gsd, cv2.MORPH_DILATE, step),
+            grey=grey,
+            agree=0.015 * height,
+        )
+        z = self._fused(given, views, height, self.relief * height, keep)
+        known = _without_specks(z, 0.01 * height, 6)
+        x, y = np.meshgrid(cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)))
+        # cliffs stay as steep as the cells allow
+        former = np.asarray(cv2.medianBlur(_stepwise(rough, x, y), 5), np.float32)
+        if not known.any():
+            return _surface(former, cells)
+        side = 2 * round(self.whole * height / cells.gsd / 2) + 1
+        firm = cv2.boxFilter(known.astype(np.float32), -1, (side, side)) > FIRM
+        refined = cv2.medianBlur(nearest_known(z, known), 5)
+        return _surface(np.where(firm, refined, former).astype(np.float32), cells)
+
+    def _coarse(
+        self,
+        surface: Surface,
+        views: Sequence[View],
+        grid: Grid,
+        grey: GreyPicture,
+        keep: Keep,
+        height: float,
+        extent: float,
+    ) -> tuple[Surface, Mask]:
+        """Heights from small pictures, without gaps, and the cells that have some of their own."""
+        gsd = extent / self.coarse.longest
+        cells = grid.coarser(max(1, round(1.5 * gsd / grid.gsd), _least(grid)))
+        given = _Round(
+            level=self.coarse,
+            gsd=gsd,
+            cells=cells,
+            known=surface,
+            low=_stretched(surface, 0.2 * height, cv2.MORPH_ERODE, -self.below * height),
+            high=replace(surface, z=surface.z + np.float32(self.above * height)),
+            grey=grey,
+            agree=0.04 * height,
+        )
+        z = self._fused(given, views, height, 0.0, keep)
+        known = _without_specks(z, 0.02 * height, 12)
+        if not known.any():
+            return surface, known
+        # where only some places agree, as in leaves, heights are those of whole crowns
+        firm = cv2.boxFilter(known.astype(np.float32), -1, (5, 5)) > FIRM
+        whole = nearest_known(z, known)
+        side = 2 * round(self.whole * height / cells.gsd) + 1
+        kernel = np.ones((side, side), np.uint8)
+        closed = np.asarray(cv2.morphologyEx(whole, cv2.MORPH_CLOSE, kernel), np.float32)
+        level = cv2.bilateralFilter(plateaus(closed, side), 5, 0.02 * height, 2.0)
+        whole = np.where(firm, cv2.medianBlur(whole, 5), level)
+        around = cv2.morphologyEx(
+            known.astype(np.uint8),
+            cv2.MORPH_CLOSE,
+            cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (15, 15)),
+        )
+        # at once: photos drawn on a slope between crowns and the plane would become streaks
+        whole = settled(np.asarray(whole, np.float32), around > 0, 0.0, 1.0)
+        return _surface(whole, cells), known
+
+    def pairs(self, views: Sequence[View], height: float, wanted: int) -> list[tuple[View, View]]:
+        """The pairs that are matched, of photos `height` m above ground: those with good baselines
+        first, until every place is seen by `wanted` of them.
+        """
+        centre = np.array([v.pose.map_C[:2] for v in views])
+        ratio = np.hypot(*(centre[:, None] - centre[None]).transpose(2, 0, 1)) / height
+        i, j = np.nonzero(np.triu((ratio >= self.base[0]) & (ratio <= self.base[1])))
+        order = np.lexsort((j, i, np.round(np.abs(np.log(ratio[i, j] / self.best_base)), 1)))
+        outline = np.concatenate([v.footprint for v in views])
+        corner, far = outline.min(0), outline.max(0)
+        side = max(height / 20, float((far - corner).max()) / 4000)
+        shape = tuple(np.ceil((far - corner) / side).astype(int)[::-1] + 1)
+        counts = np.zeros(shape, np.int16)
+        covers = [_covered(v.footprint, corner, side, counts.shape) for v in views]
+        chosen = []
+        for a, b in zip(i[order].tolist(), j[order].tolist(), strict=True):
+            (rows, columns), (mask_a, mask_b) = _common(covers[a], covers[b])
+            both = mask_a & mask_b
+            part = counts[rows, columns]
+            new = both & (part < wanted)
+            if new.any() and new.sum() > NEW * both.sum():
+                part += both
+                chosen.append((views[a], views[b]))
+        return chosen
+
+    def _fused(
+        self, given: _Round, views: Sequence[View], height: float, relief: float, keep: Keep
+    ) -> Float:
+        """Heights (rows, columns) of the cells, row 0 in the north, NaN where no pair gives one."""
+        cells = given.cells
+        pairs = [
+            p
+            for a, b in self.pairs(views, height, given.level.wanted)
+            if (p := _over(a, b, given)) is not None and _relief(p, given.known) >= relief
+        ]
+        out = np.full((cells.height, cells.width), np.nan, np.float32)
+        held: dict[int, Float] = {}
+        for row in range(0, cells.height, TILE):
+            for column in range(0, cells.width, TILE):
+                part = replace(
+                    cells,
+                    west=cells.west + column * cells.gsd,
+                    north=cells.north - row * cells.gsd,
+                    width=min(TILE, cells.width - column),
+                    height=min(TILE, cells.height - row),
+                )
+                near = [k for k, p in enumerate(pairs) if _meet(p.bounds, part.bounds)]
+                name = f"{given.level.longest} {row} {column}"
+                inner = (slice(row, row + part.height), slice(column, column + part.width))
+                out[inner] = keep(name, lambda: _tile(pairs, near, held, given, part))  # noqa: B023 - called at once
+        return out
+
+
+def _tile(
+    pairs: Sequence[Pair], near: Sequence[int], held: dict[int, Float], given: _Round, part: Grid
+) -> Float:
+    """Heights (h, w) of a part of the cells from the pairs that may see it. `held`: points of the
+    pairs of the part before.
+    """
+    for k in [k for k in held if k not in near]:
+        del held[k]
+    todo = [k for k in near if k not in held]
+    for k, points in zip(
+        todo, in_order(lambda k: _points(pairs[k], given), todo, jobs=THREADS), strict=True
+    ):
+        held[k] = points
+    layers = [layer for k in near if (layer := _splat(held[k], pairs[k].origin, part)) is not None]
+    return (
+        _agreed(layers, given.agree)
+        if layers
+        else np.full((part.height, part.width), np.nan, np.float32)
+    )
+
+
+def _over(a: View, b: View, given: _Round) -> Pair | None:
+    """The pair of two photos over the heights known between them."""
+    x, y = ((a.pose.map_C + b.pose.map_C) / 2)[:2]
+    reach = 0.3 * (float(a.pose.map_C[2]) - float(np.median(given.known.z)))
+    gx, gy = np.meshgrid(*(c + reach * np.linspace(-1, 1, 9) for c in (x, y)))
+    return pair_of(a, b, float(np.median(given.known.at(gx, gy))), given.gsd)
+
+
+def _sampled(pair: Pair, surface: Surface) -> Float:
+    """Heights (n, n) of a surface over the part that a pair shows."""
+    places = pair.places(*np.meshgrid(*(np.linspace(0, n, 48) for n in pair.size), indexing="ij"))
+    return surface.at(places[..., 0], places[..., 1])
+
+
+def _relief(pair: Pair, surface: Surface) -> float:
+    """How far heights in m under a pair lie apart, its general slope removed."""
+    z = _sampled(pair, surface)
+    r, c = np.mgrid[: z.shape[0], : z.shape[1]]
+    terms = np.column_stack([np.ones(z.size), r.ravel(), c.ravel()])
+    rest = z.ravel() - terms @ np.linalg.lstsq(terms, z.ravel(), rcond=None)[0]
+    return float(np.ptp(np.percentile(rest, [1, 99])))
+
+
+def _points(pair: Pair, given: _Round) -> Float:
+    """Points (n, 3) in m, relative to the pair's origin, of a round."""
+    side = given.level.longest
+    over = float(pair.origin[2])
+    tilt = abs(float(pair.along[2])) * pair.gsd * max(pair.size)
+    low = float(_sampled(pair, given.low).min()) - over - tilt
+    high = float(_sampled(pair, given.high).max()) - over + tilt
+    pictures = (given.grey(pair.a.photo, side), given.grey(pair.b.photo, side))
+    at = matched_points(pair, *pictures, low, high, given.level.window)
+    if not len(at):
+        return at
+    x, y, z = (at[:, k] + pair.origin[k] for k in range(3))
+    return np.asarray(at[(z > given.low.at(x, y)) & (z < given.high.at(x, y))])
+
+
+def _splat(points: Float, origin: Array, part: Grid) -> Float | None:
+    """Heights (h, w) of the cells of a grid: the means of those points that lie near the highest
+    one in each; None if there are no points.
+    """
+    column = np.floor((points[:, 0] + (origin[0] - part.west)) / part.gsd).astype(np.int64)
+    row = np.floor(((part.north - origin[1]) - points[:, 1]) / part.gsd).astype(np.int64)
+    mine = (column >= 0) & (column < part.width) & (row >= 0) & (row < part.height)
+    if not mine.any():
+        return None
+    cell, z = row[mine] * part.width + column[mine], points[mine, 2]
+    top = np.full(part.height * part.width, -np.inf, np.float32)
+    np.maximum.at(top, cell, z)
+    close = z > top[cell] - 2 * part.gsd
+    cell, z = cell[close], z[close]
+    number = np.bincount(cell, minlength=len(top))
+    with np.errstate(invalid="ignore"):
+        mean = np.bincount(cell, z, minlength=len(top)) / number
+    return np.asarray((mean + origin[2]).reshape(part.height, part.width), np.float32)
+
+
+def _agreed(layers: Sequence[Float], step: float) -> Float:
+    """Median (h, w) of layers, NaN ignored; of an even number the lower of the two in the middle.
+    NaN where of several heights none lies within `step` m of it.
+    """
+    ordered = np.sort(np.stack(layers), axis=0)
+    number = np.isfinite(ordered).sum(0)
+    middle = np.maximum(number - 1, 0) // 2
+    z = np.take_along_axis(ordered, middle[None], 0)[0]
+    if len(layers) > 1:
+        with np.errstate(invalid="ignore"):
+            close = (np.abs(ordered - z) < step).sum(0)
+        z = np.where((number > 1) & (close < 2), np.float32(np.nan), z)
+    return np.asarray(z)
+
+
+def _stepwise(surface: Surface, x: NDArray[Any], y: NDArray[Any]) -> Float:
+    """Heights (h, w) of the nearest cells of a surface."""
+    column = np.rint((x[0] - surface.x0) / surface.cell).astype(np.int64)
+    row = np.rint((y[:, 0] - surface.y0) / surface.cell).astype(np.int64)
+    rows, columns = surface.z.shape
+    return surface.z[np.clip(row, 0, rows - 1)][:, np.clip(column, 0, columns - 1)]
+
+
+def _without_specks(z: Float, step: float, least: int) -> Mask:
+    """Which heights (h, w) are kept: those of patches of at least `least` cells whose neighbours
+    differ by less than `step` m.
+    """
+    known = np.isfinite(z)
+    if not known.any():
+        return known
+    base = float(np.nanmin(z))
+    scale = min(100.0, 30000 / max(float(np.nanmax(z)) - base, 1e-6))
+    levels = np.where(known, (z - base) * scale + 1, -1000).astype(np.int16)
+    cv2.filterSpeckles(levels, -1000, least, step * scale)
+    return levels >= 0
+
+
+def _stretched(surface: Surface, reach: float, kind: int, add: float) -> Surface:
+    """The lowest or highest heights within `reach` m, moved by `add` m."""
+    side = 2 * max(1, round(reach / surface.cell)) + 1
+    z = cv2.morphologyEx(surface.z, kind, np.ones((side, side), np.uint8))
+    return replace(surface, z=np.asarray(z + np.float32(add), np.float32))
+
+
+def _surface(z: Float, cells: Grid) -> Surface:
+    return Surface(
+        z=np.ascontiguousarray(z[::-1]),
+        x0=float(cells.x(np.array(0))),
+        y0=float(cells.y(np.array(cells.height - 1))),
+        cell=cells.gsd,
+        source="multi-view matching",
+    )
+
+
+def _least(grid: Grid) -> int:
+    """The least side of a cell in map pixels for which a surface stays below `MOST_CELLS`."""
+    return int(np.ceil(np.sqrt(grid.width * grid.height / MOST_CELLS)))
+
+
+def _meet(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
+    return a[0] < b[2] and a[2] > b[0] and a[1] < b[3] and a[3] > b[1]
+
+
+Covered = tuple[slice, slice, Mask]
+
+
+def _covered(outline: Array, corner: Array, side: float, shape: Any) -> Covered:
+    """Rows and columns of a raster that an outline (k, 2) in m covers, and which of these cells."""
+    px = np.floor((outline - corner) / side).astype(np.int32)
+    low = np.clip(px.min(0), 0, None)
+    high = np.minimum(px.max(0) + 1, [shape[1], shape[0]])
+    mask = np.zeros((high[1] - low[1], high[0] - low[0]), np.uint8)
+    cv2.fillPoly(mask, [px - low.astype(np.int32)], (1,))
+    return slice(low[1], high[1]), slice(low[0], high[0]), mask > 0
+
+
+def _common(a: Covered, b: Covered) -> tuple[tuple[slice, slice], tuple[Mask, Mask]]:
+    """The common rows and columns of two parts of a raster, and both masks there."""
+    inner = [
+        slice(max(p.start, q.start), max(p.start, q.start, min(p.stop, q.stop)))
+        for p, q in zip(a[:2], b[:2], strict=True)
+    ]
+    masks = [
+        m[
+            inner[0].start - r.start : inner[0].stop - r.start,
+            inner[1].start - c.start : inner[1].stop - c.start,
+        ]
+        for r, c, m in (a, b)
+    ]
+    return (inner[0], inner[1]), (masks[0], masks[1])

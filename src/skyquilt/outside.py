@@ -1,0 +1,174 @@
+"""Checks of what comes from outside: numbers, files, the declared size of pictures, text to show.
+
+Readers and endpoints use these functions and no others for the purpose, so that a limit stands in
+one place. docs/security.md lists the limits.
+"""
+
+import errno
+import math
+import os
+import re
+import stat
+import unicodedata
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from skyquilt.errors import UnreadablePhotoError
+
+MOST_MP = 160.0
+"""Largest area of a photo in megapixels, unless --max-mp says otherwise: the largest cameras that
+drones carry have 150.
+"""
+BUDGET_PER_PX = 4
+"""Bytes per pixel of the largest allowed area that decoding one photo may need."""
+MOST_ASPECT = 20
+"""Largest ratio of a photo's sides."""
+LEAST_SIDE = 32
+"""Smallest side of a photo in px."""
+SLACK_BYTES = 64_000_000
+"""Bytes that a file may have beyond those that its pixels can need."""
+MOST_TEXT_BYTES = 64_000_000
+"""Largest side file in bytes."""
+MOST_DIGITS = 64
+"""Largest number of characters of a number."""
+_REAL = re.compile(r"[+-]?(?:\d++(?:\.\d*+)?+|\.\d++)(?:[eE][+-]?\d{1,4})?+", re.ASCII)
+_WHOLE = re.compile(r"[+-]?\d{1,30}", re.ASCII)
+
+
+def real(value: Any, low: float = -math.inf, high: float = math.inf) -> float | None:
+    """A finite number within the limits, from text or a number; None for anything else.
+
+    Text is what a person would write: at most 64 ASCII characters, no `nan`, `inf`, `1_000`.
+    """
+    if isinstance(value, str):
+        text = value.strip()
+        value = text if len(text) <= MOST_DIGITS and _REAL.fullmatch(text) else None
+    if value is None or isinstance(value, (bool, bytes, bytearray)):
+        return None
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ArithmeticError):
+        return None
+    return number if math.isfinite(number) and low <= number <= high else None
+
+
+def whole(value: Any, low: int = -(2**63), high: int = 2**63 - 1) -> int | None:
+    """A whole number within the limits, from text or an integer; None for anything else."""
+    if isinstance(value, str):
+        text = value.strip()
+        value = int(text) if _WHOLE.fullmatch(text) else None
+    if not isinstance(value, int) or isinstance(value, bool):
+        return None
+    return value if low <= value <= high else None
+
+
+def shown(text: object, most: int = 4000) -> str:
+    """Text that can be written to a terminal: control, escape and direction characters and lone
+    surrogates are shown as escapes, and what is longer than `most` characters is cut.
+    """
+    words = str(text)
+    cut = words[:most] + " ..." if len(words) > most else words
+    return "".join(c if c == "\n" or _harmless(c) else _escaped(c) for c in cut)
+
+
+def plain(text: str, most: int = 4000) -> str:
+    """The same for a name or a word of metadata, which stand in one line."""
+    return shown(text, most).replace("\n", "\\x0a")
+
+
+def _harmless(c: str) -> bool:
+    return " " <= c <= "~" or unicodedata.category(c) not in ("Cc", "Cf", "Cs", "Zl", "Zp")
+
+
+def _escaped(c: str) -> str:
+    return c.encode("unicode_escape").decode("ascii")
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Opens a file for reading; raises `OSError` where it is missing, or is a pipe, a socket, a
+    device or a folder. It never waits for another program.
+    """
+    file = open(path, "rb", opener=_at_once)  # noqa: SIM115 - Path.open has no opener
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, "it is not a regular file", str(path))
+    return file
+
+
+def _at_once(path: str, flags: int) -> int:
+    """Opens without waiting for a writer at the other end of a pipe."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def read_bounded(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
+    """The bytes of a regular file; raises `OSError` as `open_regular`, and where it has more than
+    `most`.
+    """
+    with open_regular(path) as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"it has more than {most // 10**6} MB", str(path))
+    return data
+
+
+def walk(top: Path) -> Iterator[tuple[Path, list[str], list[str]]]:
+    """Folders below `top`, each with the names of its subfolders, from which the caller may remove
+    some, and of its other files, both sorted. Links to folders are not followed; folders that
+    cannot be read count as empty. Unlike `os.walk` it takes any depth.
+    """
+    waiting = [top]
+    while waiting:
+        here = waiting.pop()
+        try:
+            with os.scandir(here) as found:
+                entries = [(e.name, e.is_dir(follow_symlinks=False)) for e in found]
+        except OSError:
+            continue
+        folders = sorted(name for name, folder in entries if folder)
+        yield here, folders, sorted(name for name, folder in entries if not folder)
+        waiting += [here / name for name in reversed(folders)]
+
+
+def check_picture(
+    width: int,
+    height: int,
+    bytes_per_px: float,
+    *,
+    file_bytes: int = 0,
+    most_mp: float = MOST_MP,
+    option: str = " (--max-mp)",
+) -> None:
+    """Refuses a picture by its declared size, before anything of that size is allocated.
+
+    `bytes_per_px`: memory that decoding needs for each pixel; `file_bytes`: size of the file;
+    `option`: how to raise the limit.
+
+    Raises:
+        UnreadablePhotoError: it is too small, too large, too long, or its file is far larger than
+            its pixels can need.
+    """
+    most = most_mp * 1e6
+    if min(width, height) < LEAST_SIDE:
+        raise UnreadablePhotoError(
+            f"it has only {width}x{height} px; at least {LEAST_SIDE} a side are needed"
+        )
+    if max(width, height) > MOST_ASPECT * min(width, height):
+        raise UnreadablePhotoError(
+            f"it has {width}x{height} px; one side may be {MOST_ASPECT} times the other at most"
+        )
+    area = width * height
+    if area > most:
+        raise UnreadablePhotoError(
+            f"it has {width}x{height} px, and {most_mp:g} megapixels are the most{option}"
+        )
+    if area * bytes_per_px > BUDGET_PER_PX * most:
+        raise UnreadablePhotoError(
+            f"decoding its {width}x{height} px would need {area * bytes_per_px / 1e6:.0f} MB, and"
+            f" {BUDGET_PER_PX * most / 1e6:.0f} MB are the most{option}"
+        )
+    if file_bytes > SLACK_BYTES + 2 * area * bytes_per_px:
+        raise UnreadablePhotoError(
+            f"its file of {file_bytes // 10**6} MB is far larger than its {width}x{height} px can"
+            " need"
+        )

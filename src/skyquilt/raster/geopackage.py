@@ -1,0 +1,101 @@
+"""Lines as a GeoPackage (OGC 12-128r18), readable by every GIS."""
+
+import sqlite3
+import struct
+from collections.abc import Iterable
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from shapely import to_wkb
+from shapely.geometry import LineString
+
+from skyquilt.errors import OutputError
+
+APPLICATION_ID, USER_VERSION = 0x47504B47, 10300
+"""`GPKG`, version 1.3."""
+UNDEFINED = -1
+"""Reference system of the format for plane coordinates that are not on Earth."""
+TABLES = """
+CREATE TABLE gpkg_spatial_ref_sys (srs_name TEXT NOT NULL, srs_id INTEGER PRIMARY KEY,
+    organization TEXT NOT NULL, organization_coordsys_id INTEGER NOT NULL,
+    definition TEXT NOT NULL, description TEXT);
+CREATE TABLE gpkg_contents (table_name TEXT PRIMARY KEY, data_type TEXT NOT NULL,
+    identifier TEXT UNIQUE, description TEXT DEFAULT '',
+    last_change DATETIME NOT NULL DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ','now')),
+    min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE, srs_id INTEGER);
+CREATE TABLE gpkg_geometry_columns (table_name TEXT PRIMARY KEY, column_name TEXT NOT NULL,
+    geometry_type_name TEXT NOT NULL, srs_id INTEGER NOT NULL, z TINYINT NOT NULL,
+    m TINYINT NOT NULL);
+INSERT INTO gpkg_spatial_ref_sys VALUES
+    ('Undefined Cartesian', -1, 'NONE', -1, 'undefined', NULL),
+    ('Undefined geographic', 0, 'NONE', 0, 'undefined', NULL),
+    ('WGS 84', 4326, 'EPSG', 4326, 'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,'
+     || '298.257223563]],PRIMEM["Greenwich",0],UNIT["degree",0.0174532925199433]]', NULL);
+"""
+
+
+def write_lines(
+    path: Path, table: str, lines: Iterable[tuple[NDArray[np.float64], float]], *, crs: str | None
+) -> int:
+    """Writes lines (n, 2) in `crs`, each with a height in m, as a table; returns their number.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    rows = [(np.asarray(line, np.float64), float(height)) for line, height in lines]
+    partial = path.with_name(path.name + ".partial")
+    partial.unlink(missing_ok=True)
+    try:
+        with closing(sqlite3.connect(partial)) as base, base:
+            _fill(base, table, rows, crs)
+        partial.replace(path)
+    except (OSError, sqlite3.Error) as error:
+        partial.unlink(missing_ok=True)
+        raise OutputError(f"{path} cannot be written: {error}") from error
+    return len(rows)
+
+
+def _fill(
+    base: sqlite3.Connection,
+    table: str,
+    rows: list[tuple[NDArray[np.float64], float]],
+    crs: str | None,
+) -> None:
+    base.executescript(TABLES)
+    base.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    base.execute(f"PRAGMA user_version = {USER_VERSION}")
+    srs = _reference(base, crs)
+    places = np.concatenate([line for line, _ in rows]) if rows else np.zeros((1, 2))
+    (west, south), (east, north) = places.min(0).tolist(), places.max(0).tolist()
+    base.execute(
+        "INSERT INTO gpkg_contents (table_name, data_type, identifier, min_x, min_y, max_x, max_y,"
+        " srs_id) VALUES (?, 'features', ?, ?, ?, ?, ?, ?)",
+        (table, table, west, south, east, north, srs),
+    )
+    base.execute(
+        "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', 'LINESTRING', ?, 0, 0)", (table, srs)
+    )
+    base.execute(f"CREATE TABLE {table} (fid INTEGER PRIMARY KEY, geom BLOB, height REAL)")
+    header = b"GP\0\1" + struct.pack("<i", srs)
+    base.executemany(
+        f"INSERT INTO {table} (geom, height) VALUES (?, ?)",
+        [(header + to_wkb(LineString(line), byte_order=1), height) for line, height in rows],
+    )
+
+
+def _reference(base: sqlite3.Connection, crs: str | None) -> int:
+    """Number of a reference system in the file."""
+    if crs is None:
+        return UNDEFINED
+    from pyproj import CRS
+
+    known = CRS.from_user_input(crs)
+    authority, code = known.to_authority() or ("NONE", "100000")
+    number = int(code) if code.isdigit() else 100000
+    base.execute(
+        "INSERT OR IGNORE INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, NULL)",
+        (known.name, number, authority, number, known.to_wkt("WKT1_GDAL")),
+    )
+    return number

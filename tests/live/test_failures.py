@@ -1,0 +1,263 @@
+"""One photo that fails, whatever the error, is left out; the rest goes on, after a restart too."""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from skyquilt.errors import OutputError
+from skyquilt.live.folder_watch import Watch
+from skyquilt.live.inbox import Inbox
+from skyquilt.live.ledger import Ledger
+from skyquilt.live.live_map import LiveMap
+from skyquilt.live.lock import FolderLock
+from skyquilt.live.photo_intake import Intake, Refused
+from skyquilt.live.settings import LiveSettings
+from skyquilt.live.workflow import iter_live
+from tests.attacks import SHARED, jpeg, needs_attacks
+
+QUICK = LiveSettings(features=600)
+
+
+def taken(out, inbox, photos, seconds=60):
+    """Runs live on a folder until so many photos are accepted and drawn; the map stays open."""
+    live = LiveMap(out, QUICK)
+    stop = threading.Event()
+    timer = threading.Timer(seconds, stop.set)
+    timer.start()
+    for _ in iter_live([inbox], live, stop=stop):
+        done = live.ledger.counts()
+        if sum(done.get(k, 0) for k in ("refined", "waiting", "refused")) >= photos:
+            stop.set()
+    timer.cancel()
+    return live
+
+
+def refused(live):
+    rows = live.ledger.rows("select name, reason from refused")
+    more = live.ledger.rows("select name, reason from photo where state = 'refused'")
+    return dict([*rows, *more])
+
+
+@needs_attacks
+def test_a_thin_photo_is_refused_and_the_others_are_mapped(flight, tmp_path):
+    inbox = tmp_path / "in"
+    inbox.mkdir()
+    shutil.copyfile(SHARED / "thin-20000x32.jpg", inbox / "a.jpg")
+    shutil.copyfile(flight.photos[0], inbox / "b.jpg")
+    live = taken(tmp_path / "out", inbox, 2)
+    assert "20000x32" in refused(live)["a.jpg"]
+    state = live.ledger.row("select state from photo where name = 'b.jpg'")
+    assert state is not None and state[0] in ("placed", "refined", "waiting")
+    live.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", ["features", "place", "draw", "refine"])
+def test_whatever_fails_on_one_photo_the_others_are_mapped(flight, tmp_path, monkeypatch, step):
+    """The second photo makes a step fail with an error that nobody foresaw."""
+    from skyquilt.live import initial_pose, links, reduced_pictures, refinement
+
+    live = LiveMap(tmp_path / "out", QUICK)
+    bad = flight.photos[1].name
+
+    def failing(honest, name_of):
+        def step_(self, *args, **more):
+            if name_of(self, *args) == bad:
+                raise ZeroDivisionError("nobody foresaw this")
+            return honest(self, *args, **more)
+
+        return step_
+
+    def by_number(self, number, *_):
+        return self.members.by_id[number].photo.name
+
+    module, cls, method, name_of = {
+        "features": (links, "LiveLinks", "features", by_number),
+        "place": (initial_pose, "InitialPose", "place", lambda self, m: m.photo.name),
+        "refine": (refinement, "Refinement", "refine", lambda self, m: m.photo.name),
+        "draw": (
+            reduced_pictures,
+            "SmallPictures",
+            "_reduced",
+            lambda self, n: self.members[n].photo.name,
+        ),
+    }[step]
+    owner = getattr(module, cls)
+    monkeypatch.setattr(owner, method, failing(getattr(owner, method), name_of))
+    for path in flight.photos[:4]:
+        live.intake.take_file(path, "drone")
+    list(live.drain_all())
+    counts = live.ledger.counts()
+    assert live.ledger.row("select state, reason from photo where name = ?", bad)[0] == "refused"
+    assert sum(counts.get(k, 0) for k in ("refined", "placed", "waiting")) == 3
+    log = (tmp_path / "out" / "errors.log").read_text()
+    assert bad in log and "ZeroDivisionError: nobody foresaw this" in log and "Traceback" in log
+    events = [json.loads(b) for _, kind, b in live.ledger.told(0) if kind == "photo"]
+    assert any(e["name"] == bad and e["state"] == "refused" for e in events)
+    live.close()
+    again = LiveMap(tmp_path / "out", QUICK)  # and it starts again
+    list(again.drain_all())
+    again.add(flight.photos[4])
+    assert again.ledger.row("select state from photo where name = ?", flight.photos[4].name)[0] in (
+        "refined",
+        "placed",
+        "waiting",
+    )
+    again.close()
+
+
+def test_an_error_of_the_disk_is_no_error_of_a_photo(flight, tmp_path, monkeypatch):
+    live = LiveMap(tmp_path / "out", QUICK)
+    live.intake.take_file(flight.photos[0], "drone")
+    honest = LiveMap._pixels
+
+    def broken(self, number):
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(LiveMap, "_pixels", lambda self, n: broken(self, n))
+    live.full.read = lambda n: broken(live, n)
+    with pytest.raises(OutputError):
+        list(live.drain())
+    monkeypatch.setattr(LiveMap, "_pixels", honest)
+    live._reload()
+    list(live.drain())
+    assert live.ledger.counts()["refused"] == 0
+    live.close()
+
+
+class Box:
+    """A watched folder and what was taken from it."""
+
+    def __init__(self, tmp_path, **settings):
+        self.folder = tmp_path / "in"
+        self.folder.mkdir(exist_ok=True)
+        self.out = tmp_path / "out"
+        self.out.mkdir(exist_ok=True)
+        self.ledger = Ledger(self.out, write=True)
+        settings = LiveSettings(**settings)
+        inbox = Inbox(self.ledger, self.out / "photos", most_bytes=settings.most_bytes)
+        self.intake = Intake(self.ledger, inbox, settings)
+        self.watch = Watch(folder=self.folder, intake=self.intake)
+
+    def look(self, seconds=1.0):
+        found = []
+        for _ in range(int(seconds / 0.05)):
+            found += self.watch.look()
+            threading.Event().wait(0.05)
+        return found
+
+
+def test_names_that_are_no_text_are_taken(tmp_path):
+    box = Box(tmp_path)
+    Path(os.fsdecode(os.fsencode(box.folder) + b"/a\xff\x1b.jpg")).write_bytes(jpeg())
+    found = box.look()
+    assert len(found) == 1 and not isinstance(found[0], Refused)
+    assert found[0].name.isprintable()
+    assert Box(tmp_path).look() == []  # it is known after a restart
+
+
+def test_a_file_that_is_gone_again_is_forgotten(tmp_path, monkeypatch):
+    box = Box(tmp_path)
+    (box.folder / "a.jpg").write_bytes(jpeg())
+    honest = Watch._unfinished
+
+    def gone(self, path):
+        path.unlink(missing_ok=True)
+        return honest(self, path)
+
+    monkeypatch.setattr(Watch, "_unfinished", gone)
+    assert box.look(0.5) == [] and box.watch.growing == {}
+
+
+def test_a_file_that_is_too_large_is_refused_and_the_next_is_taken(tmp_path):
+    box = Box(tmp_path, most_bytes=10_000)
+    (box.folder / "a.jpg").write_bytes(jpeg() + bytes(20_000))
+    (box.folder / "b.jpg").write_bytes(jpeg())
+    found = {f.name: f for f in box.look(5)}
+    assert isinstance(found["a.jpg"], Refused) and "--max-mb" in found["a.jpg"].reason
+    assert not isinstance(found["b.jpg"], Refused)
+
+
+def test_pipes_sockets_and_devices_are_refused_and_the_next_is_taken(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    box = Box(tmp_path)
+    os.mkfifo(box.folder / "a.jpg")
+    with socket.socket(socket.AF_UNIX) as one:
+        one.bind("in/b.jpg")
+    (box.folder / "c.jpg").symlink_to(os.devnull)
+    (box.folder / "d.jpg").write_bytes(jpeg())
+    found = {f.name: f for f in box.look(6)}
+    assert not isinstance(found.pop("d.jpg"), Refused)
+    assert {name: bool(f) for name, f in found.items()} == {
+        "a.jpg": False,
+        "b.jpg": False,
+        "c.jpg": False,
+    }
+
+
+def test_links_that_loop_are_not_followed(tmp_path):
+    inner = tmp_path / "in" / "x"
+    inner.mkdir(parents=True)
+    for k in range(6):
+        (inner / f"l{k}").symlink_to(tmp_path / "in", target_is_directory=True)
+    box = Box(tmp_path)
+    assert len(box.watch._closed._folders) == 2
+    (inner / "a.jpg").write_bytes(jpeg())
+    assert len(box.look()) == 1
+
+
+def test_an_inbox_that_goes_away_and_comes_back(tmp_path):
+    box = Box(tmp_path)
+    (box.folder / "a.jpg").write_bytes(jpeg())
+    assert len(box.look(0.5)) == 1
+    box.folder.rename(tmp_path / "away")
+    assert box.look(0.3) == []
+    (tmp_path / "away").rename(box.folder)
+    (box.folder / "b.jpg").write_bytes(jpeg(96, 80))
+    assert len(box.look(2.5)) == 1
+
+
+def test_two_live_maps_on_one_folder_are_refused(tmp_path):
+    code = (
+        "import sys; from pathlib import Path; from skyquilt.live.lock import FolderLock;"
+        "lock = FolderLock(Path(sys.argv[1])); lock.tell('http://here/');"
+        "print('held', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as other:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(OutputError, match=rf"process {other.pid}, http://here/"):
+            FolderLock(tmp_path)
+        other.kill()
+        other.wait()
+        FolderLock(tmp_path).close()  # whoever was killed holds nothing
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as another user")
+def test_a_folder_that_is_now_read_only_is_refused_at_the_start(tmp_path):
+    LiveMap(tmp_path / "out", QUICK).close()
+    for path in [tmp_path / "out", *(tmp_path / "out").rglob("*")]:
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    for path in [tmp_path, *tmp_path.parents][:4]:
+        path.chmod(path.stat().st_mode | 0o555)
+    pid = os.fork()
+    if pid == 0:
+        os.setuid(65534)
+        try:
+            LiveMap(tmp_path / "out", QUICK)
+        except OutputError:
+            os._exit(5)
+        finally:
+            os._exit(1)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 5

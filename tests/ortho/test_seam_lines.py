@@ -1,0 +1,145 @@
+"""Seams go around objects and through places where photos agree; hidden places are known."""
+
+import numpy as np
+import pytest
+
+from skyquilt.model.raster import Grid, Window
+from skyquilt.ortho.bare_ground import bare_ground
+from skyquilt.ortho.contours import contour_lines
+from skyquilt.ortho.exposure import NEUTRAL
+from skyquilt.ortho.labels import Labels
+from skyquilt.ortho.occlusion import Shadow
+from skyquilt.ortho.seam_lines import SeamLines, flooded
+from tests.ortho.scenes import FLAT, block, photograph, view
+
+GRID = Grid(west=-24.0, north=18.0, gsd=0.1, width=480, height=360)
+
+
+def test_floods_meet_on_the_ridge():
+    """From the left and right rim over a landscape: the labels part on its highest line, wherever
+    that runs.
+    """
+    rng = np.random.default_rng(0)
+    height = rng.integers(0, 100, (60, 80)).astype(np.uint8)
+    ridge = np.rint(40 + 15 * np.sin(np.arange(60) / 9)).astype(int)
+    height[np.arange(60), ridge] = 250
+    height[np.arange(60), ridge + 1] = 250
+    label = np.where(np.arange(80) < 40, 3, 7) * np.ones((60, 1), int)
+    sure = np.zeros(label.shape, bool)
+    sure[:, :2] = sure[:, -2:] = True
+    out = flooded(label.astype(np.int32), sure, height)
+    for row in range(60):
+        assert (out[row, : ridge[row]] == 3).all() and (out[row, ridge[row] + 2 :] == 7).all()
+
+
+def test_what_is_outside_stays_outside():
+    label = np.full((30, 30), 5, np.int32)
+    label[:, 20:] = -1
+    sure = np.zeros(label.shape, bool)
+    sure[3, 3] = True
+    out = flooded(label, sure, np.full(label.shape, 30, np.uint8))
+    assert np.array_equal(out, label)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    views = block()
+    return views, {v.photo: np.clip(photograph(v), 0, 255).astype(np.uint8) for v in views}
+
+
+def test_alike_photos_are_parted_in_the_middle(scene):
+    """On level ground that all photos show alike, seams stay near the most vertical views."""
+    views, pictures = scene
+    labels = SeamLines()(views, FLAT, GRID, lambda photo, side: pictures[photo], NEUTRAL)
+    assert not labels.hidden.any() and not labels.tall.any()
+    cells = labels.cells
+    x, y = np.meshgrid(cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)))
+    away = np.stack([np.hypot(x - v.pose.map_C[0], y - v.pose.map_C[1]) for v in views])
+    index = {v.photo: k for k, v in enumerate(views)}
+    shown = labels.photo >= 0
+    mine = np.zeros(x.shape)
+    for photo, k in index.items():
+        mine = np.where(labels.photo == photo, away[k], mine)
+    lost = (mine - away.min(0))[shown]
+    assert (lost < 0.5).mean() > 0.6 and np.percentile(lost, 90) < 8.0
+
+
+def test_tiles_continue_their_neighbours(scene, monkeypatch):
+    """Tiles of 16 cells: the same photos show nearly everywhere, and always one where there is
+    one.
+    """
+    views, pictures = scene
+    whole = SeamLines()(views, FLAT, GRID, lambda photo, side: pictures[photo], NEUTRAL)
+    again = SeamLines()(views, FLAT, GRID, lambda photo, side: pictures[photo], NEUTRAL)
+    assert np.array_equal(whole.photo, again.photo)
+    monkeypatch.setattr("skyquilt.ortho.seam_lines.TILE", 16)
+    tiled = SeamLines()(views, FLAT, GRID, lambda photo, side: pictures[photo], NEUTRAL)
+    assert np.array_equal(tiled.photo >= 0, whole.photo >= 0)
+    assert (tiled.photo == whole.photo).mean() > 0.6
+
+
+def test_what_stands_before_hides():
+    """A wall of 10 m, photographed from 40 m up and 12 m aside, hides a strip behind it: seen along
+    the ray over its top, by the intercept theorem.
+    """
+    cells = Grid(west=-30.0, north=30.0, gsd=0.25, width=240, height=240)
+    z = np.zeros((240, 240), np.float32)
+    x, y = np.meshgrid(cells.x(np.arange(240)), cells.y(np.arange(240)))
+    wall = (x > 0) & (x < 1)
+    z[wall] = 10
+    shot = view(0, -12, 0, z=40)
+    shadow = Shadow(shot, cells, z, z > 1)
+    end = -12 + 13 * 40 / 30  # the wall's far upper edge on the ground
+    rows = (np.abs(y) < 5) & (np.abs(x) < 9)
+    hidden = shadow.hides(x, y, z)
+    assert hidden[rows & (x > 1.5) & (x < end - 0.75)].all()
+    assert not hidden[rows & ((x > end + 0.75) | (x < -0.5))].any()
+    assert not hidden[rows & wall].any()
+
+
+def test_shares_of_all_photos_add_up_to_one():
+    cells = Grid(west=0, north=0, gsd=0.8, width=20, height=12)
+    rng = np.random.default_rng(2)
+    none = np.zeros((12, 20), bool)
+    photo = rng.integers(0, 3, (12, 20)).astype(np.int32)
+    labels = Labels(cells=cells, factor=8, photo=photo, hidden=none, tall=none)
+    for width in (0.0, 6.0, 30.0):
+        window = Window(row=16, column=32, height=48, width=64)
+        shares = np.stack([labels.share(k, window, width) for k in range(3)])
+        assert shares.sum(0) == pytest.approx(1, abs=1e-5)
+        near = labels.near(window, width)
+        for k in range(3):
+            where = shares[k].reshape(3, 16, 4, 16).max((1, 3)) > 0
+            assert not (where & ~near[k][1:-1, 1:-1]).any()
+
+
+def test_bare_ground_has_no_houses_and_keeps_the_slope():
+    y, x = np.mgrid[:240, :240].astype(np.float32) * 0.5
+    slope = 0.08 * x + 0.03 * y
+    z = slope.copy()
+    z[60:90, 60:100] += 7  # a house
+    z[150:200, 20:110] += 12  # a wood
+    rng = np.random.default_rng(1)
+    z += rng.normal(0, 0.05, z.shape).astype(np.float32)
+    found = bare_ground(z, np.ones(z.shape, bool), 0.5)
+    assert (found <= z + 1e-4).all()
+    assert np.percentile(np.abs(found - slope), 95) < 0.6
+    assert np.abs(found - slope)[60:90, 60:100].max() < 1.0
+
+
+def test_contours_of_a_cone_are_circles():
+    y, x = np.mgrid[:101, :101]
+    cone = (10 - 0.2 * np.hypot(x - 50, y - 50)).astype(np.float32)
+    lines = list(contour_lines(cone, 2.0))
+    assert {h for _, h in lines} >= {2.0, 4.0, 6.0, 8.0}
+    for line, height in lines:
+        if height >= 2:
+            radius = np.hypot(*(line - 50).T)
+            assert radius == pytest.approx((10 - height) / 0.2, abs=0.05)
+            assert np.array_equal(line[0], line[-1])
+
+
+def test_nothing_known_gives_no_contours():
+    z = np.full((20, 20), np.nan, np.float32)
+    z[0, 0] = 1.0
+    assert list(contour_lines(z, 0.5)) == []

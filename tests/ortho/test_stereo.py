@@ -1,0 +1,169 @@
+"""A box of known height is found; beyond the photos the surface becomes a plane."""
+
+import cv2
+import numpy as np
+import pytest
+
+from skyquilt.model.camera import Camera
+from skyquilt.model.raster import Grid
+from skyquilt.ortho.fill import filled, nearest_known, plateaus, settled
+from skyquilt.ortho.pair_matching import pair_of
+from skyquilt.ortho.stereo import Stereo
+from skyquilt.ortho.tie_surface import level
+from tests.ortho.scenes import FINE_M, GROUND, view
+
+HEIGHT, BOX = 40.0, 6.0
+"""Cameras above ground, and the box's roof above it, m."""
+WIDE = Camera(width=800, height=600, focal=700.0, cx=401.0, cy=298.0)
+HALF = 5.0
+"""Half the side of the box in m; it stands at the origin."""
+
+
+def kept(_, make):
+    return make()
+
+
+def picture(shot):
+    """The photo of level ground with a box, by casting every ray against its roof and its walls."""
+    camera = shot.camera
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    xy = np.stack(
+        [(u - camera.cx) / camera.focal, (v - camera.cy) / camera.focal, np.ones_like(u)], -1
+    )
+    d = xy.reshape(-1, 3) @ shot.pose.cam_R_map
+    cx, cy, cz = shot.pose.map_C
+    # the first height at which a ray is inside the box's walls, from the roof downwards
+    z = np.zeros(len(d))
+    for h in np.linspace(0, BOX, 61):
+        t = (h - cz) / d[:, 2]
+        inside = (np.abs(cx + t * d[:, 0]) < HALF) & (np.abs(cy + t * d[:, 1]) < HALF)
+        z = np.where(inside, h, z)
+    t = (z - cz) / d[:, 2]
+    x, y = cx + t * d[:, 0], cy + t * d[:, 1]
+    column = (x / FINE_M + GROUND.shape[1] / 2 + 37 * z / FINE_M * 0.1).astype(np.float32)
+    row = (GROUND.shape[0] / 2 - y / FINE_M + 29 * z / FINE_M * 0.1).astype(np.float32)
+    shape = (camera.height, camera.width)
+    out = cv2.remap(
+        GROUND,
+        column.reshape(shape),
+        row.reshape(shape),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REFLECT,
+    )
+    return np.clip(cv2.GaussianBlur(out, (0, 0), 0.7), 0, 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def flight():
+    places = [(-8.0, -8.0), (0.0, -8.0), (8.0, -8.0), (-8.0, 6.0), (0.0, 6.0), (8.0, 6.0)]
+    views = [
+        view(k, x, y, z=HEIGHT + 0.3 * (k % 2), camera=WIDE) for k, (x, y) in enumerate(places)
+    ]
+    pictures = {v.photo: picture(v) for v in views}
+
+    def grey(photo, longest):
+        whole = pictures[photo]
+        scale = longest / whole.shape[1]
+        return (
+            whole
+            if scale >= 1
+            else cv2.resize(whole, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        )
+
+    return views, grey
+
+
+GRID = Grid(west=-25.0, north=25.0, gsd=0.06, width=834, height=834)
+
+
+def test_a_box_stands_up(flight):
+    """Roof and ground to 15 cm, and the walls within 60 cm, which is ten map pixels."""
+    views, grey = flight
+    found = Stereo()(level(0.0), views, GRID, grey, kept)
+    x, y = np.meshgrid(np.linspace(-14, 14, 113), np.linspace(-14, 14, 113))
+    z = found.at(x, y)
+    outside = np.maximum(np.abs(x), np.abs(y)) - HALF
+    assert np.median(np.abs(z[outside < -1] - BOX)) < 0.15
+    assert (np.abs(z[outside < -1] - BOX) < 0.5).mean() > 0.98
+    assert (np.abs(z[outside > 1]) < 0.5).mean() > 0.98
+    edge = np.abs(outside) < 1.5
+    right = (z[edge] > BOX / 2) == (outside[edge] < 0)
+    off = np.abs(outside[edge])[~right]
+    assert (off < 0.6).mean() > 0.9 if len(off) else True
+    assert 0.0 < np.median(np.abs(z[outside < -1] - BOX))  # found, not given
+
+
+def test_threads_and_parts_do_not_change_the_heights(flight, monkeypatch):
+    """One thread and tiles of 64 cells: the same heights; a kept part is not matched again."""
+    views, grey = flight
+    whole = Stereo()(level(0.0), views, GRID, grey, kept)
+    monkeypatch.setattr("skyquilt.ortho.stereo.THREADS", 1)
+    monkeypatch.setattr("skyquilt.ortho.stereo.TILE", 64)
+    parts = {}
+
+    def keep(name, make):
+        return parts.setdefault(name, make()) if name not in parts else parts[name]
+
+    assert np.array_equal(Stereo()(level(0.0), views, GRID, grey, keep).z, whole.z)
+    number = len(parts)
+    assert number > 4
+
+    def never(*_):
+        raise AssertionError("matched again")
+
+    monkeypatch.setattr("skyquilt.ortho.stereo.matched_points", never)
+    assert np.array_equal(Stereo()(level(0.0), views, GRID, grey, keep).z, whole.z)
+    assert len(parts) == number
+
+
+def test_level_ground_stays_level(flight):
+    views, _ = flight
+    blank = np.full((600, 800), 90, np.uint8)
+    found = Stereo()(level(1.5), views, GRID, lambda photo, side: blank, kept)
+    assert found.z == pytest.approx(1.5, abs=0.2)
+    assert Stereo()(found, views[:1], GRID, lambda photo, side: blank, kept) is found
+
+
+def test_points_over_the_plane_lie_in_one_row():
+    """Both photos of a pair show a point in the same row, shifted by the stated disparity."""
+    a, b = view(0, -5, 0, z=40, pitch=2), view(1, 4, 3, z=41.5, roll=-3)
+    pair = pair_of(a, b, 1.0, 0.1)
+    normal = np.cross(pair.down, pair.along)
+    normal *= np.sign(normal[2])
+    for h in (-2.0, 0.0, 7.0):
+        foot = pair.places(np.array(20.0), np.array(30.0))
+        point = foot + h * normal
+        seen = []
+        for shot in (a, b):
+            c = shot.pose.map_C
+            share = ((c - pair.origin) @ normal) / ((c - point) @ normal)
+            at = c + (point - c) * share - pair.origin
+            seen.append((at @ pair.down / 0.1, at @ pair.along / 0.1))
+        assert seen[0][0] == pytest.approx(seen[1][0], abs=1e-6)
+        assert seen[0][1] - seen[1][1] == pytest.approx(pair.shift(h), abs=1e-6)
+
+
+def test_beyond_the_support_lies_the_plane():
+    """A slope of one in ten goes on as a plane, and a lone spike at its rim does not."""
+    y, x = np.mgrid[:200, :200].astype(np.float32)
+    z = 0.1 * x
+    support = x < 80
+    z[90:94, 76:80] += 8
+    noisy = np.where(support, z, 50.0).astype(np.float32)
+    out = settled(noisy, support, 0.0, 10.0)
+    assert out[:, :80] == pytest.approx(noisy[:, :80])
+    far = out[20:180, 95:120]
+    assert np.abs(far - (0.1 * x)[20:180, 95:120]).max() < 3.5
+    assert np.abs(np.diff(out[20:180, 100:], axis=1)).max() < 0.3
+
+
+def test_gaps_are_filled_from_their_sides():
+    z = np.zeros((40, 40), np.float32)
+    z[:, 20:] = 10
+    known = np.ones(z.shape, bool)
+    known[10:30, 15:25] = False
+    steep = nearest_known(np.where(known, z, -99), known)
+    assert set(np.unique(steep)) == {0.0, 10.0}
+    soft = filled(np.where(known, z, 0), known)
+    assert soft.min() >= 0 and soft.max() <= 10 and 3 < soft[20, 19] < 7
+    assert plateaus(z, 7) == pytest.approx(z, abs=0.04)
