@@ -4,8 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import simplejpeg
-
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.folder import refusal
 from skyquilt.engine.store import Store, digest
@@ -14,6 +12,7 @@ from skyquilt.model.clip import ChosenFrames, Clip, Looks
 from skyquilt.model.event import Note
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.photos.clips import frames_of
+from skyquilt.photos.frame_files import frame_jpeg
 from skyquilt.photos.survey import placed_plausibly
 from skyquilt.settings import InputSettings
 from skyquilt.video.choice import FrameChoice
@@ -97,7 +96,7 @@ def with_frames(given: SurveyInput, settings: InputSettings, store: Store) -> St
 
 
 def write_frames(output: Path, photos: Sequence[Photo], pixels: PhotoPixels) -> Steps[None]:
-    """Writes the frames among the photos to `output/frames`, as JPEG without metadata.
+    """Writes the frames among the photos to `output/frames`, as JPEG with the metadata of photos.
 
     Raises:
         OutputError: the disk is full or read-only.
@@ -108,8 +107,7 @@ def write_frames(output: Path, photos: Sequence[Photo], pixels: PhotoPixels) -> 
         path = folder / f"{photo.name}.jpg"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            data = simplejpeg.encode_jpeg(pixels(index), quality=95, colorsubsampling="444")
-            path.write_bytes(data)
+            path.write_bytes(frame_jpeg(photo, pixels(index)))
         except OSError as error:
             raise refusal(folder, error) from error
         yield done, len(frames)
