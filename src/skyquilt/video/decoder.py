@@ -53,22 +53,25 @@ class Decoder:
         """Releases the decoder."""
         self._cap.release()
 
-    def at(self, time_s: float) -> tuple[float, Frame] | None:
-        """Time in s and pixels (height, width, 3) RGB of the first frame from `time_s` on; None
-        after the last one.
+    def at(self, time_s: float, *, rgb: bool = True) -> tuple[float, Frame] | None:
+        """Time in s and pixels (height, width, 3) of the first frame from `time_s` on; None after
+        the last one. Without `rgb` they are BGR as OpenCV decodes them, which saves a copy.
         """
         near = _TOLERANCE / self.fps
         if not self._time - near <= time_s <= self._time + _AHEAD_S:
             self._seek(time_s - near)
         while self._time < time_s - near:
-            if not self._grab():
+            if not self.skip():
                 return None
         found, pixels = self._cap.retrieve()
         if not found or pixels is None:
             return None
-        return self._time, np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        if rgb:
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+        return self._time, np.asarray(pixels, dtype=np.uint8)
 
-    def _grab(self) -> bool:
+    def skip(self) -> bool:
+        """Goes on by one frame; False after the last one."""
         before = self._time
         if not self._cap.grab():
             self._time = float("inf")
@@ -84,7 +87,7 @@ class Decoder:
         while target - margin > 0:
             self._time = -1.0
             self._cap.set(cv2.CAP_PROP_POS_MSEC, 1000 * (target - margin))
-            if self._grab() and self._time <= target + 1e-9:
+            if self.skip() and self._time <= target + 1e-9:
                 return
             margin = 4 * margin + 1
         self._cap.release()
