@@ -56,7 +56,7 @@ class Bundle:
     """
     match_observations: LeastSquaresMatching | None = field(default_factory=LeastSquaresMatching)
     """Refinement of observations in larger images; None leaves keypoints unchanged."""
-    version: ClassVar[int] = 17
+    version: ClassVar[int] = 18
 
     def __call__(
         self,
@@ -203,8 +203,7 @@ def _standing(problem: Problem, state: State) -> tuple[Problem, State]:
     K = state.K.copy()
     K[:, READOUT] = problem.K0[:, READOUT]
     begin = replace(state, K=K, turn=np.zeros_like(state.turn))
-    stood = adjust(other, begin, iterations=40, tolerance=2e-5, damping=1e-6)
-    state = adjust(problem, state, iterations=20, tolerance=2e-5, damping=1e-6).state
+    stood = adjust(other, begin, iterations=10, tolerance=1e-3, damping=1e-6)
     if stood.cost < robust_cost(problem, state):
         return other, stood.state
     return problem, state
