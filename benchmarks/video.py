@@ -3,11 +3,11 @@
     python benchmarks/video.py WORK [--seeds 1,2]
     python benchmarks/video.py WORK --long 3600
 
-The first makes, for each seed, a flight of about 60 s (two lines and a turn, 1280 x 960, 5 frames/s,
-gusts that blur, MPEG-4) and prints seams of both maps, frames used against those the overlap needs,
-blurred frames among them, errors of the camera positions, and the offset found where the telemetry
-is 7 s late. The second looks through a 4K clip of that many seconds (a short one again and again)
-and prints CPU per look beside decoding, and memory.
+The first makes, for each seed, a flight of about 60 s (two lines and a turn, 1280 x 960, 5
+frames a second, gusts that blur, MPEG-4) and prints seams of both maps, frames used against
+those the overlap needs, blurred frames among them, errors of the camera positions, and the
+offset found where the telemetry is 7 s late. The second looks through a 4K clip of that many
+seconds (a short one again and again) and prints CPU per look beside decoding, and memory.
 """
 
 import argparse
