@@ -113,3 +113,20 @@ def test_a_resume_decodes_nothing(film, tmp_path, monkeypatch):
     assert [p.name for p in again.survey.photos] == names
     other = result_of(with_frames(given, replace(settings, frame_overlap=85.0), store))
     assert len(other.survey.photos) > 1.4 * len(names)
+
+
+def test_telemetry_of_another_clip_is_not_used(film, tmp_path):
+    path = tmp_path / "B.MP4"
+    path.symlink_to(film)
+    row = (
+        "{n}\n00:00:{a:02d},000 --> 00:00:{b:02d},000\n[latitude: 46.{n:06d}] [longitude: 14.3]\n\n"
+    )
+    text = "".join(row.format(n=n + 1, a=n, b=n + 1) for n in range(9))  # the clip has 24 s
+    path.with_suffix(".SRT").write_text(text)
+    settings, store = InputSettings(), Store(folder=tmp_path / "store", registry=REGISTRY)
+    found = result_of(with_frames(read_input(path, settings), settings, store))
+    assert all(p.position is None for p in found.survey.photos)
+    assert any("belongs to another clip or is torn" in n for n in found.survey.notes)
+    stated = replace(settings, clock_offset=0.0)
+    found = result_of(with_frames(read_input(path, stated), stated, store))
+    assert sum(p.position is not None for p in found.survey.photos) > 2

@@ -27,6 +27,8 @@ _REACH_S = 60.0
 _ALL_S = 1e7
 _UNLIKE = 0.35
 _MOVES_MS = 3.0
+_LEAST_SPAN = 0.6
+"""Telemetry that lasts a smaller share of its clip, or the clip of it, belongs to another one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,6 +181,18 @@ def _timed(
                 " clip, or its clock is far off, and was not used."
             ],
         )
+    if track.source == "srt" and track.on_clip:
+        told = float(track.height_time_s[-1] - track.height_time_s[0])
+        lasts = max(clip.duration_s, float(looks.time_s[-1]))
+        if not _LEAST_SPAN * lasts <= told <= lasts / _LEAST_SPAN:
+            return (
+                chosen,
+                False,
+                [
+                    f"{track.file} lasts {told:.0f} s and the clip {lasts:.0f} s: it belongs to"
+                    " another clip or is torn, and was not used. --clock-offset 0 uses it anyway."
+                ],
+            )
     inside = track.height_time_s[0] - 1 <= zero <= track.height_time_s[-1] + 1
     if not track.on_clip and (clip.start is None or not inside):
         return (
