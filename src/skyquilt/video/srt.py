@@ -54,7 +54,7 @@ class Sample:
     longitude_deg: float | None
     """WGS 84."""
     decimals: int
-    """Decimals of the longitude."""
+    """Decimals of latitude and longitude."""
     takeoff_m: float | None
     """Height above take-off."""
     sea_level_m: float | None
@@ -144,7 +144,7 @@ def _place(text: str, said: dict[str, tuple[str, float]]) -> tuple[float | None,
     """Latitude, longitude and the number of decimals."""
     far = next((said[n] for n in ("longitude", "longtitude", "longitute") if n in said), None)
     if far and "latitude" in said:
-        return _sensible(said["latitude"][1], far[1], far[0])
+        return _sensible(said["latitude"][0], far[0])
     old = _GPS.search(text)
     if not old:
         return None, None, 0
@@ -155,16 +155,16 @@ def _place(text: str, said: dict[str, tuple[str, float]]) -> tuple[float | None,
     elif abs(float(second)) > 90:
         latitude_first = True
     if latitude_first:
-        return _sensible(float(first), float(second), second)
-    return _sensible(float(second), float(first), first)
+        return _sensible(first, second)
+    return _sensible(second, first)
 
 
-def _sensible(
-    latitude: float, longitude: float, text: str
-) -> tuple[float | None, float | None, int]:
-    if abs(latitude) > 90 or abs(longitude) > 180:
+def _sensible(latitude: str, longitude: str) -> tuple[float | None, float | None, int]:
+    """Both as numbers, and the greater number of decimals: zeros at the end may be left out."""
+    if abs(float(latitude)) > 90 or abs(float(longitude)) > 180:
         return None, None, 0
-    return latitude, longitude, len(text.partition(".")[2])
+    decimals = max(len(text.partition(".")[2]) for text in (latitude, longitude))
+    return float(latitude), float(longitude), decimals
 
 
 def _gimbal(text: str, said: dict[str, tuple[str, float]]) -> tuple[float, float, float] | None:

@@ -186,7 +186,7 @@ def _read_gpx(path: Path) -> Track:
             lat, lon = node.get("lat", ""), node.get("lon", "")
             if moment is None:
                 continue
-            decimals = max(decimals, len(lon.partition(".")[2]))
+            decimals = max(decimals, *(len(v.partition(".")[2]) for v in (lat, lon)))
             fixes.append(
                 Fix(
                     time_s=moment,
@@ -288,8 +288,8 @@ def _read_csv(path: Path) -> Track:
         fixes.append(Fix(time_s=time, **values))
     if not fixes:
         raise SideFileError(f"{path.name} has no row with a time that can be read.")
-    cell = columns["longitude_deg"]
-    decimals = max(len(c[cell].partition(".")[2]) for c in table[1:] if cell < len(c))
+    cells_of = [columns["latitude_deg"], columns["longitude_deg"]]
+    decimals = max(len(c[k].partition(".")[2]) for c in table[1:] for k in cells_of if k < len(c))
     return track_of(
         fixes,
         file=path.name,
