@@ -69,6 +69,7 @@ def test_defaults_on_the_command_line_are_those_of_the_settings():
         "memory": "memory_gb",
         "relief": "relief_m",
         "contours": "contours_m",
+        "shutter_readout": "shutter_readout_ms",
     }
     defaults = dict(settings.MosaicSettings())
     named = {other_names.get(name, name): p.default for name, p in parameters.items()}

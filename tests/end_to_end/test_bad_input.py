@@ -461,7 +461,12 @@ def test_camera_aimed_at_the_horizon_by_pose(mosaic, photos):
                 b'GimbalPitchDegree="-8', b'GimbalPitchDegree="-0'
             )
         )
-    mosaic(photos, "--method", "pose").refused(2, "horizon")
+    mosaic(photos, "--method", "pose", "--max-view-angle", "20").refused(2, "no photo shows")
+    told = mosaic(photos, "--method", "pose").made()
+    low, high = 50.0, 80.0  # flown about 60 m above the ground
+    reach = high * np.tan(np.radians(70))
+    width, height = (n * told.metrics["gsd_m"] for n in told.metrics["size_px"])
+    assert low < max(width, height) < 2 * reach + 150  # the centres lie within 150 m
 
 
 # no metadata at all

@@ -42,6 +42,8 @@ IN_NO_KEY = {
     "SIGMA_YAW_DEG": "repaired metadata are in the key of the alignment, by value",
     "SIGMA_HEIGHT": "the same",
     "YAW_DEG": "conflicts are told in the report and shape nothing",
+    "CERTAIN": "conflicts are told in the report and shape nothing",
+    "CONTRADICTED_PX": "conflicts are told in the report and shape nothing",
     **dict.fromkeys(
         ("_LEAST_FOCAL", "_MOST"), "limits of files that are refused: they shape no result"
     ),

@@ -193,9 +193,7 @@ def test_views_count_the_photos(finished, shots):
     )
     off = np.abs(count.ravel().astype(int) - expected)[ok]
     assert (off == 0).mean() > 0.97
-    assert (
-        off > 1
-    ).mean() < 1e-3 and off.max() <= 2  # where the rims of two photos cross in one cell
+    assert (off > 1).mean() < 1e-3 and off.max() <= 3  # where the rims of photos cross in one cell
 
 
 # vectors and calibration

@@ -73,7 +73,7 @@ def _bordered(z: Float, known: Mask, cell: float) -> Float:
     """Heights whose unknown cells lie as low as the lowest around, so that woods at the rim end."""
     side = 2 * round(WIDEST_M / cell) + 1
     low = cv2.erode(np.where(known, z, np.inf).astype(np.float32), np.ones((side, side), np.uint8))
-    finite = np.isfinite(low)
+    finite = low < np.finfo(np.float32).max  # OpenCV gives that where no cell is known
     return np.where(known, z, filled(np.where(finite, low, 0), finite)).astype(np.float32)
 
 
