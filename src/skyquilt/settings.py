@@ -78,6 +78,14 @@ class InputSettings:
     """One of `SHUTTERS`: how the cameras expose; None = as metadata and table of cameras say."""
     shutter_readout_ms: float | None = None
     """Time in ms in which a rolling shutter reads a photo out; None = as the table says."""
+    frame_overlap: float = 75.0
+    """Overlap in percent wanted between frames that are chosen from a clip."""
+    clock_offset: float | None = None
+    """Seconds to add to a clip's time to get the time of its positions; None = found from the
+    flight's turns where possible.
+    """
+    write_frames: bool = False
+    """Write the chosen frames of clips as JPEG files."""
 
     def __post_init__(self) -> None:
         within("--max-mp", self.max_mp, 0.01, 10_000)
@@ -90,6 +98,8 @@ class InputSettings:
                 f"--shutter-readout {self.shutter_readout_ms:g} is no readout of a camera, which"
                 " takes more than 0 and at most 1000 ms; for a global shutter say --shutter global"
             )
+        within("--frame-overlap", self.frame_overlap, 30, 95)
+        within("--clock-offset", self.clock_offset, -1e8, 1e8)
         if self.shutter == "global" and self.shutter_readout_ms is not None:
             raise UsageError("--shutter global has no readout; leave --shutter-readout out")
         for value in self.lever_arm or ():

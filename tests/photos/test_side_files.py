@@ -224,7 +224,7 @@ def test_srt_by_frame_number(tmp_path, photo):
         40.5,
         "takeoff",
     )
-    assert first.angles_deg == (10, -90, 0)
+    assert first.angles_deg == pytest.approx((10, 0, 0), abs=1e-9)
     assert (second.latitude_deg, second.longitude_deg, second.altitude_m, second.datum) == (
         46.6,
         9.2,

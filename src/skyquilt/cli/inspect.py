@@ -69,8 +69,36 @@ def photo_table(survey: "Survey") -> "Table":
     return table
 
 
+def clip_table(survey: "Survey") -> "Table":
+    """One row per video clip."""
+    from rich.table import Table
+
+    table = Table(title="Videos; their frames are chosen when a map is made")
+    for heading in ("video", "start", "size", "frames", "codec"):
+        table.add_column(heading, no_wrap=True)
+    for heading in ("focal px", "readout ms", "positions", "notes"):
+        table.add_column(heading)
+    for clip in survey.clips:
+        track = clip.track
+        table.add_row(
+            clip.name,
+            clip.start.isoformat(sep=" ", timespec="seconds") if clip.start else "-",
+            f"{clip.width}x{clip.height}",
+            f"{clip.frames} in {clip.duration_s:.1f} s",
+            clip.codec,
+            f"{clip.focal.px:.0f} +- {clip.focal.sigma_px:.0f} ({clip.focal.source})",
+            f"{1000 * clip.shutter.readout_s:.0f} +- {1000 * clip.shutter.sigma_s:.0f}"
+            f" ({clip.shutter.source})",
+            f"{len(track.time_s)} ({track.file})" if track else "-",
+            " ".join(clip.notes),
+        )
+    return table
+
+
 def shared_notes(survey: "Survey") -> tuple[str, ...]:
     """Notes that all photos have."""
+    if not survey.photos:
+        return ()
     first = survey.photos[0].notes
     return tuple(n for n in first if all(n in p.notes for p in survey.photos))
 
@@ -85,7 +113,11 @@ def sentences(survey: "Survey", findings: tuple[str, ...]) -> Iterator[str]:
         yield f"Files that are no photos, ignored: {', '.join(survey.ignored)}."
     placed = sum(p.position is not None for p in survey.photos)
     turned = sum(p.attitude is not None for p in survey.photos)
-    yield f"{len(survey.photos)} photos, {placed} with a position, {turned} with camera angles."
+    if survey.photos or not survey.clips:
+        yield f"{len(survey.photos)} photos, {placed} with a position, {turned} with camera angles."
+    if survey.clips:
+        tracked = sum(c.track is not None for c in survey.clips)
+        yield f"{len(survey.clips)} videos, {tracked} with positions beside them."
 
 
 def _cells(photo: "Photo") -> tuple[str, ...]:
@@ -123,10 +155,14 @@ def _height(position: "GeoPosition | None") -> str:
 
 def command(
     photos: Annotated[
-        Path, typer.Argument(help="Folder of photos (subfolders included), or one photo.")
+        Path, typer.Argument(help="Folder of photos and videos (subfolders included), or one file.")
     ],
     geo: Annotated[
-        Path | None, typer.Option(help="Side file of positions: geo.txt, CSV, DJI .SRT or .MRK.")
+        Path | None,
+        typer.Option(
+            help="Side file of positions: geo.txt, CSV, DJI .SRT or .MRK; of videos: .SRT, GPX, a"
+            " CSV with times, or a folder of these."
+        ),
     ] = None,
     cameras: Annotated[
         Path | None, typer.Option(help="Calibrations: cameras.json of OpenDroneMap.")
@@ -134,16 +170,18 @@ def command(
     max_mp: MaxMp = MOST_MP,
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")] = False,
 ) -> None:
-    """Report the metadata of photos, and what is missing or contradictory."""
+    """Report the metadata of photos and videos, and what is missing or contradictory."""
     from skyquilt.photos.contradictions import contradictions
     from skyquilt.photos.survey import read_survey
 
-    survey = read_survey(photos, geo=geo, cameras=cameras, max_mp=max_mp)
+    survey = read_survey(photos, geo=geo, cameras=cameras, max_mp=max_mp, clips=True)
     findings = contradictions(survey.photos)
     if json:
         record = {**asdict(survey), "contradictions": findings}
         for photo in record["rejected"]:
             photo.pop("trace")
+        for clip in record["clips"]:
+            clip["track"] = clip["track"] and _summary(clip["track"])
         sys.stdout.write(json_module.dumps(record, default=str, indent=1, allow_nan=False) + "\n")
     else:
         _show(survey, findings)
@@ -155,6 +193,18 @@ def _show(survey: "Survey", findings: tuple[str, ...]) -> None:
     console = Console(soft_wrap=False)
     if not console.is_terminal:
         console = Console(width=200)  # a pipe has no width; lines should not be wrapped
-    console.print(camera_table(survey), photo_table(survey))
+    if survey.photos:
+        console.print(camera_table(survey), photo_table(survey))
+    if survey.clips:
+        console.print(clip_table(survey))
     for line in sentences(survey, findings):
         console.print(shown(line), markup=False, highlight=False)
+
+
+def _summary(track: dict[str, object]) -> dict[str, object]:
+    """A track with the number of its positions in place of these."""
+    import numpy as np
+
+    plain = {k: v for k, v in track.items() if not isinstance(v, np.ndarray)}
+    times = np.asarray(track["time_s"])
+    return plain | {"positions": len(times), "from_s": float(times[0]), "to_s": float(times[-1])}

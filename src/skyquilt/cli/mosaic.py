@@ -60,8 +60,20 @@ def command(
         Path | None,
         option(
             INPUT,
-            "Positions: geo.txt, CSV, .MRK or .SRT.",
-            default="geo.txt among the photos, if any",
+            "Positions: geo.txt, CSV, .MRK or .SRT; of videos: .SRT, GPX, a CSV with times, or a"
+            " folder of these.",
+            default="geo.txt among the photos; for videos the file beside each",
+        ),
+    ] = None,
+    frame_overlap: Annotated[
+        float, option(INPUT, "Overlap in percent wanted between frames chosen from videos.")
+    ] = 75.0,
+    clock_offset: Annotated[
+        float | None,
+        option(
+            INPUT,
+            "Seconds to add to the time in a video to get the time of its positions.",
+            default="found from the flight's turns",
         ),
     ] = None,
     cameras: Annotated[Path | None, option(INPUT, "Calibrations (cameras.json).")] = None,
@@ -219,6 +231,9 @@ def command(
             default="temperatures balanced, counts raw",
         ),
     ] = None,
+    write_frames: Annotated[
+        bool, option(FILES, "Write the frames used of videos to frames/.", "--write-frames")
+    ] = False,
     jobs: Annotated[int, option(RUN, "Threads; 0 = all processors.")] = 0,
     memory: Annotated[
         float | None, option(RUN, "Memory to stay within, in GB.", default="1.2")
@@ -230,8 +245,8 @@ def command(
         str | None,
         option(
             RUN,
-            "Make everything anew from this stage on: features, links, align, surface, balance,"
-            " seams, mosaic, measure, report.",
+            "Make everything anew from this stage on: frames (of videos), features, links, align,"
+            " surface, balance, seams, mosaic, measure, report.",
         ),
     ] = None,
     quiet: Annotated[bool, option(RUN, "Say nothing but errors.", "--quiet", "-q")] = False,
@@ -275,7 +290,7 @@ def command(
         option(POSITION, "Heading of all photos in degrees.", default="the commonest reported"),
     ] = None,
 ) -> None:
-    """Turn a folder of drone photos into a georeferenced, orthorectified mosaic.
+    """Turn a folder of drone photos and videos into a georeferenced, orthorectified mosaic.
 
     Sensible without any option. The same command again resumes a run that was killed.
     """
@@ -292,6 +307,9 @@ def command(
         method=method,
         gcp=gcp,
         geo=geo,
+        frame_overlap=frame_overlap,
+        clock_offset=clock_offset,
+        write_frames=write_frames,
         cameras=cameras,
         distances=distances,
         sequence=sequence,

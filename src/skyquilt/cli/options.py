@@ -11,7 +11,7 @@ from skyquilt.errors import UsageError
 
 Mode = Literal["quiet", "normal", "verbose", "json"]
 
-Photos = Annotated[Path, typer.Argument(help="Folder of photos (subfolders included).")]
+Photos = Annotated[Path, typer.Argument(help="Folder of photos and videos (subfolders included).")]
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")]
 Gsd = Annotated[
     float | None,

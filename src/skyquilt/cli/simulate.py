@@ -104,6 +104,22 @@ def command(
     thermal_hour: Annotated[
         float | None, typer.Option(help="solar time of the thermal flight")
     ] = None,
+    video: Annotated[
+        float | None, typer.Option(help="a clip of the flight, of so many frames per second")
+    ] = None,
+    video_seconds: Annotated[
+        float | None, typer.Option(help="the clip ends after so many seconds")
+    ] = None,
+    srt_layout: Annotated[
+        Literal["mavic3", "gimbal", "air2s", "mavic2", "p4rtk", "mavic-pro", "matrice300"] | None,
+        typer.Option(help="layout of the clip's telemetry, by the drone that writes it"),
+    ] = None,
+    srt_shift: Annotated[
+        float | None, typer.Option(help="seconds by which the telemetry is late")
+    ] = None,
+    gust_blur: Annotated[
+        float | None, typer.Option(help="blur in gusts every 20 s of the clip, px")
+    ] = None,
     drones: Annotated[int | None, typer.Option(help="flying at once")] = None,
     lose: Annotated[int | None, typer.Option(help="photos lost on the way")] = None,
     oblique: Annotated[
@@ -118,7 +134,7 @@ def command(
     ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="no progress bar")] = False,
 ) -> None:
-    """Simulate a drone survey: photos with metadata, control points, and the truth."""
+    """Simulate a drone survey: photos or a clip with metadata, control points, and the truth."""
     from skyquilt import simulate as sim
     from skyquilt.simulate.weather import Weather
 
@@ -170,6 +186,14 @@ def command(
         base, thermal, Weather(season=thermal_season or "summer", hour=thermal_hour or 13.0)
     )
     base = replace(base, seed=base.seed if seed is None else seed, lens=_lens(base, size))
+    base = _video(
+        base,
+        fps=video,
+        seconds=video_seconds,
+        layout=srt_layout,
+        shift=srt_shift,
+        gust_blur=gust_blur,
+    )
     readout = None if shutter_readout is None else shutter_readout / 1000
     base = _with(base, "lens", readout=readout, aspect=aspect)
     _show(sim.simulate(base, out, overwrite=overwrite), quiet)
@@ -197,6 +221,18 @@ def _thermal(
 
         flight = (flight or Thermal()) if wanted else None
     return replace(settings, thermal=None if flight is None else replace(flight, weather=weather))
+
+
+def _video(settings: "FlightSettings", **values: Any) -> "FlightSettings":
+    """With a clip, if `fps` is given."""
+    given = {name: value for name, value in values.items() if value is not None}
+    if "fps" not in given:
+        if given:
+            raise UsageError("options of a clip need --video FPS")
+        return settings
+    from skyquilt.simulate.settings import Video
+
+    return replace(settings, video=Video(**given))
 
 
 def _lens(settings: "FlightSettings", size: str | None) -> Any:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from skyquilt.errors import UsageError
+from skyquilt.live.clip_intake import is_clip, take_clip, unfinished_clip
 from skyquilt.live.closed_files import ClosedFiles
 from skyquilt.live.inbox import ending_of
 from skyquilt.live.ledger import hit
@@ -87,10 +88,11 @@ class Watch:
             if not known.closed and now - known.since < QUIET_S:
                 continue
             try:
-                reason = self._unfinished(Path(key))
-                if reason and now - known.since < PATIENCE_S:
+                patient = now - known.since < PATIENCE_S
+                reason = self._unfinished(Path(key), patient=patient)
+                if reason and patient:
                     continue
-                yield self._take(Path(key), key, known, reason)
+                yield from self._take(Path(key), key, known, reason)
             except FileNotFoundError:  # removed since it was seen
                 self.growing.pop(key, None)
 
@@ -107,20 +109,23 @@ class Watch:
                 known = self.growing[key] = Growing(stamp=stamp, since=now)
             known.closed |= key in closed
 
-    def _take(self, path: Path, key: str, known: Growing, reason: str) -> Accepted | Refused:
+    def _take(
+        self, path: Path, key: str, known: Growing, reason: str
+    ) -> Iterator[Accepted | Refused]:
         source = path.parent.relative_to(self.folder).as_posix()
         source = self.folder.name if source == "." else source
         if reason:
-            done: Accepted | Refused = self.intake.refuse(path.name, source, reason)
+            yield self.intake.refuse(path.name, source, reason)
+        elif is_clip(path):
+            yield from take_clip(self.intake, path, source)
         else:
-            done = self.intake.take_file(path, source)
+            yield self.intake.take_file(path, source)
         self.growing.pop(key, None)
         self._seen[_stored(key)] = known.stamp
         with self.intake.ledger.change() as db:
             row = (_stored(key), *known.stamp)
             db.execute("insert or replace into seen values (?, ?, ?)", row)
         hit("folder seen")
-        return done
 
     def _candidates(
         self, closed: set[str], *, everything: bool, now: float
@@ -138,8 +143,10 @@ class Watch:
             folders[:] = [f for f in folders if not f.startswith(".")]
             yield from (here / name for name in names if _photo_name(name))
 
-    def _unfinished(self, path: Path) -> str:
+    def _unfinished(self, path: Path, *, patient: bool) -> str:
         """Why a file cannot be taken (yet); empty where it can. Raises `FileNotFoundError`."""
+        if is_clip(path):
+            return unfinished_clip(path, patient=patient)
         most = self.intake.settings.most_bytes
         try:
             with open_regular(path) as file:
@@ -165,7 +172,8 @@ def _stored(key: str) -> str:
 
 def _photo_name(name: str) -> bool:
     low = name.lower()
-    return not low.startswith(".") and low.endswith(ENDINGS) and not low.endswith(PARTIAL)
+    taken = low.endswith(ENDINGS) or is_clip(Path(low))
+    return not low.startswith(".") and taken and not low.endswith(PARTIAL)
 
 
 def _stamp(path: Path) -> Stamp | None:

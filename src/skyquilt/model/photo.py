@@ -3,9 +3,12 @@
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from skyquilt.model.camera import Camera
+
+if TYPE_CHECKING:
+    from skyquilt.model.clip import Clip
 
 Datum = Literal["takeoff", "sea_level", "egm96", "ellipsoid", "control", "unknown"]
 """What a height refers to; `egm96`: the geoid; `sea_level`: sea level as the device defines it;
@@ -38,7 +41,7 @@ class GeoPosition:
     sigma_z_m: float = 3.0
     """Standard deviation of the height in m."""
     source: str = "exif"
-    """Where it was read: `xmp`, `exif`, `geo.txt`, `csv`, `srt`, `mrk`."""
+    """Where it was read: `xmp`, `exif`, `geo.txt`, `csv`, `srt`, `mrk`, `gpx`."""
     takeoff_m: float | None = None
     """Height above take-off in m, where given."""
     sea_level_m: float | None = None
@@ -159,6 +162,8 @@ class Photo:
     """Velocity of the aircraft as reported, north, east and down in m/s."""
     editor: str | None = None
     """Software that rewrote the file after the camera, where the metadata name one."""
+    frame_s: float | None = None
+    """Time in s of the frame in the clip that `path` is; None where `path` is a photo."""
     notes: tuple[str, ...] = ()
     """Plain sentences: what is missing, invalid or contradictory."""
 
@@ -184,7 +189,9 @@ class Survey:
     rejected: tuple[RejectedPhoto, ...] = ()
     """Image files that could not be used, with reasons."""
     ignored: tuple[str, ...] = ()
-    """Names of files that are no photos (text, video, archives) and are not read."""
+    """Names of files that are no photos (text, archives) and are not read."""
+    clips: "tuple[Clip, ...]" = ()
+    """Clips whose frames are still to be chosen."""
     notes: tuple[str, ...] = ()
     """Plain sentences about the survey as a whole (two cameras, different clocks, duplicates
     ...).

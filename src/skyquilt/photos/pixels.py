@@ -20,6 +20,7 @@ from skyquilt.outside import open_regular
 from skyquilt.photos.headers import read_header
 from skyquilt.photos.tags import MAKE
 from skyquilt.photos.thermal import thermal_frame_of_jpeg, thermal_frame_of_values
+from skyquilt.video.decoder import frame_of
 
 Pixels = NDArray[Any]
 Reduction = Literal[1, 2, 4, 8]
@@ -97,6 +98,9 @@ def _decode(photo: Photo, reduction: Reduction, *, gray: bool) -> Pixels:
     """Decodes the file. Its size was checked when its header was read, and is compared with that
     before anything is allocated: the file may have been replaced.
     """
+    if photo.frame_s is not None:
+        pixels = frame_of(photo.path, photo.frame_s)
+        return reduce_pixels(to_gray(pixels) if gray else pixels, reduction)
     size = (photo.width, photo.height)
     with open_regular(photo.path) as file:
         head = file.read(4)

@@ -12,6 +12,7 @@ from skyquilt.errors import NoPhotosError, UsageError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
 from skyquilt.outside import MOST_MP, plain, walk
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
+from skyquilt.photos.clips import is_timed, read_clips
 from skyquilt.photos.implausible_positions import (
     without_ground_heights,
     without_outliers,
@@ -20,6 +21,7 @@ from skyquilt.photos.implausible_positions import (
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
+from skyquilt.video.read import CLIP_ENDINGS, side_files
 
 _PHOTO_ENDINGS = frozenset({".jpg", ".jpeg", ".tif", ".tiff", ".png"})
 _RUN_MARK = "run.toml"
@@ -33,6 +35,8 @@ class FoundFiles:
 
     photos: tuple[tuple[str, Path], ...]
     """Name in the survey and file, sorted by name."""
+    clips: tuple[tuple[str, Path], ...]
+    """The same of video clips."""
     ignored: tuple[str, ...]
     """Names of all other files."""
     geo: Path | None
@@ -80,7 +84,8 @@ def _listed(paths: Sequence[Path]) -> FoundFiles:
     """
     files: list[Path] = []
     for path in paths:
-        files += [p for _, p in _in_folder(path).photos] if path.is_dir() else [path]
+        inside = _in_folder(path) if path.is_dir() else None
+        files += [p for _, p in (*inside.photos, *inside.clips)] if inside else [path]
     unique = list(dict.fromkeys(p.absolute() for p in files))
     top = Path(os.path.commonpath([p.parent for p in unique])) if unique else Path()
     bare = len({p.name for p in unique}) == len(unique)
@@ -100,9 +105,17 @@ def _sorted(
     files: Sequence[tuple[str, Path]], geo: Path | None, runs: tuple[str, ...]
 ) -> FoundFiles:
     photos = sorted((n, p) for n, p in files if p.suffix.lower() in _PHOTO_ENDINGS)
-    known = {n for n, _ in photos}
-    ignored = sorted(n for n, p in files if n not in known and p.name.lower() not in _SIDE_NAMES)
-    return FoundFiles(photos=tuple(photos), ignored=tuple(ignored), geo=geo, runs=runs)
+    clips = sorted((n, p) for n, p in files if p.suffix.lower() in CLIP_ENDINGS)
+    known = {n for n, _ in (*photos, *clips)}
+    beside = {p for _, clip in clips for p in side_files(clip)}
+    ignored = sorted(
+        n
+        for n, p in files
+        if n not in known and p.name.lower() not in _SIDE_NAMES and p not in beside
+    )
+    return FoundFiles(
+        photos=tuple(photos), clips=tuple(clips), ignored=tuple(ignored), geo=geo, runs=runs
+    )
 
 
 def read_survey(
@@ -111,6 +124,7 @@ def read_survey(
     geo: Path | None = None,
     cameras: Path | None = None,
     thermal_unit: str | None = None,
+    clips: bool = False,
     max_mp: float = MOST_MP,
 ) -> Survey:
     """All photos below a folder (or those given) in order of capture, without decoding their
@@ -119,8 +133,10 @@ def read_survey(
     `geo` is a side file of positions (`geo.txt`, CSV, `.SRT`, `.MRK`); without one, a `geo.txt` at
     the top of the folder is used. `cameras` is a `cameras.json`, `thermal_unit` as in `read_photo`,
     `max_mp` the largest area of a photo in megapixels.
-    A bad photo becomes a `RejectedPhoto`. Raises `UsageError` for a folder that does not exist,
-    `NoPhotosError` where no photo can be read, `SideFileError` for a bad side file.
+    With `clips`, video clips are read too, and timed positions in `geo` (or a folder of such files)
+    are those of the clips. A bad photo becomes a `RejectedPhoto`. Raises `UsageError` for a folder
+    that does not exist, `NoPhotosError` where no photo can be read, `SideFileError` for a bad side
+    file.
     """
     found = find_files(folder)
     read = [
@@ -128,32 +144,36 @@ def read_survey(
         for name, path in found.photos
     ]
     rejected = [p for p in read if isinstance(p, RejectedPhoto)]
+    films, more_rejected = read_clips(found.clips, geo) if clips else ((), ())
+    rejected += more_rejected
     photos, copies = _without_copies(p for p in read if isinstance(p, Photo))
-    if not photos:
-        raise NoPhotosError(_nothing_sentence(folder, found, rejected))
+    if not photos and not films:
+        raise NoPhotosError(_nothing_sentence(folder, found, rejected, clips=clips))
     notes: tuple[str, ...] = ()
     side = geo or found.geo
-    if side:
+    if side and photos and not (films and is_timed(side)):
         photos, notes = apply_positions(photos, side)
     if cameras:
         photos, more = apply_cameras(photos, read_cameras_json(cameras), file=cameras)
         notes = (*notes, *more)
-    photos, grounded = without_ground_heights(sorted(photos, key=capture_order))
-    photos, stuck = without_stuck(photos)
-    photos, far = without_outliers(photos)
+    photos, implausible = placed_plausibly(photos)
     return Survey(
         photos=photos,
         rejected=tuple(sorted((*rejected, *copies), key=lambda r: r.name)),
-        ignored=found.ignored,
-        notes=(
-            *notes,
-            *_run_notes(found),
-            *grounded,
-            *stuck,
-            *far,
-            *survey_notes(photos, len(copies)),
-        ),
+        ignored=found.ignored
+        if clips
+        else tuple(sorted((*found.ignored, *(n for n, _ in found.clips)))),
+        clips=films,
+        notes=(*notes, *_run_notes(found), *implausible, *survey_notes(photos, len(copies))),
     )
+
+
+def placed_plausibly(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    """Photos in order of capture, without positions that cannot be right, and notes on these."""
+    ordered, grounded = without_ground_heights(sorted(photos, key=capture_order))
+    ordered, stuck = without_stuck(ordered)
+    ordered, far = without_outliers(ordered)
+    return ordered, (*grounded, *stuck, *far)
 
 
 def capture_order(photo: Photo) -> tuple[bool, datetime, str]:
@@ -179,19 +199,24 @@ def _run_notes(found: FoundFiles) -> tuple[str, ...]:
 
 
 def _nothing_sentence(
-    folder: Path | Sequence[Path], found: FoundFiles, rejected: Sequence[RejectedPhoto]
+    folder: Path | Sequence[Path],
+    found: FoundFiles,
+    rejected: Sequence[RejectedPhoto],
+    *,
+    clips: bool,
 ) -> str:
     where = str(folder) if isinstance(folder, (str, Path)) else f"the {len(folder)} given files"
     if rejected:
         reasons = "; ".join(f"{r.name}: {r.reason}" for r in rejected[:5])
         return (
-            f"None of the {len(rejected)} image files in {where} can be read ({reasons}). Copy"
-            " them again."
+            f"None of the {len(rejected)} {'image and video' if found.clips else 'image'} files in"
+            f" {where} can be read ({reasons}). Copy them again."
         )
-    held = f"only other files ({sentence_of(found.ignored)})" if found.ignored else "nothing"
+    others = (*found.ignored, *(n for n, _ in found.clips)) if not clips else found.ignored
+    held = f"only other files ({sentence_of(others)})" if others else "nothing"
     return (
         f"There is no photo in {where}: it contains {held}. Choose a folder of JPEG, TIFF or PNG"
-        " photos."
+        f" photos{' or of videos' if clips else ''}."
     )
 
 
@@ -239,7 +264,7 @@ def _thermal_units(photos: Sequence[Photo]) -> Iterator[str]:
 
 def _gaps(photos: Sequence[Photo]) -> Iterator[str]:
     void = [p.name for p in photos if p.position is None]
-    if void:
+    if void and photos:
         which = (
             "No photo has"
             if len(void) == len(photos)
@@ -248,7 +273,7 @@ def _gaps(photos: Sequence[Photo]) -> Iterator[str]:
         yield f"{which} a usable GPS position" + (
             f": {sentence_of(void)}." if len(void) < len(photos) else "."
         )
-    if all(p.attitude is None for p in photos):
+    if photos and all(p.attitude is None for p in photos):
         yield "No photo has camera angles."
     guessed = sorted({p.camera_key for p in photos if p.focal.source == "guess"})
     if guessed:

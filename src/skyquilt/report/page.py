@@ -10,6 +10,7 @@ from markupsafe import Markup
 
 from skyquilt.errors import OutputError
 from skyquilt.report import headline
+from skyquilt.report.clips import clips_section
 from skyquilt.report.effort import time_section
 from skyquilt.report.ground import ground_of
 from skyquilt.report.input import ReportInput
@@ -47,6 +48,7 @@ def build_report(data: ReportInput) -> str:
         *values_section(data),
         surface_section(data, ground, named),
         quality_section(data),
+        *clips_section(data),
         calibration_section(data),
         control_section(data),
         conflicts_section(data),

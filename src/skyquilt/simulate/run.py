@@ -17,11 +17,20 @@ from skyquilt.simulate.ground import Ground
 from skyquilt.simulate.noise import Noise
 from skyquilt.simulate.reported import Place, Report, Start, place_at, report_all
 from skyquilt.simulate.scene import Country, Scene, empty_scene
-from skyquilt.simulate.settings import FlightSettings, Thermal
-from skyquilt.simulate.truth import Taken, covered, write_rasters, write_thermal, write_truth
+from skyquilt.simulate.settings import FlightSettings, Thermal, Video
+from skyquilt.simulate.truth import (
+    Taken,
+    TakenClip,
+    covered,
+    write_rasters,
+    write_thermal,
+    write_truth,
+)
+from skyquilt.simulate.video import ClipWriter, film, gusts, pictures_of, telemetry
 from skyquilt.simulate.weather import Weather
 
-_OURS = ("photos", "thermal", "truth", "gcp_list.txt")
+_SMOOTH_S = 30.0
+_OURS = ("photos", "thermal", "video", "truth", "gcp_list.txt")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +38,7 @@ class Progress:
     """Progress of the simulation."""
 
     stage: str
-    """`terrain`, `photos`, `thermal terrain`, `thermal` or `truth`."""
+    """`terrain`, `photos`, `video`, `thermal terrain`, `thermal` or `truth`."""
     done: int
     """Steps done in this stage."""
     total: int
@@ -66,6 +75,8 @@ class World:
     """The main flight."""
     thermal: Flight | None
     """The thermal flight."""
+    video: Flight | None
+    """The frames of the clip."""
 
 
 def prepare(settings: FlightSettings, waypoints: list[Waypoint] | None = None) -> World:
@@ -86,8 +97,13 @@ def prepare(settings: FlightSettings, waypoints: list[Waypoint] | None = None) -
         if settings.thermal
         else None
     )
+    video = (
+        _video_flight(settings, settings.video, points, place, start) if settings.video else None
+    )
     country = Country(
-        settings=settings.scene, bounds=_bounds(settings, [visible, thermal]), seed=settings.seed
+        settings=settings.scene,
+        bounds=_bounds(settings, [visible, thermal, video]),
+        seed=settings.seed,
     )
     reach = (
         0.3
@@ -103,7 +119,25 @@ def prepare(settings: FlightSettings, waypoints: list[Waypoint] | None = None) -
         country=replace(country, targets=targets),
         visible=visible,
         thermal=thermal,
+        video=video,
     )
+
+
+def _video_flight(
+    settings: FlightSettings, video: Video, points: list[Waypoint], place: Place, start: Start
+) -> Flight:
+    """The same flight filmed: errors of consecutive positions are alike, as receivers smooth."""
+    shots = film(points, settings, video, start.takeoff)
+    reporting = settings.reporting
+    reporting = replace(
+        reporting,
+        gps_correlation=max(reporting.gps_correlation, _SMOOTH_S),
+        barometer_noise=0.0,
+        yaw_lie="none",
+        dewarp=None,
+    )
+    reports = report_all(shots, reporting, place, start, settings.lens, settings.seed + 2)
+    return Flight(lens=settings.lens, shots=shots, reports=reports)
 
 
 def _thermal_flight(
@@ -194,11 +228,21 @@ def _write(world: World, output: Path) -> Iterator[Progress]:
         write_gcp_list(output / "gcp_list.txt", world.place.crs, points, seen)
     part = covered(scene.grid, visible.lens, visible.shots, 0.0)
     write_rasters(output / "truth", scene, part, world.place, world.start.base)
+    clips = []
+    if world.video is not None and settings.video is not None:
+        clips.append((yield from _roll(world, world.video, settings.video, scene, output)))
     del scene
     if world.thermal is not None and settings.thermal is not None:
         taken += yield from _film(world, world.thermal, settings.thermal, output)
     write_truth(
-        output / "truth" / "truth.json", settings, world.place, world.start, taken, points, seen
+        output / "truth" / "truth.json",
+        settings,
+        world.place,
+        world.start,
+        taken,
+        points,
+        seen,
+        clips,
     )
     yield Progress(stage="truth", done=1, total=1)
 
@@ -245,6 +289,36 @@ def _photograph(world: World, scene: Scene, output: Path) -> Generator[Progress,
         )
         yield Progress(stage="photos", done=number + 1, total=len(flight.shots), name=name)
     return taken
+
+
+def _roll(
+    world: World, flight: Flight, video: Video, scene: Scene, output: Path
+) -> Generator[Progress, None, TakenClip]:
+    """Films and writes the clip and its telemetry; returns what was taken."""
+    folder, settings = output / "video", world.settings
+    folder.mkdir(exist_ok=True)
+    camera = exposer(scene, flight.lens)
+    times = np.array([s.waypoint.time for s in flight.shots])
+    windy = gusts(times, video, settings.seed)
+    path = folder / "FLIGHT.MP4"
+    writer = ClipWriter(path=path, fps=video.fps, lens=flight.lens)
+    try:
+        for number, shot in enumerate(flight.shots):
+            rng = np.random.default_rng([settings.seed, 53, number])
+            pictures = pictures_of(settings, video, gust=bool(windy[number])).pictures
+            writer.write(camera.visible(shot, pictures, 1.0, rng))
+            yield Progress(
+                stage="video", done=number + 1, total=len(flight.shots), name=f"{number:06d}"
+            )
+    finally:
+        writer.close()
+    text = telemetry(flight.reports, times, video, flight.lens, settings.weather.moment)
+    path.with_suffix(".SRT").write_text(text, encoding="utf-8")
+    frames = [
+        Taken(shot=s, report=r, band="visible", file="video/FLIGHT.MP4", exposure=1.0)
+        for s, r in zip(flight.shots, flight.reports, strict=True)
+    ]
+    return TakenClip(file="video/FLIGHT.MP4", fps=video.fps, frames=frames, blurred=windy.tolist())
 
 
 def _moment(world: World, shot: Shot) -> Weather | None:

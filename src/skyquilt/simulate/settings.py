@@ -165,6 +165,33 @@ class Thermal:
     """Standard deviation per pixel, K."""
 
 
+SrtLayout = Literal["mavic3", "gimbal", "air2s", "mavic2", "p4rtk", "mavic-pro", "matrice300"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Video:
+    """A clip of the whole flight, turns included."""
+
+    fps: float = 5.0
+    """Frames per second."""
+    seconds: float | None = None
+    """The clip ends after so many seconds; None = at the last waypoint."""
+    layout: SrtLayout = "mavic3"
+    """Layout of the telemetry, by a drone that writes it so; `gimbal`: `mavic3` with the gimbal's
+    angles.
+    """
+    shift: float = 0.0
+    """Seconds by which the telemetry's times are late against the pictures."""
+    fixes_per_second: float = 2.0
+    """How often the receiver measures; its last fix is repeated in between."""
+    gust_every: float = 20.0
+    """A gust in every so many seconds."""
+    gust_seconds: float = 1.2
+    """Its duration."""
+    gust_blur: float = 0.0
+    """Length of the blur in a gust, px; 0 = no gusts."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class FlightSettings:
     """A whole simulated survey; equal settings give equal bytes."""
@@ -187,6 +214,8 @@ class FlightSettings:
     """Targets on the ground."""
     thermal: Thermal | None = None
     """The thermal flight, if there is one."""
+    video: Video | None = None
+    """The clip, if there is one."""
     gsd: float | None = None
     """Cell size of the terrain's raster, m; the nominal ground resolution of the photos where
     None.
@@ -276,4 +305,16 @@ def _other_rules(settings: FlightSettings) -> _Rules:
         ),
         (0 <= pictures.sun_hours <= 12, "the sun must move by 0 to 12 hours"),
         (0 <= pictures.motion_blur <= 100, "motion blur must be 0 to 100 px"),
+        (
+            settings.video is None or 0.2 <= settings.video.fps <= 120,
+            "a clip has 0.2 to 120 frames per second",
+        ),
+        (
+            settings.video is None or 0 <= settings.video.gust_blur <= 100,
+            "a gust's blur must be 0 to 100 px",
+        ),
+        (
+            settings.video is None or settings.route.drones == 1,
+            "a clip is filmed by one drone; leave --drones out",
+        ),
     ]

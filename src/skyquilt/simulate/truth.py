@@ -40,6 +40,20 @@ class Taken:
     """Brightness factor (visible), or offset in K (thermal)."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class TakenClip:
+    """A clip with the truth of each frame."""
+
+    file: str
+    """Path below the output folder."""
+    fps: float
+    """Frames per second."""
+    frames: Sequence[Taken]
+    """In order of time."""
+    blurred: Sequence[bool]
+    """Whether a gust blurred the frame."""
+
+
 def write_truth(
     path: Path,
     settings: FlightSettings,
@@ -48,6 +62,7 @@ def write_truth(
     taken: Sequence[Taken],
     points: Sequence[Surveyed],
     seen: Sequence[Observation],
+    clips: Sequence["TakenClip"] = (),
 ) -> None:
     """Writes `truth.json`: everything that is needed to check an adjustment."""
     lenses = {"visible": settings.lens}
@@ -73,6 +88,17 @@ def write_truth(
         "cameras": cameras,
         "photos": [_photo(t, place, start) for t in taken],
         "control_points": [_point(p, seen) for p in points],
+        "clips": [
+            {
+                "file": clip.file,
+                "fps": clip.fps,
+                "frames": [
+                    {**_photo(t, place, start), "name": t.shot.name, "blurred": blurred}
+                    for t, blurred in zip(clip.frames, clip.blurred, strict=True)
+                ],
+            }
+            for clip in clips
+        ],
     }
     path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
 

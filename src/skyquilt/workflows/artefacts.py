@@ -1,6 +1,6 @@
 """What the store of a run may hold."""
 
-from skyquilt.model import camera, features, poses, raster, surface
+from skyquilt.model import camera, clip, features, poses, raster, surface
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.ortho import companions
 from skyquilt.workflows.photo_features import PhotoFeatures
@@ -9,6 +9,7 @@ REGISTRY = {
     c.__name__: c
     for c in (
         PhotoFeatures,
+        clip.Looks,
         features.Features,
         features.Link,
         features.RejectedLink,

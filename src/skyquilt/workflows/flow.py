@@ -32,6 +32,7 @@ from skyquilt.ortho.radiometry import balanced
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import rejected
 from skyquilt.settings import MosaicSettings
+from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.links import Links, link_photos
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import (
@@ -110,6 +111,20 @@ class DrawnMap:
     """The additional rasters: provenance, views, preview."""
 
 
+def frames_added(
+    given: SurveyInput, settings: MosaicSettings, clock: Clock
+) -> Generator[Event, None, SurveyInput]:
+    """The survey with frames of its clips among its photos; unchanged if there are no clips.
+
+    Raises:
+        NoPhotosError: no clip has a frame, and there are no photos.
+    """
+    if not given.survey.clips:
+        return given
+    steps = with_frames(given, settings.input, clock.store)
+    return (yield from clock.stage("frames", steps))
+
+
 def align_photos(
     given: SurveyInput, methods: Methods, settings: MosaicSettings, clock: Clock
 ) -> Generator[Event, None, AlignedPhotos]:
@@ -120,6 +135,7 @@ def align_photos(
         AlignmentError: the method cannot place the photos.
     """
     store, jobs = clock.store, settings.running.threads
+    given = yield from frames_added(given, settings, clock)
     photos = given.survey.photos
     cache = PixelCache(
         read=lambda i: read_color(photos[i]), budget_bytes=pixel_budget(settings.running.memory_gb)

@@ -2,6 +2,8 @@
 
     read -> features -> links -> align -> surface -> balance -> mosaic -> measure -> report
 
+with `frames` after `read` where there are clips.
+
 Start reading at `make_map`. Its steps are those of `skyquilt.workflows.flow`.
 """
 
@@ -24,6 +26,7 @@ from skyquilt.model.photo import RejectedPhoto
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.orthomosaic import SPOOL
 from skyquilt.ortho.radiometry import value_figures
+from skyquilt.quality.clip_figures import clip_figures
 from skyquilt.quality.placement import placement_quality
 from skyquilt.quality.run_metrics import figures
 from skyquilt.quality.seam_measurement import MeasuredSeams, measure_seams
@@ -31,6 +34,7 @@ from skyquilt.quality.tone import tone_residual
 from skyquilt.settings import MosaicSettings
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
+from skyquilt.workflows.clip_frames import frame_methods, write_frames
 from skyquilt.workflows.flow import (
     AlignedPhotos,
     DrawnMap,
@@ -38,6 +42,7 @@ from skyquilt.workflows.flow import (
     align_photos,
     draw_map,
     find_ground,
+    frames_added,
     scene_of,
 )
 from skyquilt.workflows.methods import Methods, methods_for
@@ -46,6 +51,7 @@ from skyquilt.workflows.survey_input import Source, SurveyInput, check_input, re
 
 STAGES = (
     "read",
+    "frames",
     "features",
     "links",
     "align",
@@ -58,6 +64,7 @@ STAGES = (
 )
 """Stages in order."""
 ARTEFACTS = {
+    "frames": "looks",
     "features": "features",
     "read": "pictures",
     "links": "links",
@@ -168,6 +175,7 @@ def make_map(
     clock = Clock(store=store, began=began)
     clock.lap("read", began)
     yield from (Note(text=n) for n in given.survey.notes)
+    given = yield from frames_added(given, settings, clock)
     _log(run.path, given.survey.rejected)
     metrics, given = yield from _without_bad(given, run.path, key, settings, methods, clock)
     run.mark("done")
@@ -225,6 +233,9 @@ def _made(
     _log(output, aligned.found.rejected)
     ground = yield from find_ground(aligned, methods, settings, clock)
     drawn = yield from draw_map(aligned, ground, methods, settings, clock, output, key)
+    if settings.input.write_frames:
+        writing = write_frames(output, aligned.photos, aligned.pixels)
+        yield from clock.stage("write frames", writing, keeps=False)
     measuring = _measured(aligned, ground, drawn, settings)
     seams, quality = yield from clock.stage("measure", measuring, keeps=False)
     metrics = _metrics(aligned, ground, drawn, seams, settings) | {"quality": quality}
@@ -254,7 +265,15 @@ def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> s
         (p.name, p.digest, p.position, p.attitude, p.focal, p.calibration)
         for p in given.survey.photos
     ]
-    return digest(photos, list(given.control), shaping, side, methods, make_map, __version__)
+    films = [
+        (c.name, c.digest, c.track and c.track.digest, c.start and c.start.isoformat(), c.focal)
+        for c in given.survey.clips
+    ]
+    if films:  # control points are read when the frames are known
+        gcp = settings.input.gcp or Path(str(given.source)) / "gcp_list.txt"
+        side += [gcp.read_bytes().hex()] if gcp.is_file() else []
+        films.append(frame_methods(settings.input))  # type: ignore[arg-type]
+    return digest(photos, films, list(given.control), shaping, side, methods, make_map, __version__)
 
 
 def _measured(
@@ -304,6 +323,7 @@ def _metrics(
                 aligned.photos, aligned.given.control, alignment.frame.vertical_datum
             )
         }
+        | clip_figures(aligned.given.clips)
         | value_figures(aligned.photos, map_.exposure, settings.picture)
     )
 

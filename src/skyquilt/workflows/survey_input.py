@@ -6,6 +6,7 @@ from pathlib import Path
 
 from skyquilt.alignment.priors import choose_frame
 from skyquilt.errors import UsageError
+from skyquilt.model.clip import ChosenFrames
 from skyquilt.model.photo import (
     ControlPoint,
     KnownDistance,
@@ -22,7 +23,7 @@ from skyquilt.photos.survey import read_survey
 from skyquilt.settings import InputSettings, MosaicSettings
 
 Source = Path | Sequence[Path]
-"""A folder of photos, or photos."""
+"""A folder of photos and clips, or such files."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,6 +40,8 @@ class SurveyInput:
     """Known distances, to check the map."""
     rank: dict[str, int]
     """Position of each photo, by name, in the order in which photos are joined."""
+    clips: tuple[ChosenFrames, ...] = ()
+    """How frames were chosen from clips."""
 
     @property
     def title(self) -> str:
@@ -84,10 +87,26 @@ def read_input(source: Source | str, settings: InputSettings) -> SurveyInput:
         cameras=settings.cameras,
         thermal_unit=settings.thermal_unit,
         max_mp=settings.max_mp,
+        clips=True,
     )
     shutter = stated_shutter(settings.shutter, settings.shutter_readout_ms)
     if shutter is not None:
-        survey = replace(survey, photos=tuple(replace(p, shutter=shutter) for p in survey.photos))
+        survey = replace(
+            survey,
+            photos=tuple(replace(p, shutter=shutter) for p in survey.photos),
+            clips=tuple(replace(c, shutter=shutter) for c in survey.clips),
+        )
+    given = SurveyInput(source=source, survey=survey, control=(), distances=(), rank={})
+    return given if survey.clips else completed(given, settings)
+
+
+def completed(given: SurveyInput, settings: InputSettings) -> SurveyInput:
+    """The input with all that names photos, once all photos are known.
+
+    Raises:
+        SideFileError: a side file is malformed.
+    """
+    survey, source = given.survey, given.source
     if settings.lever_arm is not None:
         photos, notes = with_lever_arm(survey.photos, settings.lever_arm)
         survey = replace(survey, photos=photos, notes=(*survey.notes, *notes))
@@ -99,12 +118,12 @@ def read_input(source: Source | str, settings: InputSettings) -> SurveyInput:
     if gcp is not None:
         control, notes = read_gcp_list(gcp, names)
         survey = replace(survey, notes=(*survey.notes, *notes))
-    given = settings.distances
-    return SurveyInput(
-        source=source,
+    known = settings.distances
+    return replace(
+        given,
         survey=survey,
         control=control,
-        distances=() if given is None else read_distances(given, names, control),
+        distances=() if known is None else read_distances(known, names, control),
         rank={names[i]: k for k, i in enumerate(sequence_of(names, settings.sequence))},
     )
 
@@ -125,7 +144,7 @@ def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> N
     frame = choose_frame(
         given.survey.photos, settings.picture.crs, given.control, settings.picture.vertical_datum
     )
-    if settings.picture.boundary is not None:
+    if settings.picture.boundary is not None and not given.survey.clips:
         if frame.crs is None:
             raise UsageError(
                 "--boundary needs a georeferenced survey, and these photos have no positions;"

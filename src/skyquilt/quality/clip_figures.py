@@ -1,0 +1,45 @@
+"""The figures of clips: which frames were chosen, and why."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from skyquilt.model.clip import ChosenFrame, ChosenFrames
+
+
+def clip_figures(clips: Sequence[ChosenFrames]) -> dict[str, Any]:
+    """`clips` of metrics.json; empty where there are none."""
+    return {"clips": [_clip(c) for c in clips]} if clips else {}
+
+
+def _clip(clip: ChosenFrames) -> dict[str, Any]:
+    overlaps = [f.overlap for f in clip.chosen if np.isfinite(f.overlap)]
+    return {
+        "name": clip.clip,
+        "frames_looked_at": clip.looked,
+        "frames_chosen": len(clip.chosen),
+        "frames_with_position": clip.placed,
+        "blurred": clip.blurred,
+        "standing_still": clip.still,
+        "overlap_wanted": clip.overlap,
+        "overlap_median": round(float(np.median(overlaps)), 4) if overlaps else None,
+        "clock_offset_s": round(clip.offset_s, 3),
+        "clock_offset_sigma_s": _rounded(clip.offset_sigma_s),
+        "clock_offset_source": clip.offset_source,
+        "frames": [_frame(clip, f) for f in clip.chosen],
+    }
+
+
+def _frame(clip: ChosenFrames, frame: ChosenFrame) -> dict[str, Any]:
+    return {
+        "name": clip.name(frame),
+        "time_s": round(frame.time_s, 4),
+        "overlap": _rounded(frame.overlap),
+        "sharpness": round(frame.sharp, 3),
+        "why": frame.reason,
+    }
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else round(value, 4)

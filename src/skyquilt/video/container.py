@@ -1,0 +1,89 @@
+"""What the boxes of an MP4 or MOV file say, which OpenCV does not tell: ISO/IEC 14496-12."""
+
+import io
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import BinaryIO
+
+from skyquilt.outside import open_regular
+
+_INSIDE = (b"moov", b"trak", b"mdia", b"udta", b"meta", b"ilst")
+_MOST_BOXES = 4000
+_MODEL = re.compile(rb"(?:DJI|FC|Hasselblad|Autel|Parrot|GoPro|HERO)[ -~]{0,30}")
+_SURE = re.compile(r"^(FC\d{3,4}\w?|DJI ?[A-Za-z0-9 ]{3,25}|L[12]D-20c|HERO\d+ .{3,10})$")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Container:
+    """The header of an MP4 or MOV file."""
+
+    whole: bool
+    """Whether it has an index (`moov`); a recording that was cut off has none."""
+    kinds: tuple[str, ...]
+    """Handlers of its tracks: `vide`, `soun`, `text`, `meta` ..."""
+    created: datetime | None
+    """When it was made, UTC."""
+    model: str
+    """Camera model as some makers write it; empty where there is none."""
+
+
+def read_container(path: Path) -> Container | None:
+    """The header of a clip; None where the file is no MP4 or MOV. Raises `OSError`."""
+    with open_regular(path) as file:
+        if file.read(12)[4:8] not in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip"):
+            return None
+        size = file.seek(0, io.SEEK_END)
+        kinds: list[str] = []
+        created, whole, model = None, False, ""
+        for name, body, length in _boxes(file, 0, size):
+            whole |= name == b"moov"
+            file.seek(body)
+            if name == b"hdlr":
+                kinds.append(file.read(min(length, 12))[8:12].decode("latin-1"))
+            elif name == b"mvhd":
+                created = _created(file.read(min(length, 20)))
+            elif name == b"udta" and not model:
+                model = _model(file.read(min(length, 1 << 16)))
+    media = tuple(k for k in kinds if k in ("vide", "soun", "text", "meta", "sbtl", "tmcd"))
+    return Container(whole=whole, kinds=media, created=created, model=model)
+
+
+def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
+    """Names, starts of bodies and their lengths, depth first."""
+    open_, count = [(start, end)], 0
+    while open_ and count < _MOST_BOXES:
+        at, stop = open_.pop()
+        if at + 8 > stop:
+            continue
+        file.seek(at)
+        length, name = struct.unpack(">I4s", file.read(8))
+        body = at + 8
+        if length == 1:
+            length, body = struct.unpack(">Q", file.read(8).ljust(8, b"\0"))[0], at + 16
+        after = stop if length == 0 else at + length
+        if after <= at:
+            continue
+        count += 1
+        open_.append((after, stop))
+        yield name, body, min(after, stop) - body
+        if name in _INSIDE:
+            open_.append((body + (4 if name == b"meta" else 0), min(after, stop)))
+
+
+def _created(data: bytes) -> datetime | None:
+    if len(data) < 12:
+        return None
+    long_ = data[0] == 1 and len(data) >= 20
+    seconds = struct.unpack(">Q", data[4:12])[0] if long_ else struct.unpack(">I", data[4:8])[0]
+    # cameras whose clock is not set write 0 or dates of the eighties
+    moment = datetime(1904, 1, 1, tzinfo=UTC) + timedelta(seconds=min(seconds, 2**33))
+    return moment if moment.year >= 2000 else None
+
+
+def _model(data: bytes) -> str:
+    words = (m[0].decode("latin-1").strip() for m in _MODEL.finditer(data))
+    return next((w for w in words if _SURE.match(w)), "")
