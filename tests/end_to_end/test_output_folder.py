@@ -242,7 +242,9 @@ def test_rerun_from_each_stage(mosaic, flight, finished, stage):
     reused = {e["stage"]: e["reused"] for e in told.events if e["event"] == "StageFinished"}
     stored = {"features", "links", "align", "surface", "mosaic"}
     first = STAGES.index(stage)
-    assert reused == {s: s in stored and k + 1 < first for k, s in enumerate(STAGES[1:])}
+    assert reused == {
+        s: s in stored and k + 1 < first for k, s in enumerate(STAGES[1:]) if s != "frames"
+    }
     same_result(output, finished)
 
 
@@ -401,7 +403,7 @@ def test_ctrl_c_ends_soon_and_the_same_command_resumes(
     same_result(mosaic(flight / "photos", *SLOWER, quick=False).made().output, undisturbed)
 
 
-@pytest.mark.parametrize("delay", [0.3, *map(late, (0.1, 0.2, 0.5, 0.8))])
+@pytest.mark.parametrize("delay", [0.3, *map(late, (0.2, 0.5, 0.8))])
 def test_ctrl_c_while_the_program_is_still_loading(flight, tmp_path, delay):
     running = Running(flight / "photos", tmp_path / "out", *SLOWER)
     time.sleep(delay)

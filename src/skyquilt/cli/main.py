@@ -7,7 +7,6 @@ from typing import Any
 
 from skyquilt.cli import interrupt
 from skyquilt.errors import SkyquiltError
-from skyquilt.outside import shown
 
 
 def run() -> None:
@@ -28,6 +27,8 @@ def run() -> None:
             from skyquilt.cli.app import app
         app()
     except SkyquiltError as error:
+        from skyquilt.outside import shown
+
         sys.stderr.write(f"skyquilt: {shown(error)}\n")
         sys.exit(error.exit_code)
     except KeyboardInterrupt:

@@ -15,7 +15,7 @@ from skyquilt.engine.clock import Steps
 from skyquilt.engine.executor import in_order
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store, digest
-from skyquilt.errors import NoPhotosError
+from skyquilt.errors import NoPhotosError, OutputError
 from skyquilt.imaging.grey import halved, shrink, to_grey8
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo, RejectedPhoto
@@ -174,6 +174,8 @@ def find_features(
         photo = photos[index]
         try:
             return photo_features(photo, lambda: pixels(index), detector, store)
+        except OutputError:  # a full disk is no fault of the photo
+            raise
         except Exception as error:  # whatever it is, it concerns this photo alone
             return rejected(photo.name, error)
 
