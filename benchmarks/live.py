@@ -216,7 +216,7 @@ def seams(survey: Path, gsd: float) -> None:
         grid=grid_of(views, round_gsd(native)),
         native_gsd=native,
     )
-    compose = orthomosaic.composer(3, "uint8", ground, NEUTRAL, methods.blend, cache)
+    compose = orthomosaic.composer(3, "uint8", ground, NEUTRAL, None, methods.blend, cache)
     steps = orthomosaic.draw(
         home, compose, alignment, settings.output, None, store, "live", photos[0].unit, 2
     )

@@ -107,10 +107,12 @@ class LiveMap:
             )
 
     def _reload(self) -> None:
-        """`_load`, without photos on which it fails."""
-        while True:
+        """`_load`, without photos on which it fails; repeated where a full disk interrupted it."""
+        self._torn = True
+        while self._torn:
             try:
-                return self._load()
+                self._load()
+                self._torn = False
             except MemberFailedError as error:
                 self._refuse(error)
 
@@ -195,6 +197,8 @@ class LiveMap:
                 when there is space.
         """
         began = time.perf_counter()
+        if self._torn:
+            self._reload()
         try:
             self.queues.received.extend(self.members.take_up())
             update = self._next()
