@@ -114,18 +114,20 @@ class Watch:
     ) -> Iterator[Accepted | Refused]:
         source = path.parent.relative_to(self.folder).as_posix()
         source = self.folder.name if source == "." else source
+        done: list[Accepted | Refused] = []
         if reason:
-            yield self.intake.refuse(path.name, source, reason)
+            done.append(self.intake.refuse(path.name, source, reason))
         elif is_clip(path):
             yield from take_clip(self.intake, path, source)
         else:
-            yield self.intake.take_file(path, source)
+            done.append(self.intake.take_file(path, source))
         self.growing.pop(key, None)
         self._seen[_stored(key)] = known.stamp
         with self.intake.ledger.change() as db:
             row = (_stored(key), *known.stamp)
             db.execute("insert or replace into seen values (?, ?, ?)", row)
         hit("folder seen")
+        yield from done  # recorded first: who asks for one result only has it recorded
 
     def _candidates(
         self, closed: set[str], *, everything: bool, now: float
