@@ -168,9 +168,9 @@ def test_a_file_that_is_gone_again_is_forgotten(tmp_path, monkeypatch):
     (box.folder / "a.jpg").write_bytes(jpeg())
     honest = Watch._unfinished
 
-    def gone(self, path):
+    def gone(self, path, **more):
         path.unlink(missing_ok=True)
-        return honest(self, path)
+        return honest(self, path, **more)
 
     monkeypatch.setattr(Watch, "_unfinished", gone)
     assert box.look(0.5) == [] and box.watch.growing == {}
