@@ -329,7 +329,7 @@ class Reduced:
                 keep = product != 0
                 parts.append((i[keep], j[keep], -product[keep]))
         if isinstance(S, np.ndarray):
-            return S - self._shared @ self._shared.T
+            return S - self._shared @ self._shared.T if len(self.normal.shared) else S
         from scipy import sparse
 
         i, j, v = (np.concatenate(x) for x in zip(*parts, strict=True))
@@ -425,8 +425,8 @@ def adjust(
 def covariance(problem: Problem, state: State) -> Array | None:
     """Covariance ((pn+10m), (pn+10m)) of photos and cameras at the minimum, points marginalised.
 
-    In units of the whitened residuals, scaled by their robust variance factor. None for more than
-    `DENSE_LIMIT` unknowns, and if some unknowns are not determined.
+    Observations count as the problem weighs them. None for more than `DENSE_LIMIT` unknowns, and if
+    some unknowns are not determined.
     """
     normal = normal_equations(problem, state)
     reduced = Reduced(problem, normal, 0.0)
@@ -443,3 +443,9 @@ def covariance(problem: Problem, state: State) -> Array | None:
         return None
     fixed = CAMERA * reduced.m if reduced.q == 0 else 0  # fixed intrinsics have no variance
     return np.pad(inverse, (0, fixed)) if np.isfinite(inverse).all() else None
+
+
+def camera_sigmas(covariance: Array, cameras: int) -> Array:
+    """Standard deviations (cameras, 10) of the cameras' unknowns, of a covariance as above."""
+    own = np.diagonal(covariance)[len(covariance) - CAMERA * cameras :]
+    return np.asarray(np.sqrt(np.abs(own)).reshape(cameras, CAMERA))

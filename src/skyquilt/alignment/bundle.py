@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.adjust import DENSE_LIMIT, adjust, covariance, robust_cost
+from skyquilt.alignment.adjust import DENSE_LIMIT, adjust, camera_sigmas, covariance, robust_cost
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
 from skyquilt.alignment.deviations import believed, observed_noise, point_deviations, robust_scale
 from skyquilt.alignment.dominant_plane import levelled
@@ -385,9 +385,7 @@ def _accuracy(setup: Setup, problem: Problem, state: State, covariance: Array) -
 
 def _focal_share(problem: Problem, covariance: Array) -> float:
     """Largest ratio of a focal length's deviation after the adjustment to that before."""
-    m = len(problem.K0)
-    at = len(covariance) - CAMERA * m + CAMERA * np.arange(m)
-    after = np.sqrt(np.abs(covariance[at, at]))
+    after = camera_sigmas(covariance, len(problem.K0))[:, 0]
     return float(np.max(np.where(problem.free[:, 0], after / problem.sigma_K[:, 0], 0.0)))
 
 
@@ -398,10 +396,10 @@ def _undetermined(
     if covariance is None:
         return ()
     notes = []
-    m, height = len(problem.K0), float(np.median(_heights(state)))
+    height = float(np.median(_heights(state)))
+    after = camera_sigmas(covariance, len(problem.K0))[:, 0]
     for row, key in enumerate(setup.camera_keys):
-        at = len(covariance) - CAMERA * m + CAMERA * row
-        share = float(np.sqrt(abs(covariance[at, at])) / state.K[row, 0])
+        share = float(after[row] / state.K[row, 0])
         told = float(problem.sigma_K[row, 0] / state.K[row, 0])
         if problem.free[row, 0] and share > UNDETERMINED * told and share * height > 0.01:
             notes.append(

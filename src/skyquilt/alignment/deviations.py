@@ -42,8 +42,7 @@ def robust_scale(problem: Problem, state: State) -> float:
     equations that is left after the unknowns accounts for that.
     """
     e = residuals_px(problem, state) / problem.sigma_px[:, None]
-    unknowns = 6 * len(state.C) + int(problem.free.sum()) + 3 * len(state.X)
-    left = max(1 - unknowns / (2 * len(e)), 0.05)
+    left = max(1 - _unknowns(problem, state) / (2 * len(e)), 0.05)
     return float(1.48 * np.nanmedian(np.abs(e)) / np.sqrt(left))
 
 
@@ -53,8 +52,7 @@ def observed_noise(problem: Problem, state: State, size: Array) -> Noise:
     u = (e**2).sum(1) / problem.loss_px**2
     w = 1 / (1 + u)
     psi = e * w[:, None]
-    unknowns = 6 * len(state.C) + int(problem.free.sum()) + 3 * len(state.X)
-    spare = max(2 * len(e) - unknowns, 1)
+    spare = max(2 * len(e) - _unknowns(problem, state), 1)
     # the weights enter the normal equations; their variance and slope tell what these are worth
     variance = float((psi**2).sum()) / spare * float(w.mean()) / float((w**2).mean()) ** 2
     near = _alike(problem, psi, size)
@@ -62,6 +60,11 @@ def observed_noise(problem: Problem, state: State, size: Array) -> Noise:
     crowd = np.bincount(part).astype(float)
     together = float((crowd**2).sum() / crowd.sum())  # in the part of an observation, on average
     return Noise(variance=variance, design_effect=1 + max(near, 0.0) * (together - 1))
+
+
+def _unknowns(problem: Problem, state: State) -> int:
+    """Unknowns of an adjustment, turns left out."""
+    return 6 * len(state.C) + int(problem.free.sum()) + 3 * len(state.X)
 
 
 def _part(problem: Problem, size: Array, parts: int) -> NDArray[np.int64]:

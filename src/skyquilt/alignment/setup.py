@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.adjust import camera_sigmas
 from skyquilt.alignment.motion import velocities
-from skyquilt.alignment.problem import CAMERA, READOUT, Problem, State
+from skyquilt.alignment.problem import READOUT, Problem, State
 from skyquilt.alignment.start import Start
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.geometry.frames import angle_difference_deg, cam_R_map_from_angles
@@ -327,8 +328,7 @@ def camera_records(
         *lens, readout = (float(v) for v in state.K[row])
         sigmas = sigma_readout = None
         if covariance is not None:
-            at = len(covariance) - len(state.K) * CAMERA + CAMERA * row + np.arange(CAMERA)
-            spread = np.sqrt(np.abs(covariance[at, at])) * setup.base.free[row]
+            spread = camera_sigmas(covariance, len(state.K))[row] * setup.base.free[row]
             sigmas, sigma_readout = tuple(spread[:-1].tolist()), float(spread[-1])
         cameras[key] = Camera(
             width=photo.width,
