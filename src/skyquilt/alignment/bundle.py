@@ -48,9 +48,11 @@ class Bundle:
     order), `6t` (and tangential) or `full` (and the aspect ratio).
     """
     per_photo: int = 400
-    """Observations per photo in the adjustment; all other tie points are triangulated
-    afterwards.
+    """Observations per photo in the adjustment of up to `many` photos, and half as many beyond; all
+    other tie points are triangulated afterwards.
     """
+    many: int = 120
+    """Photos that support one another well enough for fewer observations each."""
     repair: bool = True
     """Whether metadata may contain gross errors. False = they are weighted by their stated
     deviations.
@@ -107,14 +109,15 @@ class Bundle:
         tracks = build_tracks(features, start.links)
         setup = set_up(photos, priors, start, distortion=self.distortion, repair=self.repair)
         sizes = [(p.width, p.height) for p in photos]
+        each = self.per_photo if len(start.placed) <= self.many else self.per_photo // 2
         used = setup.sensor_tracks(tracks)
-        problem, state = setup.problem(thin(used, sizes, per_photo=self.per_photo))
+        problem, state = setup.problem(thin(used, sizes, per_photo=each))
         problem, state = _rough(problem, state)
         setup = setup.moving_as(photos, state.C)
         problem = replace(problem, velocity=setup.base.velocity)
         if grey is not None and self.match_observations is not None:
             used = _sharpened(used, photos, setup, problem, state, self.match_observations, grey)
-            problem, _ = setup.problem(thin(used, sizes, per_photo=self.per_photo))
+            problem, _ = setup.problem(thin(used, sizes, per_photo=each))
             state = triangulated(problem, state)
         problem, state = _fine(problem, state)
         setup = setup.moving_as(photos, state.C)
