@@ -129,7 +129,7 @@ def _seen(clip: Clip, look: Looker, store: Store, before: int, total: int) -> St
             key = digest(clip.digest, look, number, count)
             part = store.get("looks", key)
             if part is None:
-                decoder = decoder or Decoder(clip.path)
+                decoder = decoder or Decoder(clip.path, grey=True)
                 last = float(parts[-1].time_s[-1]) if parts and len(parts[-1].time_s) else None
                 end = number == count - 1
                 for step in look(decoder, number, last=last, open_end=end):
