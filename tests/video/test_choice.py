@@ -39,7 +39,8 @@ def film(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def looks(film):
-    (found,) = [x for x in Looker()(Decoder(film, grey=True), 0, last=None, open_end=True) if _is(x)]
+    decoder = Decoder(film, grey=True)
+    (found,) = [x for x in Looker()(decoder, 0, last=None, open_end=True) if _is(x)]
     return found
 
 

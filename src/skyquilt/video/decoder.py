@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from skyquilt.errors import UnreadablePhotoError
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its complaints would go to the terminal
+# a container that names other files or addresses shall not open any
+os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file")
 _OPEN, _ERRORS = 4, 2
 _AHEAD_S = 3.0
 _TOLERANCE = 0.4

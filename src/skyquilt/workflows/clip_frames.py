@@ -135,7 +135,7 @@ def _seen(clip: Clip, look: Looker, store: Store, before: int, total: int) -> St
                 for step in look(decoder, number, last=last, open_end=end):
                     if isinstance(step, Looks):
                         part = step
-                    elif step % 10 == 0:
+                    elif step % 2 == 0:
                         yield min(before + number * look.chunk + step, total), total
                 store.put("looks", key, part)
             assert part is not None
