@@ -20,7 +20,7 @@ from skyquilt.photos.frame_files import frame_jpeg
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import rejected
 from skyquilt.settings import InputSettings
-from skyquilt.video.read import CLIP_ENDINGS, read_clip
+from skyquilt.video.read import read_clip
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.survey_input import SurveyInput, read_input
@@ -31,11 +31,6 @@ SLICE_S = 0.1
 """Time in s that may be spent on clips before other work is done."""
 Taking = Iterator[Accepted | Refused | None]
 """Results of a clip; None after a piece of work without one."""
-
-
-def is_clip(path: Path) -> bool:
-    """Whether a file is a clip by its name."""
-    return path.suffix.lower() in CLIP_ENDINGS
 
 
 def unfinished_clip(path: Path, *, patient: bool) -> str:

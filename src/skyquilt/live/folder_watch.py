@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from skyquilt.errors import UsageError
-from skyquilt.live.clip_intake import Taking, advanced, is_clip, take_clip, unfinished_clip
+from skyquilt.live.clip_intake import Taking, advanced, take_clip, unfinished_clip
 from skyquilt.live.closed_files import ClosedFiles
-from skyquilt.live.inbox import ending_of
+from skyquilt.live.inbox import ending_of, is_clip
 from skyquilt.live.ledger import hit
 from skyquilt.live.photo_intake import Accepted, Intake, Refused
 from skyquilt.model.photo import RejectedPhoto

@@ -15,12 +15,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from skyquilt.errors import OutputError
-from skyquilt.live.clip_intake import SEEN, Taking, advanced, is_clip, take_clip
-from skyquilt.live.inbox import synced
+from skyquilt.live.clip_intake import SEEN, Taking, advanced, take_clip
+from skyquilt.live.inbox import is_clip, synced
 from skyquilt.live.photo_intake import Accepted, Intake, Refused, shown_name
 from skyquilt.outside import open_regular, read_bounded
 from skyquilt.video.container import is_video
-from skyquilt.video.srt import MOST_TELEMETRY_BYTES
 from skyquilt.video.tracks import TRACK_ENDINGS
 
 WAITING = "waiting"
@@ -41,21 +40,6 @@ class Waiting:
 
     name: str
     """Its name."""
-
-
-def belongs_to_clip(name: str) -> bool:
-    """Whether a file of this name is a clip or positions of one."""
-    path = Path(name)
-    return is_clip(path) or path.suffix.lower() in TRACK_ENDINGS
-
-
-def most_bytes(intake: Intake, name: str) -> int:
-    """The largest size of an upload of this name in bytes."""
-    if is_clip(Path(name)):
-        return intake.settings.most_clip_bytes
-    if belongs_to_clip(name):
-        return MOST_TELEMETRY_BYTES
-    return intake.inbox.most_bytes
 
 
 def bring_clip(intake: Intake, file: Path, name: str, source: str) -> Waiting | Refused:

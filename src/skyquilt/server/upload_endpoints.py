@@ -21,8 +21,9 @@ from fastapi.responses import JSONResponse
 from starlette.requests import ClientDisconnect
 
 from skyquilt.errors import OutputError
+from skyquilt.live.inbox import belongs_to_clip
 from skyquilt.live.photo_intake import Accepted, Intake, Refused, shown_name
-from skyquilt.live.uploaded_clips import Waiting, belongs_to_clip, bring_clip, most_bytes
+from skyquilt.live.uploaded_clips import Waiting, bring_clip
 from skyquilt.server.access import RESUMABLE, TUS, Context, blocks_of, client_of
 from skyquilt.server.uploads import Upload, Uploads
 
@@ -47,7 +48,7 @@ class UploadEndpoints:
         frames become photos later.
         """
         intake = self.context.writing(request).intake
-        most = most_bytes(intake, name)
+        most = intake.most_bytes(name)
         limit = f"such a file may have {most} bytes"
         _check_size(_length(request), most, limit)
         client = client_of(request)
@@ -87,7 +88,7 @@ class UploadEndpoints:
         metadata = request.headers.get("upload-metadata", "")
         about = metadata_of(metadata)
         name = about.get("filename") or about.get("name") or "photo"
-        most = most_bytes(intake, name)
+        most = intake.most_bytes(name)
         _check_size(size, most, f"such a file may have {most} bytes", {"Tus-Max-Size": str(most)})
         source = about.get("source") or "upload"
         upload = self._begun(name, source, size, client_of(request), metadata)
