@@ -153,9 +153,12 @@ class Watch:
     ) -> list[tuple[Path, Stamp | None]]:
         """Files to check, with their stamp; None if the file no longer exists."""
         known = {p for p in map(Path, closed | self.growing.keys()) if _photo_name(p.name)}
-        if everything or now >= self._due:
+        if not self.folder.is_dir():
+            self._due = 0.0  # what was reported while it is away is looked for when it is back
+        elif everything or now >= self._due:
+            began = time.thread_time()  # a busy machine is no reason to look less often
             known.update(self._files())
-            took = time.monotonic() - now
+            took = time.thread_time() - began
             self._due = now + max(SCAN_TOLD_S if self._closed.told else SCAN_S, took / SHARE)
         return [(path, _stamp(path)) for path in known]
 
