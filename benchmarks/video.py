@@ -2,12 +2,14 @@
 
     python benchmarks/video.py WORK [--seeds 1,2]
     python benchmarks/video.py WORK --long 3600
+    python benchmarks/video.py WORK --clip LONG.MP4
 
 The first makes, for each seed, a flight of about 60 s (two lines and a turn, 1280 x 960, 5
 frames a second, gusts that blur, MPEG-4) and prints seams of both maps, frames used against
 those the overlap needs, blurred frames among them, errors of the camera positions, and the
 offset found where the telemetry is 7 s late. The second looks through a 4K clip of that many
-seconds (a short one again and again) and prints CPU per look beside decoding, and memory.
+seconds (a short one again and again) and prints CPU per look beside decoding, and memory. The third
+does so with a clip of any length and codec, chooses its frames, and fetches some of them.
 """
 
 import argparse
@@ -23,6 +25,7 @@ import numpy as np
 
 from skyquilt.engine.clock import result_of
 from skyquilt.engine.store import Store
+from skyquilt.photos.pixels import read_color
 from skyquilt.settings import InputSettings
 from skyquilt.video.decoder import Decoder
 from skyquilt.video.looks import Looker
@@ -131,7 +134,7 @@ def long(work: Path, seconds: float) -> None:
     decoding = (time.process_time() - started) / frames
     started, looks, decoded = time.process_time(), 0, 0
     while decoded < seconds * fps:
-        for step in Looker()(Decoder(clip), 0, last=None, open_end=True):
+        for step in Looker()(Decoder(clip, grey=True), 0, last=None, open_end=True):
             if not isinstance(step, int):
                 looks += len(step.time_s)
         decoded += frames
@@ -143,14 +146,48 @@ def long(work: Path, seconds: float) -> None:
     )
 
 
+def whole(clip: Path, work: Path) -> None:
+    """Cost of a clip as `mosaic` meets it: looks, choice, and the frames it uses."""
+    decoder, started, decoded = Decoder(clip), time.process_time(), 0
+    while decoded < 1500 and decoder.skip():
+        decoded += 1
+    decoding = (time.process_time() - started) / decoded
+    decoder.close()
+    settings, store = InputSettings(), Store(folder=work / "looks", registry=REGISTRY)
+    started, clock = time.process_time(), time.monotonic()
+    survey = result_of(with_frames(read_input(clip, settings), settings, store))
+    told, photos = survey.clips[0], survey.survey.photos
+    spent = time.process_time() - started - decoding * survey.survey.photos[-1].frame_s * told.fps
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(
+        f"{clip.name}: decoding {1000 * decoding:.1f} ms of CPU a frame; {told.looked} looks,"
+        f" {1000 * spent / told.looked:.1f} ms of CPU each beside it; {len(photos)} frames chosen;"
+        f" {time.monotonic() - clock:.0f} s; {peak:.0f} MB at most"
+    )
+    several = photos[:: max(1, len(photos) // 40)][:40]
+    started = time.process_time()
+    for photo in photos[: len(several)]:
+        read_color(photo)
+    near = (time.process_time() - started) / len(several)
+    started = time.process_time()
+    for photo in several[::-1]:
+        read_color(photo)
+    far = (time.process_time() - started) / len(several)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(f"a frame in order {near:.3f} s of CPU, by a seek {far:.3f} s; {peak:.0f} MB at most")
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("work", type=Path)
     parser.add_argument("--seeds", default="1")
     parser.add_argument("--long", type=float)
+    parser.add_argument("--clip", type=Path)
     given = parser.parse_args()
     given.work.mkdir(parents=True, exist_ok=True)
-    if given.long:
+    if given.clip:
+        whole(given.clip, given.work)
+    elif given.long:
         long(given.work, given.long)
     else:
         for number in given.seeds.split(","):

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import piexif
 import tifffile
@@ -31,6 +32,9 @@ from skyquilt.photos.sequence import sequence_of
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.tags import parse_exif, parse_xmp
 from skyquilt.raster.boundary import read_boundary
+from skyquilt.video.container import read_container
+from skyquilt.video.positions import places_at
+from skyquilt.video.tracks import TRACK_ENDINGS, read_track
 
 HERE = Path(__file__).parent
 NAMES = ("SIM_0001.jpg", "SIM_0002.jpg")
@@ -199,6 +203,64 @@ def _pngs():
         _saved(lambda b: Image.fromarray(_pixels(4)).save(b, "PNG")),
         _saved(lambda b: grey.save(b, "PNG")),
     ]
+
+
+@cache
+def _clips():
+    """An MP4 of two frames, with a camera model and a rotation in its tables."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.mp4"
+        code = cv2.VideoWriter.fourcc(*"mp4v")
+        writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, code, 5.0, (64, 64))
+        for level in (60, 90):
+            writer.write(np.full((64, 64, 3), level, np.uint8))
+        writer.release()
+        data = path.read_bytes()
+    model = b"\xa9mdl\x00\x06\x15\xc7FC3170\x00"
+    return [data, data + struct.pack(">I4s", 8 + len(model), b"udta") + model]
+
+
+def _container(data):
+    """The boxes of a clip; FFmpeg, which decodes it, is fuzzed by others."""
+    found = read_container(_file("a.mp4", data))
+    assert found is None or all(k.isprintable() for k in (found.model, *found.kinds))
+
+
+TELEMETRY = b"""1
+00:00:00,000 --> 00:00:00,033
+2024-05-01 10:00:00.000
+[focal_len: 24.00] [latitude: 46.600000] [longitude: 14.300000] [rel_alt: 50.0 abs_alt: 480.0]
+
+2
+00:00:01,000 --> 00:00:01,033
+HOME(14.3,46.6) 2024.05.01 10:00:01
+GPS(14.3001,46.6001,16) BAROMETER:50.1
+
+3
+00:00:02,000 --> 00:00:02,033
+F/5.6, SS 400, GPS (14.300200, 46.600200, 15), D 150.00m, H 50.20m, G.PRY (-90.0, 0.0, 12.3)
+
+"""
+TIMED = (
+    b"time(millisecond),latitude,longitude,height_above_takeoff(feet),compass_heading(degrees)\n"
+)
+TIMED += b"0,46.6,14.3,164,12\n200,46.60001,14.3,164.1,12.5\n400,46.60002,14.3,164.2,13\n"
+GPX = b"""<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>
+<trkpt lat="46.6" lon="14.3"><ele>480</ele><time>2024-05-01T10:00:00Z</time></trkpt>
+<trkpt lat="46.6001" lon="14.3"><ele>480.5</ele><time>2024-05-01T10:00:01Z</time></trkpt>
+</trkseg></trk></gpx>"""
+
+
+def _track(data):
+    """Positions of a clip, in the three kinds of files."""
+    for ending in TRACK_ENDINGS:
+        try:
+            track = read_track(_file(f"a{ending}", data))
+        except SkyquiltError as error:
+            _sentence(error)
+        else:
+            assert np.isfinite(track.latitude_deg).all() and len(track.time_s) > 0
+            places_at(track, np.linspace(track.time_s[0] - 5, track.time_s[-1] + 5, 9))
 
 
 def _exif_only(data):
@@ -476,6 +538,8 @@ TARGETS = {
     "jpeg": Target(_photo(".jpg"), _jpegs, "jpeg"),
     "tiff": Target(_photo(".tif"), _tiffs, "tiff"),
     "png": Target(_photo(".png"), _pngs, "png"),
+    "mp4": Target(_container, _clips, "mp4"),
+    "track": Target(_track, lambda: [TELEMETRY, TIMED, GPX], "track"),
     "exif": Target(_exif_only, lambda: [_exif()[6:]], "exif"),
     "xmp": Target(_xmp_only, lambda: [XMP], "xmp"),
     "geo_txt": Target(_positions(".txt"), lambda: [GEO], "geo_txt"),

@@ -69,3 +69,50 @@ def test_a_clip_without_positions(flight, tmp_path):
     w, v = ((p[:, :2] - p[:, :2].mean(axis=0)) @ [1, 1j] for p in (solved, true))
     left = v - np.vdot(w, v) / np.vdot(w, w) * w
     assert np.abs(left).mean() < 0.03 * np.abs(v).max()
+
+
+@pytest.fixture(scope="module")
+def mixed(flight, tmp_path_factory):
+    """The clip and the photos of the flight in one folder."""
+    folder = tmp_path_factory.mktemp("mixed")
+    for path in [*(flight[0] / "photos").glob("*.jpg"), *(flight[0] / "video").iterdir()]:
+        (folder / path.name).symlink_to(path)
+    return folder
+
+
+def test_a_folder_of_videos_and_photos_is_one_map(flight, mixed, tmp_path):
+    result = skyquilt.mosaic(mixed, tmp_path / "map")
+    metrics = result.metrics
+    frames = metrics["clips"][0]["frames_chosen"]
+    assert frames > 4
+    assert metrics["photos_used"] == metrics["photos_total"] == 6 + frames
+    assert len(metrics["blocks"]) == 1
+    assert metrics["seam_disparity_px"]["median"] < 0.3
+    truth = json.loads((flight[0] / "truth" / "truth.json").read_text())
+    true = {p["name"]: p["position"] for p in truth["photos"]}
+    true |= {f"FLIGHT.MP4.{i:06d}": f["position"] for i, f in enumerate(flight[1])}
+    shots = json.loads((tmp_path / "map" / "shots.geojson").read_text())["features"]
+    solved = np.array([s["properties"]["translation"] for s in shots])
+    known = np.array([true[s["properties"]["filename"]] for s in shots])
+    # frames and photos lie together as they were flown, up to a similarity in the plane
+    w, v = ((p[:, :2] - p[:, :2].mean(axis=0)) @ [1, 1j] for p in (solved, known))
+    left = v - np.vdot(w, v) / np.vdot(w, w) * w
+    assert np.abs(left).max() < 0.01 * np.abs(v).max()
+
+
+def test_other_maps_take_videos_or_say_that_they_do_not(flight, mixed, tmp_path):
+    from skyquilt.depth.workflow import depth
+    from skyquilt.errors import UsageError
+    from skyquilt.papers.compare import CompareSettings, iter_compare
+    from skyquilt.thermal.workflow import iter_thermal
+
+    clip = flight[0] / "video" / "FLIGHT.MP4"
+    heights = depth(mixed, tmp_path / "depth").metrics
+    assert heights["photos_used"] == heights["photos_total"] > 10
+    asked = CompareSettings(mosaic=skyquilt.MosaicSettings(), variants=("position", "bundle"))
+    *_, last = iter_compare(clip, tmp_path / "compare", asked)
+    placed = [m["placed"] for m in last.metrics["methods"].values()]
+    assert placed == 2 * [len(last.metrics["photos"])]
+    assert len(last.metrics["photos"]) > 4
+    with pytest.raises(UsageError, match="holds only videos"):
+        list(iter_thermal(flight[0] / "photos", flight[0] / "video", tmp_path / "thermal"))

@@ -224,6 +224,23 @@ def test_an_inbox_that_goes_away_and_comes_back(tmp_path):
     assert len(box.look(2.5)) == 1
 
 
+def test_what_was_reported_while_the_inbox_is_away_is_taken_when_it_is_back(tmp_path, monkeypatch):
+    """Without waiting for the next scan of the whole folder."""
+    from skyquilt.live import folder_watch
+
+    box = Box(tmp_path)
+    monkeypatch.setattr(folder_watch, "SCAN_TOLD_S", 1000.0)
+    monkeypatch.setattr(folder_watch, "SCAN_S", 1000.0)
+    (box.folder / "a.jpg").write_bytes(jpeg())
+    assert len(box.look(1.0)) == 1
+    for number in range(3):
+        (box.folder / f"b{number}.jpg").write_bytes(jpeg(96, 80 + number))
+    box.folder.rename(tmp_path / "away")
+    assert box.look(0.3) == []  # the reports are read now
+    (tmp_path / "away").rename(box.folder)
+    assert len(box.look(2.0)) == 3
+
+
 def test_two_live_maps_on_one_folder_are_refused(tmp_path):
     code = (
         "import sys; from pathlib import Path; from skyquilt.live.lock import FolderLock;"

@@ -2,11 +2,13 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -20,6 +22,7 @@ from skyquilt.live.settings import LiveSettings
 from skyquilt.raster import RasterSpec, write_array
 from skyquilt.server import connections
 from skyquilt.server.access import Guard
+from skyquilt.server.server_process import ServerConfig, ServerProcess
 from skyquilt.server.server_thread import ServerThread
 from skyquilt.server.survey import open_survey
 from skyquilt.server.wms import MOST_PIXELS
@@ -394,3 +397,80 @@ def test_absurd_heights_cost_little(tmp_path):
     assert live.ledger.counts().get("refused", 0) == 0
     live.close()
     shutil.rmtree(tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_forty_of_the_largest_images_at_once(site):
+    """Two are drawn at a time, and their memory is given back; too large ones cost nothing."""
+    side = int(MOST_PIXELS**0.5)
+    query = f"{MAP}&BBOX={box(site)}&LAYERS=mosaic&WIDTH={side}&HEIGHT={side}&TRANSPARENT=TRUE"
+    assert site.get(query).status_code == 200
+    before, most, said, done = resident_mb(), [0.0], [], threading.Event()
+
+    def watch():
+        while not done.wait(0.02):
+            most[0] = max(most[0], resident_mb())
+
+    def ask():
+        with httpx.stream("GET", f"{site.base_url}{query[1:]}", timeout=300) as answer:
+            said.append(answer.status_code)
+            for _ in answer.iter_raw(65536):  # not kept by the client
+                pass
+
+    watching = threading.Thread(target=watch)
+    watching.start()
+    threads, began = [threading.Thread(target=ask) for _ in range(40)], time.process_time()
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    spent = time.process_time() - began
+    done.set()
+    watching.join()
+    assert said == [200] * 40
+    # of the clients here too; noise is the worst that PNG can meet, a map takes two thirds of it
+    assert spent / 40 < 1.3
+    assert most[0] - before < 2 * 200 + 40 * 13
+    time.sleep(1.0)
+    assert resident_mb() - before < 150
+    began = time.process_time()
+    large = query.replace(f"={side}", "=4096")
+    assert [site.get(large).status_code for _ in range(40)] == [400] * 40
+    assert time.process_time() - began < 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["mosaic", "live"])
+def test_a_run_that_takes_too_much_memory_ends_with_a_sentence(flight, tmp_path, what):
+    """And the same command with more memory goes on."""
+    words = [sys.executable, "-m", "skyquilt", what, str(flight.folder / "photos"), "-o"]
+    words += [str(tmp_path / "out"), *(["--port", "0", "--finish"] if what == "live" else [])]
+    ended = subprocess.run([*words, "--max-memory", "0.1"], capture_output=True, text=True)
+    assert ended.returncode == 1
+    assert re.search(
+        r"^skyquilt: it needs more memory than it may take \(0\.\d of 0\.1 GB\) and was ended; ",
+        ended.stderr,
+        re.MULTILINE,
+    )
+    assert "Traceback" not in ended.stderr
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_a_viewer_that_takes_too_much_memory_is_started_anew(tmp_path):
+    live = LiveMap(tmp_path / "out", QUICK)
+    asked = ServerConfig(
+        folder=tmp_path / "out", settings=QUICK, guard=Guard(), most_memory=50_000_000
+    )
+    with ServerProcess(asked=asked) as serving:
+        first, until = serving._parts["process"].pid, time.monotonic() + 60
+        pids = {first}
+        while len(pids) < 3 and time.monotonic() < until:
+            pids.add(serving._parts["process"].pid)
+            time.sleep(0.02)
+        assert len(pids) == 3
+        assert live.work() is None  # the mapping goes on
+    live.close()
+    told = (tmp_path / "out" / "errors.log").read_text()
+    assert re.search(r"the viewer took 0\.\d of 0\.1 GB and is restarted", told)

@@ -87,7 +87,7 @@ def test_what_the_server_offers(site, client):
         assert answer.headers["tus-resumable"] == answer.headers["tus-version"] == "1.0.0"
         offered = set(answer.headers["tus-extension"].split(","))
         assert offered == {"creation", "expiration", "termination"}
-        assert answer.headers["tus-max-size"] == "3000000"
+        assert answer.headers["tus-max-size"] == "8000000000"  # of a video
 
 
 def test_a_photo_in_parts_is_taken(site, client, flight):

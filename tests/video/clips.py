@@ -56,3 +56,19 @@ def flown(places, yaws=None, blurred=(), size=SIZE):
         matrix = np.hstack([turn, shift[:, None]])
         frame = cv2.warpAffine(picture, matrix, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
         yield cv2.blur(frame, (11, 1)) if i in blurred else frame
+
+
+SRT = (
+    "{n}\n00:00:{a:06.3f} --> 00:00:{b:06.3f}\n2024-05-01 10:00:{a:06.3f}\n[focal_len: 24.00]"
+    " [latitude: {lat:.6f}] [longitude: 14.300000] [rel_alt: 50.000 abs_alt: 480.000]"
+    " [gb_yaw: 30.0 gb_pitch: -88.0 gb_roll: 0.0]\n\n"
+)
+
+
+def filmed(folder: Path, frames: int = 40) -> Path:
+    """A clip of a straight flight, A.MP4, with telemetry beside it."""
+    places = np.stack([np.full(frames, 500.0), 900 - 6.0 * np.arange(frames)], axis=1)
+    path = write_clip(folder / "A.MP4", flown(places), fps=5.0)
+    rows = (SRT.format(n=i + 1, a=i / 5, b=(i + 1) / 5, lat=46.6 + 1e-5 * i) for i in range(frames))
+    path.with_suffix(".SRT").write_text("".join(rows))
+    return path

@@ -39,7 +39,8 @@ def film(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def looks(film):
-    (found,) = [x for x in Looker()(Decoder(film), 0, last=None, open_end=True) if _is(x)]
+    decoder = Decoder(film, grey=True)
+    (found,) = [x for x in Looker()(decoder, 0, last=None, open_end=True) if _is(x)]
     return found
 
 
@@ -88,11 +89,11 @@ def test_shared_area_of_turned_frames():
 
 
 def test_chunks_see_what_one_pass_sees(film, looks):
-    look, decoder = Looker(chunk=50), Decoder(film)
+    look, decoder = Looker(chunk=50), Decoder(film, grey=True)
     parts = []
     for number in (0, 1, 2):
         last = float(parts[-1].time_s[-1]) if parts else None
-        decoder = Decoder(film)  # as after a kill: the decoder starts anew and seeks
+        decoder = Decoder(film, grey=True)  # as after a kill: the decoder starts anew and seeks
         parts += [x for x in look(decoder, number, last=last, open_end=number == 2) if _is(x)]
     both = joined(parts)
     assert both.time_s.tolist() == looks.time_s.tolist()

@@ -111,3 +111,28 @@ def _without_frames(data):
         start = at + 4 if name == b"stsz" else at
         out[start : start + 4] = bytes(4)
     return bytes(out)
+
+
+@pytest.mark.parametrize(
+    "text", ["ffconcat version 1.0\nfile a.mp4\n", "#EXTM3U\n#EXTINF:10,\na.mp4\n#EXT-X-ENDLIST\n"]
+)
+def test_text_that_names_other_files_opens_none(clip, tmp_path, text):
+    """FFmpeg would play the clip beside it."""
+    (tmp_path / "a.mp4").write_bytes(clip.read_bytes())
+    path = tmp_path / "b.mp4"
+    path.write_text(text)
+    read = read_clip(path, name="b.mp4")
+    assert isinstance(read, RejectedPhoto)
+    assert "no video in it" in read.reason
+
+
+def test_frames_of_an_absurd_size_are_refused_before_they_are_decoded(clip, tmp_path):
+    data = bytearray(clip.read_bytes())
+    at = data.index(b"mp4v", data.index(b"stsd")) + 28
+    assert struct.unpack(">HH", data[at : at + 4]) == SIZE
+    data[at : at + 4] = struct.pack(">HH", 12288, 8192)
+    path = tmp_path / "large.mp4"
+    path.write_bytes(bytes(data))
+    read = read_clip(path, name="large.mp4")
+    assert isinstance(read, RejectedPhoto)
+    assert read.reason == "it has 12288x8192 px, and 50 megapixels are the most of a frame"

@@ -20,23 +20,12 @@ from skyquilt.settings import InputSettings
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.survey_input import read_input
-from tests.video.clips import flown, write_clip
-
-SRT = (
-    "{n}\n00:00:{a:06.3f} --> 00:00:{b:06.3f}\n2024-05-01 10:00:{a:06.3f}\n[focal_len: 24.00]"
-    " [latitude: {lat:.6f}] [longitude: 14.300000] [rel_alt: 50.000 abs_alt: 480.000]"
-    " [gb_yaw: 30.0 gb_pitch: -88.0 gb_roll: 0.0]\n\n"
-)
+from tests.video.clips import filmed, flown, write_clip
 
 
 @pytest.fixture(scope="module")
 def film(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("film")
-    places = np.stack([np.full(40, 500.0), 900 - 6.0 * np.arange(40)], axis=1)
-    path = write_clip(folder / "A.MP4", flown(places), fps=5.0)
-    rows = (SRT.format(n=i + 1, a=i / 5, b=(i + 1) / 5, lat=46.6 + 1e-5 * i) for i in range(40))
-    path.with_suffix(".SRT").write_text("".join(rows))
-    return path
+    return filmed(tmp_path_factory.mktemp("film"))
 
 
 def test_a_written_frame_reads_as_the_photo_it_was(film, tmp_path):
@@ -82,3 +71,49 @@ def test_a_watched_folder_takes_the_frames_of_a_finished_clip(film, tmp_path):
     assert list(watch.look()) == []
     rows = ledger.rows("select name from photo order by id")
     assert len(rows) == len(done)
+
+
+def test_photos_are_taken_while_a_clip_is_looked_through(film, tmp_path):
+    """However long a clip is, a look at the folder takes a short time only."""
+    folder, out = tmp_path / "in", tmp_path / "out"
+    folder.mkdir()
+    out.mkdir()
+    places = np.stack([np.full(400, 500.0), 1800 - 2.5 * np.arange(400)], axis=1)
+    write_clip(folder / "LONG.MP4", flown(places, size=(960, 720)), fps=5.0)
+    ledger = Ledger(out, write=True)
+    watch = Watch(
+        folder=folder, intake=Intake(ledger, Inbox(ledger, out / "photos"), LiveSettings())
+    )
+    time.sleep(4.1)  # the patience with its positions is over
+    assert list(watch.look()) == []
+    frame = result_of(
+        with_frames(
+            read_input(film, InputSettings()),
+            InputSettings(),
+            Store(folder=tmp_path / "x", registry=REGISTRY),
+        )
+    ).survey.photos[0]
+    (folder / "photo.jpg").write_bytes(frame_jpeg(frame, read_color(frame)))
+    order, began = [], time.monotonic()
+    while "LONG.MP4" in "".join(map(str, watch.growing)) and time.monotonic() - began < 60:
+        order += [d.name for d in watch.look()]
+        time.sleep(0.01)
+    assert order[0] == "photo.jpg"
+    assert len([n for n in order if n.startswith("LONG.MP4.")]) > 5
+
+
+def test_a_clip_that_fails_in_an_unforeseen_way_is_refused_alone(film, tmp_path, monkeypatch):
+    import skyquilt.live.clip_intake as module
+
+    def broken(*_):
+        raise ZeroDivisionError("unforeseen")
+
+    out = tmp_path / "out"
+    out.mkdir()
+    ledger = Ledger(out, write=True)
+    intake = Intake(ledger, Inbox(ledger, out / "photos"), LiveSettings())
+    monkeypatch.setattr(module, "with_frames", broken)
+    done = [d for d in module.take_clip(intake, film, "here") if d is not None]
+    assert [d.name for d in done] == ["A.MP4"]
+    assert "ZeroDivisionError" in done[0].reason
+    assert "unforeseen" in (out / "errors.log").read_text()

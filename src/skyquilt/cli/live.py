@@ -78,6 +78,7 @@ def command(
     ] = None,
     features: Features = 1200,
     max_mb: Annotated[float, typer.Option(help="Largest photo file in MB.")] = 500,
+    max_clip_mb: Annotated[float, typer.Option(help="Largest uploaded video in MB.")] = 8000,
     max_mp: MaxMp = MOST_MP,
     max_photos: Annotated[int, typer.Option(help="Largest number of photos accepted.")] = 100_000,
     max_connections: MaxConnections = 200,
@@ -111,6 +112,7 @@ def command(
         max_view_angle=max_view_angle,
         features=features,
         most_bytes=int(max_mb * 1e6),
+        most_clip_bytes=int(max_clip_mb * 1e6),
         most_mp=max_mp,
         most_photos=max_photos,
     )

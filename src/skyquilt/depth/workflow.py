@@ -40,7 +40,7 @@ from skyquilt.raster.atomic import write_text
 from skyquilt.settings import MosaicSettings
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
-from skyquilt.workflows.flow import Scene, scene_of
+from skyquilt.workflows.flow import Scene, frames_added, scene_of
 from skyquilt.workflows.methods import Methods, methods_for
 from skyquilt.workflows.survey_input import SurveyInput, read_input
 
@@ -86,22 +86,29 @@ def iter_depth(
     if route not in ROUTES:
         raise UsageError(f"--route {route!r} is not one of {', '.join(ROUTES)}")
     given = read_input(photos, settings.input)
-    survey = given.survey
-    if len(survey.photos) < 2:
-        raise UsageError("depth needs at least two photos; give a neighbouring photo too")
-    if route == "auto":
-        route = "pair" if len(survey.photos) == 2 else "reconstruction"
+    if not given.survey.clips:
+        _enough(given)
     former = former_fields(output)
     claim(output, FILES, overwrite=overwrite)
     for path in former:
         path.unlink(missing_ok=True)
     clock = Clock(store=Store(folder=output / STATE / "store", registry=REGISTRY), began=began)
-    yield from (Note(text=n) for n in survey.notes)
+    yield from (Note(text=n) for n in given.survey.notes)
+    given = yield from frames_added(given, settings, clock)
+    survey = given.survey
+    _enough(given)
+    if route == "auto":
+        route = "pair" if len(survey.photos) == 2 else "reconstruction"
     scene, depth = yield from _by_route(route, given, settings, relief_m, clock)
     record = yield from clock.stage("draw", _drawn(output, route, scene, depth))
     record |= {"cpu_seconds": round(clock.cpu_total(), 2), "photos_total": len(survey.photos)}
     write_text(output / "depth.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
     yield Result(output=output, metrics=record)
+
+
+def _enough(given: SurveyInput) -> None:
+    if len(given.survey.photos) < 2:
+        raise UsageError("depth needs at least two photos; give a neighbouring photo too")
 
 
 def depth(

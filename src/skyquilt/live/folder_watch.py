@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from skyquilt.errors import UsageError
-from skyquilt.live.clip_intake import is_clip, take_clip, unfinished_clip
+from skyquilt.live.clip_intake import Taking, advanced, take_clip, unfinished_clip
 from skyquilt.live.closed_files import ClosedFiles
-from skyquilt.live.inbox import ending_of
+from skyquilt.live.inbox import ending_of, is_clip
 from skyquilt.live.ledger import hit
 from skyquilt.live.photo_intake import Accepted, Intake, Refused
 from skyquilt.model.photo import RejectedPhoto
@@ -62,6 +62,7 @@ class Watch:
     """Accepts the photos."""
     growing: dict[str, Growing] = field(default_factory=dict)
     """Files that are not taken yet, by path."""
+    _clips: dict[str, tuple[Stamp, Taking]] = field(default_factory=dict)
     _due: float = 0.0
 
     def __post_init__(self) -> None:
@@ -89,12 +90,14 @@ class Watch:
                 continue
             try:
                 patient = now - known.since < PATIENCE_S
-                reason = self._unfinished(Path(key), patient=patient)
+                begun = self._clips.get(key, (None,))[0] == known.stamp
+                reason = "" if begun else self._unfinished(Path(key), patient=patient)
                 if reason and patient:
                     continue
                 yield from self._take(Path(key), key, known, reason)
             except FileNotFoundError:  # removed since it was seen
                 self.growing.pop(key, None)
+                self._clips.pop(key, None)
 
     def _note(self, now: float) -> None:
         """Records files that are new or have grown, and files that were closed after writing."""
@@ -118,7 +121,11 @@ class Watch:
         if reason:
             done.append(self.intake.refuse(path.name, source, reason))
         elif is_clip(path):
-            yield from take_clip(self.intake, path, source)
+            found, whole = self._advanced(path, key, known, source)
+            if not whole:
+                yield from found
+                return
+            done += found
         else:
             done.append(self.intake.take_file(path, source))
         self.growing.pop(key, None)
@@ -129,14 +136,29 @@ class Watch:
         hit("folder seen")
         yield from done  # recorded first: who asks for one result only has it recorded
 
+    def _advanced(
+        self, path: Path, key: str, known: Growing, source: str
+    ) -> tuple[list[Accepted | Refused], bool]:
+        """Works on a clip for a short time; results, and whether that was all."""
+        stamp, taking = self._clips.pop(key, (known.stamp, None))
+        if taking is None or stamp != known.stamp:  # new, or written anew since
+            taking = take_clip(self.intake, path, source)
+        found, whole = advanced(taking)
+        if not whole:
+            self._clips[key] = known.stamp, taking
+        return found, whole
+
     def _candidates(
         self, closed: set[str], *, everything: bool, now: float
     ) -> list[tuple[Path, Stamp | None]]:
         """Files to check, with their stamp; None if the file no longer exists."""
         known = {p for p in map(Path, closed | self.growing.keys()) if _photo_name(p.name)}
-        if everything or now >= self._due:
+        if not self.folder.is_dir():
+            self._due = 0.0  # what was reported while it is away is looked for when it is back
+        elif everything or now >= self._due:
+            began = time.thread_time()  # a busy machine is no reason to look less often
             known.update(self._files())
-            took = time.monotonic() - now
+            took = time.thread_time() - began
             self._due = now + max(SCAN_TOLD_S if self._closed.told else SCAN_S, took / SHARE)
         return [(path, _stamp(path)) for path in known]
 

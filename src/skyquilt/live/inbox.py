@@ -17,6 +17,8 @@ from pathlib import Path
 
 from skyquilt.errors import OutputError, UnreadablePhotoError
 from skyquilt.live.ledger import Ledger, hit
+from skyquilt.video.read import CLIP_ENDINGS
+from skyquilt.video.tracks import TRACK_ENDINGS
 
 ENDINGS = {
     b"\xff\xd8\xff": ".jpg",
@@ -43,6 +45,16 @@ class Arrived:
 def ending_of(head: bytes) -> str | None:
     """The file extension that matches a file's first bytes; None if it is not a photo."""
     return next((end for magic, end in ENDINGS.items() if head.startswith(magic)), None)
+
+
+def is_clip(path: Path) -> bool:
+    """Whether a file is a clip by its name."""
+    return path.suffix.lower() in CLIP_ENDINGS
+
+
+def belongs_to_clip(name: str) -> bool:
+    """Whether a file of this name is a clip or positions of one."""
+    return Path(name).suffix.lower() in (*CLIP_ENDINGS, *TRACK_ENDINGS)
 
 
 class Inbox:

@@ -40,13 +40,13 @@ class FolderLock:
                 fcntl.lockf(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self.tell("")
         except (BlockingIOError, PermissionError) as error:
-            os.close(self._handle)
+            self.close()
             raise OutputError(
                 f"another live map works in {folder}{self._other()}; end that one, or choose"
                 " another folder"
             ) from error
         except OSError as error:
-            os.close(self._handle)
+            self.close()
             raise OutputError(
                 f"cannot write to {folder}: {error.strerror or error}; choose another output folder"
             ) from error

@@ -12,12 +12,13 @@ from pathlib import Path
 from skyquilt.engine.error_log import log_error
 from skyquilt.errors import OutputError, UnreadablePhotoError
 from skyquilt.live.failures import of_the_system
-from skyquilt.live.inbox import Arrived, Inbox
+from skyquilt.live.inbox import Arrived, Inbox, belongs_to_clip, is_clip
 from skyquilt.live.ledger import Ledger, hit
 from skyquilt.live.settings import LiveSettings
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.outside import open_regular, plain
 from skyquilt.photos.read import read_photo, rejected
+from skyquilt.video.srt import MOST_TELEMETRY_BYTES
 
 NAME = 200
 """Largest number of characters of a name that are kept."""
@@ -62,6 +63,12 @@ class Intake:
 
     def __init__(self, ledger: Ledger, inbox: Inbox, settings: LiveSettings) -> None:
         self.ledger, self.inbox, self.settings = ledger, inbox, settings
+
+    def most_bytes(self, name: str) -> int:
+        """The largest size of an upload of this name in bytes."""
+        if is_clip(Path(name)):
+            return self.settings.most_clip_bytes
+        return MOST_TELEMETRY_BYTES if belongs_to_clip(name) else self.inbox.most_bytes
 
     def take(self, blocks: Iterable[bytes], name: str, source: str) -> Accepted | Refused:
         """Accepts a file's bytes; when this returns `Accepted`, no crash can lose the photo.

@@ -53,6 +53,8 @@ class LiveSettings:
     """Features per photo, as in the batch workflow."""
     most_bytes: int = 500_000_000
     """Largest photo file in bytes."""
+    most_clip_bytes: int = 8_000_000_000
+    """Largest uploaded clip in bytes."""
     most_mp: float = MOST_MP
     """Largest area of a photo in megapixels."""
     most_photos: int = 100_000
@@ -67,6 +69,7 @@ class LiveSettings:
             ("--max-view-angle", self.max_view_angle, 0, 90),
             ("--max-photos", self.most_photos, 1, 10**7),
             ("--max-mb", self.most_bytes / 1e6, 0.01, 1e5),
+            ("--max-clip-mb", self.most_clip_bytes / 1e6, 0.01, 1e6),
             ("--max-mp", self.most_mp, 0.01, 1e4),
         ):
             if value is not None and not low <= value <= high:

@@ -17,6 +17,7 @@ from skyquilt.live.folder_watch import Watch
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.photo_intake import Refused
 from skyquilt.live.settings import LiveSettings
+from skyquilt.live.uploaded_clips import UploadedClips
 from skyquilt.model.event import Event, Note, Result
 
 IDLE_S = 0.01
@@ -43,7 +44,8 @@ def iter_live(
         UsageError: a folder is missing.
     """
     stop = stop or threading.Event()
-    watches = [Watch(folder=f, intake=live.intake) for f in folders]
+    watches: list[Watch | UploadedClips] = [Watch(folder=f, intake=live.intake) for f in folders]
+    watches.append(UploadedClips(intake=live.intake))
     busy_since = time.monotonic()
     while not stop.is_set():
         try:
@@ -66,7 +68,7 @@ def iter_live(
         stop.wait(IDLE_S)
 
 
-def _taken(watches: Sequence[Watch]) -> Iterator[Event]:
+def _taken(watches: Sequence[Watch | UploadedClips]) -> Iterator[Event]:
     for watch in watches:
         for done in watch.look():
             if isinstance(done, Refused):

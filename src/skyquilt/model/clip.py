@@ -84,6 +84,8 @@ class Clip:
     """Rotation by which a player shows the clip; never applied."""
     start: datetime | None
     """When the clip starts: naive local time of the drone, or UTC where only the container says."""
+    model: str
+    """Camera model as the container names it; empty where it does not."""
     camera_key: str
     """As `Photo.camera_key`."""
     focal: Focal
@@ -151,6 +153,10 @@ class ChosenFrames:
     """Looks at which nothing had moved since the one before."""
     overlap: float
     """Wanted share."""
+    focal: Focal
+    """Before the adjustment."""
+    shutter: Shutter
+    """Before the adjustment."""
     offset_s: float = 0.0
     """Seconds added to the clip's time to get the time of its positions."""
     offset_sigma_s: float | None = None

@@ -83,9 +83,9 @@ class Focal:
     """Focal length in px of this file."""
     sigma_px: float
     """Standard deviation in px."""
-    source: Literal["calibrated", "sensor", "focal-plane", "35mm", "guess"]
-    """Calibrated value, mm with the sensor database, focal-plane resolution, 35 mm equivalent,
-    guess.
+    source: Literal["calibrated", "sensor", "focal-plane", "mode", "35mm", "guess"]
+    """Calibrated value, mm with the sensor database, focal-plane resolution, table of video modes,
+    35 mm equivalent, guess.
     """
 
 

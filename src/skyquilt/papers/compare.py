@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from skyquilt import registry
+from skyquilt.engine.clock import Clock
 from skyquilt.engine.folder import STATE
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import AlignmentError, UsageError
@@ -20,12 +21,14 @@ from skyquilt.model.photo import ControlPoint, PointObservation
 from skyquilt.model.poses import Alignment
 from skyquilt.papers.compare_state import CompareState, taken_up
 from skyquilt.papers.comparison_page import comparison_page
+from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.raster.atomic import write_text
 from skyquilt.report.page import write_page
 from skyquilt.settings import OPTION_OF, MosaicSettings
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
+from skyquilt.workflows.flow import frames_added
 from skyquilt.workflows.methods import methods_for
 from skyquilt.workflows.mosaic import make_map, run_key
 from skyquilt.workflows.survey_input import SurveyInput, read_input
@@ -100,11 +103,20 @@ def iter_compare(
         SkyquiltError: the photos, the output or an option is wrong; a method that cannot place the
             photos is not an error; it gets a row with the reason.
     """
-    given = _first(read_input(folder, settings.mosaic.input), settings.first)
+    given = read_input(folder, settings.mosaic.input)
+    given = given if given.survey.clips else _first(given, settings.first)
     key = digest(
-        run_key(given, settings.mosaic, methods_for(settings.mosaic)), _content(settings.known)
+        run_key(given, settings.mosaic, methods_for(settings.mosaic)),
+        _content(settings.known),
+        settings.first if given.survey.clips else None,
     )
     state, goes_on = taken_up(output, key, overwrite=overwrite)
+    if given.survey.clips:  # looked through once for all methods
+        clock = Clock(
+            store=Store(folder=output / STATE / "store", registry=REGISTRY), began=Clock.now()
+        )
+        given = yield from frames_added(given, settings.mosaic, clock)
+        given = _first(given, settings.first)
     rows = _Rows(given, output, overwrite=overwrite or goes_on)  # the runs below belong to it
     base, says = _judged_by(given, output, settings, state)
     state.write(output)
@@ -146,7 +158,8 @@ class _Rows:
         told: list[str] = []
         given, overwrite = self.given, self.overwrite or again
         if settings.input.distances is not None:
-            known = read_input(given.source, settings.input).distances
+            names = [p.name for p in given.survey.photos]
+            known = read_distances(settings.input.distances, names, given.control)
             given = replace(given, distances=known)
         steps = make_map(given, self.output / name, settings, overwrite=overwrite)
         try:

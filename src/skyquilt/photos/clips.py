@@ -12,6 +12,7 @@ from skyquilt.errors import SideFileError
 from skyquilt.model.clip import ChosenFrames, Clip, Track
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.photos.read import read_photo
+from skyquilt.photos.video_modes import with_mode
 from skyquilt.video.positions import attitude_at, clip_zero, flight_yaw_at, places_at, position_at
 from skyquilt.video.read import read_clip
 from skyquilt.video.tracks import TRACK_ENDINGS, Fix, is_timed_csv, merged, read_track, track_of
@@ -39,7 +40,8 @@ def read_clips(
         track = common
         if timed is not None and timed.is_dir():
             track = track_in_folder(timed, path)
-        read.append(read_clip(path, name=name, track=track))
+        clip = read_clip(path, name=name, track=track)
+        read.append(with_mode(clip) if isinstance(clip, Clip) else clip)
     bad = [c for c in read if isinstance(c, RejectedPhoto)]
     good: dict[str, Clip] = {}
     for clip in (c for c in read if isinstance(c, Clip)):

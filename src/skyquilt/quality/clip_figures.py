@@ -27,6 +27,12 @@ def _clip(clip: ChosenFrames) -> dict[str, Any]:
         "clock_offset_s": round(clip.offset_s, 3),
         "clock_offset_sigma_s": _rounded(clip.offset_sigma_s),
         "clock_offset_source": clip.offset_source,
+        "focal_prior_px": round(clip.focal.px, 1),
+        "focal_prior_sigma_px": round(clip.focal.sigma_px, 1),
+        "focal_source": clip.focal.source,
+        "readout_prior_ms": round(1000 * clip.shutter.readout_s, 2),
+        "readout_prior_sigma_ms": round(1000 * clip.shutter.sigma_s, 2),
+        "readout_source": clip.shutter.source,
         "frames": [_frame(clip, f) for f in clip.chosen],
     }
 

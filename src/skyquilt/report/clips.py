@@ -21,6 +21,18 @@ OFFSETS = {
     "clock": "not found; clocks taken as they are",
     "none": "no positions",
 }
+FOCALS = {
+    "mode": "the table of video modes",
+    "sensor": "the sensor table",
+    "35mm": "the 35 mm equivalent in the telemetry",
+    "guess": "a guess",
+}
+READOUTS = {
+    "table": "the table of shutters",
+    "option": "given",
+    "guess": "a guess",
+    "global": "given: all rows at once",
+}
 
 
 def clips_section(data: ReportInput) -> tuple[Section, ...]:
@@ -61,11 +73,27 @@ def clips_section(data: ReportInput) -> tuple[Section, ...]:
             else ""
         ),
     )
-    lead = (
-        "Frames are chosen by overlap, sharpness and motion, not at fixed times; focal length and"
-        " shutter of the clip are under Camera calibration."
+    lenses = Table(
+        title="Video modes, before the adjustment",
+        head=("Clip", "Focal length, px", "\u00b1", "from", "Readout, ms", "\u00b1", "from"),
+        rows=tuple(_lens(c) for c in clips),
+        numeric="cnntnnt",
+        note="What the adjustment made of them is under Camera calibration.",
     )
-    return (Section(id="clips", title="Clips", lead=lead, blocks=(summary, chosen)),)
+    lead = "Frames are chosen by overlap, sharpness and motion, not at fixed times."
+    return (Section(id="clips", title="Clips", lead=lead, blocks=(summary, lenses, chosen)),)
+
+
+def _lens(clip: Mapping[str, Any]) -> tuple[str, ...]:
+    return (
+        plain(clip.get("name")),
+        fixed(clip.get("focal_prior_px"), 0),
+        fixed(clip.get("focal_prior_sigma_px"), 0),
+        FOCALS.get(str(clip.get("focal_source")), ""),
+        fixed(clip.get("readout_prior_ms"), 0),
+        fixed(clip.get("readout_prior_sigma_ms"), 0),
+        READOUTS.get(str(clip.get("readout_source")), ""),
+    )
 
 
 def _row(clip: Mapping[str, Any]) -> tuple[str, ...]:

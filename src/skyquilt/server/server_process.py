@@ -112,7 +112,7 @@ class ServerProcess:
         self._parts |= {"process": process, "wire": wire}
         try:
             return str(wire.recv()) if wire.poll(PATIENCE_S) else "the viewer does not start"
-        except EOFError:
+        except (EOFError, OSError):  # or this server ended meanwhile
             return "the viewer's process ended during its start"
 
     def _keep(self) -> None:
@@ -121,7 +121,7 @@ class ServerProcess:
             if self._ending.wait(1.0):
                 return
             log_error(self.asked.folder, "the viewer's process ended and is started anew", "")
-            while problem := self._start():
+            while (problem := self._start()) and not self._ending.is_set():
                 log_error(self.asked.folder, f"it does not start: {problem}", "")
                 if self._ending.wait(RESTART_S):
                     return

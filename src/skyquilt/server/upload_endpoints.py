@@ -21,7 +21,9 @@ from fastapi.responses import JSONResponse
 from starlette.requests import ClientDisconnect
 
 from skyquilt.errors import OutputError
+from skyquilt.live.inbox import belongs_to_clip
 from skyquilt.live.photo_intake import Accepted, Intake, Refused, shown_name
+from skyquilt.live.uploaded_clips import Waiting, bring_clip
 from skyquilt.server.access import RESUMABLE, TUS, Context, blocks_of, client_of
 from skyquilt.server.uploads import Upload, Uploads
 
@@ -42,21 +44,25 @@ class UploadEndpoints:
         self, request: Request, name: str = "photo", source: str = "upload"
     ) -> JSONResponse:
         """Accepts a photo (the body). Responds when the photo is stored durably: 201, 200 for a
-        duplicate, 422 if refused.
+        duplicate, 422 if refused. A finished video, or a file of positions with its name: 202; its
+        frames become photos later.
         """
         intake = self.context.writing(request).intake
-        most = intake.inbox.most_bytes
-        _check_size(_length(request), most, f"a photo may have {most} bytes")
+        most = intake.most_bytes(name)
+        limit = f"such a file may have {most} bytes"
+        _check_size(_length(request), most, limit)
         client = client_of(request)
         upload = await run_in_threadpool(self._begun, name, source, most, client)
         with self.uploads.writing(upload.id):
             try:
-                await self._append(request, upload, f"a photo may have {most} bytes")
+                await self._append(request, upload, limit)
                 done = await run_in_threadpool(self._handed_in, intake, upload)
             finally:
                 self.uploads.drop(upload.id)
-        if not isinstance(done, Accepted):
+        if isinstance(done, Refused):
             return _refusal(done)
+        if isinstance(done, Waiting):
+            return JSONResponse({"name": done.name, "state": _state(done)}, 202)
         said = {"id": done.id, "name": done.name, "state": _state(done)}
         return JSONResponse(said, 200 if done.duplicate else 201)
 
@@ -64,7 +70,8 @@ class UploadEndpoints:
 
     def upload_offer(self) -> Response:
         """Reports the supported tus version and extensions."""
-        most = self.context.growing().intake.inbox.most_bytes
+        intake = self.context.growing().intake
+        most = max(intake.inbox.most_bytes, intake.settings.most_clip_bytes)
         offered = {"Tus-Extension": "creation,expiration,termination", "Tus-Max-Size": str(most)}
         return Response(status_code=204, headers=VERSIONS | offered)
 
@@ -72,16 +79,17 @@ class UploadEndpoints:
         """Starts an upload of `Upload-Length` bytes; `Upload-Metadata` may contain `filename` and
         `source`. The header `Location` gives the URL for its parts.
         """
-        most = self._tus(request).inbox.most_bytes
+        intake = self._tus(request)
         size = _number(request, "upload-length")
         if size is None:
             raise HTTPException(400, "Upload-Length, the size of the photo in bytes, is needed")
-        _check_size(size, most, f"a photo may have {most} bytes", {"Tus-Max-Size": str(most)})
         if size == 0:
             raise HTTPException(422, "an empty file is not a photo")
         metadata = request.headers.get("upload-metadata", "")
         about = metadata_of(metadata)
         name = about.get("filename") or about.get("name") or "photo"
+        most = intake.most_bytes(name)
+        _check_size(size, most, f"such a file may have {most} bytes", {"Tus-Max-Size": str(most)})
         source = about.get("source") or "upload"
         upload = self._begun(name, source, size, client_of(request), metadata)
         told = {"Location": f"{RESUMABLE}/{upload.id}", **self._progress(upload)}
@@ -161,10 +169,11 @@ class UploadEndpoints:
     async def _finished(self, intake: Intake, upload: Upload) -> Response:
         """Passes a complete upload to the intake of photos."""
         done = await run_in_threadpool(self._handed_in, intake, upload)
-        if not isinstance(done, Accepted):
+        if isinstance(done, Refused):
             self.uploads.drop(upload.id)
             return _refusal(done)
-        told = {"Photo-Id": str(done.id), "Photo-State": _state(done)}
+        told = {"Photo-Id": str(done.id)} if isinstance(done, Accepted) else {}
+        told["Photo-State"] = _state(done)
         self.uploads.accept(upload, told)
         return Response(status_code=204, headers={"Upload-Offset": str(upload.size), **told})
 
@@ -218,8 +227,10 @@ class UploadEndpoints:
             return False
         return True
 
-    def _handed_in(self, intake: Intake, upload: Upload) -> Accepted | Refused:
+    def _handed_in(self, intake: Intake, upload: Upload) -> Accepted | Refused | Waiting:
         try:
+            if belongs_to_clip(upload.name):
+                return bring_clip(intake, self.uploads.path(upload), upload.name, upload.source)
             with self.uploads.path(upload).open("rb") as file:
                 blocks = iter(lambda: file.read(1 << 20), b"")
                 return intake.take(blocks, upload.name, upload.source)
@@ -272,7 +283,9 @@ def _no_room(error: OSError) -> HTTPException:
     return HTTPException(507, f"the server cannot store it ({error.strerror}); send it again later")
 
 
-def _state(done: Accepted) -> str:
+def _state(done: Accepted | Waiting) -> str:
+    if isinstance(done, Waiting):
+        return "waiting"
     return "duplicate" if done.duplicate else "received"
 
 

@@ -39,7 +39,7 @@ from skyquilt.thermal.page import write_figures, write_overlays, write_section
 from skyquilt.thermal.routes import ROUTES, Joined, as_registration, join, opened, refuse_apart
 from skyquilt.workflows.flow import Scene
 from skyquilt.workflows.mosaic import FinishedMap, make_map
-from skyquilt.workflows.survey_input import read_input
+from skyquilt.workflows.survey_input import SurveyInput, read_input
 
 FOLDER = "thermal"
 """Folder of the thermal run, below the visual one's."""
@@ -70,6 +70,9 @@ def iter_thermal(
             f"--thermal {thermal} is not a folder; give the folder of the thermal photos"
         )
     heats = read_input(thermal, heated.input)
+    if heats.survey.clips:
+        heats, said = _without_clips(heats, Path(thermal))
+        yield Note(text=said, warning=True)
     given = read_input(photos, settings.input)
     refuse_apart(given.survey.photos, heats.survey.photos)
     if not any(p.band == "thermal" for p in heats.survey.photos):
@@ -101,6 +104,18 @@ def iter_thermal(
         heats, output / FOLDER, heated.changed(crs=crs), overwrite=overwrite, rerun_from=rerun_from
     )
     yield from _joined(visual, heat, route, refused)
+
+
+def _without_clips(heats: SurveyInput, folder: Path) -> tuple[SurveyInput, str]:
+    """The thermal photos without the videos beside them, whose colours are no temperatures."""
+    names = ", ".join(c.name for c in heats.survey.clips[:3])
+    if not heats.survey.photos:
+        raise UsageError(
+            f"--thermal {folder} holds only videos ({names}), whose colours are no temperatures;"
+            " give the folder of the thermal photos"
+        )
+    survey = replace(heats.survey, clips=())
+    return replace(heats, survey=survey), f"videos in {folder} were left out: {names}"
 
 
 def _settings_of_both(asked: MosaicSettings) -> tuple[MosaicSettings, MosaicSettings]:

@@ -58,6 +58,8 @@ class FrameChoice:
             blurred=int((sharp < -self.blur).sum()),
             still=int(still.sum()),
             overlap=self.overlap,
+            focal=clip.focal,
+            shutter=clip.shutter,
         )
 
     def _run(

@@ -11,7 +11,11 @@ from typing import BinaryIO
 
 from skyquilt.outside import open_regular
 
-_INSIDE = (b"moov", b"trak", b"mdia", b"udta", b"meta", b"ilst")
+_INSIDE = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"udta", b"meta", b"ilst")
+_MP4 = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
+_SYNC = 0x47
+"""First byte of every packet of an MPEG transport stream, of 188 bytes or 192 with times."""
+_MEDIA = ("vide", "soun", "text", "meta", "sbtl", "tmcd")
 _MOST_BOXES = 4000
 _MODEL = re.compile(rb"(?:DJI|FC|Hasselblad|Autel|Parrot|GoPro|HERO)[ -~]{0,30}")
 _SURE = re.compile(r"^(FC\d{3,4}\w?|DJI ?[A-Za-z0-9 ]{3,25}|L[12]D-20c|HERO\d+ .{3,10})$")
@@ -29,27 +33,48 @@ class Container:
     """When it was made, UTC."""
     model: str
     """Camera model as some makers write it; empty where there is none."""
+    size: tuple[int, int] | None
+    """Width and height in px that its first video track declares."""
+
+
+def is_video(head: bytes) -> bool:
+    """Whether the first 400 bytes of a file are those of a container of ours: MP4, MOV, AVI,
+    Matroska or an MPEG transport stream.
+
+    FFmpeg would also read text that names other files and addresses.
+    """
+    return (
+        head[4:8] in _MP4
+        or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")
+        or head[:4] == b"\x1aE\xdf\xa3"
+        or (len(head) > 188 and head[0] == head[188] == _SYNC)
+        or (len(head) > 196 and head[4] == head[196] == _SYNC)
+    )
 
 
 def read_container(path: Path) -> Container | None:
     """The header of a clip; None where the file is no MP4 or MOV. Raises `OSError`."""
     with open_regular(path) as file:
-        if file.read(12)[4:8] not in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip"):
+        if file.read(12)[4:8] not in _MP4:
             return None
         size = file.seek(0, io.SEEK_END)
         kinds: list[str] = []
-        created, whole, model = None, False, ""
+        created, whole, model, declared = None, False, "", None
         for name, body, length in _boxes(file, 0, size):
             whole |= name == b"moov"
             file.seek(body)
             if name == b"hdlr":
-                kinds.append(file.read(min(length, 12))[8:12].decode("latin-1"))
+                kind = file.read(min(length, 12))[8:12].decode("latin-1")
+                if kind in _MEDIA:  # of a track: QuickTime has others for its data
+                    kinds.append(kind)
             elif name == b"mvhd":
                 created = _created(file.read(min(length, 20)))
             elif name == b"udta" and not model:
                 model = _model(file.read(min(length, 1 << 16)))
-    media = tuple(k for k in kinds if k in ("vide", "soun", "text", "meta", "sbtl", "tmcd"))
-    return Container(whole=whole, kinds=media, created=created, model=model)
+            elif name == b"stsd" and kinds[-1:] == ["vide"] and declared is None:
+                entry = file.read(min(length, 44))
+                declared = struct.unpack(">HH", entry[40:44]) if len(entry) == 44 else None
+    return Container(whole=whole, kinds=tuple(kinds), created=created, model=model, size=declared)
 
 
 def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:

@@ -16,18 +16,26 @@ from numpy.typing import NDArray
 from skyquilt.errors import UnreadablePhotoError
 
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its complaints would go to the terminal
+# a container that names other files or addresses shall not open any
+os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file")
 _OPEN, _ERRORS = 4, 2
 _AHEAD_S = 3.0
 _TOLERANCE = 0.4
+_PLANAR = int.from_bytes(b"I420", "little")
+"""Pixel format whose first plane is the brightness in 8 bits: 8-bit H.264, H.265 and MPEG-4."""
 Frame = NDArray[np.uint8]
 
 
 class Decoder:
     """Frames of one clip; not to be used by two threads at once."""
 
-    def __init__(self, path: Path) -> None:
-        """Raises `UnreadablePhotoError` where the file holds no video that can be decoded."""
-        self.path = path
+    def __init__(self, path: Path, *, grey: bool = False) -> None:
+        """With `grey`, frames have one channel, which saves the conversion to RGB: as much as the
+        decoding itself.
+
+        Raises `UnreadablePhotoError` where the file holds no video that can be decoded.
+        """
+        self.path, self._grey, self._plane = path, grey, False
         self._time = -1.0
         self._open()
 
@@ -47,15 +55,17 @@ class Decoder:
         self.rotation_deg = int(cap.get(cv2.CAP_PROP_ORIENTATION_META))
         code = int(cap.get(cv2.CAP_PROP_FOURCC))
         self.codec = "".join(chr(code >> 8 * i & 255) for i in range(4)).strip("\0 ")
+        if self._grey and int(cap.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) == _PLANAR:
+            self._plane = bool(cap.set(cv2.CAP_PROP_CONVERT_RGB, 0))
         self._time = -1.0
 
     def close(self) -> None:
         """Releases the decoder."""
         self._cap.release()
 
-    def at(self, time_s: float, *, rgb: bool = True) -> tuple[float, Frame] | None:
-        """Time in s and pixels (height, width, 3) of the first frame from `time_s` on; None after
-        the last one. Without `rgb` they are BGR as OpenCV decodes them, which saves a copy.
+    def at(self, time_s: float) -> tuple[float, Frame] | None:
+        """Time in s and pixels (height, width, 3) RGB, or (height, width) grey, of the first frame
+        from `time_s` on; None after the last one.
         """
         near = _TOLERANCE / self.fps
         if not self._time - near <= time_s <= self._time + _AHEAD_S:
@@ -66,8 +76,9 @@ class Decoder:
         found, pixels = self._cap.retrieve()
         if not found or pixels is None:
             return None
-        if rgb:
-            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)
+        if not self._plane:
+            code = cv2.COLOR_BGR2GRAY if self._grey else cv2.COLOR_BGR2RGB
+            pixels = cv2.cvtColor(pixels, code)
         return self._time, np.asarray(pixels, dtype=np.uint8)
 
     def skip(self) -> bool:

@@ -38,7 +38,7 @@ class Looker:
     """Corners that must agree for a motion to count."""
     chunk: int = 300
     """Looks that are stored at once."""
-    version: int = 1
+    version: int = 2
     """Changes when the results do."""
 
     def step(self, fps: float) -> int:
@@ -52,20 +52,21 @@ class Looker:
     def __call__(
         self, decoder: Decoder, number: int, *, last: float | None, open_end: bool
     ) -> Iterator[int | Looks]:
-        """Yields the number of looks done so far, then the looks of chunk `number`.
+        """Yields the number of looks done so far, then the looks of chunk `number`; `decoder` gives
+        grey frames.
 
         `last`: time in s of the last look of the chunk before, None for the first chunk. With
         `open_end` the chunk goes on to the end of the clip, however long it is.
         """
         step = self.step(decoder.fps) / decoder.fps
         tracker = _Tracker(looker=self, size=(decoder.width, decoder.height))
-        if last is not None and (found := decoder.at(last, rgb=False)):
+        if last is not None and (found := decoder.at(last)):
             tracker.look(found[1])
         rows: list[tuple[float, float, complex, complex, bool]] = []
         at, end = number * self.chunk, (number + 1) * self.chunk
         seen = -1.0 if last is None else last
         while at < end or open_end:
-            found = decoder.at(at * step, rgb=False)
+            found = decoder.at(at * step)
             if found is None:
                 break
             time, pixels = found
@@ -102,7 +103,7 @@ def sharpness(pixels: Frame) -> float:
     fine, coarse = np.zeros(2), np.zeros(2)
     for y in np.linspace(0, height - size, _PATCHES_Y).astype(int):
         for x in np.linspace(0, width - size, _PATCHES_X).astype(int):
-            grey = cv2.cvtColor(pixels[y : y + size, x : x + size], cv2.COLOR_BGR2GRAY)
+            grey = pixels[y : y + size, x : x + size]
             half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
             fine += _second(half)
             coarse += _second(
@@ -137,7 +138,7 @@ class _Tracker:
             (width // shrink, height // shrink),
             interpolation=cv2.INTER_AREA,
         )
-        grey: Grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+        grey: Grey = np.asarray(small, dtype=np.uint8)
         found = self._follow(grey)
         self._grey = grey
         if found is None or self._points is None or len(self._points) < _RENEWED:

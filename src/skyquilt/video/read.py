@@ -11,14 +11,16 @@ import cv2
 from skyquilt.errors import SideFileError, UnreadablePhotoError
 from skyquilt.model.clip import Clip, Track
 from skyquilt.model.photo import RejectedPhoto
-from skyquilt.outside import open_regular
-from skyquilt.video.container import Container, read_container
+from skyquilt.outside import check_picture, open_regular
+from skyquilt.video.container import Container, is_video, read_container
 from skyquilt.video.decoder import Decoder
 from skyquilt.video.lens import video_focal, video_shutter
 from skyquilt.video.tracks import TRACK_ENDINGS, is_timed_csv, read_track
 
 CLIP_ENDINGS = frozenset({".mp4", ".mov", ".m4v", ".avi", ".mkv", ".mts", ".m2ts", ".webm"})
 _SMALLEST = 64
+MOST_FRAME_MP = 50.0
+"""Largest area of a frame in megapixels: 8K has 33."""
 _PIECES, _PIECE = 64, 1 << 16
 
 
@@ -38,17 +40,16 @@ def read_clip(path: Path, *, name: str, track: Track | None = None) -> Clip | Re
 
 
 def _clip(path: Path, name: str, track: Track | None) -> Clip:
+    with open_regular(path) as file:
+        head = file.read(400)
     box = read_container(path)
-    _check(path, box)
+    _check(path, head, box)
     decoder = Decoder(path)
     try:
+        if min(decoder.width, decoder.height) > 0:
+            _check_size(decoder.width, decoder.height)
         if decoder.at(0.0) is None:
             raise UnreadablePhotoError("it is a video without a frame that can be decoded")
-        if min(decoder.width, decoder.height) < _SMALLEST:
-            raise UnreadablePhotoError(
-                f"its frames have only {decoder.width}x{decoder.height} px; at least {_SMALLEST} a"
-                " side are needed"
-            )
     finally:
         decoder.close()
     notes: tuple[str, ...] = ()
@@ -57,7 +58,7 @@ def _clip(path: Path, name: str, track: Track | None) -> Clip:
     start = _start(track, box)
     size = (decoder.width, decoder.height)
     focal_35mm, zoom = (track.focal_35mm, track.zoom) if track else (None, 1.0)
-    model = (box.model if box else "") or "camera"
+    model = box.model if box else ""
     return Clip(
         name=name,
         path=path,
@@ -69,7 +70,8 @@ def _clip(path: Path, name: str, track: Track | None) -> Clip:
         codec=decoder.codec,
         rotation_deg=decoder.rotation_deg,
         start=start,
-        camera_key=_camera_key(model, size, focal_35mm, zoom),
+        model=model,
+        camera_key=_camera_key(model or "camera", size, focal_35mm, zoom),
         focal=video_focal(*size, focal_35mm, zoom),
         shutter=video_shutter(decoder.fps),
         track=track,
@@ -77,9 +79,13 @@ def _clip(path: Path, name: str, track: Track | None) -> Clip:
     )
 
 
-def _check(path: Path, box: Container | None) -> None:
-    if path.stat().st_size == 0:
+def _check(path: Path, head: bytes, box: Container | None) -> None:
+    if not head:
         raise UnreadablePhotoError("it is empty (0 bytes)")
+    if not is_video(head):
+        raise UnreadablePhotoError(
+            "no video in it can be decoded: it is no MP4, MOV, AVI, MKV, MTS"
+        )
     if box is None:
         return
     if not box.whole:
@@ -89,6 +95,17 @@ def _check(path: Path, box: Container | None) -> None:
     if box.kinds and "vide" not in box.kinds:
         held = "sound only" if "soun" in box.kinds else "no pictures"
         raise UnreadablePhotoError(f"it is a video file with {held}")
+    if box.size is not None and min(box.size) > 0:
+        _check_size(*box.size)
+
+
+def _check_size(width: int, height: int) -> None:
+    """Refuses frames by their declared size: decoders keep up to 16 of them."""
+    if min(width, height) < _SMALLEST:
+        raise UnreadablePhotoError(
+            f"its frames have only {width}x{height} px; at least {_SMALLEST} a side are needed"
+        )
+    check_picture(width, height, 3, most_mp=MOST_FRAME_MP, option=" of a frame")
 
 
 def _digest(path: Path) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from skyquilt.errors import SideFileError
 from skyquilt.model.clip import Track
-from skyquilt.outside import open_regular, real
+from skyquilt.outside import open_regular, plain, real
 from skyquilt.video.srt import Sample, read_samples, side_text
 
 Array = NDArray[np.float64]
@@ -270,9 +270,9 @@ def _read_csv(path: Path) -> Track:
     columns = _where(words)
     clock = next((w for w in _TIMES if w in words), None)
     if clock is None or "latitude_deg" not in columns or "longitude_deg" not in columns:
+        head = plain(", ".join(table[0]), 200) if table else ""
         raise SideFileError(
-            f"{path.name}: its header is '{', '.join(table[0]) if table else ''}'; expected columns"
-            " time, latitude and longitude."
+            f"{path.name}: its header is '{head}'; expected columns time, latitude and longitude."
         )
     at = words.index(clock)
     fixes, seconds = [], []
@@ -289,7 +289,8 @@ def _read_csv(path: Path) -> Track:
     if not fixes:
         raise SideFileError(f"{path.name} has no row with a time that can be read.")
     cells_of = [columns["latitude_deg"], columns["longitude_deg"]]
-    decimals = max(len(c[k].partition(".")[2]) for c in table[1:] for k in cells_of if k < len(c))
+    cells_with = (c[k] for c in table[1:] for k in cells_of if k < len(c))
+    decimals = max((len(c.partition(".")[2]) for c in cells_with), default=0)
     return track_of(
         fixes,
         file=path.name,

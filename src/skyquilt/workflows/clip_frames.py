@@ -129,13 +129,13 @@ def _seen(clip: Clip, look: Looker, store: Store, before: int, total: int) -> St
             key = digest(clip.digest, look, number, count)
             part = store.get("looks", key)
             if part is None:
-                decoder = decoder or Decoder(clip.path)
+                decoder = decoder or Decoder(clip.path, grey=True)
                 last = float(parts[-1].time_s[-1]) if parts and len(parts[-1].time_s) else None
                 end = number == count - 1
                 for step in look(decoder, number, last=last, open_end=end):
                     if isinstance(step, Looks):
                         part = step
-                    elif step % 10 == 0:
+                    elif step % 2 == 0:
                         yield min(before + number * look.chunk + step, total), total
                 store.put("looks", key, part)
             assert part is not None

@@ -1,0 +1,143 @@
+"""Headers of TIFF and PNG files: size, type, EXIF, XMP. Loaded only for these."""
+
+import io
+from typing import BinaryIO
+
+import numpy as np
+import tifffile
+from PIL.PngImagePlugin import PngImageFile
+
+from skyquilt.errors import UnreadablePhotoError
+from skyquilt.outside import MOST_MP, check_picture
+from skyquilt.photos.headers import Dtype, Header
+from skyquilt.photos.tags import MOST_XMP, Directories, parse_exif, parse_xmp, read_tiff_tags
+
+MOST_CHUNKS = 100_000
+"""Largest number of chunks of a PNG."""
+_WIDTH, _HEIGHT, _BITS, _CODEC, _SAMPLES = 256, 257, 258, 259, 277
+_STRIPS, _TILES, _XMP_TAG = 273, 324, 700
+_CODECS = frozenset({1, 5, 7, 8, 32773, 32946, 34925, 50000})
+"""None, LZW, JPEG, Deflate, PackBits, Deflate (old), LZMA, Zstandard."""
+MOST_STRIPS = 1_000_000
+"""Largest number of strips or tiles of a TIFF."""
+
+
+def check_tiff(file: BinaryIO, most_mp: float = MOST_MP) -> None:
+    """Refuses a TIFF by what its first directory declares, before anything else is read."""
+    try:
+        directories = Directories(file)
+        found = directories.read(
+            directories.first, {_WIDTH, _HEIGHT, _BITS, _CODEC, _SAMPLES, _XMP_TAG}
+        )
+    except ValueError as error:
+        raise UnreadablePhotoError(f"its header is broken ({error})") from error
+    width, height, samples, codec = (
+        int(found.get(tag, otherwise))
+        for tag, otherwise in ((_WIDTH, 0), (_HEIGHT, 0), (_SAMPLES, 1), (_CODEC, 1))
+    )
+    bits = found.get(_BITS, 8)
+    deep = max(bits) if isinstance(bits, tuple) else bits
+    kept = samples * (deep + 7) // 8
+    # values other than 8 and 16 bits become 32; one more copy is made where bands are interleaved
+    check_picture(
+        width,
+        height,
+        kept if deep <= 16 else kept + 4 * samples,
+        file_bytes=file.seek(0, io.SEEK_END),
+        most_mp=most_mp,
+    )
+    if codec not in _CODECS:
+        raise UnreadablePhotoError(f"its TIFF compression {codec} is not one that is read")
+    pieces = max(directories.counts.get(_STRIPS, 0), directories.counts.get(_TILES, 0))
+    if pieces > MOST_STRIPS:
+        raise UnreadablePhotoError(f"its pixels are in more than {MOST_STRIPS} pieces")
+
+
+def read_tiff(file: BinaryIO, most_mp: float) -> Header:
+    """The header of a TIFF. Raises `UnreadablePhotoError`, and what tifffile raises."""
+    check_tiff(file, most_mp)
+    exif = read_tiff_tags(file)
+    file.seek(0)
+    with tifffile.TiffFile(file) as tiff:
+        page = tiff.pages[0]
+        if not isinstance(page, tifffile.TiffPage) or page.dtype is None:
+            raise UnreadablePhotoError("its kind of TIFF cannot be decoded")
+        _check_extent(page, file)
+        packet = (
+            page.tags[_XMP_TAG].value
+            if _XMP_TAG in page.tags and page.tags[_XMP_TAG].count <= MOST_XMP
+            else b""
+        )
+        alpha = sum(int(e) in (1, 2) for e in page.extrasamples)
+        return Header(
+            kind="tiff",
+            width=int(page.imagewidth),
+            height=int(page.imagelength),
+            channels=int(page.samplesperpixel) - alpha,
+            dtype=_stored_as(page.dtype),
+            exif=exif,
+            xmp=parse_xmp((packet,) if isinstance(packet, bytes) and packet else ()),
+        )
+
+
+def _check_extent(page: tifffile.TiffPage, file: BinaryIO) -> None:
+    need = max(
+        (o + n for o, n in zip(page.dataoffsets, page.databytecounts, strict=False)), default=0
+    )
+    have = file.seek(0, io.SEEK_END)
+    if need > have:
+        raise UnreadablePhotoError(
+            f"it is truncated: its pixels need {need} bytes, the file has {have}"
+        )
+
+
+def _stored_as(dtype: np.dtype[np.generic]) -> Dtype:
+    if dtype == np.uint8:
+        return "uint8"
+    if dtype == np.uint16:
+        return "uint16"
+    if dtype.kind in "iuf":
+        return "float32"
+    raise UnreadablePhotoError(f"its pixels are {dtype}; integers or real numbers are needed")
+
+
+def check_png(file: BinaryIO, most_mp: float = MOST_MP) -> None:
+    """Refuses a PNG by its declared size, its number of chunks, or a missing end."""
+    size = file.seek(0, io.SEEK_END)
+    file.seek(8)
+    head = file.read(21)
+    if len(head) < 21 or head[4:8] != b"IHDR":
+        raise UnreadablePhotoError("its PNG header is broken or truncated")
+    width, height = (int.from_bytes(head[k : k + 4], "big") for k in (8, 12))
+    # Pillow keeps four bytes for a pixel that is not grey, and the result is a copy
+    bytes_per_px = {0: 4.0, 4: 6.0, 2: 7.0, 3: 5.0}.get(head[17], 11.0)
+    check_picture(width, height, bytes_per_px, file_bytes=size, most_mp=most_mp)
+    file.seek(8)
+    for _ in range(MOST_CHUNKS):
+        chunk = file.read(8)
+        if len(chunk) < 8:
+            raise UnreadablePhotoError("it is truncated: its PNG data never end")
+        if chunk[4:] == b"IEND":
+            return
+        file.seek(int.from_bytes(chunk[:4], "big") + 4, io.SEEK_CUR)
+    raise UnreadablePhotoError(f"it has more than {MOST_CHUNKS} PNG chunks")
+
+
+def read_png(file: BinaryIO, most_mp: float) -> Header:
+    """The header of a PNG. Raises `UnreadablePhotoError`, and what Pillow raises."""
+    check_png(file, most_mp)
+    file.seek(0)
+    with PngImageFile(file) as image:
+        packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+        packet = packet.encode() if isinstance(packet, str) else packet
+        block = image.info.get("exif") or b""
+        gray = image.mode in ("1", "L", "LA") or image.mode.startswith(("I", "F"))
+        return Header(
+            kind="png",
+            width=image.width,
+            height=image.height,
+            channels=1 if gray else 3,
+            dtype="uint16" if image.mode.startswith("I") else "uint8",
+            exif=parse_exif(block.removeprefix(b"Exif\x00\x00")),
+            xmp=parse_xmp((packet,) if packet else ()),
+        )
