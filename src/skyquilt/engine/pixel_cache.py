@@ -1,31 +1,42 @@
-"""Cache of decoded photos within a memory budget."""
+"""Cache of decoded photos, or of what was computed from them, within a memory budget."""
 
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Generic, Protocol, TypeVar
 
-from numpy.typing import NDArray
+import numpy as np
+
+
+class HasBytes(Protocol):
+    """An array, or a record that tells its size."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory."""
+
+
+Kept = TypeVar("Kept", bound=HasBytes)
 
 
 @dataclass(kw_only=True)
-class PixelCache:
+class PixelCache(Generic[Kept]):
     """Keeps decoded photos; the least recently used are dropped when the budget is exceeded.
     Thread-safe.
     """
 
-    read: Callable[[int], NDArray[Any]]
+    read: Callable[[int], Kept]
     """Decodes a photo by its index."""
     budget_bytes: int
     """Most bytes kept; a photo larger than that is returned but not kept."""
     decoded: int = 0
     """How many times a photo was decoded."""
-    _kept: OrderedDict[int, NDArray[Any]] = field(default_factory=OrderedDict)
+    _kept: OrderedDict[int, Kept] = field(default_factory=OrderedDict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _busy: dict[int, threading.Lock] = field(default_factory=dict)
 
-    def __call__(self, photo: int) -> NDArray[Any]:
+    def __call__(self, photo: int) -> Kept:
         """Pixels of a photo, read-only."""
         with self._lock:
             own = self._busy.setdefault(photo, threading.Lock())
@@ -35,11 +46,12 @@ class PixelCache:
                     self._kept.move_to_end(photo)
                     return self._kept[photo]
             pixels = self.read(photo)
-            pixels.setflags(write=False)
+            if isinstance(pixels, np.ndarray):
+                pixels.setflags(write=False)
             self.put(photo, pixels)
             return pixels
 
-    def put(self, photo: int, pixels: NDArray[Any]) -> None:
+    def put(self, photo: int, pixels: Kept) -> None:
         """Keeps pixels that the caller decoded, if they fit."""
         with self._lock:
             self.decoded += 1
@@ -50,7 +62,7 @@ class PixelCache:
             while sum(p.nbytes for p in self._kept.values()) > self.budget_bytes:
                 self._kept.popitem(last=False)
 
-    def peek(self, photo: int) -> NDArray[Any] | None:
+    def peek(self, photo: int) -> Kept | None:
         """Pixels of a photo if they are cached; nothing is decoded."""
         with self._lock:
             return self._kept.get(photo)

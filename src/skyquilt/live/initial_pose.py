@@ -2,8 +2,10 @@
 
 import json
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.live.drone_metadata import Metadata
@@ -23,7 +25,7 @@ class InitialPose:
     def __init__(
         self,
         metadata: Metadata,
-        pixels: PixelCache,
+        pixels: PixelCache[NDArray[Any]],
         redraw: RedrawQueue,
         map_events: MapEvents,
         queues: Queues,

@@ -3,8 +3,10 @@
 from collections import OrderedDict
 from collections.abc import Collection, Iterable, Sequence
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyquilt.engine.codec import decode, encode
 from skyquilt.engine.pixel_cache import PixelCache
@@ -28,7 +30,7 @@ class LiveLinks:
     """Finds features and matches pairs of photos."""
 
     def __init__(
-        self, members: Members, methods: Methods, store: Store, pixels: PixelCache
+        self, members: Members, methods: Methods, store: Store, pixels: PixelCache[NDArray[Any]]
     ) -> None:
         self.members, self.methods, self.store, self.pixels = members, methods, store, pixels
         self._features: OrderedDict[int, Features] = OrderedDict()

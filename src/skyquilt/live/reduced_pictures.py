@@ -37,7 +37,9 @@ class SmallPictures:
     takes a quarter of the time of the photo.
     """
 
-    def __init__(self, full: PixelCache, members: dict[int, Member], store: Store) -> None:
+    def __init__(
+        self, full: PixelCache[NDArray[Any]], members: dict[int, Member], store: Store
+    ) -> None:
         self.full, self.members, self.store = full, members, store
         self._longest: dict[int, int] = {}
         self._at_hand = PixelCache(read=self._read, budget_bytes=PICTURES_BYTES)

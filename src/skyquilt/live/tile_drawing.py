@@ -107,7 +107,7 @@ class Canvas:
         self,
         tiles: TileStore,
         heights: HeightCells,
-        full: PixelCache,
+        full: PixelCache[NDArray[Any]],
         members: dict[int, Member],
         store: Store,
         max_view_angle: float,

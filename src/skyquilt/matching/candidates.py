@@ -1,5 +1,6 @@
 """Candidate pairs: neighbours by position, neighbours in time, and photos of similar content."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -10,6 +11,8 @@ from skyquilt.geometry.neighbours import nearest
 from skyquilt.model.features import Features
 
 Pair = tuple[int, int]
+MOST_SAMPLED = 100_000
+"""Descriptors from which a vocabulary is learnt, about; those of all photos may fill the memory."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +68,7 @@ class Retrieval:
     """Seed of the vocabulary."""
     version: ClassVar[int] = 1
 
-    def __call__(self, features: list[Features], asked: list[int] | None = None) -> list[Pair]:
+    def __call__(self, features: Sequence[Features], asked: list[int] | None = None) -> list[Pair]:
         """Pairs i < j for the requested photos (all by default)."""
         n = len(features)
         rows = list(range(n)) if asked is None else asked
@@ -80,10 +83,13 @@ class Retrieval:
                 pairs.add((min(i, int(j)), max(i, int(j))))
         return sorted(pairs)
 
-    def _vectors(self, features: list[Features]) -> NDArray[np.float32]:
-        chosen = [f.unit[np.argsort(-f.size)[: self.sample]] for f in features]
-        words = self._vocabulary(np.concatenate(chosen))
-        return np.stack([_vlad(d, words) for d in chosen])
+    def _vectors(self, features: Sequence[Features]) -> NDArray[np.float32]:
+        def chosen(f: Features) -> NDArray[np.float32]:
+            return f.unit[np.argsort(-f.size)[: self.sample]]
+
+        every = max(1, len(features) * self.sample // MOST_SAMPLED)
+        words = self._vocabulary(np.concatenate([chosen(f) for f in features[::every]]))
+        return np.stack([_vlad(chosen(f), words) for f in features])
 
     def _vocabulary(self, descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
         """k-means centres on at most 20,000 descriptors, on the unit sphere."""

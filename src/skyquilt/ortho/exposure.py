@@ -126,7 +126,7 @@ class Balance:
         surface: Surface,
         bounds: tuple[float, float, float, float],
     ) -> Exposure:
-        """Estimates the exposure from thumbnails (h, w, bands) of the photos."""
+        """Estimates the exposure from thumbnails (h, w[, bands]) of the photos."""
         usable = [v for v in views if v.photo in thumbnails]
         if len(usable) < 2:
             return NEUTRAL

@@ -77,8 +77,7 @@ def balanced(
         return drift_of(ground.views, thumbnails, ground.surface, bounds, unit, drift, settings)
     if not settings.balance or dtype != "uint8":
         return NEUTRAL
-    three = {i: t[..., None] if t.ndim == 2 else t for i, t in thumbnails.items()}
-    return balance(ground.views, three, ground.surface, bounds)
+    return balance(ground.views, thumbnails, ground.surface, bounds)
 
 
 def drift_of(

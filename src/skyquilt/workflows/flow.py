@@ -277,7 +277,7 @@ def scene_of(
 
 
 def _pixels_of(
-    photos: Sequence[Photo], all_photos: Sequence[Photo], cache: PixelCache
+    photos: Sequence[Photo], all_photos: Sequence[Photo], cache: PixelCache[NDArray[Any]]
 ) -> PhotoPixels:
     """Pixels of the photos in use, by their indices.
 

@@ -138,16 +138,18 @@ def link_photos(
     linker = _Linker(found, frame, priors, methods, store, jobs)
     xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
     lost = [i for i in range(n) if not np.isfinite(xy[i]).all()]
-    first = list(dict.fromkeys([*sequence(n), *_closest(methods.nearest(xy), n, 2)]))
+    # in order of capture, so that the features of a photo are read once for all its pairs
+    first = sorted({*sequence(n), *_closest(methods.nearest(xy), n, 2)})
     tried: list[Link | RejectedLink] = []
     for batch in _batches(first):
         tried += linker.batch(batch)
         yield len(tried), 2 * len(first)
     reach = overlap_reach_m([k for k in tried if isinstance(k, Link)], found, xy)
-    rest = [p for p in methods.nearest(xy, reach) if p not in set(first)] if n > 2 else []
+    rest = methods.nearest(xy, reach) if n > 2 else []
     if lost and n > 2:
         rest += methods.retrieval(found.features, None if len(lost) == n else lost)
-    rest = [p for p in dict.fromkeys(rest) if p not in set(first)]
+    done = set(first)
+    rest = sorted({p for p in rest if p not in done})
     for batch in _batches(rest):
         tried += linker.batch(batch)
         yield len(tried), len(first) + len(rest)

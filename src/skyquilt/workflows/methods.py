@@ -93,7 +93,7 @@ class Neighbours(Protocol):
 class LookAlikes(Protocol):
     """Interface: finds candidate pairs by image content."""
 
-    def __call__(self, features: list[Features], asked: list[int] | None = None) -> list[Pair]:
+    def __call__(self, features: Sequence[Features], asked: list[int] | None = None) -> list[Pair]:
         """Pairs (i < j) for the requested photos, or for all."""
         ...
 

@@ -3,9 +3,10 @@
 The batch and live workflows both use `photo_features`, so that they share artefacts in a store.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, overload
 
 import cv2
 import numpy as np
@@ -27,7 +28,7 @@ PICTURE = 1000
 heights.
 """
 KEPT_BYTES = 150_000_000
-"""Bytes of grey images kept in memory; the others are read from the store."""
+"""Bytes of grey images, and of features, kept in memory; the others are read from the store."""
 PhotoPixels = Callable[[int], NDArray[Any]]
 """Full-size pixels of a photo by its index."""
 THUMBNAIL = 256
@@ -43,6 +44,11 @@ class PhotoFeatures:
     thumbnail: NDArray[Any]
     """(h, w[, bands])."""
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory."""
+        return sys.getsizeof(self.features) + int(self.thumbnail.nbytes)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FeaturedPhotos:
@@ -50,19 +56,57 @@ class FeaturedPhotos:
 
     photos: tuple[Photo, ...]
     """The photos, in order of capture."""
-    looks: tuple[PhotoFeatures, ...]
-    """One per photo."""
+    number: tuple[int, ...]
+    """Number of each photo in `looks`."""
+    looks: Callable[[int], PhotoFeatures]
+    """Features and thumbnail of a photo by its number, from the store unless used lately."""
     rejected: tuple[RejectedPhoto, ...]
     """Photos that cannot be used, with reasons."""
 
     @property
-    def features(self) -> list[Features]:
-        """Features per photo."""
-        return [look.features for look in self.looks]
+    def features(self) -> Sequence[Features]:
+        """Features per photo; read when asked for, so that memory does not hold those of all."""
+        return _FeaturesOf(self)
 
     def thumbnails(self, photos: Sequence[int]) -> Mapping[int, NDArray[Any]]:
-        """Thumbnails of these photos, by index."""
-        return {i: self.looks[i].thumbnail for i in photos}
+        """Thumbnails of these photos, by index; read when asked for."""
+        return _ThumbnailsOf(self, photos)
+
+
+class _FeaturesOf(Sequence[Features]):
+    def __init__(self, found: FeaturedPhotos) -> None:
+        self._found = found
+
+    def __len__(self) -> int:
+        return len(self._found.photos)
+
+    @overload
+    def __getitem__(self, photo: int) -> Features: ...
+    @overload
+    def __getitem__(self, photo: slice) -> Sequence[Features]: ...
+    def __getitem__(self, photo: int | slice) -> Features | Sequence[Features]:
+        if isinstance(photo, slice):
+            return [self[i] for i in range(*photo.indices(len(self)))]
+        return self._found.looks(self._found.number[photo]).features
+
+
+class _ThumbnailsOf(Mapping[int, NDArray[Any]]):
+    def __init__(self, found: FeaturedPhotos, photos: Sequence[int]) -> None:
+        self._found, self._photos = found, dict.fromkeys(photos)
+
+    def __len__(self) -> int:
+        return len(self._photos)
+
+    def __contains__(self, photo: object) -> bool:
+        return photo in self._photos
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._photos)
+
+    def __getitem__(self, photo: int) -> NDArray[Any]:
+        if photo not in self._photos:
+            raise KeyError(photo)
+        return self._found.looks(self._found.number[photo]).thumbnail
 
 
 class GreyPictures:
@@ -179,18 +223,24 @@ def find_features(
         except Exception as error:  # whatever it is, it concerns this photo alone
             return rejected(photo.name, error)
 
-    results = []
-    for result in in_order(one, range(len(photos)), jobs=jobs):
-        results.append(result)
-        yield len(results), len(photos)
-    good = [(p, r) for p, r in zip(photos, results, strict=True) if isinstance(r, PhotoFeatures)]
-    bad = tuple(r for r in results if isinstance(r, RejectedPhoto))
+    looks = PixelCache(
+        read=lambda i: photo_features(photos[i], lambda: pixels(i), detector, store),
+        budget_bytes=KEPT_BYTES,
+    )
+    good, bad = list[int](), list[RejectedPhoto]()
+    for index, result in enumerate(in_order(one, range(len(photos)), jobs=jobs)):
+        if isinstance(result, RejectedPhoto):
+            bad.append(result)
+        else:
+            good.append(index)
+            looks.put(index, result)
+        yield index + 1, len(photos)
     if not good:
         raise NoPhotosError(
             f"none of {len(photos)} photos could be decoded; the first: {bad[0].reason}"
         )
     return FeaturedPhotos(
-        photos=tuple(p for p, _ in good), looks=tuple(k for _, k in good), rejected=bad
+        photos=tuple(photos[i] for i in good), number=tuple(good), looks=looks, rejected=tuple(bad)
     )
 
 
@@ -213,6 +263,6 @@ def of_one_kind(found: FeaturedPhotos) -> FeaturedPhotos:
     return replace(
         found,
         photos=tuple(found.photos[i] for i in keep),
-        looks=tuple(found.looks[i] for i in keep),
+        number=tuple(found.number[i] for i in keep),
         rejected=(*found.rejected, *odd),
     )
