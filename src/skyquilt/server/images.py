@@ -11,13 +11,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import cv2
-import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.raster import RasterSpec, write_array
 from skyquilt.raster.map_source import MERCATOR, Bounds, MapSource, Part, between, mercator, picture
+from skyquilt.raster.picture_files import image_bytes
 from skyquilt.server.survey import LiveSurvey, Survey
 
 MOST_PIXELS = 60_000_000
@@ -70,27 +69,6 @@ KEPT = 3000
 """Number of tiles kept in memory."""
 TILE = 256
 """Pixels of a web tile's side."""
-
-
-def image_bytes(rgba: NDArray[np.uint8], form: str, *, transparent: bool = True) -> bytes:
-    """Encodes RGBA (h, w, 4) as PNG, WebP or JPEG; without transparency the background is white."""
-    if not transparent or form == "image/jpeg":
-        alpha = rgba[..., 3:].astype(np.uint16)
-        rgb = ((rgba[..., :3] * alpha + 255 * (255 - alpha)) // 255).astype(np.uint8)
-        picture_, bgr = rgb, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-    else:
-        picture_, bgr = rgba, cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA)
-    if form == "image/webp":  # the fastest setting of the codec takes a third of the default's time
-        return bytes(imagecodecs.webp_encode(np.ascontiguousarray(picture_), level=80, method=0))
-    options = {
-        "image/png": (".png", [cv2.IMWRITE_PNG_COMPRESSION, 1]),
-        "image/jpeg": (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 85]),
-    }
-    ending, settings = options[form]
-    good, data = cv2.imencode(ending, bgr, settings)
-    if not good:
-        raise ValueError(f"a picture of {picture_.shape} cannot be written as {form}")
-    return data.tobytes()
 
 
 @dataclass(frozen=True, kw_only=True)

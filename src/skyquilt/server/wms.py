@@ -17,8 +17,9 @@ from pyproj.exceptions import CRSError
 from skyquilt.live.free_memory import give_back
 from skyquilt.outside import real, whole
 from skyquilt.raster.map_source import Bounds, MapSource, between, picture
+from skyquilt.raster.picture_files import image_bytes
 from skyquilt.server.access import Context
-from skyquilt.server.images import Images, image_bytes
+from skyquilt.server.images import Images
 from skyquilt.server.survey import covering
 
 

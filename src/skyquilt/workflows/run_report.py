@@ -53,7 +53,9 @@ def finish_run(
     run_files.write_cameras(output / "cameras.json", alignment)
     run_files.write_shots(output / "shots.geojson", photos, alignment, used_photos(ground.views))
     run_files.write_footprints(output / "footprints.geojson", photos, alignment, ground.views)
-    run_files.write_reconstruction(output / "reconstruction.json", photos, alignment, None)
+    run_files.write_reconstruction(
+        output / "reconstruction.json", photos, alignment, _colours(aligned, drawn)
+    )
     run_files.write_run(
         output / "run.toml",
         settings.as_table(),
@@ -74,6 +76,20 @@ def finish_run(
         )
     yield 3, 3
     return metrics
+
+
+def _colours(aligned: AlignedPhotos, drawn: Drawn) -> NDArray[np.uint8]:
+    """Colour (P, 3) of each tie point: that of the map at its place, grey where the map has
+    none.
+    """
+    xyz, (rows, columns) = aligned.alignment.ties.xyz, drawn.preview.shape[:2]
+    found = np.full((len(xyz), 3), 128, np.uint8)
+    c, r = (np.rint(v) for v in drawn.preview_grid.pixel(xyz[:, 0], xyz[:, 1]))
+    inside = (c >= 0) & (c < columns) & (r >= 0) & (r < rows)
+    at = r[inside].astype(int), c[inside].astype(int)
+    shown = drawn.preview[at][:, 3] > 0
+    found[np.flatnonzero(inside)[shown]] = drawn.preview[at][shown, :3]
+    return found
 
 
 def report_input(
