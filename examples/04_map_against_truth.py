@@ -32,8 +32,8 @@ def main(mosaic: Path, truth: Path, metrics: Path | None = None) -> None:
         told(points)
     else:
         print(
-            "  the photos' positions are off by metres, and what they have in common moves the whole"
-            " map; control points take it away"
+            "  the photos' positions are off by metres, and what they have in common moves the"
+            " whole map; control points take it away"
         )
 
 
