@@ -6,7 +6,7 @@ USE := .venv/installed
 DEVELOP := .venv/installed-for-tests
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --quiet --constraint constraints.txt
 
-.PHONY: install demo test test-all check format docs fuzz fuzz-quick sbom locked clean
+.PHONY: install demo test test-all check format docs fuzz fuzz-quick wheels sbom locked clean
 
 # The program with its live map and viewer: .venv/bin/skyquilt
 install: $(USE)
@@ -57,6 +57,10 @@ fuzz-quick: $(FUZZ)
 $(FUZZ): $(DEVELOP)
 	@$(PIP) --no-build-isolation --editable '.[fuzz]'
 	@touch $@
+
+# The wheel in a fresh environment of every Python from 3.11 on that is here.
+wheels: $(DEVELOP)
+	@$(BIN)/python .ci/wheels.py
 
 # A bill of materials (CycloneDX) of the installed program: its packages, versions and licences.
 sbom: $(USE)
