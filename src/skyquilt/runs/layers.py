@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from skyquilt.alignment.heights import VERTICAL_EPSG
 from skyquilt.outside import open_regular, read_bounded
-from skyquilt.raster.map_source import FileSource, Palette
+from skyquilt.raster.map_source import MapSource, Palette
 
 UNITS = {"celsius": "\u00b0C", "counts": "counts"}
 DATUMS = {
@@ -108,11 +107,13 @@ def unit_of(layer: RunLayer, figures: Mapping[str, Any]) -> str:
 
 def vertical_of(layer: RunLayer, figures: Mapping[str, Any]) -> int | None:
     """EPSG code of the zero of a layer's heights; None where there is none."""
+    from skyquilt.alignment.heights import VERTICAL_EPSG
+
     known = str(figures.get("vertical_datum"))
     return VERTICAL_EPSG.get(known) if layer.palette == "heights" else None
 
 
-def range_of(layer: RunLayer, source: FileSource) -> tuple[float, float] | None:
+def range_of(layer: RunLayer, source: MapSource) -> tuple[float, float] | None:
     """Values shown in the first and in the last colour: the 2nd and 98th percentile of what is
     measured; None for colour images.
     """

@@ -22,7 +22,6 @@ from skyquilt.photos.cameras_json import read_cameras_json
 from skyquilt.raster.map_source import FileSource
 from skyquilt.runs.layers import RunLayer, figures_of, layers_in, unit_of
 from skyquilt.runs.rasters import Raster, as_xarray, read_raster
-from skyquilt.workflows.artefacts import REGISTRY
 
 if TYPE_CHECKING:
     import xarray
@@ -115,6 +114,8 @@ class Run:
 
     def _alignment(self) -> tuple[Alignment, dict[int, str]]:
         """The alignment as it was stored, and the names of its photos."""
+        from skyquilt.workflows.artefacts import REGISTRY  # slow to load
+
         store = Store(folder=self.path / STATE / "store", registry=REGISTRY)
         kept = sorted((store.folder / "alignment").glob("*.npz"), key=lambda p: p.stat().st_mtime)
         found = store.get("alignment", kept[-1].stem) if kept else None

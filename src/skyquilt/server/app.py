@@ -13,10 +13,13 @@ from fastapi.staticfiles import StaticFiles
 
 from skyquilt.server.access import RESUMABLE, Context, Guard, Guarded, Writer
 from skyquilt.server.event_endpoints import EventEndpoints
+from skyquilt.server.file_endpoints import FileEndpoints
 from skyquilt.server.images import Images
 from skyquilt.server.layer_endpoints import LayerEndpoints
 from skyquilt.server.map_endpoints import STATIC, MapEndpoints
 from skyquilt.server.photo_endpoints import PhotoEndpoints
+from skyquilt.server.photo_views import PhotoViews
+from skyquilt.server.readouts import Readouts
 from skyquilt.server.survey import Survey
 from skyquilt.server.upload_endpoints import UploadEndpoints
 from skyquilt.server.wms import WmsEndpoints
@@ -47,6 +50,11 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         WmsEndpoints(context, images),
         PhotoEndpoints(context),
     )
+    views, read, files = (
+        PhotoViews(context, listed),
+        Readouts(context, images),
+        FileEndpoints(context),
+    )
     layers, events = LayerEndpoints(context), EventEndpoints(context)
     app.state.ending = events.ending
 
@@ -67,6 +75,14 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         (RESUMABLE + "/{number}", received.upload_part, {"methods": ["PATCH"]}),
         (RESUMABLE + "/{number}", received.upload_end, {"methods": ["DELETE"]}),
         ("/photos/{number}", listed.photo, get),
+        ("/photos/{number}/thumbnail", views.thumbnail, {**get, "response_class": Response}),
+        ("/photos/{number}/detail", views.detail, {**get, "response_class": Response}),
+        ("/photos/{number}/place", views.place, get),
+        ("/at", read.at, get),
+        ("/profile", read.profile, get),
+        ("/volume", read.volume, get),
+        ("/files", files.files, get),
+        ("/files/{name:path}", files.file, {**get, "response_class": FileResponse}),
         ("/photos/{number}/file", listed.photo_file, {**get, "response_class": FileResponse}),
         ("/layers", layers.layer_list, get),
         ("/layers", layers.layer_post, post),

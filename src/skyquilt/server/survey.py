@@ -3,7 +3,9 @@
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,11 +13,22 @@ import numpy as np
 
 from skyquilt.errors import SideFileError, UsageError
 from skyquilt.live.ledger import NAME, Ledger
-from skyquilt.outside import open_regular, plain, read_bounded, real
+from skyquilt.outside import plain, read_bounded, real
 from skyquilt.raster.map_source import FileSource, MapSource, TileSource, between
 from skyquilt.raster.read_map import open_map
 from skyquilt.raster.tile_store import TileStore
+from skyquilt.runs.layers import RunLayer, figures_of, is_tiff, layers_in
 
+GROWING = {
+    "visible": RunLayer(name="visible", title="Growing map", file=""),
+    "visible-newest": RunLayer(name="visible-newest", title="Growing map, newest on top", file=""),
+    "thermal": RunLayer(name="thermal", title="Thermal", file="", measured=True),
+    "thermal-newest": RunLayer(
+        name="thermal", title="Thermal, newest on top", file="", measured=True
+    ),
+    "base": RunLayer(name="base", title="Older map", file=""),
+}
+"""How growing maps are shown."""
 PHOTOS, TILES, FINISHED, NAMED = "photos", "tiles.db", "finished", "named"
 
 
@@ -44,9 +57,20 @@ class Survey(Protocol):
 
     growing: bool
     """Whether more photos may arrive."""
+    folder: Path
+    """Its folder."""
 
     def layers(self) -> dict[str, MapSource]:
         """Map layers by name; the first one is the default."""
+
+    def styles(self) -> dict[str, RunLayer]:
+        """How layers are shown, by name; others are colour images under their own name."""
+
+    def figures(self) -> Mapping[str, Any]:
+        """The figures of the finished map; empty while there is none."""
+
+    def results(self) -> Path | None:
+        """Folder of the finished map; None while there is none."""
 
     def photos(self) -> list[Shown]:
         """All photos in order."""
@@ -73,23 +97,12 @@ def open_survey(
         raise UsageError(f"--photos {photos} is not a folder")
     if (folder / NAME).is_file():
         return LiveSurvey(folder, base=base)
-    if _is_tiff(folder / "mosaic.tif"):
+    if is_tiff(folder / "mosaic.tif"):
         return FinishedSurvey(folder, base=base, photos=photos)
     raise UsageError(
         f"{folder} contains neither a live survey ({NAME}) nor a finished run (mosaic.tif); name"
         " the folder given to -o"
     )
-
-
-def _is_tiff(path: Path) -> bool:
-    """Whether a map is a TIFF by its content. GDAL would also read text that names other files and
-    addresses.
-    """
-    try:
-        with open_regular(path) as file:
-            return file.read(4) in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-    except OSError:
-        return False
 
 
 def base_map(path: Path | None) -> dict[str, MapSource]:
@@ -132,30 +145,54 @@ class LiveSurvey:
                 found[layer] = TileSource(
                     tiles=self.tiles, layer=layer, crs=frame["crs"], origin=(x, y), gsd=gsd
                 )
-        final = self.folder / FINISHED / "mosaic.tif"
-        if _is_tiff(final):
-            found["finished"] = FileSource(path=final)
+        home = self.folder / FINISHED
+        for name, final in self._final().items():
+            found[name] = FileSource(path=home / final.file)
         return found | self.base
+
+    def _final(self) -> dict[str, RunLayer]:
+        """Layers of the final map, if there is one."""
+        return {
+            "finished" if name == "mosaic" else f"finished-{name}": layer
+            for name, layer in layers_in(self.folder / FINISHED).items()
+        }
+
+    def styles(self) -> dict[str, RunLayer]:
+        """Growing maps, and layers of the final one."""
+        final = {
+            name: replace(layer, title=f"Final {layer.title.lower()}")
+            for name, layer in self._final().items()
+        }
+        return GROWING | final
+
+    def figures(self) -> Mapping[str, Any]:
+        """The figures of the final map; empty while there is none."""
+        return figures_of(self.folder / FINISHED)
+
+    def results(self) -> Path | None:
+        """Folder of the final map; None while there is none."""
+        home = self.folder / FINISHED
+        return home if is_tiff(home / "mosaic.tif") else None
 
     def photos(self) -> list[Shown]:
         """All accepted photos."""
         query = (
-            "select id, name, source, state, reason, footprint, file, received, digest from photo"
-            " order by id"
+            "select id, name, source, state, reason, footprint, file, received, digest, shot"
+            " from photo order by id"
         )
         return [self._shown(row) for row in self.ledger.rows(query)]
 
     def photo(self, number: int) -> Shown | None:
         """One accepted photo."""
         query = (
-            "select id, name, source, state, reason, footprint, file, received, digest from photo"
-            " where id = ?"
+            "select id, name, source, state, reason, footprint, file, received, digest, shot"
+            " from photo where id = ?"
         )
         row = self.ledger.row(query, number)
         return None if row is None else self._shown(row)
 
     def _shown(self, row: tuple[Any, ...]) -> Shown:
-        number, name, source, state, reason, place, file, received, digest = row
+        number, name, source, state, reason, place, file, received, digest, shot = row
         held = json.loads(place) if place else {}
         ring = tuple((float(a), float(b)) for a, b in held.get("ring", ()))
         record = {
@@ -163,7 +200,8 @@ class LiveSurvey:
             "name": name,
             "source": source,
             "state": state,
-            "reason": reason,
+            "reason": "" if state in ("refined", "superseded") else reason,
+            "time": _taken(str(shot)),
             "at": held.get("at"),
             "ring": [list(p) for p in ring],
             "received": received,
@@ -216,11 +254,15 @@ class FinishedSurvey:
         self.folder, self.base = folder, base_map(base)
         self._photos: list[Shown] = []
         self._source = FileSource(path=folder / "mosaic.tif")
+        self._layers, self._figures = layers_in(folder), figures_of(folder)
+        self._sources: dict[str, MapSource] = {
+            name: FileSource(path=folder / layer.file) for name, layer in self._layers.items()
+        }
         if not self._source.crs:
             raise UsageError(
                 f"{folder / 'mosaic.tif'} is not georeferenced; open report.html instead"
             )
-        home = photos or _photo_folder(folder)
+        self.home = home = photos or _photo_folder(folder)
         try:
             shots = json.loads(read_bounded(folder / "shots.geojson"))["features"]
             prints = json.loads(read_bounded(folder / "footprints.geojson"))
@@ -260,13 +302,14 @@ class FinishedSurvey:
         return Shown(
             id=k,
             name=name,
-            state="refined",
+            state="used",
             record={
                 "id": k,
                 "name": name,
-                "source": shot["properties"]["camera"],
-                "state": "refined",
+                "source": _drone(name, str(shot["properties"]["camera"])),
+                "state": "used",
                 "reason": "",
+                "time": real(shot["properties"].get("capture_time")),
                 "at": [lon, lat],
                 "ring": [list(p) for p in ring_ll],
             },
@@ -276,8 +319,20 @@ class FinishedSurvey:
         )
 
     def layers(self) -> dict[str, MapSource]:
-        """The mosaic."""
-        return {"mosaic": self._source, **self.base}
+        """The rasters of the run."""
+        return self._sources | self.base
+
+    def styles(self) -> dict[str, RunLayer]:
+        """The rasters of the run."""
+        return self._layers
+
+    def figures(self) -> Mapping[str, Any]:
+        """The content of metrics.json."""
+        return self._figures
+
+    def results(self) -> Path | None:
+        """The folder of the run."""
+        return self.folder
 
     def photos(self) -> list[Shown]:
         """All placed photos."""
@@ -292,7 +347,7 @@ class FinishedSurvey:
         try:
             metrics = json.loads(read_bounded(self.folder / "metrics.json"))
             return [
-                {"name": str(n), "reason": str(r), "state": "refused"}
+                {"name": str(n), "reason": str(r), "state": "left out"}
                 for n, r in metrics.get("photos_rejected", {}).items()
             ]
         except (OSError, ValueError, AttributeError, RecursionError):
@@ -305,6 +360,23 @@ class FinishedSurvey:
     def stamp(self) -> int:
         """Constant, since a finished run does not change."""
         return 1
+
+
+def _drone(name: str, camera: str) -> str:
+    """What tells drones of a finished run apart: camera and folder. Files that were turned upside
+    down have a calibration of their own, but no drone of their own.
+    """
+    folder = name.rpartition("/")[0]
+    return f"{camera.removesuffix('/turned')} {folder}".strip()
+
+
+def _taken(shot: str) -> float | None:
+    """Capture time (seconds since 1970) from the key of a shot (`photo_intake.shot_of`)."""
+    for part in shot.split("|")[3:4]:
+        with suppress(ValueError):
+            at = datetime.fromisoformat(part)
+            return (at if at.tzinfo else at.replace(tzinfo=UTC)).timestamp()
+    return None
 
 
 def _flat(ring: list[Any]) -> list[Any]:

@@ -67,7 +67,10 @@ class WmsEndpoints:
             if out is not None and out[..., 3].all():
                 break
             scale = self.images.scale(name, known[name])
-            rgba = picture(known[name], want.crs, want.bounds, want.width, want.height, scale)
+            palette = self.images.style(name).palette
+            rgba = picture(
+                known[name], want.crs, want.bounds, want.width, want.height, scale, palette
+            )
             if rgba is not None and out is not None:
                 np.copyto(out, rgba, where=(out[..., 3] == 0)[..., None])
             out = rgba if out is None else out

@@ -1,0 +1,3 @@
+"use strict";
+const handControl = async () => false;
+const readControl = async () => {};
