@@ -12,6 +12,7 @@ from fastapi.responses import FileResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 
 from skyquilt.server.access import RESUMABLE, Context, Guard, Guarded, Writer
+from skyquilt.server.control_endpoints import ControlEndpoints
 from skyquilt.server.event_endpoints import EventEndpoints
 from skyquilt.server.file_endpoints import FileEndpoints
 from skyquilt.server.images import Images
@@ -55,6 +56,7 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         Readouts(context, images),
         FileEndpoints(context),
     )
+    control = ControlEndpoints(context, views)
     layers, events = LayerEndpoints(context), EventEndpoints(context)
     app.state.ending = events.ending
 
@@ -83,6 +85,12 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         ("/volume", read.volume, get),
         ("/files", files.files, get),
         ("/files/{name:path}", files.file, {**get, "response_class": FileResponse}),
+        ("/control", control.control, get),
+        ("/control", control.control_put, {"methods": ["PUT"]}),
+        ("/control/read", control.control_read, post),
+        ("/control/photos", control.photos, get),
+        ("/control/run", control.run_state, get),
+        ("/control/run", control.run_start, post),
         ("/photos/{number}/file", listed.photo_file, {**get, "response_class": FileResponse}),
         ("/layers", layers.layer_list, get),
         ("/layers", layers.layer_post, post),

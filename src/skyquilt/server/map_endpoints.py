@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from skyquilt.raster.map_source import MapSource, between, ramp
 from skyquilt.server.access import Context
 from skyquilt.server.images import Images, write_cog
 from skyquilt.server.readouts import HEIGHTS
-from skyquilt.server.survey import LiveSurvey
+from skyquilt.server.survey import FinishedSurvey, LiveSurvey
 from skyquilt.version import __version__
 
 STATIC = Path(__file__).parent / "static"
@@ -42,15 +43,15 @@ class MapEndpoints:
         """
         found = []
         for name, source in self.context.survey.layers().items():
-            bounds = source.bounds()
-            box = (
-                None
-                if bounds is None
-                else between(source.crs, "EPSG:4326").transform_bounds(*bounds)
-            )
-            found.append(
-                {"name": name, "crs": source.crs, "bounds": box, **self._look(name, source)}
-            )
+            with suppress(OSError):  # a final map is just being replaced
+                bounds = source.bounds()
+                box = (
+                    None
+                    if bounds is None
+                    else between(source.crs, "EPSG:4326").transform_bounds(*bounds)
+                )
+                look = self._look(name, source)
+                found.append({"name": name, "crs": source.crs, "bounds": box, **look})
         counts = (
             self.context.survey.ledger.counts()
             if isinstance(self.context.survey, LiveSurvey)
@@ -69,6 +70,7 @@ class MapEndpoints:
             "version": __version__,
             "token": self.context.guard.token is not None,
             "finish": finish,
+            "control": isinstance(self.context.survey, FinishedSurvey),
             "title": self.context.survey.folder.resolve().name,
             "heights": next((n for n in HEIGHTS if n in self.context.survey.layers()), None),
         }

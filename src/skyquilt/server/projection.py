@@ -43,8 +43,10 @@ class Projection:
                 return float(np.median(coarse.pixels[coarse.shown]))
         return self._lowest
 
-    def pixel(self, name: str, place: Xyz) -> tuple[float, float] | None:
-        """The pixel at which a photo shows a place (map's projection, m); None if it does not."""
+    def pixel(self, name: str, place: Xyz, *, beyond: bool = False) -> tuple[float, float] | None:
+        """The pixel at which a photo shows a place (map's projection, m); None if it does not, or,
+        with `beyond`, only where the place is not in front of the camera.
+        """
         pose, camera = self.run.poses.get(name), self._camera(name)
         if pose is None:
             return None
@@ -57,7 +59,7 @@ class Projection:
             px = project(camera, local[None])[0]
             row = float(px[1])
         inside = -0.5 <= px[0] <= camera.width - 0.5 and -0.5 <= px[1] <= camera.height - 0.5
-        return (float(px[0]), float(px[1])) if inside else None
+        return (float(px[0]), float(px[1])) if inside or beyond else None
 
 
 def local_of(pose: Pose, camera: Camera, place: np.ndarray, row: float) -> np.ndarray:

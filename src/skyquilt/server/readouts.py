@@ -1,6 +1,7 @@
 """What a map says at a place: coordinates and values; heights along a line; volumes."""
 
 import math
+from contextlib import suppress
 from typing import Annotated, Any
 
 import cv2
@@ -43,7 +44,7 @@ class Readouts:
         layers = self.context.survey.layers()
         found: dict[str, Any] = {"lon": lon, "lat": lat, "crs": None, "x": None, "y": None}
         told = []
-        for name, source in layers.items():
+        for name, source in _readable(layers).items():
             x, y = between("EPSG:4326", source.crs).transform(lon, lat)
             if found["crs"] is None and math.isfinite(x) and math.isfinite(y):
                 found |= {"crs": source.crs, "x": round(x, 3), "y": round(y, 3)}
@@ -123,11 +124,21 @@ class Readouts:
         }
 
     def _heights(self) -> tuple[str, MapSource]:
-        layers = self.context.survey.layers()
+        layers = _readable(self.context.survey.layers())
         for name in HEIGHTS:
             if name in layers:
                 return name, layers[name]
         raise HTTPException(404, "this map has no heights; the final map of a flight has")
+
+
+def _readable(layers: dict[str, MapSource]) -> dict[str, MapSource]:
+    """Those whose file is there: a final map may just be replaced."""
+    found = {}
+    for name, source in layers.items():
+        with suppress(OSError):
+            source.bounds()
+            found[name] = source
+    return found
 
 
 def value_at(source: MapSource, x: float, y: float) -> float | None:
