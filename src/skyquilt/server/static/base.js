@@ -20,6 +20,9 @@ const say = (text) => { $("said").textContent = text; $("said").hidden = false; 
 const pressed = (id, on) => $(id).setAttribute("aria-pressed", String(on));
 const isPressed = (id) => $(id).getAttribute("aria-pressed") === "true";
 const writing = (more) => ({ ...more, ...($("token").value ? { "X-Token": $("token").value } : {}) });
+// The map shows its focus, and its middle, to those who use the keyboard.
+document.addEventListener("keydown", (e) => { if (e.key === "Tab") document.body.classList.add("keys"); }, true);
+document.addEventListener("pointerdown", () => document.body.classList.remove("keys"), true);
 // An item of a list that can be chosen by mouse and by keyboard.
 const choosable = (li, work) => {
   li.tabIndex = 0;

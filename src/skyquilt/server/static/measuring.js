@@ -114,7 +114,7 @@ map.getContainer().addEventListener("keydown", (e) => {
   if (e.key === "Backspace" && state.mode) undoPoint();
 });
 document.addEventListener("keydown", (e) => { if (e.key === "Escape" && !$("big").open) { if (state.mode) setMode(null); marked.clearLayers(); } });
-map.getContainer().addEventListener("focus", () => { $("cross").hidden = !(state.mode || map.getContainer().matches(":focus-visible")); });
+map.getContainer().addEventListener("focus", () => { $("cross").hidden = !(state.mode || document.body.classList.contains("keys")); });
 map.getContainer().addEventListener("blur", () => { $("cross").hidden = !state.mode; });
 const clicked = (at) => {
   if (state.tap && state.tap(at)) return;

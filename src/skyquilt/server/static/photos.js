@@ -79,6 +79,7 @@ const photosHere = async (at) => {
   });
   $("covering").replaceChildren(...(rows.length ? rows : [element("li", "no photo covers this point")]));
   if (rows.length) mark(said.photos[0], rows[0]);
+  $("here").scrollIntoView({ block: "start" });
   const told = await asked(`/at?lon=${at.lng}&lat=${at.lat}`).catch(() => ({ values: [], crs: null }));
   const lines = [degrees(at), ...(told.crs ? [`${told.crs} ${told.x.toFixed(2)} ${told.y.toFixed(2)}`] : []), ...told.values.map(valueText)];
   $("values").replaceChildren(...lines.map((text) => element("p", text)));
