@@ -1,6 +1,8 @@
 """What the viewer of a finished run says of a place, against the run's own rasters."""
 
 import io
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -124,3 +126,19 @@ def test_only_the_files_of_the_run_can_be_downloaded(web, finished):
         "export/none.png",
     ):
         assert web.get(f"/files/{name}").status_code == 404, name
+
+
+@pytest.mark.slow
+def test_the_viewer_starts_at_once(finished):
+    """In CPU seconds: other work of the machine does not count."""
+    code = (
+        "import resource, subprocess, sys; p = subprocess.Popen(sys.argv[1:], stdout=-1);"
+        " p.stdout.readline(); p.kill(); p.wait();"
+        " u = resource.getrusage(resource.RUSAGE_CHILDREN); print(u.ru_utime + u.ru_stime)"
+    )
+    words = [sys.executable, "-m", "skyquilt", "view", str(finished.output), "--port", "0"]
+    used = [
+        float(subprocess.run([sys.executable, "-c", code, *words], capture_output=True).stdout)
+        for _ in range(3)
+    ]
+    assert 0.2 < min(used) < 1.5

@@ -135,7 +135,7 @@ class ControlEndpoints:
                 if made is not None:
                     row |= {"proposed": [made.x, made.y], "score": round(made.score, 3)}
             rows.append(row)
-        return {"photos": rows}
+        return {"photos": rows, "lon": lon, "lat": lat}
 
     def run_state(self) -> dict[str, Any]:
         """The state of the run with control points."""

@@ -5,7 +5,7 @@ const map = L.map("map", { zoomControl: true, maxZoom: 25, preferCanvas: true })
 L.control.scale({ imperial: false }).addTo(map);
 map.createPane("first").style.zIndex = 240;
 map.createPane("second").style.zIndex = 250;
-const state = { layers: new Map(), photos: new Map(), last: 0, rule: "", mode: null, points: [], overlays: new Map(), fitted: false, moved: false, info: null, finish: null, tap: null };
+const state = { layers: new Map(), photos: new Map(), last: 0, rule: "", mode: null, points: [], overlays: new Map(), fitted: false, moved: false, info: null };
 const outlines = L.layerGroup(), trails = L.layerGroup().addTo(map), drawn = L.layerGroup().addTo(map), marked = L.layerGroup().addTo(map);
 const colours = ["#0047b3", "#b30059", "#006644", "#8a4b00", "#5a00b3", "#00707a"];
 

@@ -35,8 +35,8 @@ const field = (text, value, kind) => {
   return [label, input];
 };
 const addForm = () => {
-  const form = element("form"), at = control.tapped || {};
-  const [nameBox, name] = field("Name", `P${control.points.length + 1}`), [xBox, x] = field("Easting or longitude", at.x ?? ""), [yBox, y] = field("Northing or latitude", at.y ?? ""), [zBox, z] = field("Height in m, empty if unknown", "");
+  const form = element("form");
+  const [nameBox, name] = field("Name", `P${control.points.length + 1}`), [xBox, x] = field("Easting or longitude", ""), [yBox, y] = field("Northing or latitude", ""), [zBox, z] = field("Height in m, empty if unknown", "");
   const check = element("input"), checkBox = element("label", " Check point: judges the map, is not used");
   check.type = "checkbox"; checkBox.prepend(check);
   form.append(nameBox, xBox, yBox, zBox, checkBox, element("small", `Coordinates in ${control.crs}.`));
@@ -51,7 +51,7 @@ const addForm = () => {
     if (!x.value || !y.value || numbers.some((v) => !Number.isFinite(v))) { say("easting and northing are numbers"); return; }
     keepUndo();
     control.points.push({ name: label, x: numbers[0], y: numbers[1], z: z.value ? numbers[2] : null, check: check.checked });
-    Object.assign(control, { adding: false, chosen: label, tapped: null });
+    Object.assign(control, { adding: false, chosen: label });
     drawControl(); lookUp();
   };
   return form;
@@ -67,7 +67,6 @@ const listText = () => {
 };
 const drawControl = () => {
   const box = $("control"), head = element("h2", "Control points");
-  controlLayer.clearLayers();
   if (!control.open) {
     const open = button(control.points.length ? `Control points (${control.points.length})` : "Control points", () => { control.open = true; drawControl(); });
     box.replaceChildren(open);
@@ -116,8 +115,8 @@ const runPart = () => {
 const residuals = (points) => {
   const table = element("table"), head = element("tr"), body = element("tbody");
   table.id = "residuals";
-  for (const text of ["Point", "East", "North", "Up", "Photos"]) head.append(element("th", text));
-  const cm = (v) => v === null || v === undefined ? "–" : `${(100 * v).toFixed(1)} cm`;
+  for (const text of ["Point", "East, cm", "North, cm", "Up, cm", "Photos"]) head.append(element("th", text));
+  const cm = (v) => v === null || v === undefined ? "–" : (100 * v).toFixed(1);
   for (const p of points) {
     const tr = element("tr");
     tr.append(element("td", p.check ? `${p.name} (check)` : p.name), ...[p.dx_m, p.dy_m, p.dz_m].map((v) => element("td", cm(v))), element("td", String(p.sightings)));
@@ -144,8 +143,9 @@ const lookUp = async (propose) => {
       say(n ? `${n} proposed: look at each, and take away what is wrong` : "no other photo looks like the marked place");
       drawControl();
     } else drawLoupes();
-    const found = [...state.photos.values()].find((p) => p.name === (said.photos[0] || {}).name);
-    if (found && found.at) map.panTo([found.at[1], found.at[0]]);
+    controlLayer.clearLayers();
+    L.circleMarker([said.lat, said.lon], { radius: 9, color: "#00a0c8", weight: 4 }).bindTooltip(point.name, { permanent: true }).addTo(controlLayer);
+    if (!map.getBounds().contains([said.lat, said.lon])) map.panTo([said.lat, said.lon]);
   } catch (error) { control.rows = []; drawLoupes(); say(error.message); }
 };
 const drawLoupes = () => {

@@ -117,7 +117,6 @@ document.addEventListener("keydown", (e) => { if (e.key === "Escape" && !$("big"
 map.getContainer().addEventListener("focus", () => { $("cross").hidden = !(state.mode || document.body.classList.contains("keys")); });
 map.getContainer().addEventListener("blur", () => { $("cross").hidden = !state.mode; });
 const clicked = (at) => {
-  if (state.tap && state.tap(at)) return;
   photosHere(at).catch((error) => say(error.message));
 };
 map.on("click", (e) => { state.mode ? addPoint(e.latlng) : clicked(e.latlng); });
