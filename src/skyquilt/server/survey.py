@@ -396,7 +396,9 @@ def _photo_folder(folder: Path) -> Path | None:
     except (OSError, ValueError, RecursionError):
         return None
     beside = folder.parent / NAMED
-    places = [Path(str(said))] if said else []
+    # as it was given: from the folder in which the map was made, which may be any above the run
+    given = Path(str(said)) if said and "\0" not in str(said) else None
+    places = [] if given is None else [given, *(p / given for p in folder.resolve().parents)]
     return next((p for p in (*places, beside) if p.is_dir()), None)
 
 
