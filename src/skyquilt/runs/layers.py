@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from skyquilt.outside import open_regular, read_bounded
-from skyquilt.raster.map_source import MapSource, Palette
+from skyquilt.raster.colours import Palette
+from skyquilt.raster.map_source import MapSource
 
 UNITS = {"celsius": "\u00b0C", "counts": "counts"}
 DATUMS = {

@@ -9,7 +9,8 @@ import numpy as np
 
 from skyquilt.model.event import Result
 from skyquilt.model.photo import Survey
-from skyquilt.raster.map_source import FileSource, coloured
+from skyquilt.raster.colours import coloured
+from skyquilt.raster.map_source import FileSource
 from skyquilt.raster.picture_files import image_bytes
 from skyquilt.runs.layers import LAYERS, is_tiff, range_of
 

@@ -22,7 +22,7 @@ from skyquilt.engine.error_log import log_error
 from skyquilt.errors import OutputError, UsageError
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.photo_intake import Intake
-from skyquilt.server.survey import Survey
+from skyquilt.server.shown import Survey
 
 RESUMABLE = "/photos/uploads"
 """The address of resumable uploads."""

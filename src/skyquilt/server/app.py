@@ -21,7 +21,7 @@ from skyquilt.server.map_endpoints import STATIC, MapEndpoints
 from skyquilt.server.photo_endpoints import PhotoEndpoints
 from skyquilt.server.photo_views import PhotoViews
 from skyquilt.server.readouts import Readouts
-from skyquilt.server.survey import Survey
+from skyquilt.server.shown import Survey
 from skyquilt.server.upload_endpoints import UploadEndpoints
 from skyquilt.server.wms import WmsEndpoints
 from skyquilt.version import __version__

@@ -18,8 +18,8 @@ from skyquilt.raster.map_source import between
 from skyquilt.server.access import Context, blocks_of
 from skyquilt.server.control_list import MOST_BYTES, Control, checked, read_list, store, stored
 from skyquilt.server.control_run import ControlRun
+from skyquilt.server.finished_survey import FinishedSurvey
 from skyquilt.server.photo_views import PhotoViews
-from skyquilt.server.survey import FinishedSurvey
 
 MOST_PHOTOS = 40
 """Photos listed for a point."""

@@ -18,7 +18,8 @@ from skyquilt.raster import RasterSpec, write_array
 from skyquilt.raster.map_source import MERCATOR, Bounds, MapSource, Part, between, mercator, picture
 from skyquilt.raster.picture_files import image_bytes
 from skyquilt.runs.layers import RunLayer, range_of, unit_of
-from skyquilt.server.survey import LiveSurvey, Survey
+from skyquilt.server.shown import Survey
+from skyquilt.server.survey import LiveSurvey
 
 MOST_PIXELS = 60_000_000
 """Largest export in pixels."""

@@ -13,11 +13,13 @@ from starlette.background import BackgroundTask
 
 from skyquilt.live.free_memory import give_back
 from skyquilt.outside import real
-from skyquilt.raster.map_source import MapSource, between, ramp
+from skyquilt.raster.colours import ramp
+from skyquilt.raster.map_source import MapSource, between
 from skyquilt.server.access import Context
+from skyquilt.server.finished_survey import FinishedSurvey
 from skyquilt.server.images import Images, write_cog
 from skyquilt.server.readouts import HEIGHTS
-from skyquilt.server.survey import FinishedSurvey, LiveSurvey
+from skyquilt.server.survey import LiveSurvey
 from skyquilt.version import __version__
 
 STATIC = Path(__file__).parent / "static"

@@ -11,7 +11,7 @@ from skyquilt.live.inbox import ending_of
 from skyquilt.outside import open_regular
 from skyquilt.photos.headers import content_digest
 from skyquilt.server.access import Context
-from skyquilt.server.survey import Shown, covering
+from skyquilt.server.shown import Shown, covering
 
 Degrees = Annotated[float, Query(ge=-180, le=180, allow_inf_nan=False)]
 Latitude = Annotated[float, Query(ge=-90, le=90, allow_inf_nan=False)]

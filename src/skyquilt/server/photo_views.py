@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from skyquilt.outside import check_picture
 from skyquilt.raster.map_source import between
 from skyquilt.server.access import Context
+from skyquilt.server.finished_survey import FinishedSurvey
 from skyquilt.server.photo_endpoints import Degrees, Latitude, Number, PhotoEndpoints
 from skyquilt.server.readouts import HEIGHTS, value_at
-from skyquilt.server.survey import FinishedSurvey
 
 if TYPE_CHECKING:
     from skyquilt.server.projection import Projection

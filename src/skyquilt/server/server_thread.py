@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from skyquilt.errors import UsageError
 from skyquilt.server.access import Guard
-from skyquilt.server.survey import Survey
+from skyquilt.server.shown import Survey
 
 RETRY_S = 2.0
 """If the port is in use, it is tried again for this time in s."""

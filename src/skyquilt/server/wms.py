@@ -20,7 +20,7 @@ from skyquilt.raster.map_source import Bounds, MapSource, between, picture
 from skyquilt.raster.picture_files import image_bytes
 from skyquilt.server.access import Context
 from skyquilt.server.images import Images
-from skyquilt.server.survey import covering
+from skyquilt.server.shown import covering
 
 
 class WmsEndpoints:
