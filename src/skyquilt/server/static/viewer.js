@@ -35,6 +35,11 @@ const openFinal = async () => {
 const explain = () => {
   const some = boundsOf() !== null;
   $("empty").hidden = some;
+  // nothing is shown that cannot be used
+  for (const id of ["export", "fit", "distance", "area", "prints", "tracks"]) $(id).hidden = !some;
+  $("layer").parentElement.hidden = !some;
+  $("fade").hidden = !some;
+  if (!some) $("finish").hidden = true;
   if (some) return;
   $("empty").replaceChildren(
     element("h2", state.info.growing ? "No photo is on the map yet" : "This map has no place on Earth"),
