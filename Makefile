@@ -6,13 +6,16 @@ USE := .venv/installed
 DEVELOP := .venv/installed-for-tests
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --quiet --constraint constraints.txt
 
-.PHONY: demo test test-all check format fuzz fuzz-quick sbom locked clean
+.PHONY: install demo test test-all check format docs fuzz fuzz-quick wheels sbom locked clean
 
-# A simulated flight, its map, and how far the map lies from the simulator's truth.
+# The program with its live map and viewer: .venv/bin/skyquilt
+install: $(USE)
+
+# A simulated flight and its map, placed by control points. The simulator's truth shows how far the map is off.
 demo: $(USE)
 	@$(BIN)/skyquilt simulate demo/flight --preset demo --overwrite
-	@$(BIN)/skyquilt mosaic demo/flight/photos -o demo/map --overwrite
-	@$(BIN)/python examples/04_map_against_truth.py demo/map/mosaic.tif demo/flight/truth/truth_ortho.tif
+	@$(BIN)/skyquilt mosaic demo/flight/photos --gcp demo/flight/gcp_list.txt -o demo/map --overwrite
+	@$(BIN)/python examples/04_map_against_truth.py demo/map/mosaic.tif demo/flight/truth/truth_ortho.tif demo/map/metrics.json
 
 # Lint, format, types and import contract, then the tests that take no more than a few seconds each.
 test: check
@@ -27,6 +30,11 @@ check: $(DEVELOP)
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports
+
+# The documentation as a site, site/index.html: every page of docs/, and the API from the docstrings.
+docs: $(DEVELOP)
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "site/index.html"
 
 # Puts code into the form that `make check` asks for.
 format: $(DEVELOP)
@@ -50,6 +58,10 @@ $(FUZZ): $(DEVELOP)
 	@$(PIP) --no-build-isolation --editable '.[fuzz]'
 	@touch $@
 
+# The wheel in a fresh environment of every Python from 3.11 on that is here.
+wheels: $(DEVELOP)
+	@$(BIN)/python .ci/wheels.py
+
 # A bill of materials (CycloneDX) of the installed program: its packages, versions and licences.
 sbom: $(USE)
 	@$(BIN)/python .ci/sbom.py > sbom.cdx.json
@@ -72,7 +84,7 @@ locked: .venv/pyvenv.cfg
 $(USE): .venv/pyvenv.cfg pyproject.toml constraints.txt
 	@echo "installing Skyquilt into .venv (a minute or two, the first time)"
 	@$(PIP) setuptools
-	@$(PIP) --no-build-isolation --editable .
+	@$(PIP) --no-build-isolation --editable '.[live]'
 	@$(BIN)/python -m compileall -q src/skyquilt  # as pip does where it copies files
 	@touch $@
 
@@ -82,6 +94,6 @@ $(DEVELOP): $(USE)
 	@touch $@
 
 clean:
-	rm -rf .venv demo build dist sbom.cdx.json fuzz/found .pytest_cache .hypothesis .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf .venv demo site build dist sbom.cdx.json fuzz/found .pytest_cache .hypothesis .mypy_cache .ruff_cache .import_linter_cache
 	rm -rf src/*.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

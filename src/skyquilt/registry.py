@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
-STAGES = ("detector", "matcher", "estimator", "alignment", "registration")
-"""Kinds of methods that are chosen by name."""
+STAGES = ("detector", "matcher", "estimator", "alignment", "registration", "notebook")
+"""Kinds of methods that are chosen by name; `notebook`: how a record is shown as HTML."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,5 +1,6 @@
 """The command line's promises: choices, exit codes, sentences instead of tracebacks."""
 
+import os
 import re
 import subprocess
 import sys
@@ -37,10 +38,11 @@ def said(*words):
     return re.sub(r"\s+", " ", re.sub(r"[\u2500-\u257f]", " ", result.output))
 
 
-def described(option):
-    """The line of `skyquilt mosaic --help` about an option."""
+def described(*words):
+    """The line of a command's help (`mosaic`, where none is named) about an option."""
+    *command, option = words
     result = CliRunner(env={"COLUMNS": "400", "TERM": "dumb"}).invoke(
-        commands.app, ["mosaic", "--help"]
+        commands.app, [*(command or ["mosaic"]), "--help"]
     )
     return next(line for line in result.output.splitlines() if re.search(rf"{option}\b", line))
 
@@ -175,3 +177,41 @@ def described_panels():
         commands.app, ["mosaic", "--help"]
     )
     return re.findall(r"^\u256d\u2500 (.*?) \u2500", result.output, re.M)
+
+
+@pytest.mark.parametrize("option", ["--gcp", "--geo", "--cameras", "--distances"])
+def test_a_side_file_that_is_not_there_is_a_wrong_option(option, tmp_path):
+    words = ["mosaic", str(tmp_path), "-o", str(tmp_path / "out"), option, str(tmp_path / "none")]
+    result = CliRunner().invoke(commands.app, words)
+    assert isinstance(result.exception, errors.UsageError) and result.exception.exit_code == 2
+    assert option in str(result.exception) and not (tmp_path / "out").exists()
+
+
+def test_a_viewer_that_others_can_reach_needs_a_token(tmp_path):
+    words = ["view", str(tmp_path), "--host", "0.0.0.0", "--port", "0"]
+    result = CliRunner().invoke(commands.app, words)
+    assert isinstance(result.exception, errors.UsageError) and "--token" in str(result.exception)
+    assert "--token" in described("view", "--host") and "--token" in described("view", "--token")
+
+
+def test_live_creates_its_inbox_or_fails_before_anything_else(tmp_path):
+    from skyquilt.live.folder_watch import create_inbox
+
+    create_inbox(tmp_path / "new" / "inbox")
+    assert (tmp_path / "new" / "inbox").is_dir()
+    (tmp_path / "file").write_text("")
+    result = CliRunner().invoke(
+        commands.app, ["live", str(tmp_path / "file"), "-o", str(tmp_path / "out")]
+    )
+    assert isinstance(result.exception, errors.UsageError) and "is a file" in str(result.exception)
+    assert result.output == "" and not (tmp_path / "out").exists()
+
+
+def test_shells_can_complete_commands():
+    env = {"_SKYQUILT_COMPLETE": "complete_bash", "COMP_WORDS": "skyquilt exp", "COMP_CWORD": "1"}
+    code = "from skyquilt.cli.app import app; app(prog_name='skyquilt')"
+    said = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False,
+        env=os.environ | env,
+    )  # fmt: skip
+    assert said.stdout.split() == ["export"]

@@ -267,3 +267,41 @@ def test_two_spectra_lie_beside_each_other_on_either_side_of_the_handle(page, bo
         ):
             assert (np.abs(both_shown[part] - alone[name][part]).max(-1) > 8).mean() < 0.002, name
         assert page.errors == []
+
+
+def test_from_the_empty_page_to_the_final_map(browser, flight, tmp_path):
+    """What is missing is said, the growing map stays in view, and "Finish flight" ends with the
+    final map and its files.
+    """
+    context = browser.new_context(viewport={"width": 1280, "height": 900})
+    page = context.new_page()
+    page.on("dialog", lambda dialog: dialog.accept())
+    with served(tmp_path / "out", QUICK) as site:
+        page.goto(site.url)
+        page.wait_for_selector("#link.live")
+        assert "Copy photos into the watched folder" in page.inner_text("#empty")
+        shot(page, "empty")
+        assert not page.locator("#profile").is_visible()  # there are no heights yet
+        for path in flight.photos:
+            site.send(path)
+        site.until(lambda: set(site.states().values()) == {"refined"})
+        inside = (
+            "(() => { const l = skyquilt.state.layers.get('visible'); if (!l || !l.bounds) return"
+            " false; const [w, s, e, n] = l.bounds; return skyquilt.map.getBounds().contains("
+            "[[s, w], [n, e]]); })()"
+        )
+        holds(page, inside)
+        assert not page.locator("#empty").is_visible()
+        # refined photos have no reason
+        holds(page, "document.querySelectorAll('#photos small').length == 0")
+        tracks = page.evaluate("skyquilt.state.tracks")
+        assert sorted(tracks[0]) == tracks[0] and len(tracks) == 1
+        page.click("#finish")
+        holds(page, "document.querySelector('#layer').value == 'finished'", seconds=180)
+        holds(page, "document.querySelectorAll('#downloads a').length >= 3")
+        assert page.locator("#downloads a").all_inner_texts() == ["Map", "Heights", "Report"]
+        assert page.locator("#profile").is_visible()
+        page.wait_for_timeout(1500)
+        shot(page, "finished")
+        assert coloured(page) > 0.08
+    context.close()

@@ -6,6 +6,7 @@ import pytest
 
 from skyquilt.errors import OutputError
 from skyquilt.report import CameraResiduals, ReportInput, SeamMark, Shot, build_report, write_report
+from skyquilt.report.attention import attention
 
 from .report_cases import Page, run, shots
 
@@ -256,3 +257,63 @@ def test_the_file_appears_whole_or_not_at_all(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     with pytest.raises(OutputError, match="cannot be written"):
         write_report(tmp_path / "nowhere" / "report.html", run())
+
+
+def test_the_head_says_when_how_high_and_with_what_and_links_the_files():
+    from dataclasses import replace
+
+    taken = [
+        replace(s, time=f"2024-05-01T10:0{k % 10}:00", above_ground_m=55.0 + k % 3, tilt_deg=1.5)
+        for k, s in enumerate(shots(18))
+    ]
+    files = ["mosaic.tif", "dsm.tif", "metrics.json"]
+    data = run(shots=taken, processed="2026-01-02T03:04:05", files=files)
+    page = Page(build_report(data))
+    assert "2024-05-01 10:00 to 10:09" in page.text and "2026-01-02 03:04" in page.text
+    assert "56 m above ground" in page.text.replace("\u00a0", " ")
+    outside = [link for link in page.links if not link.startswith(("#", "data:"))]
+    assert outside == files
+    assert page.text.count("IMG_0004.JPG") >= 1 and "18 photos" in page.text
+
+
+def attended(**changes):
+    return [words for words, _ in attention(run(**changes))]
+
+
+def test_worth_a_look_names_what_is_worst_and_nothing_where_all_is_well():
+    views = np.full((20, 20), 7)
+    good = {"metrics": {"photos_used": 9, "photos_total": 9, "blocks": [9]}, "views": views}
+    assert attended(**good, crs="EPSG:32633") == []
+    views = views.copy()
+    views[:8] = 1
+    metrics = {
+        **good["metrics"],
+        "seam_disparity_px": {"median": 6.1, "p95": 20.0, "measured": 30, "attempted": 100},
+        "shutter": {
+            "a": {"source": "table", "readout_ms": 33.0, "largest_displacement_px": 0.0},
+            "b": {"source": "unknown", "readout_ms": 0.0, "largest_displacement_px": 0.0},
+            "c": {"source": "table", "readout_ms": 33.0, "largest_displacement_px": 4.0},
+        },
+        "thermal_values": {"unit": "counts"},
+        "accuracy": {"focal_sigma_after_over_before": 0.97, "vertical_m": {"median": 1.14}},
+        "metadata_conflicts": [{"photo": "x", "field": "yaw", "meaning": "the compass is off"}],
+    }
+    told = attended(metrics=metrics, views=views, crs="EPSG:32633")
+    starts = [
+        "Poor overlap: 40%", "Photos disagree at the seams by 6.1 px",
+        "Few seams measured: 30 of 100",
+        "Shutter not modelled: that of a", "Shutter not modelled: nothing says how b",
+        "Thermal values are sensor counts", "The flight does not determine the focal length",
+        "1 metadata conflict (yaw)",
+    ]  # fmt: skip
+    assert len(told) == len(starts)
+    for start, words in zip(starts, told, strict=True):
+        assert words.startswith(start), words
+    page = Page(build_report(run(metrics=metrics, views=views)))
+    assert "the compass is off" in page.text  # the cause as metrics.json gives it
+
+
+def test_measured_values_have_a_legend_with_their_unit():
+    page = Page(build_report(run(values=(12.3, 35.1, "\u00b0C"))))
+    assert "12.3 \u00b0C" in page.text and "35.1 \u00b0C" in page.text
+    assert "12.3 \u00b0C" not in Page(build_report(run())).text

@@ -40,9 +40,12 @@ def _yaw(photo: Photo, prior: Prior, alignment: Alignment, i: int) -> list[Metad
     if abs(off) < max(YAW_DEG, 3 * prior.sigma_yaw_deg):
         return []
     convergence = alignment.frame.convergence_deg
-    why = f"the reported heading ({prior.yaw_source}) is wrong by {off:+.0f} degrees"
+    why = (
+        f"the reported heading ({prior.yaw_source}) is wrong by {off:+.0f} degrees: a compass or"
+        " gimbal that was not calibrated"
+    )
     if abs(abs(off) - 180) < 20 and photo.editor:
-        why = "another program has turned the file upside down"
+        why = "another program has turned the file upside down, not its metadata"
     return [
         MetadataConflict(
             photo=photo.name,
@@ -79,7 +82,8 @@ def _altitudes(
                     field="altitude",
                     reported=round(reported, 1),
                     estimated=round(reported - float(e), 1),
-                    meaning=f"by image scale and neighbours it is {abs(e):.0f} m {where}",
+                    meaning=f"by image scale and neighbours it is {abs(e):.0f} m {where}:"
+                    " a drifting barometer or receiver",
                 )
             )
     return out
@@ -98,7 +102,8 @@ def _positions(
                     field="position",
                     reported=round(off, 1),
                     estimated=0.0,
-                    meaning=f"the reported position is {off:.1f} m from the adjusted one",
+                    meaning=f"the reported position is {off:.1f} m from the adjusted one"
+                    " and got little weight",
                 )
             )
     return out
@@ -122,7 +127,7 @@ def _focals(
                     reported=round(photo.focal.px, 1),
                     estimated=round(camera.focal, 1),
                     meaning=f"self-calibration of {photo.camera_key} gives another focal length (in"
-                    " px)",
+                    " px): another camera, a zoom, or a resized file",
                 )
             )
     return out
@@ -149,14 +154,14 @@ def _lenses(
         if off > CONTRADICTED_PX and certain[1:3].any():
             meaning = (
                 f"self-calibration puts the principal point of {photo.camera_key} {off:.1f} px from"
-                " that of its calibration"
+                " that of its calibration; the flight's is used"
             )
             out.append(_lens_conflict(photo, "principal_point", off, meaning))
         off = _distortion_px(camera, told)
         if off > CONTRADICTED_PX and certain[3:8].any() and told.vector[3:8].any():
             meaning = (
                 f"the distortion of {photo.camera_key} differs from its calibration by {off:.1f} px"
-                " in the corners"
+                " in the corners; the flight's is used"
             )
             out.append(_lens_conflict(photo, "lens", off, meaning))
     return out

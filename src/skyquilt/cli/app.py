@@ -7,6 +7,7 @@ import typer
 from skyquilt.cli import calibrate as calibrate_command
 from skyquilt.cli import compare as compare_command
 from skyquilt.cli import depth as depth_command
+from skyquilt.cli import export as export_command
 from skyquilt.cli import fly as fly_command
 from skyquilt.cli import inspect as inspect_command
 from skyquilt.cli import live as live_command
@@ -24,9 +25,10 @@ EXIT_CODES = (
     " 5 output cannot be written, 6 malformed side file, 7 refused with a reason, 130 interrupted."
 )
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(no_args_is_help=True, add_completion=True, pretty_exceptions_enable=False)
 app.command("mosaic", epilog=EXIT_CODES)(mosaic_command.command)
 app.command("compare", epilog=EXIT_CODES)(compare_command.command)
+app.command("export", epilog=EXIT_CODES)(export_command.command)
 app.command("live", epilog=EXIT_CODES)(live_command.command)
 app.command("view", epilog=EXIT_CODES)(view_command.command)
 app.command("fly", epilog=EXIT_CODES)(fly_command.command)

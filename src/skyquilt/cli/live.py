@@ -17,7 +17,12 @@ Port = Annotated[int, typer.Option(min=0, max=65535, help="Port of the viewer; 0
 Host = Annotated[
     str, typer.Option(help="Address to listen on; other than local ones need --token.")
 ]
-
+Token = Annotated[
+    str | None,
+    typer.Option(
+        envvar="SKYQUILT_TOKEN", help="Secret that every request which changes something must hold."
+    ),
+]
 AllowHost = Annotated[
     list[str] | None,
     typer.Option(
@@ -29,17 +34,14 @@ MaxConnections = Annotated[int, typer.Option(min=4, max=900, help="Connections f
 
 
 def command(
-    inbox: Annotated[list[Path], typer.Argument(help="Folders that photos are copied into.")],
+    inbox: Annotated[
+        list[Path],
+        typer.Argument(help="Folders that photos are copied into; created where missing."),
+    ],
     output: Output,
     port: Port = 8080,
     host: Host = "127.0.0.1",
-    token: Annotated[
-        str | None,
-        typer.Option(
-            envvar="SKYQUILT_TOKEN",
-            help="Secret that requests for uploads and layers must contain.",
-        ),
-    ] = None,
+    token: Token = None,
     gsd: Annotated[
         float | None,
         typer.Option(
@@ -98,6 +100,7 @@ def command(
     with ends_at_once():
         from skyquilt.cli.progress import show_live
         from skyquilt.engine.memory_watch import ends_run, limit_bytes
+        from skyquilt.live.folder_watch import create_inbox
         from skyquilt.live.live_map import LiveMap
         from skyquilt.live.settings import LiveSettings
         from skyquilt.live.workflow import iter_live
@@ -122,6 +125,8 @@ def command(
         allow_hosts=tuple(allow_host or ()),
         most_connections=max_connections,
     )
+    for folder in inbox:
+        create_inbox(folder)
     live = LiveMap(output, settings)
     try:
         asked = ServerConfig(

@@ -14,12 +14,16 @@ from skyquilt.cli.options import (
     UNIT_UNSAID,
     Photos,
     mode_of,
+    parse_bounds,
 )
 from skyquilt.errors import UsageError
 from skyquilt.outside import MOST_MP
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
     from skyquilt.model.event import Result
+    from skyquilt.runs.export import Export
 
 
 COMMON, INPUT, METHOD, CAMERA = "Options most people need", "Input", "Method", "Cameras"
@@ -231,6 +235,14 @@ def command(
             default="temperatures balanced, counts raw",
         ),
     ] = None,
+    export: Annotated[
+        str | None,
+        option(
+            FILES,
+            "Export the finished map as well, as `skyquilt export` does, to OUTPUT/export: png,"
+            " kmz, mbtiles, tiles, tif, heights, footprints, separated by commas.",
+        ),
+    ] = None,
     write_frames: Annotated[
         bool, option(FILES, "Write the frames used of videos to frames/.", "--write-frames")
     ] = False,
@@ -295,7 +307,7 @@ def command(
     Sensible without any option. The same command again resumes a run that was killed.
     """
     with ends_at_once():
-        from skyquilt.cli.progress import show
+        from skyquilt.cli.progress import show, show_exports
         from skyquilt.engine.memory_watch import ends_run, limit_bytes
         from skyquilt.settings import MosaicSettings
         from skyquilt.workflows.mosaic import STAGES, iter_mosaic
@@ -303,6 +315,7 @@ def command(
     if rerun_from is not None and rerun_from not in STAGES[1:]:
         raise UsageError(f"--rerun-from {rerun_from!r} is not one of {', '.join(STAGES[1:])}")
     mode = mode_of(quiet=quiet, json=json, verbose=verbose)
+    exporting = _exporting(export, output)
     settings = MosaicSettings(
         method=method,
         gcp=gcp,
@@ -369,6 +382,23 @@ def command(
     advice = "the same command resumes, with --memory smaller or --max-memory larger"
     with ends_run(limit_bytes(max_memory), advice):
         show(events, mode=mode, summary=None if thermal is None else with_thermal)
+        if exporting is not None:
+            show_exports(exporting(), mode=mode)
+
+
+def _exporting(export: str | None, output: Path) -> "Callable[[], Iterator[Export]] | None":
+    """What `--export` asks for, checked before the map is made.
+
+    Raises:
+        UsageError: it names what cannot be exported.
+    """
+    if export is None:
+        return None
+    from skyquilt.runs.export import Wanted, parse_what
+    from skyquilt.runs.export import export as exports
+
+    wanted = Wanted(what=parse_what(export))
+    return lambda: exports(output, wanted)
 
 
 def with_thermal(result: "Result") -> str:
@@ -402,20 +432,3 @@ def parse_lever_arm(text: str | None) -> tuple[float, float, float] | None:
             f"--lever-arm is right,forward,up, three numbers in m; got {text!r}"
         ) from error
     return right, forward, up
-
-
-def parse_bounds(text: str | None) -> tuple[float, float, float, float] | None:
-    """Four numbers separated by commas.
-
-    Raises:
-        UsageError: they are not.
-    """
-    if text is None:
-        return None
-    try:
-        west, south, east, north = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise UsageError(
-            f"--bounds is west,south,east,north, four numbers; got {text!r}"
-        ) from error
-    return west, south, east, north

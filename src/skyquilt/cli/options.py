@@ -64,3 +64,20 @@ def mode_of(*, quiet: bool, json: bool, verbose: bool | None = None) -> Mode:
         names = "--quiet and --json" if verbose is None else "--quiet, --verbose and --json"
         raise UsageError(f"{names} exclude one another")
     return "quiet" if quiet else "json" if json else "verbose" if verbose else "normal"
+
+
+def parse_bounds(text: str | None) -> tuple[float, float, float, float] | None:
+    """Four numbers separated by commas.
+
+    Raises:
+        UsageError: they are not.
+    """
+    if text is None:
+        return None
+    try:
+        west, south, east, north = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise UsageError(
+            f"--bounds is west,south,east,north, four numbers; got {text!r}"
+        ) from error
+    return west, south, east, north

@@ -4,11 +4,16 @@ import json
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from skyquilt.live.events import Update
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
 from skyquilt.outside import shown
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from skyquilt.runs.export import Export
 
 
 def show_live(events: Iterable[Event | Update], url: str, *, mode: str) -> None:
@@ -91,6 +96,24 @@ def as_record(happened: Event) -> dict[str, Any]:
 
 def _bars(events: Iterable[Event], summary: Callable[[Result], str], *, verbose: bool) -> None:
     from rich.console import Console
+
+    console = Console(stderr=True)
+    if console.is_terminal:
+        result = _on_terminal(events, console, verbose=verbose)
+    else:
+        from skyquilt.cli.progress_lines import ProgressLines
+
+        with ProgressLines(write=_error_line, verbose=verbose) as lines:
+            result = lines.follow(events)
+    Console().print(shown(summary(result)), markup=False, highlight=False, soft_wrap=True)
+
+
+def _error_line(text: str) -> None:
+    sys.stderr.write(text + "\n")
+    sys.stderr.flush()
+
+
+def _on_terminal(events: Iterable[Event], console: "Console", *, verbose: bool) -> Result:
     from rich.progress import (
         BarColumn,
         Progress,
@@ -99,7 +122,6 @@ def _bars(events: Iterable[Event], summary: Callable[[Result], str], *, verbose:
         TimeRemainingColumn,
     )
 
-    console = Console(stderr=True)
     columns = (
         TextColumn("{task.description:<9}"),
         BarColumn(),
@@ -108,7 +130,7 @@ def _bars(events: Iterable[Event], summary: Callable[[Result], str], *, verbose:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+    with Progress(*columns, console=console) as progress:
         tasks: dict[str, Any] = {}
         for happened in events:
             if isinstance(happened, StageStarted):
@@ -131,7 +153,18 @@ def _bars(events: Iterable[Event], summary: Callable[[Result], str], *, verbose:
                 )
             elif isinstance(happened, Result):
                 result = happened
-    Console().print(shown(summary(result)), markup=False, highlight=False, soft_wrap=True)
+    return result
+
+
+def show_exports(exports: "Iterable[Export]", *, mode: str) -> None:
+    """Reports each export when it is written."""
+    for done in exports:
+        if mode == "json":
+            _line({"event": "Export", "path": str(done.path), "note": done.note})
+        elif mode != "quiet":
+            note = f" ({done.note})" if done.note else ""
+            sys.stdout.write(f"export: {done.path}{note}\n")
+            sys.stdout.flush()
 
 
 def times(happened: StageFinished) -> str:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.live import AllowHost, Host, MaxConnections, Port
+from skyquilt.cli.live import AllowHost, Host, MaxConnections, Port, Token
 from skyquilt.cli.options import MaxMemory
 from skyquilt.outside import plain
 
@@ -20,6 +20,7 @@ def command(
     ],
     port: Port = 8080,
     host: Host = "127.0.0.1",
+    token: Token = None,
     base: Annotated[
         Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")
     ] = None,
@@ -40,14 +41,13 @@ def command(
         from skyquilt.server.access import Guard
         from skyquilt.server.server_thread import ServerThread
         from skyquilt.server.survey import open_survey
-    survey = open_survey(folder, base=base, photos=photos)
-    # read-only: there is no writer that could need the token
     guard = Guard(
         host=host,
-        token="looking-only",
+        token=token,
         allow_hosts=tuple(allow_host or ()),
         most_connections=max_connections,
     )
+    survey = open_survey(folder, base=base, photos=photos)
     watch = ends_run(limit_bytes(max_memory), "start it again with a larger --max-memory")
     with watch, ServerThread(survey=survey, guard=guard, folder=folder, port=port) as serving:
         typer.echo(f"{serving.url} shows {plain(str(folder))}; Ctrl-C ends")

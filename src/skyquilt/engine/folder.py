@@ -2,6 +2,7 @@
 
 import errno
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ CONTRACT = (
     "run.toml",
 )
 """Files of a finished run."""
-STATE = ".skyquilt"
+STATE, EXPORTS = ".skyquilt", "export"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +92,7 @@ def open_run(path: Path, key: str, *, overwrite: bool, again: bool = False) -> R
         if taken:
             for name in (*CONTRACT, error_log.NAME):
                 (path / name).unlink(missing_ok=True)
+            shutil.rmtree(path / EXPORTS, ignore_errors=True)  # of the map that is replaced
         (path / STATE).mkdir(parents=True, exist_ok=True)
         probe = path / STATE / "probe"
         probe.write_bytes(b"x")

@@ -50,6 +50,19 @@ class Growing:
     """Whether it was closed after writing since then."""
 
 
+def create_inbox(folder: Path) -> None:
+    """Creates a folder for photos where it is missing.
+
+    Raises:
+        UsageError: it cannot be created, or is a file.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        why = "is a file" if folder.is_file() else f"cannot be created ({error.strerror or error})"
+        raise UsageError(f"{folder} {why}; name a folder for the photos") from error
+
+
 @dataclass(kw_only=True)
 class Watch:
     """Watches a folder and its subfolders. The ledger stores which files were seen, so that a

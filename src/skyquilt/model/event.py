@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from skyquilt import registry
+
 
 @dataclass(frozen=True, kw_only=True)
 class StageStarted:
@@ -62,6 +64,26 @@ class Result:
     """The run's folder."""
     metrics: Mapping[str, Any]
     """The content of metrics.json."""
+
+    def facts(self) -> dict[str, str]:
+        """What matters of it, by name."""
+        m = self.metrics
+        told = {"folder": str(self.output)}
+        if "photos_used" in m:
+            told["photos"] = f"{m['photos_used']} of {m.get('photos_total')}"
+        if m.get("gsd_m"):
+            told["pixel"] = f"{100 * m['gsd_m']:.3g} cm"
+        if "crs" in m:
+            told["crs"] = str(m["crs"] or "not georeferenced")
+        if (seams := m.get("seam_disparity_px")) and seams.get("median") is not None:
+            told["seams"] = f"{seams['median']} px"
+        return told
+
+    def __repr__(self) -> str:
+        return f"Result({', '.join(f'{k}: {v}' for k, v in self.facts().items())})"
+
+    def _repr_html_(self) -> str:
+        return str(registry.load("notebook", "result")(self))
 
 
 Event = StageStarted | StageProgress | StageFinished | Note | Result

@@ -5,6 +5,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from skyquilt import registry
 from skyquilt.model.camera import Camera
 
 if TYPE_CHECKING:
@@ -196,6 +197,26 @@ class Survey:
     """Plain sentences about the survey as a whole (two cameras, different clocks, duplicates
     ...).
     """
+
+    def facts(self) -> dict[str, str]:
+        """What matters of it, by name."""
+        cameras = sorted({p.camera_key for p in self.photos})
+        times = sorted(p.time.replace(tzinfo=None) for p in self.photos if p.time is not None)
+        told = {
+            "photos": str(len(self.photos)),
+            "with positions": str(sum(p.position is not None for p in self.photos)),
+            "cameras": ", ".join(cameras[:3]) + (" ..." if len(cameras) > 3 else ""),
+        }
+        if times:
+            told["taken"] = f"{times[0]:%Y-%m-%d %H:%M} to {times[-1]:%H:%M}"
+        counts = {"rejected": self.rejected, "ignored": self.ignored, "clips": self.clips}
+        return told | {name: str(len(many)) for name, many in counts.items() if many}
+
+    def __repr__(self) -> str:
+        return f"Survey({', '.join(f'{k}: {v}' for k, v in self.facts().items())})"
+
+    def _repr_html_(self) -> str:
+        return str(registry.load("notebook", "survey")(self))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -49,6 +49,8 @@ class Drawn:
     """(h, w, 4) the map, reduced, RGBA."""
     preview_grid: Grid
     """Its grid."""
+    preview_range: tuple[float, float] | None
+    """Values of the first and the last colour of the preview; None for photos."""
 
 
 def shot_numbers(compose: Composer) -> NDArray[np.uint32]:
@@ -113,12 +115,18 @@ def coloured(preview: NDArray[Any], shown: NDArray[np.uint8]) -> NDArray[np.uint
     if preview.dtype == np.uint8 and preview.shape[2] == 3:
         return np.dstack([preview, shown])
     value = preview[..., 0].astype(np.float32)
-    seen = value[shown > 127]
-    low, high = np.percentile(seen, [1, 99]) if seen.size else (0.0, 1.0)
+    low, high = colour_range(preview, shown)
     index = np.clip((value - low) / max(float(high - low), 1e-6) * 255, 0, 255).astype(np.uint8)
     if preview.dtype == np.uint8:
         return np.dstack([preview[..., :1]] * 3 + [shown])
     return np.dstack([cv2.applyColorMap(index, cv2.COLORMAP_INFERNO)[..., ::-1], shown])
+
+
+def colour_range(preview: NDArray[Any], shown: NDArray[np.uint8]) -> tuple[float, float]:
+    """Values of the first and the last colour of measured values: their 1st and 99th percentile."""
+    seen = preview[..., 0].astype(np.float32)[shown > 127]
+    low, high = np.percentile(seen, [1, 99]) if seen.size else (0.0, 1.0)
+    return float(low), float(high)
 
 
 class Companions:

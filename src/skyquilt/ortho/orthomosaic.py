@@ -23,6 +23,7 @@ from skyquilt.ortho.companions import (
     BlockExtras,
     Companions,
     Drawn,
+    colour_range,
     coloured,
     extras_of,
     geotransform,
@@ -163,6 +164,9 @@ def draw(
         views_grid=whole.coarse,
         preview=coloured(whole.preview, whole.shown),
         preview_grid=whole.grid.coarser(whole.factor),
+        preview_range=None
+        if whole.preview.dtype == np.uint8
+        else colour_range(whole.preview, whole.shown),
     )
 
 

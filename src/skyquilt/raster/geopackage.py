@@ -1,15 +1,17 @@
-"""Lines as a GeoPackage (OGC 12-128r18), readable by every GIS."""
+"""Lines and polygons as a GeoPackage (OGC 12-128r18), readable by every GIS."""
 
 import sqlite3
 import struct
 from collections.abc import Iterable
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from shapely import to_wkb
-from shapely.geometry import LineString
+from shapely.geometry import LineString, Polygon
 
 from skyquilt.errors import OutputError
 
@@ -44,7 +46,33 @@ def write_lines(
     Raises:
         OutputError: the file cannot be written.
     """
-    rows = [(np.asarray(line, np.float64), float(height)) for line, height in lines]
+    rows = [(LineString(np.asarray(line, np.float64)), float(height)) for line, height in lines]
+    return _write(path, _Table(name=table, kind="LINESTRING", column="height REAL"), rows, crs)
+
+
+def write_polygons(
+    path: Path, table: str, rings: Iterable[tuple[NDArray[np.float64], str]], *, crs: str | None
+) -> int:
+    """Writes polygons, each an outer ring (n, 2) in `crs` with a name, as a table; returns their
+    number.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    rows = [(Polygon(np.asarray(ring, np.float64)), name) for ring, name in rings]
+    return _write(path, _Table(name=table, kind="POLYGON", column="filename TEXT"), rows, crs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Table:
+    """A table of features."""
+
+    name: str
+    kind: str
+    column: str
+
+
+def _write(path: Path, table: _Table, rows: list[tuple[Any, Any]], crs: str | None) -> int:
     partial = path.with_name(path.name + ".partial")
     partial.unlink(missing_ok=True)
     try:
@@ -58,30 +86,28 @@ def write_lines(
 
 
 def _fill(
-    base: sqlite3.Connection,
-    table: str,
-    rows: list[tuple[NDArray[np.float64], float]],
-    crs: str | None,
+    base: sqlite3.Connection, table: _Table, rows: list[tuple[Any, Any]], crs: str | None
 ) -> None:
     base.executescript(TABLES)
     base.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     base.execute(f"PRAGMA user_version = {USER_VERSION}")
     srs = _reference(base, crs)
-    places = np.concatenate([line for line, _ in rows]) if rows else np.zeros((1, 2))
-    (west, south), (east, north) = places.min(0).tolist(), places.max(0).tolist()
+    boxes = np.array([g.bounds for g, _ in rows]) if rows else np.zeros((1, 4))
+    (west, south), (east, north) = boxes[:, :2].min(0).tolist(), boxes[:, 2:].max(0).tolist()
     base.execute(
         "INSERT INTO gpkg_contents (table_name, data_type, identifier, min_x, min_y, max_x, max_y,"
         " srs_id) VALUES (?, 'features', ?, ?, ?, ?, ?, ?)",
-        (table, table, west, south, east, north, srs),
+        (table.name, table.name, west, south, east, north, srs),
     )
     base.execute(
-        "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', 'LINESTRING', ?, 0, 0)", (table, srs)
+        "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)",
+        (table.name, table.kind, srs),
     )
-    base.execute(f"CREATE TABLE {table} (fid INTEGER PRIMARY KEY, geom BLOB, height REAL)")
+    base.execute(f"CREATE TABLE {table.name} (fid INTEGER PRIMARY KEY, geom BLOB, {table.column})")
     header = b"GP\0\1" + struct.pack("<i", srs)
     base.executemany(
-        f"INSERT INTO {table} (geom, height) VALUES (?, ?)",
-        [(header + to_wkb(LineString(line), byte_order=1), height) for line, height in rows],
+        f"INSERT INTO {table.name} (geom, {table.column.split()[0]}) VALUES (?, ?)",
+        [(header + to_wkb(shape, byte_order=1), value) for shape, value in rows],
     )
 
 

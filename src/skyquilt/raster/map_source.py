@@ -1,6 +1,6 @@
 """Images of any part of a map, in any projection, from any kind of source."""
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
 
+from skyquilt.raster.colours import Palette, coloured
 from skyquilt.raster.tile_store import LEVELS, SIDE, Address, TileStore
 
 MERCATOR = 20037508.342789244
@@ -115,35 +116,66 @@ class TileSource:
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class FileAbout:
+    """What a GeoTIFF says of itself."""
+
+    crs: str
+    """Projection; empty where there is none."""
+    bounds: Bounds
+    """Extent in it."""
+    bands: int
+    """1, or 3 for colours."""
+    dtype: str
+    """Type of its pixels."""
+    resolution: float
+    """Size of a pixel."""
+    tags: dict[str, str]
+    """Its own tags."""
+    units: tuple[str, ...]
+    """Unit of each band; empty where none is stated."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FileSource:
     """A finished map (GeoTIFF)."""
 
     path: Path
     """The file."""
-    _about: dict[str, object] = field(default_factory=dict)
+    _known: dict[str, FileAbout] = field(default_factory=dict)
 
-    def _open(self) -> dict[str, object]:
+    def about(self) -> FileAbout:
+        """What the file says of itself, read once."""
         import rasterio
 
-        if not self._about:
+        if not self._known:
             with rasterio.open(self.path) as raster:
-                self._about.update(
-                    crs=raster.crs.to_string() if raster.crs else "",
+                bands = 3 if raster.count >= 3 else 1
+                system = raster.crs
+                units = tuple(u or "" for u in raster.units[:bands])
+                self._known["about"] = FileAbout(
+                    crs=_plane(system.to_string()) if system else "",
                     bounds=tuple(raster.bounds),
-                    bands=3 if raster.count >= 3 else 1,
+                    bands=bands,
+                    dtype=raster.dtypes[0],
+                    resolution=float(raster.res[0]),
+                    tags={k: str(v) for k, v in raster.tags().items() if k != "AREA_OR_POINT"},
+                    units=units if any(units) else (),
                 )
-        return self._about
+        return self._known["about"]
 
     @property
     def crs(self) -> str:
         """Its projection; empty where it has none."""
-        return str(self._open()["crs"])
+        return self.about().crs
 
     def bounds(self) -> Bounds | None:
         """Its extent."""
-        west, south, east, north = self._open()["bounds"]  # type: ignore[misc]
-        return west, south, east, north  # type: ignore[has-type]
+        return self.about().bounds
+
+    def resolution(self) -> float:
+        """Size of a pixel in units of its projection."""
+        return self.about().resolution
 
     def part(self, bounds: Bounds, gsd: float) -> Part | None:
         """The part, read from a suitable overview of the file."""
@@ -151,19 +183,25 @@ class FileSource:
         from rasterio.windows import from_bounds
 
         with rasterio.open(self.path) as raster:
+            left, top = raster.bounds.left, raster.bounds.top
             west, south, east, north = (
-                max(bounds[0], raster.bounds.left),
+                max(bounds[0], left),
                 max(bounds[1], raster.bounds.bottom),
                 min(bounds[2], raster.bounds.right),
-                min(bounds[3], raster.bounds.top),
+                min(bounds[3], top),
             )
             if west >= east or south >= north:
                 return None
             step = max(gsd, raster.res[0], max(east - west, north - south) / 4096)
-            h, w = max(1, round((north - south) / step)), max(1, round((east - west) / step))
+            if step < 1.001 * raster.res[0]:
+                step = raster.res[0]
+            # whole steps from the corner, or neighbouring parts would show shifted pixels
+            west = left + math.floor((west - left) / step + 1e-6) * step
+            north = top - math.floor((top - north) / step + 1e-6) * step
+            h, w = (max(1, math.ceil(v / step - 1e-6)) for v in (north - south, east - west))
             window = from_bounds(west, south, west + w * step, north, raster.transform)
             window = from_bounds(west, north - h * step, west + w * step, north, raster.transform)
-            bands = list(range(1, int(str(self._open()["bands"])) + 1))
+            bands = list(range(1, self.about().bands + 1))
             pixels = raster.read(
                 bands, window=window, out_shape=(len(bands), h, w), boundless=True, fill_value=0
             )
@@ -173,6 +211,18 @@ class FileSource:
             mask &= np.isfinite(moved).all(-1)
             moved = np.nan_to_num(moved).astype(np.float32)
         return Part(pixels=moved, shown=mask, west=west, north=north, gsd=step)
+
+
+def _plane(crs: str) -> str:
+    """The horizontal part of a projection: a map is a plane, whatever its heights refer to."""
+    from pyproj import CRS
+
+    known = CRS(crs)
+    if not known.is_compound:
+        return crs
+    flat = known.sub_crs_list[0]
+    code = flat.to_epsg()
+    return f"EPSG:{code}" if code else str(flat.to_wkt())
 
 
 @lru_cache(maxsize=64)
@@ -188,11 +238,62 @@ def picture(
     width: int,
     height: int,
     scale: tuple[float, float] | None = None,
+    palette: Palette = "heat",
 ) -> NDArray[np.uint8] | None:
     """RGBA (height, width, 4) of bounds in any projection; None where the map has no content.
 
-    `scale`: for measured values, those (degrees Celsius, counts) shown as black and as white.
+    `scale`: for measured values, those (degrees Celsius, counts, m) shown in the first and in the
+    last colour of the palette.
     """
+    found = _located(source, crs, bounds, width, height)
+    if found is None:
+        return None
+    part, u, v = found
+    colour, shown = coloured(part.pixels, scale, palette), part.shown.astype(np.uint8) * 255
+    out = np.empty((height, width, 4), np.uint8)
+    for r0 in range(0, height, ROWS):  # the coordinates of all pixels would need most memory
+        band = slice(r0, min(r0 + ROWS, height))
+        ui, vi = (_dense(m, band, width) for m in (u, v))
+        warped = cv2.remap(colour, ui, vi, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        out[band, :, :3] = warped.reshape(-1, width, 3)
+        out[band, :, 3] = cv2.remap(
+            shown, ui, vi, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
+        )
+    return out if out[..., 3].any() else None
+
+
+def values(
+    source: MapSource, crs: str, bounds: Bounds, width: int, height: int
+) -> tuple[NDArray[Any], NDArray[np.bool_]] | None:
+    """The map's own values (height, width, bands) of bounds in any projection, and where it has
+    any; None where it has no content.
+
+    Measured values are interpolated among valid ones only; numbers (of photos) are never mixed.
+    """
+    found = _located(source, crs, bounds, width, height)
+    if found is None:
+        return None
+    part, u, v = found
+    pixels, shown = part.pixels, part.shown.astype(np.float32)
+    whole = slice(0, height)
+    ui, vi = (_dense(m, whole, width) for m in (u, v))
+    inside = cv2.remap(shown, ui, vi, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT) > 0
+    if pixels.dtype.kind == "f":
+        weighted = np.where(part.shown[..., None], pixels, 0).astype(np.float32)
+        sums = cv2.remap(weighted, ui, vi, cv2.INTER_LINEAR).reshape(height, width, -1)
+        weight = cv2.remap(shown, ui, vi, cv2.INTER_LINEAR)
+        inside &= weight > 0.01
+        out: NDArray[Any] = sums / np.maximum(weight, 0.01)[..., None]
+    else:
+        how = cv2.INTER_LINEAR if pixels.dtype == np.uint8 else cv2.INTER_NEAREST
+        out = np.asarray(cv2.remap(pixels, ui, vi, how, borderMode=cv2.BORDER_REPLICATE))
+    return out.reshape(height, width, -1).astype(pixels.dtype), inside
+
+
+def _located(
+    source: MapSource, crs: str, bounds: Bounds, width: int, height: int
+) -> tuple[Part, NDArray[np.float32], NDArray[np.float32]] | None:
+    """The part of a map that an image shows, and its columns and rows at the image's nodes."""
     columns, rows = (
         np.arange(-1, width // NODES + 2) * NODES,
         np.arange(-1, height // NODES + 2) * NODES,
@@ -219,17 +320,7 @@ def picture(
         return None
     u = ((mx - part.west) / part.gsd - 0.5).astype(np.float32)
     v = ((part.north - my) / part.gsd - 0.5).astype(np.float32)
-    colour, shown = coloured(part.pixels, scale), part.shown.astype(np.uint8) * 255
-    out = np.empty((height, width, 4), np.uint8)
-    for r0 in range(0, height, ROWS):  # the coordinates of all pixels would need most memory
-        band = slice(r0, min(r0 + ROWS, height))
-        ui, vi = (_dense(m, band, width) for m in (u, v))
-        warped = cv2.remap(colour, ui, vi, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        out[band, :, :3] = warped.reshape(-1, width, 3)
-        out[band, :, 3] = cv2.remap(
-            shown, ui, vi, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT
-        )
-    return out if out[..., 3].any() else None
+    return part, u, v
 
 
 def _dense(nodes: NDArray[np.float32], rows: slice, width: int) -> NDArray[np.float32]:
@@ -240,18 +331,6 @@ def _dense(nodes: NDArray[np.float32], rows: slice, width: int) -> NDArray[np.fl
         np.arange(width, dtype=np.float32), np.arange(rows.start, rows.stop, dtype=np.float32)
     )
     return np.asarray(cv2.remap(nodes, c / NODES + 1, r / NODES + 1, cv2.INTER_LINEAR), np.float32)
-
-
-def coloured(pixels: NDArray[Any], scale: Sequence[float] | None = None) -> NDArray[np.uint8]:
-    """RGB (h, w, 3) of a map's pixels; measured values in colours from black over red and yellow to
-    white.
-    """
-    if pixels.dtype == np.uint8:
-        return pixels if pixels.shape[2] == 3 else np.repeat(pixels[..., :1], 3, 2)
-    values = pixels[..., 0].astype(np.float32)
-    low, high = scale if scale is not None else (float(values.min()), float(values.max()))
-    grey = np.clip((values - low) / max(high - low, 1e-6) * 255, 0, 255).astype(np.uint8)
-    return np.ascontiguousarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[..., ::-1])
 
 
 def mercator(z: int, x: int, y: int) -> Bounds:

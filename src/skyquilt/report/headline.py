@@ -9,7 +9,10 @@ from skyquilt.report.input import ReportInput
 from skyquilt.report.numbers import axes, count, fixed, items, mapping, number, seconds, significant
 from skyquilt.report.parts import Tile, Verdict
 
-SEAMS_MEASURED = 0.6
+SEAMS_MEASURED, SEAM_GOOD_PX, SEAM_FAIR_PX = 0.6, 2.0, 5.0
+"""Share of samples that must be measured, and displacements in px up to which seams are good and
+fair.
+"""
 
 
 def verdict(value: float, good: float, fair: float) -> Verdict:
@@ -219,7 +222,7 @@ def seam(m: Mapping[str, Any], data: ReportInput) -> Tile | None:
         return None
     measured, attempted = number(seams.get("measured")), number(seams.get("attempted"))
     share = measured / attempted if measured is not None and attempted else None
-    judged = verdict(median, 2, 5)
+    judged = verdict(median, SEAM_GOOD_PX, SEAM_FAIR_PX)
     also = f" 95\u202f% are below {fixed(p95, 1)} px." if p95 is not None else ""
     says = f"Typical displacement where two photos meet.{also} Good up to 2 px, fair up to 5."
     if share is not None and share < SEAMS_MEASURED:

@@ -28,6 +28,18 @@ class Shot:
     """How it was placed."""
     footprint: NDArray[Any]
     """(k, 2) outline on the ground in m (map frame); empty if unknown."""
+    time: str = ""
+    """Capture time, ISO 8601; empty if unknown."""
+    above_ground_m: float | None = None
+    """Height of the camera above the ground below it in m."""
+    yaw_deg: float | None = None
+    """Direction of the image top in degrees clockwise from true north."""
+    tilt_deg: float | None = None
+    """Angle between the optical axis and the vertical in degrees."""
+    tie_points: int | None = None
+    """Number of tie points that it shows."""
+    error_px: float | None = None
+    """RMS of their residuals in px."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,6 +124,14 @@ class ReportInput:
     """(h, w, 3) uint8 crops of the map around the largest steps of colour, the worst first."""
     depths: Sequence[DepthPicture] = ()
     """Depth maps of a few registrations, for methods that compute them."""
+    values: tuple[float, float, str] | None = None
+    """For measured values: those of the first and of the last colour of the preview, and their unit
+    as printed.
+    """
+    processed: str = ""
+    """When the map was made, ISO 8601, local time."""
+    files: Sequence[str] = ()
+    """Names of the files beside the page that it links to."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """The resolved settings, nested as they are."""
     title: str = "Survey"

@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from skyquilt.report import images
 from skyquilt.report.ground import Ground
 from skyquilt.report.input import Bounds, ReportInput, SeamMark, Shot
-from skyquilt.report.numbers import nice
+from skyquilt.report.numbers import fixed, nice
 from skyquilt.report.parts import LegendItem
 from skyquilt.report.svg import arrows, dots, path, polyline
 
 PREVIEW_PX, VIEWS_PX, SURFACE_PX = 1600, 700, 480
 MOST_SHOTS, MOST_SEAMS = 2500, 4000
+VALUE_STEPS = 6
+"""Entries of the legend of measured values."""
 MANY = 300
 """Number of photos from which marks are drawn finer."""
 SEAM_EDGES = (0.5, 1.0, 2.0, 5.0)
@@ -73,7 +75,26 @@ def mosaic(data: ReportInput, ground: Ground) -> Layer | None:
         return None
     small = images.shrunk(data.preview, PREVIEW_PX)
     return Layer(
-        id="mosaic", label="Mosaic", shape=clipped("mosaic", small, data.bounds, ground), on=True
+        id="mosaic",
+        label="Mosaic",
+        shape=clipped("mosaic", small, data.bounds, ground),
+        on=True,
+        legend=() if data.values is None else value_legend(*data.values),
+    )
+
+
+def value_legend(low: float, high: float, unit: str) -> tuple[LegendItem, ...]:
+    """Colours of measured values from the lowest to the highest."""
+    share = np.linspace(0, 1, VALUE_STEPS)
+    grey = np.rint(255 * share).astype(np.uint8)[None]
+    bgr = cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[0]
+    decimals = 1 if high - low < 50 else 0
+    return tuple(
+        LegendItem(
+            colour=images.css(colour[::-1]),
+            text=f"{fixed(low + s * (high - low), decimals)} {unit}",
+        )
+        for s, colour in zip(share, bgr, strict=True)
     )
 
 

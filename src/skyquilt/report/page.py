@@ -10,13 +10,14 @@ from markupsafe import Markup
 
 from skyquilt.errors import OutputError
 from skyquilt.report import headline
+from skyquilt.report.about import FILES, facts_of, photos_section
+from skyquilt.report.attention import attention
 from skyquilt.report.clips import clips_section
 from skyquilt.report.effort import time_section
 from skyquilt.report.ground import ground_of
 from skyquilt.report.input import ReportInput
 from skyquilt.report.layers import layers_of
 from skyquilt.report.mapview import map_view
-from skyquilt.report.numbers import count, items, mapping, plain
 from skyquilt.report.overlap import overlap_section, surface_section
 from skyquilt.report.parts import Section, Tile, values_section
 from skyquilt.report.positions import positions_section
@@ -53,6 +54,7 @@ def build_report(data: ReportInput) -> str:
         control_section(data),
         conflicts_section(data),
         rejected_section(data),
+        *photos_section(data),
         notes_section(data),
         time_section(data),
         settings_section(data),
@@ -61,6 +63,8 @@ def build_report(data: ReportInput) -> str:
         data=data,
         summary=headline.summary(data),
         tiles=headline.tiles(data),
+        facts=facts_of(data),
+        files=[(name, FILES[name]) for name in FILES if name in data.files],
         attention=attention(data),
         map=map_view(data, ground, layers) if ground and layers else None,
         sections=sections,
@@ -88,22 +92,6 @@ def write_page(path: Path, page: str) -> None:
             f"the report cannot be written to {path}: {error.strerror or error}. "
             "Make room or choose another output folder."
         ) from error
-
-
-def attention(data: ReportInput) -> tuple[tuple[str, str], ...]:
-    """Warnings to be read first: sentences, each with the section that shows more."""
-    m = data.metrics
-    found = [(plain(w), "") for w in items(m.get("warnings"))[:20]]
-    found += [
-        (f"{t.label}: {t.value} {t.unit}".rstrip() + ".", t.anchor)
-        for t in headline.tiles(data)
-        if t.verdict == "poor"
-    ]
-    if n := len(items(m.get("metadata_conflicts"))):
-        found.append((f"{count(n, 'metadata conflict')}.", "conflicts"))
-    if n := len(mapping(m.get("photos_rejected"))):
-        found.append((f"{count(n, 'photo')} rejected.", "rejected"))
-    return tuple(found)
 
 
 def tied(words: str) -> str:

@@ -35,30 +35,6 @@ MEANINGS = {
 }
 FAR = 3.0
 """Number of standard deviations of the prior from which a parameter counts as far from it."""
-CONFLICTS = {
-    "yaw": (
-        "The image top does not point in the reported direction: the file was rotated afterwards,"
-        " or the compass is wrong."
-    ),
-    "altitude": (
-        "The reported height does not fit the image scale: a drifting barometer or a different"
-        " zero of heights."
-    ),
-    "position": "The GPS position is far from the position estimated from the images; it was given"
-    " little weight.",
-    "lens": (
-        "The flight shows another lens distortion than the calibration in the files: they may be of"
-        " another camera or temperature. The flight's is used."
-    ),
-    "principal_point": (
-        "The flight shows another principal point than the calibration in the files. The flight's"
-        " is used."
-    ),
-    "focal": (
-        "The estimated focal length differs from the reported one: check the camera, a zoom or a"
-        " resized file."
-    ),
-}
 UNITS = {"yaw": "\u00b0", "altitude": " m", "position": " m", "focal": " px"} | dict.fromkeys(
     ("lens", "principal_point"), " px"
 )
@@ -199,7 +175,7 @@ def conflicts_section(data: ReportInput) -> Section:
             plain(c.get("field")),
             _figure(c, "reported"),
             _figure(c, "estimated"),
-            CONFLICTS.get(str(c.get("field")), "The metadata and the images disagree."),
+            plain(c.get("meaning")) or "the metadata and the images disagree",
         )
         for c in found[:MOST_ROWS]
     )

@@ -22,7 +22,7 @@ from skyquilt.engine.error_log import log_error
 from skyquilt.errors import OutputError, UsageError
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.photo_intake import Intake
-from skyquilt.server.survey import Survey
+from skyquilt.server.shown import Survey
 
 RESUMABLE = "/photos/uploads"
 """The address of resumable uploads."""
@@ -252,6 +252,13 @@ class Context:
     def writing(self, request: Request) -> Writer:
         """The growing map, if the request is allowed to write to it; otherwise an HTTP error."""
         writer = self.growing()
+        self.admitted(request)
+        return writer
+
+    def admitted(self, request: Request) -> None:
+        """An HTTP error if the request may not write: it lacks the token, or another site sent
+        it.
+        """
         given = request.headers.get("authorization") or request.headers.get("x-token")
         if not self.guard.admits(given):
             raise HTTPException(
@@ -262,4 +269,3 @@ class Context:
         origin = request.headers.get("origin")
         if origin is not None and origin.split("://")[-1] != request.headers.get("host", ""):
             raise HTTPException(403, "pages of other sites may not write here")
-        return writer

@@ -12,12 +12,16 @@ from fastapi.responses import FileResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 
 from skyquilt.server.access import RESUMABLE, Context, Guard, Guarded, Writer
+from skyquilt.server.control_endpoints import ControlEndpoints
 from skyquilt.server.event_endpoints import EventEndpoints
+from skyquilt.server.file_endpoints import FileEndpoints
 from skyquilt.server.images import Images
 from skyquilt.server.layer_endpoints import LayerEndpoints
 from skyquilt.server.map_endpoints import STATIC, MapEndpoints
 from skyquilt.server.photo_endpoints import PhotoEndpoints
-from skyquilt.server.survey import Survey
+from skyquilt.server.photo_views import PhotoViews
+from skyquilt.server.readouts import Readouts
+from skyquilt.server.shown import Survey
 from skyquilt.server.upload_endpoints import UploadEndpoints
 from skyquilt.server.wms import WmsEndpoints
 from skyquilt.version import __version__
@@ -47,6 +51,12 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         WmsEndpoints(context, images),
         PhotoEndpoints(context),
     )
+    views, read, files = (
+        PhotoViews(context, listed),
+        Readouts(context, images),
+        FileEndpoints(context),
+    )
+    control = ControlEndpoints(context, views)
     layers, events = LayerEndpoints(context), EventEndpoints(context)
     app.state.ending = events.ending
 
@@ -67,6 +77,20 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         (RESUMABLE + "/{number}", received.upload_part, {"methods": ["PATCH"]}),
         (RESUMABLE + "/{number}", received.upload_end, {"methods": ["DELETE"]}),
         ("/photos/{number}", listed.photo, get),
+        ("/photos/{number}/thumbnail", views.thumbnail, {**get, "response_class": Response}),
+        ("/photos/{number}/detail", views.detail, {**get, "response_class": Response}),
+        ("/photos/{number}/place", views.place, get),
+        ("/at", read.at, get),
+        ("/profile", read.profile, get),
+        ("/volume", read.volume, get),
+        ("/files", files.files, get),
+        ("/files/{name:path}", files.file, {**get, "response_class": FileResponse}),
+        ("/control", control.control, get),
+        ("/control", control.control_put, {"methods": ["PUT"]}),
+        ("/control/read", control.control_read, post),
+        ("/control/photos", control.photos, get),
+        ("/control/run", control.run_state, get),
+        ("/control/run", control.run_start, post),
         ("/photos/{number}/file", listed.photo_file, {**get, "response_class": FileResponse}),
         ("/layers", layers.layer_list, get),
         ("/layers", layers.layer_post, post),

@@ -11,14 +11,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import cv2
-import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.raster import RasterSpec, write_array
 from skyquilt.raster.map_source import MERCATOR, Bounds, MapSource, Part, between, mercator, picture
-from skyquilt.server.survey import LiveSurvey, Survey
+from skyquilt.raster.picture_files import image_bytes
+from skyquilt.runs.layers import RunLayer, range_of, unit_of
+from skyquilt.server.shown import Survey
+from skyquilt.server.survey import LiveSurvey
 
 MOST_PIXELS = 60_000_000
 """Largest export in pixels."""
@@ -72,27 +73,6 @@ TILE = 256
 """Pixels of a web tile's side."""
 
 
-def image_bytes(rgba: NDArray[np.uint8], form: str, *, transparent: bool = True) -> bytes:
-    """Encodes RGBA (h, w, 4) as PNG, WebP or JPEG; without transparency the background is white."""
-    if not transparent or form == "image/jpeg":
-        alpha = rgba[..., 3:].astype(np.uint16)
-        rgb = ((rgba[..., :3] * alpha + 255 * (255 - alpha)) // 255).astype(np.uint8)
-        picture_, bgr = rgb, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-    else:
-        picture_, bgr = rgba, cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA)
-    if form == "image/webp":  # the fastest setting of the codec takes a third of the default's time
-        return bytes(imagecodecs.webp_encode(np.ascontiguousarray(picture_), level=80, method=0))
-    options = {
-        "image/png": (".png", [cv2.IMWRITE_PNG_COMPRESSION, 1]),
-        "image/jpeg": (".jpg", [cv2.IMWRITE_JPEG_QUALITY, 85]),
-    }
-    ending, settings = options[form]
-    good, data = cv2.imencode(ending, bgr, settings)
-    if not good:
-        raise ValueError(f"a picture of {picture_.shape} cannot be written as {form}")
-    return data.tobytes()
-
-
 @dataclass(frozen=True, kw_only=True)
 class WebTile:
     """A web tile as it is sent to clients."""
@@ -114,7 +94,7 @@ class Images:
         self._kept: OrderedDict[tuple[str, int, int, int], WebTile] = OrderedDict()
         self._lock = threading.Lock()
         self._known, self._stamp = survey.version(), survey.stamp()
-        self._scales: dict[str, tuple[int, tuple[float, float]]] = {}
+        self._scales: dict[str, tuple[int, tuple[float, float] | None]] = {}
 
     def kept(self, layer: str, z: int, x: int, y: int) -> WebTile | None:
         """A cached web tile that is up to date; None if it must be drawn."""
@@ -131,9 +111,8 @@ class Images:
             return found
         before = self._known
         source = self.survey.layers()[layer]
-        rgba = picture(
-            source, "EPSG:3857", mercator(z, x, y), TILE, TILE, self.scale(layer, source)
-        )
+        scale, palette = self.scale(layer, source), self.style(layer).palette
+        rgba = picture(source, "EPSG:3857", mercator(z, x, y), TILE, TILE, scale, palette)
         made = WebTile(data=None if rgba is None else image_bytes(rgba, "image/webp"))
         with self._lock:
             if self._known == before:  # otherwise it may have changed while it was drawn
@@ -143,26 +122,24 @@ class Images:
         return made
 
     def scale(self, layer: str, source: MapSource) -> tuple[float, float] | None:
-        """Values shown as black and as white: the 2nd and 98th percentile of a measured layer,
-        renewed as it grows.
+        """Values in the first and the last colour of a measured layer, renewed as it grows; None
+        for colour images.
         """
-        if not layer.startswith("thermal") and layer not in ("mosaic", "finished"):
-            return None
         version = self.survey.version()
         known = self._scales.get(layer)
         if known is not None and version - known[0] < 50:
             return known[1]
-        bounds = source.bounds()
-        part = (
-            None
-            if bounds is None
-            else source.part(bounds, max(bounds[2] - bounds[0], bounds[3] - bounds[1]) / 512)
-        )
-        if part is None or part.pixels.dtype == np.uint8 or not part.shown.any():
-            return None
-        low, high = np.percentile(part.pixels[..., 0][part.shown], [2, 98])
-        self._scales[layer] = (version, (float(low), float(high)))
-        return float(low), float(high)
+        found = range_of(self.style(layer), source)
+        self._scales[layer] = (version, found)
+        return found
+
+    def style(self, layer: str) -> RunLayer:
+        """How a layer is shown."""
+        return self.survey.styles().get(layer) or RunLayer(name=layer, title=layer, file="")
+
+    def unit(self, layer: str) -> str:
+        """Unit of a layer's values as printed; empty where they have none."""
+        return unit_of(self.style(layer), self.survey.figures())
 
     def _forget_changed(self) -> None:
         """Removes cached tiles whose content was redrawn since the last call."""

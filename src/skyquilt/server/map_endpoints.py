@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,12 @@ from starlette.background import BackgroundTask
 
 from skyquilt.live.free_memory import give_back
 from skyquilt.outside import real
-from skyquilt.raster.map_source import between
+from skyquilt.raster.colours import ramp
+from skyquilt.raster.map_source import MapSource, between
 from skyquilt.server.access import Context
+from skyquilt.server.finished_survey import FinishedSurvey
 from skyquilt.server.images import Images, write_cog
+from skyquilt.server.readouts import HEIGHTS
 from skyquilt.server.survey import LiveSurvey
 from skyquilt.version import __version__
 
@@ -41,13 +45,15 @@ class MapEndpoints:
         """
         found = []
         for name, source in self.context.survey.layers().items():
-            bounds = source.bounds()
-            box = (
-                None
-                if bounds is None
-                else between(source.crs, "EPSG:4326").transform_bounds(*bounds)
-            )
-            found.append({"name": name, "crs": source.crs, "bounds": box})
+            with suppress(OSError):  # a final map is just being replaced
+                bounds = source.bounds()
+                box = (
+                    None
+                    if bounds is None
+                    else between(source.crs, "EPSG:4326").transform_bounds(*bounds)
+                )
+                look = self._look(name, source)
+                found.append({"name": name, "crs": source.crs, "bounds": box, **look})
         counts = (
             self.context.survey.ledger.counts()
             if isinstance(self.context.survey, LiveSurvey)
@@ -66,7 +72,26 @@ class MapEndpoints:
             "version": __version__,
             "token": self.context.guard.token is not None,
             "finish": finish,
+            "control": isinstance(self.context.survey, FinishedSurvey),
+            "title": self.context.survey.folder.resolve().name,
+            "heights": next((n for n in HEIGHTS if n in self.context.survey.layers()), None),
         }
+
+    def _look(self, name: str, source: MapSource) -> dict[str, Any]:
+        """Title of a layer and, for values, the legend: colours, what the first and the last one
+        stand for, unit.
+        """
+        style = self.images.style(name)
+        scale = self.images.scale(name, source) if style.measured else None
+        found: dict[str, Any] = {"title": style.title, "measured": style.measured}
+        if scale is not None:
+            found["legend"] = {
+                "colours": ramp(style.palette, 9),
+                "low": round(scale[0], 3),
+                "high": round(scale[1], 3),
+                "unit": self.images.unit(name),
+            }
+        return found
 
     async def tile(
         self, request: Request, z: int, x: int, y: int, layer: str | None = None

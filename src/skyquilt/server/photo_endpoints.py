@@ -1,6 +1,7 @@
 """Endpoints of photos: all photos, those that cover a point, one photo, its file."""
 
 import hashlib
+from pathlib import Path as FilePath
 from typing import Annotated, Any
 
 from fastapi import HTTPException, Path, Query
@@ -10,7 +11,7 @@ from skyquilt.live.inbox import ending_of
 from skyquilt.outside import open_regular
 from skyquilt.photos.headers import content_digest
 from skyquilt.server.access import Context
-from skyquilt.server.survey import Shown, covering
+from skyquilt.server.shown import Shown, covering
 
 Degrees = Annotated[float, Query(ge=-180, le=180, allow_inf_nan=False)]
 Latitude = Annotated[float, Query(ge=-90, le=90, allow_inf_nan=False)]
@@ -66,13 +67,21 @@ class PhotoEndpoints:
 
     def photo_file(self, number: Number) -> FileResponse:
         """A photo at full resolution, as it was sent."""
+        path, kind = self._file(number)
+        return FileResponse(path, media_type=kind, headers={"Content-Disposition": "inline"})
+
+    def checked(self, number: int) -> FilePath:
+        """The file of a photo, if it is the one that the map was made from."""
+        return self._file(number)[0]
+
+    def _file(self, number: int) -> tuple[FilePath, str]:
         found = self._known(number)
         if found.path is None or not found.path.is_file():
             raise HTTPException(404, "its file no longer exists")
         kind = self._verified(found)
         if kind is None:
             raise HTTPException(404, "its file is not the photo that the map was made from")
-        return FileResponse(found.path, media_type=kind, headers={"Content-Disposition": "inline"})
+        return found.path, kind
 
     def _verified(self, found: Shown) -> str | None:
         """The media type of a photo's file; None where it is no photo, or its content is not the

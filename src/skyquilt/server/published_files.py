@@ -10,7 +10,8 @@ from skyquilt.errors import OutputError
 from skyquilt.live.ledger import hit
 from skyquilt.raster.map_source import MERCATOR, Bounds, between, mercator, picture
 from skyquilt.raster.mbtiles import touched, write_mbtiles
-from skyquilt.server.images import TILE, changed_boxes, image_bytes, write_cog
+from skyquilt.raster.picture_files import image_bytes
+from skyquilt.server.images import TILE, changed_boxes, write_cog
 from skyquilt.server.survey import LiveSurvey
 
 PAUSE_S = 3.0

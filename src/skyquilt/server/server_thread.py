@@ -11,11 +11,14 @@ from typing import Any, Self
 
 from skyquilt.errors import UsageError
 from skyquilt.server.access import Guard
-from skyquilt.server.survey import Survey
+from skyquilt.server.shown import Survey
 
 RETRY_S = 2.0
 """If the port is in use, it is tried again for this time in s."""
-NEEDED = "the live map and its viewer need some more packages: pip install 'skyquilt[live]'"
+NEEDED = (
+    "the live map and its viewer need the packages of the extra `live`; in the folder of the"
+    " source: make install, or .venv/bin/pip install -c constraints.txt '.[live]'"
+)
 
 
 def bound(host: str, port: int) -> socket.socket:

@@ -17,9 +17,10 @@ from pyproj.exceptions import CRSError
 from skyquilt.live.free_memory import give_back
 from skyquilt.outside import real, whole
 from skyquilt.raster.map_source import Bounds, MapSource, between, picture
+from skyquilt.raster.picture_files import image_bytes
 from skyquilt.server.access import Context
-from skyquilt.server.images import Images, image_bytes
-from skyquilt.server.survey import covering
+from skyquilt.server.images import Images
+from skyquilt.server.shown import covering
 
 
 class WmsEndpoints:
@@ -66,7 +67,10 @@ class WmsEndpoints:
             if out is not None and out[..., 3].all():
                 break
             scale = self.images.scale(name, known[name])
-            rgba = picture(known[name], want.crs, want.bounds, want.width, want.height, scale)
+            palette = self.images.style(name).palette
+            rgba = picture(
+                known[name], want.crs, want.bounds, want.width, want.height, scale, palette
+            )
             if rgba is not None and out is not None:
                 np.copyto(out, rgba, where=(out[..., 3] == 0)[..., None])
             out = rgba if out is None else out

@@ -5,6 +5,7 @@ the report.
 import json
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from skyquilt.coregistration.pictures import Source
 from skyquilt.ortho.companions import coloured
 from skyquilt.raster.atomic import whole_file, write_text
 from skyquilt.report.images import shrunk
+from skyquilt.report.layers import value_legend
 from skyquilt.report.numbers import DASH, fixed, mapping, number, plain
 from skyquilt.report.page import section_html, write_page
 from skyquilt.report.parts import UNITS, Block, Section, Sentences, Table
@@ -126,7 +128,15 @@ def thermal_section(
         picture(shrunk(p, LONGEST), title, caption.format(low=low, high=high))
         for p, (title, caption) in zip(pictures, _CAPTIONS, strict=True)
     ]
+    legend = value_legend(*ends, unit)
+    figures = [
+        replace(f, legend=legend) if f.title in ("Thermal map", "Thermal over visual") else f
+        for f in figures
+    ]
     blocks: list[Block] = [_error(record), *figures, *_refused(record)]
+    if record.get("unit") == "counts":
+        words = "The values are sensor counts, not degrees: higher means warmer."
+        blocks.insert(0, Sentences(items=(words,)))
     return Section(
         id="thermal", title="Thermal map", lead=_ROUTES[str(record["route"])], blocks=tuple(blocks)
     )

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from skyquilt.geometry.camera_formats import camera_to_opensfm
 from skyquilt.geometry.frames import angles_from_cam_R_map, rotation_from_vector
 from skyquilt.imaging.views import View
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Alignment
+from skyquilt.model.poses import Alignment, Pose
 from skyquilt.raster import vector
 from skyquilt.raster.atomic import write_text
 from skyquilt.version import __version__
@@ -43,6 +44,15 @@ def write_cameras(path: Path, alignment: Alignment) -> None:
     write_text(path, json.dumps(records, indent=1))
 
 
+def seconds_of(time: datetime | None) -> float | None:
+    """Seconds since 1970 as OpenSfM counts them: a time without an offset is taken as UTC, so that
+    it does not depend on the machine.
+    """
+    if time is None:
+        return None
+    return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
+
+
 def shot_properties(photo: Photo, alignment: Alignment, i: int) -> dict[str, Any]:
     """The properties of a photo in shots.geojson."""
     pose, camera = alignment.poses[i], alignment.camera(i)
@@ -55,14 +65,27 @@ def shot_properties(photo: Photo, alignment: Alignment, i: int) -> dict[str, Any
         "focal": camera.focal / max(photo.width, photo.height),
         "width": photo.width,
         "height": photo.height,
-        "capture_time": photo.time.timestamp() if photo.time else None,
+        "capture_time": seconds_of(photo.time),
         "translation": [float(v) for v in in_crs(alignment, pose.map_C)],
         "rotation": rotation_vector(pose.cam_R_map),
+        **_motion(pose),
         "yaw": round((yaw + alignment.frame.convergence_deg) % 360, 3),
         "pitch": round(pitch, 3),
         "roll": round(roll, 3),
         "block": block,
         "tie_points": int((alignment.ties.photo == i).sum()),
+    }
+
+
+def _motion(pose: Pose) -> dict[str, list[float]]:
+    """How the camera moved while its rows were read out: metres (east, north, up), and radians
+    about its axes; nothing where it did not.
+    """
+    if pose.motion is None:
+        return {}
+    return {
+        "readout_shift": [float(v) for v in pose.motion.shift_m],
+        "readout_turn": [float(v) for v in pose.motion.turn_rad],
     }
 
 
@@ -89,10 +112,10 @@ def write_footprints(
 
 
 def write_reconstruction(
-    path: Path, photos: Sequence[Photo], alignment: Alignment, colours: NDArray[Any] | None
+    path: Path, photos: Sequence[Photo], alignment: Alignment, colours: NDArray[np.uint8]
 ) -> None:
     """reconstruction.json in the format of OpenSfM: topocentric east-north-up coordinates about
-    `reference_lla`.
+    `reference_lla`. `colours`: (P, 3) of the tie points.
     """
     enu = Topocentric(alignment)
     shots = {}
@@ -104,7 +127,7 @@ def write_reconstruction(
             "rotation": rotation_vector(R),
             "translation": [float(v) for v in -R @ C],
             "orientation": 1,
-            "capture_time": 0.0,
+            "capture_time": seconds_of(photos[i].time) or 0.0,
             "gps_position": [float(v) for v in C],
             "gps_dop": 15.0,
         }
@@ -115,7 +138,7 @@ def write_reconstruction(
     points = {
         str(k): {
             "coordinates": [round(float(v), 4) for v in c],
-            "color": [128.0, 128.0, 128.0] if colours is None else [float(v) for v in colours[k]],
+            "color": [float(v) for v in colours[k]],
         }
         for k, c in zip(chosen.tolist(), coordinates, strict=True)
     }

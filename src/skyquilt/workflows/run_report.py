@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Clock, Steps, peak_memory_mb
+from skyquilt.geometry.frames import angles_from_cam_R_map
 from skyquilt.imaging.views import STEP
 from skyquilt.model.event import Note
 from skyquilt.model.raster import Window
@@ -19,8 +21,10 @@ from skyquilt.ortho.height_files import write_heights
 from skyquilt.ortho.orthomosaic import used_photos, write_surface
 from skyquilt.quality.seam_measurement import MeasuredSeams
 from skyquilt.raster.atomic import write_text
+from skyquilt.report.about import FILES
 from skyquilt.report.input import CameraResiduals, DepthPicture, ReportInput, SeamMark, Shot
 from skyquilt.report.page import write_report
+from skyquilt.report.parts import UNITS
 from skyquilt.settings import MosaicSettings
 from skyquilt.version import __version__
 from skyquilt.workflows import run_files
@@ -30,6 +34,8 @@ DEPTHS, DEPTH_WIDTH = 4, 420
 """Depth maps shown, and their width in px."""
 CROP = 320
 """Side in map px of the crops of the worst places of the seams."""
+LATER = ("metrics.json",)
+"""Files that are written after the report."""
 LEAST_DISPARITIES = 12
 """Fewest disparities for a depth map."""
 
@@ -53,7 +59,9 @@ def finish_run(
     run_files.write_cameras(output / "cameras.json", alignment)
     run_files.write_shots(output / "shots.geojson", photos, alignment, used_photos(ground.views))
     run_files.write_footprints(output / "footprints.geojson", photos, alignment, ground.views)
-    run_files.write_reconstruction(output / "reconstruction.json", photos, alignment, None)
+    run_files.write_reconstruction(
+        output / "reconstruction.json", photos, alignment, _colours(aligned, drawn)
+    )
     run_files.write_run(
         output / "run.toml",
         settings.as_table(),
@@ -63,7 +71,7 @@ def finish_run(
     )
     yield 1, 3
     metrics = metrics | _times(clock)
-    page = report_input(aligned, ground, drawn, compose, seams, metrics, settings)
+    page = report_input(output, aligned, ground, drawn, compose, seams, metrics, settings)
     write_report(output / "report.html", page)
     yield 2, 3
     metrics |= _times(clock)
@@ -76,7 +84,22 @@ def finish_run(
     return metrics
 
 
+def _colours(aligned: AlignedPhotos, drawn: Drawn) -> NDArray[np.uint8]:
+    """Colour (P, 3) of each tie point: that of the map at its place, grey where the map has
+    none.
+    """
+    xyz, (rows, columns) = aligned.alignment.ties.xyz, drawn.preview.shape[:2]
+    found = np.full((len(xyz), 3), 128, np.uint8)
+    c, r = (np.rint(v) for v in drawn.preview_grid.pixel(xyz[:, 0], xyz[:, 1]))
+    inside = (c >= 0) & (c < columns) & (r >= 0) & (r < rows)
+    at = r[inside].astype(int), c[inside].astype(int)
+    shown = drawn.preview[at][:, 3] > 0
+    found[np.flatnonzero(inside)[shown]] = drawn.preview[at][shown, :3]
+    return found
+
+
 def report_input(
+    output: Path,
     aligned: AlignedPhotos,
     ground: Ground,
     drawn: Drawn,
@@ -107,6 +130,11 @@ def report_input(
         worst_seams=_crops(compose, seams, drawn),
         depths=_depths(aligned),
         settings=settings.as_table(),
+        values=None
+        if drawn.preview_range is None
+        else (*drawn.preview_range, UNITS.get(aligned.photos[0].unit, "")),
+        processed=datetime.now().isoformat(timespec="seconds"),
+        files=[name for name in FILES if (output / name).is_file() or name in LATER],
         title=Path(aligned.given.title).name,
         version=__version__,
     )
@@ -167,6 +195,8 @@ def _shots(aligned: AlignedPhotos, ground: Ground) -> list[Shot]:
     outline = {v.photo: v.footprint for v in ground.views}
     block = {i: k for k, b in enumerate(alignment.blocks) for i in b}
     held = set(alignment.held)
+    error = np.linalg.norm(alignment.ties.residual_px, axis=1)
+    tied = {i: error[alignment.ties.photo == i] for i in alignment.poses}
     return [
         Shot(
             name=aligned.photos[i].name,
@@ -175,9 +205,28 @@ def _shots(aligned: AlignedPhotos, ground: Ground) -> list[Shot]:
             block=block.get(i, 0),
             method=alignment.method if i in held else "pose",
             footprint=outline.get(i, np.zeros((0, 2))),
+            **_shot_figures(aligned, ground, i, tied[i]),
         )
         for i, pose in sorted(alignment.poses.items())
     ]
+
+
+def _shot_figures(
+    aligned: AlignedPhotos, ground: Ground, i: int, error_px: NDArray[np.float64]
+) -> dict[str, Any]:
+    """What the table of photos says of one."""
+    pose, photo, frame = aligned.alignment.poses[i], aligned.photos[i], aligned.alignment.frame
+    yaw, _, _ = angles_from_cam_R_map(pose.cam_R_map)
+    below = float(ground.surface.at(pose.map_C[:1], pose.map_C[1:2])[0])
+    axis = float(np.clip(-pose.cam_R_map[2, 2], -1, 1))
+    return {
+        "time": photo.time.isoformat() if photo.time else "",
+        "above_ground_m": float(pose.map_C[2]) - below if np.isfinite(below) else None,
+        "yaw_deg": (yaw + frame.convergence_deg) % 360,
+        "tilt_deg": float(np.degrees(np.arccos(axis))),
+        "tie_points": len(error_px),
+        "error_px": float(np.sqrt((error_px**2).mean())) if len(error_px) else None,
+    }
 
 
 def _residuals(aligned: AlignedPhotos) -> list[CameraResiduals]:

@@ -81,6 +81,7 @@ def read_input(source: Source | str, settings: InputSettings) -> SurveyInput:
         UsageError, NoPhotosError, SideFileError: there is nothing to read, or it is malformed.
     """
     source = Path(source) if isinstance(source, str) else source
+    _check_named(settings)
     survey = read_survey(
         source,
         geo=settings.geo,
@@ -98,6 +99,18 @@ def read_input(source: Source | str, settings: InputSettings) -> SurveyInput:
         )
     given = SurveyInput(source=source, survey=survey, control=(), distances=(), rank={})
     return given if survey.clips else completed(given, settings)
+
+
+def _check_named(settings: InputSettings) -> None:
+    """Refuses options that name a file which is not there, before anything is read.
+
+    Raises:
+        UsageError: one does.
+    """
+    for option in ("gcp", "geo", "cameras", "distances"):
+        path = getattr(settings, option)
+        if path is not None and not path.exists():
+            raise UsageError(f"--{option} {path} does not exist; check the path")
 
 
 def completed(given: SurveyInput, settings: InputSettings) -> SurveyInput:

@@ -1,0 +1,267 @@
+"""Exports of a finished run: any part of it, in the formats of other programs.
+
+Each is computed block by block from the files of the run, so memory stays bounded.
+"""
+
+import json
+import math
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from skyquilt.engine.folder import EXPORTS
+from skyquilt.errors import SideFileError, UsageError
+from skyquilt.outside import read_bounded
+from skyquilt.raster import CogWriter, RasterSpec
+from skyquilt.raster.atomic import mended, write_text
+from skyquilt.raster.geopackage import write_polygons
+from skyquilt.raster.map_source import Bounds, FileSource, between, picture, values
+from skyquilt.raster.picture_files import PngRows, image_bytes
+from skyquilt.runs.grid import ExportGrid, grid_of
+from skyquilt.runs.kmz import write_kmz
+from skyquilt.runs.layers import RunLayer, figures_of, layers_in, range_of, unit_of, vertical_of
+from skyquilt.runs.web_tiles import web_tiles, write_mbtiles_file
+
+WHAT = ("png", "kmz", "mbtiles", "tiles", "tif", "heights", "footprints")
+"""What can be exported."""
+PLACED = ("kmz", "mbtiles", "tiles")
+"""What only a georeferenced map has."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Export:
+    """A file or folder that was written."""
+
+    path: Path
+    """Where."""
+    note: str = ""
+    """What a reader needs to know of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Wanted:
+    """What is to be exported."""
+
+    what: tuple[str, ...]
+    """Some of `WHAT`."""
+    layer: str = "mosaic"
+    """Which raster; `heights` and `footprints` do not depend on it."""
+    bounds: Bounds | None = None
+    """West, south, east, north in `crs`; None = all."""
+    crs: str | None = None
+    """Coordinate system of the files; None = that of the map. Web tiles and KMZ have their own."""
+    gsd_m: float | None = None
+    """Size of a pixel in m; None = that of the map."""
+
+    def __post_init__(self) -> None:
+        unknown = [w for w in self.what if w not in WHAT]
+        if unknown or not self.what:
+            raise UsageError(
+                f"cannot export {', '.join(unknown) or 'nothing'}; choose of {', '.join(WHAT)}"
+            )
+        if self.gsd_m is not None and not 1e-4 <= self.gsd_m <= 1e4:
+            raise UsageError(f"--gsd {100 * self.gsd_m:g} lies outside 0.01 to 1000000 cm")
+        if self.bounds is not None and not (
+            all(map(math.isfinite, self.bounds))
+            and self.bounds[0] < self.bounds[2]
+            and self.bounds[1] < self.bounds[3]
+        ):
+            raise UsageError("--bounds is west,south,east,north, and has no area here")
+        if self.crs is not None:
+            _check_crs(self.crs)
+
+
+def parse_what(text: str) -> tuple[str, ...]:
+    """Names separated by commas, each once."""
+    return tuple(dict.fromkeys(w.strip() for w in text.split(",") if w.strip()))
+
+
+def export(folder: Path, wanted: Wanted, output: Path | None = None) -> Iterator[Export]:
+    """Writes each export to `output` (default: the folder `export` of the run), and yields it.
+
+    Raises:
+        UsageError: the folder is no finished run, or has no such part. OutputError: the disk is
+            full or read-only.
+    """
+    layers = layers_in(folder)
+    if "mosaic" not in layers:
+        raise UsageError(
+            f"{folder} holds no finished run (mosaic.tif); name the folder given to -o"
+        )
+    if wanted.layer not in layers:
+        raise UsageError(f"{folder} has no layer {wanted.layer!r}; it has {', '.join(layers)}")
+    if "heights" in wanted.what and "heights" not in layers:
+        raise UsageError(f"{folder} has no heights (dsm.tif or surface.tif)")
+    placed = [w for w in wanted.what if w in PLACED]
+    if placed and not FileSource(path=folder / "mosaic.tif").crs:
+        raise UsageError(
+            f"the map is not georeferenced, which {', '.join(placed)} must be; png and tif need not"
+        )
+    target = output or folder / EXPORTS
+    with mended(target):
+        target.mkdir(parents=True, exist_ok=True)
+    for what in wanted.what:
+        name = "heights" if what == "heights" else wanted.layer
+        yield _one(what, folder, layers[name], wanted, target)
+
+
+def _one(what: str, folder: Path, layer: RunLayer, wanted: Wanted, target: Path) -> Export:
+    if what == "footprints":
+        return _footprints(folder, wanted, target)
+    source = FileSource(path=folder / layer.file)
+    grid = grid_of(source, wanted.bounds, wanted.crs, wanted.gsd_m)
+    if what in ("tif", "heights"):
+        return _tif(source, layer, grid, target / f"{layer.name}.tif", folder)
+    scale = range_of(layer, source)
+    note = ""
+    if scale is not None and layer.measured:
+        unit = unit_of(layer, figures_of(folder))
+        note = f"colours from {scale[0]:.4g} to {scale[1]:.4g} {unit}".rstrip()
+    if what == "png":
+        path = _png(source, layer, grid, scale, target)
+    elif what == "kmz":
+        path = target / f"{layer.name}.kmz"
+        write_kmz(path, source, grid, scale, layer, folder.resolve().name)
+    elif what == "mbtiles":
+        path = target / f"{layer.name}.mbtiles"
+        write_mbtiles_file(path, source, grid, scale, layer)
+    else:
+        path = _tiles(source, layer, grid, scale, target)
+    return Export(path=path, note=note)
+
+
+def _png(
+    source: FileSource,
+    layer: RunLayer,
+    grid: ExportGrid,
+    scale: tuple[float, float] | None,
+    target: Path,
+) -> Path:
+    """A picture with a world file (pixel centre of the top left) and its coordinate system."""
+    path = target / f"{layer.name}.png"
+    with PngRows(path, grid.width, grid.height) as file:
+        for row, height in grid.strips():
+            strip = np.zeros((height, grid.width, 4), np.uint8)
+            for column, width in grid.columns():
+                box = grid.bounds(row, column, height, width)
+                found = picture(source, grid.crs, box, width, height, scale, layer.palette)
+                if found is not None:
+                    strip[:, column : column + width] = found
+            file.write(strip)
+    numbers = (grid.step, 0, 0, -grid.step, grid.west + grid.step / 2, grid.north - grid.step / 2)
+    write_text(path.with_suffix(".pgw"), "".join(f"{v:.12g}\n" for v in numbers))
+    if grid.crs:
+        from pyproj import CRS
+
+        write_text(path.with_suffix(".prj"), CRS(grid.crs).to_wkt("WKT1_ESRI"))
+        srs = escape(CRS(grid.crs).to_wkt("WKT1_GDAL"))  # where GDAL and QGIS look for it
+        about = f"<PAMDataset><SRS>{srs}</SRS></PAMDataset>\n"
+        write_text(path.with_name(path.name + ".aux.xml"), about)
+    return path
+
+
+def _tif(source: FileSource, layer: RunLayer, grid: ExportGrid, path: Path, folder: Path) -> Export:
+    """A Cloud Optimized GeoTIFF of the values themselves."""
+    about = source.about()
+    real = about.dtype.startswith("float")
+    colours = about.dtype == "uint8" and not layer.measured
+    spec = RasterSpec(
+        width=grid.width,
+        height=grid.height,
+        bands=about.bands,
+        dtype=about.dtype,
+        transform=(grid.step, 0, grid.west, 0, -grid.step, grid.north),
+        crs=grid.crs or None,
+        vertical=vertical_of(layer, figures_of(folder)) if grid.crs == source.crs else None,
+        nodata=float("nan") if real else None,
+        compress="jpeg" if colours else "deflate",
+        mask=not real,
+        overviews="average" if real or colours else "nearest",
+        tags=about.tags,
+        band_units=about.units,
+    )
+    with CogWriter(path, spec) as writer:
+        for block in writer.blocks():
+            box = grid.bounds(block.row0, block.col0, block.height, block.width)
+            found = values(source, grid.crs, box, block.width, block.height)
+            if found is None:
+                writer.finish_block(block)
+                continue
+            pixels, shown = found
+            if real:
+                pixels = np.where(shown[..., None], pixels, np.float32(np.nan))
+            writer.write_block(block, np.ascontiguousarray(pixels), None if real else shown)
+    return Export(path=path, note=unit_of(layer, figures_of(folder)) if layer.measured else "")
+
+
+def _tiles(
+    source: FileSource,
+    layer: RunLayer,
+    grid: ExportGrid,
+    scale: tuple[float, float] | None,
+    target: Path,
+) -> Path:
+    """A folder z/x/y.webp as web maps address tiles, and its description (TileJSON)."""
+    folder = target / f"{layer.name}-tiles"
+    partial = target / f"{layer.name}-tiles.partial"
+    with mended(folder):
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir()
+        tiles = web_tiles(source, grid, scale, layer)
+        for z, x, y, rgba in tiles:
+            place = partial / str(z) / str(x)
+            place.mkdir(parents=True, exist_ok=True)
+            (place / f"{y}.webp").write_bytes(image_bytes(rgba, "image/webp"))
+        about = {
+            "tilejson": "3.0.0",
+            "name": layer.title,
+            "scheme": "xyz",
+            "tiles": ["{z}/{x}/{y}.webp"],
+            "minzoom": tiles.zooms[0],
+            "maxzoom": tiles.zooms[1],
+            "bounds": list(tiles.degrees),
+        }
+        (partial / "tiles.json").write_text(json.dumps(about, indent=1))
+        shutil.rmtree(folder, ignore_errors=True)
+        partial.replace(folder)
+    return folder
+
+
+def _footprints(folder: Path, wanted: Wanted, target: Path) -> Export:
+    """A GeoPackage of the ground that each photo shows."""
+    source = FileSource(path=folder / "mosaic.tif")
+    crs, box = wanted.crs or source.crs, wanted.bounds
+    rings: list[tuple[np.ndarray, str]] = []
+    try:
+        features = json.loads(read_bounded(folder / "footprints.geojson"))["features"]
+        for feature in features:
+            ring = np.array(feature["geometry"]["coordinates"][0], float)[:, :2]
+            if source.crs:  # GeoJSON is in degrees
+                ring = np.column_stack(between("EPSG:4326", crs).transform(ring[:, 0], ring[:, 1]))
+            low, high = ring.min(0), ring.max(0)
+            if box is None or (
+                low[0] < box[2] and high[0] > box[0] and low[1] < box[3] and high[1] > box[1]
+            ):
+                rings.append((ring, str(feature["properties"]["filename"])))
+    except (OSError, ValueError, LookupError, TypeError) as error:
+        raise SideFileError(
+            f"{folder / 'footprints.geojson'} cannot be read ({error}); make the map again"
+        ) from error
+    path = target / "footprints.gpkg"
+    return Export(
+        path=path, note=f"{write_polygons(path, 'footprints', rings, crs=crs or None)} photos"
+    )
+
+
+def _check_crs(text: str) -> None:
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        CRS(text)
+    except CRSError as error:
+        raise UsageError(f"--crs {text!r} is no coordinate system, such as EPSG:32633") from error

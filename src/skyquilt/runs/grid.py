@@ -1,0 +1,110 @@
+"""The pixel grid of an export: coordinate system, bounds and pixel size, as asked for."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from skyquilt.errors import UsageError
+from skyquilt.raster.map_source import Bounds, FileSource, between
+
+METRES_PER_DEGREE = 111_320.0
+"""Length of a degree of latitude."""
+MOST_PIXELS = 20_000_000_000
+"""Largest export in pixels."""
+BLOCK = 2048
+"""Side in px of what is computed at a time."""
+ROWS_BYTES = 64_000_000
+"""Memory in bytes for the rows that are written at a time."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportGrid:
+    """Square pixels, north up."""
+
+    crs: str
+    """Coordinate system; empty for a map that is not georeferenced."""
+    west: float
+    """Left edge in units of `crs`."""
+    north: float
+    """Top edge in units of `crs`."""
+    step: float
+    """Size of a pixel in units of `crs`."""
+    metres: float
+    """About the same in m."""
+    width: int
+    """Columns."""
+    height: int
+    """Rows."""
+
+    def bounds(self, row: int, column: int, height: int, width: int) -> Bounds:
+        """Bounds of a window in units of `crs`."""
+        west, north = self.west + column * self.step, self.north - row * self.step
+        return west, north - height * self.step, west + width * self.step, north
+
+    @property
+    def whole(self) -> Bounds:
+        """Bounds of everything."""
+        return self.bounds(0, 0, self.height, self.width)
+
+    def strips(self) -> Iterator[tuple[int, int]]:
+        """First row and number of rows of the strips from the top down."""
+        rows = max(16, min(BLOCK // 4, ROWS_BYTES // (4 * self.width)))
+        for row in range(0, self.height, rows):
+            yield row, min(rows, self.height - row)
+
+    def columns(self) -> Iterator[tuple[int, int]]:
+        """First column and number of columns of the blocks of a strip."""
+        for column in range(0, self.width, BLOCK):
+            yield column, min(BLOCK, self.width - column)
+
+
+def grid_of(
+    source: FileSource, bounds: Bounds | None, crs: str | None, gsd_m: float | None
+) -> ExportGrid:
+    """The grid asked for; None = that of the map.
+
+    Raises:
+        UsageError: the map is not georeferenced, there is nothing within the bounds, or it would be
+            too large.
+    """
+    from pyproj import CRS
+
+    if crs is not None and not source.crs:
+        raise UsageError("the map is not georeferenced, so --crs cannot be given")
+    target, native = crs or source.crs, source.resolution()
+    extent = source.bounds()
+    assert extent is not None
+    own = target == source.crs or (crs is not None and CRS(crs) == CRS(source.crs))
+    if not own:
+        extent = between(source.crs, target).transform_bounds(*extent)
+    degrees = bool(target) and CRS(target).is_geographic
+    step = (gsd_m or native) / (METRES_PER_DEGREE if degrees else 1.0)
+    west, south, east, north = bounds or extent
+    west, south, east, north = (
+        max(west, extent[0]),
+        max(south, extent[1]),
+        min(east, extent[2]),
+        min(north, extent[3]),
+    )
+    if west >= east or south >= north:
+        raise UsageError(
+            f"the map has nothing within --bounds; it covers"
+            f" {','.join(f'{v:.6f}'.rstrip('0').rstrip('.') for v in extent)} in {target}"
+        )
+    if own:  # whole pixels of the map, or all would be interpolated
+        west = extent[0] + math.floor((west - extent[0]) / native + 1e-6) * native
+        north = extent[3] - math.floor((extent[3] - north) / native + 1e-6) * native
+    width, height = (max(1, math.ceil(v / step - 1e-6)) for v in (east - west, north - south))
+    if width * height > MOST_PIXELS:
+        raise UsageError(
+            f"this part has {width} x {height} px; choose a larger --gsd or smaller --bounds"
+        )
+    return ExportGrid(
+        crs=target,
+        west=west,
+        north=north,
+        step=step,
+        metres=gsd_m or native,
+        width=width,
+        height=height,
+    )

@@ -1,0 +1,46 @@
+"use strict";
+// What all parts of the page share. The page never builds HTML from what photos or layers say: text goes in as text.
+const $ = (id) => document.getElementById(id);
+const map = L.map("map", { zoomControl: true, maxZoom: 25, preferCanvas: true }).setView([0, 0], 2);
+L.control.scale({ imperial: false }).addTo(map);
+map.createPane("first").style.zIndex = 240;
+map.createPane("second").style.zIndex = 250;
+const state = { layers: new Map(), photos: new Map(), last: 0, rule: "", mode: null, points: [], overlays: new Map(), fitted: false, moved: false, info: null };
+const outlines = L.layerGroup(), trails = L.layerGroup().addTo(map), drawn = L.layerGroup().addTo(map), marked = L.layerGroup().addTo(map);
+const colours = ["#0047b3", "#b30059", "#006644", "#8a4b00", "#5a00b3", "#00707a"];
+
+const element = (tag, text, cls) => {
+  const e = document.createElement(tag);
+  if (text !== undefined) e.textContent = text;
+  if (cls) e.className = cls;
+  return e;
+};
+const button = (text, work) => { const b = element("button", text); b.type = "button"; b.onclick = work; return b; };
+const say = (text) => { $("said").textContent = text; $("said").hidden = false; clearTimeout(say.t); say.t = setTimeout(() => { $("said").hidden = true; }, 8000); };
+const pressed = (id, on) => $(id).setAttribute("aria-pressed", String(on));
+const isPressed = (id) => $(id).getAttribute("aria-pressed") === "true";
+const writing = (more) => ({ ...more, ...($("token").value ? { "X-Token": $("token").value } : {}) });
+// The map shows its focus, and its middle, to those who use the keyboard.
+document.addEventListener("keydown", (e) => { if (e.key === "Tab") document.body.classList.add("keys"); }, true);
+document.addEventListener("pointerdown", () => document.body.classList.remove("keys"), true);
+// An item of a list that can be chosen by mouse and by keyboard.
+const choosable = (li, work) => {
+  li.tabIndex = 0;
+  li.onclick = work;
+  li.onkeydown = (e) => { if (e.target === li && (e.key === "Enter" || e.key === " ")) { e.preventDefault(); work(); } };
+  return li;
+};
+const asked = async (url, options) => {
+  const answer = await fetch(url, options);
+  const said = await answer.json().catch(() => ({}));
+  if (!answer.ok) throw new Error(typeof said.detail === "string" ? said.detail : `the server answers ${answer.status}`);
+  return said;
+};
+const inSize = (n) => n > 1e6 ? `${(n / 1e6).toFixed(1)} MB` : `${Math.max(1, Math.round(n / 1e3))} kB`;
+const saveText = (name, text) => {
+  const a = element("a");
+  a.href = URL.createObjectURL(new Blob([text], { type: "application/geo+json" }));
+  a.download = name;
+  a.click();
+  setTimeout(() => URL.revokeObjectURL(a.href), 5000);
+};

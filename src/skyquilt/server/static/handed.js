@@ -1,0 +1,75 @@
+"use strict";
+// Layers and photos handed in. Where nothing may be written, GeoJSON is shown on this page alone.
+const overlayLabel = (properties) => Object.entries(properties || {}).slice(0, 8).map(([k, v]) => `${k}: ${v}`).join("\n");
+const drawOverlay = (name, data) => {
+  if (state.overlays.has(name)) { state.overlays.get(name).remove(); state.overlays.delete(name); }
+  if (data) {
+    const layer = L.geoJSON(data, {
+      style: { color: "#c20000", weight: 3 }, pointToLayer: (f, at) => L.circleMarker(at, { radius: 8, color: "#c20000" }),
+      onEachFeature: (f, l) => l.bindPopup(element("pre", overlayLabel(f.properties))),
+    }).addTo(map);
+    state.overlays.set(name, layer);
+  }
+  $("overlays").replaceChildren(...[...state.overlays].map(([n, l]) => {
+    const li = element("li", n), toggle = button("on", () => { const on = map.hasLayer(l); on ? l.remove() : l.addTo(map); toggle.textContent = on ? "off" : "on"; });
+    toggle.setAttribute("aria-label", `show or hide ${n}`);
+    li.append(toggle);
+    return li;
+  }));
+};
+const showOverlay = async (name) => {
+  const answer = await fetch(`/layers/${encodeURIComponent(name)}`);
+  drawOverlay(name, answer.ok ? await answer.json() : null);
+};
+const readOverlays = async () => { for (const { name } of (await asked("/layers")).layers) await showOverlay(name); };
+const showHere = async (file) => {
+  try {
+    const data = JSON.parse(await file.text());
+    drawOverlay(file.name, data);
+    const box = state.overlays.get(file.name).getBounds();
+    if (box.isValid() && !map.getBounds().intersects(box)) map.fitBounds(box);
+  } catch (error) { say(`${file.name} is not GeoJSON (${error.message})`); }
+};
+const handIn = async (files) => {
+  for (const file of files) {
+    const layer = /\.(geo)?json$/i.test(file.name);
+    if (!state.info || !state.info.growing) {
+      if (layer) await showHere(file);
+      else if (!(await handControl(file))) say(`${file.name}: here, GeoJSON and lists of control points can be shown`);
+      continue;
+    }
+    const url = layer ? `/layers?name=${encodeURIComponent(file.name)}` : `/photos?name=${encodeURIComponent(file.name)}&source=browser`;
+    const answer = await fetch(url, { method: "POST", body: file, headers: writing({ "Content-Type": "application/octet-stream" }) }).catch(() => null);
+    if (!answer) { say(`${file.name}: the server does not answer`); continue; }
+    const said = await answer.json().catch(() => ({}));
+    if (!answer.ok) say(`${file.name}: ${said.detail || said.reason || answer.status}`);
+  }
+};
+$("files").onchange = () => { handIn([...$("files").files]); $("files").value = ""; };
+$("drop").onkeydown = (e) => { if (e.key === "Enter" || e.key === " ") { e.preventDefault(); $("files").click(); } };
+for (const name of ["dragover", "dragleave", "drop"]) document.addEventListener(name, (e) => {
+  e.preventDefault();
+  $("drop").classList.toggle("over", name === "dragover");
+  if (name === "drop" && e.dataTransfer) handIn([...e.dataTransfer.files]);
+});
+$("finish").onclick = async () => {
+  if (!window.confirm("Adjust all photos together and draw the final map at full resolution?")) return;
+  await asked("/finish", { method: "POST", headers: writing({}) }).then(() => say("The final map is being made; this one stays."), (error) => say(error.message));
+};
+// -- files of the finished map ----------------------------------------------------------------------------------
+const readFiles = async () => {
+  const { files } = await asked("/files");
+  $("final").hidden = !files.length;
+  const row = (f) => {
+    const li = element("li"), a = element("a", f.name === "report.html" ? "Report" : f.what === "export" ? f.name : f.what[0].toUpperCase() + f.what.slice(1));
+    a.href = `/files/${f.name.split("/").map(encodeURIComponent).join("/")}`;
+    if (f.name === "report.html") { a.target = "_blank"; a.rel = "noopener"; } else a.download = "";
+    li.append(a, element("small", `${f.name}, ${inSize(f.bytes)}`));
+    return li;
+  };
+  const main = ["mosaic.tif", "dsm.tif", "thermal.tif", "report.html"];
+  $("downloads").replaceChildren(...main.map((n) => files.find((f) => f.name === n)).filter(Boolean).map(row));
+  const rest = files.filter((f) => !main.includes(f.name));
+  $("more").hidden = !rest.length;
+  $("allfiles").replaceChildren(...rest.map(row));
+};

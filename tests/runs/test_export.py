@@ -1,0 +1,166 @@
+"""Exports, read back by GDAL and compared with the run's own rasters."""
+
+import json
+import sqlite3
+import zipfile
+from contextlib import closing
+
+import numpy as np
+import pytest
+import rasterio
+from pyproj import Transformer
+from rasterio.warp import Resampling, reproject
+from typer.testing import CliRunner
+
+from skyquilt.cli import app as commands
+from skyquilt.errors import UsageError
+from skyquilt.runs.export import WHAT, Wanted, export
+
+
+@pytest.fixture(scope="module")
+def exported(finished, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("exports")
+    wanted = Wanted(what=WHAT)
+    return folder, list(export(finished.output, wanted, folder))
+
+
+def middle(finished, share=0.5):
+    with rasterio.open(finished.output / "mosaic.tif") as file:
+        b = file.bounds
+    w, h = (b.right - b.left) * share / 2, (b.top - b.bottom) * share / 2
+    x, y = (b.left + b.right) / 2, (b.bottom + b.top) / 2
+    return x - w, y - h, x + w, y + h
+
+
+def test_every_kind_is_written(exported):
+    folder, done = exported
+    assert len(done) == len(WHAT) and all(e.path.exists() for e in done)
+    assert not list(folder.rglob("*.partial*"))
+
+
+def test_the_picture_is_the_map_pixel_for_pixel_and_lies_at_its_place(finished, exported):
+    folder, _ = exported
+    with (
+        rasterio.open(folder / "mosaic.png") as png,
+        rasterio.open(finished.output / "mosaic.tif") as tif,
+    ):
+        assert png.crs == tif.crs and png.shape == tif.shape
+        assert np.allclose(tuple(png.transform), tuple(tif.transform), atol=1e-6)
+        rgba, rgb, mask = png.read(), tif.read(), tif.dataset_mask()
+    shown = rgba[3] > 0
+    assert np.array_equal(shown, mask > 0)
+    assert np.array_equal(rgba[:3][:, shown], rgb[:, shown])
+
+
+def test_a_part_in_another_system_agrees_with_gdal(finished, tmp_path):
+    own = middle(finished)
+    to = Transformer.from_crs("EPSG:32633", "EPSG:3035", always_xy=True)
+    west, south, east, north = to.transform_bounds(*own)
+    wanted = Wanted(
+        what=("tif", "heights"), bounds=(west, south, east, north), crs="EPSG:3035", gsd_m=0.4
+    )
+    list(export(finished.output, wanted, tmp_path))
+    for name, source, most in (("mosaic", "mosaic.tif", 12), ("heights", "dsm.tif", 0.12)):
+        with rasterio.open(tmp_path / f"{name}.tif") as ours:
+            assert ours.crs.to_epsg() == 3035 and abs(ours.res[0] - 0.4) < 1e-9
+            got, mask = ours.read(1).astype(float), ours.dataset_mask() > 0
+            theirs = np.full(ours.shape, np.nan)
+            with rasterio.open(finished.output / source) as file:
+                values = np.where(file.dataset_mask() > 0, file.read(1).astype(float), np.nan)
+                reproject(
+                    values, theirs, src_transform=file.transform, src_crs="EPSG:32633",
+                    dst_transform=ours.transform, dst_crs="EPSG:3035",
+                    resampling=Resampling.average, src_nodata=np.nan, dst_nodata=np.nan,
+                )  # fmt: skip
+        both = mask & np.isfinite(theirs)
+        assert both.mean() > 0.3
+        assert np.median(np.abs(got[both] - theirs[both])) < most
+        shifted = np.abs(got[:, 3:] - theirs[:, :-3])[both[:, 3:] & both[:, :-3]]
+        assert np.median(np.abs(got[both] - theirs[both])) < 0.7 * np.nanmedian(shifted)
+
+
+def test_web_tiles_and_mbtiles_and_kmz_show_the_same_ground(finished, exported):
+    folder, _ = exported
+    with rasterio.open(finished.output / "mosaic.tif") as file:
+        to = Transformer.from_crs(file.crs, "EPSG:3857", always_xy=True)
+        extent = to.transform_bounds(*file.bounds)
+    with rasterio.open(folder / "mosaic.mbtiles") as tiles:
+        assert tiles.driver == "MBTiles"
+        size = 2 * 20037508.34 / 256 / 2 ** int(tiles.tags()["ZOOM_LEVEL"])
+        assert np.allclose(tuple(tiles.bounds), extent, atol=3 * size)
+        alpha = tiles.read(4)
+    assert 0.3 < (alpha > 0).mean() < 1
+    about = json.loads((folder / "mosaic-tiles" / "tiles.json").read_text())
+    count = len(list((folder / "mosaic-tiles").rglob("*.webp")))
+    with closing(sqlite3.connect(folder / "mosaic.mbtiles")) as base:
+        assert base.execute("select count(*) from tiles").fetchone()[0] == count > 10
+    assert about["maxzoom"] > about["minzoom"]
+    with rasterio.open(folder / "mosaic.kmz") as kmz:
+        assert kmz.driver == "KMLSUPEROVERLAY" and kmz.crs.to_epsg() == 4326
+        west, north = kmz.bounds.left, kmz.bounds.top
+    back = Transformer.from_crs("EPSG:3857", "EPSG:4326", always_xy=True)
+    lon, _, _, lat = back.transform_bounds(*extent)
+    assert abs(west - lon) < 1e-6 and abs(north - lat) < 1e-6
+    with zipfile.ZipFile(folder / "mosaic.kmz") as archive:
+        assert archive.testzip() is None and archive.namelist()[0] == "doc.kml"
+
+
+def test_footprints_are_those_of_the_run(finished, exported):
+    folder, _ = exported
+    with closing(sqlite3.connect(folder / "footprints.gpkg")) as base:
+        names = [n for (n,) in base.execute("select filename from footprints")]
+        box = base.execute("select min_x, min_y, max_x, max_y from gpkg_contents").fetchone()
+    assert len(names) == finished.metrics["photos_used"]
+    with rasterio.open(finished.output / "mosaic.tif") as file:
+        b = file.bounds
+    assert box[0] <= b.left + 1 and box[2] >= b.right - 1 and box[3] > box[1]
+
+
+def test_memory_does_not_grow_with_the_part(finished, tmp_path, monkeypatch):
+    """The rows written at a time are bounded, and the result is the same."""
+    from skyquilt.runs import grid
+
+    list(export(finished.output, Wanted(what=("png",), gsd_m=0.3), tmp_path / "a"))
+    monkeypatch.setattr(grid, "ROWS_BYTES", 1)
+    monkeypatch.setattr(grid, "BLOCK", 64)
+    list(export(finished.output, Wanted(what=("png",), gsd_m=0.3), tmp_path / "b"))
+    pixels = []
+    for name in "ab":
+        with rasterio.open(tmp_path / name / "mosaic.png") as file:
+            pixels.append(file.read().astype(int))
+    both = (pixels[0][3] > 0) & (pixels[1][3] > 0)
+    assert both.mean() > 0.3 and np.mean(pixels[0][3] != pixels[1][3]) < 0.005
+    assert np.mean(np.abs(pixels[0] - pixels[1])[:, both]) < 1.5
+
+
+@pytest.mark.parametrize(
+    "wanted",
+    [{"what": ("gif",)}, {"what": ()}, {"what": ("png",), "gsd_m": 0.0},
+     {"what": ("png",), "crs": "EPSG:0"}, {"what": ("png",), "bounds": (1.0, 1.0, 0.0, 2.0)}],
+)  # fmt: skip
+def test_what_cannot_be_exported_is_refused(wanted):
+    with pytest.raises(UsageError):
+        Wanted(**wanted)
+
+
+def test_what_a_run_does_not_have_is_refused(finished, tmp_path):
+    for wanted, words in (
+        (Wanted(what=("png",), layer="thermal"), "no layer 'thermal'"),
+        (Wanted(what=("png",), bounds=(0.0, 0.0, 1.0, 1.0)), "nothing within"),
+        (Wanted(what=("png",), gsd_m=1e-4), "larger --gsd"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            list(export(finished.output, wanted, tmp_path))
+    with pytest.raises(UsageError, match="no finished run"):
+        list(export(tmp_path, Wanted(what=("png",))))
+
+
+def test_the_command_and_the_short_cut_of_mosaic_are_one(finished, flight, tmp_path):
+    run = CliRunner().invoke
+    said = run(
+        commands.app,
+        ["export", str(finished.output), "--what", "png,kmz", "--gsd", "40", "-o", str(tmp_path)],
+    )
+    assert said.exit_code == 0 and said.output.count("export: ") == 2
+    wrong = run(commands.app, ["mosaic", str(flight), "-o", str(tmp_path / "x"), "--export", "gif"])
+    assert isinstance(wrong.exception, UsageError) and not (tmp_path / "x").exists()

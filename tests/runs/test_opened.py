@@ -1,0 +1,98 @@
+"""A finished run, opened again in Python."""
+
+import shutil
+
+import numpy as np
+import pytest
+import rasterio
+
+import skyquilt
+from skyquilt.errors import UsageError
+
+
+@pytest.fixture(scope="module")
+def run(finished):
+    return skyquilt.open_run(finished.output)
+
+
+def test_observations_are_explained_by_poses_and_cameras(run, finished):
+    """The tie points, projected through the poses and cameras of the run's files, fall where the
+    residuals say: every part fits every other.
+    """
+    seen = run.observations
+    assert len(seen.points) == finished.metrics["tie_points"]
+    assert len(seen.px) == finished.metrics["sightings"]
+    for name in list(run.poses)[:3]:
+        chosen = seen.photo == name
+        pose, camera = run.poses[name], run.cameras[run.camera_of[name]]
+        local = (seen.points[seen.point[chosen]] - pose.map_C) @ pose.cam_R_map.T
+        if pose.motion is not None:  # rows are read out one after the other
+            s = (seen.px[chosen][:, 1:] - (camera.height - 1) / 2) / (camera.height - 1)
+            turned = np.cross(pose.motion.turn_rad, local)
+            local = local + s * (turned - pose.cam_R_map @ pose.motion.shift_m)
+        x, y = (local[:, :2] / local[:, 2:]).T
+        r2 = x * x + y * y
+        radial = 1 + r2 * (camera.k1 + r2 * (camera.k2 + r2 * camera.k3))
+        u = x * radial + 2 * camera.p1 * x * y + camera.p2 * (r2 + 2 * x * x)
+        v = y * radial + camera.p1 * (r2 + 2 * y * y) + 2 * camera.p2 * x * y
+        px = np.column_stack(
+            [camera.focal * u + camera.cx, camera.focal * camera.aspect * v + camera.cy]
+        )
+        off = px - seen.px[chosen] - seen.residual_px[chosen]
+        assert chosen.sum() > 20 and np.abs(off).max() < 0.02
+
+
+def test_rasters_are_those_of_the_files(run, finished):
+    with rasterio.open(finished.output / "dsm.tif") as file:
+        whole, b = file.read(1), file.bounds
+    found = run.raster("heights")
+    assert np.array_equal(found.pixels[..., 0], whole, equal_nan=True)
+    assert (found.west, found.north) == (b.left, b.top)
+    half = run.raster("heights", gsd_m=2 * found.gsd_m)
+    assert half.gsd_m == pytest.approx(2 * found.gsd_m)
+    both = half.shown & found.shown[: 2 * half.shown.shape[0] : 2, : 2 * half.shown.shape[1] : 2]
+    fine = found.pixels[: 2 * half.shown.shape[0] : 2, : 2 * half.shown.shape[1] : 2, 0]
+    assert np.nanmedian(np.abs(half.pixels[..., 0] - fine)[both]) < 0.1
+    part = run.raster("mosaic", bounds=(b.left + 10, b.bottom + 10, b.right - 10, b.top - 10))
+    assert abs(part.x[0] - (b.left + 10)) < part.gsd_m
+    with pytest.raises(UsageError, match="thermal"):
+        run.raster("thermal")
+    with pytest.raises(UsageError, match="nothing within"):
+        run.raster(bounds=(0, 0, 1, 1))
+
+
+def test_xarray_has_coordinates_and_unit(run):
+    pytest.importorskip("xarray")
+    found = run.xarray("heights")
+    assert found.dims == ("y", "x", "band") and found.attrs["crs"] == run.crs
+    assert float(found.y[0]) > float(found.y[-1]) and found.attrs["units"].startswith("m ")
+
+
+def test_without_its_store_a_run_says_what_is_missing(finished, tmp_path):
+    for name in ("mosaic.tif", "metrics.json", "shots.geojson", "cameras.json"):
+        shutil.copy(finished.output / name, tmp_path)
+    opened = skyquilt.open_run(tmp_path)
+    assert len(opened.poses) == 9
+    with pytest.raises(UsageError, match="make the map again"):
+        _ = opened.observations
+    with pytest.raises(UsageError, match="no finished run"):
+        skyquilt.open_run(tmp_path / "nowhere")
+
+
+def test_what_notebooks_show_is_short_and_holds_a_map(run, finished, flight):
+    result, survey = finished.events[-1], skyquilt.read_survey(flight / "photos")
+    for thing in (run, result, survey):
+        assert len(repr(thing)) < 300 and "9" in repr(thing)
+        html = thing._repr_html_()
+        assert html.count("<div") == html.count("</div") == 1 and len(html) < 400_000
+    assert "data:image/png" in result._repr_html_() and "<svg" in survey._repr_html_()
+
+
+def test_other_programs_find_times_and_colours(finished):
+    shots, points = (finished.json("reconstruction.json")[0][k] for k in ("shots", "points"))
+    times = [s["capture_time"] for s in shots.values()]
+    assert len(set(times)) == 9 and min(times) > 1e9
+    colours = np.array([p["color"] for p in points.values()])
+    assert (colours == 128).all(1).mean() < 0.1 and colours.std(0).min() > 5
+    listed = [f["properties"]["capture_time"] for f in finished.json("shots.geojson")["features"]]
+    assert sorted(listed) == sorted(times)
