@@ -35,9 +35,10 @@ KML = "{http://www.opengis.net/kml/2.2}"
 def plan():
     """Two lines of three points on ground of 120 m, one drone, a detour in the middle."""
     site = make_site(
-        box(X, Y, X + 60, Y + 30), (KeepOut(shape=box(X + 70, Y - 40, X + 80, Y - 20), name="<barn>"),),
+        box(X, Y, X + 60, Y + 30),
+        (KeepOut(shape=box(X + 70, Y - 40, X + 80, Y - 20), name="<barn>"),),
         ZONE,
-    )  # fmt: skip
+    )
     points = tuple(
         PicturePoint(id=k + 1, x=X + 30 * (k % 3), y=Y + 25 * (k // 3), z=180.0 + k, ground=120.0,
                      yaw=90.0)

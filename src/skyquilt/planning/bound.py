@@ -3,9 +3,10 @@
 Take all sorties of a plan together, S of them. Without the legs from and to the ground they are S
 paths through all n points: a forest with n - S edges. So the smallest forest with n - S edges (the
 minimum spanning tree less its S - 1 longest edges: Kruskal 1956), the S cheapest first legs and the
-S cheapest last legs are a lower bound of all flying time. Every point has two legs, so a weight w_i added to all legs at point i adds 2 sum(w) to every plan; the w that give the largest bound are
+S cheapest last legs are a lower bound of all flying time. Every point has two legs, so a weight w_i
+added to all legs at point i adds 2 sum(w) to every plan; the w that give the largest bound are
 sought by the subgradient method (Held and Karp 1971; for several routes Fisher 1994). Shared evenly
-by K drones this bounds the last landing; the farthest point bounds it alone.
+by the drones that fly, this bounds the last landing; the farthest point bounds it alone.
 """
 
 import math
