@@ -76,6 +76,13 @@ def command(
     base: Annotated[
         Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")
     ] = None,
+    plan: Annotated[
+        Path | None,
+        typer.Option(help="plan.json that is flown; kept in OUTPUT for the next start."),
+    ] = None,
+    fill: Annotated[
+        bool, typer.Option("--fill", help="Plan what is missing when the flight has ended.")
+    ] = False,
     features: Features = 1200,
     max_mb: Annotated[float, typer.Option(help="Largest photo file in MB.")] = 500,
     max_mp: MaxMp = MOST_MP,
@@ -97,6 +104,8 @@ def command(
     with ends_at_once():
         from skyquilt.cli.progress import show_live
         from skyquilt.engine.memory_watch import ends_run, limit_bytes
+        from skyquilt.errors import UsageError
+        from skyquilt.live.fill import known_plan
         from skyquilt.live.live_map import LiveMap
         from skyquilt.live.settings import LiveSettings
         from skyquilt.live.workflow import iter_live
@@ -122,6 +131,8 @@ def command(
     )
     live = LiveMap(output, settings)
     try:
+        if known_plan(output, plan) is None and fill:
+            raise UsageError("--fill needs a plan; give --plan")
         asked = ServerConfig(
             folder=output,
             settings=settings,
@@ -135,7 +146,7 @@ def command(
             ServerProcess(asked=asked, port=port) as serving,
         ):
             live.lock.tell(serving.url)
-            events = iter_live(inbox, live, finish=finish)
+            events = iter_live(inbox, live, finish=finish, fill=fill)
             show_live(events, serving.url, mode="quiet" if quiet else "json" if json else "normal")
     finally:
         live.close()

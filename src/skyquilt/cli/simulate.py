@@ -1,6 +1,6 @@
 """`skyquilt simulate`: a flight with known truth over procedural terrain."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -242,7 +242,7 @@ def _planned(
     blurred: float | None,
     size: str | None,
     overwrite: bool,
-) -> "Iterable[sim.Progress]":
+) -> "Iterator[sim.Progress]":
     """The flight of a plan."""
     from skyquilt import simulate as sim
     from skyquilt.simulate.planned import planned_flight

@@ -1,5 +1,7 @@
 """'Fly what is missing here': the part of a finished run or a live map that too few photos see."""
 
+import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -13,12 +15,19 @@ from shapely.geometry import shape as from_geojson
 from shapely.geometry.base import BaseGeometry
 
 from skyquilt.errors import RefusedError, SideFileError
-from skyquilt.planning.records import Site
+from skyquilt.outside import read_bounded
+from skyquilt.planning.ground_cover import OUTSIDE, Cover, cover_of, to_mercator
+from skyquilt.planning.plan_file import read_plan
+from skyquilt.planning.points import is_shut
+from skyquilt.planning.records import Plan, Site
 from skyquilt.planning.site import geographic, make_site, read_keep_out, utm_of
+from skyquilt.planning.terrain import FLAT
 
 VIEWS = "views.tif"
 COVERAGE = "coverage.tif"
 """Written by a live map: the number of sharp photos of each cell, over the area of its plan."""
+PLAN, STATE = "plan.json", "plan_state.json"
+"""What a live map flies, and which points have no sharp photo yet."""
 MOST_CELLS = 1_500
 """Largest side of the raster that is looked at."""
 LEAST_M2 = 1.0
@@ -27,6 +36,67 @@ LEAST_M2 = 1.0
 def is_run(path: Path) -> bool:
     """Whether a path is a folder with a raster of views."""
     return Path(path).is_dir()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FlownMission:
+    """A plan and what has been flown of it."""
+
+    plan: Plan
+    """The plan."""
+    cover: Cover
+    """Cells of its area."""
+    counts: NDArray[np.int32]
+    """(rows, columns) sharp photos of each."""
+    again: frozenset[int]
+    """Points without a sharp photo."""
+
+    def at(self, xy: NDArray[np.float64]) -> NDArray[np.int32]:
+        """Photos that see places (n, 2) in the plan's zone."""
+        places = to_mercator(xy, self.plan.site.crs)
+        column = ((places[:, 0] - self.cover.west) / self.cover.cell).astype(np.int64)
+        row = ((self.cover.north - places[:, 1]) / self.cover.cell).astype(np.int64)
+        rows, columns = self.counts.shape
+        known = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
+        found = np.zeros(len(xy), np.int32)
+        found[known] = self.counts[row[known], column[known]]
+        return found
+
+
+def is_mission(folder: Path) -> bool:
+    """Whether a folder is a live map that knows its plan."""
+    return all((Path(folder) / n).is_file() for n in (PLAN, STATE, COVERAGE))
+
+
+def read_mission_state(folder: Path) -> FlownMission:
+    """What a live map has written of its plan; raises SideFileError where a file is damaged."""
+    folder = Path(folder)
+    plan = read_plan(folder / PLAN)
+    try:
+        record = json.loads(read_bounded(folder / STATE).decode("utf-8"))
+        again = frozenset(int(k) for k in record["again"])
+        with rasterio.open(folder / COVERAGE) as raster:
+            values = raster.read(1)
+            affine = raster.transform
+    except (OSError, ValueError, LookupError, TypeError, rasterio.errors.RasterioError) as error:
+        raise SideFileError(f"{folder}: {STATE} or {COVERAGE} is damaged: {error}") from error
+    like = planned_cover(plan)
+    inside = values != OUTSIDE
+    if inside.shape != like.inside.shape:
+        raise SideFileError(f"{folder}: {COVERAGE} does not belong to {PLAN}")
+    cover = Cover(west=affine.c, north=affine.f, cell=affine.a, inside=inside,
+                  ground_m=like.ground_m)  # fmt: skip
+    return FlownMission(
+        plan=plan, cover=cover, counts=np.where(inside, values, 0).astype(np.int32), again=again
+    )
+
+
+def planned_cover(plan: Plan) -> Cover:
+    """The cells of a plan's area, without closed places."""
+    height = float(np.median([p.z - p.ground for p in plan.points])) if plan.points else 0.0
+    clearance = float(plan.options.get("clearance_m") or 0.0)
+    shut = [k.shape for k in plan.site.keep_out if is_shut(k, FLAT, height, clearance)]
+    return cover_of(plan.site.observe.difference(union_all(shut)), plan.site.crs)
 
 
 def missing_site(folder: Path, views: int, *, keep_out: Path | None = None) -> Site:

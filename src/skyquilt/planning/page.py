@@ -7,7 +7,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 
-from skyquilt.planning.coverage import Cells, counted
+from skyquilt.planning.coverage import Cells
 from skyquilt.planning.lattice import to_uv
 from skyquilt.planning.records import Array, Plan
 from skyquilt.raster.map_source import FileSource, picture
@@ -27,13 +27,15 @@ COLOURS = ("#d97706", "#2563eb", "#7c3aed", "#059669", "#db2777", "#0891b2", "#6
 
 
 def write_plan_page(
-    path: Path, plan: Plan, cells: Cells, seen: list[NDArray[np.int32]], base: Path | None
+    path: Path, plan: Plan, cells: Cells, views: NDArray[np.int32], base: Path | None
 ) -> None:
-    """Writes the page; `base`: an old map to draw below."""
-    write_page(path, plan_page(plan, cells, seen, base))
+    """Writes the page; `views`: photos that see each cell, flat; `base`: an old map to draw
+    below.
+    """
+    write_page(path, plan_page(plan, cells, views, base))
 
 
-def plan_page(plan: Plan, cells: Cells, seen: list[NDArray[np.int32]], base: Path | None) -> str:
+def plan_page(plan: Plan, cells: Cells, views: NDArray[np.int32], base: Path | None) -> str:
     """The page as text."""
     frame = Frame(plan)
     sections = [
@@ -48,7 +50,7 @@ def plan_page(plan: Plan, cells: Cells, seen: list[NDArray[np.int32]], base: Pat
             id="coverage",
             title="Coverage",
             lead="Number of photos that see each place, by their footprints on the terrain.",
-            blocks=(_coverage(plan, frame, cells, seen),),
+            blocks=(_coverage(plan, frame, cells, views),),
         ),
         Section(id="options", title="Options", blocks=(_options(plan),), folded=True),
     ]
@@ -187,8 +189,8 @@ def _scale_bar(frame: Frame) -> Markup:
     ).format(y, metres * frame.scale, y - 8, metres)
 
 
-def _coverage(plan: Plan, frame: Frame, cells: Cells, seen: list[NDArray[np.int32]]) -> Figure:
-    views = np.where(cells.inside.ravel(), counted(cells, seen), -1).reshape(cells.inside.shape)
+def _coverage(plan: Plan, frame: Frame, cells: Cells, counts: NDArray[np.int32]) -> Figure:
+    views = np.where(cells.inside.ravel(), counts, -1).reshape(cells.inside.shape)
     width, height = int(frame.width), int(frame.height)
     x = frame.west + (np.arange(width) + 0.5) / frame.scale
     y = frame.north - (np.arange(height) + 0.5) / frame.scale
@@ -196,7 +198,7 @@ def _coverage(plan: Plan, frame: Frame, cells: Cells, seen: list[NDArray[np.int3
     uv = to_uv(np.column_stack([gx.ravel(), gy.ravel()]), cells.heading)
     column = np.searchsorted(cells.u, uv[:, 0]) - 1
     row = np.searchsorted(cells.v, uv[:, 1]) - 1
-    rows, columns = views.shape
+    rows, columns = cells.inside.shape
     known = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
     drawn = np.full(len(uv), -1)
     drawn[known] = views[row[known], column[known]]

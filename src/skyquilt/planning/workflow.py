@@ -10,11 +10,12 @@ import numpy as np
 from skyquilt.engine.folder import claim
 from skyquilt.errors import UsageError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageStarted
-from skyquilt.planning.coverage import all_seen, sight_may_be_blocked
+from skyquilt.planning.coverage import all_seen, counted, make_cells, sight_may_be_blocked
 from skyquilt.planning.exports import WRITERS, write_missions
+from skyquilt.planning.fill import follow_up
 from skyquilt.planning.fleet import alike, read_fleet, start_at
 from skyquilt.planning.kml import write_kml
-from skyquilt.planning.missing import is_run, missing_site
+from skyquilt.planning.missing import is_mission, is_run, missing_site, read_mission_state
 from skyquilt.planning.page import write_plan_page
 from skyquilt.planning.plan_file import write_plan
 from skyquilt.planning.points import height_of, place_points
@@ -61,14 +62,45 @@ def iter_plan(order: Order, output: Path, *, overwrite: bool = False) -> Iterato
     Raises:
         UsageError, SideFileError, RefusedError, OutputError: one sentence each.
     """
-    settings = order.settings.checked()
     output = Path(output)
+    if is_mission(order.area):
+        yield from refilled(order, output, overwrite=overwrite)
+        return
+    settings = order.settings.checked()
     if is_run(order.area):
         site = missing_site(order.area, settings.views or 1, keep_out=order.keep_out)
     else:
         site = read_site(order.area, keep_out=order.keep_out, width_m=settings.width_m)
     drones, view = fleet_of(order, site)
     yield from planned(order, site, drones, view, output, overwrite=overwrite)
+
+
+def refilled(order: Order, output: Path, *, overwrite: bool) -> Iterator[Event]:
+    """The follow-up of a live map that knows its plan, by what its photos show so far."""
+    yield StageStarted(stage="routes", total=0)
+    begun, cpu = time.monotonic(), time.process_time()
+    mission = read_mission_state(order.area)
+    site = mission.plan.site
+    terrain = FLAT
+    if order.terrain is not None:
+        terrain = read_terrain(order.terrain, site.crs, site.observe, 500)
+    plan = follow_up(mission.plan, mission.cover, mission.counts, mission.again, terrain)
+    yield StageFinished(
+        stage="routes", seconds=time.monotonic() - begun, cpu_seconds=time.process_time() - cpu,
+        reused=False,
+    )  # fmt: skip
+    for text in plan.warnings:
+        yield Note(text=text, warning=True)
+    view = plan.drones[0].view
+    size = plan.proof.cell_m if plan.proof else 1.0
+    cells = make_cells(site.observe, plan.points[0].yaw, 2 * size, FLAT)
+    xyz = np.array([(p.x, p.y, p.z - p.ground) for p in plan.points])
+    seen = all_seen(cells, view, xyz, np.array([p.yaw for p in plan.points]), blocked=False)
+    before = mission.at(cells.centres(np.arange(cells.inside.size))[:, :2])
+    _make_room(output, overwrite)
+    names = write_all(output, plan)
+    write_plan_page(output / "plan.html", plan, cells, counted(cells, seen) + before, order.base)
+    yield Result(output=output, metrics=summary_of(plan, names))
 
 
 def fleet_of(order: Order, site: Site) -> tuple[tuple[Drone, ...], View]:
@@ -126,7 +158,7 @@ def planned(
     seen = all_seen(cells, view, xyz, yaw, blocked=sight_may_be_blocked(view, terrain))
     _make_room(output, overwrite)
     names = write_all(output, plan)
-    write_plan_page(output / "plan.html", plan, cells, seen, order.base)
+    write_plan_page(output / "plan.html", plan, cells, counted(cells, seen), order.base)
     yield Result(output=output, metrics=summary_of(plan, names))
 
 
