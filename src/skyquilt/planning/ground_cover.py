@@ -73,7 +73,7 @@ class Cover:
         drawn = rasterize([local], (r1 - r0, c1 - c0), transform=Affine.identity(), dtype=np.uint8)
         found = (drawn > 0) & self.inside[r0:r1, c0:c1]
         i, j = np.nonzero(found)
-        return ((i + r0) * columns + j + c0).astype(np.int32)
+        return np.asarray((i + r0) * columns + j + c0, np.int32)
 
     def counts(self, seen: Sequence[NDArray[np.int32]]) -> NDArray[np.int32]:
         """(rows, columns) number of photos."""
