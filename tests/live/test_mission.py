@@ -175,7 +175,7 @@ def test_areas_are_planned_in_a_process_of_their_own(tmp_path):
     ring = [[13.1, 52.1], [13.102, 52.1], [13.102, 52.101], [13.1, 52.101], [13.1, 52.1]]
     body = json.dumps({"type": "Polygon", "coordinates": [ring]})
     asked = {"camera": "FC6310", "height": 100, "overlap": 60, "sidelap": 50}
-    with watched(tmp_path / "out", None) as (_, web, _url):
+    with watched(tmp_path / "out", None) as (live, web, _):
         assert web.post("/plan/missing").status_code == 409
         assert web.post("/plan", params=asked, content="{").status_code == 422
         assert (
@@ -185,9 +185,11 @@ def test_areas_are_planned_in_a_process_of_their_own(tmp_path):
         assert answer.status_code == 202, answer.text
         until(lambda: web.get("/plan").json()["plans"])
         assert web.get("/plans/plan-1/plan.html").status_code == 200
-        told = web.post("/plan", params={**asked, "camera": "FC9999"}, content=body)
-        assert told.status_code == 202
-        until(lambda: not web.post("/plan/missing").json()["detail"].startswith("a plan is"))
+        wrong = {**asked, "camera": "FC9999"}
+        until(lambda: web.post("/plan", params=wrong, content=body).status_code == 202)
+        until(lambda: any('"refused"' in text for _, kind, text in live.ledger.told(0)))
+        (text,) = [t for _, kind, t in live.ledger.told(0) if '"refused"' in t]
+        assert "no camera 'FC9999' is known" in text
 
 
 def test_a_mission_without_photos_is_planned_and_its_state_is_written(tmp_path):
