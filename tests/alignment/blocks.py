@@ -132,3 +132,27 @@ def make_block(
 def least_squares_only(problem):
     """The problem with plain squares everywhere."""
     return replace(problem, loss_px=1e6, loss_C=1e6, loss_R=1e6)
+
+
+def dense_matrix(matrix):
+    """All rows and columns of a matrix of blocks."""
+    pat = matrix.pattern
+    p, photos = pat.size, pat.count * pat.size
+    out = np.zeros((photos + pat.border,) * 2)
+    for a, b, block in zip(pat.first, pat.second, matrix.blocks, strict=True):
+        out[b * p : b * p + p, a * p : a * p + p] = block.T
+        out[a * p : a * p + p, b * p : b * p + p] = block
+    beside = matrix.beside.reshape(photos, -1)
+    out[:photos, photos:], out[photos:, :photos], out[photos:, photos:] = (
+        beside,
+        beside.T,
+        matrix.corner,
+    )
+    return out
+
+
+def dense_covariance(found):
+    """(6n + 10m) square, in the order of the system; zero where all intrinsics are fixed."""
+    out = found.factor.solve(np.eye(found.factor.total))
+    border = found.inverse.pattern.border
+    return np.pad(out, (0, 0 if border else len(found.cameras)))

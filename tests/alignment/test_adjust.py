@@ -7,18 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment import adjust as module
-from skyquilt.alignment.adjust import (
-    Reduced,
-    adjust,
-    covariance,
-    normal_equations,
-    polish_points,
-    robust_cost,
-)
+from skyquilt.alignment import equations
+from skyquilt.alignment.adjust import adjust, covariance, polish_points
 from skyquilt.alignment.bundle import leave_one_out, prune
+from skyquilt.alignment.equations import Equations, observation_equations
 from skyquilt.alignment.problem import attitude_error, linearise, residuals_px
-from tests.alignment.blocks import FREE, least_squares_only, make_block
+from skyquilt.alignment.robust import prior_terms, robust_cost
+from skyquilt.geometry import block_cholesky
+from skyquilt.geometry.block_cholesky import Factor
+from tests.alignment.blocks import (
+    FREE,
+    dense_covariance,
+    dense_matrix,
+    least_squares_only,
+    make_block,
+)
 
 
 def unknowns_error(block, state):
@@ -98,7 +101,7 @@ def test_a_step_is_that_of_the_dense_normal_equations(small):
     )
     expected = np.zeros(len(g))
     expected[used] = -np.linalg.solve(H[np.ix_(used, used)], g[used])
-    photos, cameras, points = Reduced(problem, normal_equations(problem, state), 0.0).step()
+    photos, cameras, points = Equations(problem, state).step(state, 0.0)
     assert photos.ravel() == pytest.approx(expected[: 6 * n], abs=1e-6)
     assert cameras.ravel() == pytest.approx(expected[6 * n : 6 * n + 10 * m], abs=1e-6)
     assert points.ravel() == pytest.approx(expected[6 * n + 10 * m :], abs=1e-5)
@@ -113,7 +116,7 @@ def test_the_covariance_is_the_dense_inverse_s(small):
     )
     whole = np.linalg.inv(H[np.ix_(used, used)])
     u = int(used[: 6 * n + 10 * m].sum())
-    mine = covariance(problem, state)
+    mine = dense_covariance(covariance(problem, state))
     keep = np.flatnonzero(used[: 6 * n + 10 * m])
     scale = np.sqrt(np.outer(np.diag(whole)[:u], np.diag(whole)[:u]))
     assert np.abs((mine[np.ix_(keep, keep)] - whole[:u, :u]) / scale).max() < 1e-5
@@ -129,13 +132,10 @@ def test_the_gradient_is_the_slope_of_the_robust_cost():
     )
     far = np.random.default_rng(1).normal(0, 4, block.start.C.shape)  # so far that losses matter
     state = replace(block.start, C=block.start.C + far)
-    normal = normal_equations(problem, state)
-    assert normal.cost == pytest.approx(robust_cost(problem, state), rel=1e-12)
-    shapes = [normal.gp.shape, normal.gc.shape, normal.gv.shape]
     rng = np.random.default_rng(0)
-    for part, gradient in enumerate([normal.gp, normal.gc, normal.gv]):
-        step = [np.zeros(s) for s in shapes]
-        step[part] = rng.normal(0, 1, shapes[part]) * (1e-2 if part == 1 else 1.0)
+    for part, gradient in enumerate(gradients(problem, state)):
+        step = [np.zeros(gradients(problem, state)[k].shape) for k in range(3)]
+        step[part] = rng.normal(0, 1, gradient.shape) * (1e-2 if part == 1 else 1.0)
         if part == 0:
             step[0][:, :3] = (
                 0  # attitudes: the prior's Jacobian is the identity only near R0; see below
@@ -145,52 +145,93 @@ def test_the_gradient_is_the_slope_of_the_robust_cost():
         h = 1e-5
         up, down = (robust_cost(problem, state.moved(*(s * h * d for d in step))) for s in (1, -1))
         assert (step[part] * gradient).sum() == pytest.approx((up - down) / (4 * h), rel=2e-4)
-    step = [np.zeros(s) for s in shapes]
-    step[0][:, :3] = rng.normal(0, 1, (len(state.C), 3))
     start = replace(state, R=problem.R0)
-    normal = normal_equations(problem, start)
-    up, down = (robust_cost(problem, start.moved(*(s * 1e-6 * d for d in step))) for s in (1, -1))
-    assert (step[0] * normal.gp).sum() == pytest.approx((up - down) / 4e-6, rel=2e-4)
+    photos = np.zeros((len(state.C), 6))
+    photos[:, :3] = rng.normal(0, 1, (len(state.C), 3))
+    rest = np.zeros(state.K.shape), np.zeros(state.X.shape)
+    up, down = (robust_cost(problem, start.moved(s * 1e-6 * photos, *rest)) for s in (1, -1))
+    gradient = gradients(problem, start)[0]
+    assert (photos * gradient).sum() == pytest.approx((up - down) / 4e-6, rel=2e-4)
 
 
-@pytest.mark.parametrize("points", [60, 4000])
-def test_the_sparse_system_is_the_dense_one(monkeypatch, points):
-    block = make_block(
-        5, lines=2, per_line=4, points=points, cameras=2
-    )  # 4000 points: several chunks
-    normal = normal_equations(block.problem, block.start)
-    dense = Reduced(block.problem, normal, 1e-3)
-    monkeypatch.setattr(module, "DENSE_LIMIT", 10)
-    thin = Reduced(block.problem, normal, 1e-3)
-    assert not isinstance(thin.S, np.ndarray)
-    assert thin.S.toarray() == pytest.approx(dense.S, rel=1e-9, abs=1e-6)
-    assert thin.g == pytest.approx(dense.g)
-    for a, b in zip(dense.step(), thin.step(), strict=True):
+def gradients(problem, state):
+    """Of photos (n, 6), cameras (m, 10) and points (P, 3), with the priors."""
+    normal, priors = observation_equations(problem, state), prior_terms(problem, state)
+    photos = priors.photo_gradient[:, :6].copy()
+    photos[normal.seen] += normal.gp
+    return photos, normal.gc + priors.camera_gradient, normal.gv
+
+
+@pytest.mark.parametrize(("points", "offset"), [(60, False), (4000, True)])
+def test_the_divided_system_is_the_dense_one(monkeypatch, points, offset):
+    """Nested dissection gives the step and the covariance of one dense matrix; 4000 points: several
+    parts.
+    """
+    block = make_block(5, lines=2, per_line=18, points=points, cameras=2, overlap=0.5)
+    X0 = block.problem.X0.copy()
+    X0[::10] = block.truth.X[::10]
+    surveyed = replace(block.problem, X0=X0, sigma_X=np.full(X0.shape, 0.02))
+    problem = replace(surveyed, offset=True) if offset else block.problem
+    whole = Equations(problem, block.start)
+    assert len(whole.pattern.fronts) == 1
+    monkeypatch.setattr(block_cholesky, "LEAF", 6)
+    monkeypatch.setattr(equations, "LEAF", 6)
+    divided = Equations(problem, block.start)
+    assert len(divided.pattern.fronts) >= 5
+    matrix, gradient = divided.reduced(block.start, 1e-3)
+    expected, same = whole.reduced(block.start, 1e-3)
+    assert dense_matrix(matrix) == pytest.approx(dense_matrix(expected), rel=1e-9, abs=1e-6)
+    assert gradient == pytest.approx(same)
+    solved = np.linalg.solve(dense_matrix(expected), gradient)
+    assert Factor(matrix).solve(gradient) == pytest.approx(solved, rel=1e-6, abs=1e-9)
+    for a, b in zip(whole.step(block.start, 1e-3), divided.step(block.start, 1e-3), strict=True):
         assert b == pytest.approx(a, rel=1e-6, abs=1e-8)
-    assert covariance(block.problem, block.start) is None
+    found = covariance(problem, block.start)
+    inverse = np.linalg.inv(dense_matrix(divided.reduced(block.start, 0.0)[0]))
+    scale = np.sqrt(np.diag(inverse))
+    for photos in ([3], [0, 1, 7], [5, 0, 35, 20]):  # the last ones share no point
+        at = (6 * np.array(photos)[:, None] + np.arange(6)).ravel()
+        at = np.concatenate([at, np.arange(6 * 36, len(inverse))])
+        apart = (found.of(photos) - inverse[np.ix_(at, at)]) / np.outer(scale[at], scale[at])
+        assert np.abs(apart).max() < 1e-6
+    assert found.photo_sigmas.ravel() == pytest.approx(
+        np.sqrt(np.diag(inverse)[: 6 * 36]).reshape(-1, 6)[:, 3:].ravel(), rel=1e-6
+    )
 
 
-def test_both_dense_solvers_agree_and_refuse_alike(monkeypatch):
-    block = make_block(5, lines=2, per_line=4, points=60)
-    reduced = Reduced(block.problem, normal_equations(block.problem, block.start), 1e-3)
-    assert reduced.size <= module.SMALL
-    small = reduced.solve(reduced.g)
-    monkeypatch.setattr(module, "SMALL", 0)
-    assert reduced.solve(reduced.g) == pytest.approx(small, rel=1e-6, abs=1e-9)
-    reduced.S = -reduced.S
-    for limit in (0, 500):
-        monkeypatch.setattr(module, "SMALL", limit)
-        with pytest.raises(np.linalg.LinAlgError):
-            reduced.solve(reduced.g)
+def test_the_common_shift_is_that_of_an_adjustment_with_shifted_positions():
+    """Measured centres that are all shifted leave the block where control points hold it."""
+    block = make_block(5, lines=2, per_line=4, points=300, noise=0.0)
+    X0 = block.problem.X0.copy()
+    X0[:8] = block.truth.X[:8]
+    C0 = block.truth.C + [40.0, -30.0, 12.0]
+    problem = replace(
+        block.problem, X0=X0, sigma_X=np.full(X0.shape, 0.01), C0=C0, K0=block.truth.K, offset=True
+    )
+    found = adjust(problem, block.start, iterations=60, tolerance=1e-12)
+    assert np.abs(found.state.C - block.truth.C).max() < 0.15
 
 
-def test_the_sparse_adjustment_ends_where_the_dense_one_does(monkeypatch):
-    block = make_block(6, lines=2, per_line=4)
-    dense = adjust(block.problem, block.start, tolerance=1e-12)
-    monkeypatch.setattr(module, "DENSE_LIMIT", 10)
-    thin = adjust(block.problem, block.start, tolerance=1e-12)
-    assert pytest.approx(dense.state.C, abs=1e-6) == thin.state.C
-    assert thin.cost == pytest.approx(dense.cost, rel=1e-9)
+def test_the_divided_adjustment_ends_where_the_whole_does(monkeypatch):
+    block = make_block(6, lines=3, per_line=5)
+    whole = adjust(block.problem, block.start, tolerance=1e-12)
+    monkeypatch.setattr(block_cholesky, "LEAF", 3)
+    monkeypatch.setattr(equations, "LEAF", 3)
+    divided = adjust(block.problem, block.start, tolerance=1e-12)
+    assert pytest.approx(whole.state.C, abs=1e-6) == divided.state.C
+    assert divided.cost == pytest.approx(whole.cost, rel=1e-9)
+
+
+def test_an_undetermined_system_has_no_covariance():
+    block = make_block(6, lines=2, per_line=3)
+    nothing = replace(
+        block.problem,
+        C0=np.full_like(block.problem.C0, np.nan),
+        sigma_K=np.full_like(block.problem.sigma_K, -1.0),
+        trust=-1.0,
+    )
+    with np.errstate(invalid="ignore"):
+        assert covariance(nothing, block.start) is None
 
 
 # what it finds
@@ -231,7 +272,7 @@ def test_a_block_with_lies_is_recovered_within_its_deviations():
         dropped = len(block.problem.px) - len(problem.px)  # a point seen twice goes with its lie
         assert 0.8 < dropped / block.wrong.sum() < 2.2
         e, mask = unknowns_error(block, found.state), free_mask(block)
-        cov = covariance(problem, found.state)[np.ix_(mask, mask)]
+        cov = dense_covariance(covariance(problem, found.state))[np.ix_(mask, mask)]
         ratios.append(float(e[mask] @ np.linalg.solve(cov, e[mask])) / mask.sum())
         errors.append(float(np.sqrt(((found.state.C - block.truth.C)[:, :2] ** 2).mean())))
         assert np.abs(found.state.K[0, 0] - block.truth.K[0, 0]) < 20
@@ -266,7 +307,7 @@ def test_deviations_are_calibrated():
         problem = least_squares_only(block.problem)
         found = adjust(problem, block.start, iterations=40, tolerance=1e-10)
         e, mask = unknowns_error(block, found.state), free_mask(block)
-        cov = covariance(problem, found.state)[np.ix_(mask, mask)]
+        cov = dense_covariance(covariance(problem, found.state))[np.ix_(mask, mask)]
         total += float(e[mask] @ np.linalg.solve(cov, e[mask]))
         dof += int(mask.sum())
         per_axis.append((e[mask] / np.sqrt(np.diag(cov)))[-5:])
@@ -417,5 +458,5 @@ def test_too_few_positions_to_leave_one_out():
     C0 = block.problem.C0.copy()
     C0[0] = np.nan
     problem = replace(block.problem, C0=C0)
-    assert leave_one_out(problem, block.truth, np.eye(26)) is None
+    assert leave_one_out(problem, block.truth, covariance(problem, block.truth)) is None
     assert leave_one_out(block.problem, block.truth, None) is None

@@ -105,7 +105,7 @@ def test_the_readout_is_determined_where_lines_go_both_ways_without_turning():
         problem, truth, _ = block(seed)
         start = replace(truth, C=problem.C0, K=problem.K0.copy())
         found = adjust(problem, start, iterations=40, tolerance=1e-9).state
-        sigma = float(np.sqrt(covariance(problem, found)[-1, -1]))
+        sigma = float(np.sqrt(covariance(problem, found).cameras[-1, -1]))
         assert sigma < 0.1 * LENS.readout  # far below its prior of half the readout
         errors.append((found.K[0, READOUT] - LENS.readout) / sigma)
     assert np.sqrt(np.mean(np.square(errors))) < 2.2
@@ -116,12 +116,12 @@ def test_a_drone_that_turns_with_its_lines_leaves_readout_and_aspect_to_their_pr
     start = replace(truth, C=problem.C0, K=problem.K0.copy())
     found = adjust(problem, start, iterations=40, tolerance=1e-9).state
     full = covariance(problem, found)
-    sigma, shape = np.sqrt(full[-1, -1]), np.sqrt(full[-2, -2])
-    assert full[-1, -2] / sigma / shape < -0.6  # one makes up for the other
+    shape, sigma = full.camera_sigmas[0, -2:]
+    assert full.cameras[-1, -2] / sigma / shape < -0.6  # one makes up for the other
     other, truth, _ = block(fixed_yaw=True)
     start = replace(truth, C=other.C0, K=other.K0.copy())
     found = adjust(other, start, iterations=40, tolerance=1e-9).state
-    assert sigma > 3 * np.sqrt(covariance(other, found)[-1, -1])
+    assert sigma > 3 * np.sqrt(covariance(other, found).cameras[-1, -1])
 
 
 def test_turns_are_found_beside_readout():

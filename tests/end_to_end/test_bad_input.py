@@ -47,8 +47,16 @@ def test_a_folder_of_other_files(mosaic, tmp_path):
     folder = tmp_path / "other"
     folder.mkdir()
     (folder / "notes.txt").write_text("hello")
+    (folder / "flight.wmv").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(100))
+    mosaic(folder).refused(3, "only other files", "flight.wmv", "notes.txt")
+
+
+def test_only_a_torn_clip(mosaic, tmp_path):
+    folder = tmp_path / "other"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("hello")
     (folder / "flight.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(100))
-    mosaic(folder).refused(3, "only other files", "flight.mp4", "notes.txt")
+    mosaic(folder).refused(3, "flight.mp4", "cut off", "copy them again")
 
 
 def test_no_photo_is_readable(mosaic, photos):
@@ -147,7 +155,7 @@ def test_a_photo_that_cannot_be_read_any_more_when_the_map_is_drawn(mosaic, phot
     assert "Input/output error" in told.metrics["photos_rejected"]["SIM_0005.jpg"]
 
 
-def test_png_tiff_and_video_among_jpegs(mosaic, photos):
+def test_png_tiff_and_a_torn_clip_among_jpegs(mosaic, photos):
     first, second = named(photos)[:2]
     block = taken_apart(first.read_bytes())[0]
     Image.fromarray(pixels_of(first)).save(photos / "SIM_0001.png", exif=block)
@@ -157,9 +165,10 @@ def test_png_tiff_and_video_among_jpegs(mosaic, photos):
     (photos / "DJI_0001.MP4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(1000))
     (photos / "._SIM_0003.jpg").write_bytes(b"\0\5\x16\7")
     told = mosaic(photos).made()
-    assert told.metrics["photos_total"] == 9
+    assert told.metrics["photos_total"] == 10
     assert told.metrics["photos_used"] == 9
-    assert told.metrics["photos_rejected"] == {}
+    assert list(told.metrics["photos_rejected"]) == ["DJI_0001.MP4"]
+    assert "cut off" in told.metrics["photos_rejected"]["DJI_0001.MP4"]
 
 
 def test_two_cameras_are_both_used(mosaic, photos, flight):

@@ -111,7 +111,7 @@ KEYS = {
         ("alignment", "MOST_PAIRS"),
         ("alignment", "NOMINAL_HEIGHT_M"),
         ("alignment", "HALF_TURN"),
-        ("alignment", "DENSE_LIMIT"),
+        ("alignment", "ELIMINATED"),
         ("surface", "_SINGLE_TREE"),
         ("swept", "BORDER_PX"),
         ("swept", "TILE"),

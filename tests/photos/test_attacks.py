@@ -209,7 +209,7 @@ BAD = {
         "srt",
         "s.srt",
         "²\n00:00:00,000 --> 00:00:01,000\nGPS(13.1,52.1,15)\n".encode(),
-        "no latitude",
+        "no subtitles",
     ),
 }
 

@@ -7,13 +7,14 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.adjust import DENSE_LIMIT, adjust, camera_sigmas, covariance, robust_cost
+from skyquilt.alignment.adjust import Covariance, adjust, covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
 from skyquilt.alignment.deviations import believed, observed_noise, point_deviations, robust_scale
 from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
-from skyquilt.alignment.problem import CAMERA, READOUT, Problem, State, residuals_px, swept
+from skyquilt.alignment.problem import READOUT, Problem, State, residuals_px, swept
+from skyquilt.alignment.robust import robust_cost
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
 from skyquilt.alignment.start import Start, find_start
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
@@ -56,7 +57,7 @@ class Bundle:
     """
     match_observations: LeastSquaresMatching | None = field(default_factory=LeastSquaresMatching)
     """Refinement of observations in larger images; None leaves keypoints unchanged."""
-    version: ClassVar[int] = 18
+    version: ClassVar[int] = 19
 
     def __call__(
         self,
@@ -179,7 +180,7 @@ def _weighed(problem: Problem, state: State, setup: Setup) -> tuple[Problem, Sta
     """
     reach = np.linalg.norm(swept(problem, state), axis=1) / _heights(state)
     rolls = bool((reach * state.K[problem.camera, 0] > ROLLS_PX).any())
-    if rolls and 9 * len(state.C) + CAMERA * len(state.K) <= DENSE_LIMIT:
+    if rolls:
         readout = np.abs(state.K[problem.camera, READOUT])
         problem = replace(problem, sigma_turn=np.maximum(TURN_RAD_S * readout, 1e-9))
         state = adjust(problem, state, iterations=15, tolerance=1e-3, damping=1e-6).state
@@ -223,17 +224,7 @@ def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]
     good = (error < limit) | pinned[problem.point]
     enough = np.bincount(problem.point[good], minlength=len(state.X)) >= 2
     good &= enough[problem.point] | pinned[problem.point]
-    points, renumbered = np.unique(problem.point[good], return_inverse=True)
-    thinner = replace(
-        problem,
-        point=renumbered.astype(np.int64),
-        photo=problem.photo[good],
-        px=problem.px[good],
-        sigma_px=problem.sigma_px[good],
-        share=problem.share[good],
-        X0=problem.X0[points],
-        sigma_X=problem.sigma_X[points],
-    )
+    thinner, points = problem.only(good)
     return thinner, replace(state, X=state.X[points])
 
 
@@ -283,7 +274,7 @@ def position_noise(error: Array) -> float:
 
 
 def leave_one_out(
-    problem: Problem, state: State, C_covariance: Array | None
+    problem: Problem, state: State, covariance: Covariance | None
 ) -> tuple[float, float, float] | None:
     """RMS per axis in m of the difference between each measured position and its prediction from
     all other observations.
@@ -292,7 +283,7 @@ def leave_one_out(
     instead of n adjustments.
     """
     known = np.flatnonzero(np.isfinite(problem.C0[:, :2]).all(1))
-    if C_covariance is None or len(known) < 3:
+    if covariance is None or len(known) < 3:
         return None
     out = []
     for i in known:
@@ -302,8 +293,7 @@ def leave_one_out(
         precision = np.diag(1 / problem.sigma_C[i][axes] ** 2) / np.sqrt(
             1 + (white @ white) / problem.loss_C**2
         )
-        at = problem.photo_unknowns * i + 3
-        own = C_covariance[at : at + 3, at : at + 3][np.ix_(axes, axes)]
+        own = covariance.photos[i, 3:6, 3:6][np.ix_(axes, axes)]
         full = np.full(3, np.nan)
         full[axes] = np.linalg.solve(np.eye(len(e)) - own @ precision, e)
         out.append(full)
@@ -346,8 +336,10 @@ def _outcome(
     seen = np.bincount(ties.photo, minlength=len(photos))
     weak = {int(i): f"it has only {seen[i]} tie points" for i in setup.members if seen[i] < 8}
     full = covariance(problem, state)
-    cameras, camera_of = camera_records(photos, setup, state, full)
-    placed = pose_records(setup, state, full, problem.photo_unknowns)
+    cameras, camera_of = camera_records(
+        photos, setup, state, None if full is None else full.camera_sigmas
+    )
+    placed = pose_records(setup, state, None if full is None else full.photo_sigmas)
     poses = {i: p for i, p in placed.items() if i not in weak}
     blocks = tuple(tuple(i for i in b if i not in weak) for b in start.blocks)
     metric = frame.metric and (start.metric or any(not c.check for c in control))
@@ -368,7 +360,7 @@ def _outcome(
     )
 
 
-def _accuracy(setup: Setup, problem: Problem, state: State, covariance: Array) -> Accuracy:
+def _accuracy(setup: Setup, problem: Problem, state: State, covariance: Covariance) -> Accuracy:
     """Predicted deviations of a sample of ground points."""
     seen = np.flatnonzero(np.bincount(problem.point, minlength=len(state.X)) >= 2)
     sample = seen[:: max(1, len(seen) // SAMPLED)]
@@ -383,21 +375,21 @@ def _accuracy(setup: Setup, problem: Problem, state: State, covariance: Array) -
     )
 
 
-def _focal_share(problem: Problem, covariance: Array) -> float:
+def _focal_share(problem: Problem, covariance: Covariance) -> float:
     """Largest ratio of a focal length's deviation after the adjustment to that before."""
-    after = camera_sigmas(covariance, len(problem.K0))[:, 0]
+    after = covariance.camera_sigmas[:, 0]
     return float(np.max(np.where(problem.free[:, 0], after / problem.sigma_K[:, 0], 0.0)))
 
 
 def _undetermined(
-    setup: Setup, problem: Problem, state: State, covariance: Array | None
+    setup: Setup, problem: Problem, state: State, covariance: Covariance | None
 ) -> tuple[str, ...]:
     """Sentences about what the flight does not determine."""
     if covariance is None:
         return ()
     notes = []
     height = float(np.median(_heights(state)))
-    after = camera_sigmas(covariance, len(problem.K0))[:, 0]
+    after = covariance.camera_sigmas[:, 0]
     for row, key in enumerate(setup.camera_keys):
         share = float(after[row] / state.K[row, 0])
         told = float(problem.sigma_K[row, 0] / state.K[row, 0])

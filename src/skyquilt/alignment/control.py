@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from skyquilt.alignment.adjust import adjust
+from skyquilt.alignment.adjust import Covariance, adjust
 from skyquilt.alignment.deviations import point_deviations
 from skyquilt.alignment.heights import control_height
 from skyquilt.alignment.problem import Problem, State, residuals_px
@@ -226,7 +226,7 @@ def residuals_of_control(
     setup: Setup,
     problem: Problem,
     state: State,
-    covariance: Array | None = None,
+    covariance: Covariance | None = None,
 ) -> tuple[ControlResidual, ...]:
     """Errors of all control and check points at the solution, intersected from the final poses
     alone.

@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.adjust import normal_equations
+from skyquilt.alignment.adjust import Covariance
+from skyquilt.alignment.equations import observation_equations
 from skyquilt.alignment.problem import CAMERA, Problem, State, residuals_px
 
 Array = NDArray[np.float64]
@@ -86,7 +87,7 @@ def _alike(problem: Problem, psi: Array, size: Array) -> float:
 
 
 def point_deviations(
-    problem: Problem, state: State, covariance: Array, points: NDArray[np.int64]
+    problem: Problem, state: State, covariance: Covariance, points: NDArray[np.int64]
 ) -> Array:
     """Standard deviations (k, 3) in m of points of a problem.
 
@@ -96,19 +97,22 @@ def point_deviations(
         covariance: of photos and cameras, as from `adjust.covariance`.
         points: (k,) which points.
     """
-    normal = normal_equations(replace(problem, trust=1.0), state)
+    own, _ = replace(problem, trust=1.0).only(np.isin(problem.point, points))
+    normal = observation_equations(own, replace(state, X=state.X[np.sort(points)]))
     p, q = normal.Wp.shape[1], normal.Wc.shape[1]
-    n, first = len(state.C), np.searchsorted(problem.point, np.arange(len(state.X) + 1))
+    first = np.searchsorted(own.point, np.arange(len(points) + 1))
     out = np.full((len(points), 3), np.nan)
-    for k, point in enumerate(points.tolist()):
-        own = slice(first[point], first[point + 1])
-        photo = problem.photo[own]
-        camera = p * n + CAMERA * problem.camera[photo][:, None] + np.arange(q)
-        at = np.concatenate([(p * photo[:, None] + np.arange(p)).ravel(), camera.ravel()])
-        W = np.concatenate([normal.Wp[own].reshape(-1, 3), normal.Wc[own].reshape(-1, 3)])
+    for k, point in enumerate(np.argsort(np.argsort(points)).tolist()):
+        seen = slice(first[point], first[point + 1])
+        photo = own.photo[seen]
+        local = np.arange(p * len(photo))
+        camera = len(local) + CAMERA * own.camera[photo][:, None] + np.arange(q)
+        at = np.concatenate([local, camera.ravel()])
+        W = np.concatenate([normal.Wp[seen].reshape(-1, 3), normal.Wc[seen].reshape(-1, 3)])
         V = normal.V[point] + 1e-9 * np.eye(3)
         moved = np.linalg.solve(V, W.T)
-        total = np.linalg.inv(V) + moved @ covariance[np.ix_(at, at)] @ moved.T
+        among = covariance.of(photo)[np.ix_(at, at)]
+        total = np.linalg.inv(V) + moved @ among @ moved.T
         out[k] = np.sqrt(np.maximum(np.diag(total), 0.0))
     return out
 

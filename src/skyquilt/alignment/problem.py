@@ -1,6 +1,8 @@
 """A bundle adjustment problem: unknowns, observations, and priors with their deviations."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +17,10 @@ READOUT = len(PARAMETERS)
 """Column of a camera's readout time in s, after the intrinsics."""
 CAMERA = READOUT + 1
 """Unknowns of a camera."""
+PART = 8192
+"""Observations that are computed at once, about: what a computation holds then stays small, however
+large the survey.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,6 +120,58 @@ class Problem:
         """The same problem with another scale of the loss on observations."""
         return replace(self, loss_px=loss_px)
 
+    def at(self, observations: NDArray[np.bool_] | slice) -> "Problem":
+        """The problem with some of its observations; points keep their numbers."""
+        return replace(
+            self,
+            point=self.point[observations],
+            photo=self.photo[observations],
+            px=self.px[observations],
+            sigma_px=self.sigma_px[observations],
+            share=self.share[observations],
+            trust=self.trust[observations] if isinstance(self.trust, np.ndarray) else self.trust,
+        )
+
+    def only(self, observations: NDArray[np.bool_]) -> tuple["Problem", Index]:
+        """The problem with some of its observations and with the points that these show,
+        renumbered; and the numbers these points had.
+        """
+        points, number = np.unique(self.point[observations], return_inverse=True)
+        thinner = replace(
+            self.at(observations),
+            point=number.astype(np.int64),
+            X0=self.X0[points],
+            sigma_X=self.sigma_X[points],
+        )
+        return thinner, points
+
+    def cuts(self, about: int) -> list[int]:
+        """Borders of ranges of about so many observations, each of whole points."""
+        if len(self.point) <= about:
+            return [0, len(self.point)]
+        starts = np.flatnonzero(np.r_[True, np.diff(self.point) != 0])
+        wanted = np.arange(about, len(self.point), about)
+        inner = np.unique(starts[np.searchsorted(starts, wanted, "right") - 1])
+        return [0, *inner[inner > 0].tolist(), len(self.point)]
+
+    def parts(self, state: "State") -> Iterator[tuple["Problem", "State", slice]]:
+        """The problem in parts of whole points, with the state of those points and which they
+        are.
+        """
+        for lo, hi in pairwise(self.cuts(PART)):
+            if lo == hi:
+                continue
+            first, last = int(self.point[lo]), int(self.point[hi - 1]) + 1
+            part = self.at(slice(lo, hi))
+            points = slice(first, last)
+            yield (
+                replace(
+                    part, point=part.point - first, X0=self.X0[points], sigma_X=self.sigma_X[points]
+                ),
+                replace(state, X=state.X[points]),
+                points,
+            )
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Linearised:
@@ -201,9 +259,13 @@ def residuals_px(problem: Problem, state: State) -> Array:
     """Image residuals (N, 2) in px, projected minus observed; NaN for points behind their
     camera.
     """
-    local, _, behind = _local(problem, state)
-    px = pixels(local[:, :2] / local[:, 2:], state.K[problem.camera[problem.photo], :READOUT])
-    return np.where(behind[:, None], np.nan, px - problem.px)
+    out = np.empty(problem.px.shape)
+    for lo in range(0, len(out), PART):
+        part = problem.at(slice(lo, lo + PART))
+        local, _, behind = _local(part, state)
+        px = pixels(local[:, :2] / local[:, 2:], state.K[part.camera[part.photo], :READOUT])
+        out[lo : lo + PART] = np.where(behind[:, None], np.nan, px - part.px)
+    return out
 
 
 def attitude_error(R: Array, R0: Array) -> Array:

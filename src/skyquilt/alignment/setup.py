@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.adjust import camera_sigmas
 from skyquilt.alignment.motion import velocities
 from skyquilt.alignment.problem import READOUT, Problem, State
 from skyquilt.alignment.start import Start
@@ -294,11 +293,9 @@ def _calibrated_sigma(camera: Camera, sigma_focal: float) -> Array:
     return np.asarray(np.maximum(stated, least))
 
 
-def pose_records(
-    setup: Setup, state: State, covariance: Array | None = None, unknowns: int = 6
-) -> dict[int, Pose]:
+def pose_records(setup: Setup, state: State, sigmas: Array | None = None) -> dict[int, Pose]:
     """Poses of the files (for a turned file, the pose of the sensor turned by 180 degrees);
-    `unknowns` of a photo in the covariance.
+    `sigmas` (n, 3): deviations of the centres in m.
     """
     shift = setup.base.velocity * state.K[setup.camera, READOUT, None]
     poses = {}
@@ -310,25 +307,22 @@ def pose_records(
             motion = motion and Motion(
                 shift_m=-motion.shift_m, turn_rad=-HALF_TURN @ motion.turn_rad
             )
-        sigma = None
-        if covariance is not None:
-            at = unknowns * row + 3 + np.arange(3)
-            sigma = np.sqrt(np.abs(covariance[at, at]))
+        sigma = None if sigmas is None else sigmas[row]
         poses[m] = Pose(cam_R_map=R, map_C=state.C[row], motion=motion, sigma_m=sigma)
     return poses
 
 
 def camera_records(
-    photos: Sequence[Photo], setup: Setup, state: State, covariance: Array | None
+    photos: Sequence[Photo], setup: Setup, state: State, deviations: Array | None
 ) -> tuple[dict[str, Camera], dict[int, str]]:
-    """Calibrations with deviations, and the name of each photo's calibration."""
+    """Calibrations with deviations (m, 10), and the name of each photo's calibration."""
     cameras: dict[str, Camera] = {}
     for row, key in enumerate(setup.camera_keys):
         photo = next(p for p in photos if p.camera_key == key)
         *lens, readout = (float(v) for v in state.K[row])
         sigmas = sigma_readout = None
-        if covariance is not None:
-            spread = camera_sigmas(covariance, len(state.K))[row] * setup.base.free[row]
+        if deviations is not None:
+            spread = deviations[row] * setup.base.free[row]
             sigmas, sigma_readout = tuple(spread[:-1].tolist()), float(spread[-1])
         cameras[key] = Camera(
             width=photo.width,

@@ -1,0 +1,323 @@
+"""Cholesky factors of large sparse matrices whose unknowns come in blocks that lie in a plane.
+
+A photo's block of unknowns is coupled only with those of photos that show the same ground. *Nested
+dissection* (George 1973) eliminates the blocks on both sides of a line first and those along it
+last, again and again; the *multifrontal* method (Duff and Reid 1983) does so in small dense
+matrices. For a survey of n photos the cost grows as n^1.5 and the memory as n log n, instead of n^3
+and n^2. Unknowns that are coupled with all others, the *border* (cameras), are eliminated last.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+LEAF = 40
+"""Blocks that are eliminated together without another division."""
+WORTHWHILE = 0.35
+"""A division is taken when its line holds at most this share of the blocks."""
+SMALL = 500
+"""Largest matrix that NumPy factors. SciPy's triangular solver takes less time, but loading it
+takes longer than it saves on small problems.
+"""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Front:
+    """Blocks eliminated together, and what they are coupled with after all before them are gone."""
+
+    own: Index
+    """The blocks."""
+    unknowns: Index
+    """Rows of the whole matrix: first the blocks' own, then the coupled ones."""
+    eliminated: int
+    """How many of them are the blocks' own."""
+    parent: int
+    """The front that takes what is left; -1 for the last."""
+    pairs: Index
+    """Coupled pairs of blocks of which the first eliminated block is one of `own`."""
+    rows: Index
+    """(len(pairs), p) rows of each pair's first block in the front."""
+    columns: Index
+    """(len(pairs), p) rows of its second block."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Pattern:
+    """Which blocks are coupled, and the order in which they are eliminated."""
+
+    count: int
+    """Blocks."""
+    size: int
+    """Unknowns p of a block."""
+    border: int
+    """Unknowns coupled with all blocks, at the end of the matrix."""
+    first: Index
+    """(E,) first block of each coupled pair, itself included, ..."""
+    second: Index
+    """(E,) ... and the second, never less; sorted by both."""
+    key: Index
+    """(E,) ascending numbers of the pairs, first times `count` plus second."""
+    fronts: tuple[Front, ...]
+    """In order of elimination."""
+
+    def find(self, a: Index, b: Index) -> Index:
+        """Pairs a <= b, by their place; -1 where they are not coupled."""
+        wanted = a * self.count + b
+        at = np.minimum(np.searchsorted(self.key, wanted), len(self.key) - 1)
+        return np.where(self.key[at] == wanted, at, -1)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Matrix:
+    """A symmetric matrix of blocks."""
+
+    pattern: Pattern
+    """Which blocks it has."""
+    blocks: Array
+    """(E, p, p) block of each coupled pair."""
+    beside: Array
+    """(n, p, b) blocks with the border."""
+    corner: Array
+    """(b, b) the border with itself."""
+
+
+def pattern(place: Array, size: int, border: int, a: Index, b: Index) -> Pattern:
+    """The order of elimination.
+
+    Args:
+        place: (n, 2) where the blocks lie in the plane; only the cost depends on it.
+        size: unknowns of a block.
+        border: unknowns coupled with all blocks.
+        a: coupled blocks, ...
+        b: ... and those they are coupled with, in any order; repeated pairs do no harm.
+    """
+    n = len(place)
+    key = np.unique(
+        np.concatenate([np.minimum(a, b) * n + np.maximum(a, b), np.arange(n) * (n + 1)])
+    )
+    first, second = key // n, key % n
+    apart = first != second
+    groups = list(_dissected(np.arange(n), first[apart], second[apart], place))
+    return Pattern(
+        count=n,
+        size=size,
+        border=border,
+        first=first,
+        second=second,
+        key=key,
+        fronts=_fronts(n, size, border, first, second, groups),
+    )
+
+
+def _dissected(nodes: Index, a: Index, b: Index, place: Array) -> Iterator[tuple[Index, int]]:
+    """(blocks, number of groups below) of each group in order of elimination; a, b: pairs among the
+    nodes.
+    """
+    cut = _cut(nodes, a, b, place) if len(nodes) > LEAF else None
+    if cut is None:
+        yield nodes, 0
+        return
+    side, below = cut, 0
+    for number in (0, 1):
+        part = nodes[side[nodes] == number]
+        if not len(part):
+            continue
+        inside = (side[a] == number) & (side[b] == number)
+        for group in _dissected(part, a[inside], b[inside], place):
+            below += 1
+            yield group
+    yield nodes[side[nodes] == 2], below
+
+
+def _cut(nodes: Index, a: Index, b: Index, place: Array) -> NDArray[np.int8] | None:
+    """The side of each block, 0 or 1, or 2 on the line between; None if no line is worth it."""
+    best, least = None, int(WORTHWHILE * len(nodes))
+    for axis in (0, 1):
+        order = nodes[np.argsort(place[nodes, axis], kind="stable")]
+        side = np.zeros(len(place), np.int8)
+        side[order[len(order) // 2 :]] = 1
+        across = side[a] != side[b]
+        for number in (0, 1):
+            line = np.unique(np.where(side[a[across]] == number, a[across], b[across]))
+            if len(line) <= least:
+                best, least = side.copy(), len(line)
+                best[line] = 2
+    return best
+
+
+def _fronts(
+    n: int, size: int, border: int, first: Index, second: Index, groups: list[tuple[Index, int]]
+) -> tuple[Front, ...]:
+    """The groups with what they are coupled with."""
+    order = np.concatenate([own for own, _ in groups])
+    group_of, rank = np.empty(n, np.int64), np.empty(n, np.int64)
+    group_of[order] = np.repeat(np.arange(len(groups)), [len(own) for own, _ in groups])
+    rank[order] = np.arange(n)
+    parents = _parents([below for _, below in groups])
+    earlier = np.minimum(group_of[first], group_of[second])
+    by_group = np.argsort(earlier, kind="stable")
+    cuts = np.searchsorted(earlier[by_group], np.arange(len(groups) + 1))
+    steps, last = np.arange(size), n * size + np.arange(border)
+    coupled = [list[Index]() for _ in groups]
+    at, fronts = np.empty(n, np.int64), list[Front]()
+    for k, (own, _) in enumerate(groups):
+        pairs = by_group[cuts[k] : cuts[k + 1]]
+        ends = np.concatenate([first[pairs], second[pairs], *coupled[k]])
+        beyond = np.unique(ends[group_of[ends] > k])
+        beyond = beyond[np.argsort(rank[beyond], kind="stable")]
+        if parents[k] >= 0:
+            coupled[parents[k]].append(beyond)
+        members = np.concatenate([own, beyond])
+        at[members] = np.arange(len(members))
+        fronts.append(
+            Front(
+                own=own,
+                unknowns=np.concatenate([(members[:, None] * size + steps).ravel(), last]),
+                eliminated=len(own) * size + (border if parents[k] < 0 else 0),
+                parent=parents[k],
+                pairs=pairs,
+                rows=at[first[pairs]][:, None] * size + steps,
+                columns=at[second[pairs]][:, None] * size + steps,
+            )
+        )
+    return tuple(fronts)
+
+
+def _parents(below: list[int]) -> list[int]:
+    """The front that takes what each leaves, from the number of fronts below each; -1 for the
+    last.
+    """
+    parents, waiting = [-1] * len(below), list[int]()
+    for k, number in enumerate(below):
+        while waiting and waiting[-1] >= k - number:
+            parents[waiting.pop()] = k
+        waiting.append(k)
+    return parents
+
+
+class Factor:
+    """The Cholesky factor of a matrix.
+
+    Raises:
+        LinAlgError: the matrix is not positive definite.
+    """
+
+    def __init__(self, matrix: Matrix) -> None:
+        self.pattern = matrix.pattern
+        self.total = matrix.pattern.count * matrix.pattern.size + matrix.pattern.border
+        self._parts = list[tuple[Array, Array]]()
+        """Of each front: L (e, e) of the eliminated rows, and M (c, e) below it, S = L M^T."""
+        left = dict[int, list[tuple[Index, Array]]]()
+        for k, front in enumerate(self.pattern.fronts):
+            whole = _assembled(matrix, front)
+            for unknowns, rest in left.pop(k, []):
+                at = _places(front.unknowns, unknowns, self.total)
+                whole[at[:, None], at] += rest
+            e = front.eliminated
+            L = _cholesky(whole[:e, :e])
+            M = _forward(L, whole[:e, e:]).T if e < len(whole) else np.zeros((0, e))
+            self._parts.append((L, M))
+            if front.parent >= 0:
+                rest = whole[e:, e:] - M @ M.T
+                left.setdefault(front.parent, []).append((front.unknowns[e:], rest))
+
+    def solve(self, rhs: Array) -> Array:
+        """The matrix's inverse times rhs (total,) or (total, k)."""
+        x = np.array(rhs, float)
+        for front, (L, M) in zip(self.pattern.fronts, self._parts, strict=True):
+            e = front.eliminated
+            x[front.unknowns[:e]] = half = _forward(L, x[front.unknowns[:e]])
+            x[front.unknowns[e:]] -= M @ half
+        for front, (L, M) in zip(self.pattern.fronts[::-1], self._parts[::-1], strict=True):
+            e = front.eliminated
+            rest = x[front.unknowns[:e]] - M.T @ x[front.unknowns[e:]]
+            x[front.unknowns[:e]] = _backward(L, rest)
+        return x
+
+    def selected_inverse(self) -> Matrix:
+        """The inverse where the matrix has blocks (Erisman and Tinney 1975), from the last front to
+        the first.
+        """
+        pattern, p = self.pattern, self.pattern.size
+        blocks = np.empty((len(pattern.first), p, p))
+        beside = np.empty((pattern.count, p, pattern.border))
+        corner = np.zeros((pattern.border, pattern.border))
+        waiting = np.array([f.parent for f in pattern.fronts])
+        known = dict[int, Array]()
+        for k in range(len(pattern.fronts) - 1, -1, -1):
+            front, (L, M) = pattern.fronts[k], self._parts[k]
+            e = front.eliminated
+            inverse_L = _forward(L, np.eye(e))
+            Z = np.empty((len(front.unknowns),) * 2)
+            if front.parent < 0:
+                Z[:, :] = inverse_L.T @ inverse_L
+                corner = Z[e - pattern.border :, e - pattern.border :].copy()
+            else:
+                at = _places(pattern.fronts[front.parent].unknowns, front.unknowns[e:], self.total)
+                beyond = known[front.parent][at[:, None], at]
+                down = M @ inverse_L
+                Z[e:, e:] = beyond
+                Z[e:, :e] = -beyond @ down
+                Z[:e, e:] = Z[e:, :e].T
+                Z[:e, :e] = inverse_L.T @ inverse_L - down.T @ Z[e:, :e]
+            blocks[front.pairs] = Z[front.rows[:, :, None], front.columns[:, None, :]]
+            own = len(front.own) * p
+            beside[front.own] = Z[:own, len(Z) - pattern.border :].reshape(
+                len(front.own), p, pattern.border
+            )
+            known[k] = Z
+            known = {j: z for j, z in known.items() if (waiting[:k] == j).any()}
+        return Matrix(pattern=pattern, blocks=blocks, beside=beside, corner=corner)
+
+
+def _assembled(matrix: Matrix, front: Front) -> Array:
+    """The rows of a front in the matrix itself."""
+    b, p = matrix.pattern.border, matrix.pattern.size
+    whole = np.zeros((len(front.unknowns),) * 2)
+    own, size = len(front.own) * p, len(whole)
+    blocks = matrix.blocks[front.pairs]
+    whole[front.rows[:, :, None], front.columns[:, None, :]] = blocks
+    whole[front.columns[:, :, None], front.rows[:, None, :]] = np.swapaxes(blocks, 1, 2)
+    beside = matrix.beside[front.own].reshape(own, b)
+    whole[:own, size - b :] = beside
+    whole[size - b :, :own] = beside.T
+    if front.parent < 0:
+        whole[size - b :, size - b :] = matrix.corner
+    return whole
+
+
+def _places(among: Index, wanted: Index, total: int) -> Index:
+    """Where each of the wanted unknowns stands among others."""
+    at = np.empty(total, np.int64)
+    at[among] = np.arange(len(among))
+    return at[wanted]
+
+
+def _cholesky(A: Array) -> Array:
+    if len(A) <= SMALL:
+        return np.asarray(np.linalg.cholesky(A), np.float64)
+    from scipy import linalg
+
+    return np.asarray(linalg.cholesky(A, lower=True, check_finite=False))
+
+
+def _forward(L: Array, rhs: Array) -> Array:
+    """L^-1 rhs."""
+    if len(L) <= SMALL:
+        return np.asarray(np.linalg.solve(L, rhs))
+    from scipy import linalg
+
+    return np.asarray(linalg.solve_triangular(L, rhs, lower=True, check_finite=False))
+
+
+def _backward(L: Array, rhs: Array) -> Array:
+    """L^-T rhs."""
+    if len(L) <= SMALL:
+        return np.asarray(np.linalg.solve(L.T, rhs))
+    from scipy import linalg
+
+    return np.asarray(linalg.solve_triangular(L, rhs, lower=True, trans="T", check_finite=False))
