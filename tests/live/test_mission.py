@@ -209,3 +209,49 @@ def test_a_mission_without_photos_is_planned_and_its_state_is_written(tmp_path):
     finally:
         live.close()
         shutil.rmtree(tmp_path / "o")
+
+
+def test_shapes_of_gis_files_become_layers(tmp_path):
+    from skyquilt.errors import UsageError
+    from skyquilt.server.layer_files import layer_of_file
+
+    (tmp_path / "a.kml").write_text(
+        '<kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><name>way</name><LineString>'
+        "<coordinates>13.1,52.1 13.2,52.15</coordinates></LineString></Placemark></kml>"
+    )
+    live = LiveMap(tmp_path / "o", QUICK)
+    try:
+        layer_of_file(live.ledger, tmp_path / "a.kml", 3)
+        (body,) = live.ledger.row("select body from layer where name = 'a.kml'")
+        (found,) = json.loads(body)["features"]
+        assert found["properties"]["name"] == "way"
+        assert found["geometry"]["coordinates"] == [[13.1, 52.1], [13.2, 52.15]]
+        (tmp_path / "b.kml").write_text((tmp_path / "a.kml").read_text())
+        with pytest.raises(UsageError, match="1 layers already"):
+            layer_of_file(live.ledger, tmp_path / "b.kml", 1)
+    finally:
+        live.close()
+
+
+def test_older_maps_are_layers_below_also_as_mbtiles(tmp_path):
+    from skyquilt.errors import UsageError
+    from skyquilt.raster.map_source import between, picture
+    from skyquilt.raster.mbtiles import write_mbtiles
+    from skyquilt.server.survey import base_map
+
+    tile = cv2.imencode(".png", np.full((256, 256, 4), (40, 80, 160, 255), np.uint8))[1].tobytes()
+    x, y = between("EPSG:4326", "EPSG:3857").transform(13.1, 52.1)
+    half = 20037508.342789244
+    z, size = 18, 2 * half / 2**18
+    column, row = int((x + half) / size), int((half - y) / size)
+    write_mbtiles(tmp_path / "old.mbtiles", [(z, column, row, tile)], name="old",
+                  bounds=(13.09, 52.09, 13.11, 52.11), zooms=(z, z))  # fmt: skip
+    found = base_map([tmp_path / "old.mbtiles", tmp_path / "old.mbtiles"])
+    assert list(found) == ["base", "base-2"]
+    west, north = column * size - half, half - row * size
+    box = (west + 0.3 * size, north - 0.7 * size, west + 0.7 * size, north - 0.3 * size)
+    rgba = picture(found["base"], "EPSG:3857", box, 64, 64)
+    assert rgba is not None and tuple(rgba[32, 32]) == (160, 80, 40, 255)
+    (tmp_path / "no.tif").write_text("no map")
+    with pytest.raises(UsageError, match="not a georeferenced map"):
+        base_map([tmp_path / "no.tif"])

@@ -74,7 +74,14 @@ def command(
     thermal_unit: ThermalUnit = None,
     max_view_angle: MaxViewAngle = 70.0,
     base: Annotated[
-        Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")
+        list[Path] | None,
+        typer.Option(help="An older map (GeoTIFF, COG, MBTiles) to show below (repeatable)."),
+    ] = None,
+    layer: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Shapes to show over the map: GeoJSON, KML, GeoPackage, Shapefile (repeatable)."
+        ),
     ] = None,
     plan: Annotated[
         Path | None,
@@ -110,6 +117,7 @@ def command(
         from skyquilt.live.settings import LiveSettings
         from skyquilt.live.workflow import iter_live
         from skyquilt.server.access import Guard
+        from skyquilt.server.layer_files import layer_of_file
         from skyquilt.server.server_process import ServerConfig, ServerProcess
     settings = LiveSettings(
         gsd_cm=gsd,
@@ -131,13 +139,15 @@ def command(
     )
     live = LiveMap(output, settings)
     try:
+        for path in layer or ():
+            layer_of_file(live.ledger, path, guard.most_layers)
         if known_plan(output, plan) is None and fill:
             raise UsageError("--fill needs a plan; give --plan")
         asked = ServerConfig(
             folder=output,
             settings=settings,
             guard=guard,
-            base=base,
+            base=tuple(base or ()),
             most_memory=int(viewer_memory * 1e9),
         )
         advice = "no accepted photo is lost: the same command continues"

@@ -63,8 +63,8 @@ class ServerConfig:
     """The process that starts it, with which it ends."""
     most_memory: int = 1_500_000_000
     """Resident memory in bytes at which it is ended and started anew; 0 = no limit."""
-    base: Path | None = None
-    """An older orthophoto as a further layer; None = none."""
+    base: tuple[Path, ...] = ()
+    """Older maps as further layers."""
 
 
 @dataclass(kw_only=True)

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -92,17 +92,18 @@ def _is_tiff(path: Path) -> bool:
         return False
 
 
-def base_map(path: Path | None) -> dict[str, MapSource]:
-    """An older orthophoto as a layer; empty if no path is given.
+def base_map(paths: Path | Sequence[Path] | None) -> dict[str, MapSource]:
+    """Older maps (GeoTIFF, COG, MBTiles) as layers `base`, `base-2` ...; empty if none is given.
 
     Raises:
-        UsageError: it is not a georeferenced raster.
+        UsageError: one is not a georeferenced raster.
     """
-    if path is None:
-        return {}
-    if open_map(path) is None or not FileSource(path=path).crs:
-        raise UsageError(f"--base {path} is not a georeferenced map that GDAL can read")
-    return {"base": FileSource(path=path)}
+    found: dict[str, MapSource] = {}
+    for number, path in enumerate([paths] if isinstance(paths, Path) else paths or (), 1):
+        if open_map(path) is None or not FileSource(path=path).crs:
+            raise UsageError(f"--base {path} is not a georeferenced map that GDAL can read")
+        found["base" if number == 1 else f"base-{number}"] = FileSource(path=path)
+    return found
 
 
 class LiveSurvey:
@@ -110,8 +111,8 @@ class LiveSurvey:
 
     growing = True
 
-    def __init__(self, folder: Path, *, base: Path | None = None) -> None:
-        """Opens it for reading; `base` is an older orthophoto.
+    def __init__(self, folder: Path, *, base: Path | Sequence[Path] | None = None) -> None:
+        """Opens it for reading; `base` are older maps.
 
         Raises:
             OutputError: it cannot be read. UsageError: `base` is not a map.

@@ -143,6 +143,14 @@
     L.geoJSON(await answer.json(), { pointToLayer: (f, p) => L.circleMarker(p, { radius: 5, color: "#7c3aed", weight: 2, fillOpacity: 0.4, interactive: false }) }).addTo(follow);
   };
 
+  // -- photos placed by their metadata alone: pale, with a dashed outline, until they are refined
+  const provisional = L.layerGroup().addTo(map);
+  const unsure = () => {
+    provisional.clearLayers();
+    for (const p of state.photos.values()) if (p.state === "placed" && p.ring && p.ring.length > 2) L.polygon(p.ring.map(([x, y]) => [y, x]), { color: "#fff", weight: 2, dashArray: "4 5", fillColor: "#fff", fillOpacity: 0.22, interactive: false }).addTo(provisional);
+  };
+  const unsureSoon = soon(async () => unsure(), 350);
+
   // -- news
   const listen = () => {
     const news = new EventSource("/events");
@@ -155,8 +163,9 @@
       readSoon();
     });
     news.addEventListener("coverage", coverSoon);
+    news.addEventListener("photo", unsureSoon);
   };
   kept(); show();
   read().then(readCover).catch(() => {}).then(() => { if (!section.hidden) listen(); });
-  window.skyquilt.plan = { shapes: () => shapes, marks, cover: () => sharing };
+  window.skyquilt.plan = { shapes: () => shapes, marks, cover: () => sharing, provisional };
 })();
