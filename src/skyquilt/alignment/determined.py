@@ -85,8 +85,13 @@ class _Growth:
         left, reasons = photos - {start}, dict[int, str]()
         self._join(start)
         tried = np.zeros(len(self.number), np.int64)
-        while ready := [i for i in left if self.number[i] > AGAIN * tried[i]]:
-            photo = max(ready, key=lambda i: (self.number[i], -i))
+        among_left = np.zeros(len(self.number), np.bool_)
+        among_left[list(left)] = True
+        while True:
+            ready = np.flatnonzero(among_left & (self.number > AGAIN * tried))
+            if not len(ready):
+                break
+            photo = int(ready[np.argmax(self.number[ready])])
             tried[photo] = self.number[photo]
             why = self._why_weak(photo)
             if why:
@@ -94,6 +99,7 @@ class _Growth:
                 continue
             reasons.pop(photo, None)
             left.remove(photo)
+            among_left[photo] = False
             self._join(photo)
         return {i: reasons.get(i) or self._why_weak(i) for i in sorted(left)}
 
@@ -101,8 +107,10 @@ class _Growth:
         points = self.alignment.ties.point[self.own[photo]]
         new = np.unique(points[~self.shown[points]])
         self.shown[new] = True
-        for a, b in zip(self.first[new].tolist(), self.first[new + 1].tolist(), strict=True):
-            self.number[self.alignment.ties.photo[a:b]] += 1
+        length = self.first[new + 1] - self.first[new]
+        within = np.arange(int(length.sum())) - np.repeat(np.cumsum(length) - length, length)
+        seen = self.alignment.ties.photo[np.repeat(self.first[new], length) + within]
+        self.number += np.bincount(seen, minlength=len(self.number))
 
     def _why_weak(self, photo: int) -> str:
         ties, own = self.alignment.ties, self.own[photo]

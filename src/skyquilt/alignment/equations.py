@@ -19,7 +19,7 @@ from skyquilt.geometry.block_cholesky import LEAF, Factor, Index, Matrix, patter
 Array = NDArray[np.float64]
 KEPT = 100_000
 """Observations of which the equations of a state are kept (1 kB each) until they are used again."""
-ELIMINATED = 512
+ELIMINATED = 160
 """Observations whose points are eliminated at once, about: few enough to be of few photos."""
 
 

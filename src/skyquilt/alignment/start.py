@@ -81,7 +81,8 @@ def find_start(
     georeferenced: set[int] = set()
     metric = True
     for solution in solutions:
-        inner = [plane[key] for key in kept if key[0] in set(solution.members.tolist())]
+        members = set(solution.members.tolist())
+        inner = [plane[key] for key in kept if key[0] in members]
         solution, spread, scaled = georeference(
             solution, inner, [priors[m] for m in solution.members]
         )

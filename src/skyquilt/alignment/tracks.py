@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -128,12 +129,34 @@ def build_tracks(
     repeated = np.flatnonzero((np.diff(track) == 0) & (np.diff(photo) == 0))
     good = ~np.isin(track, track[repeated])
     used, photo, track = used[good], photo[good], track[good]
-    _, point = np.unique(track, return_inverse=True)
-    px = np.concatenate([f.px for f in features])[used]
-    scale = np.array([f.scale for f in features])[photo]
+    order, point = _by_photos(track, photo)
+    used, photo = used[order], photo[order]
+    px, scale = np.empty((len(used), 2)), np.empty(len(used))
+    by_photo = np.argsort(photo, kind="stable")
+    cuts = np.searchsorted(photo[by_photo], np.arange(len(features) + 1))
+    for i, (lo, hi) in enumerate(pairwise(cuts.tolist())):
+        if lo < hi:
+            own = by_photo[lo:hi]
+            px[own], scale[own] = features[i].px[used[own] - offset[i]], features[i].scale
     return Tracks(
         point=point.astype(np.int64), photo=photo, px=px, sigma_px=np.maximum(sigma * scale, 0.3)
     )
+
+
+def _by_photos(track: Index, photo: Index) -> tuple[Index, Index]:
+    """The order of observations in which tracks that the same photos show follow one another, and
+    the number of each one's track: so neighbouring observations are of few photos.
+
+    `track` (N,) ascending, `photo` (N,) ascending within each track.
+    """
+    starts = np.flatnonzero(np.r_[True, np.diff(track) != 0])
+    length = np.diff(np.r_[starts, len(track)])
+    nth = [photo[starts + np.minimum(k, length - 1)] for k in range(3)]
+    place = np.empty(len(starts), np.int64)
+    place[np.lexsort((np.arange(len(starts)), *nth[::-1]))] = np.arange(len(starts))
+    number = np.repeat(place, length)
+    order = np.argsort(number, kind="stable")
+    return order, number[order]
 
 
 def thin(

@@ -20,8 +20,8 @@ LEAF = 40
 WORTHWHILE = 0.35
 """A division is taken when its line holds at most this share of the blocks."""
 SMALL = 500
-"""Largest matrix that NumPy factors. SciPy's triangular solver takes less time, but loading it
-takes longer than it saves on small problems.
+"""Largest system that NumPy solves. SciPy's triangular solver takes less time, but loading it takes
+longer than it saves on small systems.
 """
 
 
@@ -209,6 +209,7 @@ class Factor:
     def __init__(self, matrix: Matrix) -> None:
         self.pattern = matrix.pattern
         self.total = matrix.pattern.count * matrix.pattern.size + matrix.pattern.border
+        self._plain = self.total <= SMALL
         self._parts = list[tuple[Array, Array]]()
         """Of each front: L (e, e) of the eliminated rows, and M (c, e) below it, S = L M^T."""
         left = dict[int, list[tuple[Index, Array]]]()
@@ -218,8 +219,8 @@ class Factor:
                 at = _places(front.unknowns, unknowns, self.total)
                 whole[at[:, None], at] += rest
             e = front.eliminated
-            L = _cholesky(whole[:e, :e])
-            M = _forward(L, whole[:e, e:]).T if e < len(whole) else np.zeros((0, e))
+            L = self._cholesky(whole[:e, :e])
+            M = self._forward(L, whole[:e, e:]).T if e < len(whole) else np.zeros((0, e))
             self._parts.append((L, M))
             if front.parent >= 0:
                 rest = whole[e:, e:] - M @ M.T
@@ -230,12 +231,12 @@ class Factor:
         x = np.array(rhs, float)
         for front, (L, M) in zip(self.pattern.fronts, self._parts, strict=True):
             e = front.eliminated
-            x[front.unknowns[:e]] = half = _forward(L, x[front.unknowns[:e]])
+            x[front.unknowns[:e]] = half = self._forward(L, x[front.unknowns[:e]])
             x[front.unknowns[e:]] -= M @ half
         for front, (L, M) in zip(self.pattern.fronts[::-1], self._parts[::-1], strict=True):
             e = front.eliminated
             rest = x[front.unknowns[:e]] - M.T @ x[front.unknowns[e:]]
-            x[front.unknowns[:e]] = _backward(L, rest)
+            x[front.unknowns[:e]] = self._backward(L, rest)
         return x
 
     def selected_inverse(self) -> Matrix:
@@ -251,7 +252,7 @@ class Factor:
         for k in range(len(pattern.fronts) - 1, -1, -1):
             front, (L, M) = pattern.fronts[k], self._parts[k]
             e = front.eliminated
-            inverse_L = _forward(L, np.eye(e))
+            inverse_L = self._forward(L, np.eye(e))
             Z = np.empty((len(front.unknowns),) * 2)
             if front.parent < 0:
                 Z[:, :] = inverse_L.T @ inverse_L
@@ -272,6 +273,31 @@ class Factor:
             known[k] = Z
             known = {j: z for j, z in known.items() if (waiting[:k] == j).any()}
         return Matrix(pattern=pattern, blocks=blocks, beside=beside, corner=corner)
+
+    def _cholesky(self, A: Array) -> Array:
+        if self._plain:
+            return np.asarray(np.linalg.cholesky(A), np.float64)
+        from scipy import linalg
+
+        return np.asarray(linalg.cholesky(A, lower=True, check_finite=False))
+
+    def _forward(self, L: Array, rhs: Array) -> Array:
+        """L^-1 rhs."""
+        if self._plain or not L.size:
+            return np.asarray(np.linalg.solve(L, rhs))
+        from scipy import linalg
+
+        return np.asarray(linalg.solve_triangular(L, rhs, lower=True, check_finite=False))
+
+    def _backward(self, L: Array, rhs: Array) -> Array:
+        """L^-T rhs."""
+        if self._plain or not L.size:
+            return np.asarray(np.linalg.solve(L.T, rhs))
+        from scipy import linalg
+
+        return np.asarray(
+            linalg.solve_triangular(L, rhs, lower=True, trans="T", check_finite=False)
+        )
 
 
 def _assembled(matrix: Matrix, front: Front) -> Array:
@@ -295,29 +321,3 @@ def _places(among: Index, wanted: Index, total: int) -> Index:
     at = np.empty(total, np.int64)
     at[among] = np.arange(len(among))
     return at[wanted]
-
-
-def _cholesky(A: Array) -> Array:
-    if len(A) <= SMALL:
-        return np.asarray(np.linalg.cholesky(A), np.float64)
-    from scipy import linalg
-
-    return np.asarray(linalg.cholesky(A, lower=True, check_finite=False))
-
-
-def _forward(L: Array, rhs: Array) -> Array:
-    """L^-1 rhs."""
-    if len(L) <= SMALL:
-        return np.asarray(np.linalg.solve(L, rhs))
-    from scipy import linalg
-
-    return np.asarray(linalg.solve_triangular(L, rhs, lower=True, check_finite=False))
-
-
-def _backward(L: Array, rhs: Array) -> Array:
-    """L^-T rhs."""
-    if len(L) <= SMALL:
-        return np.asarray(np.linalg.solve(L.T, rhs))
-    from scipy import linalg
-
-    return np.asarray(linalg.solve_triangular(L, rhs, lower=True, trans="T", check_finite=False))
