@@ -11,7 +11,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -20,6 +20,7 @@ import numpy as np
 import piexif
 import tifffile
 from PIL import Image
+from shapely import box
 
 from skyquilt.errors import SkyquiltError, UnreadablePhotoError
 from skyquilt.model.photo import Focal, Photo, RejectedPhoto
@@ -31,6 +32,16 @@ from skyquilt.photos.read import read_photo
 from skyquilt.photos.sequence import sequence_of
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.tags import parse_exif, parse_xmp
+from skyquilt.planning.check import check_mission
+from skyquilt.planning.exports import write_missions
+from skyquilt.planning.features import read_features
+from skyquilt.planning.fleet import read_fleet
+from skyquilt.planning.missions import read_mission
+from skyquilt.planning.plan_file import read_plan, write_plan
+from skyquilt.planning.records import Drone, PicturePoint, Plan, Sortie, Waypoint
+from skyquilt.planning.site import make_site, read_site
+from skyquilt.planning.terrain import FLAT
+from skyquilt.planning.view import find_view
 from skyquilt.raster.boundary import read_boundary
 from skyquilt.video.container import read_container
 from skyquilt.video.positions import places_at
@@ -445,6 +456,65 @@ def _boundary(ending):
     return _side(f"area{ending}", read)
 
 
+# -- missions
+
+
+def _features(ending):
+    def read(path):
+        for found in read_features(path)[0]:
+            assert all(k.isprintable() and v.isprintable() for k, v in found.properties.items())
+        site = read_site(path, width_m=20.0)
+        assert np.isfinite(site.observe.bounds).all(), site.observe.bounds
+
+    return _side(f"site{ending}", read)
+
+
+def _mission(ending):
+    def read(path):
+        mission = read_mission(path)
+        assert np.isfinite(mission.places).all() and np.isfinite(mission.heights).all()
+        check_mission(mission, None, None, FLAT, views=1, clearance=0)
+
+    return _side(f"mission{ending}", read)
+
+
+FLEET = (
+    b'[[drone]]\nname = "a"\nstart = {latitude = 52.1, longitude = 13.1}\nendurance_min = 20\n'
+    b'speed = 6\nformats = ["dji"]\ncamera = "FC330"\n'
+)
+WAYPOINTS = (
+    b"QGC WPL 110\n0\t1\t0\t16\t0\t0\t0\t0\t52.1\t13.1\t50\t1\n"
+    b"1\t0\t3\t16\t0\t0\t0\t90\t52.1\t13.1\t50\t1\n2\t0\t3\t206\t10\t0\t1\t0\t0\t0\t0\t1\n"
+    b"3\t0\t3\t16\t0\t0\t0\t0\t52.101\t13.1\t50\t1\n4\t0\t3\t203\t0\t0\t0\t0\t1\t0\t0\t1\n"
+)
+
+
+@cache
+def _planned():
+    """A small plan and its files by ending."""
+    points = tuple(
+        PicturePoint(id=k, x=370_000.0 + 20 * k, y=5_773_000.0, z=50.0, ground=0.0, yaw=0.0)
+        for k in (1, 2)
+    )
+    place = (370_000.0, 5_773_000.0)
+    drone = Drone(name="a", start=place, landing=place, view=find_view("FC330"))
+    way = tuple(Waypoint(x=p.x, y=p.y, z=p.z, time_s=float(p.id), point=p.id) for p in points)
+    ground = Waypoint(x=place[0], y=place[1], z=0.0, time_s=0.0)
+    plan = Plan(
+        site=make_site(box(370_000, 5_773_000, 370_040, 5_773_020), (), "EPSG:32633"),
+        drones=(drone,),
+        points=points,
+        sorties=(Sortie(drone=0, number=1, way=(ground, *way, replace(ground, time_s=9.0))),),
+        options={},
+        terrain=False,
+    )
+    folder = Path(_folder().name)
+    write_plan(folder / "seed.json", plan)
+    write_missions(folder, plan)
+    found = {e: (folder / f"01-a{e}").read_bytes() for e in (".plan", ".waypoints", ".kmz")}
+    return {**found, ".json": (folder / "seed.json").read_bytes()}
+
+
 # -- HTTP
 
 
@@ -564,6 +634,21 @@ TARGETS = {
     "wkt": Target(_boundary(".wkt"), lambda: [WKT], "wkt"),
     "geopackage": Target(_boundary(".gpkg"), lambda: [_geopackage()], "geopackage"),
     "shapefile": Target(_boundary(".shp"), lambda: [_shapefile()], "shapefile"),
+    "site_geojson": Target(_features(".geojson"), lambda: [GEOJSON], "site_geojson"),
+    "site_kml": Target(_features(".kml"), lambda: [KML], "site_kml"),
+    "site_gpkg": Target(_features(".gpkg"), lambda: [_geopackage()], "site_gpkg"),
+    "site_shp": Target(_features(".shp"), lambda: [_shapefile()], "site_shp"),
+    "mission_plan": Target(_mission(".plan"), lambda: [_planned()[".plan"]], "mission_plan"),
+    "mission_waypoints": Target(
+        _mission(".waypoints"), lambda: [WAYPOINTS, _planned()[".waypoints"]], "mission_waypoints"
+    ),
+    "mission_kmz": Target(_mission(".kmz"), lambda: [_planned()[".kmz"]], "mission_kmz"),
+    "plan_json": Target(_side("plan.json", read_plan), lambda: [_planned()[".json"]], "plan_json"),
+    "fleet": Target(
+        _side("fleet.toml", lambda path: read_fleet(path, "EPSG:32633", None)),
+        lambda: [FLEET],
+        "fleet",
+    ),
     "http": Target(_http, _requests, "http"),
 }
 """By name."""

@@ -78,3 +78,11 @@ def test_without_arguments_each_says_how_to_call_it(path):
 
 def test_they_are_numbered_without_gaps():
     assert [int(p.name[:2]) for p in sorted(EXAMPLES.glob("*.py"))] == list(range(5))
+
+
+@pytest.mark.slow
+def test_the_loop_of_a_mission_closes_all_holes(tmp_path):
+    said = run("05_plan_fly_watch_fill.py", tmp_path)
+    shares = [float(s) for s in re.findall(r"flight: ([\d.]+) % of the area", said)]
+    assert len(shares) == 2 and shares[0] < 100 == shares[1], said
+    assert said.endswith("all have their views\n") and "not all" not in said

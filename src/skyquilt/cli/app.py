@@ -12,6 +12,7 @@ from skyquilt.cli import fly as fly_command
 from skyquilt.cli import inspect as inspect_command
 from skyquilt.cli import live as live_command
 from skyquilt.cli import mosaic as mosaic_command
+from skyquilt.cli import plan as plan_command
 from skyquilt.cli import register as register_command
 from skyquilt.cli import simulate as simulate_command
 from skyquilt.cli import spectral_bench as spectral_bench_command
@@ -32,6 +33,7 @@ app.command("export", epilog=EXIT_CODES)(export_command.command)
 app.command("live", epilog=EXIT_CODES)(live_command.command)
 app.command("view", epilog=EXIT_CODES)(view_command.command)
 app.command("fly", epilog=EXIT_CODES)(fly_command.command)
+app.add_typer(plan_command.app, name="plan", epilog=EXIT_CODES)
 app.command("inspect", epilog=EXIT_CODES)(inspect_command.command)
 app.command("register", epilog=EXIT_CODES)(register_command.command)
 app.command("depth", epilog=EXIT_CODES)(depth_command.command)

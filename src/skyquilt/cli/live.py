@@ -76,8 +76,22 @@ def command(
     thermal_unit: ThermalUnit = None,
     max_view_angle: MaxViewAngle = 70.0,
     base: Annotated[
-        Path | None, typer.Option(help="An older orthophoto (GeoTIFF) to show below.")
+        list[Path] | None,
+        typer.Option(help="An older map (GeoTIFF, COG, MBTiles) to show below (repeatable)."),
     ] = None,
+    layer: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Shapes to show over the map: GeoJSON, KML, GeoPackage, Shapefile (repeatable)."
+        ),
+    ] = None,
+    plan: Annotated[
+        Path | None,
+        typer.Option(help="plan.json that is flown; kept in OUTPUT for the next start."),
+    ] = None,
+    fill: Annotated[
+        bool, typer.Option("--fill", help="Plan what is missing when the flight has ended.")
+    ] = False,
     features: Features = 1200,
     max_mb: Annotated[float, typer.Option(help="Largest photo file in MB.")] = 500,
     max_clip_mb: Annotated[float, typer.Option(help="Largest uploaded video in MB.")] = 8000,
@@ -100,11 +114,14 @@ def command(
     with ends_at_once():
         from skyquilt.cli.progress import show_live
         from skyquilt.engine.memory_watch import ends_run, limit_bytes
+        from skyquilt.errors import UsageError
+        from skyquilt.live.fill import known_plan
         from skyquilt.live.folder_watch import create_inbox
         from skyquilt.live.live_map import LiveMap
         from skyquilt.live.settings import LiveSettings
         from skyquilt.live.workflow import iter_live
         from skyquilt.server.access import Guard
+        from skyquilt.server.layer_files import layer_of_file
         from skyquilt.server.server_process import ServerConfig, ServerProcess
     settings = LiveSettings(
         gsd_cm=gsd,
@@ -129,11 +146,15 @@ def command(
         create_inbox(folder)
     live = LiveMap(output, settings)
     try:
+        for path in layer or ():
+            layer_of_file(live.ledger, path, guard.most_layers)
+        if known_plan(output, plan) is None and fill:
+            raise UsageError("--fill needs a plan; give --plan")
         asked = ServerConfig(
             folder=output,
             settings=settings,
             guard=guard,
-            base=base,
+            base=tuple(base or ()),
             most_memory=int(viewer_memory * 1e9),
         )
         advice = "no accepted photo is lost: the same command continues"
@@ -142,7 +163,7 @@ def command(
             ServerProcess(asked=asked, port=port) as serving,
         ):
             live.lock.tell(serving.url)
-            events = iter_live(inbox, live, finish=finish)
+            events = iter_live(inbox, live, finish=finish, fill=fill)
             show_live(events, serving.url, mode="quiet" if quiet else "json" if json else "normal")
     finally:
         live.close()

@@ -1,6 +1,6 @@
 """`skyquilt simulate`: a flight with known truth over procedural terrain."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -121,6 +121,18 @@ def command(
         float | None, typer.Option(help="blur in gusts every 20 s of the clip, px")
     ] = None,
     drones: Annotated[int | None, typer.Option(help="flying at once")] = None,
+    plan: Annotated[
+        Path | None, typer.Option(help="plan.json to fly: its places, times, camera and site")
+    ] = None,
+    wind: Annotated[
+        str | None, typer.Option(help="SPEED,FROM in m/s and degrees: pushes photos off places")
+    ] = None,
+    lost: Annotated[
+        float | None, typer.Option(help="photos of the plan lost on the way, percent")
+    ] = None,
+    blurred: Annotated[
+        float | None, typer.Option(help="photos blurred one by one, percent")
+    ] = None,
     lose: Annotated[int | None, typer.Option(help="photos lost on the way")] = None,
     oblique: Annotated[
         int | None,
@@ -196,9 +208,56 @@ def command(
     )
     readout = None if shutter_readout is None else shutter_readout / 1000
     base = _with(base, "lens", readout=readout, aspect=aspect)
-    _show(sim.simulate(base, out, overwrite=overwrite), quiet)
+    pushed = _pair("--wind", wind)
+    if pushed is not None:
+        base = _with(base, "route", wind=pushed[0], wind_from=pushed[1])
+    if plan is None:
+        if lost is not None:
+            raise UsageError("--lost is a share of a plan's photos; use --lose, or give --plan")
+        base = _spoilt(base, blurred)
+        flight = sim.simulate(base, out, overwrite=overwrite)
+    else:
+        flight = _planned(base, plan, out, lost=lost, blurred=blurred, size=size,
+                          overwrite=overwrite)  # fmt: skip
+    _show(flight, quiet)
     if not quiet:
         typer.echo(f"photos: {out / 'photos'}\ntruth:  {out / 'truth'}")
+
+
+def _spoilt(settings: "FlightSettings", percent: float | None) -> "FlightSettings":
+    """With a share of the photos blurred."""
+    if percent is None:
+        return settings
+    if not 0 <= percent <= 100:
+        raise UsageError(f"--blurred must be 0 to 100 %, not {percent:g}")
+    return _with(settings, "pictures", blurred=round(percent / 100 * settings.route.photos))
+
+
+def _planned(
+    settings: "FlightSettings",
+    path: Path,
+    out: Path,
+    *,
+    lost: float | None,
+    blurred: float | None,
+    size: str | None,
+    overwrite: bool,
+) -> "Iterator[sim.Progress]":
+    """The flight of a plan."""
+    from skyquilt import simulate as sim
+    from skyquilt.simulate.planned import planned_flight
+
+    if not 0 <= (lost or 0) < 50:
+        raise UsageError(f"--lost must be 0 to 49 %, not {lost:g}")
+    flight = planned_flight(path, settings, lost=(lost or 0) / 100)
+    changed = replace(flight.settings, lens=_lens(flight.settings, size))
+    return sim.simulate(
+        _spoilt(changed, blurred),
+        out,
+        overwrite=overwrite,
+        waypoints=flight.waypoints,
+        takeoff=flight.takeoff,
+    )
 
 
 def _share(percent: float | None) -> float | None:

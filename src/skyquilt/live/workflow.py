@@ -12,9 +12,10 @@ from skyquilt.engine.error_log import NAME as ERRORS
 from skyquilt.engine.error_log import log_error
 from skyquilt.errors import OutputError, SkyquiltError
 from skyquilt.live.events import Update
+from skyquilt.live.fill import iter_fill
 from skyquilt.live.final_map import iter_finish
 from skyquilt.live.folder_watch import Watch
-from skyquilt.live.live_map import LiveMap
+from skyquilt.live.live_map import PHOTOS, LiveMap
 from skyquilt.live.photo_intake import Refused
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.uploaded_clips import UploadedClips
@@ -22,6 +23,10 @@ from skyquilt.model.event import Event, Note, Result
 
 IDLE_S = 0.01
 """Pause in s between checks when there is nothing to do."""
+OVER_S = 60.0
+"""Without `finish`: the flight is over, as far as a follow-up is concerned, after so many seconds
+without a photo.
+"""
 FULL_S = 2.0
 """Pause in s when the disk is full."""
 STEADY_S = 5.0
@@ -33,12 +38,13 @@ def iter_live(
     live: LiveMap,
     *,
     finish: bool = False,
+    fill: bool = False,
     stop: threading.Event | None = None,
 ) -> Iterator[Event | Update]:
     """Maps photos as they arrive in folders or otherwise in `live`, until `stop`.
 
-    `finish`: makes the final map and ends when no photo has arrived for some seconds. Every pause
-    and refusal is reported.
+    `finish`: makes the final map and ends when no photo has arrived for some seconds; `fill`: plans
+    what is missing when the flight has ended. Every pause and refusal is reported.
 
     Raises:
         UsageError: a folder is missing.
@@ -47,6 +53,7 @@ def iter_live(
     watches: list[Watch | UploadedClips] = [Watch(folder=f, intake=live.intake) for f in folders]
     watches.append(UploadedClips(intake=live.intake))
     busy_since = time.monotonic()
+    filled = not fill
     while not stop.is_set():
         try:
             yield from _taken(watches)
@@ -57,9 +64,14 @@ def iter_live(
             continue
         if update is not None:
             busy_since = time.monotonic()
+            filled = filled and not (fill and update.what == "placed")
             yield update
             continue
         growing = any(w.growing for w in watches) or live.background.busy
+        over = STEADY_S if finish else OVER_S
+        if not filled and not growing and time.monotonic() - busy_since > over:
+            filled = True
+            yield from iter_fill(live.folder, live.ledger, live.folder / PHOTOS)
         if finish and not growing and time.monotonic() - busy_since > STEADY_S:
             yield from _finished(live, live.settings)
             return

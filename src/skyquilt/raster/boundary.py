@@ -6,7 +6,7 @@ import json
 import sqlite3
 import struct
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from functools import reduce
 from itertools import pairwise
@@ -65,7 +65,7 @@ def read_boundary(path: Path, crs: str | None) -> Polygon | MultiPolygon:
         )
     try:
         shapes, source = reader(path)
-        _check_size(shapes)
+        check_size(shapes)
         areas = [area for shape in shapes for area in _areas(make_valid(shape))]
         if not areas:
             kinds = sorted({shape.geom_type for shape in shapes}) or ["nothing"]
@@ -87,7 +87,7 @@ def read_boundary(path: Path, crs: str | None) -> Polygon | MultiPolygon:
         ) from error
 
 
-def _check_size(shapes: Sequence[BaseGeometry]) -> None:
+def check_size(shapes: Sequence[BaseGeometry]) -> None:
     """Refuses outlines that would take minutes, and numbers that are no places."""
     count = sum(int(get_num_coordinates(shape)) for shape in shapes)
     if count > MOST_VERTICES:
@@ -191,12 +191,16 @@ def _geometries(content: dict[str, Any]) -> list[dict[str, Any]]:
 
 def read_kml(path: Path) -> Shapes:
     """All polygons of a KML file; a path whose last point equals its first counts as a polygon."""
-    return _kml_shapes(read_bounded(path)), WGS84
+    return kml_shapes(fromstring(read_bounded(path))), WGS84
 
 
 def read_kmz(path: Path) -> Shapes:
     """All polygons of every KML file inside the archive."""
-    shapes: list[BaseGeometry] = []
+    return [shape for text in kml_texts(path) for shape in kml_shapes(fromstring(text))], WGS84
+
+
+def kml_texts(path: Path) -> Iterator[bytes]:
+    """The KML files inside an archive."""
     left = MOST_TEXT_BYTES
     with open_regular(path) as file, zipfile.ZipFile(file) as archive:
         for name in [n for n in archive.namelist() if n.lower().endswith(".kml")]:
@@ -205,16 +209,15 @@ def read_kmz(path: Path) -> Shapes:
             left -= len(text)
             if left < 0:
                 raise ValueError(f"it unpacks to more than {MOST_TEXT_BYTES // 10**6} MB")
-            shapes += _kml_shapes(text)
-    return shapes, WGS84
+            yield text
 
 
 def _text(path: Path) -> str:
     return read_bounded(path).decode("utf-8-sig")
 
 
-def _kml_shapes(text: bytes) -> list[BaseGeometry]:
-    root = fromstring(text)
+def kml_shapes(root: Any) -> list[BaseGeometry]:
+    """Polygons and lines below an element; closed lines are polygons."""
     shapes: list[BaseGeometry] = []
     for polygon in root.iterfind(".//{*}Polygon"):
         (outer,) = (
@@ -247,6 +250,16 @@ def read_wkt(path: Path) -> Shapes:
 
 def read_geopackage(path: Path) -> Shapes:
     """The first feature table of a GeoPackage (OGC 12-128r18)."""
+    rows, crs = geopackage_rows(path)
+    return [force_2d(from_wkb(blob[gpkg_header(blob) :])) for blob, _ in rows], crs
+
+
+def geopackage_rows(
+    path: Path, *, everything: bool = False
+) -> tuple[list[tuple[bytes, dict[str, Any]]], str]:
+    """Shapes of the first feature table, as stored, and its CRS; with `everything` also the other
+    columns by name.
+    """
     with open_regular(path):
         pass  # it exists, and is a file
     with closing(sqlite3.connect(path.absolute().as_uri() + "?mode=ro", uri=True)) as base:
@@ -259,19 +272,23 @@ def read_geopackage(path: Path) -> Shapes:
         steps = iter(range(MOST_STEPS))
         # a view in the file may be any query: it is ended after so many steps
         base.set_progress_handler(lambda: next(steps, None) is None, 1000)
-        rows = base.execute(f'SELECT "{column}" FROM "{table}" LIMIT {MOST_VERTICES}')
-        blobs, size = [], 0
-        for (blob,) in rows:
-            if isinstance(blob, bytes):
-                blobs.append(blob)
-                size += len(blob)
+        wanted = f'"{column}", *' if everything else f'"{column}"'
+        rows = base.execute(f'SELECT {wanted} FROM "{table}" LIMIT {MOST_VERTICES}')
+        names = [about[0] for about in rows.description[1:]]
+        kept, size = [], 0
+        for blob, *others in rows:
+            size += sum(len(v) for v in (blob, *others) if isinstance(v, str | bytes))
             if size > MOST_TEXT_BYTES:
-                raise ValueError(f"its shapes have more than {MOST_TEXT_BYTES // 10**6} MB")
-    crs = f"{authority}:{code}" if authority.upper() == "EPSG" else definition
-    return [force_2d(from_wkb(blob[_gpkg_header(blob) :])) for blob in blobs], crs
+                raise ValueError(f"its rows have more than {MOST_TEXT_BYTES // 10**6} MB")
+            if isinstance(blob, bytes):
+                words = {
+                    n: v for n, v in zip(names, others, strict=True) if not isinstance(v, bytes)
+                }
+                kept.append((blob, words))
+    return kept, f"{authority}:{code}" if authority.upper() == "EPSG" else definition
 
 
-def _gpkg_header(blob: bytes) -> int:
+def gpkg_header(blob: bytes) -> int:
     """Number of bytes before the WKB: 8 plus an envelope of 0, 32, 48 or 64."""
     return 8 + (0, 32, 48, 48, 64)[blob[3] >> 1 & 7]
 
@@ -280,29 +297,46 @@ def read_shapefile(path: Path) -> Shapes:
     """Polygons (types 5, 15, 25) of a Shapefile with its `.prj` beside it (ESRI white paper,
     1998).
     """
+    shapes = [shape for record in shapefile_records(path) for shape in shp_polygon(record)]
+    return shapes, projection_beside(path)
+
+
+def shapefile_records(path: Path) -> Iterator[bytes]:
+    """The contents of the records of a Shapefile."""
     data, at = read_bounded(path), 100
-    shapes: list[BaseGeometry] = []
     if data[:4] != b"\0\0\x27\x0a":
         raise ValueError("the file code is not 9994")
     while at < len(data):
         size = 2 * int.from_bytes(data[at + 4 : at + 8], "big")
-        shapes += _shp_polygon(data[at + 8 : at + 8 + size])
+        yield data[at + 8 : at + 8 + size]
         at += 8 + size
+
+
+def projection_beside(path: Path) -> str:
+    """The CRS in the `.prj` beside a Shapefile; WGS 84 where there is none."""
     projection = path.with_suffix(".prj")
     if not projection.exists():
-        return shapes, WGS84
-    return shapes, read_bounded(projection, MOST_PRJ).decode("utf-8", "replace")
+        return WGS84
+    return read_bounded(projection, MOST_PRJ).decode("utf-8", "replace")
 
 
-def _shp_polygon(record: bytes) -> list[BaseGeometry]:
-    (kind,) = struct.unpack_from("<i", record)
-    if kind not in (5, 15, 25):
-        return []
+def shp_parts(record: bytes) -> tuple[list[int], NDArray[np.float64]]:
+    """Where the parts of a polygon or line start, and where the last one ends, and all vertices
+    (n, 2).
+    """
     parts, count = struct.unpack_from("<ii", record, 36)
     if not (0 < parts <= MOST_RINGS and 0 < count <= MOST_VERTICES):
         raise ValueError(f"a record has {parts} rings with {count} vertices")
     starts = [*struct.unpack_from(f"<{parts}i", record, 44), count]
-    places = np.frombuffer(record, "<f8", 2 * count, 44 + 4 * parts).reshape(count, 2)
+    return starts, np.frombuffer(record, "<f8", 2 * count, 44 + 4 * parts).reshape(count, 2)
+
+
+def shp_polygon(record: bytes) -> list[BaseGeometry]:
+    """The polygon of a record; nothing where it holds another kind of shape."""
+    (kind,) = struct.unpack_from("<i", record)
+    if kind not in (5, 15, 25):
+        return []
+    starts, places = shp_parts(record)
     rings = [Polygon(places[start:end]) for start, end in pairwise(starts)]
     # rings inside others are holes
     return [reduce(lambda area, ring: area.symmetric_difference(ring), rings)]

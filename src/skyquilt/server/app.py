@@ -18,8 +18,10 @@ from skyquilt.server.file_endpoints import FileEndpoints
 from skyquilt.server.images import Images
 from skyquilt.server.layer_endpoints import LayerEndpoints
 from skyquilt.server.map_endpoints import STATIC, MapEndpoints
+from skyquilt.server.mission_watch import MissionWatch
 from skyquilt.server.photo_endpoints import PhotoEndpoints
 from skyquilt.server.photo_views import PhotoViews
+from skyquilt.server.plan_endpoints import PlanEndpoints
 from skyquilt.server.readouts import Readouts
 from skyquilt.server.shown import Survey
 from skyquilt.server.upload_endpoints import UploadEndpoints
@@ -27,8 +29,14 @@ from skyquilt.server.wms import WmsEndpoints
 from skyquilt.version import __version__
 
 
-def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) -> FastAPI:
-    """The application."""
+def make_app(
+    survey: Survey,
+    guard: Guard,
+    writer: Writer | None,
+    folder: Path,
+    watch: MissionWatch | None = None,
+) -> FastAPI:
+    """The application; `watch` follows the plan of a live survey."""
     context, images = Context(survey, guard, writer), Images(survey)
     received = UploadEndpoints(context, folder)
 
@@ -59,6 +67,7 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
     control = ControlEndpoints(context, views)
     layers, events = LayerEndpoints(context), EventEndpoints(context)
     app.state.ending = events.ending
+    plans = PlanEndpoints(context, folder, watch)
 
     get, post = {"methods": ["GET"]}, {"methods": ["POST"]}
     for path, work, options in (
@@ -98,6 +107,12 @@ def make_app(survey: Survey, guard: Guard, writer: Writer | None, folder: Path) 
         ("/layers/{name}", layers.layer_delete, {"methods": ["DELETE"]}),
         ("/events", events.events, {**get, "response_class": StreamingResponse}),
         ("/finish", layers.finish, post),
+        ("/plan", plans.plan, get),
+        ("/plan", plans.new, post),
+        ("/plan/missing", plans.missing, post),
+        ("/plans/{name}/{file}", plans.plan_file, {**get, "response_class": FileResponse}),
+        ("/coverage", plans.coverage, get),
+        ("/coverage.png", plans.coverage_picture, {**get, "response_class": Response}),
     ):
         app.add_api_route(path, work, **options)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")

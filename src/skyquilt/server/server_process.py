@@ -20,12 +20,14 @@ from typing import Any, Self
 from skyquilt.engine.error_log import log_error
 from skyquilt.engine.memory_watch import MemoryWatch
 from skyquilt.errors import SkyquiltError, UsageError
+from skyquilt.live.fill import known_plan
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.live_map import PHOTOS
 from skyquilt.live.photo_intake import Intake
 from skyquilt.live.settings import LiveSettings
 from skyquilt.server.access import Guard
+from skyquilt.server.mission_watch import MissionWatch
 from skyquilt.server.published_files import PublishedFiles
 from skyquilt.server.server_thread import ServerThread, address, bound
 from skyquilt.server.survey import LiveSurvey
@@ -61,8 +63,8 @@ class ServerConfig:
     """The process that starts it, with which it ends."""
     most_memory: int = 1_500_000_000
     """Resident memory in bytes at which it is ended and started anew; 0 = no limit."""
-    base: Path | None = None
-    """An older orthophoto as a further layer; None = none."""
+    base: tuple[Path, ...] = ()
+    """Older maps as further layers."""
 
 
 @dataclass(kw_only=True)
@@ -185,12 +187,15 @@ def _serve(
     try:
         survey = LiveSurvey(asked.folder, base=asked.base)
         door = UploadEndpoint(asked.folder, asked.settings)
+        watch = MissionWatch(asked.folder, known_plan(asked.folder))
         with (
+            watch,
             ServerThread(
                 survey=survey,
                 guard=asked.guard,
                 folder=asked.folder,
                 writer=door,
+                watch=watch,
                 listening=listening,
             ),
             PublishedFiles(LiveSurvey(asked.folder), asked.folder),

@@ -64,6 +64,8 @@ class ServerThread:
     """The survey's folder."""
     writer: Any = None
     """The growing map; None for a finished run."""
+    watch: Any = None
+    """A `MissionWatch` that follows the plan of a live survey."""
     port: int = 0
     """Port on which it listens; 0 = a free port, which can be read here after the start."""
     listening: socket.socket | None = None
@@ -85,7 +87,7 @@ class ServerThread:
             raise UsageError(NEEDED) from error
         listening = self.listening or bound(self.guard.host, self.port)
         self.port = int(listening.getsockname()[1])
-        app = make_app(self.survey, self.guard, self.writer, self.folder)
+        app = make_app(self.survey, self.guard, self.writer, self.folder, self.watch)
         config = uvicorn.Config(
             app,
             log_level="error",

@@ -1,6 +1,6 @@
 """What the server shows, whatever it comes from: a growing survey or a finished run."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -66,17 +66,18 @@ class Survey(Protocol):
         """A number that differs if something may have changed; fast to read."""
 
 
-def base_map(path: Path | None) -> dict[str, MapSource]:
-    """An older orthophoto as a layer; empty if no path is given.
+def base_map(paths: Path | Sequence[Path] | None) -> dict[str, MapSource]:
+    """Older maps (GeoTIFF, COG, MBTiles) as layers `base`, `base-2` ...; empty if none is given.
 
     Raises:
-        UsageError: it is not a georeferenced raster.
+        UsageError: one is not a georeferenced raster.
     """
-    if path is None:
-        return {}
-    if open_map(path) is None or not FileSource(path=path).crs:
-        raise UsageError(f"--base {path} is not a georeferenced map that GDAL can read")
-    return {"base": FileSource(path=path)}
+    found: dict[str, MapSource] = {}
+    for number, path in enumerate([paths] if isinstance(paths, Path) else paths or (), 1):
+        if open_map(path) is None or not FileSource(path=path).crs:
+            raise UsageError(f"--base {path} is not a georeferenced map that GDAL can read")
+        found["base" if number == 1 else f"base-{number}"] = FileSource(path=path)
+    return found
 
 
 def covering(photos: list[Shown], lon: float, lat: float) -> list[Shown]:

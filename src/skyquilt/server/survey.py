@@ -1,7 +1,7 @@
 """Opens what the server shows: a growing survey, read from its folder, or a finished run."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -54,8 +54,8 @@ class LiveSurvey:
 
     growing = True
 
-    def __init__(self, folder: Path, *, base: Path | None = None) -> None:
-        """Opens it for reading; `base` is an older orthophoto.
+    def __init__(self, folder: Path, *, base: Path | Sequence[Path] | None = None) -> None:
+        """Opens it for reading; `base` are older maps.
 
         Raises:
             OutputError: it cannot be read. UsageError: `base` is not a map.
@@ -94,7 +94,12 @@ class LiveSurvey:
             name: replace(layer, title=f"Final {layer.title.lower()}")
             for name, layer in self._final().items()
         }
-        return GROWING | final
+        older = {
+            name: replace(GROWING["base"], name=name, title=f"Older map {number}")
+            for number, name in enumerate(self.base, 1)
+            if number > 1
+        }
+        return GROWING | older | final
 
     def figures(self) -> Mapping[str, Any]:
         """The figures of the final map; empty while there is none."""

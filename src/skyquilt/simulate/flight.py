@@ -31,6 +31,10 @@ class Waypoint:
     """Index of the drone."""
     time: float = 0.0
     """Seconds since the first photo of the flight."""
+    z: float | None = None
+    """Height above the base in m, where it is not the route's height above the take-off."""
+    point: int | None = None
+    """Id of the picture-point of a plan."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,13 +214,18 @@ def fly(points: list[Waypoint], route: Route, takeoff: float, seed: int, prefix:
     for number, point in enumerate(points):
         dx, dy, dz = rng.normal(0, route.jitter, 3)
         yaw, pitch, roll = rng.normal(0, [route.yaw_noise, route.tilt_noise, route.tilt_noise])
+        east, north = route.pushed(rng)
         course = np.radians(point.heading if point.course is None else point.course)
         speed = 0.0 if route.stops else route.speed
         letter = f"{chr(ord('A') + point.drone % 26)}_" if route.drones > 1 else ""
         shot = Shot(
             name=f"{prefix}_{letter}{number + 1:04d}",
             waypoint=point,
-            centre=(point.x + dx, point.y + dy, takeoff + route.height + 0.6 * dz),
+            centre=(
+                point.x + dx + east,
+                point.y + dy + north,
+                (takeoff + route.height if point.z is None else point.z) + 0.6 * dz,
+            ),
             yaw=wrap(point.heading + yaw),
             pitch=float(pitch),
             roll=float(roll),

@@ -79,8 +79,13 @@ class World:
     """The frames of the clip."""
 
 
-def prepare(settings: FlightSettings, waypoints: list[Waypoint] | None = None) -> World:
-    """Plans, flies and reports; `waypoints` replaces the planned route.
+def prepare(
+    settings: FlightSettings,
+    waypoints: list[Waypoint] | None = None,
+    takeoff: tuple[float, float] | None = None,
+) -> World:
+    """Plans, flies and reports; `waypoints` replaces the planned route, `takeoff` (local x, y) the
+    place from which heights count, that of the first photo.
 
     Raises UsageError for settings that do not fit together.
     """
@@ -88,7 +93,8 @@ def prepare(settings: FlightSettings, waypoints: list[Waypoint] | None = None) -
     points = plan(settings.route, settings.lens) if waypoints is None else waypoints
     place = place_at(settings.scene.latitude, settings.scene.longitude)
     hills = Ground(noise=Noise(seed=settings.seed), relief=settings.scene.relief)
-    start = Start(base=settings.scene.base, takeoff=hills.at(points[0].x, points[0].y))
+    home = takeoff or (points[0].x, points[0].y)
+    start = Start(base=settings.scene.base, takeoff=hills.at(*home))
     shots = fly(points, settings.route, start.takeoff, settings.seed, "SIM")
     reports = report_all(shots, settings.reporting, place, start, settings.lens, settings.seed)
     visible = Flight(lens=settings.lens, shots=shots, reports=reports)
@@ -180,13 +186,15 @@ def simulate(
     *,
     overwrite: bool = False,
     waypoints: list[Waypoint] | None = None,
+    takeoff: tuple[float, float] | None = None,
 ) -> Iterator[Progress]:
-    """Simulates a survey with known truth and writes it; yields progress.
+    """Simulates a survey with known truth and writes it; yields progress. `waypoints` and
+    `takeoff` as for `prepare`.
 
     Raises UsageError for settings that do not fit together, OutputError where the folder is not
     empty or not writable.
     """
-    world = prepare(settings, waypoints)
+    world = prepare(settings, waypoints, takeoff)
     try:
         _make_room(output, overwrite)
         yield from _write(world, output)
@@ -271,8 +279,12 @@ def _photograph(world: World, scene: Scene, output: Path) -> Generator[Progress,
     folder = output / "photos"
     folder.mkdir(exist_ok=True)
     taken = []
+    shaken = np.random.default_rng([world.settings.seed, 54]).permutation(len(flight.shots))
+    spoilt = set(shaken[: pictures.blurred].tolist())
+    sharp, shake = pictures, replace(pictures, motion_blur=pictures.blurred_px)
     for number, (shot, report) in enumerate(zip(flight.shots, flight.reports, strict=True)):
         rng = np.random.default_rng([world.settings.seed, 51, number])
+        pictures = shake if number in spoilt else sharp
         gain = float(np.exp(rng.normal(0, pictures.exposure_noise)))
         pixels = camera.visible(shot, pictures, gain, rng, _moment(world, shot))
         if report.turned:
@@ -285,7 +297,14 @@ def _photograph(world: World, scene: Scene, output: Path) -> Generator[Progress,
         )
         write_jpeg(folder / name, pixels, report, body, pictures.quality)
         taken.append(
-            Taken(shot=shot, report=report, band="visible", file=f"photos/{name}", exposure=gain)
+            Taken(
+                shot=shot,
+                report=report,
+                band="visible",
+                file=f"photos/{name}",
+                exposure=gain,
+                blurred=number in spoilt,
+            )
         )
         yield Progress(stage="photos", done=number + 1, total=len(flight.shots), name=name)
     return taken

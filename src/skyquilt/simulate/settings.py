@@ -1,7 +1,10 @@
 """Settings of a simulated flight, as nested records."""
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
+
+import numpy as np
 
 from skyquilt.errors import UsageError
 from skyquilt.simulate.camera import Lens
@@ -50,10 +53,24 @@ class Route:
     """Drones that fly at the same time, each on its share of the lines."""
     lost: int = 0
     """Photos planned but not delivered, never two neighbours."""
+    wind: float = 0.0
+    """Speed of the wind, m/s: it pushes photos off their places, by a tenth of a second's way on
+    average, in gusts by as much more or less.
+    """
+    wind_from: float = 0.0
+    """Where it comes from, degrees from the map's north."""
     oblique: int = 0
     """Photos taken besides the planned ones, looking ahead, some with the sky."""
     oblique_tilts: tuple[float, float] = (57.0, 80.0)
     """Least and largest tilt of these from the vertical, degrees; they are spread evenly."""
+
+    def pushed(self, rng: np.random.Generator) -> tuple[float, float]:
+        """How far east and north the wind pushes the next photo, m."""
+        if self.wind <= 0:
+            return 0.0, 0.0
+        off = 0.1 * self.wind * (1 + float(rng.normal()))
+        to = math.radians(self.wind_from + 180)
+        return off * math.sin(to), off * math.cos(to)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,6 +87,10 @@ class Pictures:
     """Standard deviation of the lens's blur, px."""
     motion_blur: float = 0.0
     """Length of the blur along the flight, px."""
+    blurred: int = 0
+    """Photos spoilt one by one, by a shake of the camera."""
+    blurred_px: float = 16.0
+    """Length of their blur, px."""
     noise: float = 1.5
     """Standard deviation of the sensor noise, levels of 255."""
     quality: int = 92
@@ -304,6 +325,11 @@ def _other_rules(settings: FlightSettings) -> _Rules:
             f"vignetting must be 0 to 90 %, not {100 * pictures.vignetting:.0f} %",
         ),
         (0 <= pictures.sun_hours <= 12, "the sun must move by 0 to 12 hours"),
+        (
+            0 <= pictures.blurred <= settings.route.photos,
+            f"at most all {settings.route.photos} photos can be blurred, not {pictures.blurred}",
+        ),
+        (0 <= settings.route.wind <= 40, "wind must be 0 to 40 m/s"),
         (0 <= pictures.motion_blur <= 100, "motion blur must be 0 to 100 px"),
         (
             settings.video is None or 0.2 <= settings.video.fps <= 120,

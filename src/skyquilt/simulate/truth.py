@@ -38,6 +38,8 @@ class Taken:
     """Path below the output folder."""
     exposure: float
     """Brightness factor (visible), or offset in K (thermal)."""
+    blurred: bool = False
+    """Whether a shake of the camera spoilt it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +122,8 @@ def _photo(taken: Taken, place: Place, start: Start) -> dict[str, Any]:
         "camera": taken.band + ("-turned" if report.turned else ""),
         "drone": shot.waypoint.drone,
         "line": shot.waypoint.line,
+        "point": shot.waypoint.point,
+        "blurred": taken.blurred,
         "time_s": round(shot.waypoint.time, 3),
         "position": [place.easting + x, place.northing + y, start.base + z],
         "cam_R_map": rotation.tolist(),

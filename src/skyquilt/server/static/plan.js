@@ -1,0 +1,171 @@
+"use strict";
+// The plan on the map: points as they turn, coverage, areas drawn here, follow-up plans.
+(() => {
+  const { map, state } = window.skyquilt;
+  const colours = { planned: "#2563eb", taken: "#15803d", missing: "#dc2626", unsharp: "#d97706" };
+  const words = { planned: "planned", taken: "taken", missing: "missing", unsharp: "unsharp" };
+  const make = (tag, text, cls) => { const e = document.createElement(tag); if (text !== undefined) e.textContent = text; if (cls) e.className = cls; return e; };
+  const button = (text, id) => { const b = make("button", text); b.id = id; b.type = "button"; return b; };
+  const token = () => document.getElementById("token");
+  const headers = (more) => ({ ...more, ...(token() && token().value ? { "X-Token": token().value } : {}) });
+  const said = make("output", ""); said.id = "plan-said";
+
+  // -- the panel
+  const section = make("section"); section.id = "mission";
+  const share = make("p", "", "share"), drones = make("ul"), legend = make("p", "", "plan-legend"), plans = make("ul");
+  share.id = "coverage-share"; drones.id = "drones"; plans.id = "plans";
+  for (const [kind, colour] of Object.entries(colours)) { const dot = make("i"); dot.style.background = colour; legend.append(dot, `${words[kind]} `); }
+  const showPoints = button("Points", "plan-points"), showCover = button("Coverage", "plan-coverage"), fill = button("Plan what is missing", "plan-fill");
+  const drawArea = button("Draw area", "draw-area"), drawClosed = button("Draw keep-out", "draw-closed"), clear = button("Clear", "draw-clear"), go = button("Plan these", "plan-go");
+  for (const [b, on] of [[showPoints, true], [showCover, false], [drawArea, false], [drawClosed, false]]) b.setAttribute("aria-pressed", String(on));
+  const field = (id, label, value, size) => { const l = make("label", label), i = make("input"); i.id = id; i.value = value; i.size = size; l.append(i); return l; };
+  const row = (...parts) => { const r = make("div", undefined, "row"); r.append(...parts); return r; };
+  const asking = row(field("plan-camera", "Camera ", "FC6310", 7), field("plan-height", "Height, m ", "60", 3), field("plan-drones", "Drones ", "1", 2));
+  section.append(make("h2", "Plan"), share, drones, legend, row(showPoints, showCover, fill), row(drawArea, drawClosed, clear, go), asking, said, plans);
+  const panel = document.getElementById("panel"), at = document.getElementById("here");
+  panel.insertBefore(section, at);
+
+  // -- the plan
+  const points = L.layerGroup().addTo(map), ways = L.layerGroup().addTo(map), follow = L.layerGroup().addTo(map), sketch = L.layerGroup().addTo(map);
+  const marks = new Map();
+  let cover = null, known = null, sharing = "";
+  const draw = (plan, states) => {
+    points.clearLayers(); ways.clearLayers(); marks.clear();
+    if (!plan) return;
+    L.geoJSON(plan.area, { style: { color: "#2563eb", weight: 2, fill: false }, interactive: false }).addTo(ways);
+    for (const k of plan.keep_out) L.geoJSON(k.geometry, { style: { color: "#dc2626", weight: 2, fillOpacity: 0.25 }, interactive: false }).addTo(ways);
+    for (const way of plan.ways) L.polyline(way.map(([x, y]) => [y, x]), { color: "#64748b", weight: 1.5, opacity: 0.8, interactive: false }).addTo(ways);
+    for (const [id, lon, lat] of plan.points) {
+      const mark = L.circleMarker([lat, lon], { radius: 5, weight: 2, fillOpacity: 0.9, interactive: false }).addTo(points);
+      marks.set(id, mark);
+    }
+    turn(states);
+    if (!state.fitted && plan.points.length) { map.fitBounds(plan.points.map(([, x, y]) => [y, x]), { padding: [30, 30] }); state.fitted = true; }
+  };
+  const turn = (states) => {
+    for (const [id, mark] of marks) {
+      const kind = states[id] || "planned";
+      mark.setStyle({ color: colours[kind], fillColor: kind === "planned" ? "#fff" : colours[kind] });
+    }
+  };
+  const minutes = (s) => `${Math.floor(s / 60)}:${String(Math.round(s % 60)).padStart(2, "0")}`;
+  const read = async () => {
+    const answer = await fetch("/plan");
+    if (!answer.ok) { section.hidden = true; return; }
+    const told = await answer.json(), key = JSON.stringify(told.plan && [told.plan.points.length, told.plan.points[0]]);
+    if (key !== known) { known = key; draw(told.plan, told.states); } else turn(told.states);
+    legend.hidden = showPoints.hidden = fill.hidden = !told.plan;
+    drones.replaceChildren(...told.drones.map((d) => make("li", `${d.name}: ${d.taken} of ${d.planned} photos, ${minutes(d.seconds_left)} left`)));
+    plans.replaceChildren(...told.plans.map((p) => {
+      const li = make("li"), open = make("a", p.name);
+      open.href = `/plans/${encodeURIComponent(p.name)}/plan.html`; open.target = "_blank"; open.rel = "noopener";
+      li.append(open, " ");
+      for (const file of p.files.filter((f) => /^\d\d-/.test(f))) {
+        const link = make("a", file.replace(/^.*\./, ""));
+        link.href = `/plans/${encodeURIComponent(p.name)}/${encodeURIComponent(file)}`; link.title = file; link.download = file; link.className = "file";
+        li.append(link, " ");
+      }
+      return li;
+    }));
+  };
+  const readCover = async () => {
+    const answer = await fetch("/coverage");
+    if (!answer.ok) return;
+    const told = await answer.json();
+    share.textContent = told.bounds ? `${(100 * told.share).toFixed(1)} % of the area has ${told.views} views` : "";
+    sharing = told;
+    if (cover) { cover.remove(); cover = null; }
+    if (told.bounds && showCover.getAttribute("aria-pressed") === "true") {
+      const [west, south, east, north] = told.bounds;
+      cover = L.imageOverlay(`/coverage.png?v=${Date.now()}`, [[south, west], [north, east]], { opacity: 0.75, zIndex: 260, interactive: false }).addTo(map);
+    }
+  };
+  const soon = (work, wait) => { let t = null; return () => { if (!t) t = setTimeout(() => { t = null; work().catch(() => {}); }, wait); }; };
+  const readSoon = soon(read, 300), coverSoon = soon(readCover, 600);
+  showPoints.onclick = () => { const on = showPoints.getAttribute("aria-pressed") !== "true"; showPoints.setAttribute("aria-pressed", String(on)); for (const l of [points, ways]) on ? l.addTo(map) : l.remove(); };
+  showCover.onclick = () => { showCover.setAttribute("aria-pressed", String(showCover.getAttribute("aria-pressed") !== "true")); coverSoon(); };
+
+  // -- areas drawn here; they stay in this browser
+  const KEY = "skyquilt-areas";
+  let shapes = [], open = null;
+  const kept = () => { try { shapes = JSON.parse(localStorage.getItem(KEY)) || []; } catch { shapes = []; } };
+  const keep = () => { try { localStorage.setItem(KEY, JSON.stringify(shapes)); } catch { /* private window */ } };
+  const show = () => {
+    sketch.clearLayers();
+    for (const s of [...shapes, ...(open ? [open] : [])]) L.polygon(s.ring, { color: s.closed ? "#dc2626" : "#2563eb", weight: 3, dashArray: s === open ? "6 4" : null, interactive: false }).addTo(sketch);
+    if (open) for (const p of open.ring) L.circleMarker(p, { radius: 4, interactive: false }).addTo(sketch);
+    go.disabled = !shapes.some((s) => !s.closed);
+  };
+  const done = () => {
+    if (open && open.ring.length > 2) { shapes.push(open); keep(); }
+    open = null;
+    drawArea.setAttribute("aria-pressed", "false"); drawClosed.setAttribute("aria-pressed", "false");
+    map.getContainer().style.cursor = ""; map.doubleClickZoom.enable();
+    show();
+  };
+  const begin = (closed, b) => () => {
+    const on = b.getAttribute("aria-pressed") === "true";
+    done();
+    if (on) return;
+    open = { closed, ring: [] };
+    b.setAttribute("aria-pressed", "true");
+    map.getContainer().style.cursor = "crosshair"; map.doubleClickZoom.disable();
+    said.textContent = "Click the corners; press the button again to end.";
+  };
+  drawArea.onclick = begin(false, drawArea); drawClosed.onclick = begin(true, drawClosed);
+  clear.onclick = () => { shapes = []; open = null; keep(); done(); said.textContent = ""; };
+  map.getContainer().addEventListener("click", (e) => {
+    if (!open || !e.target.closest || e.target.closest(".leaflet-control")) return;
+    e.stopPropagation();
+    const { lat, lng } = map.mouseEventToLatLng(e);
+    open.ring.push([lat, lng]);
+    show();
+  }, true);
+  const sent = async (url, body) => {
+    const answer = await fetch(url, { method: "POST", body, headers: headers({ "Content-Type": "application/json" }) }).catch(() => null);
+    if (!answer) { said.textContent = "the server does not answer"; return; }
+    const told = await answer.json().catch(() => ({}));
+    said.textContent = answer.ok ? "The plan is being computed ..." : (typeof told.detail === "string" ? told.detail : "this cannot be planned");
+  };
+  go.onclick = () => {
+    done();
+    const features = shapes.map((s) => ({ type: "Feature", properties: s.closed ? { keep_out: true } : {}, geometry: { type: "Polygon", coordinates: [[...s.ring, s.ring[0]].map(([y, x]) => [x, y])] } }));
+    const value = (id) => encodeURIComponent(document.getElementById(id).value);
+    sent(`/plan?camera=${value("plan-camera")}&height=${value("plan-height")}&drones=${value("plan-drones")}`, JSON.stringify({ type: "FeatureCollection", features }));
+  };
+  fill.onclick = () => sent("/plan/missing", "");
+  const ready = async (name) => {
+    const answer = await fetch(`/plans/${encodeURIComponent(name)}/points.geojson`);
+    if (!answer.ok) return;
+    const ways = await (await fetch(`/plans/${encodeURIComponent(name)}/routes.geojson`)).json();
+    follow.clearLayers();
+    L.geoJSON(ways, { style: { color: "#7c3aed", weight: 2 }, interactive: false }).addTo(follow);
+    L.geoJSON(await answer.json(), { pointToLayer: (f, p) => L.circleMarker(p, { radius: 5, color: "#7c3aed", weight: 2, fillOpacity: 0.4, interactive: false }) }).addTo(follow);
+  };
+
+  // -- photos placed by their metadata alone: pale, with a dashed outline, until they are refined
+  const provisional = L.layerGroup().addTo(map);
+  const unsure = () => {
+    provisional.clearLayers();
+    for (const p of state.photos.values()) if (p.state === "placed" && p.ring && p.ring.length > 2) L.polygon(p.ring.map(([x, y]) => [y, x]), { color: "#fff", weight: 2, dashArray: "4 5", fillColor: "#fff", fillOpacity: 0.22, interactive: false }).addTo(provisional);
+  };
+  const unsureSoon = soon(async () => unsure(), 350);
+
+  // -- news
+  const listen = () => {
+    const news = new EventSource("/events");
+    news.onopen = () => { readSoon(); coverSoon(); };
+    news.onerror = () => { if (news.readyState === 2) setTimeout(listen, 2000); };
+    news.addEventListener("plan", (e) => {
+      const told = JSON.parse(e.data);
+      if (told.text) said.textContent = told.text;
+      if (told.state === "ready") ready(told.name).catch(() => {});
+      readSoon();
+    });
+    news.addEventListener("coverage", coverSoon);
+    news.addEventListener("photo", unsureSoon);
+  };
+  kept(); show();
+  read().then(readCover).catch(() => {}).then(() => { if (!section.hidden) listen(); });
+  window.skyquilt.plan = { shapes: () => shapes, marks, cover: () => sharing, provisional };
+})();
