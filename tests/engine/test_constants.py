@@ -45,7 +45,13 @@ IN_NO_KEY = {
     "CERTAIN": "conflicts are told in the report and shape nothing",
     "CONTRADICTED_PX": "conflicts are told in the report and shape nothing",
     **dict.fromkeys(
-        ("_LEAST_FOCAL", "_MOST"), "limits of files that are refused: they shape no result"
+        ("_WIDTH", "_HEIGHT", "_BITS", "_CODEC", "_SAMPLES", "_STRIPS", "_TILES", "_XMP_TAG")
+        + ("_CODECS",),
+        "the numbers that the TIFF format gives to tags",
+    ),
+    **dict.fromkeys(
+        ("MOST_CHUNKS", "MOST_STRIPS", "_LEAST_FOCAL", "_MOST"),
+        "limits of files that are refused: they shape no result",
     ),
     **dict.fromkeys(
         ("NOISE", "TEXTURE", "RIM", "_DERIVE", "_SMOOTH", "RADIUS", "MIN_PEAK", "BROAD_PEAK")
