@@ -108,9 +108,12 @@ def _check_named(settings: InputSettings) -> None:
         UsageError: one does.
     """
     for option in ("gcp", "geo", "cameras", "distances"):
-        path = getattr(settings, option)
-        if path is not None and not path.exists():
-            raise UsageError(f"--{option} {path} does not exist; check the path")
+        _check_exists(option, getattr(settings, option))
+
+
+def _check_exists(option: str, path: Path | None) -> None:
+    if path is not None and not path.exists():
+        raise UsageError(f"--{option} {path} does not exist; check the path")
 
 
 def completed(given: SurveyInput, settings: InputSettings) -> SurveyInput:
@@ -157,6 +160,7 @@ def check_input(given: SurveyInput, output: Path, settings: MosaicSettings) -> N
     frame = choose_frame(
         given.survey.photos, settings.picture.crs, given.control, settings.picture.vertical_datum
     )
+    _check_exists("boundary", settings.picture.boundary)
     if settings.picture.boundary is not None and not given.survey.clips:
         if frame.crs is None:
             raise UsageError(
