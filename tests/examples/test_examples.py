@@ -77,7 +77,7 @@ def test_without_arguments_each_says_how_to_call_it(path):
 
 
 def test_they_are_numbered_without_gaps():
-    assert [int(p.name[:2]) for p in sorted(EXAMPLES.glob("*.py"))] == list(range(5))
+    assert [int(p.name[:2]) for p in sorted(EXAMPLES.glob("*.py"))] == list(range(6))
 
 
 @pytest.mark.slow

@@ -149,7 +149,7 @@ def _by_photos(track: Index, photo: Index) -> tuple[Index, Index]:
 
     `track` (N,) ascending, `photo` (N,) ascending within each track.
     """
-    starts = np.flatnonzero(np.r_[True, np.diff(track) != 0])
+    starts = np.flatnonzero(np.r_[True, np.diff(track) != 0])[: len(track)]
     length = np.diff(np.r_[starts, len(track)])
     nth = [photo[starts + np.minimum(k, length - 1)] for k in range(3)]
     place = np.empty(len(starts), np.int64)
