@@ -9,10 +9,11 @@ import pytest
 
 from skyquilt.alignment import equations
 from skyquilt.alignment.adjust import adjust, covariance, polish_points
-from skyquilt.alignment.bundle import leave_one_out, prune
 from skyquilt.alignment.equations import Equations, observation_equations
+from skyquilt.alignment.outcome import leave_one_out
 from skyquilt.alignment.problem import attitude_error, linearise, residuals_px
 from skyquilt.alignment.robust import prior_terms, robust_cost
+from skyquilt.alignment.stages import prune
 from skyquilt.geometry import block_cholesky
 from skyquilt.geometry.block_cholesky import Factor
 from tests.alignment.blocks import (

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from skyquilt.alignment.bundle import Bundle, position_noise, prune
+from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import Control, control_in_frame, fit_similarity_3d
 from skyquilt.alignment.setup import HALF_TURN
+from skyquilt.alignment.stages import position_noise, prune
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import angles_from_cam_R_map, rotation_from_vector

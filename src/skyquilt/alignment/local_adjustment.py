@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import adjust
-from skyquilt.alignment.bundle import prune
 from skyquilt.alignment.motion import velocities
 from skyquilt.alignment.problem import Problem, State, residuals_px
 from skyquilt.alignment.setup import HALF_TURN, Setup, pose_records, set_up
+from skyquilt.alignment.stages import prune
 from skyquilt.alignment.start import Start, plane_link
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated

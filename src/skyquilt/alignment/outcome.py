@@ -1,0 +1,113 @@
+"""What an adjustment tells: ground points, predicted accuracy, and what a flight leaves open."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.adjust import Covariance
+from skyquilt.alignment.deviations import point_deviations
+from skyquilt.alignment.problem import Problem, State, residuals_px
+from skyquilt.alignment.setup import Setup
+from skyquilt.alignment.stages import heights_above, prune
+from skyquilt.alignment.tracks import Tracks
+from skyquilt.alignment.triangulate import polish, triangulated
+from skyquilt.model.poses import Accuracy, TiePoints
+
+Array = NDArray[np.float64]
+SAMPLED = 400
+"""Ground points whose accuracy is predicted, about."""
+UNDETERMINED = 0.7
+"""A focal length whose deviation stays above this share of its prior's is not determined."""
+
+
+def leave_one_out(
+    problem: Problem, state: State, covariance: Covariance | None
+) -> tuple[float, float, float] | None:
+    """RMS per axis in m of the difference between each measured position and its prediction from
+    all other observations.
+
+    Computed from the covariance of the full solution (the usual identity of linear least squares)
+    instead of n adjustments.
+    """
+    known = np.flatnonzero(np.isfinite(problem.C0[:, :2]).all(1))
+    if covariance is None or len(known) < 3:
+        return None
+    out = []
+    for i in known:
+        axes = np.isfinite(problem.C0[i])
+        e = (state.C[i] - problem.C0[i])[axes]
+        white = e / problem.sigma_C[i][axes]
+        precision = np.diag(1 / problem.sigma_C[i][axes] ** 2) / np.sqrt(
+            1 + (white @ white) / problem.loss_C**2
+        )
+        own = covariance.photos[i, 3:6, 3:6][np.ix_(axes, axes)]
+        full = np.full(3, np.nan)
+        full[axes] = np.linalg.solve(np.eye(len(e)) - own @ precision, e)
+        out.append(full)
+    rms = np.sqrt(np.nanmean(np.array(out) ** 2, axis=0)) if out else np.full(3, np.nan)
+    return float(rms[0]), float(rms[1]), float(rms[2])
+
+
+def ground_points(tracks: Tracks, setup: Setup, problem: Problem, state: State) -> TiePoints:
+    """All tracks triangulated with the final poses; outliers and unstable points are removed."""
+    everything, _ = setup.problem(tracks)
+    everything = replace(everything, loss_px=2.0)
+    whole = triangulated(everything, state)
+    whole, _ = polish(everything, whole, iterations=3)
+    everything, whole = prune(everything, whole, 5.0)
+    whole, sigma_z = polish(everything, whole, iterations=2)
+    height = float(np.median(state.C[:, 2]) - np.median(whole.X[:, 2]))
+    keep = (sigma_z < 0.05 * abs(height))[everything.point]
+    points, renumbered = np.unique(everything.point[keep], return_inverse=True)
+    photo = setup.members[everything.photo[keep]]
+    return TiePoints(
+        xyz=whole.X[points],
+        point=renumbered.astype(np.int64),
+        photo=photo,
+        px=setup.file_px(photo, everything.px[keep]),
+        residual_px=residuals_px(everything, whole)[keep] * setup.file_sign(photo),
+    )
+
+
+def accuracy(setup: Setup, problem: Problem, state: State, covariance: Covariance) -> Accuracy:
+    """Predicted deviations of a sample of ground points."""
+    seen = np.flatnonzero(np.bincount(problem.point, minlength=len(state.X)) >= 2)
+    sample = seen[:: max(1, len(seen) // SAMPLED)]
+    tied = bool(np.isfinite(problem.X0).any())
+    stated = np.median(setup.stated_sigma_C, axis=0)
+    return Accuracy(
+        xyz=state.X[sample],
+        sigma_m=point_deviations(problem, state, covariance, sample),
+        shared_m=(0.0, 0.0) if tied else (float(stated[0]), float(stated[2])),
+        focal_share=_focal_share(problem, covariance),
+        design_effect=problem.design_effect,
+    )
+
+
+def _focal_share(problem: Problem, covariance: Covariance) -> float:
+    """Largest ratio of a focal length's deviation after the adjustment to that before."""
+    after = covariance.camera_sigmas[:, 0]
+    return float(np.max(np.where(problem.free[:, 0], after / problem.sigma_K[:, 0], 0.0)))
+
+
+def undetermined(
+    setup: Setup, problem: Problem, state: State, covariance: Covariance | None
+) -> tuple[str, ...]:
+    """Sentences about what the flight does not determine."""
+    if covariance is None:
+        return ()
+    notes = []
+    height = float(np.median(heights_above(state)))
+    after = covariance.camera_sigmas[:, 0]
+    for row, key in enumerate(setup.camera_keys):
+        share = float(after[row] / state.K[row, 0])
+        told = float(problem.sigma_K[row, 0] / state.K[row, 0])
+        if problem.free[row, 0] and share > UNDETERMINED * told and share * height > 0.01:
+            notes.append(
+                f"This flight does not determine the focal length of {key}: it stays as uncertain"
+                f" as its metadata ({100 * share:.1f} %), and heights of the ground with it"
+                f" ({share * height:.2g} m, one standard deviation); control points, oblique photos"
+                " or lines at two heights would."
+            )
+    return tuple(notes)

@@ -1,0 +1,145 @@
+"""The stages of an adjustment: ever narrower losses, outliers removed in between, observations and
+positions believed as far as they show to be right.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.adjust import adjust
+from skyquilt.alignment.deviations import believed, observed_noise, robust_scale
+from skyquilt.alignment.problem import READOUT, Problem, State, residuals_px, swept
+from skyquilt.alignment.robust import robust_cost
+from skyquilt.alignment.setup import Setup
+
+Array = NDArray[np.float64]
+ROLLS_PX = 0.3
+"""Cameras that move by more than this in px of the photo while a photo is read out turn, too."""
+TURN_RAD_S = np.radians(1.5)
+"""Deviation of the rates at which they turn, in rad/s; it makes up for errors of velocities too."""
+DOUBTED = 2.5
+"""Positions that a block misses by more than this many deviations are not what they claim."""
+
+
+def rough(problem: Problem, state: State) -> tuple[Problem, State]:
+    """First stage: intrinsics fixed under a wide loss, then all free under a narrower one; outliers
+    are removed in between.
+    """
+    fixed = replace(problem, free=np.zeros_like(problem.free), loss_px=20.0)
+    state = adjust(fixed, state, iterations=10, tolerance=3e-2).state
+    problem, state = prune(problem, state, 40.0)
+    state = adjust(problem.with_loss(6.0), state, iterations=20, tolerance=3e-3, damping=1e-5).state
+    return prune(problem, state, 12.0)
+
+
+def fine(problem: Problem, state: State) -> tuple[Problem, State]:
+    """Second stage: all unknowns free under ever narrower losses; outliers are removed in
+    between.
+    """
+    problem, state = prune(problem, state, 20.0)
+    state = adjust(problem.with_loss(2.5), state, iterations=20, tolerance=2e-3, damping=1e-6).state
+    problem, state = prune(problem, state, 5.0)
+    return problem, adjust(
+        problem.with_loss(2.0), state, iterations=15, tolerance=3e-4, damping=1e-6
+    ).state
+
+
+def weighed(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
+    """The adjustment repeated with observations as sharp as their residuals show them to be, and
+    with the weight that those are worth; with turns of the cameras where rows were exposed one
+    after the other.
+    """
+    reach = np.linalg.norm(swept(problem, state), axis=1) / heights_above(state)
+    rolls = bool((reach * state.K[problem.camera, 0] > ROLLS_PX).any())
+    if rolls:
+        readout = np.abs(state.K[problem.camera, READOUT])
+        problem = replace(problem, sigma_turn=np.maximum(TURN_RAD_S * readout, 1e-9))
+        state = adjust(problem, state, iterations=15, tolerance=1e-3, damping=1e-6).state
+    for _ in range(2):
+        scale = robust_scale(problem, state)
+        problem = replace(problem, sigma_px=problem.sigma_px * scale)
+        noise = observed_noise(problem.with_loss(2.0), state, setup.size[setup.members])
+        problem = believed(problem.with_loss(2.0), noise)
+        state = adjust(problem, state, iterations=15, tolerance=3e-4, damping=1e-6).state
+    return _standing(problem, state) if rolls else (problem, state)
+
+
+def _standing(problem: Problem, state: State) -> tuple[Problem, State]:
+    """The adjustment as if cameras stood still while they expose, where that explains the photos
+    better: drones that stop for each photo have positions and times as if they flew on.
+    """
+    still = problem.velocity * 0.0
+    free = problem.free.copy()
+    free[:, READOUT] = False
+    other = replace(problem, velocity=still, free=free)
+    K = state.K.copy()
+    K[:, READOUT] = problem.K0[:, READOUT]
+    begin = replace(state, K=K, turn=np.zeros_like(state.turn))
+    stood = adjust(other, begin, iterations=10, tolerance=1e-3, damping=1e-6)
+    if stood.cost < robust_cost(problem, state):
+        return other, stood.state
+    return problem, state
+
+
+def heights_above(state: State) -> Array:
+    """Heights (n,) in m of the cameras above the points."""
+    return np.maximum(state.C[:, 2] - np.median(state.X[:, 2]), 1.0)
+
+
+def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]:
+    """Removes observations with residuals above `limit` deviations and points left with one
+    observation; control points are kept.
+    """
+    error = np.linalg.norm(residuals_px(problem, state), axis=1) / problem.sigma_px
+    pinned = np.asarray(np.isfinite(problem.X0).any(1))
+    good = (error < limit) | pinned[problem.point]
+    enough = np.bincount(problem.point[good], minlength=len(state.X)) >= 2
+    good &= enough[problem.point] | pinned[problem.point]
+    thinner, points = problem.only(good)
+    return thinner, replace(state, X=state.X[points])
+
+
+def believe_positions(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
+    """Positions believed as far as the photos confirm them.
+
+    The start gave them deviations as wide as their scatter about it, which is coarse. Here they get
+    those that they state, or their scatter between neighbours where that is larger. Only
+    differences from photo to photo count: a smooth misfit may be a deformation of the block, and
+    positions with less weight would permit it. Where a block then still misses its positions by
+    more than these deviations allow, they are not what they claim (a drifting barometer, a plain
+    GPS that states centimetres), and what the start gave stays.
+    """
+    started = problem.sigma_C
+    doubted = np.zeros(started.shape, bool)
+    for _ in range(3):
+        error = state.C - problem.C0
+        sigma = started.copy()
+        for block in setup.block_rows:
+            for axes in (slice(0, 2), slice(2, 3)):
+                stated = setup.stated_sigma_C[block][:, axes]
+                wanted = np.maximum(stated, position_noise(error[block][:, axes]))
+                trusted = ~doubted[block][:, axes]
+                sigma[block, axes] = np.where(trusted, wanted, sigma[block, axes])
+        if np.allclose(sigma, problem.sigma_C, rtol=0.15, equal_nan=True):
+            break
+        problem = replace(problem, sigma_C=sigma)
+        state = adjust(problem.with_loss(2.0), state, iterations=10, tolerance=1e-4).state
+        misfit = np.abs(state.C - problem.C0) / problem.sigma_C
+        for block in setup.block_rows:
+            for axes in (slice(0, 2), slice(2, 3)):
+                known = misfit[block][:, axes][np.isfinite(misfit[block][:, axes])]
+                if len(known) and 1.48 * np.median(known) > DOUBTED:
+                    doubted[block, axes] = True
+    return problem, state
+
+
+def position_noise(error: Array) -> float:
+    """Robust deviation in m of each axis of position errors (n, 2), in order of capture, from
+    their neighbours' mean.
+    """
+    known = error[np.isfinite(error).all(1)]
+    if len(known) < 6:
+        return 0.0
+    local = known[1:-1] - (known[:-2] + known[2:]) / 2
+    return float(1.48 * np.median(np.abs(local)) / np.sqrt(1.5))
