@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.equations import sums_by_point
 from skyquilt.alignment.problem import READOUT, Problem, State, linearised_points
 from skyquilt.geometry.camera import undistort
 from skyquilt.model.camera import PARAMETERS, Camera
@@ -27,11 +28,20 @@ def intersect(point: NDArray[np.int64], origin: Array, direction: Array, count: 
 
 def triangulated(problem: Problem, state: State) -> State:
     """The state with all points of the problem (as many as in `X0`) intersected from their rays."""
+    X = np.zeros((len(problem.X0), 3))
+    for part, _, points in problem.parts(state):
+        X[points] = _intersected(part, state)
+    return replace(state, X=X)
+
+
+def _intersected(problem: Problem, state: State) -> Array:
+    """Points (P, 3) of the observations of a part."""
     xy = np.empty((len(problem.px), 2))
     for row, k in enumerate(state.K):
         own = problem.camera[problem.photo] == row
-        camera = Camera(width=1, height=1, **dict(zip(PARAMETERS, k[:READOUT], strict=True)))
-        xy[own] = undistort(camera, problem.px[own])
+        if own.any():
+            camera = Camera(width=1, height=1, **dict(zip(PARAMETERS, k[:READOUT], strict=True)))
+            xy[own] = undistort(camera, problem.px[own])
     local = np.column_stack([xy, np.ones(len(xy))])
     origin, photo, share = state.C[problem.photo], problem.photo, problem.share[:, None]
     if state.turn.any():
@@ -40,23 +50,23 @@ def triangulated(problem: Problem, state: State) -> State:
         moved = problem.velocity * state.K[problem.camera, READOUT, None]
         origin = origin + share * moved[photo]
     direction = np.einsum("nji,nj->ni", state.R[photo], local)
-    X = intersect(problem.point, origin, direction, len(problem.X0))
-    return replace(state, X=X)
+    return intersect(problem.point, origin, direction, len(problem.X0))
 
 
 def polish(problem: Problem, state: State, *, iterations: int = 5) -> tuple[State, Array]:
     """Gauss-Newton on the points alone; returns the state and the standard deviation (P,) of each
     point's height in m.
     """
-    sigma_z = np.full(len(state.X), np.inf)
-    for _ in range(iterations):
-        residual, J = linearised_points(problem, state)
-        w = 1 / (1 + (residual**2).sum(1) / problem.loss_px**2)
-        H, g = np.zeros((len(state.X), 3, 3)), np.zeros((len(state.X), 3))
-        np.add.at(H, problem.point, np.swapaxes(J, 1, 2) @ J * w[:, None, None])
-        np.add.at(g, problem.point, np.einsum("nki,nk->ni", J, residual) * w[:, None])
-        H += np.eye(3) * 1e-9
-        step = -np.linalg.solve(H, g[..., None])[..., 0]
-        state = replace(state, X=state.X + step)
-        sigma_z = np.sqrt(np.abs(np.linalg.inv(H)[:, 2, 2]))
-    return state, sigma_z
+    X, sigma_z = state.X.copy(), np.full(len(state.X), np.inf)
+    for part, own, points in problem.parts(state):
+        for _ in range(iterations):
+            residual, J = linearised_points(part, own)
+            w = 1 / (1 + (residual**2).sum(1) / part.loss_px**2)
+            rows = np.concatenate([J, residual[..., None]], 2)
+            products = np.swapaxes(J, 1, 2) @ rows * w[:, None, None]
+            sums = sums_by_point(part, products, len(own.X))
+            H = sums[:, :, :3] + np.eye(3) * 1e-9
+            own = replace(own, X=own.X - np.linalg.solve(H, sums[:, :, 3:])[..., 0])
+            sigma_z[points] = np.sqrt(np.abs(np.linalg.inv(H)[:, 2, 2]))
+        X[points] = own.X
+    return replace(state, X=X), sigma_z
