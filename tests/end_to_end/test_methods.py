@@ -68,6 +68,7 @@ def test_hybrid_fits_better_than_pose_and_image_too(mosaic, lines, tmp_path):
     assert corr["pose"] < corr["hybrid"] - 0.02 and corr["pose"] < corr["image"] - 0.02
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
@@ -86,6 +87,7 @@ def test_options_of_methods(mosaic, lines, options):
     assert told.metrics["photos_used"] == len(named(lines / "photos"))
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_equal_seeds_give_equal_maps(mosaic, lines, tmp_path):
     found = [
@@ -213,6 +215,7 @@ def test_photos_that_a_sequence_does_not_name_are_left_out(mosaic, flight, tmp_p
     assert told.metrics["photos_rejected"]["SIM_0005.jpg"] == "it is not listed in the sequence"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_compare_sets_methods_side_by_side(lines, tmp_path):
     out = tmp_path / "out"

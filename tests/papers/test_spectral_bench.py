@@ -118,6 +118,7 @@ def test_unknown_methods_and_taken_outputs(listed, tmp_path):
         list(iter_spectral_bench(listed, tmp_path, ("usurf",)))
 
 
+@pytest.mark.long
 @pytest.mark.real
 @pytest.mark.slow
 def test_auto_on_the_real_pairs(tmp_path):

@@ -74,6 +74,7 @@ def test_bundle_by_every_estimator(flight, tmp_path, estimator):
     assert 0.005 < off_m(flight, tmp_path / "out") < 0.3  # four map pixels of the photos
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "estimator", ["ransac", "lmeds", "magsac", "ste", "ncc", "phase", "ecc", "mi"]
@@ -85,6 +86,7 @@ def test_image_by_every_estimator(flight, tmp_path, estimator):
     assert made.metrics["quality"]["lambda_corr"] > 0.7
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["ste", "ransac", "lmeds", "magsac"])
 def test_flight_lines_by_every_estimator(flight, tmp_path, estimator):
