@@ -15,13 +15,14 @@ from pathlib import Path
 import numpy as np
 from shapely import box
 
+from skyquilt.alignment.priors import utm_epsg
 from skyquilt.live.fill import known_plan
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
 from skyquilt.photos.survey import read_survey
 from skyquilt.planning.plan_file import write_plan
 from skyquilt.planning.records import Drone, PicturePoint, Plan, Proof, Sortie, Waypoint
-from skyquilt.planning.site import in_zone, make_site, utm_of
+from skyquilt.planning.site import in_zone, make_site
 from skyquilt.planning.view import find_view
 from skyquilt.server.access import Guard
 from skyquilt.server.server_process import ServerConfig, ServerProcess
@@ -32,7 +33,7 @@ def plan_around(photos: Path, path: Path) -> None:
     survey = read_survey(photos)
     first = next(p for p in survey.photos if p.position is not None).position
     assert first is not None
-    crs = utm_of(first.longitude_deg, first.latitude_deg)
+    crs = utm_epsg(first.latitude_deg, first.longitude_deg)
     x, y = in_zone(crs, np.array([[first.longitude_deg, first.latitude_deg]]))[0]
     points = tuple(
         PicturePoint(id=k + 1, x=x - 160 + 8 * (k % 40), y=y - 125 + 10 * (k // 40), z=60.0,

@@ -65,7 +65,7 @@ class Covariance:
 
     def of(self, photos: Sequence[int] | Index) -> Array:
         """(p k + b, p k + b) of some photos and the border of the system: all cameras with free
-        unknowns, then the common shift of positions, if it is one.
+        unknowns, then the common shift of positions, if there is one.
         """
         pat, chosen = self.inverse.pattern, np.asarray(photos, np.int64)
         k, p = len(chosen), pat.size

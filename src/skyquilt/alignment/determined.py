@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.setup import INDEPENDENT
 from skyquilt.geometry.camera import project_with_derivatives, rays
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Alignment, Pose, Prior, TiePoints
@@ -25,8 +26,6 @@ chance.
 """
 AGAIN = 1.2
 """A photo is looked at again when it has this many times as many points as before."""
-INDEPENDENT = 40
-"""Independent observations that tell as much as a photo's many correlated ones."""
 GRID = np.stack(np.meshgrid(*2 * [np.linspace(0.02, 0.98, 5)]), -1).reshape(-1, 2)
 """Places in the picture, as shares of its width and height, where the deviation is predicted."""
 STEEPEST = np.tan(np.radians(70.0))

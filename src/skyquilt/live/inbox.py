@@ -106,10 +106,10 @@ class Inbox:
             synced(self.folder)
             hit("photo file named")
         except OSError as error:
-            _gone(partial)
+            gone(partial)
             raise _refusal(self.folder, error) from error
         except BaseException:
-            _gone(partial)
+            gone(partial)
             raise
         return Arrived(path=path, digest=digest.hexdigest(), size=size)
 
@@ -132,7 +132,8 @@ def synced(folder: Path) -> None:
             os.close(handle)
 
 
-def _gone(path: Path) -> None:
+def gone(path: Path) -> None:
+    """Deletes a file that may not be there, or not be ours to delete."""
     with suppress(OSError):
         path.unlink()
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from shapely import Polygon, union_all
 
+from skyquilt.alignment.priors import utm_epsg
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.live.ledger import Ledger
 from skyquilt.model.photo import RejectedPhoto
@@ -23,7 +24,7 @@ from skyquilt.photos.read import read_photo
 from skyquilt.planning.ground_cover import Cover, cover_of, to_mercator, write_cover
 from skyquilt.planning.missing import COVERAGE, STATE, planned_cover
 from skyquilt.planning.records import Plan
-from skyquilt.planning.site import in_zone, utm_of
+from skyquilt.planning.site import in_zone
 from skyquilt.raster.atomic import write_text
 from skyquilt.video.looks import sharpness
 
@@ -152,7 +153,7 @@ class Mission:
         if not rings:
             return None
         places = np.concatenate(rings)
-        crs = utm_of(*places.mean(axis=0))
+        crs = utm_epsg(*places.mean(axis=0)[::-1])
         hull = union_all([Polygon(in_zone(crs, r)).buffer(0) for r in rings]).convex_hull
         if self._cover is None or not self._within(places):
             self._cover = cover_of(hull.buffer(0.15 * hull.length / 4), crs)

@@ -5,14 +5,13 @@ import re
 import time
 import unicodedata
 from collections.abc import Iterable
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from skyquilt.engine.error_log import log_error
 from skyquilt.errors import OutputError, UnreadablePhotoError
 from skyquilt.live.failures import of_the_system
-from skyquilt.live.inbox import Arrived, Inbox, belongs_to_clip, is_clip
+from skyquilt.live.inbox import Arrived, Inbox, belongs_to_clip, gone, is_clip
 from skyquilt.live.ledger import Ledger, hit
 from skyquilt.live.settings import LiveSettings
 from skyquilt.model.photo import Photo, RejectedPhoto
@@ -95,7 +94,7 @@ class Intake:
         except Exception as error:  # whatever it is, it concerns this photo alone
             if system := of_the_system(error):
                 raise system from error
-            _gone(arrived.path)
+            gone(arrived.path)
             log_error(self.ledger.path.parent, name, error)
             return self.refuse(name, source, rejected(name, error).reason)
 
@@ -135,14 +134,14 @@ class Intake:
             most_mp=self.settings.most_mp,
         )
         if isinstance(photo, RejectedPhoto):
-            _gone(arrived.path)
+            gone(arrived.path)
             if photo.trace:
                 log_error(self.ledger.path.parent, f"{name}: {photo.reason}", photo.trace)
             return self.refuse(name, source, photo.reason)
         try:
             return self._row(arrived, photo, name, source)
         except OutputError:
-            _gone(arrived.path)
+            gone(arrived.path)
             raise
 
     def _row(self, arrived: Arrived, photo: Photo, name: str, source: str) -> Accepted | Refused:
@@ -160,7 +159,7 @@ class Intake:
             )
             larger = next((n for _, n, w in same if w > photo.width), None)
             if larger is not None:
-                _gone(arrived.path)
+                gone(arrived.path)
                 return self.refuse(
                     name, source, f"it is a smaller copy of {larger}, which was already received"
                 )
@@ -198,8 +197,3 @@ def shot_of(photo: Photo) -> str:
     shape = round(photo.width / photo.height, 1)
     place = f"{photo.position.latitude_deg:.7f} {photo.position.longitude_deg:.7f}"
     return f"{camera}|{photo.band}|{shape}|{photo.time.isoformat()}|{place}"
-
-
-def _gone(path: Path) -> None:
-    with suppress(OSError):
-        path.unlink()

@@ -18,13 +18,14 @@ def _table() -> dict[str, tuple[tuple[float, float], ...]]:
     text = files("skyquilt.photos").joinpath("shutters.csv").read_text("utf-8")
     table: dict[str, tuple[tuple[float, float], ...]] = {}
     for row in csv.DictReader(text.splitlines()):
-        key = _plain(row["model"])
+        key = plain_model(row["model"])
         entry = (float(row["below_mp"] or "inf"), float(row["readout_ms"]) / 1000)
         table[key] = (*table.get(key, ()), entry)
     return table
 
 
-def _plain(text: str) -> str:
+def plain_model(text: str) -> str:
+    """A camera model's name without case, spaces and signs, as tables are searched."""
     return "".join(c for c in text.lower() if c.isalnum())
 
 
@@ -41,7 +42,7 @@ def find_shutter(model: str, megapixels: float, rolling: bool | None) -> Shutter
     """
     if rolling is False:
         return Shutter(readout_s=0.0, sigma_s=0.0, source="global")
-    for below, readout in _table().get(_plain(model), ()):
+    for below, readout in _table().get(plain_model(model), ()):
         if megapixels < below:
             return Shutter(readout_s=readout, sigma_s=_TABLE_SHARE * readout, source="table")
     if rolling:

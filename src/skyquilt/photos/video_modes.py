@@ -13,7 +13,7 @@ from importlib.resources import files
 from skyquilt.model.clip import Clip
 from skyquilt.model.photo import Focal, Shutter
 from skyquilt.photos.lens import find_sensor
-from skyquilt.photos.shutter import find_shutter
+from skyquilt.photos.shutter import find_shutter, plain_model
 
 _SENSOR_SIGMA = 0.10
 """Of a focal length from the sensor: modes cut up to a fifth off the width."""
@@ -57,17 +57,13 @@ def _table() -> dict[str, tuple[Mode, ...]]:
             source=row["source"],
         )
         for model in row["models"].split("|"):
-            table[_plain(model)] = (*table.get(_plain(model), ()), mode)
+            table[plain_model(model)] = (*table.get(plain_model(model), ()), mode)
     return table
-
-
-def _plain(text: str) -> str:
-    return "".join(c for c in text.lower() if c.isalnum())
 
 
 def find_mode(model: str, width: int, height: int) -> Mode | None:
     """The row for a camera model, as EXIF or the container names it, and a size; None without."""
-    modes = _table().get(_plain(model), ())
+    modes = _table().get(plain_model(model), ())
     return next((m for m in modes if (m.width, m.height) == (width, height)), None)
 
 

@@ -7,6 +7,7 @@ from itertools import combinations, pairwise
 import numpy as np
 from shapely import LineString, MultiPoint, Polygon
 
+from skyquilt.alignment.priors import utm_epsg
 from skyquilt.errors import RefusedError
 from skyquilt.planning.coverage import Cuts, all_seen, make_cells, sight_may_be_blocked
 from skyquilt.planning.flights import Surface, nearest
@@ -16,7 +17,7 @@ from skyquilt.planning.missions import Mission
 from skyquilt.planning.plan_file import convergence
 from skyquilt.planning.points import MOST_CUTS, Layout
 from skyquilt.planning.records import Array, KeepOut, Plan, Proof, Site, View
-from skyquilt.planning.site import in_zone, make_site, utm_of
+from skyquilt.planning.site import in_zone, make_site
 from skyquilt.planning.terrain import Terrain
 
 PER_FOOTPRINT = 48
@@ -80,7 +81,7 @@ def check_mission(
     clearance: float,
 ) -> Verdict:
     """Checks a mission of another program; without areas, the outline of its photos counts."""
-    crs = site.crs if site else utm_of(*mission.places.mean(axis=0))
+    crs = site.crs if site else utm_epsg(*mission.places.mean(axis=0)[::-1])
     places = in_zone(crs, mission.places)
     start = in_zone(crs, np.array([mission.home]))[0] if mission.home else places[0]
     zero = float(terrain.at(start[0], start[1])) if mission.relative else 0.0

@@ -4,11 +4,12 @@ from pathlib import Path
 
 from shapely import MultiPoint
 
+from skyquilt.alignment.priors import utm_epsg
 from skyquilt.errors import UsageError
 from skyquilt.planning.check import Verdict, check_mission, check_plan
 from skyquilt.planning.missions import read_mission
 from skyquilt.planning.plan_file import read_plan
-from skyquilt.planning.site import in_zone, read_site, utm_of
+from skyquilt.planning.site import in_zone, read_site
 from skyquilt.planning.terrain import FLAT, read_terrain
 from skyquilt.planning.view import find_view
 
@@ -45,7 +46,7 @@ def check_file(
     site = read_site(area, width_m=width_m) if area else None
     ground = FLAT
     if terrain is not None:
-        crs = site.crs if site else utm_of(*mission.places.mean(axis=0))
+        crs = site.crs if site else utm_epsg(*mission.places.mean(axis=0)[::-1])
         hull = MultiPoint(in_zone(crs, mission.places)).convex_hull.buffer(1.0)
         ground = read_terrain(terrain, crs, hull, AROUND_M)
     return check_mission(mission, view, site, ground, views=views or 1, clearance=clearance)

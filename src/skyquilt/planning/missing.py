@@ -14,13 +14,14 @@ from shapely import transform, union_all
 from shapely.geometry import shape as from_geojson
 from shapely.geometry.base import BaseGeometry
 
+from skyquilt.alignment.priors import utm_epsg
 from skyquilt.errors import RefusedError, SideFileError
 from skyquilt.outside import read_bounded
 from skyquilt.planning.ground_cover import OUTSIDE, Cover, cover_of, to_mercator
 from skyquilt.planning.plan_file import read_plan
 from skyquilt.planning.points import is_shut
 from skyquilt.planning.records import Plan, Site
-from skyquilt.planning.site import geographic, make_site, read_keep_out, utm_of
+from skyquilt.planning.site import geographic, make_site, read_keep_out
 from skyquilt.planning.terrain import FLAT
 
 VIEWS = "views.tif"
@@ -148,7 +149,7 @@ def missing_site(folder: Path, views: int, *, keep_out: Path | None = None) -> S
 def _placed(area: BaseGeometry, crs: str, keep_out: Path | None) -> Site:
     """The site of an area in any projection."""
     middle = geographic(crs, np.array([area.centroid.coords[0]]))[0]
-    zone = utm_of(*middle)
+    zone = utm_epsg(*middle[::-1])
     turned = Transformer.from_crs(crs, zone, always_xy=True)
     moved = transform(area, lambda xy: np.column_stack(turned.transform(xy[:, 0], xy[:, 1])))
     return make_site(moved.buffer(0), read_keep_out(keep_out, zone) if keep_out else (), zone)

@@ -18,6 +18,7 @@ from shapely import (
 )
 from shapely.geometry.base import BaseGeometry
 
+from skyquilt.alignment.priors import utm_epsg
 from skyquilt.errors import SideFileError, UsageError
 from skyquilt.outside import plain, real
 from skyquilt.planning.features import Feature, read_features
@@ -66,12 +67,6 @@ def make_site(observe: BaseGeometry, closed: Sequence[KeepOut], crs: str) -> Sit
                 keep_out=tuple(closed))  # fmt: skip
 
 
-def utm_of(longitude: float, latitude: float) -> str:
-    """The UTM zone of a place, as EPSG code."""
-    zone = min(int((longitude + 180) // 6) + 1, 60)
-    return f"EPSG:{(32600 if latitude >= 0 else 32700) + zone}"
-
-
 def _sorted(path: Path, keep_out: Path | None) -> tuple[list[BaseGeometry], list[KeepOut], str]:
     """Shapes to observe and closed places, in the zone of the first file, and the zone."""
     found, source = read_features(path)
@@ -86,7 +81,7 @@ def _sorted(path: Path, keep_out: Path | None) -> tuple[list[BaseGeometry], list
             f"{Path(path).name}: longitude {low[0]:.4g} to {high[0]:.4g} and latitude {low[1]:.4g}"
             f" to {high[1]:.4g} are no place to fly"
         )
-    crs = utm_of(*((low + high) / 2))
+    crs = utm_epsg(*((low + high) / 2)[::-1])
     shapes, closed = [], []
     for number, (feature, shape) in enumerate(zip(found, longitudes, strict=True), 1):
         placed = _moved(shape, "EPSG:4326", crs, path)
