@@ -1,12 +1,18 @@
 """`register` with method `auto` on pairs made from known ones: registrations accepted by chance,
-and the effect of other rotations, scales and shifts.
+the effect of other rotations, scales and shifts, and whether stated errors hold.
 
-    python benchmarks/spectral.py PAIRS.csv [--unrelated 300] [--rounds 3]
+    python benchmarks/spectral.py PAIRS.csv [--unrelated 300] [--rounds 3] [--stated 300]
 
 Unrelated: image A of one pair with the MIRRORED image B of any pair. No registration of them can be
 right, even if two pairs of the list show the same place, and the images have the statistics of the
 true pairs. Variations: image B of each pair is rotated, scaled, shifted and darkened; the truth is
 known.
+
+Stated errors: the same variations, but a part of one picture is blank (no data, black, noise, or
+blurred beyond recognition), so that patches confirm the registration in the rest only. The search
+starts at the similarity nearest to the truth, since not the search is tested. The 95 % bound at the
+worst corner of the overlap is compared with the distance from the truth there. `--corners 0.01`
+also moves B's corners by up to 1 % of its longer side each, which no similarity can follow.
 """
 
 import argparse
@@ -19,10 +25,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.coregistration.methods import registration_method
+from skyquilt.coregistration.orientation import Pyramid
 from skyquilt.coregistration.pictures import open_picture
+from skyquilt.coregistration.refine_registration import stiff
+from skyquilt.coregistration.stated_error import state_error
+from skyquilt.coregistration.structure import sharpened
+from skyquilt.coregistration.usable import both_usable
 from skyquilt.model.photo import RejectedPhoto
-from skyquilt.model.registration import Picture
+from skyquilt.model.registration import Picture, RefusedRegistration, Registration
 from skyquilt.papers.pair_list import Pair, overlap_error, read_pairs
+from skyquilt.papers.spectral_bench import corner_error
 
 METHOD = registration_method("auto")
 
@@ -34,6 +46,8 @@ def main() -> None:
     parser.add_argument("pairs")
     parser.add_argument("--unrelated", type=int, default=300)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--stated", type=int, default=0)
+    parser.add_argument("--corners", type=float, default=0.0)
     parser.add_argument("--seed", type=int, default=1)
     asked = parser.parse_args()
     pairs = read_pairs(Path(asked.pairs))
@@ -42,6 +56,8 @@ def main() -> None:
         unrelated(pairs, asked.unrelated, rng)
     if asked.rounds:
         variations(pairs, asked.rounds, rng)
+    if asked.stated:
+        stated(pairs, asked.stated, asked.corners, rng)
 
 
 def unrelated(pairs: tuple[Pair, ...], count: int, rng: np.random.Generator) -> None:
@@ -96,6 +112,111 @@ def variations(pairs: tuple[Pair, ...], rounds: int, rng: np.random.Generator) -
         f"variations: {sum(a for a, _ in every)} accepted, {sum(r for _, r in every)} right of"
         f" {len(every)}"
     )
+
+
+def stated(pairs: tuple[Pair, ...], count: int, corners: float, rng: np.random.Generator) -> None:
+    """Stated errors of `count` accepted registrations of pictures that are blank in part."""
+    rows: list[tuple[str, float, float, bool, str]] = []
+    tried = 0
+    while len(rows) < count:
+        for pair, picture, truth, _ in varied(pairs, rng, 30.0):
+            if len(rows) == count:
+                break
+            a, (b, truth) = values(pair.a), bent(picture, truth, corners, rng)
+            tried += 1
+            one, other, how = parted(a, b, rng)
+            found = near_truth(one, other, truth)
+            if not isinstance(found, Registration):
+                continue
+            told = state_error(found, a.shape[:2], b.shape[:2], None)
+            assert told is not None
+            actual = corner_error(found.b_H_a, truth, a.shape[:2], b.shape[:2])
+            rows.append((pair.kind, told.error_px, actual, told.error_px <= told.tolerance_px, how))
+        print(f"  {len(rows)} of {tried} accepted", flush=True)
+    for kind in dict.fromkeys(r[0] for r in rows):
+        print(f"  {kind:16} {held([r for r in rows if r[0] == kind])}")
+    for how in dict.fromkeys(r[4] for r in rows):
+        print(f"  {how:16} {held([r for r in rows if r[4] == how])}")
+    print(f"stated: {held(rows)}")
+    print(f"of these within the default tolerance: {held([r for r in rows if r[3]])}")
+
+
+def held(rows: list[tuple[str, float, float, bool, str]]) -> str:
+    told, actual = np.array([r[1] for r in rows]), np.array([r[2] for r in rows])
+    if not len(rows):
+        return "none"
+    return (
+        f"{len(rows):3} registrations, {np.mean(actual <= told):.1%} within the bound, stated /"
+        f" actual {np.median(told / actual):.2f}; actual {np.median(actual):.2f} px, 90 %"
+        f" {np.percentile(actual, 90):.2f} px"
+    )
+
+
+def near_truth(a: Picture, b: Picture, truth: NDArray) -> Registration | RefusedRegistration:
+    """The decision of `auto` on the similarity nearest to the truth, refined as usual."""
+    usable = both_usable(a, b)
+    if isinstance(usable, RefusedRegistration):
+        return usable
+    pyramid = Pyramid(a=usable[0], b=usable[1], sides=METHOD.sides[-2:])
+    return METHOD.decide(pyramid, [sharpened(pyramid, stiff(truth, a.shape), 0)])
+
+
+def bent(
+    picture: NDArray, truth: NDArray, corners: float, rng: np.random.Generator
+) -> tuple[NDArray, NDArray]:
+    """B with its corners moved by up to a share of its longer side, and the truth."""
+    height, width = picture.shape[:2]
+    ends = np.array([[0, 0], [width - 1, 0], [width - 1, height - 1], [0, height - 1]], np.float32)
+    reach = corners * max(height, width)
+    moved = ends + rng.uniform(-reach, reach, (4, 2)).astype(np.float32)
+    change = cv2.getPerspectiveTransform(ends, moved) if corners else np.eye(3)
+    return cv2.warpPerspective(picture, change, (width, height)), change @ truth
+
+
+def parted(a: NDArray, b: NDArray, rng: np.random.Generator) -> tuple[Picture, Picture, str]:
+    """Both pictures, one of them blank but for a half, a rectangle or a disc."""
+    first, how = rng.random() < 0.5, str(rng.choice(["no data", "black", "noise", "blurred"]))
+    changed = a if first else b
+    kept = part(changed.shape[:2], rng)
+    valid = None
+    if how == "no data":
+        valid = kept
+    else:
+        changed = blanked(changed, kept, how, rng)
+    new = Picture(values=changed, valid=valid)
+    return (new, Picture(values=b), how) if first else (Picture(values=a), new, how)
+
+
+def part(shape: tuple[int, int], rng: np.random.Generator) -> NDArray:
+    """A mask (H, W) of a quarter to four fifths of a picture."""
+    height, width = shape
+    y, x = np.mgrid[:height, :width].astype(float)
+    kind = rng.choice(["half", "rectangle", "disc"])
+    if kind == "half":
+        turn = rng.uniform(0, 2 * np.pi)
+        across = (x / width - 0.5) * np.cos(turn) + (y / height - 0.5) * np.sin(turn)
+        return across > rng.uniform(-0.15, 0.1)
+    if kind == "rectangle":
+        w, h = rng.uniform(0.45, 0.9, 2) * (width, height)
+        left, top = rng.uniform(0, 1, 2) * (width - w, height - h)
+        return (x >= left) & (x < left + w) & (y >= top) & (y < top + h)
+    radius = rng.uniform(0.31, 0.5) * np.sqrt(height * width)
+    cx, cy = rng.uniform(0.25, 0.75, 2) * (width, height)
+    return np.hypot(x - cx, y - cy) < radius
+
+
+def blanked(picture: NDArray, kept: NDArray, how: str, rng: np.random.Generator) -> NDArray:
+    """The picture with black, noise or a blurred copy of itself outside the part that is kept."""
+    grain = cv2.GaussianBlur(rng.normal(0, 7, picture.shape).astype(np.float32), (0, 0), 1.1)
+    rest = np.zeros_like(grain)
+    if how == "noise":
+        rest = picture.mean() + grain
+    elif how == "blurred":
+        far = 0.06 * np.sqrt(kept.size)
+        rest = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), far) + grain
+    soft = cv2.GaussianBlur(kept.astype(np.float32), (0, 0), 2) if how != "black" else kept
+    share = soft.reshape(*kept.shape, *[1] * (picture.ndim - 2)).astype(np.float32)
+    return np.clip(picture * share + rest * (1 - share), 0, 255).astype(np.uint8)
 
 
 def varied(

@@ -56,6 +56,9 @@ def test_the_record_tells_the_transform(done):
     assert error(np.array(record["b_H_a"]), TRUTH) < 0.3
     assert record["inliers"] == record["evidence"]["patches_agreeing"] >= 9
     assert 0.2 < record["q"] <= 1 and 0 < record["residual_px"] < 2
+    assert error(np.array(record["b_H_a"]), TRUTH) < record["error_px"] < record["tolerance_px"]
+    assert max(c[2] for c in record["error_corners"]) == record["error_px"]
+    assert record["valid_area"]["share"] == 1 and len(record["valid_area"]["polygon"]) >= 4
     assert sorted(p.name for p in output.iterdir()) == sorted(CONTRACT)
 
 
@@ -96,7 +99,7 @@ def test_pictures_and_page(done):
         picture = cv2.imread(str(output / name))
         assert picture is not None and picture.std() > 10, name
     page = (output / "report.html").read_text()
-    assert page.count("<img") == 4 and "accepted" in page and 'src="http' not in page
+    assert page.count("<img") == 5 and "accepted" in page and 'src="http' not in page
     assert "b.png on a.jpg" in page
 
 
@@ -116,11 +119,38 @@ def test_a_refusal_is_written_down_and_has_its_exit_code(files, tmp_path, capsys
     assert "Refused" in (output / "report.html").read_text()
 
 
+def test_an_error_larger_than_tolerated_is_a_refusal(files, tmp_path, capsys):
+    folder, _, _ = files
+    output = tmp_path / "out"
+    words = (folder / "a.jpg", folder / "b.png", "-o", output, "--quiet", "--tolerance", "0.2")
+    assert command("register", *words) == 7
+    said = capsys.readouterr().err
+    record = json.loads((output / "registration.json").read_text())
+    assert "0.2 px are tolerated" in said and record["reason"] in said
+    assert not record["accepted"] and record["error_px"] > 0.2 == record["tolerance_px"]
+    assert record["valid_area"]["share"] < 1 and sorted(p.name for p in output.iterdir()) == [
+        "registration.json",
+        "report.html",
+    ]
+
+
+def test_the_error_map_lies_on_a(done, files):
+    output, record = done
+    _, a, _ = files
+    with rasterio.open(output / "error.tif") as raster:
+        bound = raster.read(1)
+        assert np.isnan(raster.nodata) and max(raster.shape) == 128
+        assert raster.transform.a * raster.width == pytest.approx(a.shape[1], rel=0.01)
+    inside = np.isfinite(bound)
+    assert 0.5 < inside.mean() < 1
+    assert 0 < bound[inside].min() < bound[inside].max() <= record["error_px"]
+
+
 def test_a_picture_on_itself_is_the_identity_and_said_so(files, tmp_path):
     folder, _, _ = files
     record = register(folder / "b.png", folder / "b.png", tmp_path / "out").metrics
     assert record["accepted"] and record["model"] == "identity"
-    assert record["b_H_a"] == np.eye(3).tolist()
+    assert record["b_H_a"] == np.eye(3).tolist() and record["error_px"] == 0
     assert "same picture" in record["reason"]
 
 

@@ -71,6 +71,8 @@ def test_rows_are_held_against_the_truth(bench):
         "accepted",
         "right",
         "error_px",
+        "corner_px",
+        "stated_px",
         "q",
         "inliers",
         "seconds",
@@ -78,6 +80,8 @@ def test_rows_are_held_against_the_truth(bench):
     }
     assert all(set(r) == wanted for r in rows)
     assert good["accepted"] and good["right"] and good["error_px"] < 0.3
+    assert good["error_px"] <= good["corner_px"] <= good["stated_px"] < 3
+    assert rows[1]["stated_px"] is None  # by features: nothing is stated
     assert lie["accepted"] and not lie["right"] and lie["error_px"] == pytest.approx(7, abs=0.3)
     assert all(
         r["accepted"] or (r["error_px"] is None and r["q"] == 0 and r["reason"]) for r in rows
@@ -89,6 +93,7 @@ def test_tables_count(bench):
     output, events = bench
     page = (output / "report.html").read_text()
     assert "1 right, 1 wrong of 2" in page
+    assert "Stated errors" in page and "1 of 2; " in page  # the lie is not within its bound
     assert "Table 6.4" in page and "2/2" in page and "Table 6.5" in page
     notes = [e.text for e in events if type(e).__name__ == "Note"]
     assert notes[0].startswith("auto: 2 of 2 accepted, 1 right, 1 wrong")

@@ -1,7 +1,8 @@
 """`skyquilt register`: registers two images of different spectra."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -31,6 +32,14 @@ def command(
             help="Try first the registration that metadata and positions suggest.",
         ),
     ] = True,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            help="Largest error in px of B that is tolerated over the picture: a registration that"
+            " may be further off in a corner (95 %) is refused. For auto and structure."
+            " Default: 2 % of B's diagonal."
+        ),
+    ] = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -45,7 +54,7 @@ def command(
         from skyquilt.coregistration.workflow import iter_register
 
     mode = mode_of(quiet=quiet, json=json)
-    settings = RegisterSettings(method=method, use_metadata=metadata)
+    settings = RegisterSettings(method=method, use_metadata=metadata, tolerance_px=tolerance)
     events = iter_register(a, b, output, settings, overwrite=overwrite)
     show(events, mode=mode, summary=summary)
 
@@ -57,7 +66,14 @@ def summary(result: "Result") -> str:
         (
             f"{m['model']}, {m['inliers']} inliers, residual {m['residual_px']} px, Q {m['q']:.2f},"
             f" {m['cpu_seconds']:.2f} s of CPU",
+            *_error(m),
             f"B on A: {result.output / 'b_on_a.tif'}",
             f"report: {result.output / 'report.html'}",
         )
     )
+
+
+def _error(m: Mapping[str, Any]) -> tuple[str, ...]:
+    if m["error_px"] is None:
+        return ()
+    return (f"error: within {m['error_px']:.1f} px of B over the picture (95 %)",)

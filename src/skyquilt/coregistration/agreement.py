@@ -33,6 +33,14 @@ class Agreement:
     """(n, 2) centres of the patches that agree, in px of b at the resolution of the test."""
     shift: NDArray[np.float64]
     """(n, 2) shift in px at which each patch matches best: b's content is at px + shift."""
+    every_px: NDArray[np.float64]
+    """(m, 2) centres of all patches of that size, agreeing or not."""
+    every_shift: NDArray[np.float64]
+    """(m, 2) their shifts."""
+    every_width: NDArray[np.float64]
+    """(m,) height of each correlation peak `_BESIDE` px beside it, as a share of its height: 0 for
+    a needle, 1 for a plateau.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,16 +68,22 @@ class Agree:
             surprises.append(_fisher(ranks))
             if across == self.across[0]:
                 rows, count = [f[1:] for f in found], len(found)
-        table = np.array(rows, np.float64).reshape(-1, 4)
-        table = table[np.hypot(table[:, 2], table[:, 3]) <= self.near]
+        table = np.array(rows, np.float64).reshape(-1, 5)
+        near = table[np.hypot(table[:, 2], table[:, 3]) <= self.near]
         return Agreement(
-            surprise=float(np.mean(surprises)), patches=count, px=table[:, :2], shift=table[:, 2:]
+            surprise=float(np.mean(surprises)),
+            patches=count,
+            px=near[:, :2],
+            shift=near[:, 2:4],
+            every_px=table[:, :2],
+            every_shift=table[:, 2:4],
+            every_width=table[:, 4],
         )
 
     def _patches(
         self, fields: Fields, target: Fields, both: NDArray[Any], across: int
-    ) -> Iterator[tuple[float, float, float, float, float]]:
-        """Rank, centre and shift of each patch."""
+    ) -> Iterator[tuple[float, float, float, float, float, float]]:
+        """Rank, centre, shift and width of the peak of each patch."""
         height, width = both.shape
         side = int(np.sqrt(height * width) / across)
         reach = self.reach
@@ -90,6 +104,7 @@ class Agree:
                     top + (side - 1) / 2,
                     reach - x,
                     reach - y,
+                    _width(score),
                 )
 
     def _rank(self, score: NDArray[Any]) -> float:
@@ -132,6 +147,25 @@ def _summit(score: NDArray[np.float32]) -> tuple[float, float]:
         column + _between(score[row, max(column - 1, 0) : column + 2]),
         row + _between(score[max(row - 1, 0) : row + 2, column]),
     )
+
+
+_BESIDE = 3
+"""Distance in px from a peak at which its height measures its width."""
+
+
+def _width(score: NDArray[np.float32]) -> float:
+    """Height of the correlation beside its peak as a share of that at the peak, both above the
+    median.
+    """
+    row, column = (
+        int(np.clip(at, _BESIDE, size - 1 - _BESIDE))
+        for at, size in zip(divmod(int(score.argmax()), score.shape[1]), score.shape, strict=True)
+    )
+    ground = float(np.median(score))
+    peak = float(score[row, column]) - ground
+    rows = score[[row - _BESIDE, row + _BESIDE], column]
+    columns = score[row, [column - _BESIDE, column + _BESIDE]]
+    return (float(rows.mean() + columns.mean()) / 2 - ground) / max(peak, 1e-6)
 
 
 def _between(three: NDArray[np.float32]) -> float:

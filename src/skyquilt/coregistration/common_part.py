@@ -45,6 +45,7 @@ class CommonPart:
             b_H_a=matrix / matrix[2, 2],
             px_a=outcome.px_a + self.shift_a,
             px_b=outcome.px_b + self.shift_b,
+            error=outcome.error and outcome.error.moved(1.0, self.shift_b),
         )
 
 

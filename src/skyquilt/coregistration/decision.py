@@ -9,6 +9,7 @@ import scipy.fft
 from numpy.typing import NDArray
 
 from skyquilt.coregistration.agreement import Agree, Agreement
+from skyquilt.coregistration.error_field import FREE, Scatter, StateError, overlap_corners
 from skyquilt.coregistration.orientation import (
     Orientation,
     Pyramid,
@@ -18,6 +19,7 @@ from skyquilt.coregistration.orientation import (
     warped,
 )
 from skyquilt.coregistration.subpixel import Fit, Freedom, SubpixelRefinement
+from skyquilt.geometry.transforms import transfer
 from skyquilt.model.registration import Matrix, RefusedRegistration, Registration
 
 Outcome = Registration | RefusedRegistration
@@ -36,10 +38,16 @@ class Decide:
     by chance.
     """
     gain: float = 0.02
-    """Relative gain in correlation required for a model with more parameters."""
+    """Relative gain in correlation required for a homography instead of a similarity."""
+    determined: float = 3.0
+    """Change at a corner required for it, in standard deviations by the patches' scatter: where
+    patches cover a part of the picture only, a homography fits them better and the rest worse.
+    """
+    state: StateError = field(default_factory=StateError)
+    """The error over the whole picture."""
     finest: float = 640.0
     """Side in px of the square to whose area larger images are reduced for the final refinement."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(self, pyramid: Pyramid, fits: Sequence[Fit]) -> Outcome:
         """The decision on transforms in px of the finest level."""
@@ -60,12 +68,16 @@ class Decide:
     def _finished(self, pyramid: Pyramid, fit: Fit, agreement: Agreement) -> Registration:
         """The registration with the model that the images support, in px of the images."""
         a, b = pyramid.at(pyramid.last)
-        freedoms: tuple[Freedom, ...] = ("affine", "homography")
         model: Freedom = "similarity"
-        for freer in freedoms:
-            other = SubpixelRefinement(freedom=freer)(a, b, fit.b_H_a)
-            if other.correlation > (1 + self.gain) * fit.correlation:
-                model, fit, agreement = freer, other, self.agree(a, b, other.b_H_a)
+        corners = overlap_corners(fit.b_H_a, a.shape, b.shape)
+        scatter = self._scatter(agreement, corners, b.shape, model)
+        freer = SubpixelRefinement(freedom="homography")(a, b, fit.b_H_a)
+        if freer.correlation > (1 + self.gain) * fit.correlation:
+            change = transfer(freer.b_H_a @ np.linalg.inv(fit.b_H_a), corners) - corners
+            if self.state.determined(scatter, change, corners) > self.determined:
+                model, fit = "homography", freer
+                agreement = self.agree(a, b, fit.b_H_a)
+                scatter = self._scatter(agreement, corners, b.shape, model)
         full = self._finest(pyramid, pyramid.full(fit.b_H_a, pyramid.last), model)
         to_full = np.linalg.inv(b.small_S_full)
         return Registration(
@@ -74,6 +86,26 @@ class Decide:
             evidence=_evidence(agreement, fit),
             px_a=_apply(np.linalg.inv(full) @ to_full, agreement.px),
             px_b=_apply(to_full, agreement.px + agreement.shift),
+            error=self.state(scatter, FREE[model]).moved(
+                float(to_full[0, 0]), np.asarray(to_full[:2, 2], np.float64)
+            ),
+        )
+
+    def _scatter(
+        self,
+        agreement: Agreement,
+        corners: NDArray[np.float64],
+        shape: tuple[int, int],
+        model: Freedom,
+    ) -> Scatter:
+        return self.state.scatter(
+            agreement.every_px,
+            agreement.every_shift,
+            agreement.every_width,
+            centre=corners.mean(0),
+            unit=float(np.hypot(*shape)) / 2,
+            reach=float(self.agree.reach),
+            free=FREE[model],
         )
 
     def _finest(self, pyramid: Pyramid, full: Matrix, model: Freedom) -> Matrix:

@@ -9,9 +9,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.coregistration.fusion import alpha, checkerboard, false_colour, shown, side_by_side
+from skyquilt.coregistration.fusion import (
+    alpha,
+    checkerboard,
+    error_colours,
+    false_colour,
+    shown,
+    side_by_side,
+)
 from skyquilt.coregistration.page import registration_page
 from skyquilt.coregistration.pictures import Source
+from skyquilt.coregistration.stated_error import error_map
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.model.registration import Matrix, RefusedRegistration, Registration
 from skyquilt.raster.atomic import whole_file, write_text
@@ -59,8 +67,10 @@ def _band(source: Path, number: int, bands: int, kind: str) -> str:
 
 
 OVERLAYS = ("side_by_side.png", "checkerboard.png", "false_colour.png", "alpha.png")
-CONTRACT = ("registration.json", "report.html", "b_on_a.tif", "b.vrt", *OVERLAYS)
+CONTRACT = ("registration.json", "report.html", "b_on_a.tif", "b.vrt", "error.tif", *OVERLAYS)
 """Files of an accepted registration; a refused one writes only the first two."""
+ERROR_ACROSS = 128
+"""Most pixels along the longer side of error.tif; the error changes slowly."""
 LONGEST_SHOWN = 1600
 """Longer side in px of the images for display."""
 _MARGIN = 2
@@ -73,6 +83,8 @@ def draw(output: Path, a: Source, b: Source, outcome: Registration) -> None:
     resample_onto(output / "b_on_a.tif", a, b, outcome.b_H_a)
     if not (b.photo and b.photo.unit):  # a virtual raster would show a radiometric photo's palette
         write_text(output / "b.vrt", _vrt(a, b, outcome.b_H_a))
+    if outcome.error is not None:
+        write_error(output / "error.tif", a, b, outcome)
     for name, picture in zip(OVERLAYS, overlays(a, b, outcome), strict=True):
         done, data = cv2.imencode(".png", np.ascontiguousarray(picture[..., ::-1]))
         assert done
@@ -98,6 +110,45 @@ def overlays(a: Source, b: Source, outcome: Registration) -> list[NDArray[np.uin
     ]
 
 
+def write_error(path: Path, a: Source, b: Source, outcome: Registration) -> None:
+    """Writes the error map: on a coarse grid over A, the distance in px of B within which the
+    registration is right with 95 %.
+    """
+    step = max(1.0, max(a.height, a.width) / ERROR_ACROSS)
+    bound = error_map(outcome, (a.height, a.width), (b.height, b.width), step)
+    m = a.place.affine if a.place else (1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
+    spec = RasterSpec(
+        width=bound.shape[1],
+        height=bound.shape[0],
+        bands=1,
+        dtype="float32",
+        transform=(m[0] * step, m[1] * step, m[2], m[3] * step, m[4] * step, m[5]),
+        crs=a.place.crs if a.place else None,
+        nodata=float("nan"),
+        mask=False,
+        compress="deflate",
+        band_units=("px of B",),
+        tags={"SOFTWARE": "Skyquilt"},
+    )
+    with CogWriter(path, spec) as writer:
+        for block in writer.blocks():
+            part = bound[
+                block.row0 : block.row0 + block.height, block.col0 : block.col0 + block.width
+            ]
+            writer.write_block(block, part, np.isfinite(part))
+
+
+def _error_picture(a: Source, b: Source, outcome: Registration, tolerance: float) -> list[Any]:
+    """The error map in colours over A (RGB), in a list; none if the method states no error."""
+    if outcome.error is None:
+        return []
+    grey, _ = _reduced(a)
+    step = max(a.height, a.width) / max(grey.shape)
+    bound = error_map(outcome, (a.height, a.width), (b.height, b.width), step)
+    fine = cv2.resize(bound, (grey.shape[1], grey.shape[0]), interpolation=cv2.INTER_NEAREST)
+    return [error_colours(grey, np.asarray(fine), tolerance)]
+
+
 def page(
     record: dict[str, Any],
     opened: tuple[Source | RejectedPhoto, Source | RejectedPhoto],
@@ -109,6 +160,7 @@ def page(
     if isinstance(a, Source) and isinstance(b, Source):
         if isinstance(outcome, Registration):
             pictures = overlays(a, b, outcome)
+            pictures += _error_picture(a, b, outcome, record["tolerance_px"])
         else:
             none = np.zeros((0, 2))
             pictures = [side_by_side(_reduced(a)[0], _reduced(b)[0], none, none)]

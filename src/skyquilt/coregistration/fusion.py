@@ -50,6 +50,26 @@ def alpha(a: Grey, b: Grey, seen: Mask, weight: float = 0.5) -> Rgb:
     return np.asarray(np.rint(base * (1 - share) + colours * share).astype(np.uint8))
 
 
+def error_colours(a: Grey, bound: NDArray[Any], tolerance: float) -> Rgb:
+    """a, tinted by a bound of the error (H, W) from blue (0) over white (half the tolerance) to red
+    (the tolerance and more); grey where the bound is NaN. Lines follow steps of a quarter of the
+    tolerance.
+    """
+    level = np.clip(np.nan_to_num(bound / tolerance), 0, 1)[..., None]
+    cold, warm = np.array([40, 80, 220.0]), np.array([220, 40, 40.0])
+    low, high = np.minimum(2 * level, 1), np.maximum(2 * level - 1, 0)
+    colour = (cold * (1 - low) + 255 * low) * (1 - high) + warm * high
+    base = np.repeat(a[..., None], 3, 2).astype(np.float32)
+    known = np.isfinite(bound)
+    out = np.where(known[..., None], 0.55 * base + 0.45 * colour, base)
+    steps = np.floor(4 * np.nan_to_num(bound / tolerance, nan=-1.0))
+    line = np.zeros(a.shape, bool)
+    line[:, 1:] |= steps[:, 1:] != steps[:, :-1]
+    line[1:] |= steps[1:] != steps[:-1]
+    out[line & known] = 20
+    return np.asarray(np.rint(out).astype(np.uint8))
+
+
 def checkerboard(a: Grey, b: Grey, seen: Mask, squares: int = 8) -> Rgb:
     """a and b in alternating squares; `squares`: their number along the longer side. Structures
     continue across the squares if the registration is right.

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from skyquilt import registry
 from skyquilt.coregistration.auto import Auto
 from skyquilt.coregistration.structure import Structure, StructureMatches
+from skyquilt.errors import UsageError
 from skyquilt.matching.ransac import Ransac
 from skyquilt.model.registration import Registers
 from skyquilt.settings import one_of
@@ -15,6 +16,10 @@ INLIERS = 9
 """Fewest inliers of an accepted registration by the thesis's methods [Y 6.4.1]."""
 
 
+STATING = ("auto", "structure")
+"""Methods that state their error over the picture."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RegisterSettings:
     """All settings of a registration of two pictures."""
@@ -23,9 +28,22 @@ class RegisterSettings:
     """A registered way of registration."""
     use_metadata: bool = True
     """Whether metadata and places are tried first; what they say is a guess only."""
+    tolerance_px: float | None = None
+    """Largest tolerated error over the picture, px of b; None: a share of its diagonal
+    (`stated_error.TOLERANCE`).
+    """
 
     def __post_init__(self) -> None:
         one_of("--method", self.method, registry.names("registration"))
+        if self.tolerance_px is None:
+            return
+        if not 0 < self.tolerance_px < float("inf"):
+            raise UsageError(f"--tolerance is {self.tolerance_px:g}; give a number of px above 0")
+        if self.method not in STATING:
+            raise UsageError(
+                f"--tolerance: method {self.method} does not state its error;"
+                f" {', '.join(STATING)} do"
+            )
 
 
 def registration_method(name: str) -> Registers:

@@ -20,6 +20,11 @@ _CAPTIONS = (
     ),
     ("False colour", "A in green, B in magenta: fringes show where edges do not coincide."),
     ("B over A", "B in warm colours, half transparent."),
+    (
+        "Error",
+        "How far the registration may be off (95 %), over A: blue is none, red the tolerance; a"
+        " line at each quarter of it. The error grows away from the patches that agree.",
+    ),
 )
 _EVIDENCE = {
     "surprise": "agreement of independent patches, -log10 of its probability by chance",
@@ -32,7 +37,7 @@ _EVIDENCE = {
 
 def registration_page(record: Mapping[str, Any], pictures: Sequence[NDArray[np.uint8]]) -> str:
     """The page from the record in registration.json and RGB images: four for an accepted
-    registration, one for a refused one.
+    registration, a fifth if its error is stated; one for a refused one.
     """
     sections = (
         [Section(id="pictures", title="Pictures", blocks=tuple(_figures(pictures)))]
@@ -63,7 +68,7 @@ def _figures(pictures: Sequence[NDArray[np.uint8]]) -> list[Figure]:
         return [
             picture(pictures[0], "Side by side", "Both images unchanged; there is no registration.")
         ]
-    return [picture(p, *words) for p, words in zip(pictures, _CAPTIONS, strict=True)]
+    return [picture(p, *words) for p, words in zip(pictures, _CAPTIONS, strict=False)]
 
 
 def _summary(record: Mapping[str, Any]) -> str:
@@ -95,6 +100,13 @@ def _tiles(record: Mapping[str, Any]) -> tuple[Tile, ...]:
             value=fixed(record["residual_px"], 2),
             unit="px",
             says="RMS distance in B between inliers and their transformed positions.",
+        ),
+        Tile(
+            label="Error",
+            value=fixed(record["error_px"], 1),
+            unit="px",
+            says="Distance in B within which every corner of the picture is right with 95 %;"
+            f" {fixed(record['tolerance_px'], 1)} px are tolerated.",
         ),
         Tile(
             label="Time", value=seconds(record["cpu_seconds"]), says="CPU time of the registration."

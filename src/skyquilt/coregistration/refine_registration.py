@@ -126,6 +126,7 @@ def _placed(
         model=way.freedom,
         b_H_a=full_size(fields, target, fit.b_H_a),
         evidence={**outcome.evidence, "likeness": round(fit.correlation, 4), **told},
+        error=None,  # that of the registration before the refinement
     )
 
 

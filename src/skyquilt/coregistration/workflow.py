@@ -16,6 +16,7 @@ import numpy as np
 from skyquilt.coregistration.files import CONTRACT, draw, page
 from skyquilt.coregistration.methods import RegisterSettings, registration_method
 from skyquilt.coregistration.pictures import Source, guess_of, open_picture
+from skyquilt.coregistration.stated_error import StatedError, state_error, tolerated
 from skyquilt.engine.clock import cpu_seconds
 from skyquilt.engine.folder import claim
 from skyquilt.errors import RefusedError
@@ -36,6 +37,7 @@ class _Told:
     """A registration in px of the files, with what it was made from."""
 
     outcome: Outcome
+    stated: StatedError | None
     guess: Guess | None
     cpu_s: float
 
@@ -66,7 +68,7 @@ def iter_register(
         cpu_seconds=round(cpu_seconds() - cpu, 3),
         reused=False,
     )
-    record = as_record(told.outcome, settings.method, told.guess)
+    record = as_record(told.outcome, settings.method, told.guess, told.stated)
     record |= {
         "a": str(a),
         "b": str(b),
@@ -111,6 +113,7 @@ def outcome_of(a: Source, b: Source, method: str, guess: Guess | None) -> Outcom
         return outcome
     full_a, full_b = a.full_S_picture, b.full_S_picture
     matrix = full_b @ outcome.b_H_a @ np.linalg.inv(full_a)
+    error = outcome.error and outcome.error.moved(_factor(full_b), full_b[:2, 2])
     if _same(a, b):
         outcome = replace(
             outcome,
@@ -118,17 +121,33 @@ def outcome_of(a: Source, b: Source, method: str, guess: Guess | None) -> Outcom
             note="A and B are the same picture: it lies on itself, unmoved.",
         )
         matrix = np.eye(3)
+        error = error and replace(error, covariance=np.zeros((8, 8)), shared=0.0)
     px_a, px_b = _scaled(outcome.px_a, full_a), _scaled(outcome.px_b, full_b)
     q = spread_quality(px_a, a.width, a.height, delta=0.1 * a.width)
-    return replace(outcome, b_H_a=matrix / matrix[2, 2], px_a=px_a, px_b=px_b, q=q)
+    return replace(outcome, b_H_a=matrix / matrix[2, 2], px_a=px_a, px_b=px_b, q=q, error=error)
 
 
-def as_record(outcome: Outcome, method: str, guess: Guess | None) -> dict[str, Any]:
+def within_tolerance(
+    outcome: Outcome, a: Source, b: Source, tolerance_px: float | None
+) -> tuple[Outcome, StatedError | None]:
+    """The outcome, refused if its error over the picture is larger than tolerated, and what it
+    states; None if it states nothing.
+    """
+    if isinstance(outcome, RefusedRegistration):
+        return outcome, None
+    stated = state_error(outcome, (a.height, a.width), (b.height, b.width), tolerance_px)
+    return tolerated(outcome, stated), stated
+
+
+def as_record(
+    outcome: Outcome, method: str, guess: Guess | None, stated: StatedError | None
+) -> dict[str, Any]:
     """What registration.json says."""
     shared = {
         "method": method,
         "guess": guess.source if guess else None,
         "evidence": dict(outcome.evidence),
+        **_error_record(stated),
     }
     if isinstance(outcome, RefusedRegistration):
         return {
@@ -153,6 +172,21 @@ def as_record(outcome: Outcome, method: str, guess: Guess | None) -> dict[str, A
     }
 
 
+def _error_record(stated: StatedError | None) -> dict[str, Any]:
+    if stated is None:
+        return {"error_px": None, "tolerance_px": None, "error_corners": [], "valid_area": None}
+    corners = np.c_[stated.corners_a, stated.corners_px]
+    return {
+        "error_px": round(stated.error_px, 3),
+        "tolerance_px": round(stated.tolerance_px, 3),
+        "error_corners": np.round(corners, 3).tolist(),
+        "valid_area": {
+            "share": round(stated.valid_share, 4),
+            "polygon": np.round(stated.valid_a, 2).tolist(),
+        },
+    }
+
+
 def residual(outcome: Registration) -> float | None:
     """RMS distance in px of B between the inliers and where the transform puts them; None without
     inliers.
@@ -171,12 +205,20 @@ def _told(
     for name, one in zip("AB", opened, strict=True):
         if isinstance(one, RejectedPhoto):
             reason = f"picture {name} ({one.name}) cannot be used: {one.reason}"
-            return _Told(outcome=RefusedRegistration(reason=reason), guess=None, cpu_s=0.0)
+            refusal = RefusedRegistration(reason=reason)
+            return _Told(outcome=refusal, stated=None, guess=None, cpu_s=0.0)
     a, b = opened
     assert isinstance(a, Source) and isinstance(b, Source)
     guess = guess_of(a, b) if settings.use_metadata else None
-    outcome = outcome_of(a, b, settings.method, guess)
-    return _Told(outcome=outcome, guess=guess, cpu_s=cpu_seconds() - since)
+    outcome, stated = within_tolerance(
+        outcome_of(a, b, settings.method, guess), a, b, settings.tolerance_px
+    )
+    return _Told(outcome=outcome, stated=stated, guess=guess, cpu_s=cpu_seconds() - since)
+
+
+def _factor(full: np.ndarray) -> float:
+    """Px of a file per px of its picture; both axes differ by a rounding at most."""
+    return float(np.sqrt(full[0, 0] * full[1, 1]))
 
 
 def _same(a: Source, b: Source) -> bool:

@@ -46,6 +46,65 @@ class Guess:
     """Where it comes from, as a phrase."""
 
 
+def offsets(px: NDArray[np.float64], centre: NDArray[np.float64], unit: float) -> Matrix:
+    """(n, 2, 8) changes in px of places (n, 2) by the parameters of a small homography: shifts,
+    scale and rotation (the similarity), two shears (with them the affine transform), two
+    perspectives. Each is in px, at distance `unit` from `centre`.
+    """
+    x, y = ((px - centre) / unit).T
+    one, none = np.ones_like(x), np.zeros_like(x)
+    columns = (
+        (one, none),
+        (none, one),
+        (x, y),
+        (-y, x),
+        (x, -y),
+        (y, x),
+        (x * x, x * y),
+        (x * y, y * y),
+    )
+    return np.stack([np.stack(column, 1) for column in columns], 2)
+
+
+ALONG, ROUND = 3.841, 5.991
+"""Squared distance that 95 % of normal errors keep, in variances: of errors along one direction,
+and of errors equal in all. Between both it is interpolated by the variances along two axes.
+"""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ErrorField:
+    """How far a registration may be off, at any place of b."""
+
+    centre: NDArray[np.float64]
+    """(2,) origin of `offsets`, px of b."""
+    unit: float
+    """Unit of length of `offsets`, px of b."""
+    covariance: NDArray[np.float64]
+    """(8, 8) of the parameters of `offsets`, px^2."""
+    shared: float
+    """Variance per axis of an error that is the same everywhere, px^2."""
+
+    def bound_px(self, px: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n,) distance in px of b within which the registration is right with 95 %, at px (n, 2)
+        of b.
+        """
+        J = offsets(np.asarray(px, np.float64), self.centre, self.unit)
+        (xx, xy), (_, yy) = np.einsum("nij,jk,nlk->iln", J, self.covariance, J)
+        middle, half = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+        along, across = middle + half + self.shared, np.maximum(middle - half, 0) + self.shared
+        return np.asarray(np.sqrt(ALONG * along + (ROUND - ALONG) * across))
+
+    def moved(self, scale: float, shift: NDArray[np.float64]) -> "ErrorField":
+        """The same in other pixels of b: multiplied by a factor, then shifted."""
+        return ErrorField(
+            centre=scale * self.centre + shift,
+            unit=scale * self.unit,
+            covariance=scale**2 * self.covariance,
+            shared=scale**2 * self.shared,
+        )
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Registration:
     """A registration of two images that show the same ground; a is the reference."""
@@ -64,6 +123,8 @@ class Registration:
     """A sentence on what is special about this registration."""
     q: float = 0.0
     """Spread of the inliers over a [Yahyanejad 2013, (6.3)], in [0, 1]."""
+    error: ErrorField | None = None
+    """How far it may be off, over b; None by methods that do not measure it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -3,6 +3,7 @@ truth, and every pair.
 """
 
 from collections.abc import Mapping, Sequence
+from statistics import median
 from typing import Any
 
 from skyquilt.report.numbers import DASH, fixed
@@ -18,6 +19,7 @@ def bench_page(record: Mapping[str, Any]) -> str:
     classes = tuple(dict.fromkeys(r["class"] for r in rows))
     sections = (
         Section(id="truth", title="Truth", blocks=(_truth(rows, methods, classes),)),
+        Section(id="stated", title="Stated errors", blocks=(_stated(rows, methods, classes),)),
         Section(id="thesis", title="The thesis's tables", blocks=_thesis(rows, methods, classes)),
         Section(id="cost", title="Cost", blocks=(_cost(rows, methods),)),
         Section(id="pairs", title="Pairs", blocks=(_pairs(rows),)),
@@ -44,6 +46,25 @@ def _truth(rows: Rows, methods: tuple[str, ...], classes: tuple[str, ...]) -> Ta
         rows=_by_class(rows, methods, classes, cell),
         numeric="t" + "n" * len(methods),
         note="Right: accepted with an RMS error over the overlap below the pair's tolerance.",
+    )
+
+
+def _stated(rows: Rows, methods: tuple[str, ...], classes: tuple[str, ...]) -> Table:
+    def cell(of: Rows) -> str:
+        told = [r for r in of if r["stated_px"] is not None and r["corner_px"] is not None]
+        if not told:
+            return DASH
+        held = sum(r["corner_px"] <= r["stated_px"] for r in told)
+        ratio = median(r["stated_px"] / max(r["corner_px"], 1e-3) for r in told)
+        return f"{held} of {len(told)}; {fixed(ratio, 1)}"
+
+    return Table(
+        title="Stated errors: bounds that hold; median of stated to actual",
+        head=("class", *methods),
+        rows=_by_class(rows, methods, classes, cell),
+        numeric="t" + "n" * len(methods),
+        note="The bound (95 %) at the worst corner of the part of A that B covers, compared with"
+        " the actual distance from the truth there.",
     )
 
 
@@ -108,6 +129,8 @@ def _pairs(rows: Rows) -> Table:
             r["method"],
             "right" if r["right"] else "wrong" if r["accepted"] else "refused",
             fixed(r["error_px"], 2),
+            fixed(r["corner_px"], 2),
+            fixed(r["stated_px"], 2),
             fixed(r["q"], 2),
             str(r["inliers"]),
             fixed(r["seconds"], 2),
@@ -115,5 +138,17 @@ def _pairs(rows: Rows) -> Table:
         )
         for r in rows
     )
-    head = ("class", "pair", "method", "verdict", "error, px", "Q", "inliers", "CPU, s", "reason")
-    return Table(title="Every pair by every method", head=head, rows=lines, numeric="ttttnnnnt")
+    head = (
+        "class",
+        "pair",
+        "method",
+        "verdict",
+        "error, px",
+        "worst corner, px",
+        "stated, px",
+        "Q",
+        "inliers",
+        "CPU, s",
+        "reason",
+    )
+    return Table(title="Every pair by every method", head=head, rows=lines, numeric="ttttnnnnnnt")

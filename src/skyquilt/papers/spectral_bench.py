@@ -7,14 +7,19 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from skyquilt import registry
+from skyquilt.coregistration.error_field import overlap_corners
 from skyquilt.coregistration.pictures import guess_of, open_picture
-from skyquilt.coregistration.workflow import outcome_of
+from skyquilt.coregistration.stated_error import StatedError
+from skyquilt.coregistration.workflow import outcome_of, within_tolerance
 from skyquilt.engine.clock import Clock, cpu_seconds
 from skyquilt.engine.folder import claim
+from skyquilt.geometry.transforms import transfer
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
 from skyquilt.model.photo import RejectedPhoto
-from skyquilt.model.registration import RefusedRegistration, Registration
+from skyquilt.model.registration import Matrix, RefusedRegistration, Registration
 from skyquilt.papers.bench_page import bench_page
 from skyquilt.papers.pair_list import Pair, overlap_error, read_pairs
 from skyquilt.raster.atomic import write_text
@@ -72,7 +77,7 @@ def iter_spectral_bench(
 def judged(pair: Pair, method: str) -> dict[str, Any]:
     """One row of bench.json: a pair registered by a method and compared with the truth."""
     since = cpu_seconds()
-    outcome, shapes = _registered(pair, method)
+    outcome, stated, shapes = _registered(pair, method)
     spent = round(cpu_seconds() - since, 3)
     row = {"class": pair.kind, "source": pair.source, "method": method}
     if isinstance(outcome, RefusedRegistration):
@@ -80,6 +85,8 @@ def judged(pair: Pair, method: str) -> dict[str, Any]:
             "accepted": False,
             "right": False,
             "error_px": None,
+            "corner_px": None,
+            "stated_px": stated and round(stated.error_px, 3),
             "q": 0.0,
             "inliers": outcome.inliers,
             "seconds": spent,
@@ -90,6 +97,8 @@ def judged(pair: Pair, method: str) -> dict[str, Any]:
         "accepted": True,
         "right": error < pair.tolerance_px,
         "error_px": round(error, 3),
+        "corner_px": round(min(corner_error(outcome.b_H_a, pair.b_H_a, *shapes), 1e6), 3),
+        "stated_px": stated and round(stated.error_px, 3),
         "q": round(outcome.q, 4),
         "inliers": len(outcome.px_a),
         "seconds": spent,
@@ -111,9 +120,23 @@ def totals(rows: Sequence[dict[str, Any]], methods: Sequence[str]) -> list[str]:
     return lines
 
 
+def corner_error(
+    b_H_a: Matrix, truth: Matrix, shape_a: tuple[int, int], shape_b: tuple[int, int]
+) -> float:
+    """Largest distance in px of b between the positions by two transforms, over the corners of the
+    part of a (H, W) that b (H, W) covers: what a stated error is compared with.
+    """
+    corners = overlap_corners(b_H_a, shape_a, shape_b)
+    apart = transfer(np.asarray(truth @ np.linalg.inv(b_H_a), np.float64), corners) - corners
+    distance = float(np.linalg.norm(apart, axis=1).max())
+    return distance if np.isfinite(distance) else float("inf")
+
+
 def _registered(
     pair: Pair, method: str
-) -> tuple[Registration | RefusedRegistration, tuple[tuple[int, int], tuple[int, int]]]:
+) -> tuple[
+    Registration | RefusedRegistration, StatedError | None, tuple[tuple[int, int], tuple[int, int]]
+]:
     opened = [open_picture(path) for path in (pair.a, pair.b)]
     a, b = opened
     for name, one in zip("AB", opened, strict=True):
@@ -121,6 +144,7 @@ def _registered(
             refusal = RefusedRegistration(
                 reason=f"picture {name} ({one.name}) cannot be used: {one.reason}"
             )
-            return refusal, ((0, 0), (0, 0))
+            return refusal, None, ((0, 0), (0, 0))
     assert not isinstance(a, RejectedPhoto) and not isinstance(b, RejectedPhoto)
-    return outcome_of(a, b, method, guess_of(a, b)), ((a.height, a.width), (b.height, b.width))
+    found, stated = within_tolerance(outcome_of(a, b, method, guess_of(a, b)), a, b, None)
+    return found, stated, ((a.height, a.width), (b.height, b.width))

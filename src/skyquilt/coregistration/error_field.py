@@ -1,0 +1,163 @@
+"""How far a registration may be off over the whole picture, from where the patches lie that
+confirm it.
+
+Patches that are matched one by one lie off their registered position by their own errors. Their
+scatter gives the covariance of a homography fitted to them, and with it the error at any place,
+which grows away from the patches. What no scatter can show is added with priors in units of the
+scatter: the part of the true transform that the chosen model cannot follow (parallax, lens,
+perspective), and an error that all patches share, since the same edge does not lie at quite the
+same place in two spectra.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.geometry.transforms import transfer
+from skyquilt.model.registration import ErrorField, Matrix, offsets
+
+FREE = {"identity": 4, "similarity": 4, "affine": 6, "homography": 8}
+"""Parameters of each model, the first ones of `offsets`."""
+_FLAT = 100.0
+"""Prior of a free parameter, in units of the scatter: none."""
+_OUTLIER = 0.5
+"""Share of the patches that match elsewhere, at the start."""
+_ROUNDS = 30
+_NARROWEST = 0.05
+"""Smallest width of a peak that is distinguished."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scatter:
+    """The errors of patches around a registration."""
+
+    sigma: float
+    """Standard deviation of a matching patch along one axis, px."""
+    width: float
+    """Typical width of a matching patch's correlation peak (`agreement.Agreement`)."""
+    information: NDArray[np.float64]
+    """(8, 8) of the parameters of `offsets` from the patches, for a sigma of 1 px."""
+    centre: NDArray[np.float64]
+    """(2,) origin of `offsets`, px of b."""
+    unit: float
+    """Unit of length of `offsets`, px of b."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StateError:
+    """The error of a registration from the shifts of its patches."""
+
+    dependence: float = 2.0
+    """Number of patches that weigh like one independent one: neighbours err alike."""
+    misfit: float = 0.5
+    """Prior of each parameter beyond the model's, at half b's diagonal, in units of the
+    scatter.
+    """
+    shared: float = 0.6
+    """Error that all patches share, in units of the scatter."""
+    usual_width: float = 0.3
+    """Width of correlation peaks at which all this holds."""
+    blur: float = 0.3
+    """Exponent of the error in the width relative to the usual one: the more blurred the structure
+    that two spectra share, the more of the error is common to all patches, and not seen in their
+    scatter.
+    """
+    least_px: float = 0.05
+    """Scatter expected without any patch, px; it counts as much as `weight` observations."""
+    weight: float = 3.0
+    """See `least_px`."""
+    version: ClassVar[int] = 1
+
+    def scatter(
+        self,
+        px: NDArray[np.float64],
+        shift: NDArray[np.float64],
+        width: NDArray[np.float64],
+        *,
+        centre: NDArray[np.float64],
+        unit: float,
+        reach: float,
+        free: int,
+    ) -> Scatter:
+        """Separates patches that match near the registered position from those that match anywhere
+        (by expectation maximisation of a normal and a uniform distribution), and measures the
+        scatter of the former around a common transform.
+
+        px (n, 2) centres of patches, shift (n, 2) the shifts at which each matches best, both px of
+        b, width (n,) of its correlation peak; reach: largest shift compared; free: parameters of
+        the model.
+        """
+        J = offsets(px, centre, unit)
+        prior = self._prior(free)
+        near = np.hypot(shift[:, 0], shift[:, 1]) < reach / 4
+        typical = float(np.median(width[near])) if near.any() else 1.0
+        likely = near.astype(np.float64)
+        share, sigma, data = 1 - _OUTLIER, 1.0, np.zeros((8, 8))
+        for _ in range(_ROUNDS):
+            data = np.einsum("n,nij,nik->jk", likely, J, J)
+            p = np.linalg.solve(data + prior, np.einsum("n,nij,ni->j", likely, J, shift))
+            off = ((shift - J @ p) ** 2).sum(1)
+            used = float(np.trace(np.linalg.solve(data + prior, data)))
+            square = float(likely @ off) + float(p @ prior @ p) + self.weight * self.least_px**2
+            spare = max(2 * float(likely.sum()) - used, 1.0) + self.weight
+            sigma = max(float(np.sqrt(square / spare)), self.least_px)
+            density = share * np.exp(-off / (2 * sigma**2)) / (2 * np.pi * sigma**2)
+            likely = density / (density + (1 - share) / (2 * reach + 1) ** 2)
+            share = float(np.clip(likely.mean(), 0.05, 0.98))
+        return Scatter(sigma=sigma, width=typical, information=data, centre=centre, unit=unit)
+
+    def _prior(self, free: int) -> NDArray[np.float64]:
+        """(8, 8) information of the prior for a sigma of 1 px."""
+        deviation = np.full(8, self.misfit)
+        deviation[:free] = _FLAT
+        return np.diag(1 / deviation**2)
+
+    def __call__(self, scatter: Scatter, free: int) -> ErrorField:
+        """The error over b of a model with so many free parameters."""
+        width = max(scatter.width, _NARROWEST) / self.usual_width
+        square = self.dependence * scatter.sigma**2 * width ** (2 * self.blur)
+        return ErrorField(
+            centre=scatter.centre,
+            unit=scatter.unit,
+            covariance=np.asarray(
+                square * np.linalg.inv(scatter.information + self._prior(free)), np.float64
+            ),
+            shared=self.shared**2 * square,
+        )
+
+    def determined(
+        self, scatter: Scatter, change_px: NDArray[np.float64], at: NDArray[np.float64]
+    ) -> float:
+        """Largest ratio of a change (n, 2) px of a transform, at px (n, 2) of b, to the standard
+        deviation of a homography fitted to the patches.
+        """
+        J = offsets(at, scatter.centre, scatter.unit)
+        inverse = np.linalg.inv(scatter.information + self._prior(FREE["homography"]))
+        deviation = scatter.sigma * np.sqrt(np.einsum("nij,jk,nik->n", J, inverse, J) / 2)
+        return float((np.linalg.norm(change_px, axis=1) / deviation).max())
+
+
+def overlap_corners(
+    b_H_a: Matrix, shape_a: tuple[int, int], shape_b: tuple[int, int]
+) -> NDArray[np.float64]:
+    """(n, 2) px of b: corners of the part of b (H, W) that a (H, W) covers; b's own corners if the
+    transform maps part of a to infinity or beside b.
+    """
+    ours, theirs = _frame(shape_b), _frame(shape_a)
+    depth = np.c_[theirs, np.ones(4)] @ b_H_a[2]
+    if (depth * depth[0] <= 0).any():
+        return ours
+    there = transfer(b_H_a, theirs)
+    if not np.isfinite(there).all() or np.abs(there).max() > 1e6:
+        return ours
+    _area, found = cv2.intersectConvexConvex(there.astype(np.float32), ours.astype(np.float32))
+    return ours if found is None or len(found) < 3 else found.reshape(-1, 2).astype(np.float64)
+
+
+def _frame(shape: tuple[int, int]) -> NDArray[np.float64]:
+    height, width = shape
+    low, right, bottom = -0.5, width - 0.5, height - 0.5
+    return np.array([[low, low], [right, low], [right, bottom], [low, bottom]])

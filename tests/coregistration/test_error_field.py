@@ -1,0 +1,194 @@
+"""The stated error of a registration: against drawn errors, and for pictures blank in part."""
+
+import numpy as np
+import pytest
+
+from skyquilt.coregistration.error_field import FREE, StateError, overlap_corners
+from skyquilt.coregistration.methods import RegisterSettings, registration_method
+from skyquilt.coregistration.stated_error import TOLERANCE, error_map, state_error, tolerated
+from skyquilt.errors import UsageError
+from skyquilt.geometry.transforms import fit, transfer
+from skyquilt.model.registration import (
+    ErrorField,
+    Picture,
+    RefusedRegistration,
+    Registration,
+    offsets,
+)
+from skyquilt.papers.spectral_bench import corner_error
+from tests.coregistration.scenes import pair, turned
+
+SHAPE = (400, 480)
+CORNERS = np.array([[0.0, 0], [255, 0], [255, 255], [0, 255]])
+FRAME = {"centre": np.array([127.5, 127.5]), "unit": 180.0, "reach": 12.0}
+
+
+def patches(low, high):
+    x, y = np.meshgrid(np.arange(low, high, 42.0), np.arange(20, 250, 42.0))
+    return np.c_[x.ravel(), y.ravel()]
+
+
+def width(px):
+    return np.full(len(px), 0.3)
+
+
+def test_offsets_are_the_derivatives_of_a_homography():
+    """Against differences of homographies that differ from the identity by one entry."""
+    unit, small = 180.0, 1e-3
+    px = np.array([[10.0, 20], [200, 30], [90, 240]])
+    entries = {4: (0, 0), 6: (2, 0), 7: (2, 1)}
+    back = np.array([[1, 0, -127.5], [0, 1, -127.5], [0, 0, 1]])
+    for k, at in entries.items():
+        h = np.eye(3)
+        h[at] += small * (-1 / unit**2 if at[0] == 2 else 1 / unit)
+        if k == 4:
+            h[1, 1] -= small / unit
+        moved = transfer(np.linalg.inv(back) @ h @ back, px) - px
+        assert moved == pytest.approx(small * offsets(px, FRAME["centre"], unit)[:, :, k], abs=1e-6)
+
+
+@pytest.mark.parametrize("model", ["similarity", "homography"])
+def test_bounds_hold_for_drawn_errors(model):
+    """Patches with errors of 0.7 px each (in the left half, for the similarity), and the transform
+    fitted to them.
+    """
+    rng = np.random.default_rng(5)
+    state = StateError(dependence=1.0, misfit=1e-3, shared=0.0, blur=0.0)
+    px = patches(20, 140 if model == "similarity" else 240)
+    held = []
+    for _ in range(150):
+        shift = rng.normal(0, 0.7, px.shape)
+        error = transfer(fit(model, px, px + shift), CORNERS) - CORNERS
+        scatter = state.scatter(px, shift, width(px), free=FREE[model], **FRAME)
+        held.append(np.linalg.norm(error, axis=1) <= state(scatter, FREE[model]).bound_px(CORNERS))
+    assert 0.91 < np.mean(held) < 0.99
+
+
+def test_patches_that_match_anywhere_are_left_out():
+    rng = np.random.default_rng(2)
+    px = np.concatenate([patches(20, 250)] * 3)
+    shift = rng.normal(0, 0.5, px.shape)
+    wild = rng.random(len(px)) < 0.4
+    shift[wild] = rng.uniform(-12, 12, (wild.sum(), 2))
+    scatter = StateError().scatter(px, shift, width(px), free=4, **FRAME)
+    assert scatter.sigma == pytest.approx(0.5, rel=0.15)
+    assert scatter.information[0, 0] == pytest.approx((~wild).sum(), rel=0.1)
+
+
+def test_the_bound_grows_away_from_the_patches_and_with_their_scatter():
+    rng = np.random.default_rng(3)
+    px = patches(20, 140)
+    unit = rng.normal(0, 1, px.shape)
+    state = StateError()
+    one, three = (
+        state(state.scatter(px, size * unit, width(px), free=4, **FRAME), 4).bound_px(CORNERS)
+        for size in (0.3, 0.9)
+    )
+    assert (one[[1, 2]] > 1.25 * one[[0, 3]]).all()
+    assert three == pytest.approx(3 * one, rel=0.15)
+
+
+def test_broad_peaks_widen_the_bound():
+    px = patches(20, 250)
+    shift = np.random.default_rng(4).normal(0, 0.5, px.shape)
+    state = StateError()
+    sharp, broad = (
+        state(state.scatter(px, shift, size * np.ones(len(px)), free=4, **FRAME), 4)
+        for size in (0.1, 0.5)
+    )
+    assert broad.bound_px(CORNERS) == pytest.approx(5**0.3 * sharp.bound_px(CORNERS))
+
+
+def test_the_bound_follows_the_pixels():
+    state = StateError()
+    px = patches(20, 140)
+    shift = np.random.default_rng(1).normal(0, 1, px.shape)
+    field = state(state.scatter(px, shift, width(px), free=4, **FRAME), 4)
+    moved = field.moved(2.5, np.array([7.0, -3.0]))
+    assert moved.bound_px(2.5 * CORNERS + [7, -3]) == pytest.approx(2.5 * field.bound_px(CORNERS))
+
+
+def test_the_corners_of_the_overlap():
+    right = np.array([[1, 0, 100.0], [0, 1, 0], [0, 0, 1]])
+    found = overlap_corners(right, (50, 200), (50, 200))
+    assert sorted(map(tuple, np.round(found, 1))) == [
+        (99.5, -0.5),
+        (99.5, 49.5),
+        (199.5, -0.5),
+        (199.5, 49.5),
+    ]
+    horizon = np.array([[1, 0, 0], [0, 1, 0], [0.02, 0, -1.0]])
+    assert overlap_corners(horizon, (50, 200), (50, 200))[:, 0].tolist() == [
+        -0.5,
+        199.5,
+        199.5,
+        -0.5,
+    ]
+
+
+def growing(slope=0.02):
+    """An identity whose bound grows from B's left edge."""
+    covariance = np.zeros((8, 8))
+    covariance[2, 2] = covariance[3, 3] = slope**2
+    error = ErrorField(centre=np.array([0.0, 50]), unit=1.0, covariance=covariance, shared=1e-6)
+    none = np.zeros((0, 2))
+    return Registration(model="similarity", b_H_a=np.eye(3), px_a=none, px_b=none, error=error)
+
+
+def test_what_is_stated_and_tolerated():
+    """A bound of slope * 2.448 px per px of distance from one point, by hand."""
+    shape, found = (100, 300), growing()
+    said = state_error(found, shape, shape, 8.0)
+    assert said.error_px == pytest.approx(2.448 * 0.02 * np.hypot(299.5, 50.5), rel=0.01)
+    reach = 8 / (2.448 * 0.02)
+    assert said.valid_share == pytest.approx(reach / 300, abs=0.02)
+    assert said.valid_a[:, 0].max() == pytest.approx(reach, abs=4)
+    refused = tolerated(found, said)
+    assert isinstance(refused, RefusedRegistration)
+    assert "14.9 px in a corner" in refused.reason and "8.0 px are tolerated" in refused.reason
+    assert tolerated(found, state_error(found, shape, shape, 20.0)) is found
+    assert state_error(found, shape, shape, None).tolerance_px == pytest.approx(
+        TOLERANCE * np.hypot(*shape)
+    )
+
+
+def test_the_map_agrees_with_the_bounds():
+    found = growing()
+    grid = error_map(found, (100, 300), (100, 200), 10.0)
+    assert grid.shape == (10, 30) and np.isnan(grid[:, 20:]).all()
+    x, y = 10 * 12 + 4.5, 10 * 3 + 4.5
+    assert grid[3, 12] == pytest.approx(
+        float(found.error.bound_px(np.array([[x, y]]))[0]), rel=1e-5
+    )
+
+
+@pytest.mark.parametrize("tolerance", [0.0, -3.0, float("nan")])
+def test_a_tolerance_is_a_number_of_pixels(tolerance):
+    with pytest.raises(UsageError, match="tolerance"):
+        RegisterSettings(tolerance_px=tolerance)
+
+
+def test_methods_without_a_stated_error_take_no_tolerance():
+    with pytest.raises(UsageError, match="does not state its error"):
+        RegisterSettings(method="surf", tolerance_px=5.0)
+
+
+def test_a_picture_that_is_blank_in_part_says_so():
+    """The error is within the bound, and the bound larger than with the whole picture, and more so
+    on the blank side.
+    """
+    truth = turned(1.0, 12.0, SHAPE, SHAPE, (6.0, -4.0))
+    a, b = pair(truth, seed=14)
+    auto = registration_method("auto")
+    valid = np.zeros(SHAPE, bool)
+    valid[:, :220] = True
+    whole = auto(Picture(values=a), Picture(values=b))
+    half = auto(Picture(values=a, valid=valid), Picture(values=b))
+    bounds = []
+    for found in (whole, half):
+        said = state_error(found, SHAPE, SHAPE, None)
+        assert corner_error(found.b_H_a, truth, SHAPE, SHAPE) <= said.error_px < 6
+        bounds.append(said)
+    assert bounds[1].error_px > 1.25 * bounds[0].error_px
+    left = bounds[1].corners_a[:, 0] < 240
+    assert bounds[1].corners_px[~left].mean() > 1.3 * bounds[1].corners_px[left].mean()
