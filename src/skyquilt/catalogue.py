@@ -36,10 +36,13 @@ REGISTRATIONS = {
     "sift": "skyquilt.papers.rfae:sift",
     "surf": "skyquilt.papers.rfae:surf",
     "usurf": "skyquilt.papers.rfae:usurf",
+    "sift-octave0": "skyquilt.papers.rfae:sift_from_own_size",
+    "surf-lobe": "skyquilt.papers.rfae:surf_by_lobe",
     "rfae": "skyquilt.papers.rfae:rfae",
     "rfae-sift": "skyquilt.papers.rfae:rfae_sift",
     "surf+rfae": "skyquilt.papers.rfae:surf_and_rfae",
     "structure": "skyquilt.coregistration.methods:structure",
+    "shapes": "skyquilt.coregistration.methods:shapes",
 }
 TRANSFORMS = ("translation", "similarity", "affine", "homography")
 _ANY = tuple(DETECTORS)

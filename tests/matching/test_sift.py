@@ -74,6 +74,20 @@ def test_a_blob_is_found_where_it_is_in_full_pixels(size):
     assert np.abs(off[near]).max() < 0.15 and np.abs(off[near].mean(0)).max() < 0.05
 
 
+@pytest.mark.parametrize("octave", [0, 1])
+def test_a_later_first_octave_leaves_out_small_features_and_moves_none(picture, octave):
+    """Against the features that the usual first octave finds."""
+    usual, later = (
+        Sift(count=100_000, longest=640, first_octave=first)(picture) for first in (-1, octave)
+    )
+    smallest = np.percentile(later.size, 1) / np.percentile(usual.size, 1)
+    assert 1.6 ** (octave + 1) < smallest < 2.5 ** (octave + 1) and len(later) < len(usual) / 2
+    known = usual.px[usual.size > np.percentile(later.size, 50)]
+    off = np.array([later.px[np.linalg.norm(later.px - p, axis=1).argmin()] - p for p in known])
+    near = np.linalg.norm(off, axis=1) < 2
+    assert near.mean() > 0.7 and np.abs(np.median(off[near], axis=0)).max() < 0.06
+
+
 def test_the_pixel_convention_of_shrinking():
     """A pixel of a picture shrunk by k covers k of the full one's: centre 0 lies at (k - 1) / 2."""
     assert full_px(np.array([[0.0, 0.0], [9.0, 4.0]]), (5, 10), (20, 40)).tolist() == [

@@ -10,7 +10,14 @@ from skyquilt.coregistration.methods import registration_method
 from skyquilt.model.estimate import NoEstimate
 from skyquilt.model.features import DESCRIPTOR_UNIT, Features
 from skyquilt.model.registration import Picture, RefusedRegistration, Registration
-from skyquilt.papers.rfae import BetterByQ, Outliers, best, binary_edges, gradient_magnitude
+from skyquilt.papers.rfae import (
+    BetterByQ,
+    Outliers,
+    best,
+    binary_edges,
+    gradient_magnitude,
+    noise_threshold,
+)
 from skyquilt.quality.registration_quality import spread_quality
 from tests.coregistration.scenes import error, layout, spectrum, turned
 
@@ -31,7 +38,7 @@ def test_edges_are_sobels_normalised():
     picture = np.random.default_rng(0).integers(0, 255, (40, 50)).astype(np.uint8)
     x, y = (ndimage.sobel(picture.astype(float), axis) / 4 for axis in (1, 0))
     expected = np.hypot(x, y) / np.hypot(x, y)[1:-1, 1:-1].max()
-    magnitude = gradient_magnitude(picture)
+    magnitude = gradient_magnitude(picture, largest=100)
     inner = (slice(1, -1),) * 2
     assert magnitude.max() == pytest.approx(1.0)
     ratio = magnitude[inner] / np.maximum(expected[inner], 1e-9)
@@ -40,6 +47,29 @@ def test_edges_are_sobels_normalised():
         edges = binary_edges(magnitude, theta)
         assert set(np.unique(edges)) == {0, 255}
         assert ((edges == 255) == (magnitude > theta)).all()
+
+
+def test_a_lamp_does_not_hide_the_other_edges():
+    """Normalised by the 95th percentile, all but one edge stay as they are."""
+    picture = np.full((200, 200), 100, np.uint8)
+    picture[:, ::8] = 140
+    lit = picture.copy()
+    lit[90:98, 90:98] = 255
+    dull = picture.copy()
+    dull[90:98, 90:98] = 100
+    for largest, same in ((95.0, True), (100.0, False)):
+        edges = [binary_edges(gradient_magnitude(p, largest), 0.6) for p in (dull, lit)]
+        assert ((edges[0] == edges[1]).mean() > 0.99) == same
+
+
+@pytest.mark.parametrize("sigma", [4.0, 10.0])
+def test_the_threshold_from_noise_takes_one_hundredth_of_noise_for_edges(sigma):
+    rng = np.random.default_rng(3)
+    noise = np.clip(rng.normal(128, sigma, (300, 300)), 0, 255).astype(np.uint8)
+    noise[100:200, 100:200] //= 2  # an edge, to which the threshold hardly reacts
+    theta = noise_threshold(noise, largest=99.9)
+    magnitude = gradient_magnitude(noise, largest=99.9)
+    assert (magnitude[10:90, 10:290] > theta).mean() == pytest.approx(0.01, abs=0.004)
 
 
 def test_a_picture_without_edges_has_none():

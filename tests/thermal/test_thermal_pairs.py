@@ -9,7 +9,7 @@ import pytest
 
 from skyquilt.engine.clock import result_of
 from skyquilt.settings import MosaicSettings
-from skyquilt.thermal.by_pairs import by_pairs, overlapping
+from skyquilt.thermal.by_pairs import by_homographies, by_pairs, overlapping
 from skyquilt.workflows.mosaic import make_map
 from skyquilt.workflows.survey_input import read_input
 
@@ -51,6 +51,22 @@ def test_a_misplaced_block_is_brought_back(scene, other):
     moved = np.c_[px, np.ones(4)] @ found.b_H_a.T
     # both maps have the same grid about their origins, so that right places are equal pixels
     assert np.linalg.norm(moved[:, :2] / moved[:, 2:] - px, axis=1).max() < 1.0
+
+
+@pytest.mark.slow
+def test_one_pair_suffices_by_homographies(scene, other, monkeypatch):
+    """(5.7) as written, with all pairs and with one: level ground leaves some px, one pair more."""
+    grid = scene.ground.grid
+    px = np.array([[0.3, 0.3], [0.7, 0.3], [0.3, 0.7], [0.6, 0.6]]) * (grid.width, grid.height)
+    offs = []
+    for most in (24, 1):
+        monkeypatch.setattr("skyquilt.thermal.by_pairs.MOST_PAIRS", most)
+        found = by_homographies(scene, other)
+        assert found and found.model == "homography"
+        moved = np.c_[px, np.ones(4)] @ found.b_H_a.T
+        offs.append(np.linalg.norm(moved[:, :2] / moved[:, 2:] - px, axis=1))
+        assert found.evidence["pairs_registered"] == (1 if most == 1 else pytest.approx(7, abs=2))
+    assert offs[0].max() < 2.0 and np.median(offs[1]) < 6.0
 
 
 def test_blocks_that_share_no_ground_are_refused(scene, other):

@@ -218,7 +218,8 @@ def command(
             THERMAL,
             "How the thermal map finds its place: rig (both cameras on one drone: on the visual"
             " poses), maps (the pictures of both), pairs (of photos), heights (the surfaces under"
-            " them), positions (GPS alone), auto (the first that can be believed).",
+            " them), positions (GPS alone), auto (the first that can be believed), homographies"
+            " (of pairs, as the thesis writes them; never by auto).",
         ),
     ] = "auto",
     thermal_unit: Annotated[

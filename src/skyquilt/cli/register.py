@@ -20,9 +20,10 @@ def command(
     method: Annotated[
         str,
         typer.Option(
-            help="auto (structure, accepted only where independent patches agree), or a published"
-            " method, which accepts nine inliers: sift, surf, usurf, rfae, rfae-sift, surf+rfae;"
-            " or structure."
+            help="auto (structure, accepted only where independent patches agree); parts of it or"
+            " beside it: structure, shapes (areas and objects); or a published method, which"
+            " accepts nine inliers: sift, sift-octave0, surf, surf-lobe, usurf, rfae, rfae-sift,"
+            " surf+rfae."
         ),
     ] = "auto",
     metadata: Annotated[
@@ -36,7 +37,7 @@ def command(
         float | None,
         typer.Option(
             help="Largest error in px of B that is tolerated over the picture: a registration that"
-            " may be further off in a corner (95 %) is refused. For auto and structure."
+            " may be further off in a corner (95 %) is refused. For auto, structure and shapes."
             " Default: 2 % of B's diagonal."
         ),
     ] = None,

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from skyquilt import registry
 from skyquilt.coregistration.auto import Auto
+from skyquilt.coregistration.shapes import ShapeMatches
 from skyquilt.coregistration.structure import Structure, StructureMatches
 from skyquilt.errors import UsageError
 from skyquilt.matching.ransac import Ransac
@@ -16,7 +17,7 @@ INLIERS = 9
 """Fewest inliers of an accepted registration by the thesis's methods [Y 6.4.1]."""
 
 
-STATING = ("auto", "structure")
+STATING = ("auto", "structure", "shapes")
 """Methods that state their error over the picture."""
 
 
@@ -65,6 +66,11 @@ def auto() -> Auto:
 def structure() -> Structure:
     """A structure descriptor alone, verified by patches."""
     return Structure(propose=_proposals())
+
+
+def shapes() -> Structure:
+    """Areas and objects as shapes, verified by patches."""
+    return Structure(propose=ShapeMatches())
 
 
 def _proposals() -> StructureMatches:

@@ -84,6 +84,8 @@ class Propagate:
 
     model: Model = "homography"
     """Type of the transform."""
+    balanced: bool = True
+    """Whether places seen in several pairs weigh no more than others."""
     radius: float = 0.05
     """Radius for the balanced weights, as a share of the extent of the points."""
     scale_px: float = 3.0
@@ -108,7 +110,11 @@ class Propagate:
             reason = f"{len(points.px_a)} correspondences were found, {self.minimum} are needed"
             return RefusedRegistration(reason=reason)
         extent = float(np.linalg.norm(np.ptp(points.px_a, axis=0)))
-        balance = balanced_weights(points.px_a, self.radius * extent)
+        balance = (
+            balanced_weights(points.px_a, self.radius * extent)
+            if self.balanced
+            else np.ones(len(points.px_a))
+        )
         matrix = self._fitted(points, balance)
         error = (
             None

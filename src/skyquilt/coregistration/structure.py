@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,14 @@ class Proposal:
     """Number of matches."""
     reason: str = ""
     """Why there is no transform."""
+
+
+class Proposes(Protocol):
+    """A way to propose a transform."""
+
+    def __call__(self, a: Usable, b: Usable) -> Proposal:
+        """The transform, or why there is none."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,9 +74,9 @@ class StructureMatches:
 
 @dataclass(frozen=True, kw_only=True)
 class Structure:
-    """Structure matches, refined and verified."""
+    """A proposal by matches, refined and verified."""
 
-    propose: StructureMatches
+    propose: Proposes
     """The matches."""
     decide: Decide = field(default_factory=Decide)
     """The decision."""

@@ -26,6 +26,10 @@ class Sift:
     """OpenCV's contrast threshold."""
     levels: int = 3
     """Scale levels per octave; the thesis uses 43 for pairs of different spectra [Y 5.2.1]."""
+    first_octave: int = -1
+    """-1 starts with the image at twice its size, 0 at its own, 1 at half of it: each leaves out
+    the smallest features of the one before [Y 5.2.1].
+    """
     root: bool = True
     """RootSIFT; False keeps Lowe's descriptors, as the thesis used them."""
     cells: int = 10
@@ -49,6 +53,10 @@ class Sift:
         to.
         """
         grey = to_grey8(small)
+        if self.first_octave > -1:  # OpenCV's first octave doubles whatever it is given
+            part = 2 ** (self.first_octave + 1)
+            size = (max(1, grey.shape[1] // part), max(1, grey.shape[0] // part))
+            grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
         # without precise upscaling, OpenCV reports keypoints a quarter of a pixel too far down and
         # right
         detector = cv2.SIFT.create(

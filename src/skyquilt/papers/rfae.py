@@ -6,7 +6,7 @@ number. These methods are for comparison; use `Auto` in practice.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol
 
 import cv2
@@ -28,17 +28,44 @@ from skyquilt.quality.registration_quality import spread_quality
 
 THRESHOLDS = (0.2, 0.4, 0.6)
 """Shares of the largest gradient above which a pixel is an edge [Y 5.2.2]."""
+LARGEST = 95.0
+"""Percentile of the gradients that counts as the largest: the single largest one is that of a lamp
+or a hot object, and leaves no edges elsewhere.
+"""
+FALSE_EDGES = 0.01
+"""Share of the pixels of plain noise that the threshold from the sensor's noise takes for edges."""
+_PLAIN = 0.6745
+"""Median of the absolute value of a normal variable, in standard deviations."""
 
 
-def gradient_magnitude(values: NDArray[Any]) -> NDArray[np.float32]:
-    """(H, W) in [0, 1]: length of Sobel's gradient (5.5) over its largest value; 0 for a constant
-    image.
+def gradient_magnitude(values: NDArray[Any], largest: float = LARGEST) -> NDArray[np.float32]:
+    """(H, W) in [0, 1]: length of Sobel's gradient (5.5) over the percentile `largest` of its
+    values; 0 for a constant image.
     """
     grey = to_grey8(values).astype(np.float32)
     x = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.25)
     y = cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.25)
     length = np.hypot(x, y)
-    return np.asarray(length / max(float(length.max()), 1e-6), np.float32)
+    scale = float(np.percentile(length, largest)) or float(length.max())
+    return np.asarray(np.minimum(length / max(scale, 1e-6), 1), np.float32)
+
+
+def noise_threshold(values: NDArray[Any], largest: float = LARGEST) -> float:
+    """The gradient that noise alone exceeds in `FALSE_EDGES` of the pixels, in units of
+    `gradient_magnitude`: the thesis's threshold from the statistics of a sensor [Y 5.2.2].
+
+    The noise is the median of Immerkaer's (1996) difference of Laplacians, which edges hardly
+    change; a gradient of normal noise has a Rayleigh distribution.
+    """
+    grey = to_grey8(values).astype(np.float32)
+    kernel = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    rest = np.abs(cv2.filter2D(grey, cv2.CV_32F, kernel))
+    sigma = float(np.median(rest)) / _PLAIN / 6  # the kernel's norm
+    gradient = sigma * np.sqrt(12) / 4  # Sobel's norm, with its factor 1/4
+    x = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.25)
+    y = cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.25)
+    scale = float(np.percentile(np.hypot(x, y), largest))
+    return float(np.sqrt(-2 * np.log(FALSE_EDGES)) * gradient / max(scale, 1e-6))
 
 
 def binary_edges(magnitude: NDArray[np.float32], theta: float) -> NDArray[np.uint8]:
@@ -104,6 +131,10 @@ class Outliers:
         )
 
 
+LOBES = (1, 3, 5, 7)
+"""Initial lobes of SURF that are tried: filters of 3, 9, 15 and 21 px."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class ByFeatures:
     """SIFT, SURF or upright SURF on the images themselves."""
@@ -133,7 +164,11 @@ class Rfae:
     """Features to a registration."""
     thresholds: tuple[float, ...] = THRESHOLDS
     """Shares of the largest gradient."""
-    version: ClassVar[int] = 1
+    largest: float = LARGEST
+    """Percentile of the gradients that counts as the largest; 100 as printed."""
+    of_noise: bool = True
+    """Whether a threshold from the noise of each picture is tried too."""
+    version: ClassVar[int] = 2
 
     def __call__(self, a: Picture, b: Picture, guess: Guess | None = None) -> Outcome:
         """The registration of b to a; a guess is not used."""
@@ -143,8 +178,11 @@ class Rfae:
         return best([self.relate(fa, fb, a.shape) for fa in in_a for fb in in_b])
 
     def _features(self, picture: Picture) -> list[Features]:
-        magnitude = gradient_magnitude(picture.values)
-        return [self.detect(binary_edges(magnitude, theta)) for theta in self.thresholds]
+        magnitude = gradient_magnitude(picture.values, self.largest)
+        tried = list(self.thresholds)
+        if self.of_noise:
+            tried.append(float(np.clip(noise_threshold(picture.values, self.largest), 0.02, 0.9)))
+        return [self.detect(binary_edges(magnitude, theta)) for theta in tried]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,6 +219,20 @@ def surf() -> ByFeatures:
 def usurf() -> ByFeatures:
     """The same without orientation."""
     return ByFeatures(detect=_surf(upright=True), relate=_outliers())
+
+
+def sift_from_own_size() -> ByFeatures:
+    """SIFT with 43 levels whose first octave is 0: the image is not doubled [Y 5.2.1]."""
+    return ByFeatures(detect=replace(_sift(), first_octave=0), relate=_outliers())
+
+
+def surf_by_lobe() -> BetterByQ:
+    """SURF with the initial lobe that gives the highest Q [Y 6.4.1, Fig. 6.11]."""
+    return BetterByQ(
+        methods=tuple(
+            ByFeatures(detect=replace(_surf(), lobe=lobe), relate=_outliers()) for lobe in LOBES
+        )
+    )
 
 
 def rfae() -> Rfae:

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from skyquilt.coregistration.methods import registration_method
 from skyquilt.coregistration.propagation import PairPoints, Propagate
 from skyquilt.coregistration.refine_registration import RefineRegistration
-from skyquilt.geometry.transforms import transfer
-from skyquilt.imaging.views import View
+from skyquilt.geometry.transforms import fit, transfer
+from skyquilt.imaging.views import View, on_ground
 from skyquilt.model.raster import Grid, Window
-from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registration
+from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistration, Registration
 from skyquilt.ortho.blend import First
 from skyquilt.ortho.compose import Composer
 from skyquilt.workflows.flow import Scene
@@ -65,6 +65,68 @@ def by_pairs(visual: Scene, thermal: Scene) -> Registration | RefusedRegistratio
         "pairs_by_colour": float(sum(by_colour for _, by_colour in told)),
     }
     return replace(outcome, evidence={**outcome.evidence, **counts})
+
+
+def by_homographies(visual: Scene, thermal: Scene) -> Registration | RefusedRegistration:
+    """The same as (5.7) is written: photos are registered as they are, their points carried by one
+    homography per photo (of level ground) and weighted equally, and a homography is fitted. One
+    registered pair is enough.
+    """
+    asked = overlapping(visual, thermal)
+    there = ({v.photo: _homography(s, v) for v in s.ground.views} for s in (visual, thermal))
+    on_a, on_b = there
+    found = [
+        pair
+        for a, b in asked
+        if (pair := _as_they_are(visual, thermal, (a, on_a[a.photo]), (b, on_b[b.photo])))
+    ]
+    if not found:
+        return RefusedRegistration(
+            reason=f"none of {len(asked)} overlapping pairs of photos could be registered"
+        )
+    outcome = Propagate(model="homography", balanced=False)(found, on_a, on_b)
+    if isinstance(outcome, RefusedRegistration):
+        return outcome
+    counts = {"pairs_tried": float(len(asked)), "pairs_registered": float(len(found))}
+    return replace(outcome, evidence={**outcome.evidence, **counts})
+
+
+def _homography(scene: Scene, view: View) -> Matrix:
+    """(3, 3) from the pixels of a photo to those of its map, over level ground at the block's
+    median height; the lens's distortion is left out.
+    """
+    surface = scene.ground.surface
+    level = replace(surface, z=np.full_like(surface.z, np.nanmedian(surface.z)))
+    photo = scene.aligned.photos[view.photo]
+    ends = np.linspace(0, 1, _GRID)
+    x, y = np.meshgrid(ends * (photo.width - 1), ends * (photo.height - 1))
+    px = np.c_[x.ravel(), y.ravel()]
+    ground = on_ground(view, px, level)
+    found = fit("homography", px, np.stack(scene.ground.grid.pixel(*ground[:, :2].T), 1))
+    assert found is not None  # a grid determines it
+    return found
+
+
+def _as_they_are(
+    visual: Scene, thermal: Scene, a: tuple[View, Matrix], b: tuple[View, Matrix]
+) -> PairPoints | None:
+    """Points of two photos in their own pixels; None if they cannot be registered."""
+    pictures = [
+        Picture(values=np.ascontiguousarray(s.aligned.pixels(v.photo)))
+        for s, v in ((visual, a[0]), (thermal, b[0]))
+    ]
+    ours, theirs = visual.ground.grid, thermal.ground.grid
+    shift = _shift(visual, thermal)
+    corners = np.array([[0.0, 0], [ours.width, 0], [0, ours.height], [ours.width, ours.height]])
+    east, north = ours.x(corners[:, 0]) - shift[0], ours.y(corners[:, 1]) - shift[1]
+    between = fit("similarity", corners, np.stack(theirs.pixel(east, north), 1))
+    assert between is not None
+    start = np.linalg.inv(b[1]) @ between @ a[1]
+    guess = Guess(b_H_a=start / start[2, 2], source="the adjustments of both flights")
+    outcome = registration_method("auto")(pictures[0], pictures[1], guess)
+    if not isinstance(outcome, Registration):
+        return None
+    return PairPoints(a=a[0].photo, b=b[0].photo, px_a=outcome.px_a, px_b=outcome.px_b)
 
 
 def overlapping(visual: Scene, thermal: Scene) -> list[tuple[View, View]]:

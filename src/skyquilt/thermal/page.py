@@ -73,6 +73,8 @@ _ROUTES = {
     "pairs": "Both flights were mapped separately; pairs of their photos were registered and their"
     " correspondences transferred to"
     " both maps.",
+    "homographies": "Both flights were mapped separately; pairs of their photos were registered as"
+    " they are, and their correspondences carried to both maps by homographies of level ground.",
     "heights": "Both flights were mapped separately; their ground heights were registered, which"
     " do not depend on the"
     " time of day.",

@@ -16,9 +16,10 @@ from skyquilt.errors import RefusedError
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registration
 
-ROUTES = ("auto", "rig", "maps", "pairs", "heights", "positions")
+ROUTES = ("auto", "rig", "maps", "pairs", "heights", "positions", "homographies")
 """Registration methods: by the rig if one drone took both, by the images of both maps, by pairs of
 photos, by heights, or by positions alone. `auto` uses the first of these that is accepted.
+`homographies` is the thesis's (5.7) as written.
 """
 REFINE = RefineRegistration(free=SubpixelRefinement(freedom="affine", steps=12))
 """Refinement of an accepted registration of maps, with as many parameters as the images support."""
@@ -51,13 +52,14 @@ def join(
     route: str,
     *,
     pairs: Callable[[], Outcome] = lambda: _NO_PHOTOS,
+    homographies: Callable[[], Outcome] = lambda: _NO_PHOTOS,
     finer: Callable[[Registration], Outcome] = lambda outcome: outcome,
 ) -> Joined:
     """Registers the thermal map b to the visual map a.
 
-    `auto` uses the first of images, pairs and heights that is accepted. `pairs` registers pairs of
-    photos of both maps, px of a to px of b; `finer` refines a registration by heights measured in
-    those photos.
+    `auto` uses the first of images, pairs and heights that is accepted. `pairs` and `homographies`
+    register pairs of photos of both maps, px of a to px of b; `finer` refines a registration by
+    heights measured in those photos.
 
     Raises:
         RefusedError: the requested method is refused.
@@ -73,9 +75,10 @@ def join(
         "pairs": pairs,
         "heights": lambda: _by_heights(a, b, surfaces, guess, finer),
     }
+    asked = {**ways, "homographies": homographies}
     refused: list[tuple[str, str]] = []
-    for name in ways if route == "auto" else (route,) if route in ways else ():
-        outcome = ways[name]()
+    for name in ways if route == "auto" else (route,) if route in asked else ():
+        outcome = asked[name]()
         if isinstance(outcome, Registration):
             return Joined(
                 route=name, thermal_H_visual=outcome.b_H_a, outcome=outcome, refused=tuple(refused)
@@ -159,7 +162,8 @@ def _registered(a: Source, b: Source, one: Picture, other: Picture, guess: Guess
     moved_a, moved_b = (
         px @ S[:2, :2].T + S[:2, 2] for px, S in ((outcome.px_a, full_a), (outcome.px_b, full_b))
     )
-    return replace(outcome, b_H_a=matrix / matrix[2, 2], px_a=moved_a, px_b=moved_b)
+    full = matrix / matrix[2, 2]
+    return replace(outcome, b_H_a=full, px_a=moved_a, px_b=moved_b, error=None)
 
 
 def refuse_apart(visual: Sequence[Photo], thermal: Sequence[Photo]) -> None:

@@ -33,7 +33,7 @@ from skyquilt.ortho.radiometry import recorded_tags, value_figures
 from skyquilt.photos.together import taken_together
 from skyquilt.settings import MosaicSettings, PictureSettings
 from skyquilt.thermal.by_heights import finer
-from skyquilt.thermal.by_pairs import by_pairs
+from skyquilt.thermal.by_pairs import by_homographies, by_pairs
 from skyquilt.thermal.by_rig import draw_rigged, drift_of_rigged, rig_figures, rigged
 from skyquilt.thermal.page import write_figures, write_overlays, write_section
 from skyquilt.thermal.routes import ROUTES, Joined, as_registration, join, opened, refuse_apart
@@ -156,6 +156,7 @@ def _joined(
         (output / "surface.tif", heat.result.output / "surface.tif"),
         route,
         pairs=lambda: by_pairs(*scenes()),
+        homographies=lambda: by_homographies(*scenes()),
         finer=lambda outcome: finer(*scenes(), outcome),
     )
     joined = replace(joined, refused=(*refused, *joined.refused))
