@@ -76,10 +76,7 @@ class PointTies:
 
 def _ties_of(normal: Normal) -> PointTies:
     return PointTies(
-        V=normal.V,
-        gv=normal.gv,
-        Wp=normal.Wp.astype(np.float32),
-        Wc=normal.Wc.astype(np.float32),
+        V=normal.V, gv=normal.gv, Wp=normal.Wp.astype(np.float32), Wc=normal.Wc.astype(np.float32)
     )
 
 
