@@ -170,8 +170,8 @@ def thin(
     """Selects tracks for an adjustment: long ones first, until every photo has `per_photo`
     observations spread over its area.
 
-    `sizes`: (width, height) of each photo. A photo that would be left with fewer than `least`, since
-    its observations lie in few of the cells, keeps all of them.
+    `sizes`: (width, height) of each photo. A photo that would be left with fewer than `least`,
+    since its observations lie in few of the cells, keeps all of them.
     """
     length = np.bincount(tracks.point, minlength=tracks.count)
     size = np.array(sizes)[tracks.photo]
