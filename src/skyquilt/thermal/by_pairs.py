@@ -17,7 +17,8 @@ from skyquilt.coregistration.methods import registration_method
 from skyquilt.coregistration.propagation import PairPoints, Propagate
 from skyquilt.coregistration.refine_registration import RefineRegistration
 from skyquilt.geometry.transforms import fit, transfer
-from skyquilt.imaging.views import View, on_ground
+from skyquilt.imaging.nodes import View
+from skyquilt.imaging.views import on_ground
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.registration import Guess, Matrix, Picture, RefusedRegistration, Registration
 from skyquilt.ortho.blend import First
