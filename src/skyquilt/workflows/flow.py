@@ -8,7 +8,7 @@ command gets at the photos and the ground of a finished map by the same steps.
 """
 
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -48,6 +48,8 @@ from skyquilt.workflows.photo_features import (
 from skyquilt.workflows.survey_input import SurveyInput
 
 T = TypeVar("T")
+ADJUSTING = "adjusting"
+"""Folder in the store with the parts of an adjustment that is not finished."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -340,7 +342,13 @@ def _align(known: AlignmentInputs, methods: Methods, store: Store) -> Steps[Alig
         list(known.order),
         methods.align,
     )
-    alignment = store.get_or("alignment", key, lambda: methods.align(known))
+
+    def keep(part: str, make: Callable[[], T], /) -> T:
+        return store.get_or(ADJUSTING, digest(key, part), make)
+
+    resumable = replace(known, keep=keep)
+    alignment = store.get_or("alignment", key, lambda: methods.align(resumable))
+    store.forget([ADJUSTING])
     yield 1, 1
     return alignment
 
