@@ -9,10 +9,10 @@ from pyproj import Transformer
 
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import Control, control_in_frame, fit_similarity_3d
-from skyquilt.alignment.kept import made_now
 from skyquilt.alignment.setup import HALF_TURN
 from skyquilt.alignment.stages import position_noise, prune
 from skyquilt.engine.codec import decode, encode
+from skyquilt.engine.kept import made_now
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import angles_from_cam_R_map, rotation_from_vector

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.equations import Equations, add_diagonal, sums_by_point
-from skyquilt.alignment.kept import Keep, made_now
 from skyquilt.alignment.problem import CAMERA, Problem, State, linearised_points
 from skyquilt.alignment.robust import observation_weights, point_terms, robust_cost
+from skyquilt.engine.kept import Keep, made_now
 from skyquilt.geometry.block_cholesky import Factor, Index, Matrix
 from skyquilt.geometry.levenberg_marquardt import levenberg_marquardt
 

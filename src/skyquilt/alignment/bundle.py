@@ -9,7 +9,6 @@ import numpy as np
 from skyquilt.alignment.adjust import covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
 from skyquilt.alignment.dominant_plane import levelled
-from skyquilt.alignment.kept import Keep, made_now, within
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, undetermined
@@ -19,6 +18,7 @@ from skyquilt.alignment.stages import believe_positions, fine, rough, weighed
 from skyquilt.alignment.start import Start, find_start
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
+from skyquilt.engine.kept import Keep, made_now, within
 from skyquilt.errors import AlignmentError
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo

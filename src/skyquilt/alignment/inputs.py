@@ -7,7 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.kept import Keep, made_now
+from skyquilt.engine.kept import Keep, made_now
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import ControlPoint, Photo
 from skyquilt.model.poses import Alignment, MapFrame, Prior

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import adjust
 from skyquilt.alignment.deviations import believed, observed_noise, robust_scale
-from skyquilt.alignment.kept import Keep, made_now, within
 from skyquilt.alignment.problem import READOUT, Problem, State, residuals_px, swept
 from skyquilt.alignment.robust import robust_cost
 from skyquilt.alignment.setup import Setup
+from skyquilt.engine.kept import Keep, made_now, within
 
 Array = NDArray[np.float64]
 ROLLS_PX = 0.3

@@ -271,8 +271,11 @@ def _labels(
         picture_recipe(),
         [p.digest for p in aligned.photos],
     )
+    keep = store.parts("seams", key)
     return store.get_or(
-        "seams", key, lambda: methods.seams(on.views, on.surface, on.grid, aligned.grey, exposure)
+        "seams",
+        key,
+        lambda: methods.seams(on.views, on.surface, on.grid, aligned.grey, exposure, keep),
     )
 
 
@@ -342,11 +345,7 @@ def _align(known: AlignmentInputs, methods: Methods, store: Store) -> Steps[Alig
         list(known.order),
         methods.align,
     )
-
-    def keep(part: str, make: Callable[[], T], /) -> T:
-        return store.get_or(ADJUSTING, digest(key, part), make)
-
-    resumable = replace(known, keep=keep)
+    resumable = replace(known, keep=store.parts(ADJUSTING, key))
     alignment = store.get_or("alignment", key, lambda: methods.align(resumable))
     store.forget([ADJUSTING])
     yield 1, 1

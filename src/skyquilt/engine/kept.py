@@ -1,4 +1,4 @@
-"""Parts of an adjustment that an interrupted run need not repeat."""
+"""Parts of a long step that an interrupted run need not repeat."""
 
 from collections.abc import Callable
 from typing import Protocol, TypeVar
