@@ -116,11 +116,8 @@ class Bundle:
         problem = replace(problem, velocity=setup.base.velocity)
         method = self.match_observations
         if grey is not None and method is not None:
-
-            def sharpen() -> Tracks:
-                return _sharpened(used, photos, setup, problem, state, method, grey)
-
-            used = keep("sharp", sharpen)
+            part = within(keep, "sharp")
+            used = _sharpened(used, photos, setup, problem, state, method, grey, part)
             begin = 0
         if begin != each:
             problem, _ = setup.problem(thin(used, sizes, per_photo=each, least=least))
@@ -147,6 +144,7 @@ def _sharpened(
     state: State,
     match_observations: LeastSquaresMatching,
     grey: GreyPicture,
+    keep: Keep,
 ) -> Tracks:
     """Tracks (sensor pixels) with observations refined in larger images."""
     everything, _ = setup.problem(tracks)
@@ -155,7 +153,7 @@ def _sharpened(
     poses = pose_records(setup, state)
     filed = replace(tracks, px=setup.file_px(tracks.photo, tracks.px))
     sharp = match_observations(
-        filed, xyz, poses, {i: cameras[k] for i, k in camera_of.items()}, grey
+        filed, xyz, poses, {i: cameras[k] for i, k in camera_of.items()}, grey, keep
     )
     return replace(sharp, px=setup.file_px(sharp.photo, sharp.px))
 

@@ -1,6 +1,6 @@
 """What the store of a run may hold."""
 
-from skyquilt.alignment import problem, tracks
+from skyquilt.alignment import problem
 from skyquilt.model import camera, clip, features, poses, raster, surface
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.ortho import companions
@@ -26,7 +26,6 @@ REGISTRY = {
         poses.Join,
         surface.Surface,
         problem.State,
-        tracks.Tracks,
         RejectedPhoto,
         companions.BlockExtras,
         raster.Grid,
