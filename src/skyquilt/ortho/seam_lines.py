@@ -266,11 +266,6 @@ class _Scene:
         self.views, self.cells, self.z, self.over = views, cells, z, over
         self._grey, self._exposure, self._longest = grey, exposure, longest
         self._tall = over > STANDING_M
-        soft = cv2.blur(z, (3, 3))
-        self._slopes = (
-            cv2.Sobel(soft, cv2.CV_32F, 0, 1, scale=1 / (8 * cells.gsd)),
-            cv2.Sobel(soft, cv2.CV_32F, 1, 0, scale=1 / (8 * cells.gsd)),
-        )
         self._shadows: OrderedDict[int, Shadow] = OrderedDict()
 
     def scores(
@@ -302,6 +297,7 @@ class _Scene:
             ]
         )
         part = (slice(row, row + h), slice(column, column + w))
+        slopes = self._slopes(*part)
         for k, n in enumerate(nodes):  # what lies flat yields to sharper photos
             smear = smeared(n, 2 * self.cells.gsd / STEP)
             if smear.any():
@@ -312,19 +308,35 @@ class _Scene:
         for k, view in enumerate(views):
             shadow = self._shadow(view)
             if not shadow.empty:
-                lost = shadow.hides(fx, fy, self.z[part]) | self._grazing(view, part, fx, fy)
+                lost = shadow.hides(fx, fy, self.z[part]) | self._grazing(
+                    view, slopes, self.z[part], fx, fy
+                )
                 behind = cv2.morphologyEx(
                     lost.view(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)
                 )
                 score[k][behind > 0] += HIDDEN
         return views, score, nodes
 
-    def _grazing(self, view: View, part: Any, x: NDArray[Any], y: NDArray[Any]) -> Mask:
+    def _slopes(self, rows: slice, columns: slice) -> tuple[Float, Float]:
+        """Slopes (h, w) of the heights down and to the right."""
+        r, c = max(rows.start - 2, 0), max(columns.start - 2, 0)
+        soft = cv2.blur(self.z[r : rows.stop + 2, c : columns.stop + 2], (3, 3))
+        inner = (slice(rows.start - r, rows.stop - r), slice(columns.start - c, columns.stop - c))
+        down, right = (
+            cv2.Sobel(soft, cv2.CV_32F, *along, scale=1 / (8 * self.cells.gsd))[inner]
+            for along in ((0, 1), (1, 0))
+        )
+        return np.asarray(down, np.float32), np.asarray(right, np.float32)
+
+    @staticmethod
+    def _grazing(
+        view: View, slopes: tuple[Float, Float], z: Float, x: NDArray[Any], y: NDArray[Any]
+    ) -> Mask:
         """Cells (h, w) that a photo sees so flatly that they would be drawn as streaks."""
         cx, cy, cz = view.pose.map_C
-        down, right = self._slopes
-        toward = (x - cx) * right[part] - (y - cy) * down[part]
-        return np.asarray(1 + toward / np.maximum(cz - self.z[part], 0.1) < GRAZING)
+        down, right = slopes
+        toward = (x - cx) * right - (y - cy) * down
+        return np.asarray(1 + toward / np.maximum(cz - z, 0.1) < GRAZING)
 
     def _shadow(self, view: View) -> Shadow:
         found = self._shadows.pop(view.photo, None)
