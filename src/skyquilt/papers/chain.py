@@ -18,12 +18,13 @@ from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Join, MapFrame, Prior
 from skyquilt.papers.direct import Direct
-from skyquilt.papers.lens_order import of_order, to_working, working_K
+from skyquilt.papers.lens_order import WORKING_WIDTH, of_order, to_working, working_K
 from skyquilt.papers.pieces import Piece, lay
 from skyquilt.papers.plane_registration import (
     Estimator,
     Leveller,
     Matcher,
+    at_share,
     implausible,
     plane_alignment,
     registered,
@@ -41,14 +42,14 @@ class Chain:
     match: Matcher
     """Matching."""
     estimate: Estimator
-    """Robust estimation of the transformation, thresholds in px of the working image."""
+    """Robust estimation of the transformation, thresholds in px of a photo 1500 px wide."""
     level: Leveller | None = None
     """Levelled features; None = all inliers are used."""
     distortion: str = "6t"
     """Order of the lens model, which is fitted to the calibration of the photos."""
     height_m: float | None = None
     """Height above ground in m that scales pieces without positions."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(
         self,
@@ -82,9 +83,8 @@ class Chain:
         a = to_working(lens[photo], px)
         b = to_working(lens[onto], features[onto].px[matches.index_b])
         centre = working_K(lens[photo])[:2, 2]
-        found = registered(
-            photo, onto, px, a, b, estimate=self.estimate, level=self.level, centre=centre
-        )
+        estimate, level = at_share(self.estimate, self.level, lens[onto].width / WORKING_WIDTH)
+        found = registered(photo, onto, px, a, b, estimate=estimate, level=level, centre=centre)
         if isinstance(found, NoEstimate):
             return found
         H = np.linalg.inv(working_K(lens[onto])) @ found[0] @ working_K(lens[photo])
