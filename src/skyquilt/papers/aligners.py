@@ -146,13 +146,14 @@ def image(settings: MosaicSettings) -> ByImage:
         return ByImage(method=_direct_chain(settings))
     order, height = settings.camera.distortion or "6t", settings.camera.height_m
     match = registry.load("matcher", settings.matching.matcher or "mutual")()
-    if settings.image.image_search == "chain":
+    if settings.image.image_search != "overview":
         chain = Chain(
             match=match,
             estimate=_estimator(settings, CHAIN_PX, "similarity"),
             level=_level(settings, WORKING_WIDTH),
             distortion=order,
             height_m=height,
+            loop=settings.image.image_search == "loop",
         )
         return ByImage(method=chain)
     detect = registry.load("detector", settings.matching.detector or "sift")

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.inputs import GreyPicture
 from skyquilt.alignment.pose import reported_camera
+from skyquilt.geometry.camera import undistort
 from skyquilt.imaging.plane import to_grid
 from skyquilt.model.camera import Camera
 from skyquilt.model.estimate import NoEstimate
@@ -19,6 +20,7 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Join, MapFrame, Prior
 from skyquilt.papers.direct import Direct
 from skyquilt.papers.lens_order import WORKING_WIDTH, of_order, to_working, working_K
+from skyquilt.papers.loop import closed
 from skyquilt.papers.pieces import Piece, lay
 from skyquilt.papers.plane_registration import (
     Estimator,
@@ -49,6 +51,8 @@ class Chain:
     """Order of the lens model, which is fitted to the calibration of the photos."""
     height_m: float | None = None
     """Height above ground in m that scales pieces without positions."""
+    loop: bool = False
+    """Also compare photos where the chain comes back, and spread its closing error [Y 2.3.4]."""
     version: ClassVar[int] = 2
 
     def __call__(
@@ -72,6 +76,7 @@ class Chain:
             order,
             cameras,
             self.height_m,
+            loop=self.loop,
         )
 
     def _join(
@@ -165,9 +170,12 @@ def chained(
     order: Sequence[int],
     cameras: dict[str, Camera],
     height_m: float | None,
+    *,
+    loop: bool = False,
 ) -> Alignment:
     """Photos one after the other: `join` gives onto_H_photo (3, 3) between undistorted image planes
-    of a photo and the one before it, or why they do not match: then a new piece begins.
+    of a photo and the one before it, or why they do not match: then a new piece begins. With `loop`
+    the pieces' loops are closed.
     """
     pieces: list[dict[int, Array]] = []
     joins, notes, last = [], [], -1
@@ -182,10 +190,23 @@ def chained(
                 notes.append(broken(photos[photo].name, photos[last].name, joined.reason))
             pieces.append({photo: np.eye(3)})
         last = photo
+    if loop:
+        for k, piece in enumerate(pieces):
+            extent = {i: _corners(cameras[photos[i].camera_key]) for i in piece}
+            pieces[k], more = closed(piece, extent, join)
+            joins += more
+        notes.append(f"{len(joins) + len(pieces) - len(order)} closings of loops were found")
     laid = lay([Piece(plane_H_cam=p) for p in pieces], priors, height_m)
     return plane_alignment(
         "image", frame, photos, laid.poses, laid.metric, cameras, pieces, joins, notes
     )
+
+
+def _corners(camera: Camera) -> Array:
+    """Corners (4, 2) of a photo in its undistorted image plane."""
+    right, low = camera.width - 1.0, camera.height - 1.0
+    px = np.array([[0.0, 0.0], [right, 0.0], [right, low], [0.0, low]])
+    return np.asarray(undistort(camera, px))
 
 
 def broken(photo: str, before: str, reason: str) -> str:
