@@ -131,16 +131,16 @@ class Stereo:
             agree=0.015 * height,
         )
         z = self._fused(given, views, height, self.relief * height, keep)
-        known = _without_specks(z, 0.01 * height, 6)
+        known = without_specks(z, 0.01 * height, 6)
         x, y = np.meshgrid(cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)))
         # cliffs stay as steep as the cells allow
         former = np.asarray(cv2.medianBlur(_stepwise(rough, x, y), 5), np.float32)
         if not known.any():
-            return _surface(former, cells)
+            return surface_of(former, cells)
         side = 2 * round(self.whole * height / cells.gsd / 2) + 1
         firm = cv2.boxFilter(known.astype(np.float32), -1, (side, side)) > FIRM
         refined = cv2.medianBlur(nearest_known(z, known), 5)
-        return _surface(np.where(firm, refined, former).astype(np.float32), cells)
+        return surface_of(np.where(firm, refined, former).astype(np.float32), cells)
 
     def _coarse(
         self,
@@ -166,7 +166,7 @@ class Stereo:
             agree=0.04 * height,
         )
         z = self._fused(given, views, height, 0.0, keep)
-        known = _without_specks(z, 0.02 * height, 12)
+        known = without_specks(z, 0.02 * height, 12)
         if not known.any():
             return surface, known
         # where only some places agree, as in leaves, heights are those of whole crowns
@@ -184,7 +184,7 @@ class Stereo:
         )
         # at once: photos drawn on a slope between crowns and the plane would become streaks
         whole = settled(np.asarray(whole, np.float32), around > 0, 0.0, 1.0)
-        return _surface(whole, cells), known
+        return surface_of(whole, cells), known
 
     def pairs(self, views: Sequence[View], height: float, wanted: int) -> list[tuple[View, View]]:
         """The pairs that are matched, of photos `height` m above ground: those with good baselines
@@ -252,7 +252,9 @@ def _tile(
         todo, in_order(lambda k: _points(pairs[k], given), todo, jobs=THREADS), strict=True
     ):
         held[k] = points
-    layers = [layer for k in near if (layer := _splat(held[k], pairs[k].origin, part)) is not None]
+    layers = [
+        layer for k in near if (layer := splatted(held[k], pairs[k].origin, part)) is not None
+    ]
     return (
         _agreed(layers, given.agree)
         if layers
@@ -298,7 +300,7 @@ def _points(pair: Pair, given: _Round) -> Float:
     return np.asarray(at[(z > given.low.at(x, y)) & (z < given.high.at(x, y))])
 
 
-def _splat(points: Float, origin: Array, part: Grid) -> Float | None:
+def splatted(points: Float, origin: Array, part: Grid) -> Float | None:
     """Heights (h, w) of the cells of a grid: the means of those points that lie near the highest
     one in each; None if there are no points.
     """
@@ -341,7 +343,7 @@ def _stepwise(surface: Surface, x: NDArray[Any], y: NDArray[Any]) -> Float:
     return surface.z[np.clip(row, 0, rows - 1)][:, np.clip(column, 0, columns - 1)]
 
 
-def _without_specks(z: Float, step: float, least: int) -> Mask:
+def without_specks(z: Float, step: float, least: int) -> Mask:
     """Which heights (h, w) are kept: those of patches of at least `least` cells whose neighbours
     differ by less than `step` m.
     """
@@ -362,7 +364,8 @@ def _stretched(surface: Surface, reach: float, kind: int, add: float) -> Surface
     return replace(surface, z=np.asarray(z + np.float32(add), np.float32))
 
 
-def _surface(z: Float, cells: Grid) -> Surface:
+def surface_of(z: Float, cells: Grid) -> Surface:
+    """The surface of heights (rows, columns) in m of cells, row 0 in the north, without gaps."""
     return Surface(
         z=np.ascontiguousarray(z[::-1]),
         x0=float(cells.x(np.array(0))),
