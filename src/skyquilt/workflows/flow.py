@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from skyquilt.alignment.inputs import AlignmentInputs, GreyPicture
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
-from skyquilt.engine.pixel_cache import PixelCache, pixel_budget
+from skyquilt.engine.pixel_cache import PixelCache, pixel_budget, resident_budget
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import PhotoFailedError
 from skyquilt.model.event import Event, Note
@@ -138,11 +138,15 @@ def align_photos(
     given = yield from frames_added(given, settings, clock)
     photos = given.survey.photos
     cache = PixelCache(
-        read=lambda i: read_color(photos[i]), budget_bytes=pixel_budget(settings.running.memory_gb)
+        read=lambda i: read_color(photos[i]),
+        budget_bytes=pixel_budget(settings.running.memory_gb),
+        resident_bytes=resident_budget(settings.running.memory_gb),
     )
     found = yield from clock.stage(
         "features", find_features(photos, cache, methods.detector, store, jobs)
     )
+    if cache.dropped:  # the map is drawn by place, not in this order: what is left would not help
+        cache.clear()
     found = of_one_kind(found)
     pixels = _pixels_of(found.photos, photos, cache)
     grey = GreyPictures(found.photos, pixels, store)
