@@ -5,7 +5,8 @@ out here. docs/papers.md holds the results, with a verdict for each claim.
 
 NAME:
     table-6.1     lambda of the four approaches, first 8 photos of a round trip (Y 6.1.2)
-    fig-6.4       correlation and distance from the GPS position along the round trip (Y 6.1.3)
+    fig-6.4       correlation and distance from the GPS position, photo by photo (Y 6.1.3; needs
+                  ../shared/data)
     times         CPU time of aligning 9, 18 and 37 photos (Y 6.1.2, 6.1.3, 6.5)
     fig-6.5       eta along a strip (Y 6.2), and with every other photo (Y Fig. 4.5)
     models        where the similarity keeps the shape better than the homography, and where not
@@ -123,7 +124,7 @@ def roundtrip(work: Path, seed: int, photos: int = 40) -> Path:
 def compared(
     photos: Path, out: Path, variants: tuple[str, ...], **more: Any
 ) -> dict[str, dict[str, Any]]:
-    settings = CompareSettings(mosaic=MosaicSettings(gsd_cm=8), variants=variants, **more)
+    settings = CompareSettings(mosaic=MosaicSettings(gsd_cm=10), variants=variants, **more)
     *_, last = iter_compare(photos, out, settings, overwrite=True)
     assert isinstance(last, Result)
     return dict(last.metrics["methods"])
@@ -185,21 +186,18 @@ def table_61(work: Path, seeds: int) -> None:
 
 
 def fig_64(work: Path, seeds: int) -> None:
-    """The whole round trip: does a photo near its GPS position fit better?"""
+    """A whole survey: does a photo that stays near its GPS position fit better?"""
+    if not (DATA / "brighton").is_dir():
+        raise SystemExit("brighton is not beside this checkout")
+    names = ("position", "pose", "image", "image-overview", "hybrid", "hybrid-anneal")
     rows = []
-    for seed in range(1, seeds + 1):
-        folder = roundtrip(work, seed)
-        made = compared(folder / "photos", work / "f64", ("position", "pose", "image", "hybrid"))
-        means = [np.nanmean(_array(c["correlation_with_last_of_photo"])) for c in made.values()]
-        h = made["hybrid"]
-        corr = _array(h["correlation_with_last_of_photo"])
-        off = _array(h["off_position_over_width"])
+    for name, c in compared(DATA / "brighton", work / "f64", names).items():
+        corr = _array(c["correlation_with_last_of_photo"])
+        off = _array(c["off_position_over_width"])
         both = np.isfinite(corr) & np.isfinite(off)
-        r = np.corrcoef(corr[both], off[both])[0, 1]
-        rows.append((seed, *(f"{m:.3f}" for m in means), f"{r:+.2f}"))
-    table(
-        ("flight", "position", "pose", "image", "hybrid", "r(correlation, distance), hybrid"), rows
-    )
+        r = np.corrcoef(corr[both], off[both])[0, 1] if off[both].std() > 0 else np.nan
+        rows.append((name, f"{np.nanmean(corr):.3f}", f"{off[both].mean():.3f}", f"{r:+.2f}"))
+    table(("approach", "CC with the photo before", "distance, widths", "r of both"), rows)
 
 
 def _array(values: Sequence[float | None]) -> np.ndarray:

@@ -31,8 +31,8 @@ def command(
     route: Annotated[
         str,
         typer.Option(
-            help="pair (two photos, or the first two in sequence that match), disparities (of all"
-            " linked pairs, merged), reconstruction (heights of the whole adjustment), auto (pair"
+            help="pair (two photos, or the first two in sequence that match: every pixel),"
+            " disparities (of the features of all linked pairs, merged), reconstruction (heights of the whole adjustment), auto (pair"
             " for two photos)."
         ),
     ] = "auto",
