@@ -129,6 +129,16 @@ def test_a_block_is_found(plain):
     assert camera.sigmas is not None and 0.5 < camera.sigmas[0] < 10 and camera.sigmas[8] > 0
 
 
+def test_large_surveys_are_placed_as_well_from_fewer_observations(plain):
+    """As if 18 photos were many; the truth is as near as from all observations."""
+    flown, usual = plain
+    found = flown.aligned(many=5, per_photo=180, ties=120)
+    assert set(found.poses) == set(usual.poses)
+    assert len(found.ties.point) < 0.9 * len(usual.ties.point)
+    assert relative_error(flown, found) < 1.3 * relative_error(flown, usual)
+    assert worst_turn_deg(flown, found) < 0.6
+
+
 def test_tie_points_project_where_they_were_seen(plain):
     _, found = plain
     t = found.ties

@@ -100,11 +100,12 @@ class Bundle:
         setup = set_up(photos, priors, start, distortion=self.distortion, repair=self.repair)
         sizes = [(p.width, p.height) for p in photos]
         begin = each = self.per_photo
+        least = 0
         if len(start.placed) > self.many:
-            begin, each = ROUGHLY, self.per_photo // 3
-            tracks = thin(tracks, sizes, per_photo=self.ties)
+            begin, each, least = ROUGHLY, self.per_photo // 3, ROUGHLY
+            tracks = thin(tracks, sizes, per_photo=self.ties, least=self.ties // 2)
         used = setup.sensor_tracks(tracks)
-        problem, state = setup.problem(thin(used, sizes, per_photo=begin))
+        problem, state = setup.problem(thin(used, sizes, per_photo=begin, least=least))
         problem, state = rough(problem, state)
         setup = setup.moving_as(photos, state.C)
         problem = replace(problem, velocity=setup.base.velocity)
@@ -112,7 +113,7 @@ class Bundle:
             used = _sharpened(used, photos, setup, problem, state, self.match_observations, grey)
             begin = 0
         if begin != each:
-            problem, _ = setup.problem(thin(used, sizes, per_photo=each))
+            problem, _ = setup.problem(thin(used, sizes, per_photo=each, least=least))
             state = triangulated(problem, state)
         problem, state = fine(problem, state)
         setup = setup.moving_as(photos, state.C)

@@ -160,12 +160,18 @@ def _by_photos(track: Index, photo: Index) -> tuple[Index, Index]:
 
 
 def thin(
-    tracks: Tracks, sizes: Sequence[tuple[int, int]], *, per_photo: int, cells: int = 8
+    tracks: Tracks,
+    sizes: Sequence[tuple[int, int]],
+    *,
+    per_photo: int,
+    cells: int = 8,
+    least: int = 0,
 ) -> Tracks:
     """Selects tracks for an adjustment: long ones first, until every photo has `per_photo`
     observations spread over its area.
 
-    `sizes`: (width, height) of each photo.
+    `sizes`: (width, height) of each photo. A photo that would be left with fewer than `least`,
+    since its observations lie in few of the cells, keeps all of them.
     """
     length = np.bincount(tracks.point, minlength=tracks.count)
     size = np.array(sizes)[tracks.photo]
@@ -176,4 +182,7 @@ def thin(
     rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
     chosen = np.zeros(tracks.count, bool)
     chosen[tracks.point[order[rank < max(1, per_photo // cells**2)]]] = True
+    if least:
+        number = np.bincount(tracks.photo[chosen[tracks.point]], minlength=len(sizes))
+        chosen[tracks.point[number[tracks.photo] < least]] = True
     return tracks.only(chosen[tracks.point])

@@ -9,7 +9,7 @@ from contextlib import suppress
 
 _TRIM, _MMAP, _ARENAS = -1, -3, -8
 """Parameters of `mallopt` of glibc: M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX."""
-LARGE_BYTES = 4 << 20
+LARGE_BYTES = 32 << 20
 """Blocks of memory that are the system's again as soon as they are freed. With smaller ones, time
 is lost in getting pages; glibc's own limit rises to 32 MB with what is freed.
 """

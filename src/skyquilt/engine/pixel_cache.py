@@ -91,6 +91,13 @@ class PixelCache(Generic[Kept]):
         with self._lock:
             return self._kept.get(photo)
 
+    def make_room(self) -> None:
+        """Drops all photos unless every one fitted so far: of a survey that does not fit, few of
+        those that are kept are asked for again before they would be dropped.
+        """
+        if self.dropped:
+            self.clear()
+
     def clear(self) -> None:
         """Drops all photos."""
         with self._lock:
@@ -109,4 +116,4 @@ def resident_budget(memory_gb: float | None) -> int:
     """Resident memory in bytes above which decoded photos make room: what is allowed, less what a
     step takes for a moment.
     """
-    return int(((memory_gb or USUAL_GB) - 0.2) * 1e9)
+    return int(((memory_gb or USUAL_GB) - 0.4) * 1e9)

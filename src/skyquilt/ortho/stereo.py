@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.executor import in_order
-from skyquilt.imaging.views import View
+from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid
-from skyquilt.model.surface import Surface
+from skyquilt.model.surface import WIDEST, Surface
 from skyquilt.ortho.fill import nearest_known, plateaus, settled
 from skyquilt.ortho.pair_matching import Array, Float, Mask, Pair, matched_points, pair_of
 
@@ -137,7 +137,7 @@ class Stereo:
         )
         z = self._fused(given, views, height, self.relief * height, keep)
         known = without_specks(z, 0.01 * height, 6)
-        x, y = np.meshgrid(cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)))
+        x, y = cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height))
         # cliffs stay as steep as the cells allow
         former = np.asarray(cv2.medianBlur(_stepwise(rough, x, y), 5), np.float32)
         if not known.any():
@@ -348,9 +348,9 @@ def _agreed(heights: Sequence[Cells], step: float, shape: tuple[int, int]) -> Fl
 
 
 def _stepwise(surface: Surface, x: NDArray[Any], y: NDArray[Any]) -> Float:
-    """Heights (h, w) of the nearest cells of a surface."""
-    column = np.rint((x[0] - surface.x0) / surface.cell).astype(np.int64)
-    row = np.rint((y[:, 0] - surface.y0) / surface.cell).astype(np.int64)
+    """Heights (h, w) of the nearest cells of a surface, at x (w,) and y (h,)."""
+    column = np.rint((x - surface.x0) / surface.cell).astype(np.int64)
+    row = np.rint((y - surface.y0) / surface.cell).astype(np.int64)
     rows, columns = surface.z.shape
     return surface.z[np.clip(row, 0, rows - 1)][:, np.clip(column, 0, columns - 1)]
 
@@ -388,8 +388,11 @@ def surface_of(z: Float, cells: Grid) -> Surface:
 
 
 def _least(grid: Grid) -> int:
-    """The least side of a cell in map pixels for which a surface stays below `MOST_CELLS`."""
-    return int(np.ceil(np.sqrt(grid.width * grid.height / MOST_CELLS)))
+    """The least side of a cell in map pixels for which a surface stays below `MOST_CELLS`, and each
+    of its sides below `WIDEST`.
+    """
+    cells = np.sqrt(grid.width * grid.height / MOST_CELLS)
+    return int(np.ceil(max(cells, grid.width / WIDEST, grid.height / WIDEST)))
 
 
 def _meet(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
