@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import View
+from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.fill import nearest_known
