@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.executor import in_order
+from skyquilt.engine.kept import Keep
 from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import WIDEST, Surface
@@ -24,8 +25,6 @@ from skyquilt.ortho.pair_matching import Array, Float, Mask, Pair, matched_point
 
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
-Keep = Callable[[str, Callable[[], Float]], Float]
-"""Gives a part of the result by its name: the one kept of an interrupted run, or made now."""
 Cells = tuple[NDArray[np.intp], Float]
 """Numbers (n,) of cells of a grid, row by row, and their heights (n,) in m."""
 MOST_CELLS = 2.4e7
