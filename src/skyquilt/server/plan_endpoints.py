@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from fastapi import HTTPException, Query, Request
 from fastapi.responses import FileResponse, JSONResponse, Response
@@ -16,14 +16,14 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from skyquilt.errors import OutputError
-from skyquilt.live.fill import PLANS, next_folder
 from skyquilt.live.ledger import Ledger
+from skyquilt.live.plan_folders import PLANS, next_folder
 from skyquilt.outside import plain
-from skyquilt.planning.ground_cover import picture_of
-from skyquilt.planning.plan_file import as_record
 from skyquilt.server.access import Context, blocks_of
 from skyquilt.server.layer_endpoints import LayerError, checked
-from skyquilt.server.mission_watch import MissionWatch
+
+if TYPE_CHECKING:
+    from skyquilt.server.mission_watch import MissionWatch  # only for live surveys
 
 MOST_RUNNING = 1
 """Plans that are computed at a time."""
@@ -38,17 +38,19 @@ Percent = Annotated[float, Query(ge=0, le=97)]
 class PlanEndpoints:
     """Endpoints of the plan; without a watch (a finished run) there is none."""
 
-    def __init__(self, context: Context, folder: Path, watch: MissionWatch | None) -> None:
+    def __init__(self, context: Context, folder: Path, watch: "MissionWatch | None") -> None:
         self.context, self.folder, self.watch = context, folder, watch
         self._running: subprocess.Popen[str] | None = None
 
-    def _watching(self) -> MissionWatch:
+    def _watching(self) -> "MissionWatch":
         if self.watch is None:
             raise HTTPException(404, "this survey is finished; only a live one knows a plan")
         return self.watch
 
     def plan(self) -> dict[str, Any]:
         """The plan and the state of its points."""
+        from skyquilt.planning.plan_file import as_record  # `view` has no plan
+
         watch = self._watching()
         if watch.plan is None:
             return {"plan": None, "drones": [], "states": {}, "plans": self._names()}
@@ -80,6 +82,8 @@ class PlanEndpoints:
         """The number of views as a picture in Web Mercator: red none, orange too few, green
         enough.
         """
+        from skyquilt.planning.ground_cover import picture_of  # `view` has no plan
+
         state = self._watching().state
         if state is None or state.cover is None or state.counts is None:
             raise HTTPException(404, "there is no coverage yet")
