@@ -66,7 +66,10 @@ def test_an_area_and_a_keep_out_are_drawn_and_planned(page, tmp_path):  # noqa: 
         holds(page, "document.querySelectorAll('#plans a.file').length >= 8", 180)
         page.wait_for_timeout(1000)
         shot(page, "drawn")
-        page.reload()
-        page.wait_for_selector("#link.live")
-        assert page.evaluate("skyquilt.plan.shapes().length") == 2
+        another = page.context.browser.new_page()  # another person's browser
+        another.goto(url)
+        holds(another, "skyquilt.plan && skyquilt.plan.shapes().length == 2")
+        another.click("#draw-clear")
+        holds(page, "skyquilt.plan.shapes().length == 0")
+        another.close()
         assert not page.errors

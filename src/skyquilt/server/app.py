@@ -113,6 +113,8 @@ def make_app(
         ("/plan", plans.plan, get),
         ("/plan", plans.new, post),
         ("/plan/missing", plans.missing, post),
+        ("/areas", plans.areas, get),
+        ("/areas", plans.areas_put, {"methods": ["PUT"]}),
         ("/plans/{name}/{file}", plans.plan_file, {**get, "response_class": FileResponse}),
         ("/coverage", plans.coverage, get),
         ("/coverage.png", plans.coverage_picture, {**get, "response_class": Response}),

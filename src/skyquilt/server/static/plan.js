@@ -85,11 +85,22 @@
   showPoints.onclick = () => { const on = showPoints.getAttribute("aria-pressed") !== "true"; showPoints.setAttribute("aria-pressed", String(on)); for (const l of [points, ways]) on ? l.addTo(map) : l.remove(); };
   showCover.onclick = () => { showCover.setAttribute("aria-pressed", String(showCover.getAttribute("aria-pressed") !== "true")); coverSoon(); };
 
-  // -- areas drawn here; they stay in this browser
-  const KEY = "skyquilt-areas";
+  // -- areas drawn here; they are kept in the survey's folder
   let shapes = [], open = null;
-  const kept = () => { try { shapes = JSON.parse(localStorage.getItem(KEY)) || []; } catch { shapes = []; } };
-  const keep = () => { try { localStorage.setItem(KEY, JSON.stringify(shapes)); } catch { /* private window */ } };
+  const collection = () => ({ type: "FeatureCollection", features: shapes.map((s) => ({ type: "Feature", properties: s.closed ? { keep_out: true } : {}, geometry: { type: "Polygon", coordinates: [[...s.ring, s.ring[0]].map(([y, x]) => [x, y])] } })) });
+  const readAreas = async () => {
+    const answer = await fetch("/areas");
+    if (!answer.ok || open) return;
+    const polygons = (await answer.json()).features.filter((f) => f.geometry.type === "Polygon");
+    shapes = polygons.map((f) => ({ closed: Boolean(f.properties.keep_out), ring: f.geometry.coordinates[0].slice(0, -1).map(([x, y]) => [y, x]) }));
+    show();
+  };
+  const keep = async () => {
+    const answer = await fetch("/areas", { method: "PUT", body: JSON.stringify(collection()), headers: headers({ "Content-Type": "application/json" }) }).catch(() => null);
+    if (answer && answer.ok) return;
+    const told = answer ? await answer.json().catch(() => ({})) : {};
+    said.textContent = `The areas are not kept: ${typeof told.detail === "string" ? told.detail : "the server does not answer"}`;
+  };
   const show = () => {
     sketch.clearLayers();
     for (const s of [...shapes, ...(open ? [open] : [])]) L.polygon(s.ring, { color: s.closed ? "#dc2626" : "#2563eb", weight: 3, dashArray: s === open ? "6 4" : null, interactive: false }).addTo(sketch);
@@ -129,9 +140,8 @@
   };
   go.onclick = () => {
     done();
-    const features = shapes.map((s) => ({ type: "Feature", properties: s.closed ? { keep_out: true } : {}, geometry: { type: "Polygon", coordinates: [[...s.ring, s.ring[0]].map(([y, x]) => [x, y])] } }));
     const value = (id) => encodeURIComponent(document.getElementById(id).value);
-    sent(`/plan?camera=${value("plan-camera")}&height=${value("plan-height")}&drones=${value("plan-drones")}`, JSON.stringify({ type: "FeatureCollection", features }));
+    sent(`/plan?camera=${value("plan-camera")}&height=${value("plan-height")}&drones=${value("plan-drones")}`, JSON.stringify(collection()));
   };
   fill.onclick = () => sent("/plan/missing", "");
   const ready = async (name) => {
@@ -163,9 +173,10 @@
       readSoon();
     });
     news.addEventListener("coverage", coverSoon);
+    news.addEventListener("areas", () => readAreas().catch(() => {}));
     news.addEventListener("photo", unsureSoon);
   };
-  kept(); show();
-  read().then(readCover).catch(() => {}).then(() => { if (!section.hidden) listen(); });
+  show();
+  read().then(readCover).catch(() => {}).then(() => { if (!section.hidden) { readAreas().catch(() => {}); listen(); } });
   window.skyquilt.plan = { shapes: () => shapes, marks, cover: () => sharing, provisional };
 })();
