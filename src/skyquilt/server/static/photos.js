@@ -46,6 +46,7 @@ const listPhotos = () => {
   $("photos").replaceChildren(...rows);
   const again = held && $("photos").querySelector(`li[data-id="${held}"] button`);
   if (again) again.focus({ preventScroll: true });  // the list is made anew while the map grows
+  document.dispatchEvent(new Event("photoslisted"));
 };
 let listing = null;
 const listSoon = () => { if (!listing) listing = setTimeout(() => { listing = null; listPhotos(); }, 250); };

@@ -154,12 +154,18 @@
   };
 
   // -- photos placed by their metadata alone: pale, with a dashed outline, until they are refined
-  const provisional = L.layerGroup().addTo(map);
+  const provisional = L.layerGroup().addTo(map), pale = L.layerGroup().addTo(map);
+  const turning = (ring) => ring.reduce((sum, [x, y], k) => { const [u, v] = ring[(k + 1) % ring.length]; return sum + x * v - u * y; }, 0);
   const unsure = () => {
-    provisional.clearLayers();
-    for (const p of state.photos.values()) if (p.state === "placed" && p.ring && p.ring.length > 2) L.polygon(p.ring.map(([x, y]) => [y, x]), { color: "#fff", weight: 2, dashArray: "4 5", fillColor: "#fff", fillOpacity: 0.22, interactive: false }).addTo(provisional);
+    provisional.clearLayers(); pale.clearLayers();
+    const rings = [...state.photos.values()].filter((p) => p.state === "placed" && p.ring && p.ring.length > 2).map((p) => { const ring = p.ring.map(([x, y]) => [y, x]); return turning(ring) < 0 ? ring.reverse() : ring; });
+    if (!rings.length) return;
+    // one shape, so that places that many photos show are no paler than others
+    L.polygon(rings.map((ring) => [ring]), { stroke: false, fillColor: "#fff", fillOpacity: 0.22, fillRule: "nonzero", interactive: false }).addTo(pale);
+    for (const ring of rings) L.polygon(ring, { color: "#fff", weight: 2, dashArray: "4 5", fill: false, interactive: false }).addTo(provisional);
   };
-  const unsureSoon = soon(async () => unsure(), 350);
+  document.addEventListener("photoslisted", unsure);
+  unsure();
 
   // -- news
   const listen = () => {
@@ -174,7 +180,6 @@
     });
     news.addEventListener("coverage", coverSoon);
     news.addEventListener("areas", () => readAreas().catch(() => {}));
-    news.addEventListener("photo", unsureSoon);
   };
   show();
   read().then(readCover).catch(() => {}).then(() => { if (!section.hidden) { readAreas().catch(() => {}); listen(); } });
