@@ -5,22 +5,36 @@ python benchmarks/large_flight.py FOLDER [--photos 2000]
 Terrain, camera, noise and metadata are those of the simulator. Only the ray casting is simplified:
 rays meet a smoothed ground (hills; houses and trees are painted on it flat), so nothing is hidden
 by anything else. The photos are suitable for measuring time and memory per photo, but not for
-measuring accuracy.
+measuring accuracy; the poses in truth/truth.json are true, and no true rasters are written.
+
+The same command goes on where an earlier one stopped. The terrain lies in files, of which only
+what is being drawn is in memory.
 """
 
 import argparse
+import json
+import mmap
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
-from skyquilt.simulate import FlightSettings, expose, simulate
+from skyquilt.simulate import FlightSettings, Progress, expose, prepare
 from skyquilt.simulate.raycast import Rays, sample
+from skyquilt.simulate.run import World, photograph
+from skyquilt.simulate.scene import Scene
 from skyquilt.simulate.settings import Control, Route
+from skyquilt.simulate.truth import write_truth
 
 GSD = 0.1
 """Cell of the country's raster in m; the photos' own is 0.045 m."""
+LAYERS = {"height": ((), np.float32), "rgb": ((3,), np.uint8), "look": ((4,), np.float16)}
+"""Rasters of the terrain."""
+OFTEN = 8
+"""Steps after which what was drawn is put away."""
 
 
 def smooth_hits(surface: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
@@ -32,6 +46,60 @@ def smooth_hits(surface: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.ndarray
     return rays.at(height), height
 
 
+def open_terrain(world: World, folder: Path) -> Scene:
+    """The terrain's files, made where they are not there."""
+    grid = world.country.grid(world.settings.resolution)
+    folder.mkdir(parents=True, exist_ok=True)
+    rasters: dict[str, Any] = {}
+    for name, (tail, kind) in LAYERS.items():
+        path, shape = folder / f"{name}.npy", (grid.height, grid.width, *tail)
+        known = path.exists() and np.load(path, mmap_mode="r").shape == shape
+        mode = "r+" if known else "w+"
+        rasters[name] = np.lib.format.open_memmap(path, mode=mode, dtype=kind, shape=shape)
+        if not known:
+            (folder / "done.json").unlink(missing_ok=True)
+    return Scene(grid=grid, thermal=None, **rasters)
+
+
+def put_away(scene: Scene) -> None:
+    """Gives back the memory of a terrain that lies in files."""
+    for raster in (scene.height, scene.rgb, scene.look):
+        raster._mmap.madvise(mmap.MADV_DONTNEED)
+
+
+def draw(world: World, scene: Scene, folder: Path) -> Iterator[Progress]:
+    """Draws what is not drawn yet."""
+    note = folder / "done.json"
+    done = json.loads(note.read_text()) if note.exists() else 0
+    steps = world.country.draw(scene, world.settings.weather, scratch=folder, done=done)
+    for done, total in steps:
+        if done % OFTEN == 0 or done == total:
+            for raster in (scene.height, scene.rgb, scene.look):
+                raster.flush()
+            note.write_text(json.dumps(done))
+            put_away(scene)
+        yield Progress(stage="terrain", done=done, total=total)
+
+
+def run(world: World, folder: Path) -> Iterator[Progress]:
+    """The whole flight."""
+    scene = open_terrain(world, folder / ".terrain")
+    yield from draw(world, scene, folder / ".terrain")
+    photos = photograph(world, scene, folder, resume=True)
+    while True:
+        try:
+            step = next(photos)
+        except StopIteration as end:
+            taken = end.value
+            break
+        if step.done % OFTEN == 0:
+            put_away(scene)
+        yield step
+    (folder / "truth").mkdir(exist_ok=True)
+    truth = folder / "truth" / "truth.json"
+    write_truth(truth, world.settings, world.place, world.start, taken, [], [], [])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -41,15 +109,13 @@ def main() -> None:
     asked = parser.parse_args()
     expose.first_hits = smooth_hits
     route, control = Route(photos=asked.photos, drones=3), Control(points=0, checks=0)
-    settings = FlightSettings(seed=2, route=route, control=control, gsd=GSD)
-    began, last = time.process_time(), -1
-    for step in simulate(settings, asked.folder, overwrite=True):
-        if step.done * 10 // step.total != last:
-            last = step.done * 10 // step.total
-            print(
-                f"{step.stage} {step.done} of {step.total}, {time.process_time() - began:.0f} s",
-                flush=True,
-            )
+    world = prepare(FlightSettings(seed=2, route=route, control=control, gsd=GSD))
+    began, last = time.process_time(), ("", -1)
+    for step in run(world, asked.folder):
+        if last != (step.stage, step.done * 10 // step.total):
+            last = step.stage, step.done * 10 // step.total
+            spent = time.process_time() - began
+            print(f"{step.stage} {step.done} of {step.total}, {spent:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

@@ -89,7 +89,10 @@ def open_regular(path: Path) -> BinaryIO:
     """Opens a file for reading; raises `OSError` where it is missing, or is a pipe, a socket, a
     device or a folder. It never waits for another program.
     """
-    file = open(path, "rb", opener=_at_once)  # noqa: SIM115 - Path.open has no opener
+    try:
+        file = open(path, "rb", opener=_at_once)  # noqa: SIM115 - Path.open has no opener
+    except ValueError as error:  # a zero character
+        raise OSError(errno.EINVAL, "it is not the name of a file", str(path)) from error
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
         raise OSError(errno.EINVAL, "it is not a regular file", str(path))
@@ -99,6 +102,24 @@ def open_regular(path: Path) -> BinaryIO:
 def _at_once(path: str, flags: int) -> int:
     """Opens without waiting for a writer at the other end of a pipe."""
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def is_file(path: Path) -> bool:
+    """Whether a regular file has this name; False also for a name that the system refuses, such as
+    one that is too long.
+    """
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """The same for a folder."""
+    try:
+        return path.is_dir()
+    except OSError:
+        return False
 
 
 def read_bounded(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:

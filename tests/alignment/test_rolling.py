@@ -12,7 +12,8 @@ from skyquilt.alignment.adjust import adjust, covariance
 from skyquilt.alignment.motion import velocities
 from skyquilt.alignment.problem import READOUT, Problem, State, residuals_px
 from skyquilt.alignment.triangulate import polish, triangulated
-from skyquilt.imaging.views import View, on_ground, project_all, project_nodes
+from skyquilt.imaging.nodes import View, project_all, project_nodes
+from skyquilt.imaging.views import on_ground
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Motion, Pose
 from skyquilt.model.surface import Surface

@@ -215,3 +215,34 @@ def test_shells_can_complete_commands():
         env=os.environ | env,
     )  # fmt: skip
     assert said.stdout.split() == ["export"]
+
+
+LONG = "a" * 5000
+"""A name that no system takes."""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("mosaic", LONG, "-o", "OUT"),
+        ("mosaic", "IN", "-o", LONG),
+        ("mosaic", "IN", "-o", "OUT", "--gcp", LONG),
+        ("mosaic", "IN", "-o", "OUT", "--thermal", LONG),
+        ("inspect", LONG),
+        ("plan", LONG, "-o", "OUT", "--camera", "FC6310", "--gsd", "2"),
+        ("view", LONG),
+        ("live", LONG, "-o", "OUT"),
+        ("live", "IN", "-o", LONG),
+        ("export", LONG, "--what", "png"),
+        ("compare", LONG, "-o", "OUT"),
+        ("depth", LONG, "-o", "OUT"),
+    ],
+    ids=lambda words: " ".join(w[:8] for w in words),
+)
+def test_a_name_that_the_system_refuses_gets_a_sentence(monkeypatch, capsys, tmp_path, words):
+    (tmp_path / "IN").mkdir()
+    monkeypatch.chdir(tmp_path)
+    code = run(monkeypatch, *words)
+    said = capsys.readouterr().err
+    assert code in (2, 3, 5), said
+    assert "skyquilt: " in said and "Traceback" not in said

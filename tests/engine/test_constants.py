@@ -121,7 +121,6 @@ KEYS = {
         ("surface", "_SINGLE_TREE"),
         ("swept", "BORDER_PX"),
         ("swept", "TILE"),
-        ("map", "DENSE"),
         ("map", "MOST_PADDED"),
         ("map", "STILL"),
         ("map", "PROVENANCE"),

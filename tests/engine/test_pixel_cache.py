@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from skyquilt.engine import pixel_cache
 from skyquilt.engine.pixel_cache import PixelCache
 
 
@@ -95,3 +96,33 @@ def test_cleared():
     kept.clear()
     kept(1)
     assert kept.decoded == 2
+
+
+def test_fewer_are_kept_while_other_things_fill_the_memory(monkeypatch):
+    monkeypatch.setattr(pixel_cache, "LEAST_BYTES", 200)
+    shared = PixelCache(read=lambda i: np.full(100, i, np.uint8), budget_bytes=600)
+    shared.resident_bytes, other = 1000, 0
+    monkeypatch.setattr(
+        pixel_cache, "resident_bytes", lambda: other + sum(p.nbytes for p in shared._kept.values())
+    )
+    for i in range(8):
+        shared(i)
+    assert len(shared._kept) == 6  # the budget
+    other = 700
+    shared(8)
+    assert len(shared._kept) == 3  # what is left
+    other = 5000
+    shared(9)
+    assert list(shared._kept) == [8, 9]  # the least
+
+
+def test_a_survey_that_does_not_fit_is_dropped_as_a_whole():
+    kept = cache(300)
+    for i in range(3):
+        kept(i)
+    kept.make_room()
+    assert kept.peek(0) is not None
+    kept(3)
+    kept.make_room()
+    assert all(kept.peek(i) is None for i in range(4))
+    assert kept(3)[0] == 3

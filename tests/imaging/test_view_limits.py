@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from skyquilt.imaging.nodes import STEP, densify, inside_everywhere, node_places, project_nodes
 from skyquilt.imaging.view_limits import (
     COARSEST,
     ViewLimits,
@@ -13,14 +14,7 @@ from skyquilt.imaging.view_limits import (
     limits_for,
     support_of,
 )
-from skyquilt.imaging.views import (
-    STEP,
-    densify,
-    footprint,
-    inside_everywhere,
-    node_places,
-    project_nodes,
-)
+from skyquilt.imaging.views import footprint
 from skyquilt.model.raster import Grid, Window
 from skyquilt.ortho.blend import Average, Feather
 from skyquilt.ortho.plan import planned

@@ -8,18 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyquilt.geometry.camera import project
-from skyquilt.imaging.views import (
+from skyquilt.imaging.nodes import (
     STEP,
     cut,
     densify,
-    footprint,
-    grid_of,
     least_scores,
-    native_gsd,
     node_places,
     project_all,
     project_nodes,
 )
+from skyquilt.imaging.views import footprint, grid_of, native_gsd
 from skyquilt.model.camera import Camera
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface

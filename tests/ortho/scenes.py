@@ -9,7 +9,8 @@ import numpy as np
 
 from skyquilt.geometry.camera import undistort
 from skyquilt.geometry.frames import cam_R_map_from_angles
-from skyquilt.imaging.views import View, footprint
+from skyquilt.imaging.nodes import View
+from skyquilt.imaging.views import footprint
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Pose
 from skyquilt.model.raster import Grid

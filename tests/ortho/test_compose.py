@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from skyquilt.geometry.camera import project
+from skyquilt.imaging.nodes import STEP, inside
 from skyquilt.imaging.registration import shifts_between
-from skyquilt.imaging.views import STEP, inside
 from skyquilt.live.tile_drawing import Newest
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface

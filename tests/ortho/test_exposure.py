@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skyquilt.geometry import block_cholesky
 from skyquilt.model.raster import Window
-from skyquilt.ortho import exposure
+from skyquilt.ortho import differences
 from skyquilt.ortho.exposure import NEUTRAL, Balance, Exposure, image_place, odds_table, with_odds
 from tests.ortho.scenes import FLAT, GRID, block, composer, photograph
 
@@ -170,19 +171,19 @@ def stated_plainly(terms, row, point, y, ridge, count):
         mean = same * w / (same @ w)[:, None]
         root = np.sqrt(w)[:, None]
         B, z = root * (A - mean @ A), root * (y - mean @ y)
-        pull = np.diag(np.tile(ridge, count) * exposure.SIGMA_LEVEL**2 * exposure.CORRELATED)
+        pull = np.diag(np.tile(ridge, count) * differences.SIGMA_LEVEL**2 * differences.CORRELATED)
         before, x = x, np.linalg.solve(B.T @ B + pull, -B.T @ z)
-        if np.abs(x - before).max() < exposure.SETTLED:
+        if np.abs(x - before).max() < differences.SETTLED:
             break
         level = y + A @ x
         w = 1 / (1 + ((level - mean @ level) ** 2).mean(1) / 0.25**2)
     return x.reshape(count, k, -1)
 
 
-@pytest.mark.parametrize("dense", [1, 1000])
+@pytest.mark.parametrize("leaf", [2, 1000])
 @pytest.mark.parametrize(("k", "bands"), [(6, 1), (1, 3)])
-def test_blocks_give_what_full_matrices_give(k, bands, dense, monkeypatch):
-    monkeypatch.setattr(exposure, "DENSE", dense)
+def test_blocks_give_what_full_matrices_give(k, bands, leaf, monkeypatch):
+    monkeypatch.setattr(block_cholesky, "LEAF", leaf)
     rng = np.random.default_rng(k)
     seen = rng.random((60, 7)) < 0.5
     seen[0] = False
@@ -193,5 +194,6 @@ def test_blocks_give_what_full_matrices_give(k, bands, dense, monkeypatch):
     row = row[shuffled]
     terms = np.concatenate([np.ones((len(row), 1)), rng.uniform(-1, 1, (len(row), k - 1))], 1)
     y, ridge = rng.normal(0, 0.4, (len(row), bands)), rng.uniform(1, 50, k)
-    found = exposure._robust_differences(terms, row, point, y, ridge, 7)
+    pairs = differences.Pairs.of(row, point, rng.uniform(0, 9, (7, 2)))
+    found = differences.robust_differences(terms, pairs, y, ridge)
     assert np.abs(found - stated_plainly(terms, row, point, y, ridge, 7)).max() < 1e-9

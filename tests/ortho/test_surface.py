@@ -8,11 +8,12 @@ from hypothesis import strategies as st
 
 from skyquilt.geometry.camera import undistort
 from skyquilt.geometry.frames import cam_R_map_from_angles
-from skyquilt.imaging.views import View, footprint
+from skyquilt.imaging.nodes import View
+from skyquilt.imaging.views import footprint
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Pose
 from skyquilt.model.raster import Grid
-from skyquilt.model.surface import Surface
+from skyquilt.model.surface import STRIP, WIDEST, Surface
 from skyquilt.ortho.sweep import Sweep
 from skyquilt.ortho.tie_surface import FromTiePoints, grid_spacing, level, without_outliers
 from tests.texture import texture
@@ -229,3 +230,30 @@ def test_one_photo_sweeps_nothing(scene):
     views, pictures = scene
     known = level(0.0)
     assert Sweep()(known, views[:1], GRID, shrunk(pictures)) is known
+
+
+def test_heights_on_a_raster_are_those_at_its_places():
+    rng = np.random.default_rng(3)
+    surface = Surface(
+        z=rng.normal(0, 3, (40, 50)).astype(np.float32), x0=3.0, y0=-7.0, cell=0.7, source="plane"
+    )
+    x, y = np.arange(0, 45, 0.31), np.arange(-12, 30, 0.05)[::-1]
+    assert len(y) > 3 * STRIP
+    assert (surface.on(x, y) == surface.at(*np.meshgrid(x, y))).all()
+    assert surface.on(x, y[:0]).shape == (0, len(x))
+
+
+@pytest.mark.parametrize("along", [0, 1])
+def test_the_heights_of_a_long_corridor_stay_within_what_opencv_takes(along):
+    """30 km of railway, points every half metre."""
+    rng = np.random.default_rng(4)
+    xyz = rng.uniform(0, 1, (60_000, 3)) * (30_000, 4, 0)
+    xyz[:, 2] = xyz[:, 0] / 1000
+    box = (0.0, 0.0, 30_000.0, 4.0)
+    if along:
+        xyz[:, :2], box = xyz[:, 1::-1], (0.0, 0.0, 4.0, 30_000.0)
+    found = FromTiePoints()(xyz, box)
+    assert max(found.z.shape) <= WIDEST + 1
+    at = np.linspace(100, 29_900, 50)
+    places = (at, np.full(50, 2.0))[:: 1 - 2 * along]
+    assert found.at(*places) == pytest.approx(at / 1000, abs=0.05)

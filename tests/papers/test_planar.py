@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
-from skyquilt.imaging.views import make_views, on_ground, project_nodes
+from skyquilt.imaging.nodes import project_nodes
+from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.model.poses import Pose
 from skyquilt.ortho.tie_surface import level
 from skyquilt.papers.pieces import map_H_cam_of, planar_pose

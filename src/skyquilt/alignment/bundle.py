@@ -23,6 +23,9 @@ from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, MapFrame, Prior
 
+ROUGHLY = 64
+"""Observations per photo of the first stage, which only removes outliers and sets out."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Bundle:
@@ -33,11 +36,13 @@ class Bundle:
     order), `6t` (and tangential) or `full` (and the aspect ratio).
     """
     per_photo: int = 400
-    """Observations per photo in the adjustment of up to `many` photos, and half as many beyond; all
-    other tie points are triangulated afterwards.
+    """Observations per photo in the adjustment of up to `many` photos, and a third as many beyond;
+    all other tie points are triangulated afterwards.
     """
     many: int = 120
     """Photos that support one another well enough for fewer observations each."""
+    ties: int = 640
+    """Tie points per photo, about, that are kept of more than `many` photos."""
     repair: bool = True
     """Whether metadata may contain gross errors. False = they are weighted by their stated
     deviations.
@@ -48,7 +53,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 19
+    version: ClassVar[int] = 20
 
     def __call__(
         self,
@@ -98,14 +103,19 @@ class Bundle:
         tracks = build_tracks(features, start.links)
         setup = set_up(photos, priors, start, distortion=self.distortion, repair=self.repair)
         sizes = [(p.width, p.height) for p in photos]
-        each = self.per_photo if len(start.placed) <= self.many else self.per_photo // 2
+        begin = each = self.per_photo
+        if len(start.placed) > self.many:
+            begin, each = ROUGHLY, self.per_photo // 3
+            tracks = thin(tracks, sizes, per_photo=self.ties)
         used = setup.sensor_tracks(tracks)
-        problem, state = setup.problem(thin(used, sizes, per_photo=each))
+        problem, state = setup.problem(thin(used, sizes, per_photo=begin))
         problem, state = rough(problem, state)
         setup = setup.moving_as(photos, state.C)
         problem = replace(problem, velocity=setup.base.velocity)
         if grey is not None and self.match_observations is not None:
             used = _sharpened(used, photos, setup, problem, state, self.match_observations, grey)
+            begin = 0
+        if begin != each:
             problem, _ = setup.problem(thin(used, sizes, per_photo=each))
             state = triangulated(problem, state)
         problem, state = fine(problem, state)

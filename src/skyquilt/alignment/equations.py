@@ -17,8 +17,10 @@ from skyquilt.alignment.robust import observation_weights, point_terms, position
 from skyquilt.geometry.block_cholesky import LEAF, Factor, Index, Matrix, pattern
 
 Array = NDArray[np.float64]
-KEPT = 100_000
-"""Observations of which the equations of a state are kept (1 kB each) until they are used again."""
+KEPT = 600_000
+"""Observations whose points are kept tied to photos and cameras (0.25 kB each) between the step of
+these and that of the points; those of larger problems are computed again.
+"""
 ELIMINATED = 160
 """Observations whose points are eliminated at once, about: few enough to be of few photos."""
 
@@ -53,6 +55,29 @@ class Normal:
     """(m, q) gradient."""
     gv: Array
     """(P, 3) gradient, with the points' priors."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PointTies:
+    """What the step of a part's points needs of its equations, given that of photos and cameras.
+
+    In single precision: the points are polished after the step.
+    """
+
+    V: Array
+    """(P, 3, 3) point blocks."""
+    gv: Array
+    """(P, 3) gradient."""
+    Wp: NDArray[np.float32]
+    """(N, p, 3) photo-point blocks."""
+    Wc: NDArray[np.float32]
+    """(N, q, 3) camera-point blocks."""
+
+
+def _ties_of(normal: Normal) -> PointTies:
+    return PointTies(
+        V=normal.V, gv=normal.gv, Wp=normal.Wp.astype(np.float32), Wc=normal.Wc.astype(np.float32)
+    )
 
 
 def sums_by_point(problem: Problem, values: Array, count: int) -> Array:
@@ -145,22 +170,19 @@ class Equations:
         self.q = CAMERA if problem.free.any() else 0
         border = self.q * self.m + (3 if problem.offset else 0)
         self.pattern = pattern(state.C[:, :2], self.p, border, *_together(problem))
-        self._kept: tuple[State | None, list[tuple[Problem, Normal]]] = None, []
+        self._ties: list[tuple[Problem, PointTies]] = []
 
     def normals(self, state: State) -> Iterator[tuple[Problem, Normal]]:
-        """The equations of each part of the observations; those of small problems are kept until
-        another state is asked for.
-        """
-        if len(self.problem.px) > KEPT:
-            yield from self._parts(state)
-            return
-        if self._kept[0] is not state:
-            self._kept = state, list(self._parts(state))
-        yield from self._kept[1]
-
-    def _parts(self, state: State) -> Iterator[tuple[Problem, Normal]]:
+        """The equations of each part of the observations."""
         for part, own, _ in self.problem.parts(state):
             yield part, observation_equations(part, own)
+
+    def _point_ties(self, state: State) -> Iterator[tuple[Problem, PointTies]]:
+        """Those of the points of each part, kept since `reduced` unless the problem is large."""
+        if len(self.problem.px) <= KEPT:
+            yield from self._ties
+        else:
+            yield from ((part, _ties_of(normal)) for part, normal in self.normals(state))
 
     def step(self, state: State, damping: float) -> tuple[Array, Array, Array]:
         """The Gauss-Newton step of photos (n, p), cameras (m, 10) and points (P, 3).
@@ -177,8 +199,8 @@ class Equations:
         placed = du[:photos].reshape(-1, self.p)
         points = np.concatenate(
             [
-                _points_step(part, normal, damping, placed, cameras)
-                for part, normal in self.normals(state)
+                _points_step(part, ties, damping, placed, cameras)
+                for part, ties in self._point_ties(state)
             ]
         )
         return placed, cameras, points
@@ -198,7 +220,10 @@ class Equations:
         )
         g, gc = priors.photo_gradient[:, :p].copy(), np.zeros(pat.border)
         gc[: q * m] = priors.camera_gradient[:, :q].ravel()
+        self._ties.clear()
         for part, normal in self.normals(state):
+            if len(self.problem.px) <= KEPT:
+                self._ties.append((part, _ties_of(normal)))
             U[normal.seen] += normal.U
             Uc += normal.Uc
             cameras = part.camera[normal.seen]
@@ -231,23 +256,23 @@ class Equations:
             out.corner[at, at] = total if total > 0 else 1.0
 
 
-def _points_inverse(normal: Normal, damping: float) -> Array:
+def _points_inverse(blocks: Array, damping: float) -> Array:
     """L^-1 (P, 3, 3) of the damped point blocks L L^T."""
-    V = normal.V.copy()
+    V = blocks.copy()
     k = np.arange(3)
     V[:, k, k] = V[:, k, k] * (1 + damping) + 1e-12
     return np.asarray(np.linalg.inv(np.linalg.cholesky(V)))
 
 
 def _points_step(
-    part: Problem, normal: Normal, damping: float, photos: Array, cameras: Array
+    part: Problem, ties: PointTies, damping: float, photos: Array, cameras: Array
 ) -> Array:
     """The step (P, 3) of a part's points with that of photos (n, p) and cameras (m, 10)."""
-    coupled = np.einsum("nij,ni->nj", normal.Wp, photos[part.photo])
-    if normal.Wc.shape[1]:
-        coupled += np.einsum("nij,ni->nj", normal.Wc, cameras[part.camera[part.photo]])
-    L_inv = _points_inverse(normal, damping)
-    rhs = normal.gv + sums_by_point(part, coupled, len(normal.V))
+    coupled = np.einsum("nij,ni->nj", ties.Wp, photos[part.photo])
+    if ties.Wc.shape[1]:
+        coupled += np.einsum("nij,ni->nj", ties.Wc, cameras[part.camera[part.photo]])
+    L_inv = _points_inverse(ties.V, damping)
+    rhs = ties.gv + sums_by_point(part, coupled, len(ties.V))
     half = np.einsum("pij,pj->pi", L_inv, rhs)
     return np.asarray(-np.einsum("pji,pj->pi", L_inv, half))
 
@@ -256,7 +281,7 @@ def _eliminate_points(
     part: Problem, normal: Normal, damping: float, out: Matrix, g: Array, gc: Array
 ) -> None:
     """Takes what the points of a part tie together from matrix and gradients, in place."""
-    L_inv = _points_inverse(normal, damping)
+    L_inv = _points_inverse(normal.V, damping)
     z = np.einsum("pij,pj->pi", L_inv, normal.gv)
     p, q = normal.Wp.shape[1], normal.Wc.shape[1]
     for lo, hi in pairwise(part.cuts(ELIMINATED)):

@@ -1,19 +1,26 @@
 """Entry point of the command line: errors as sentences, exit codes as documented."""
 
+import errno
 import os
 import sys
 from io import TextIOWrapper
 from typing import Any
 
 from skyquilt.cli import interrupt
-from skyquilt.errors import SkyquiltError
+from skyquilt.errors import SkyquiltError, UsageError
+
+REFUSED = {
+    errno.ENAMETOOLONG, errno.EINVAL, errno.ELOOP, errno.ENOTDIR, errno.EACCES, errno.EPERM
+}  # fmt: skip
+"""What a system answers to a name, or to a person, that it does not let in."""
 
 
 def run() -> None:
     """Entry point; an error that the user can correct is one sentence on standard error and its own
     exit code.
 
-    Wrong options end with 2 (as all usage errors), an interrupt with 130. Any other exception is a
+    Wrong options end with 2 (as all usage errors), and so do names that the system refuses; an
+    interrupt with 130. Any other exception is a
     bug in the program: its traceback is shown, and the exit code is 1.
     """
     # threads work on different photos; threads within one matrix product would only wait
@@ -31,6 +38,14 @@ def run() -> None:
 
         sys.stderr.write(f"skyquilt: {shown(error)}\n")
         sys.exit(error.exit_code)
+    except OSError as error:
+        if error.errno not in REFUSED or error.filename is None:
+            raise
+        from skyquilt.outside import plain
+
+        name = plain(os.fsdecode(error.filename), 200)
+        sys.stderr.write(f"skyquilt: {name} cannot be used: {error.strerror}\n")
+        sys.exit(UsageError.exit_code)
     except KeyboardInterrupt:
         interrupt.leave()
     except SystemExit as end:

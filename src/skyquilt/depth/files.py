@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.heights import VERTICAL_EPSG
 from skyquilt.depth.pairs import PairField
-from skyquilt.imaging.views import View
+from skyquilt.imaging.nodes import View
 from skyquilt.matching.levelled import depth_map
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment

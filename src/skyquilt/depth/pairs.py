@@ -13,7 +13,8 @@ from scipy.sparse.linalg import lsmr
 
 from skyquilt.geometry.camera import rays
 from skyquilt.geometry.transforms import transfer
-from skyquilt.imaging.views import View, on_ground
+from skyquilt.imaging.nodes import View
+from skyquilt.imaging.views import on_ground
 from skyquilt.matching.levelled import WORKING_WIDTH, Level, disparities, threshold_px
 from skyquilt.matching.ransac import Ransac
 from skyquilt.model.estimate import NoEstimate

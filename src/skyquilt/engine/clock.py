@@ -6,6 +6,7 @@ from collections.abc import Generator
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
+from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.store import Store
 from skyquilt.model.event import Event, StageFinished, StageProgress, StageStarted
 
@@ -88,6 +89,8 @@ class Clock:
             result: T = stop.value
         finally:
             work.close()
+        del work
+        give_back()
         self.lap(name, begun)
         yield StageFinished(
             stage=name,

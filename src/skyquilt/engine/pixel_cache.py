@@ -8,6 +8,13 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
+from skyquilt.engine.memory_watch import resident_bytes
+
+USUAL_GB = 1.2
+"""Memory allowed by default."""
+LEAST_BYTES = 150_000_000
+"""Bytes of decoded photos that are kept whatever else is in memory."""
+
 
 class HasBytes(Protocol):
     """An array, or a record that tells its size."""
@@ -30,8 +37,15 @@ class PixelCache(Generic[Kept]):
     """Decodes a photo by its index."""
     budget_bytes: int
     """Most bytes kept; a photo larger than that is returned but not kept."""
+    resident_bytes: int = 0
+    """Resident memory of the process above which fewer are kept, but at least `LEAST_BYTES`; 0 = as
+    many as the budget allows.
+    """
     decoded: int = 0
     """How many times a photo was decoded."""
+    dropped: int = 0
+    """How many were dropped for others."""
+    _bytes: int = 0
     _kept: OrderedDict[int, Kept] = field(default_factory=OrderedDict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _busy: dict[int, threading.Lock] = field(default_factory=dict)
@@ -57,24 +71,49 @@ class PixelCache(Generic[Kept]):
             self.decoded += 1
             if pixels.nbytes > self.budget_bytes:
                 return
+            self._bytes += pixels.nbytes - (self._kept[photo].nbytes if photo in self._kept else 0)
             self._kept[photo] = pixels
             self._kept.move_to_end(photo)
-            while sum(p.nbytes for p in self._kept.values()) > self.budget_bytes:
-                self._kept.popitem(last=False)
+            allowed = self._allowed()
+            while self._bytes > allowed and len(self._kept) > 1:
+                self._bytes -= self._kept.popitem(last=False)[1].nbytes
+                self.dropped += 1
+
+    def _allowed(self) -> int:
+        """Bytes that may be kept now."""
+        if not self.resident_bytes:
+            return self.budget_bytes
+        room = self._bytes + self.resident_bytes - resident_bytes()
+        return min(self.budget_bytes, max(room, LEAST_BYTES))
 
     def peek(self, photo: int) -> Kept | None:
         """Pixels of a photo if they are cached; nothing is decoded."""
         with self._lock:
             return self._kept.get(photo)
 
+    def make_room(self) -> None:
+        """Drops all photos unless every one fitted so far: of a survey that does not fit, few of
+        those that are kept are asked for again before they would be dropped.
+        """
+        if self.dropped:
+            self.clear()
+
     def clear(self) -> None:
         """Drops all photos."""
         with self._lock:
             self._kept.clear()
+            self._bytes = 0
 
 
 def pixel_budget(memory_gb: float | None) -> int:
-    """Bytes for decoded photos: the memory allowed (None = 1.2 GB) less that of code, features and
-    tiles.
+    """Bytes for decoded photos: the memory allowed (None = `USUAL_GB`) less that of code, features
+    and tiles.
     """
-    return int(max(0.15, (memory_gb or 1.2) - 0.6) * 1e9)
+    return int(max(LEAST_BYTES, ((memory_gb or USUAL_GB) - 0.6) * 1e9))
+
+
+def resident_budget(memory_gb: float | None) -> int:
+    """Resident memory in bytes above which decoded photos make room: what is allowed, less what a
+    step takes for a moment.
+    """
+    return int(((memory_gb or USUAL_GB) - 0.4) * 1e9)

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 _SINGLE_TREE = 4
 """FLANN_INDEX_KDTREE_SINGLE: a single tree with exact search, unlike FLANN's other indices."""
 _TO_THE_END = -1
+_AT_ONCE = 100_000
+"""Places that are looked up at once, to bound memory."""
 
 
 def nearest(
@@ -30,12 +32,15 @@ def nearest(
     tree = cv2.flann.Index(
         _single(points - middle), {"algorithm": _SINGLE_TREE, "leaf_max_size": 10}
     )
-    index, _ = tree.knnSearch(_single(at - middle), k, params={"checks": _TO_THE_END})
-    distance = np.linalg.norm(points[index] - at[:, None], axis=2)
-    order = np.argsort(distance, axis=1, kind="stable")
-    return np.take_along_axis(distance, order, 1), np.take_along_axis(index, order, 1).astype(
-        np.int64
-    )
+    distances, indices = np.empty((len(at), k)), np.empty((len(at), k), np.int64)
+    for low in range(0, len(at), _AT_ONCE):
+        some = slice(low, low + _AT_ONCE)
+        index, _ = tree.knnSearch(_single(at[some] - middle), k, params={"checks": _TO_THE_END})
+        distance = np.linalg.norm(points[index] - at[some, None], axis=2)
+        order = np.argsort(distance, axis=1, kind="stable")
+        distances[some] = np.take_along_axis(distance, order, 1)
+        indices[some] = np.take_along_axis(index, order, 1)
+    return distances, indices
 
 
 def _single(xy: NDArray[Any]) -> NDArray[np.float32]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.geometry.camera import monotone_radius, pixels, rays
-from skyquilt.imaging.views import View, project_nodes
+from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.model.camera import Camera
 from skyquilt.model.surface import Surface
 

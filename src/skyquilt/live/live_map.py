@@ -17,6 +17,7 @@ import numpy as np
 
 from skyquilt.engine.error_log import NAME as ERRORS
 from skyquilt.engine.error_log import log_error
+from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
 from skyquilt.errors import OutputError, UnreadablePhotoError, UsageError
@@ -26,7 +27,6 @@ from skyquilt.live.background_adjustment import BackgroundAdjustment, adjust_blo
 from skyquilt.live.drone_metadata import Metadata
 from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.failures import MemberFailedError, concerning, of_the_system
-from skyquilt.live.free_memory import give_back
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.initial_pose import InitialPose
 from skyquilt.live.ledger import Ledger

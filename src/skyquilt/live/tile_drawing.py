@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from skyquilt.engine.executor import in_order
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
+from skyquilt.imaging.nodes import View
 from skyquilt.imaging.view_limits import COARSEST, ViewLimits, limits_for
-from skyquilt.imaging.views import View, footprint
+from skyquilt.imaging.views import footprint
 from skyquilt.live.failures import concerning
 from skyquilt.live.ledger import hit
 from skyquilt.live.members import Member

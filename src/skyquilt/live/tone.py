@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.imaging.grey import shrink
-from skyquilt.imaging.views import View, project_nodes
+from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.exposure import Exposure
 

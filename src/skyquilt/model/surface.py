@@ -1,11 +1,17 @@
 """The height surface over which photos are orthorectified."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+WIDEST = 32_000
+"""Most cells of a raster of heights along a side: OpenCV's functions take at most 32,766."""
+STRIP = 256
+"""Rows of a raster that are computed at once."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,6 +50,15 @@ class Surface:
                 )
             )
         return np.concatenate(parts, 1, dtype=np.float32).reshape(shape)
+
+    def on(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float32]:
+        """Heights (rows, columns) in m on a raster whose columns lie at x (columns,) and whose rows
+        lie at y (rows,); memory holds little more than the result.
+        """
+        out = np.empty((len(y), len(x)), np.float32)
+        for low, high in pairwise([*range(0, len(y), STRIP), len(y)]):
+            out[low:high] = self.at(*np.meshgrid(x, y[low:high]))
+        return out
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -18,6 +18,8 @@ WIDEST_M = 40.0
 """Radius in m of the largest opening: half the width of the widest building or wood."""
 SLOPE = 0.15
 """Rise of the ground over the radius of an opening; what is removed and rises more is an object."""
+ENOUGH = 300_000
+"""Cells, about, from which the general slope is estimated."""
 OVER_M = 0.5
 """Height in m over the interpolated ground from which a cell is an object."""
 
@@ -58,6 +60,8 @@ def _lowest(z: Float, factor: int) -> Float:
 def _plane(z: Float, known: Mask) -> Float:
     """(h, w) the general slope of heights: a plane by robust least squares."""
     row, column = np.nonzero(known)
+    some = slice(None, None, max(1, len(row) // ENOUGH))
+    row, column = row[some], column[some]
     terms = np.column_stack([np.ones(len(row)), row, column])
     height, weight = z[row, column].astype(np.float64), np.ones(len(row))
     x: NDArray[Any] = np.zeros(3)

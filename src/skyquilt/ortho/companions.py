@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.imaging.grey import averaged
-from skyquilt.imaging.views import STEP
+from skyquilt.imaging.nodes import STEP
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid
 from skyquilt.ortho.compose import Composed, Composer

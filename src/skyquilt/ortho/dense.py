@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from skyquilt.imaging.views import View
+from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import HeightField, Surface
 from skyquilt.ortho.sweep import GreyPicture, Sweep

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import View, project_nodes
+from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.model.surface import Surface
 
 Doubles = NDArray[np.float64]

@@ -15,25 +15,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import View, project_nodes
+from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.model.surface import Surface
+from skyquilt.ortho.differences import (
+    CORRELATED,
+    SETTLED,
+    SIGMA_LEVEL,
+    Pairs,
+    robust_differences,
+    within_points,
+)
 
 Float = NDArray[np.float32]
 
-SETTLED = 1e-3
-"""A change of log odds that is not visible in 8-bit values; ends the iteration."""
-SIGMA_LEVEL = 0.15
-"""Standard deviation in log odds of the difference in brightness of one ground point between two
-photos with the same exposure.
-"""
-CORRELATED = 30.0
-"""Errors of neighbouring samples are correlated: this number of samples counts as one independent
-sample.
-"""
 ROUNDS = 8
 """Rounds in which photos' gains and cameras' radial terms are solved for in turn, at most."""
-DENSE = 1000
-"""Largest number of unknowns for which the normal equations are solved as a full matrix."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,14 +135,15 @@ class Balance:
         """Condition: log odds + gain + radial + field is the same in all photos of a ground point,
         so differences from the point's mean are zero.
         """
-        photos, n, N = [v.photo for v in views], len(views), len(s.point)
+        photos, N = [v.photo for v in views], len(s.point)
         _, point = np.unique(s.point, return_inverse=True)
+        pairs = Pairs.of(s.row, point, np.array([v.footprint.mean(0) for v in views]))
         basis = _basis(s.place[:, 0], s.place[:, 1])
-        radial = self._radial(s, views, point)
+        radial = self._radial(s, views, pairs)
         grey = s.log.mean(1, keepdims=True) + (basis * radial[s.row]).sum(1)[:, None]
         terms = np.concatenate([np.ones((N, 1)), basis[:, :5]], 1)
         ridge = 1 / np.array([self.sigma_gain] + 5 * [self.sigma_field]) ** 2
-        x = _robust_differences(terms, s.row, point, grey, ridge, n)[..., 0]
+        x = robust_differences(terms, pairs, grey, ridge)[..., 0]
         fields = radial.copy()
         fields[:, :5] += x[:, 1:]
         largest = [
@@ -155,19 +152,17 @@ class Balance:
         ]
         fields *= (np.array(largest) > self.even)[:, None]
         even = s.log + (basis * fields[s.row]).sum(1)[:, None]
-        bare = _apart(s.log.mean(1), s.row, point, self.sigma_gain, n)
-        if _apart(even.mean(1), s.row, point, self.sigma_gain, n) > (1 - self.gained) * bare:
+        bare = _apart(s.log.mean(1), pairs, self.sigma_gain)
+        if _apart(even.mean(1), pairs, self.sigma_gain) > (1 - self.gained) * bare:
             fields, even = np.zeros_like(fields), s.log
-        gains = _robust_differences(terms[:, :1], s.row, point, even, ridge[:1], n)[:, 0]
+        gains = robust_differences(terms[:, :1], pairs, even, ridge[:1])[:, 0]
         gains = (gains - np.median(gains, axis=0)).astype(np.float32)
         return Exposure(
             gains=dict(zip(photos, gains, strict=True)),
             fields=dict(zip(photos, fields.astype(np.float32), strict=True)),
         )
 
-    def _radial(
-        self, s: "Samples", views: Sequence[View], point: NDArray[Any]
-    ) -> NDArray[np.float64]:
+    def _radial(self, s: "Samples", views: Sequence[View], pairs: Pairs) -> NDArray[np.float64]:
         """(n, 6) the radial fall of light of each view's camera, as a field; photos' gains and
         cameras' terms are solved for in turn.
         """
@@ -183,8 +178,8 @@ class Balance:
         pull = np.eye(len(found)) * SIGMA_LEVEL**2 * CORRELATED / self.sigma_radial**2
         for _ in range(ROUNDS):
             level = (grey + columns @ found)[:, None]
-            gain = _robust_differences(ones, s.row, point, level, ridge, len(views))[:, 0, 0]
-            before, found = found, _within_points(columns, grey + gain[s.row], point, pull)
+            gain = robust_differences(ones, pairs, level, ridge)[:, 0, 0]
+            before, found = found, within_points(columns, grey + gain[s.row], pairs.point, pull)
             if np.abs(found - before).max() < SETTLED:
                 break
         fields = np.zeros((len(views), 6))
@@ -206,11 +201,13 @@ class Balance:
         z = surface.at(x, y)
         point, row, place, value = [], [], [], []
         for index, view in enumerate(views):
-            nodes = project_nodes(view, x, y, z)
-            seen = np.flatnonzero(nodes.seen.ravel())
-            if not len(seen):
+            part = _around(view, x[0], y[:, 0])
+            nodes = project_nodes(view, x[part], y[part], z[part])
+            r, c = np.nonzero(nodes.seen)
+            if not len(r):
                 continue
-            u, v = nodes.u.ravel()[seen], nodes.v.ravel()[seen]
+            u, v, seen = nodes.u[r, c], nodes.v[r, c], (r + part[0].start) * x.shape[1]
+            seen += c + part[1].start
             point.append(seen)
             row.append(np.full(len(seen), index))
             place.append(np.stack(image_place(view, u, v), -1))
@@ -248,6 +245,17 @@ class Samples:
     """(N, bands) log odds of the brightness."""
 
 
+def _around(view: View, x: NDArray[Any], y: NDArray[Any]) -> tuple[slice, slice]:
+    """Rows and columns of a grid, x and y ascending in m, that a view may see."""
+    low, high = view.footprint.min(0), view.footprint.max(0)
+    margin = 0.2 * float((high - low).max())
+    rows, columns = (
+        slice(*np.searchsorted(along, [low[k] - margin, high[k] + margin]).tolist())
+        for k, along in ((1, y), (0, x))
+    )
+    return rows, columns
+
+
 def image_place(view: View, u: NDArray[Any], v: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
     """x and y of photo pixels from the image's centre, in half diagonals of the image."""
     w, h = view.camera.width - 1.0, view.camera.height - 1.0
@@ -275,142 +283,12 @@ def _sampled(
     return np.asarray(smooth[row, column].astype(np.float64))
 
 
-def _robust_differences(
-    terms: NDArray[Any],
-    row: NDArray[Any],
-    point: NDArray[Any],
-    y: NDArray[Any],
-    ridge: NDArray[Any],
-    count: int,
-) -> NDArray[np.float64]:
-    """x (count, k, bands) that makes y + terms . x[row] equal within each point, y (N, bands) and
-    terms (N, k), with robust weights common to all bands, against moving objects and shadows.
-    `ridge` (k,): weight of the prior of zero for x.
-    """
-    pairs = _Pairs.of(row, point)
-    w = np.ones(len(y))
-    x: NDArray[np.float64] = np.zeros((count, terms.shape[1], y.shape[1]))
-    pull = np.tile(ridge * SIGMA_LEVEL**2 * CORRELATED, count)
-    for _ in range(6):
-        mass = np.maximum(np.bincount(point, w), 1e-9)
-        weighted = w[:, None] * terms
-        blocks = pairs.products(weighted / np.sqrt(mass[point])[:, None])
-        mean_y = _sums(point, w[:, None] * y, len(mass)) / mass[:, None]
-        rhs = -_sums(row, weighted[:, :, None] * (y - mean_y[point])[:, None], count)
-        own = _sums(row, weighted[:, :, None] * terms[:, None], count)
-        before, x = (
-            x,
-            _solved(own, pairs, blocks, pull, rhs.reshape(len(pull), -1)).reshape(x.shape),
-        )
-        if np.abs(x - before).max() < SETTLED:
-            break
-        level = y + np.einsum("nk,nkb->nb", terms, x[row])
-        residual = level - (_sums(point, w[:, None] * level, len(mass)) / mass[:, None])[point]
-        w = 1 / (1 + (residual**2).mean(1) / 0.25**2)
-    return x
-
-
-def _apart(
-    y: NDArray[Any], row: NDArray[Any], point: NDArray[Any], sigma: float, count: int
-) -> float:
+def _apart(y: NDArray[Any], pairs: Pairs, sigma: float) -> float:
     """Median difference from the mean of their point, in log odds, of samples (N,) after one gain
     for each photo.
     """
-    ridge, ones = np.array([1 / sigma**2]), np.ones((len(y), 1))
-    level = y + _robust_differences(ones, row, point, y[:, None], ridge, count)[row, 0, 0]
+    point, ridge, ones = pairs.point, np.array([1 / sigma**2]), np.ones((len(y), 1))
+    level = y + robust_differences(ones, pairs, y[:, None], ridge)[pairs.row, 0, 0]
     mean = np.bincount(point, level) / np.maximum(np.bincount(point), 1)
     several = np.bincount(point)[point] > 1
     return float(np.median(np.abs(level - mean[point])[several])) if several.any() else 0.0
-
-
-def _within_points(
-    terms: NDArray[Any], y: NDArray[Any], point: NDArray[Any], pull: NDArray[Any]
-) -> NDArray[np.float64]:
-    """x (k,) that makes y + terms . x equal within each point, y (N,) and terms (N, k), with robust
-    weights; `pull` (k, k): weight of the prior of zero.
-    """
-    w, x = np.ones(len(y)), np.zeros(terms.shape[1])
-    count = int(point.max()) + 1
-    for _ in range(5):
-        mass = np.maximum(np.bincount(point, w, count), 1e-9)
-        apart = terms - (_sums(point, w[:, None] * terms, count) / mass[:, None])[point]
-        off = y - (np.bincount(point, w * y, count) / mass)[point]
-        x = -np.linalg.solve(apart.T @ (w[:, None] * apart) + pull, apart.T @ (w * off))
-        w = 1 / (1 + ((off + apart @ x) / SIGMA_LEVEL) ** 2)
-    return np.asarray(x)
-
-
-def _sums(group: NDArray[Any], values: NDArray[Any], count: int) -> NDArray[np.float64]:
-    """(count, ...) sums of values (N, ...) by group (N,)."""
-    flat = values.reshape(len(values), -1)
-    total = [np.bincount(group, column, count) for column in flat.T]
-    return np.asarray(np.stack(total, 1).reshape(count, *values.shape[1:]), np.float64)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Pairs:
-    """All pairs of samples of one point, a sample with itself included, sorted by their photos."""
-
-    a: NDArray[np.int64]
-    """(M,) first sample."""
-    b: NDArray[np.int64]
-    """(M,) second sample; its photo is not before the first's."""
-    cuts: NDArray[np.int64]
-    """(G + 1,) start of the pairs of each two photos."""
-    row_a: NDArray[np.int64]
-    """(G,) first photo."""
-    row_b: NDArray[np.int64]
-    """(G,) second photo."""
-
-    @classmethod
-    def of(cls, row: NDArray[Any], point: NDArray[Any]) -> "_Pairs":
-        """The pairs of samples (N,), whose rows and points are given."""
-        order = np.lexsort((row, point))
-        a, b = [], []
-        for lag in range(int(np.bincount(point).max(initial=0))):
-            same = np.flatnonzero(point[order[lag:]] == point[order[: len(order) - lag]])
-            a.append(order[same])
-            b.append(order[same + lag])
-        first, second = np.concatenate(a), np.concatenate(b)
-        sort = np.lexsort((row[second], row[first]))
-        first, second = first[sort], second[sort]
-        new = np.flatnonzero((np.diff(row[first]) != 0) | (np.diff(row[second]) != 0)) + 1
-        cuts = np.r_[0, new, len(first)]
-        return cls(
-            a=first, b=second, cuts=cuts, row_a=row[first[cuts[:-1]]], row_b=row[second[cuts[:-1]]]
-        )
-
-    def products(self, terms: NDArray[Any]) -> NDArray[np.float64]:
-        """(G, k, k) sums of the outer products of terms (N, k) over the pairs of two photos."""
-        left, right = terms[self.a], terms[self.b]
-        ends = zip(self.cuts[:-1].tolist(), self.cuts[1:].tolist(), strict=True)
-        return np.stack([left[i:j].T @ right[i:j] for i, j in ends])
-
-
-def _solved(
-    own: NDArray[Any], pairs: _Pairs, blocks: NDArray[Any], pull: NDArray[Any], rhs: NDArray[Any]
-) -> NDArray[Any]:
-    """Solution (n k, bands) of the normal equations: own blocks (n, k, k) minus those of pairs,
-    with a prior of zero.
-    """
-    n, k, _ = own.shape
-    i, j = (
-        np.r_[pairs.row_a, pairs.row_b, np.arange(n)],
-        np.r_[pairs.row_b, pairs.row_a, np.arange(n)],
-    )
-    turned = np.where((pairs.row_a != pairs.row_b)[:, None, None], blocks.transpose(0, 2, 1), 0.0)
-    values = np.concatenate([-blocks, -turned, own])
-    if n * k <= DENSE:
-        normal = np.zeros((n, n, k, k))
-        np.add.at(normal, (i, j), values)
-        return np.asarray(
-            np.linalg.solve(normal.swapaxes(1, 2).reshape(n * k, n * k) + np.diag(pull), rhs)
-        )
-    from scipy import sparse  # imported only where it saves more time than it takes to load
-    from scipy.sparse import linalg
-
-    at = np.arange(k)
-    rows = (k * i[:, None, None] + at[:, None] + 0 * at).ravel()
-    columns = (k * j[:, None, None] + 0 * at[:, None] + at).ravel()
-    normal = sparse.coo_matrix((values.ravel(), (rows, columns)), (n * k, n * k)).tocsc()
-    return np.asarray(linalg.splu((normal + sparse.diags(pull)).tocsc()).solve(rhs))

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import SideFileError, UsageError
+from skyquilt.imaging.nodes import View
 from skyquilt.imaging.view_limits import USUAL, ViewLimits, limits_for
-from skyquilt.imaging.views import View, grid_of, make_views, native_gsd
+from skyquilt.imaging.views import grid_of, make_views, native_gsd
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface

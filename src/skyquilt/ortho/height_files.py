@@ -33,8 +33,7 @@ def write_heights(
         OutputError: a file cannot be written.
     """
     cells = _cells(ground)
-    x, y = np.meshgrid(cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)))
-    z = ground.surface.at(x, y)
+    z = ground.surface.on(cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)))
     known = _shown(drawn, cells)
     datum = {"VERTICAL_DATUM": alignment.frame.vertical_datum, "SOURCE": ground.surface.source}
     _write(output / "dsm.tif", np.where(known, z, np.float32(np.nan)), cells, alignment, datum)

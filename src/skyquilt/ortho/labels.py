@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import STEP, densify
+from skyquilt.imaging.nodes import STEP, densify
 from skyquilt.model.raster import Grid, Window
 
 Float = NDArray[np.float32]

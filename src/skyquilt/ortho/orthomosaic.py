@@ -15,7 +15,7 @@ from skyquilt.engine.executor import in_order
 from skyquilt.engine.folder import STATE
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import UsageError
-from skyquilt.imaging.views import View
+from skyquilt.imaging.nodes import View
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Window
 from skyquilt.ortho.blend import Blend
@@ -258,7 +258,7 @@ def write_surface(output: Path, ground: Ground, alignment: Alignment) -> None:
         else max(grid.width, grid.height)
     )
     coarse = grid.coarser(factor)
-    x, y = np.meshgrid(coarse.x(np.arange(coarse.width)), coarse.y(np.arange(coarse.height)))
+    z = ground.surface.on(coarse.x(np.arange(coarse.width)), coarse.y(np.arange(coarse.height)))
     about = {"VERTICAL_DATUM": alignment.frame.vertical_datum, "SOURCE": ground.surface.source}
     spec = RasterSpec(
         width=coarse.width,
@@ -272,7 +272,7 @@ def write_surface(output: Path, ground: Ground, alignment: Alignment) -> None:
         nodata=float("nan"),
         tags={"SOFTWARE": "Skyquilt"} | about,
     )
-    write_array(output / "surface.tif", ground.surface.at(x, y).astype(np.float32), spec)
+    write_array(output / "surface.tif", z, spec)
 
 
 def used_photos(views: Sequence[View]) -> list[int]:

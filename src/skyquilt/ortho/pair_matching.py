@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import STEP, View, densify, inside_everywhere, project_nodes
+from skyquilt.imaging.nodes import STEP, View, densify, inside_everywhere, project_nodes
 
 Float = NDArray[np.float32]
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import View, inside, project_nodes
+from skyquilt.imaging.nodes import View, inside, project_nodes
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.compose import PhotoPixels
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import (
+from skyquilt.imaging.nodes import (
     STEP,
     Nodes,
     View,

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import View
+from skyquilt.imaging.nodes import View
 from skyquilt.model.photo import Photo
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.exposure import NEUTRAL, Exposure

@@ -19,9 +19,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import STEP, View, densify, overlapping, project_all
+from skyquilt.imaging.nodes import STEP, View, densify, overlapping, project_all
 from skyquilt.model.raster import Grid
-from skyquilt.model.surface import Surface
+from skyquilt.model.surface import WIDEST, Surface
 from skyquilt.ortho.bare_ground import bare_ground
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.labels import Labels
@@ -94,10 +94,12 @@ class SeamLines:
     ) -> Labels:
         """The photo of each cell of a map's grid."""
         factor = CELL
-        while factor * grid.gsd < LEAST_M or grid.width * grid.height > MOST_CELLS * factor**2:
+        wide, high = grid.width, grid.height
+        most = max(np.sqrt(wide * high / MOST_CELLS), wide / WIDEST, high / WIDEST)
+        while factor * grid.gsd < LEAST_M or factor < most:
             factor *= 2
         cells = grid.coarser(factor)
-        z = _heights(surface, cells)
+        z = surface.on(cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)))
         over = z - bare_ground(z, _covered(views, cells), cells.gsd)
         scene = _Scene(
             views=views,
@@ -177,11 +179,6 @@ class SeamLines:
             height=np.clip(level, 0, 255).astype(np.uint8),
             hidden=(best[0] >= HIDDEN) & (order[0] >= 0),
         )
-
-
-def _heights(surface: Surface, cells: Grid) -> Float:
-    x, y = np.meshgrid(cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)))
-    return surface.at(x, y)
 
 
 def _covered(views: Sequence[View], cells: Grid) -> Mask:

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.imaging.nodes import STEP, Nodes
 from skyquilt.imaging.view_limits import ground_sizes
-from skyquilt.imaging.views import STEP, Nodes
 
 Mask = NDArray[np.bool_]
 AROUND = np.ones((3, 3), np.uint8)

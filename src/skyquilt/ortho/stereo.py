@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.executor import in_order
-from skyquilt.imaging.views import View
+from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid
-from skyquilt.model.surface import Surface
+from skyquilt.model.surface import WIDEST, Surface
 from skyquilt.ortho.fill import nearest_known, plateaus, settled
 from skyquilt.ortho.pair_matching import Array, Float, Mask, Pair, matched_points, pair_of
 
@@ -26,6 +26,8 @@ GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
 Keep = Callable[[str, Callable[[], Float]], Float]
 """Gives a part of the result by its name: the one kept of an interrupted run, or made now."""
+Cells = tuple[NDArray[np.intp], Float]
+"""Numbers (n,) of cells of a grid, row by row, and their heights (n,) in m."""
 MOST_CELLS = 2.4e7
 """Largest number of cells of a surface."""
 TILE = 512
@@ -70,6 +72,8 @@ class _Round:
     """Source of the photos' grey images."""
     agree: float
     """Heights of different pairs that agree differ by less than this in m."""
+    middle: float
+    """Median of the heights so far in m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,10 +133,11 @@ class Stereo:
             high=_stretched(rough, 3 * gsd, cv2.MORPH_DILATE, step),
             grey=grey,
             agree=0.015 * height,
+            middle=float(np.median(rough.z)),
         )
         z = self._fused(given, views, height, self.relief * height, keep)
         known = _without_specks(z, 0.01 * height, 6)
-        x, y = np.meshgrid(cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)))
+        x, y = cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height))
         # cliffs stay as steep as the cells allow
         former = np.asarray(cv2.medianBlur(_stepwise(rough, x, y), 5), np.float32)
         if not known.any():
@@ -164,6 +169,7 @@ class Stereo:
             high=replace(surface, z=surface.z + np.float32(self.above * height)),
             grey=grey,
             agree=0.04 * height,
+            middle=float(np.median(surface.z)),
         )
         z = self._fused(given, views, height, 0.0, keep)
         known = _without_specks(z, 0.02 * height, 12)
@@ -252,18 +258,14 @@ def _tile(
         todo, in_order(lambda k: _points(pairs[k], given), todo, jobs=THREADS), strict=True
     ):
         held[k] = points
-    layers = [layer for k in near if (layer := _splat(held[k], pairs[k].origin, part)) is not None]
-    return (
-        _agreed(layers, given.agree)
-        if layers
-        else np.full((part.height, part.width), np.nan, np.float32)
-    )
+    heights = [_splat(held[k], pairs[k].origin, part) for k in near]
+    return _agreed([h for h in heights if len(h[0])], given.agree, (part.height, part.width))
 
 
 def _over(a: View, b: View, given: _Round) -> Pair | None:
     """The pair of two photos over the heights known between them."""
     x, y = ((a.pose.map_C + b.pose.map_C) / 2)[:2]
-    reach = 0.3 * (float(a.pose.map_C[2]) - float(np.median(given.known.z)))
+    reach = 0.3 * (float(a.pose.map_C[2]) - given.middle)
     gx, gy = np.meshgrid(*(c + reach * np.linspace(-1, 1, 9) for c in (x, y)))
     return pair_of(a, b, float(np.median(given.known.at(gx, gy))), given.gsd)
 
@@ -298,45 +300,57 @@ def _points(pair: Pair, given: _Round) -> Float:
     return np.asarray(at[(z > given.low.at(x, y)) & (z < given.high.at(x, y))])
 
 
-def _splat(points: Float, origin: Array, part: Grid) -> Float | None:
-    """Heights (h, w) of the cells of a grid: the means of those points that lie near the highest
-    one in each; None if there are no points.
+def _splat(points: Float, origin: Array, part: Grid) -> Cells:
+    """Heights of the cells of a grid that points fall in: in each the mean of those near the
+    highest one.
     """
-    column = np.floor((points[:, 0] + (origin[0] - part.west)) / part.gsd).astype(np.int64)
-    row = np.floor(((part.north - origin[1]) - points[:, 1]) / part.gsd).astype(np.int64)
+    column = np.floor((points[:, 0] + (origin[0] - part.west)) / part.gsd).astype(np.int32)
+    row = np.floor(((part.north - origin[1]) - points[:, 1]) / part.gsd).astype(np.int32)
     mine = (column >= 0) & (column < part.width) & (row >= 0) & (row < part.height)
     if not mine.any():
-        return None
-    cell, z = row[mine] * part.width + column[mine], points[mine, 2]
-    top = np.full(part.height * part.width, -np.inf, np.float32)
+        return np.zeros(0, np.intp), np.zeros(0, np.float32)
+    column, row, z = column[mine], row[mine], points[mine, 2]
+    # only the rectangle that this pair shows
+    west, wide = int(column.min()), int(np.ptp(column)) + 1
+    north, high = int(row.min()), int(np.ptp(row)) + 1
+    cell = (row - north) * wide + (column - west)
+    top = np.full(high * wide, -np.inf, np.float32)
     np.maximum.at(top, cell, z)
     close = z > top[cell] - 2 * part.gsd
     cell, z = cell[close], z[close]
     number = np.bincount(cell, minlength=len(top))
-    with np.errstate(invalid="ignore"):
-        mean = np.bincount(cell, z, minlength=len(top)) / number
-    return np.asarray((mean + origin[2]).reshape(part.height, part.width), np.float32)
+    known = np.flatnonzero(number)
+    mean = np.bincount(cell, z, minlength=len(top))[known] / number[known]
+    at = (known // wide + north) * part.width + known % wide + west
+    return at, (mean + origin[2]).astype(np.float32)
 
 
-def _agreed(layers: Sequence[Float], step: float) -> Float:
-    """Median (h, w) of layers, NaN ignored; of an even number the lower of the two in the middle.
-    NaN where of several heights none lies within `step` m of it.
+def _agreed(heights: Sequence[Cells], step: float, shape: tuple[int, int]) -> Float:
+    """Median (h, w) of the heights of each cell; of an even number the lower of the two in the
+    middle. NaN where there are none, or where of several none lies within `step` m of it.
     """
-    ordered = np.sort(np.stack(layers), axis=0)
-    number = np.isfinite(ordered).sum(0)
-    middle = np.maximum(number - 1, 0) // 2
-    z = np.take_along_axis(ordered, middle[None], 0)[0]
-    if len(layers) > 1:
-        with np.errstate(invalid="ignore"):
-            close = (np.abs(ordered - z) < step).sum(0)
-        z = np.where((number > 1) & (close < 2), np.float32(np.nan), z)
-    return np.asarray(z)
+    number = np.zeros(shape[0] * shape[1], np.intp)
+    for cell, _ in heights:
+        number[cell] += 1
+    ordered = np.full((int(number.max(initial=0)), len(number)), np.nan, np.float32)
+    if not len(ordered):
+        return np.full(shape, np.nan, np.float32)
+    number[:] = 0
+    for cell, z in heights:
+        ordered[number[cell], cell] = z
+        number[cell] += 1
+    ordered.sort(axis=0)
+    z = np.take_along_axis(ordered, np.maximum(number - 1, 0)[None] // 2, 0)[0]
+    with np.errstate(invalid="ignore"):
+        close = (np.abs(ordered - z) < step).sum(0)
+    z = np.where((number > 1) & (close < 2), np.float32(np.nan), z)
+    return np.asarray(z.reshape(shape))
 
 
 def _stepwise(surface: Surface, x: NDArray[Any], y: NDArray[Any]) -> Float:
-    """Heights (h, w) of the nearest cells of a surface."""
-    column = np.rint((x[0] - surface.x0) / surface.cell).astype(np.int64)
-    row = np.rint((y[:, 0] - surface.y0) / surface.cell).astype(np.int64)
+    """Heights (h, w) of the nearest cells of a surface, at x (w,) and y (h,)."""
+    column = np.rint((x - surface.x0) / surface.cell).astype(np.int64)
+    row = np.rint((y - surface.y0) / surface.cell).astype(np.int64)
     rows, columns = surface.z.shape
     return surface.z[np.clip(row, 0, rows - 1)][:, np.clip(column, 0, columns - 1)]
 
@@ -373,8 +387,11 @@ def _surface(z: Float, cells: Grid) -> Surface:
 
 
 def _least(grid: Grid) -> int:
-    """The least side of a cell in map pixels for which a surface stays below `MOST_CELLS`."""
-    return int(np.ceil(np.sqrt(grid.width * grid.height / MOST_CELLS)))
+    """The least side of a cell in map pixels for which a surface stays below `MOST_CELLS`, and each
+    of its sides below `WIDEST`.
+    """
+    cells = np.sqrt(grid.width * grid.height / MOST_CELLS)
+    return int(np.ceil(max(cells, grid.width / WIDEST, grid.height / WIDEST)))
 
 
 def _meet(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.views import STEP, Nodes, View, densify, project_nodes
+from skyquilt.imaging.nodes import STEP, Nodes, View, densify, project_nodes
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
 
@@ -158,8 +158,7 @@ class Sweep:
         cell = 4
         rows, columns = -(-work.height // cell), -(-work.width // cell)
         coarse = work.coarser(cell)
-        gx, gy = np.meshgrid(coarse.x(np.arange(columns)), coarse.y(np.arange(rows)))
-        known = surface.at(gx, gy)
+        known = surface.on(coarse.x(np.arange(columns)), coarse.y(np.arange(rows)))
         pad = ((0, rows * cell - work.height), (0, columns * cell - work.width))
         blocks = [
             np.pad(a, pad)

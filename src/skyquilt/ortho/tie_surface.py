@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.geometry.neighbours import nearest
-from skyquilt.model.surface import Surface
+from skyquilt.model.surface import WIDEST, Surface
 
 Array = NDArray[np.float64]
+AT_ONCE = 400_000
+"""Cells that are interpolated at once, about."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +43,14 @@ class FromTiePoints:
         rows = max(2, int(np.ceil((bounds[3] - bounds[1]) / cell)) + 1)
         x = bounds[0] + np.arange(columns) * cell
         y = bounds[1] + np.arange(rows) * cell
-        z = self._interpolate(points, np.stack(np.meshgrid(x, y), -1).reshape(-1, 2), cell).reshape(
-            rows, columns
+        strip = max(1, AT_ONCE // columns)
+        z = np.concatenate(
+            [
+                self._interpolate(
+                    points, np.stack(np.meshgrid(x, y[k : k + strip]), -1).reshape(-1, 2), cell
+                ).reshape(-1, columns)
+                for k in range(0, rows, strip)
+            ]
         )
         smooth = np.asarray(
             cv2.GaussianBlur(z.astype(np.float32), (0, 0), self.smoothing_cells), np.float32
@@ -77,7 +85,8 @@ def grid_spacing(points: Array, bounds: tuple[float, float, float, float]) -> fl
     typical = max(0.6 * float(np.median(distance[:, 1])) + 1e-3, 1e-3)
     area = (bounds[2] - bounds[0]) * (bounds[3] - bounds[1])
     density = np.sqrt((np.ptp(points[:, 0]) * np.ptp(points[:, 1]) + 1e-6) / len(points))
-    return float(max(typical, 0.5 * density, np.sqrt(area / 4e6)))
+    longest = max(bounds[2] - bounds[0], bounds[3] - bounds[1])
+    return float(max(typical, 0.5 * density, np.sqrt(area / 4e6), longest / WIDEST))
 
 
 def level(z: float) -> Surface:

@@ -10,7 +10,7 @@ from skyquilt.errors import UsageError
 from skyquilt.geometry.camera import undistort
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import RejectedPhoto
-from skyquilt.outside import plain
+from skyquilt.outside import is_file, plain
 from skyquilt.photos.cameras_json import read_cameras_json
 from skyquilt.photos.lens import find_sensor
 from skyquilt.photos.read import read_photo
@@ -32,7 +32,7 @@ def find_view(text: str) -> View:
     if path.suffix.lower() == ".json":
         name, camera = next(iter(read_cameras_json(path).items()))
         return view_of(camera, name)
-    if path.is_file():
+    if is_file(path):
         return _of_photo(path)
     return _of_model(text)
 

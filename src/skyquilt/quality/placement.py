@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Steps
+from skyquilt.imaging.nodes import View
 from skyquilt.imaging.plane import view_patch
-from skyquilt.imaging.views import View, on_ground
+from skyquilt.imaging.views import on_ground
 from skyquilt.model.photo import KnownDistance, Photo, PointObservation
 from skyquilt.model.poses import Alignment, Prior
 from skyquilt.ortho.ground import GreyPicture, Ground

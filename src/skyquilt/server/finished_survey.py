@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from skyquilt.errors import SideFileError, UsageError
-from skyquilt.outside import plain, read_bounded, real
+from skyquilt.outside import is_file, is_folder, plain, read_bounded, real
 from skyquilt.raster.map_source import FileSource, MapSource, between
 from skyquilt.runs.layers import RunLayer, figures_of, layers_in
 from skyquilt.server.shown import Shown, base_map
@@ -95,7 +95,7 @@ class FinishedSurvey:
                 "ring": [list(p) for p in ring_ll],
             },
             ring=ring_ll,
-            path=path if inside and path is not None and path.is_file() else None,
+            path=path if inside and path is not None and is_file(path) else None,
             digest=str(shot["properties"].get("digest", "")),
         )
 
@@ -171,4 +171,4 @@ def _photo_folder(folder: Path) -> Path | None:
     # as it was given: from the folder in which the map was made, which may be any above the run
     given = Path(str(said)) if said and "\0" not in str(said) else None
     places = [] if given is None else [given, *(p / given for p in folder.resolve().parents)]
-    return next((p for p in (*places, beside) if p.is_dir()), None)
+    return next((p for p in (*places, beside) if is_folder(p)), None)

@@ -11,8 +11,8 @@ from fastapi import HTTPException, Request, Response
 from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
+from skyquilt.engine.free_memory import give_back
 from skyquilt.errors import UsageError
-from skyquilt.live.free_memory import give_back
 from skyquilt.outside import real
 from skyquilt.raster.colours import ramp
 from skyquilt.raster.map_source import MapSource, between

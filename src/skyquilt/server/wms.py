@@ -14,7 +14,7 @@ from fastapi.responses import JSONResponse
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
-from skyquilt.live.free_memory import give_back
+from skyquilt.engine.free_memory import give_back
 from skyquilt.outside import real, whole
 from skyquilt.raster.map_source import Bounds, MapSource, between, picture
 from skyquilt.raster.picture_files import image_bytes

@@ -42,6 +42,8 @@ class Exposer:
     """The true camera."""
     directions: Floats
     """(h, w, 2) from `Lens.rays`."""
+    lowest: float
+    """Height of the lowest ground, m above the base."""
 
     def pixels(self, shot: Shot) -> tuple[Floats, Floats, Grid]:
         """Where each pixel's ray first meets the surface.
@@ -86,8 +88,7 @@ class Exposer:
     def window(self, shot: Shot) -> Grid:
         """The part of the scene that a shot can see."""
         grid = self.scene.grid
-        lowest = float(self.scene.height[::16, ::16].min()) - 1.0
-        ground = grid.pixels(footprint(self.lens, shot, lowest))
+        ground = grid.pixels(footprint(self.lens, shot, self.lowest))
         low, high = (
             np.floor(ground.min(axis=0)).astype(int) - 34,
             np.ceil(ground.max(axis=0)).astype(int) + 34,
@@ -139,7 +140,8 @@ class Exposer:
 
 def exposer(scene: Scene, lens: Lens) -> Exposer:
     """Prepares a camera over a scene."""
-    return Exposer(scene=scene, lens=lens, directions=lens.rays())
+    lowest = float(scene.height[::16, ::16].min()) - 1.0
+    return Exposer(scene=scene, lens=lens, directions=lens.rays(), lowest=lowest)
 
 
 def footprint(lens: Lens, shot: Shot, level: float) -> Doubles:

@@ -225,7 +225,7 @@ def _make_room(output: Path, overwrite: bool) -> None:
 def _write(world: World, output: Path) -> Iterator[Progress]:
     settings, country = world.settings, world.country
     scene = yield from _drawn(world, output, "terrain", settings.resolution, heat=False)
-    taken = yield from _photograph(world, scene, output)
+    taken = yield from photograph(world, scene, output)
     points = survey(settings.control, country, world.place)
     visible = world.visible
     found = observations(
@@ -272,8 +272,12 @@ def _drawn(
     return scene
 
 
-def _photograph(world: World, scene: Scene, output: Path) -> Generator[Progress, None, list[Taken]]:
-    """Takes and writes the visible photos; returns what was taken."""
+def photograph(
+    world: World, scene: Scene, output: Path, *, resume: bool = False
+) -> Generator[Progress, None, list[Taken]]:
+    """Takes and writes the visible photos; returns what was taken. `resume`: files that are there
+    already are kept.
+    """
     pictures, flight = world.settings.pictures, world.visible
     camera = exposer(scene, flight.lens)
     folder = output / "photos"
@@ -286,16 +290,19 @@ def _photograph(world: World, scene: Scene, output: Path) -> Generator[Progress,
         rng = np.random.default_rng([world.settings.seed, 51, number])
         pictures = shake if number in spoilt else sharp
         gain = float(np.exp(rng.normal(0, pictures.exposure_noise)))
-        pixels = camera.visible(shot, pictures, gain, rng, _moment(world, shot))
-        if report.turned:
-            pixels = np.ascontiguousarray(pixels[::-1, ::-1])
         name = f"{shot.name}.jpg"
-        body = Body(
-            model="Simulated 4:3",
-            serial=f"SIM{shot.waypoint.drone + 1:03d}",
-            start=world.settings.weather.moment,
-        )
-        write_jpeg(folder / name, pixels, report, body, pictures.quality)
+        if not (resume and (folder / name).exists()):
+            pixels = camera.visible(shot, pictures, gain, rng, _moment(world, shot))
+            if report.turned:
+                pixels = np.ascontiguousarray(pixels[::-1, ::-1])
+            body = Body(
+                model="Simulated 4:3",
+                serial=f"SIM{shot.waypoint.drone + 1:03d}",
+                start=world.settings.weather.moment,
+            )
+            part = folder / f".{name}"  # whole, or not there
+            write_jpeg(part, pixels, report, body, pictures.quality)
+            part.replace(folder / name)
         taken.append(
             Taken(
                 shot=shot,

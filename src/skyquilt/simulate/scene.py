@@ -131,21 +131,24 @@ class Country:
         paint_targets(canvas, self.targets)
         return canvas
 
-    def draw(self, scene: Scene, weather: Weather, *, scratch: Path) -> Iterator[tuple[int, int]]:
+    def draw(
+        self, scene: Scene, weather: Weather, *, scratch: Path, done: int = 0
+    ) -> Iterator[tuple[int, int]]:
         """Fills a scene, first its surfaces, then their light, block by block; yields (done,
-        total).
+        total). `done`: steps of it that are done already, for a scene that has its `look`.
         """
         looks = scene.look
         if looks is None:
             looks = _room(scene.grid, (4,), np.float16, scratch / "look")
         blocks = scene.grid.blocks(_BLOCK)
-        for number, block in enumerate(blocks):
-            canvas = self.paint(block, weather)
-            scene.height[block.slices], looks[block.slices] = canvas.height, canvas.look
-            yield number + 1, 2 * len(blocks)
-        for number, block in enumerate(blocks):
-            _light(scene, looks, block, weather, flat=self.settings.kind == "chessboard")
-            yield len(blocks) + number + 1, 2 * len(blocks)
+        for step in range(done, 2 * len(blocks)):
+            block = blocks[step % len(blocks)]
+            if step < len(blocks):
+                canvas = self.paint(block, weather)
+                scene.height[block.slices], looks[block.slices] = canvas.height, canvas.look
+            else:
+                _light(scene, looks, block, weather, flat=self.settings.kind == "chessboard")
+            yield step + 1, 2 * len(blocks)
 
 
 def empty_scene(grid: Grid, *, thermal: bool, scratch: Path, hours: bool = False) -> Scene:

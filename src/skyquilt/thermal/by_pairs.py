@@ -17,7 +17,7 @@ from skyquilt.coregistration.methods import registration_method
 from skyquilt.coregistration.propagation import PairPoints, Propagate
 from skyquilt.coregistration.refine_registration import RefineRegistration
 from skyquilt.geometry.transforms import transfer
-from skyquilt.imaging.views import View
+from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.registration import Guess, Picture, RefusedRegistration, Registration
 from skyquilt.ortho.blend import First

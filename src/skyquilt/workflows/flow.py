@@ -14,10 +14,11 @@ from typing import Any, TypeVar
 
 from numpy.typing import NDArray
 
-from skyquilt.alignment.inputs import AlignmentInputs, GreyPicture
+from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
-from skyquilt.engine.pixel_cache import PixelCache, pixel_budget
+from skyquilt.engine.free_memory import give_back
+from skyquilt.engine.pixel_cache import PixelCache, pixel_budget, resident_budget
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import PhotoFailedError
 from skyquilt.model.event import Event, Note
@@ -69,7 +70,7 @@ class AlignedPhotos:
     """Poses and calibration."""
     pixels: PhotoPixels
     """Full-size pixels of a photo by its index."""
-    grey: GreyPicture
+    grey: GreyPictures
     """Gives the grey image of a photo."""
 
     @property
@@ -140,10 +141,12 @@ def align_photos(
     cache = PixelCache(
         read=lambda i: pixels_of(photos[i], store),
         budget_bytes=pixel_budget(settings.running.memory_gb),
+        resident_bytes=resident_budget(settings.running.memory_gb),
     )
     found = yield from clock.stage(
         "features", find_features(photos, cache, methods.detector, store, jobs)
     )
+    cache.make_room()
     found = of_one_kind(found)
     pixels = _pixels_of(found.photos, photos, cache)
     grey = GreyPictures(found.photos, pixels, store)
@@ -229,6 +232,9 @@ def draw_map(
     labels = yield from clock.stage(
         "seams", _at_once(lambda: _labels(aligned, on, exposure, methods, clock.store))
     )
+    aligned.found.looks.make_room()
+    aligned.grey.make_room()
+    give_back()
     compose = orthomosaic.composer(
         first.channels, first.dtype, on, exposure, labels, methods.blend, aligned.pixels
     )

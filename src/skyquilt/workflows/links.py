@@ -10,7 +10,8 @@ from skyquilt.alignment.pose import ByPose
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.executor import in_order
 from skyquilt.engine.store import Store, digest
-from skyquilt.imaging.views import View, make_views, on_ground, project_nodes
+from skyquilt.imaging.nodes import View, project_nodes
+from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.matching.candidates import Pair, sequence
 from skyquilt.matching.matchers import Guided
 from skyquilt.model.features import Features, Link, RejectedLink

@@ -18,7 +18,7 @@ from skyquilt.alignment.aligners import Auto, ByLinks, ByReport, by_pose
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.inputs import Aligner
 from skyquilt.alignment.pose import ByPosition
-from skyquilt.imaging.views import View
+from skyquilt.imaging.nodes import View
 from skyquilt.matching.candidates import Nearest, Pair, Retrieval
 from skyquilt.matching.matchers import Guided
 from skyquilt.matching.verify import Verify

@@ -19,6 +19,7 @@ from skyquilt.alignment.heights import height_figures
 from skyquilt.engine.clock import Clock, Steps, result_of
 from skyquilt.engine.error_log import log_error
 from skyquilt.engine.folder import STATE, RunFolder, open_run
+from skyquilt.engine.free_memory import return_large_blocks
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import PhotoFailedError, SkyquiltError
 from skyquilt.model.event import Event, Note, Result
@@ -161,6 +162,7 @@ def make_map(
     Raises:
         SkyquiltError: any error that the user can correct.
     """
+    return_large_blocks()
     began, methods = began or Clock.now(), methods or methods_for(settings)
     check_input(given, output, settings)
     key = run_key(given, settings, methods)

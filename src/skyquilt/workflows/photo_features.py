@@ -58,7 +58,7 @@ class FeaturedPhotos:
     """The photos, in order of capture."""
     number: tuple[int, ...]
     """Number of each photo in `looks`."""
-    looks: Callable[[int], PhotoFeatures]
+    looks: PixelCache[PhotoFeatures]
     """Features and thumbnail of a photo by its number, from the store unless used lately."""
     rejected: tuple[RejectedPhoto, ...]
     """Photos that cannot be used, with reasons."""
@@ -126,6 +126,11 @@ class GreyPictures:
             self._small.clear()
             self._longest = longest
         return self._small(photo)
+
+    def make_room(self) -> None:
+        """Drops the images kept in memory where not all fit."""
+        self._cache.make_room()
+        self._small.make_room()
 
     def _shrunken(self, photo: int) -> NDArray[np.uint8]:
         return np.ascontiguousarray(shrink(self._cache(photo), self._longest)[0])

@@ -14,7 +14,7 @@ from pyproj import Transformer
 
 from skyquilt.geometry.camera_formats import camera_to_opensfm
 from skyquilt.geometry.frames import angles_from_cam_R_map, rotation_from_vector
-from skyquilt.imaging.views import View
+from skyquilt.imaging.nodes import View
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Pose
 from skyquilt.raster import vector

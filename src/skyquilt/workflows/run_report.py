@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from skyquilt.engine.clock import Clock, Steps, peak_memory_mb
 from skyquilt.engine.folder import FILES
 from skyquilt.geometry.frames import angles_from_cam_R_map
-from skyquilt.imaging.views import STEP
+from skyquilt.imaging.nodes import STEP
 from skyquilt.model.event import Note
 from skyquilt.model.raster import Window
 from skyquilt.ortho.companions import PROVENANCE, Drawn
@@ -110,8 +110,8 @@ def report_input(
 ) -> ReportInput:
     """The data shown in the report."""
     frame, views = aligned.alignment.frame, drawn.views_grid
-    x, y = np.meshgrid(views.x(np.arange(views.width)), views.y(np.arange(views.height)))
-    heights = np.where(drawn.views > 0, ground.surface.at(x, y), np.float32(np.nan))
+    z = ground.surface.on(views.x(np.arange(views.width)), views.y(np.arange(views.height)))
+    heights = np.where(drawn.views > 0, z, np.float32(np.nan))
     return ReportInput(
         metrics=metrics,
         preview=drawn.preview,
