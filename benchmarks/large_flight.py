@@ -1,6 +1,8 @@
-"""Simulates a flight of thousands of 2 MP photos from three drones, in minutes rather than hours.
+"""Simulates large flights in minutes rather than hours.
 
-python benchmarks/large_flight.py FOLDER [--photos 2000]
+python benchmarks/large_flight.py FOLDER [--photos 2000]    2 MP photos from three drones
+python benchmarks/large_flight.py FOLDER --kind dense       172 photos of 0.5 MP, 87 % overlap
+python benchmarks/large_flight.py FOLDER --kind wing        167 photos of 9.7 MP, 50 % overlap
 
 Terrain, camera, noise and metadata are those of the simulator. Only the ray casting is simplified:
 rays meet a smoothed ground (hills; houses and trees are painted on it flat), so nothing is hidden
@@ -16,6 +18,7 @@ import json
 import mmap
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +26,25 @@ import cv2
 import numpy as np
 
 from skyquilt.simulate import FlightSettings, Progress, expose, prepare
+from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.raycast import Rays, sample
 from skyquilt.simulate.run import World, photograph
 from skyquilt.simulate.scene import Scene
 from skyquilt.simulate.settings import Control, Route
 from skyquilt.simulate.truth import write_truth
 
+KINDS = {
+    "large": (Lens(), Route(photos=2000, drones=3)),
+    "dense": (
+        Lens(width=816, height=612, focal=680.0),
+        Route(photos=172, overlap=0.87, sidelap=0.7, height=40.0),
+    ),
+    "wing": (
+        Lens(width=3600, height=2700, focal=2900.0),
+        Route(photos=167, overlap=0.5, sidelap=0.6, height=120.0, speed=15.0),
+    ),
+}
+"""Camera and route by name."""
 GSD = 0.1
 """Cell of the country's raster in m; the photos' own is 0.045 m."""
 LAYERS = {"height": ((), np.float32), "rgb": ((3,), np.uint8), "look": ((4,), np.float16)}
@@ -105,11 +121,22 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--photos", type=int, default=2000)
+    parser.add_argument("--kind", choices=KINDS, default="large")
+    parser.add_argument("--photos", type=int, help="instead of the kind's own number")
+    parser.add_argument("--seed", type=int, default=2)
     asked = parser.parse_args()
     expose.first_hits = smooth_hits
-    route, control = Route(photos=asked.photos, drones=3), Control(points=0, checks=0)
-    world = prepare(FlightSettings(seed=2, route=route, control=control, gsd=GSD))
+    lens, route = KINDS[asked.kind]
+    if asked.photos:
+        route = replace(route, photos=asked.photos)
+    settings = FlightSettings(
+        seed=asked.seed,
+        lens=lens,
+        route=route,
+        control=Control(points=0, checks=0),
+        gsd=min(GSD, 2 * route.height / lens.focal),
+    )
+    world = prepare(settings)
     began, last = time.process_time(), ("", -1)
     for step in run(world, asked.folder):
         if last != (step.stage, step.done * 10 // step.total):

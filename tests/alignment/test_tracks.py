@@ -120,6 +120,19 @@ def test_only_drops_tracks_left_with_one_observation():
     assert (np.bincount(left.point) >= 2).all()
 
 
+def test_a_photo_whose_observations_lie_in_few_cells_keeps_them_all():
+    tracks = random_tracks(2, count=3000)
+    shore = (tracks.photo == 5) & (tracks.px[:, 0] > 80)  # the rest of photo 5 is water
+    tracks = tracks.only(~shore)
+    had = np.bincount(tracks.photo)
+    few, many = (
+        np.bincount(thin(tracks, [(800, 600)] * 12, per_photo=64, least=k).photo) for k in (0, 150)
+    )
+    assert few[5] < had[5] and many[5] == had[5]
+    assert (many >= np.minimum(had, 150)).all()
+    assert many.sum() < 0.9 * had.sum()
+
+
 def test_thinning_keeps_every_cell_of_every_photo_and_its_longest_tracks():
     tracks = random_tracks(2, count=3000)
     cells, per_photo = 4, 64

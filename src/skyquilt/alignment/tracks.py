@@ -88,6 +88,22 @@ class Tracks:
         """Number of tracks."""
         return int(self.point[-1]) + 1 if len(self.point) else 0
 
+    def parts(self, about: int) -> Iterator[tuple[slice, slice]]:
+        """Observations and points of parts of whole tracks, with about so many observations."""
+        wanted = np.arange(about, len(self.point), about)
+        starts = np.searchsorted(self.point, self.point[wanted]) if len(wanted) else wanted
+        for low, high in pairwise(np.unique([0, *starts.tolist(), len(self.point)]).tolist()):
+            yield slice(low, high), slice(int(self.point[low]), int(self.point[high - 1]) + 1)
+
+    def part(self, observations: slice, points: slice) -> "Tracks":
+        """Some of the tracks."""
+        return Tracks(
+            point=self.point[observations] - points.start,
+            photo=self.photo[observations],
+            px=self.px[observations],
+            sigma_px=self.sigma_px[observations],
+        )
+
     def only(self, observation: NDArray[np.bool_]) -> "Tracks":
         """The selected observations, without tracks left with one observation; renumbered."""
         point = self.point[observation]
@@ -160,12 +176,18 @@ def _by_photos(track: Index, photo: Index) -> tuple[Index, Index]:
 
 
 def thin(
-    tracks: Tracks, sizes: Sequence[tuple[int, int]], *, per_photo: int, cells: int = 8
+    tracks: Tracks,
+    sizes: Sequence[tuple[int, int]],
+    *,
+    per_photo: int,
+    cells: int = 8,
+    least: int = 0,
 ) -> Tracks:
     """Selects tracks for an adjustment: long ones first, until every photo has `per_photo`
     observations spread over its area.
 
-    `sizes`: (width, height) of each photo.
+    `sizes`: (width, height) of each photo. A photo that would be left with fewer than `least`,
+    since its observations lie in few of the cells, keeps all of them.
     """
     length = np.bincount(tracks.point, minlength=tracks.count)
     size = np.array(sizes)[tracks.photo]
@@ -176,4 +198,7 @@ def thin(
     rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
     chosen = np.zeros(tracks.count, bool)
     chosen[tracks.point[order[rank < max(1, per_photo // cells**2)]]] = True
+    if least:
+        number = np.bincount(tracks.photo[chosen[tracks.point]], minlength=len(sizes))
+        chosen[tracks.point[number[tracks.photo] < least]] = True
     return tracks.only(chosen[tracks.point])

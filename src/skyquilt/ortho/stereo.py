@@ -16,16 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.executor import in_order
+from skyquilt.engine.kept import Keep
 from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid
-from skyquilt.model.surface import WIDEST, Surface
+from skyquilt.model.surface import STRIP, WIDEST, Surface
 from skyquilt.ortho.fill import nearest_known, plateaus, settled
 from skyquilt.ortho.pair_matching import Array, Float, Mask, Pair, matched_points, pair_of
 
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
-Keep = Callable[[str, Callable[[], Float]], Float]
-"""Gives a part of the result by its name: the one kept of an interrupted run, or made now."""
 Cells = tuple[NDArray[np.intp], Float]
 """Numbers (n,) of cells of a grid, row by row, and their heights (n,) in m."""
 MOST_CELLS = 2.4e7
@@ -137,15 +136,16 @@ class Stereo:
         )
         z = self._fused(given, views, height, self.relief * height, keep)
         known = _without_specks(z, 0.01 * height, 6)
+        refined = nearest_known(z, known) if known.any() else z
+        del z, given  # large surveys have rasters of 100 MB
+        refined = np.asarray(cv2.medianBlur(refined, 5), np.float32)
+        side = 2 * round(self.whole * height / cells.gsd / 2) + 1
+        firm = cv2.boxFilter(known.astype(np.float32), -1, (side, side)) > FIRM
         x, y = cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height))
         # cliffs stay as steep as the cells allow
         former = np.asarray(cv2.medianBlur(_stepwise(rough, x, y), 5), np.float32)
-        if not known.any():
-            return _surface(former, cells)
-        side = 2 * round(self.whole * height / cells.gsd / 2) + 1
-        firm = cv2.boxFilter(known.astype(np.float32), -1, (side, side)) > FIRM
-        refined = cv2.medianBlur(nearest_known(z, known), 5)
-        return _surface(np.where(firm, refined, former).astype(np.float32), cells)
+        np.copyto(former, refined, where=firm)
+        return _surface(former, cells)
 
     def _coarse(
         self,
@@ -364,7 +364,10 @@ def _without_specks(z: Float, step: float, least: int) -> Mask:
         return known
     base = float(np.nanmin(z))
     scale = min(100.0, 30000 / max(float(np.nanmax(z)) - base, 1e-6))
-    levels = np.where(known, (z - base) * scale + 1, -1000).astype(np.int16)
+    levels = np.full(z.shape, -1000, np.int16)
+    for row in range(0, len(z), STRIP):
+        part = slice(row, row + STRIP)
+        levels[part][known[part]] = (z[part][known[part]] - base) * scale + 1
     cv2.filterSpeckles(levels, -1000, least, step * scale)
     return levels >= 0
 
