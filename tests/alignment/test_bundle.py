@@ -133,6 +133,14 @@ def test_a_block_is_found(plain):
     assert camera.sigmas is not None and 0.5 < camera.sigmas[0] < 10 and camera.sigmas[8] > 0
 
 
+def test_a_block_that_is_soon_adjusted_again_is_found_nearly_as_well(plain):
+    flown, thorough = plain
+    quick = flown.aligned(thorough=False)
+    assert quick.accuracy is None and thorough.accuracy is not None
+    assert worst_turn_deg(flown, quick) < 0.6
+    assert 0.02 < relative_error(flown, quick) < 1.2 * relative_error(flown, thorough)
+
+
 def test_large_surveys_are_placed_as_well_from_fewer_observations(plain):
     """As if 18 photos were many; the truth is as near as from all observations."""
     flown, usual = plain

@@ -30,10 +30,10 @@ from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.radiometry import balanced
-from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import rejected
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.clip_frames import with_frames
+from skyquilt.workflows.frame_pixels import pixels_of
 from skyquilt.workflows.links import Links, link_photos
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import (
@@ -141,7 +141,7 @@ def align_photos(
     given = yield from frames_added(given, settings, clock)
     photos = given.survey.photos
     cache = PixelCache(
-        read=lambda i: read_color(photos[i]),
+        read=lambda i: pixels_of(photos[i], store),
         budget_bytes=pixel_budget(settings.running.memory_gb),
         resident_bytes=resident_budget(settings.running.memory_gb),
     )

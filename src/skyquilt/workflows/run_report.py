@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Clock, Steps, peak_memory_mb
+from skyquilt.engine.folder import FILES
 from skyquilt.geometry.frames import angles_from_cam_R_map
 from skyquilt.imaging.nodes import STEP
 from skyquilt.model.event import Note
@@ -21,7 +22,6 @@ from skyquilt.ortho.height_files import write_heights
 from skyquilt.ortho.orthomosaic import used_photos, write_surface
 from skyquilt.quality.seam_measurement import MeasuredSeams
 from skyquilt.raster.atomic import write_text
-from skyquilt.report.about import FILES
 from skyquilt.report.input import CameraResiduals, DepthPicture, ReportInput, SeamMark, Shot
 from skyquilt.report.page import write_report
 from skyquilt.report.parts import UNITS
