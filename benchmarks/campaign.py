@@ -469,7 +469,7 @@ def soak(folder, progress, until):
             progress.note("soak", f"{missing} of {sent} are missing: {latest}")
     finally:
         running.terminate()
-        running.wait(30)
+        running.wait(300)  # it ends after the step at hand, however busy the machine is
 
 
 def moved(body, lap):

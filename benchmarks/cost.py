@@ -75,7 +75,7 @@ def run_process(command: list[str]) -> tuple[float, float, float]:
 def _watch(process: "subprocess.Popen[bytes]", peak: list[float]) -> None:
     while process.poll() is None:
         peak[0] = max(peak[0], tree_rss_mb(process.pid))
-        time.sleep(0.1)
+        time.sleep(0.25)
 
 
 def tree_rss_mb(root: int) -> float:

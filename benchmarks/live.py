@@ -3,7 +3,8 @@
 python benchmarks/live.py latency SURVEY [--rate 1.0] [--gsd 5]   file complete to tile fetched
 python benchmarks/live.py browser SURVEY                          to tile shown by a browser
 python benchmarks/live.py viewers SURVEY [--viewers 20]           the same with moving viewers
-python benchmarks/live.py cost SURVEY                             CPU seconds per photo and step
+python benchmarks/live.py cost SURVEY                             CPU seconds per photo and step,
+                                                                  and the longest step
 python benchmarks/live.py seams SURVEY [--gsd 5]                  seam disparity, live and batch
 
 `live_scaling.py` measures whether the work per photo stays bounded.
@@ -116,6 +117,7 @@ def cost(survey: Path, gsd: float) -> None:
     home = Path(tempfile.mkdtemp())
     live = LiveMap(home / "out", LiveSettings(gsd_cm=gsd))
     used: dict[str, list[float]] = {}
+    longest = 0.0
     for path in photos_of(survey):
         shown, first = 0.0, True
         began = time.process_time()
@@ -127,6 +129,7 @@ def cost(survey: Path, gsd: float) -> None:
             if update is None:
                 break
             seconds = time.process_time() - began
+            longest = max(longest, seconds)
             what = "drawn first" if update.what == "drawn" and first else update.what
             first = first and not (update.what == "drawn" and not live.redraw.urgent)
             steps[what] = steps.get(what, 0.0) + seconds
@@ -135,7 +138,7 @@ def cost(survey: Path, gsd: float) -> None:
             used.setdefault(key, []).append(seconds)
     print(
         {k: round(sum(v) / len(photos_of(survey)), 3) for k, v in used.items()},
-        "s of CPU per photo",
+        f"s of CPU per photo; longest step {longest:.2f} s",
     )
     live.close()
     shutil.rmtree(home, ignore_errors=True)

@@ -10,7 +10,7 @@ import struct
 import tempfile
 import zipfile
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -43,6 +43,9 @@ from skyquilt.planning.site import make_site, read_site
 from skyquilt.planning.terrain import FLAT
 from skyquilt.planning.view import find_view
 from skyquilt.raster.boundary import read_boundary
+from skyquilt.server.layer_endpoints import LayerError, checked
+from skyquilt.server.layer_files import layer_of_bytes
+from skyquilt.video.codec_size import codec_sizes
 from skyquilt.video.container import read_container
 from skyquilt.video.positions import places_at
 from skyquilt.video.tracks import TRACK_ENDINGS, read_track
@@ -235,6 +238,21 @@ def _container(data):
     """The boxes of a clip; FFmpeg, which decodes it, is fuzzed by others."""
     found = read_container(_file("a.mp4", data))
     assert found is None or all(k.isprintable() for k in (found.model, *found.kinds))
+
+
+@cache
+def _descriptions():
+    """Sample descriptions of the recorded clips: H.264, H.265, MPEG-4."""
+    recorded = (HERE.parent / "tests" / "video" / "recorded").glob("*.mp4")
+    found = []
+    for data in [*_clips()[:1], *(p.read_bytes() for p in sorted(recorded))]:
+        at = data.index(b"stsd") - 4
+        found.append(data[at + 8 : at + struct.unpack(">I", data[at : at + 4])[0]])
+    return found
+
+
+def _codec(data):
+    assert all(min(size) >= 0 and max(size) < 2**40 for size in codec_sizes(data))
 
 
 TELEMETRY = b"""1
@@ -469,6 +487,24 @@ def _features(ending):
     return _side(f"site{ending}", read)
 
 
+def _zipped():
+    held = io.BytesIO()
+    with zipfile.ZipFile(held, "w") as archive:
+        archive.writestr("area.shp", _shapefile())
+        archive.writestr("area.prj", 'GEOGCS["GCS_WGS_1984"]')
+    return held.getvalue()
+
+
+def _handed_in(data):
+    """A layer as the live map's page sends it."""
+    try:
+        layer = layer_of_bytes(data, "a.zip")
+    except SkyquiltError:
+        return
+    with suppress(LayerError):
+        checked(json.dumps(layer).encode())
+
+
 def _mission(ending):
     def read(path):
         mission = read_mission(path)
@@ -609,6 +645,7 @@ TARGETS = {
     "tiff": Target(_photo(".tif"), _tiffs, "tiff"),
     "png": Target(_photo(".png"), _pngs, "png"),
     "mp4": Target(_container, _clips, "mp4"),
+    "codec": Target(_codec, _descriptions, "codec"),
     "track": Target(_track, lambda: [TELEMETRY, TIMED, GPX], "track"),
     "exif": Target(_exif_only, lambda: [_exif()[6:]], "exif"),
     "xmp": Target(_xmp_only, lambda: [XMP], "xmp"),
@@ -638,6 +675,7 @@ TARGETS = {
     "site_kml": Target(_features(".kml"), lambda: [KML], "site_kml"),
     "site_gpkg": Target(_features(".gpkg"), lambda: [_geopackage()], "site_gpkg"),
     "site_shp": Target(_features(".shp"), lambda: [_shapefile()], "site_shp"),
+    "layer_zip": Target(_handed_in, lambda: [_zipped()], "layer_zip"),
     "mission_plan": Target(_mission(".plan"), lambda: [_planned()[".plan"]], "mission_plan"),
     "mission_waypoints": Target(
         _mission(".waypoints"), lambda: [WAYPOINTS, _planned()[".waypoints"]], "mission_waypoints"

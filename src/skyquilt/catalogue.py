@@ -68,7 +68,7 @@ ALIGNMENTS: dict[str, tuple[str, dict[str, tuple[str, ...]]]] = {
             "transform": TRANSFORMS,
             "relief": (),
             "levelled": (),
-            "image-search": ("chain", "overview"),
+            "image-search": ("chain", "loop", "overview"),
         },
     ),
     "hybrid": ("skyquilt.papers.aligners:hybrid", {**_LINKS, "optimiser": ("anneal", "surfaces")}),

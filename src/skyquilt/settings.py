@@ -14,7 +14,7 @@ from skyquilt import registry
 from skyquilt.errors import UsageError
 from skyquilt.outside import MOST_MP
 
-IMAGE_SEARCHES = ("chain", "overview")
+IMAGE_SEARCHES = ("chain", "loop", "overview")
 OPTIMISERS = ("anneal", "surfaces")
 LINES = ("heading", "distance")
 TRANSFORMS = ("translation", "similarity", "affine", "homography")
@@ -259,7 +259,9 @@ class ImageSettings:
     levelled: bool = True
     """Register by features of the dominant plane only."""
     image_search: str = "chain"
-    """One of `IMAGE_SEARCHES`: against the last photo, or against the whole map so far."""
+    """One of `IMAGE_SEARCHES`: against the last photo, the same with loops closed, or against the
+    whole map so far.
+    """
     relief_m: float | None = None
     """Largest height variation on the ground in m; None = a tenth of the flying height."""
 

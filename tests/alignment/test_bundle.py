@@ -11,6 +11,8 @@ from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import Control, control_in_frame, fit_similarity_3d
 from skyquilt.alignment.setup import HALF_TURN
 from skyquilt.alignment.stages import position_noise, prune
+from skyquilt.engine.codec import decode, encode
+from skyquilt.engine.kept import made_now
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import angles_from_cam_R_map, rotation_from_vector
@@ -19,6 +21,7 @@ from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link, Matches
 from skyquilt.model.photo import ControlPoint, PointObservation
 from skyquilt.model.poses import MapFrame
+from skyquilt.workflows.artefacts import REGISTRY
 from tests.alignment.blocks import HEIGHT, LENS, WIDTH, make_block, seen_by
 from tests.alignment.surveys import photo, prior
 
@@ -87,8 +90,9 @@ class Flown:
     def aligned(self, **options):
         control = options.pop("control", ())
         frame = options.pop("frame", FRAME)
+        keep = options.pop("keep", made_now)
         return Bundle(**options)(
-            self.photos, frame, self.priors, self.features, self.links, control
+            self.photos, frame, self.priors, self.features, self.links, control, None, keep
         )
 
     def file_pose(self, i):
@@ -129,6 +133,14 @@ def test_a_block_is_found(plain):
     assert camera.sigmas is not None and 0.5 < camera.sigmas[0] < 10 and camera.sigmas[8] > 0
 
 
+def test_a_block_that_is_soon_adjusted_again_is_found_nearly_as_well(plain):
+    flown, thorough = plain
+    quick = flown.aligned(thorough=False)
+    assert quick.accuracy is None and thorough.accuracy is not None
+    assert worst_turn_deg(flown, quick) < 0.6
+    assert 0.02 < relative_error(flown, quick) < 1.2 * relative_error(flown, thorough)
+
+
 def test_large_surveys_are_placed_as_well_from_fewer_observations(plain):
     """As if 18 photos were many; the truth is as near as from all observations."""
     flown, usual = plain
@@ -137,6 +149,41 @@ def test_large_surveys_are_placed_as_well_from_fewer_observations(plain):
     assert len(found.ties.point) < 0.9 * len(usual.ties.point)
     assert relative_error(flown, found) < 1.3 * relative_error(flown, usual)
     assert worst_turn_deg(flown, found) < 0.6
+
+
+class StoppedError(Exception):
+    pass
+
+
+def test_an_interrupted_adjustment_of_many_photos_goes_on_at_its_iteration(plain):
+    flown, _ = plain
+    kept, made = {}, []
+
+    def keep(part, make):
+        if part not in kept:
+            if len(made) == stop:
+                raise StoppedError
+            made.append(part)
+            kept[part] = encode(make())  # as the store keeps it
+        return decode(kept[part], REGISTRY)
+
+    stop = None
+    whole = flown.aligned(many=5, keep=keep)
+    parts, kept = made, {}
+    assert len(parts) == len(set(parts)) > 10
+    for stop in (2, 5, len(parts) // 2, len(parts) - 1):
+        made = []
+        with pytest.raises(StoppedError):
+            flown.aligned(many=5, keep=keep)
+        stop = None
+        again = flown.aligned(many=5, keep=keep)
+        assert made == parts  # nothing twice
+        assert all((p.map_C == again.poses[i].map_C).all() for i, p in whole.poses.items())
+        assert (whole.ties.xyz == again.ties.xyz).all()
+        kept = {}
+    made = []
+    flown.aligned(keep=keep)
+    assert made == []  # few photos are adjusted in a moment
 
 
 def test_tie_points_project_where_they_were_seen(plain):

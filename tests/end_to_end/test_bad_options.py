@@ -26,7 +26,7 @@ pytestmark = pytest.mark.filterwarnings(
             ("--transform", "shear"),
             ("--transform 'shear'", "translation, similarity, affine, homography"),
         ),
-        (("--image-search", "all"), ("--image-search 'all'", "chain, overview")),
+        (("--image-search", "all"), ("--image-search 'all'", "chain, loop, overview")),
         (("--optimiser", "luck"), ("--optimiser 'luck'", "anneal, surfaces")),
         (("--lines", "eye"), ("--lines 'eye'", "heading, distance")),
         (("--max-view-angle", "91"), ("--max-view-angle 91", "outside 0 to 90")),

@@ -1,6 +1,7 @@
 """Every method of alignment by its name, from photos to map, and what it refuses."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -250,7 +251,7 @@ def test_compare_sets_methods_side_by_side(lines, tmp_path):
 
 
 @pytest.mark.slow
-def test_compare_judges_by_the_bundle_where_nothing_is_known(lines, tmp_path):
+def test_compare_judges_by_baselines_where_nothing_is_known(lines, tmp_path):
     code, _, err = skyquilt(
         "compare",
         lines / "photos",
@@ -267,10 +268,18 @@ def test_compare_judges_by_the_bundle_where_nothing_is_known(lines, tmp_path):
     )
     assert code == 0, err
     record = json.loads((tmp_path / "out" / "compare.json").read_text())
-    assert "from a model" in record["judged_by"] and len(record["photos"]) == 8
-    bundle = record["methods"]["bundle"]["distances"]
-    assert bundle and all(abs(d["error_m"]) < 0.3 for d in bundle)
-    assert (tmp_path / "out" / "distances.csv").is_file()
+    assert "baselines" in record["judged_by"] and len(record["photos"]) == 8
+    # what the bundle says of its own tie points is no judge: those distances are gone
+    assert not (tmp_path / "out" / "distances.csv").exists()
+    truth = json.loads((lines / "truth" / "truth.json").read_text())["photos"]
+    place = {p["name"]: p["position"] for p in truth}
+    bundle, pose = (record["methods"][m] for m in ("bundle", "pose"))
+    assert len(bundle["distances"]) == len(pose["distances"]) == 15
+    for d in bundle["distances"]:
+        true = math.dist(place[d["a"]][:2], place[d["b"]][:2])
+        assert d["on_map"] == pytest.approx(true, rel=0.05)  # reported ones are off by up to 36 %
+    assert pose["lambda_spat"] is None is pose["distances"][0]["on_map"]  # it repeats them
+    assert 0.9 < bundle["lambda_spat"] < 1
 
 
 @pytest.mark.parametrize(

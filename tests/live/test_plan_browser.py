@@ -2,9 +2,12 @@
 
 import zipfile
 
+import numpy as np
 import pytest
 
+from tests.accessible import problems
 from tests.live.test_browser import browser, holds, page, shot  # noqa: F401 - fixtures
+from tests.live.test_browser import seen as page_pixels
 from tests.live.test_mission import plan_of, watched
 
 pytestmark = pytest.mark.slow
@@ -66,7 +69,46 @@ def test_an_area_and_a_keep_out_are_drawn_and_planned(page, tmp_path):  # noqa: 
         holds(page, "document.querySelectorAll('#plans a.file').length >= 8", 180)
         page.wait_for_timeout(1000)
         shot(page, "drawn")
-        page.reload()
+        another = page.context.browser.new_page()  # another person's browser
+        another.goto(url)
+        holds(another, "skyquilt.plan && skyquilt.plan.shapes().length == 2")
+        another.click("#draw-clear")
+        holds(page, "skyquilt.plan.shapes().length == 0")
+        another.close()
+        assert not page.errors
+
+
+def test_photos_placed_by_their_metadata_are_pale_until_they_are_refined(page, flight, tmp_path):  # noqa: F811
+    """A dashed outline, and a fifth of white over what is not sure yet, however many photos show
+    it; gone when they are refined.
+    """
+    with watched(tmp_path / "out", None) as (live, web, url):
+        refined, live._refined = live._refined, lambda: None
+        for path in flight.photos[:3]:
+            web.post("/photos", params={"name": path.name}, content=path.read_bytes())
+        page.goto(url)
         page.wait_for_selector("#link.live")
-        assert page.evaluate("skyquilt.plan.shapes().length") == 2
+        count = "skyquilt.plan.provisional.getLayers().length"
+        holds(page, f"{count} == 3", 60)
+        styles = page.evaluate(
+            "skyquilt.plan.provisional.getLayers().map(l => l.options.dashArray)"
+        )
+        assert all(styles)
+        page.click("#tracks")  # their lines would be counted too
+        page.click("#fit")
+        page.wait_for_timeout(3000)
+        shot(page, "provisional")
+        pale = page_pixels(page)
+        assert problems(page) == []
+        live._refined = refined
+        holds(page, f"{count} == 0", 60)
+        page.wait_for_timeout(4000)
+        shot(page, "no-longer-provisional")
+        sure = page_pixels(page)
+        drawn = (np.abs(sure - (217, 217, 217)).max(-1) > 30) & (
+            np.abs(pale - (217, 217, 217)).max(-1) > 12
+        )
+        assert drawn.sum() > 5000
+        lifted = (pale[drawn].mean() - sure[drawn].mean()) / (255 - sure[drawn].mean())
+        assert 0.18 < lifted < 0.27  # 0.22, and the outlines; where three photos overlap, too
         assert not page.errors

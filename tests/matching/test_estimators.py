@@ -2,6 +2,8 @@
 it cannot.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -175,6 +177,40 @@ def test_ste_falls_back_to_its_second_half():
     assert error(found, H) < 1.0
     again = RansacSte()(a, b)
     assert (again.b_H_a == found.b_H_a).all() and again.iterations == found.iterations
+
+
+@pytest.mark.parametrize(
+    ("errors", "method", "tries"),
+    [
+        ((0.3, 0.9, 0.1), "RANSAC-1-OPT", 3),  # only step 1 is tested against 0.5 (A 2.5, step 2)
+        ((0.6, 0.1), "RANSAC-2-OPT", 1),
+        ((0.3, 0.9, 0.9, 0.9, 0.9, 0.1), "RANSAC-2-OPT", 5),
+    ],
+)
+def test_ste_tests_only_the_first_error_against_the_half_pixel(monkeypatch, errors, method, tries):
+    """The flow of A's Figure 8, with the errors of RANSAC-1-OPT dictated."""
+    a, b, _, _ = matches("homography", 0, 0.0, 150)
+    told, made = list(errors), []
+
+    def first(self, rng, a, b):
+        found = self._ransac_2(rng, a, b)
+        made.append(told.pop(0))
+        return found
+
+    def optimised(self, found, a, b):
+        return replace(found, ste=0.4 if seconds else made[-1])
+
+    seconds = []
+    real = RansacSte._second
+
+    def second(self, *rest):
+        seconds.append(1)
+        return real(self, *rest)
+
+    monkeypatch.setattr(RansacSte, "_ransac_1", first)
+    monkeypatch.setattr(RansacSte, "_optimised", optimised)
+    monkeypatch.setattr(RansacSte, "_second", second)
+    assert RansacSte()(a, b).method == method and len(made) == tries
 
 
 def test_ste_as_printed_breaks_where_the_extension_holds():

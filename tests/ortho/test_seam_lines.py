@@ -143,3 +143,27 @@ def test_nothing_known_gives_no_contours():
     z = np.full((20, 20), np.nan, np.float32)
     z[0, 0] = 1.0
     assert list(contour_lines(z, 0.5)) == []
+
+
+def test_seams_go_on_at_their_tile(scene, monkeypatch):
+    views, pictures = scene
+    monkeypatch.setattr("skyquilt.ortho.seam_lines.TILE", 16)
+    kept, made = {}, []
+
+    def keep(part, make):
+        if part not in kept:
+            made.append(part)
+            kept[part] = make()
+        return kept[part]
+
+    grey = lambda photo, side: pictures[photo]  # noqa: E731
+    whole = SeamLines()(views, FLAT, GRID, grey, NEUTRAL)
+    first = SeamLines()(views, FLAT, GRID, grey, NEUTRAL, keep)
+    assert len(made) > 3
+    for part in made[2:]:
+        del kept[part]
+    before = len(made)
+    again = SeamLines()(views, FLAT, GRID, grey, NEUTRAL, keep)
+    assert made[before:] == made[2:before]
+    for labels in (first, again):
+        assert (labels.photo == whole.photo).all() and (labels.hidden == whole.hidden).all()

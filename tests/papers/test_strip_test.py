@@ -31,7 +31,7 @@ def ends(folder):
 @pytest.mark.slow
 def test_the_order_of_the_thesis(finished):
     folder, events = finished
-    (none, two, four, six, tangential, flat, similarity), found = ends(folder)
+    (none, two, four, six, tangential, flat, similarity, *halves), found = ends(folder)
     assert similarity >= 0.97
     assert (
         none < 0.3 and none < two < tangential and four < tangential and six < tangential
@@ -40,9 +40,14 @@ def test_the_order_of_the_thesis(finished):
     rms = [v["calibration_rms_px"] for v in found["variants"][:5]]
     assert rms == sorted(rms, reverse=True) and rms[0] > 5 * rms[-1]
     for v in found["variants"]:
-        assert len(v["eta"]) == 21 and v["eta"][0] == 1 and 0 < min(v["eta"]) <= max(v["eta"]) <= 1
+        eta = v["eta"][:: v["every"]]
+        assert len(v["eta"]) == 21 and eta[0] == 1 and 0 < min(eta) <= max(eta) <= 1
+        assert sum(e is None for e in v["eta"]) == (0 if v["every"] == 1 else 10)
+    # Y Fig. 4.5: with every other photo the overlap is 40 % and the similarity keeps the shape
+    homography, similar = halves
+    assert similar > 0.95 and similar > homography
     assert isinstance(events[-1], Result) and events[-1].metrics["flights"] == 1
-    assert [e.done for e in events if isinstance(e, StageProgress)] == list(range(1, 8))
+    assert [e.done for e in events if isinstance(e, StageProgress)] == list(range(1, 10))
 
 
 @pytest.mark.slow
@@ -53,7 +58,7 @@ def test_the_page_is_whole(finished):
     _, found = ends(finished[0])
     for v in found["variants"]:
         assert page.count(v["name"]) >= 3  # in both legends and in the table
-    assert page.count('<path style="fill:none') == 14
+    assert page.count('<path style="fill:none') == 18
 
 
 def test_a_perfect_camera_over_level_boards_keeps_the_shape(tmp_path):

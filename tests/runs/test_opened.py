@@ -1,5 +1,6 @@
 """A finished run, opened again in Python."""
 
+import re
 import shutil
 
 import numpy as np
@@ -96,3 +97,24 @@ def test_other_programs_find_times_and_colours(finished):
     assert (colours == 128).all(1).mean() < 0.1 and colours.std(0).min() > 5
     listed = [f["properties"]["capture_time"] for f in finished.json("shots.geojson")["features"]]
     assert sorted(listed) == sorted(times)
+
+
+def test_notebooks_are_legible_in_light_and_dark(finished, flight):
+    """Every colour that is drawn has a contrast of 3 (WCAG 1.4.11) on white and on dark paper;
+    text takes the notebook's own colour, and what is not text has a name.
+    """
+    for thing in (skyquilt.open_run(finished.output), skyquilt.read_survey(flight / "photos")):
+        html = thing._repr_html_()
+        colours = set(re.findall(r'(?:fill|stroke)="(#[0-9a-f]+)"', html))
+        for colour in colours:
+            digits = colour[1:] if len(colour) == 7 else "".join(c * 2 for c in colour[1:])
+            shares = [int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4)]
+            light = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in shares]
+            y = 0.2126 * light[0] + 0.7152 * light[1] + 0.0722 * light[2]
+            for paper in (1.0, 0.0056):  # white, and the #111 of dark notebooks
+                low, high = sorted((y, paper))
+                assert (high + 0.05) / (low + 0.05) >= 3, colour
+        assert "color:" not in html and "background" not in html
+        pictures = re.findall(r"<(?:img|svg|table)[^>]*>", html)
+        assert len(pictures) == 2
+        assert all("alt=" in p or "aria-label=" in p for p in pictures)

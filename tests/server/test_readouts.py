@@ -9,6 +9,10 @@ import pytest
 import rasterio
 from pyproj import Transformer
 
+from skyquilt.raster.map_source import FileSource
+from skyquilt.runs.layers import RunLayer
+from skyquilt.server.parts import write_part
+
 
 @pytest.fixture(scope="module")
 def ground(finished):
@@ -35,6 +39,44 @@ def test_every_raster_is_a_layer_and_measured_ones_have_a_legend(web, finished):
         box = {"bbox": f"{west},{south},{east},{north}", "layer": name}
         assert web.get("/export", params=box).status_code == 200, name
     assert web.get("/wms", params={"service": "WMS", "request": "GetCapabilities"}).is_success
+
+
+def test_a_saved_part_is_the_map_s_own_pixels(web, finished):
+    with rasterio.open(finished.output / "dsm.tif") as file:
+        box = [v + d for v, d in zip(file.bounds, (3.03, 4.04, -5.05, -2.02), strict=True)]
+        to = Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True)
+        bbox = ",".join(str(v) for v in to.transform_bounds(*box))
+        whole, step = file.read(1), file.res[0]
+        answer = web.get("/export", params={"bbox": bbox, "layer": "heights"})
+        with rasterio.open(io.BytesIO(answer.content)) as part:
+            z = part.read(1)
+            assert part.res == file.res and part.units == file.units
+            c, r = (round(v) for v in ~file.transform @ (part.bounds.left, part.bounds.top))
+            assert part.bounds.left == pytest.approx(file.bounds.left + c * step, abs=1e-6)
+    expected = whole[r : r + z.shape[0], c : c + z.shape[1]]
+    assert z.size > 1000 and np.array_equal(z, expected, equal_nan=True)
+
+
+def test_a_saved_part_of_an_older_map_in_degrees(finished, tmp_path):
+    """Its pixels are small numbers of degrees, not metres."""
+    with rasterio.open(
+        tmp_path / "old.tif",
+        "w",
+        driver="GTiff",
+        width=300,
+        height=200,
+        count=1,
+        dtype="uint8",
+        crs="EPSG:4326",
+        transform=rasterio.transform.from_origin(15.0, 50.0, 1e-6, 1e-6),
+    ) as file:
+        file.write(np.arange(60_000).reshape(1, 200, 300).astype(np.uint8))  # fmt: skip
+    source = FileSource(path=tmp_path / "old.tif")
+    layer = RunLayer(name="base", title="", file="")
+    bounds = (15.00005, 49.99985, 15.00015, 49.99995)
+    assert write_part(source, layer, bounds, tmp_path / "part.tif")
+    with rasterio.open(tmp_path / "part.tif") as part:
+        assert (part.width, part.height) == (100, 100) and part.crs.to_epsg() == 4326
 
 
 def test_a_place_has_coordinates_height_and_values(web, ground):

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from PIL import Image
 from playwright.sync_api import sync_playwright
+from pyproj import Transformer
 
 from skyquilt.server.access import Guard
 from skyquilt.server.server_thread import ServerThread
 from skyquilt.server.survey import open_survey
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.mosaic import mosaic
+from tests.accessible import problems, tab_order
 
 pytestmark = pytest.mark.slow
 SHOTS = os.environ.get("SKYQUILT_SCREENSHOTS")
@@ -211,6 +213,60 @@ def test_the_photo_is_shown_in_full_with_the_place_marked(browser, site):
     with page.expect_download() as saving:
         page.locator("#downloads a").first.click()
     assert Path(saving.value.path()).read_bytes()[:2] == b"II"
+    assert page.errors == []
+
+
+@pytest.mark.parametrize("look", ["light", "dark"])
+def test_screen_readers_and_keyboards_reach_everything(browser, site, run, look):
+    """By Chromium's accessibility tree, the way of the Tab key, and the contrast of all text."""
+    page = opened(browser, site, look)
+    page.mouse.click(*middle(page))
+    page.wait_for_selector("#covering li.chosen img.thumb")
+    page.click("#distance")
+    page.get_by_role("button", name="Control points").click()
+    page.get_by_role("button", name="Add a point").click()
+    assert page.evaluate("document.activeElement.tagName") == "INPUT"
+    page.wait_for_timeout(500)
+    assert problems(page) == []
+    page.reload()
+    page.wait_for_selector("#link.live")
+    page.wait_for_timeout(1500)
+    order = tab_order(page)
+    assert all(at["seen"] and at["outline"] for at in order)
+    assert [at["at"] for at in order] == sorted(at["at"] for at in order)
+    reached = [at["what"] for at in order]
+    for name in ("layer", "distance", "export", "drop", "fold"):
+        assert name in reached, reached
+    page.goto((run / "report.html").as_uri())
+    assert problems(page) == []
+    order = tab_order(page)
+    assert len(order) > 20 and all(at["seen"] and at["outline"] for at in order)
+
+
+def test_a_control_point_is_taken_from_the_map_by_a_click(browser, site):
+    page = opened(browser, site)
+    page.get_by_role("button", name="Control points").click()
+    page.get_by_role("button", name="Add a point").click()
+    page.click("#controlpick")
+    x, y = middle(page)
+    page.mouse.click(x + 60, y - 40)
+    holds(page, "document.querySelectorAll('#control form input')[1].value != ''")
+    at = page.evaluate(
+        "([x, y]) => { const p = skyquilt.map.containerPointToLatLng([x, y]);"
+        " return [p.lng, p.lat]; }",
+        [x + 60 - page.locator("#map").bounding_box()["x"],
+         y - 40 - page.locator("#map").bounding_box()["y"]],
+    )  # fmt: skip
+    values = [float(page.locator("#control form input").nth(k).input_value()) for k in (1, 2)]
+    to = Transformer.from_crs("EPSG:4326", "EPSG:32633", always_xy=True)
+    assert np.abs(np.array(values) - to.transform(*at)).max() < 0.01
+    assert page.locator("#covering li").count() == 0  # the click chose a place, no photos
+    shot(page, "pick")
+    page.locator("#control form button[type=submit]").click()
+    holds(page, "control.points.length == 1 && control.rows.length > 2")
+    assert page.locator("#controlpick").count() == 0
+    page.mouse.click(x, y)
+    page.wait_for_selector("#covering li.chosen")  # clicks choose photos again
     assert page.errors == []
 
 

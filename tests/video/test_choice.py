@@ -9,6 +9,7 @@ import pytest
 from skyquilt.engine.clock import result_of
 from skyquilt.engine.store import Store
 from skyquilt.model.clip import Looks
+from skyquilt.photos.pixels import read_color
 from skyquilt.settings import InputSettings
 from skyquilt.video.choice import FrameChoice, relative_sharpness, shared
 from skyquilt.video.decoder import Decoder
@@ -16,6 +17,7 @@ from skyquilt.video.looks import Looker, joined
 from skyquilt.video.read import read_clip
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.clip_frames import with_frames
+from skyquilt.workflows.frame_pixels import pixels_of
 from skyquilt.workflows.survey_input import read_input
 from tests.video.clips import SIZE, flown, write_clip
 
@@ -114,6 +116,18 @@ def test_a_resume_decodes_nothing(film, tmp_path, monkeypatch):
     assert [p.name for p in again.survey.photos] == names
     other = result_of(with_frames(given, replace(settings, frame_overlap=85.0), store))
     assert len(other.survey.photos) > 1.4 * len(names)
+
+
+def test_a_frame_is_decoded_from_its_clip_once(film, tmp_path, monkeypatch):
+    store = Store(folder=tmp_path, registry=REGISTRY)
+    photos = result_of(with_frames(read_input(film, InputSettings()), InputSettings(), store))
+    photo = photos.survey.photos[3]
+    plain = read_color(photo).astype(float)
+    first = pixels_of(photo, store)
+    assert first.shape == plain.shape and first.dtype == np.uint8
+    assert 10 * np.log10(255**2 / ((first - plain) ** 2).mean()) > 38
+    monkeypatch.setattr("skyquilt.photos.pixels.frame_of", None)
+    assert (pixels_of(photo, store) == first).all()
 
 
 def test_telemetry_of_another_clip_is_not_used(film, tmp_path):

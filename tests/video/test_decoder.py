@@ -28,6 +28,16 @@ def test_a_seek_gives_the_same_frame_as_going_there(clip):
     decoder.close()
 
 
+def test_distant_frames_are_sought_and_near_ones_gone_to(clip, monkeypatch):
+    """Each in the way that decodes fewer frames; OpenCV's seek decodes 16 and more."""
+    decoder, sought = Decoder(clip), []
+    seek = decoder._seek
+    monkeypatch.setattr(decoder, "_seek", lambda t: (sought.append(round(t * 29.97)), seek(t)))
+    order = [0, 20, 40, 80, 120, 140]
+    assert [number_of(decoder.at(i / 29.97)[1]) for i in order] == order
+    assert sought == [80, 120]
+
+
 def test_frames_of_many_clips_are_told_apart_and_missing_ones_refused(tmp_path):
     paths = [write_clip(tmp_path / f"{k}.mp4", list(numbered(20))[k:], fps=10) for k in range(6)]
     assert [number_of(frame_of(p, 0.5)) for p in [*paths, *paths[::-1]]] == [

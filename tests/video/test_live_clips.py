@@ -61,9 +61,9 @@ def test_a_watched_folder_takes_the_frames_of_a_finished_clip(film, tmp_path):
     assert list(watch.look()) == []
     (folder / "A.MP4").write_bytes(data)
     shutil.copy(film.with_suffix(".SRT"), folder)
-    done, until = [], time.monotonic() + 10
-    while not done and time.monotonic() < until:
-        done = list(watch.look())
+    done, until = [], time.monotonic() + 60
+    while (not done or watch.growing) and time.monotonic() < until:
+        done += watch.look()
         time.sleep(0.02)
     assert len(done) > 3
     assert all(isinstance(d, Accepted) for d in done)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from skyquilt.alignment.equations import Equations, add_diagonal, sums_by_point
 from skyquilt.alignment.problem import CAMERA, Problem, State, linearised_points
 from skyquilt.alignment.robust import observation_weights, point_terms, robust_cost
+from skyquilt.engine.kept import Keep, made_now
 from skyquilt.geometry.block_cholesky import Factor, Index, Matrix
 from skyquilt.geometry.levenberg_marquardt import levenberg_marquardt
 
@@ -108,6 +109,7 @@ def adjust(
     iterations: int = 30,
     tolerance: float = 1e-5,
     damping: float = 1e-4,
+    keep: Keep = made_now,
 ) -> Adjusted:
     """Minimises the robust cost.
 
@@ -121,6 +123,7 @@ def adjust(
         iterations: largest number of steps.
         tolerance: relative decrease of the cost below which the adjustment has converged.
         damping: first damping, relative to the diagonal of the normal equations.
+        keep: keeps each iteration, from where an interrupted run goes on.
     """
     system = Equations(problem, state)
     last: list[tuple[State, float]] = []
@@ -138,7 +141,13 @@ def adjust(
         return last[0][1] if known else cost(state), step
 
     found = levenberg_marquardt(
-        state, equations, cost, iterations=iterations, tolerance=tolerance, damping=damping
+        state,
+        equations,
+        cost,
+        iterations=iterations,
+        tolerance=tolerance,
+        damping=damping,
+        keep=keep,
     )
     return Adjusted(
         state=found.state, cost=found.cost, iterations=found.iterations, converged=found.converged

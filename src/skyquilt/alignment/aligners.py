@@ -48,6 +48,7 @@ class ByLinks:
             inputs.links,
             control,
             inputs.grey,
+            inputs.keep,
         )
         return replace(with_loose_photos(found, inputs.photos, inputs.priors), why=REQUESTED)
 

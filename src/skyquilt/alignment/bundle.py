@@ -14,10 +14,11 @@ from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, ti
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, undetermined
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
-from skyquilt.alignment.stages import believe_positions, fine, rough, weighed
+from skyquilt.alignment.stages import believe_positions, fine, plain, rough, weighed
 from skyquilt.alignment.start import Start, find_start
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
+from skyquilt.engine.kept import Keep, made_now, within
 from skyquilt.errors import AlignmentError
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
@@ -49,6 +50,10 @@ class Bundle:
     """
     match_observations: LeastSquaresMatching | None = field(default_factory=LeastSquaresMatching)
     """Refinement of observations in larger images; None leaves keypoints unchanged."""
+    thorough: bool = True
+    """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
+    False takes a third of the time, for blocks that are soon adjusted again.
+    """
     version: ClassVar[int] = 20
 
     def __call__(
@@ -60,9 +65,11 @@ class Bundle:
         links: Sequence[Link],
         control: Sequence[Control] = (),
         grey: GreyPicture | None = None,
+        keep: Keep = made_now,
     ) -> Alignment:
         """Aligns the photos that are connected by links; `grey` gives images for the refinement of
-        observations.
+        observations. `keep`: parts of the adjustment of more than `many` photos are kept, so that
+        an interrupted run goes on.
 
         Raises:
             AlignmentError: no two photos are linked.
@@ -71,7 +78,8 @@ class Bundle:
 
         def block(aside: frozenset[int]) -> Alignment:
             upright = [k for k in links if k.a not in aside and k.b not in aside]
-            return self._block(photos, frame, priors, features, upright, control, grey)
+            part = within(keep, f"{sorted(aside)}") if len(photos) > self.many else made_now
+            return self._block(photos, frame, priors, features, upright, control, grey, part)
 
         try:
             found = block(aside)
@@ -91,6 +99,7 @@ class Bundle:
         links: Sequence[Link],
         control: Sequence[Control],
         grey: GreyPicture | None,
+        keep: Keep,
     ) -> Alignment:
         """Adjusts the photos that these links connect."""
         start = find_start(photos, priors, features, links)
@@ -106,24 +115,32 @@ class Bundle:
             tracks = thin(tracks, sizes, per_photo=self.ties, least=self.ties // 2)
         used = setup.sensor_tracks(tracks)
         problem, state = setup.problem(thin(used, sizes, per_photo=begin, least=least))
-        problem, state = rough(problem, state)
+        problem, state = rough(problem, state, within(keep, "rough"))
         setup = setup.moving_as(photos, state.C)
         problem = replace(problem, velocity=setup.base.velocity)
-        if grey is not None and self.match_observations is not None:
-            used = _sharpened(used, photos, setup, problem, state, self.match_observations, grey)
+        method = self.match_observations
+        if grey is not None and method is not None:
+            part = within(keep, "sharp")
+            used = _sharpened(used, photos, setup, problem, state, method, grey, part)
             begin = 0
         if begin != each:
             problem, _ = setup.problem(thin(used, sizes, per_photo=each, least=least))
             state = triangulated(problem, state)
-        problem, state = fine(problem, state)
+        problem, state = fine(problem, state, within(keep, "fine"))
         setup = setup.moving_as(photos, state.C)
         problem = replace(problem, velocity=setup.base.velocity)
-        problem, state = weighed(problem, state, setup)
+        if self.thorough:
+            problem, state = weighed(problem, state, setup, within(keep, "weighed"))
+        else:
+            problem, state = plain(problem, state, within(keep, "plain"))
         setup = replace(setup, base=replace(setup.base, velocity=problem.velocity))
         if self.repair:
-            problem, state = believe_positions(problem, state, setup)
+            part = within(keep, "positions")
+            problem, state = believe_positions(problem, state, setup, part)
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
-        done = _outcome(photos, frame, setup, start, used, problem, state, reports)
+        done = _outcome(
+            photos, frame, setup, start, used, problem, state, reports, predicted=self.thorough
+        )
         held = setup.georeferenced or any(not c.check for c in reports)
         return done if held or tilts_reported(priors) else levelled(done)
 
@@ -136,6 +153,7 @@ def _sharpened(
     state: State,
     match_observations: LeastSquaresMatching,
     grey: GreyPicture,
+    keep: Keep,
 ) -> Tracks:
     """Tracks (sensor pixels) with observations refined in larger images."""
     everything, _ = setup.problem(tracks)
@@ -144,7 +162,7 @@ def _sharpened(
     poses = pose_records(setup, state)
     filed = replace(tracks, px=setup.file_px(tracks.photo, tracks.px))
     sharp = match_observations(
-        filed, xyz, poses, {i: cameras[k] for i, k in camera_of.items()}, grey
+        filed, xyz, poses, {i: cameras[k] for i, k in camera_of.items()}, grey, keep
     )
     return replace(sharp, px=setup.file_px(sharp.photo, sharp.px))
 
@@ -158,6 +176,8 @@ def _outcome(
     problem: Problem,
     state: State,
     control: Sequence[Control],
+    *,
+    predicted: bool,
 ) -> Alignment:
     ties = ground_points(tracks, setup, problem, state)
     seen = np.bincount(ties.photo, minlength=len(photos))
@@ -181,7 +201,7 @@ def _outcome(
         ties=ties,
         rejected=weak,
         control=residuals_of_control(control, frame, setup, problem, state, full),
-        accuracy=None if full is None else accuracy(setup, problem, state, full),
+        accuracy=accuracy(setup, problem, state, full) if predicted and full else None,
         notes=undetermined(setup, problem, state, full),
         loo_rms_m=leave_one_out(problem, state, full) if setup.georeferenced else None,
     )

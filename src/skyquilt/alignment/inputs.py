@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.engine.kept import Keep, made_now
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import ControlPoint, Photo
 from skyquilt.model.poses import Alignment, MapFrame, Prior
@@ -35,6 +36,8 @@ class AlignmentInputs:
     """Photos in the order in which they are joined; photos not listed are left out."""
     grey: GreyPicture
     """Gives grey images."""
+    keep: Keep = made_now
+    """Keeps parts of large adjustments."""
 
 
 class Aligner(Protocol):

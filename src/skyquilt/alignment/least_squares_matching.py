@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.tracks import Tracks
+from skyquilt.engine.kept import Keep, made_now
 from skyquilt.geometry.camera import pixels
 from skyquilt.imaging.align_patches import translate
 from skyquilt.model.camera import Camera
@@ -25,6 +26,10 @@ GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), with at most the given px on its longest side."""
 MARGIN = 3
 """Largest shift of an observation in patch px."""
+PART = 100_000
+"""Observations, about, whose patches are in memory at once (0.5 kB each). Tracks that the same
+photos show follow one another, so a part needs few photos.
+"""
 BATCH = 4000
 """Number of observations registered at a time, to bound memory."""
 
@@ -52,10 +57,29 @@ class LeastSquaresMatching:
         poses: Mapping[int, Pose],
         cameras: Mapping[int, Camera],
         grey: GreyPicture,
+        keep: Keep = made_now,
     ) -> Tracks:
         """Tracks (file pixels) with refined observations; `xyz` (count, 3): their points in the map
-        frame.
+        frame. `keep`: each part of some ten thousand observations.
         """
+        px, sigma = tracks.px.copy(), tracks.sigma_px.copy()
+        for some, points in tracks.parts(PART):
+
+            def part(some: slice = some, points: slice = points) -> tuple[Array, Array]:
+                return self._sharper(tracks.part(some, points), xyz[points], poses, cameras, grey)
+
+            px[some], sigma[some] = keep(f"{points.start}", part)
+        return replace(tracks, px=px, sigma_px=sigma)
+
+    def _sharper(
+        self,
+        tracks: Tracks,
+        xyz: Array,
+        poses: Mapping[int, Pose],
+        cameras: Mapping[int, Camera],
+        grey: GreyPicture,
+    ) -> tuple[Array, Array]:
+        """Refined observations (N, 2), and their deviations (N,)."""
         anchor = self._anchors(tracks, cameras)
         patches, scale = self._patches(tracks, xyz, poses, cameras, grey)
         others = np.flatnonzero(anchor[tracks.point] != np.arange(len(tracks.point)))
@@ -68,7 +92,7 @@ class LeastSquaresMatching:
         sharp = np.maximum(self.sigma * scale[others[good]], 0.2)
         sigma[others[good]] = sharp
         sigma[first[good]] = np.maximum(self.sigma * scale[first[good]], 0.2)
-        return replace(tracks, px=px, sigma_px=sigma)
+        return px, sigma
 
     def _registered(
         self, patches: NDArray[np.uint8], first: NDArray[np.int64], others: NDArray[np.int64]

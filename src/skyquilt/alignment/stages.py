@@ -12,6 +12,7 @@ from skyquilt.alignment.deviations import believed, observed_noise, robust_scale
 from skyquilt.alignment.problem import READOUT, Problem, State, residuals_px, swept
 from skyquilt.alignment.robust import robust_cost
 from skyquilt.alignment.setup import Setup
+from skyquilt.engine.kept import Keep, made_now, within
 
 Array = NDArray[np.float64]
 ROLLS_PX = 0.3
@@ -22,50 +23,69 @@ DOUBTED = 2.5
 """Positions that a block misses by more than this many deviations are not what they claim."""
 
 
-def rough(problem: Problem, state: State) -> tuple[Problem, State]:
+def rough(problem: Problem, state: State, keep: Keep = made_now) -> tuple[Problem, State]:
     """First stage: intrinsics fixed under a wide loss, then all free under a narrower one; outliers
     are removed in between.
     """
     fixed = replace(problem, free=np.zeros_like(problem.free), loss_px=20.0)
-    state = adjust(fixed, state, iterations=10, tolerance=3e-2).state
+    part = within(keep, "fixed")
+    state = adjust(fixed, state, iterations=10, tolerance=3e-2, keep=part).state
     problem, state = prune(problem, state, 40.0)
-    state = adjust(problem.with_loss(6.0), state, iterations=20, tolerance=3e-3, damping=1e-5).state
+    narrow, part = problem.with_loss(6.0), within(keep, "free")
+    state = adjust(narrow, state, iterations=20, tolerance=3e-3, damping=1e-5, keep=part).state
     return prune(problem, state, 12.0)
 
 
-def fine(problem: Problem, state: State) -> tuple[Problem, State]:
+def fine(problem: Problem, state: State, keep: Keep = made_now) -> tuple[Problem, State]:
     """Second stage: all unknowns free under ever narrower losses; outliers are removed in
     between.
     """
     problem, state = prune(problem, state, 20.0)
-    state = adjust(problem.with_loss(2.5), state, iterations=20, tolerance=2e-3, damping=1e-6).state
+    narrow, part = problem.with_loss(2.5), within(keep, "2.5")
+    state = adjust(narrow, state, iterations=20, tolerance=2e-3, damping=1e-6, keep=part).state
     problem, state = prune(problem, state, 5.0)
-    return problem, adjust(
-        problem.with_loss(2.0), state, iterations=15, tolerance=3e-4, damping=1e-6
-    ).state
+    narrow, part = problem.with_loss(2.0), within(keep, "2.0")
+    state = adjust(narrow, state, iterations=15, tolerance=3e-4, damping=1e-6, keep=part).state
+    return problem, state
 
 
-def weighed(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
+def weighed(
+    problem: Problem, state: State, setup: Setup, keep: Keep = made_now
+) -> tuple[Problem, State]:
     """The adjustment repeated with observations as sharp as their residuals show them to be, and
     with the weight that those are worth; with turns of the cameras where rows were exposed one
     after the other.
     """
-    reach = np.linalg.norm(swept(problem, state), axis=1) / heights_above(state)
-    rolls = bool((reach * state.K[problem.camera, 0] > ROLLS_PX).any())
+    rolls = _rolls(problem, state)
     if rolls:
         readout = np.abs(state.K[problem.camera, READOUT])
         problem = replace(problem, sigma_turn=np.maximum(TURN_RAD_S * readout, 1e-9))
-        state = adjust(problem, state, iterations=15, tolerance=1e-3, damping=1e-6).state
-    for _ in range(2):
+        part = within(keep, "turns")
+        state = adjust(problem, state, iterations=15, tolerance=1e-3, damping=1e-6, keep=part).state
+    for again in range(2):
         scale = robust_scale(problem, state)
         problem = replace(problem, sigma_px=problem.sigma_px * scale)
         noise = observed_noise(problem.with_loss(2.0), state, setup.size[setup.members])
         problem = believed(problem.with_loss(2.0), noise)
-        state = adjust(problem, state, iterations=15, tolerance=3e-4, damping=1e-6).state
-    return _standing(problem, state) if rolls else (problem, state)
+        part = within(keep, str(again))
+        state = adjust(problem, state, iterations=15, tolerance=3e-4, damping=1e-6, keep=part).state
+    return _standing(problem, state, within(keep, "still")) if rolls else (problem, state)
 
 
-def _standing(problem: Problem, state: State) -> tuple[Problem, State]:
+def plain(problem: Problem, state: State, keep: Keep) -> tuple[Problem, State]:
+    """In place of `weighed`, in a third of the time: observations keep their weights, and only
+    drones that stop are told from those that fly on.
+    """
+    return _standing(problem, state, keep) if _rolls(problem, state) else (problem, state)
+
+
+def _rolls(problem: Problem, state: State) -> bool:
+    """Whether a camera moves visibly while a photo is read out."""
+    reach = np.linalg.norm(swept(problem, state), axis=1) / heights_above(state)
+    return bool((reach * state.K[problem.camera, 0] > ROLLS_PX).any())
+
+
+def _standing(problem: Problem, state: State, keep: Keep) -> tuple[Problem, State]:
     """The adjustment as if cameras stood still while they expose, where that explains the photos
     better: drones that stop for each photo have positions and times as if they flew on.
     """
@@ -76,7 +96,7 @@ def _standing(problem: Problem, state: State) -> tuple[Problem, State]:
     K = state.K.copy()
     K[:, READOUT] = problem.K0[:, READOUT]
     begin = replace(state, K=K, turn=np.zeros_like(state.turn))
-    stood = adjust(other, begin, iterations=10, tolerance=1e-3, damping=1e-6)
+    stood = adjust(other, begin, iterations=10, tolerance=1e-3, damping=1e-6, keep=keep)
     if stood.cost < robust_cost(problem, state):
         return other, stood.state
     return problem, state
@@ -100,7 +120,9 @@ def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]
     return thinner, replace(state, X=state.X[points])
 
 
-def believe_positions(problem: Problem, state: State, setup: Setup) -> tuple[Problem, State]:
+def believe_positions(
+    problem: Problem, state: State, setup: Setup, keep: Keep = made_now
+) -> tuple[Problem, State]:
     """Positions believed as far as the photos confirm them.
 
     The start gave them deviations as wide as their scatter about it, which is coarse. Here they get
@@ -112,7 +134,7 @@ def believe_positions(problem: Problem, state: State, setup: Setup) -> tuple[Pro
     """
     started = problem.sigma_C
     doubted = np.zeros(started.shape, bool)
-    for _ in range(3):
+    for again in range(3):
         error = state.C - problem.C0
         sigma = started.copy()
         for block in setup.block_rows:
@@ -124,7 +146,8 @@ def believe_positions(problem: Problem, state: State, setup: Setup) -> tuple[Pro
         if np.allclose(sigma, problem.sigma_C, rtol=0.15, equal_nan=True):
             break
         problem = replace(problem, sigma_C=sigma)
-        state = adjust(problem.with_loss(2.0), state, iterations=10, tolerance=1e-4).state
+        narrow, part = problem.with_loss(2.0), within(keep, str(again))
+        state = adjust(narrow, state, iterations=10, tolerance=1e-4, keep=part).state
         misfit = np.abs(state.C - problem.C0) / problem.sigma_C
         for block in setup.block_rows:
             for axes in (slice(0, 2), slice(2, 3)):

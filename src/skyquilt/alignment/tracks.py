@@ -88,6 +88,22 @@ class Tracks:
         """Number of tracks."""
         return int(self.point[-1]) + 1 if len(self.point) else 0
 
+    def parts(self, about: int) -> Iterator[tuple[slice, slice]]:
+        """Observations and points of parts of whole tracks, with about so many observations."""
+        wanted = np.arange(about, len(self.point), about)
+        starts = np.searchsorted(self.point, self.point[wanted]) if len(wanted) else wanted
+        for low, high in pairwise(np.unique([0, *starts.tolist(), len(self.point)]).tolist()):
+            yield slice(low, high), slice(int(self.point[low]), int(self.point[high - 1]) + 1)
+
+    def part(self, observations: slice, points: slice) -> "Tracks":
+        """Some of the tracks."""
+        return Tracks(
+            point=self.point[observations] - points.start,
+            photo=self.photo[observations],
+            px=self.px[observations],
+            sigma_px=self.sigma_px[observations],
+        )
+
     def only(self, observation: NDArray[np.bool_]) -> "Tracks":
         """The selected observations, without tracks left with one observation; renumbered."""
         point = self.point[observation]

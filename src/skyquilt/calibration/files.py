@@ -1,7 +1,7 @@
 """Output files of a calibration: the camera, its figures, plots, the detected boards, a page."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,16 +40,20 @@ def finish(
     key: str,
     centres: Calibration,
     corners: Calibration,
-    judged: Judged,
+    judged: Judged | None,
     clock: Clock,
     frames: Path,
+    unknown: Sequence[str] = (),
 ) -> Steps[dict[str, Any]]:
-    """Writes all files; calibration.json comes last."""
+    """Writes all files; calibration.json comes last. `judged` is None and `unknown` says what is
+    left open where there were too few views to keep any out.
+    """
     yield 0, 1
     write_text(
         output / "cameras.json", json.dumps({key: camera_to_opensfm(_stated(centres))}, indent=1)
     )
-    figures = as_record(seen, board, key, centres, corners, judged) | {"frames_from": frames.name}
+    figures = as_record(seen, board, key, centres, corners, judged)
+    figures |= {"frames_from": frames.name, "unknown": list(unknown)}
     sheet = contact_sheet(seen)
     done, data = cv2.imencode(".jpg", sheet[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
     assert done
@@ -89,10 +93,14 @@ def _stated(found: Calibration) -> Camera:
 
 
 def as_record(
-    seen: Seen, board: Board, key: str, centres: Calibration, corners: Calibration, judged: Judged
+    seen: Seen,
+    board: Board,
+    key: str,
+    centres: Calibration,
+    corners: Calibration,
+    judged: Judged | None,
 ) -> dict[str, Any]:
     """The record of calibration.json."""
-    gain = 1 - judged.mse_undistorted_px2 / judged.mse_raw_px2 if judged.mse_raw_px2 > 0 else 0.0
     return {
         "camera": key,
         "version": __version__,
@@ -103,13 +111,18 @@ def as_record(
         "views": [_view_record(v, centres, k) for k, v in enumerate(seen.views)],
         "centres": _calibration_record(centres, judged),
         "corners": _calibration_record(corners, judged),
-        "registration": {
-            "pairs": judged.pairs,
-            "pairs_unseen_by_the_camera": judged.unseen,
-            "mse_raw_px2": round(judged.mse_raw_px2, 4),
-            "mse_undistorted_px2": round(judged.mse_undistorted_px2, 4),
-            "reduction_percent": round(100 * gain, 1),
-        },
+        "registration": None if judged is None else _registration_record(judged),
+    }
+
+
+def _registration_record(judged: Judged) -> dict[str, Any]:
+    gain = 1 - judged.mse_undistorted_px2 / judged.mse_raw_px2 if judged.mse_raw_px2 > 0 else 0.0
+    return {
+        "pairs": judged.pairs,
+        "pairs_unseen_by_the_camera": judged.unseen,
+        "mse_raw_px2": round(judged.mse_raw_px2, 4),
+        "mse_undistorted_px2": round(judged.mse_undistorted_px2, 4),
+        "reduction_percent": round(100 * gain, 1),
     }
 
 
@@ -128,7 +141,7 @@ def _view_record(view: BoardView, centres: Calibration, k: int) -> dict[str, Any
     }
 
 
-def _calibration_record(found: Calibration, judged: Judged) -> dict[str, Any]:
+def _calibration_record(found: Calibration, judged: Judged | None) -> dict[str, Any]:
     x, y = found.mean_error_px
     return {
         "parameters": {
@@ -143,7 +156,9 @@ def _calibration_record(found: Calibration, judged: Judged) -> dict[str, Any]:
         "points": sum(len(s.px) for s in found.observations),
         "rms_px": round(found.rms_px, 4),
         "mean_error_px": [round(x, 4), round(y, 4)],
-        "held_out_px": {by: round(e, 4) for by, e in judged.held_out_px[found.marks].items()},
+        "held_out_px": None
+        if judged is None
+        else {by: round(e, 4) for by, e in judged.held_out_px[found.marks].items()},
     }
 
 

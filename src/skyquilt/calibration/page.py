@@ -67,15 +67,20 @@ def calibration_page(data: CalibrationInput) -> str:
                 blocks=_parameter_tables(data),
             ),
             Section(id="errors", title="Reprojection errors", blocks=tuple(_figures(data))),
-            Section(
-                id="registration",
-                title="Effect of undistortion on registration",
-                blocks=(_registration(data),),
-            ),
+            *_judged_or_open(data),
             Section(id="boards", title="Boards as found", blocks=(_boards(data),)),
             Section(id="views", title="Views", blocks=_views(data)),
         ),
     )
+
+
+def _judged_or_open(data: CalibrationInput) -> tuple[Section, ...]:
+    """The effect of undistortion; or, with too few views to show it, what they leave open."""
+    if data.figures["registration"] is None:
+        told = Sentences(items=tuple(data.figures["unknown"]))
+        return (Section(id="unknown", title="What so few views leave open", blocks=(told,)),)
+    title = "Effect of undistortion on registration"
+    return (Section(id="registration", title=title, blocks=(_registration(data),)),)
 
 
 _LEAD = (
@@ -108,10 +113,8 @@ def _summary(data: CalibrationInput) -> str:
 
 
 def _tiles(data: CalibrationInput) -> tuple[Tile, ...]:
-    m, found = data.figures, data.centres
-    held = m["centres"]["held_out_px"]["centres"]
+    found = data.centres
     share = 100 * found.sigma("focal") / found.camera.focal
-    gain = m["registration"]["reduction_percent"]
     return (
         Tile(
             label="Focal length",
@@ -127,6 +130,17 @@ def _tiles(data: CalibrationInput) -> tuple[Tile, ...]:
             unit="px",
             says="RMS over all centres.",
         ),
+        *_held_out_tiles(data),
+    )
+
+
+def _held_out_tiles(data: CalibrationInput) -> tuple[Tile, ...]:
+    """Errors on what the camera was not made from; none with too few views."""
+    m, found = data.figures, data.centres
+    if m["registration"] is None:
+        return ()
+    held, gain = m["centres"]["held_out_px"]["centres"], m["registration"]["reduction_percent"]
+    return (
         Tile(
             label="On views kept out",
             value=fixed(held, 3),
@@ -177,15 +191,10 @@ def _parameters(data: CalibrationInput, found: Calibration) -> Table:
         rows=(
             ("Pixel error (mean absolute, x, y), px", f"({fixed(x, 4)}, {fixed(y, 4)})", ""),
             ("Reprojection error (RMS), px", fixed(found.rms_px, 4), ""),
-            (
-                f"RMS of views kept out, judged by {_WORDS['centres']}, px",
-                fixed(held["centres"], 4),
-                "",
-            ),
-            (
-                f"RMS of views kept out, judged by {_WORDS['corners']}, px",
-                fixed(held["corners"], 4),
-                "",
+            *(
+                (f"RMS of views kept out, judged by {_WORDS[by]}, px", fixed(held[by], 4), "")
+                for by in ("centres", "corners")
+                if held is not None
             ),
             row("Focal length, px", ("focal",), 2),
             row("Principal point, px", ("cx", "cy"), 2),
@@ -199,6 +208,8 @@ def _parameters(data: CalibrationInput, found: Calibration) -> Table:
 
 def _dropped(found: Calibration) -> str:
     if not found.dropped:
+        if "k3" not in found.free:
+            return "Few views: k3, p1 and p2 were not estimated, the others with priors."
         return "No coefficient was smaller than its tolerance."
     parts = [
         f"{n} ({significant(v, 3)}, tolerance {significant(t, 3)})" for n, v, t in found.dropped

@@ -13,6 +13,7 @@ from skyquilt.calibration import files as calibrate_files
 from skyquilt.calibration.board_views import SERIES, Seen, look, one_camera
 from skyquilt.calibration.calibrate import Calibrate, strangers
 from skyquilt.calibration.deviations import widened
+from skyquilt.calibration.few_views import FewViews, cannot_know
 from skyquilt.calibration.find_board import FindBoard
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.folder import claim
@@ -24,6 +25,8 @@ from skyquilt.model.event import Event, Note, Result
 from skyquilt.photos.survey import read_survey
 
 FEWEST_VIEWS = 3
+STATED = 0.05
+"""Standard deviation of a focal length stated by the user, as a share of it."""
 _UNKNOWN = 0.1
 """If the deviation of the focal length is larger than this share of it, the focal length is not
 determined.
@@ -42,6 +45,10 @@ class CalibrateSettings:
     """Side of a square in m."""
     series: str = "auto"
     """One of `SERIES`."""
+    few_views: bool = False
+    """Make do with one or two views, as the thesis: see `few_views.FewViews`."""
+    focal_px: float | None = None
+    """Prior of the focal length in px for few views; None = what the frames tell or let guess."""
     jobs: int = 0
     """Threads; 0 = all processors."""
 
@@ -52,6 +59,10 @@ class CalibrateSettings:
             raise UsageError(
                 f"--board {self.columns}x{self.rows}: 3 to 100 squares a side are expected"
             )
+        if self.focal_px is not None and not self.few_views:
+            raise UsageError("--focal has no effect without --few-views")
+        if self.focal_px is not None and not 10 <= self.focal_px <= 1e6:
+            raise UsageError(f"--focal {self.focal_px:g} lies outside 10 to 1e+06 px")
         if not 1e-4 <= self.square_m <= 100:
             raise UsageError(
                 f"--square {self.square_m:g}: the side of a square in m, 0.0001 to 100, is expected"
@@ -88,11 +99,27 @@ def iter_calibrate(
     )
     unread = (RejectedView(name=r.name, reason=r.reason) for r in survey.rejected)
     seen = replace(seen, rejected=(*unread, *seen.rejected))
-    _enough(seen)
+    few = settings.few_views and 1 <= len(seen.views) < FEWEST_VIEWS
+    if not few:
+        _enough(seen)
     yield Note(
         text=f"the board was found in {len(seen.views)} of {len(seen.views) + len(seen.rejected)}"
         " views"
     )
+    key = survey.photos[0].camera_key
+    if few:
+        focal = survey.photos[0].focal
+        prior = FewViews(
+            focal_px=settings.focal_px or focal.px,
+            sigma_px=STATED * settings.focal_px if settings.focal_px else focal.sigma_px,
+        )
+        both = yield from clock.stage("calibrate", _with_priors(seen, board, prior))
+        open_ = cannot_know(both[0], prior)
+        work = calibrate_files.finish(output, seen, board, key, *both, None, clock, frames, open_)
+        figures = yield from clock.stage("report", work)
+        yield from (Note(text=sentence) for sentence in open_)
+        yield Result(output=output, metrics=figures)
+        return
     centres, corners = Calibrate(), Calibrate(marks="corners")
     seen, by_centres, by_corners = yield from clock.stage(
         "calibrate", _calibrated(seen, board, centres, corners)
@@ -103,7 +130,6 @@ def iter_calibrate(
         "judge",
         calibrate_judging.judge(seen.views, board, (centres, corners), (by_centres, by_corners)),
     )
-    key = survey.photos[0].camera_key
     work = calibrate_files.finish(
         output, seen, board, key, by_centres, by_corners, judged, clock, frames
     )
@@ -156,6 +182,18 @@ def _calibrated(
     return seen, widened(by_centres, by_corners), widened(by_corners, by_centres)
 
 
+def _with_priors(
+    seen: Seen, board: Board, prior: FewViews
+) -> Steps[tuple[Calibration, Calibration]]:
+    """Calibrations from centres and from corners of one or two views."""
+    yield 0, 2
+    by_centres = prior(seen.views, board)
+    yield 1, 2
+    by_corners = replace(prior, marks="corners")(seen.views, board)
+    yield 2, 2
+    return widened(by_centres, by_corners), widened(by_corners, by_centres)
+
+
 def _enough(seen: Seen) -> None:
     """Refuses too few views for a calibration.
 
@@ -169,7 +207,8 @@ def _enough(seen: Seen) -> None:
         " and"
         f" {FEWEST_VIEWS} or more are needed{_reasons(seen.rejected)}; take more, tilted by 20 to"
         " 40 degrees in"
-        " different directions, the whole board in the frame"
+        " different directions, the whole board in the frame, or add --few-views for a lens with"
+        " assumptions"
     )
 
 

@@ -29,6 +29,20 @@ def command(
             " (each folder is a pose), views (never)."
         ),
     ] = "auto",
+    few_views: Annotated[
+        bool,
+        typer.Option(
+            help="Make do with one or two views: focal length, principal point, k1 and k2 have"
+            " priors, and the report says what the views leave open."
+        ),
+    ] = False,
+    focal: Annotated[
+        float | None,
+        typer.Option(
+            help="With --few-views: the focal length in px, believed to 5 %.",
+            show_default="what the frames tell",
+        ),
+    ] = None,
     jobs: Annotated[int, typer.Option(help="Threads; 0 = all processors.", min=0)] = 0,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
@@ -44,7 +58,13 @@ def command(
     mode = mode_of(quiet=quiet, json=json)
     columns, rows = parse_board(board)
     settings = CalibrateSettings(
-        columns=columns, rows=rows, square_m=square, series=series, jobs=jobs
+        columns=columns,
+        rows=rows,
+        square_m=square,
+        series=series,
+        few_views=few_views,
+        focal_px=focal,
+        jobs=jobs,
     )
     events = iter_calibrate(frames, output, settings, overwrite=overwrite)
     show(events, mode=mode, summary=summary)
@@ -67,24 +87,33 @@ def summary(result: "Result") -> str:
     m = result.metrics
     found, other = m["centres"], m["corners"]
     held, held_corners = (m[k]["held_out_px"] for k in ("centres", "corners"))
+    kept_out = (
+        ()
+        if held is None
+        else (
+            f"on held-out views, each with its own marks: {held['centres']:.3f} px, from corners"
+            f" {held_corners['corners']:.3f} px; both measured at the corners:"
+            f" {held['corners']:.3f} px, from corners {held_corners['corners']:.3f} px",
+        )
+    )
     values = found["parameters"]
     terms = [
         f"{n} {values[n]['value']:+.4f} ± {values[n]['sigma']:.4f}"
         for n in values
-        if values[n]["free"]
-    ][3:]
+        if values[n]["free"] and n not in ("focal", "cx", "cy")
+    ]
+    counted = "1 view" if m["views_used"] == 1 else f"{m['views_used']} views"
     return "\n".join(
         (
-            f"{m['views_used']} views ({m['frames']} frames), {found['points']} centres of squares",
+            f"{counted} ({m['frames']} frames), {found['points']} centres of squares",
             f"focal length {values['focal']['value']:.2f} ± {values['focal']['sigma']:.2f} px,"
             " principal point"
             f" ({values['cx']['value']:.1f}, {values['cy']['value']:.1f}),"
             f" {', '.join(terms) or 'no distortion'}",
             f"reprojection error from centres {found['rms_px']:.3f} px (RMS), from corners"
             f" {other['rms_px']:.3f} px",
-            f"on held-out views, each with its own marks: {held['centres']:.3f} px, from corners"
-            f" {held_corners['corners']:.3f} px; both measured at the corners:"
-            f" {held['corners']:.3f} px, from corners {held_corners['corners']:.3f} px",
+            *kept_out,
+            *m["unknown"],
             *(
                 f"left out: {name}: {reason}"
                 for name, reason in list(m["views_rejected"].items())[:10]

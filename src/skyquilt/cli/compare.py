@@ -50,7 +50,7 @@ def command(
         Path | None,
         typer.Option(
             help="Known points (gcp_list.txt) to judge by; they align nothing.",
-            show_default="tie points of bundle",
+            show_default="baselines between cameras",
         ),
     ] = None,
     gsd: Gsd = None,

@@ -31,9 +31,9 @@ def command(
     route: Annotated[
         str,
         typer.Option(
-            help="pair (two photos, or the first two in sequence that match), disparities (of all"
-            " linked pairs, merged), reconstruction (heights of the whole adjustment), auto (pair"
-            " for two photos)."
+            help="pair (every pixel of two photos, or of the first two in sequence that match),"
+            " disparities (of the features of all linked pairs, merged), reconstruction (heights of"
+            " the whole adjustment), auto (pair for two photos)."
         ),
     ] = "auto",
     gsd: Gsd = None,

@@ -275,8 +275,8 @@ def command(
         str,
         option(
             IMAGE,
-            "What a photo is registered to: chain (the last photo), overview (the whole map so"
-            " far).",
+            "What a photo is registered to: chain (the last photo), loop (the same, with the"
+            " loops of the chain closed), overview (the whole map so far).",
         ),
     ] = "chain",
     relief: Annotated[

@@ -53,8 +53,12 @@ def write_depth(
     grid: Grid,
     alignment: Alignment,
     tags: dict[str, str],
+    *,
+    measured: Surface | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Writes depth.tif in blocks; returns a preview (h, w) and its valid pixels."""
+    """Writes depth.tif in blocks; returns a preview (h, w) and its valid pixels: those that two
+    photos cover, and where `measured`, if given, is 1.
+    """
     spec = RasterSpec(
         width=grid.width,
         height=grid.height,
@@ -72,14 +76,17 @@ def write_depth(
     with CogWriter(path, spec) as writer:
         for block in writer.blocks():
             known = inside(block.row0, block.col0, block.height, block.width)
+            if measured is not None:
+                known &= _heights(measured, grid, block) > 0.5
             writer.write_block(
                 block, np.where(known, _heights(surface, grid, block), np.nan), known
             )
     small = grid.coarser(preview_factor(grid))
     whole = Block(row0=0, col0=0, height=small.height, width=small.width, tile=spec.tile)
-    return _heights(surface, small, whole), seen_twice(views, small)(
-        0, 0, small.height, small.width
-    )
+    known = seen_twice(views, small)(0, 0, small.height, small.width)
+    if measured is not None:
+        known &= _heights(measured, small, whole) > 0.5
+    return _heights(surface, small, whole), known
 
 
 def _heights(surface: Surface, grid: Grid, block: Block) -> NDArray[np.float32]:

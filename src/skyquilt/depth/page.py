@@ -13,10 +13,10 @@ from skyquilt.report.page import plain_page
 from skyquilt.report.parts import Block, Figure, Section, Table, Tile
 
 _ROUTES = {
-    "pair": "Disparities of two photos after their homography, signed along the baseline.",
-    "disparities": "Disparities of all linked pairs after their homographies, signed along and"
-    " normalised by their"
-    " baselines, merged on the map.",
+    "pair": "Disparities of every pixel of two photos along their baseline, as heights over the"
+    " dominant plane.",
+    "disparities": "Disparities of the features of all linked pairs after their homographies,"
+    " signed along and normalised by their baselines, merged on the map.",
     "reconstruction": "Heights of the whole adjustment, projected to the plane.",
 }
 _MOST = 12

@@ -1,8 +1,10 @@
 """The workflow of `depth`: heights on the map grid, by one of three methods of the thesis
 [Yahyanejad 2013, 5.2.3].
 
-    pair             two photos: disparities after the homography, signed along the baseline
-    disparities      the same of all linked pairs, normalised by their baselines, merged on the map
+    pair             two photos: disparities of every pixel along the baseline
+    disparities      disparities of the features of all linked pairs after their homographies,
+                     signed along and normalised by their baselines, merged on the map; of two
+                     photos it is the thesis's way for a pair
     reconstruction   the heights of the whole adjustment, projected on the plane (5.8)
 
 The photos are placed as by `mosaic`, so depth.tif fits the map.
@@ -18,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt import registry
+from skyquilt.depth.dense_pair import dense_heights
 from skyquilt.depth.files import (
     FILES,
     PAIRS,
@@ -58,6 +61,8 @@ class Depth:
 
     surface: Surface
     """Heights."""
+    measured: Surface | None = None
+    """1 where heights were measured, 0 elsewhere; None = wherever two photos see the ground."""
     fields: tuple[PairField, ...] = ()
     """Pairs used; empty for the reconstruction."""
     without: tuple[NoField, ...] = ()
@@ -159,9 +164,25 @@ def _by_route(
         steps = _disparities(scene, methods, relief_m, refuse=False)
         found = yield from clock.stage("disparities", steps, keeps=False)
         if found.fields:
-            return scene, found
+            steps = _dense(scene, found)
+            return scene, (yield from clock.stage("dense", steps, keeps=False))
         why = why or (found.without[0].reason if found.without else "they do not match")
     raise RefusedError(f"no two photos in sequence determine a height; of the first two: {why}")
+
+
+def _dense(scene: Scene, features: Depth) -> Steps[Depth]:
+    """Heights of a pair from every pixel; those of its features where that gives none."""
+    yield 0, 1
+    ground = scene.ground
+    a, b = (next(v for v in ground.views if v.photo == i) for i in _pair(features))
+    level = float(np.median(ground.surface.z))
+    found = dense_heights((a, b), scene.aligned.grey, level, ground.grid)
+    yield 1, 1
+    return features if found is None else replace(features, surface=found[0], measured=found[1])
+
+
+def _pair(found: Depth) -> tuple[int, int]:
+    return found.fields[0].a, found.fields[0].b
 
 
 def _disparities(
@@ -204,7 +225,13 @@ def _drawn(output: Path, route: str, scene: Scene, depth: Depth) -> Steps[dict[s
     unit = "m" if alignment.frame.metric else "arbitrary"
     tags = {"UNIT": unit, "ROUTE": route, "VERTICAL_DATUM": counted}
     z, known = write_depth(
-        output / "depth.tif", depth.surface, ground.views, ground.grid, alignment, tags
+        output / "depth.tif",
+        depth.surface,
+        ground.views,
+        ground.grid,
+        alignment,
+        tags,
+        measured=depth.measured,
     )
     if not known.any():
         raise RefusedError("no area is covered by two placed photos, so there are no heights")

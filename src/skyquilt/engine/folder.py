@@ -25,6 +25,24 @@ CONTRACT = (
 )
 """Files of a finished run."""
 STATE, EXPORTS = ".skyquilt", "export"
+FILES = {
+    "mosaic.tif": "map",
+    "thermal.tif": "thermal map",
+    "dsm.tif": "heights",
+    "hillshade.tif": "relief",
+    "dtm.tif": "bare ground",
+    "contours.gpkg": "contour lines",
+    "surface.tif": "ground drawn on",
+    "views.tif": "photos per place",
+    "provenance.tif": "photo shown",
+    "shots.geojson": "positions of photos",
+    "footprints.geojson": "footprints",
+    "cameras.json": "cameras",
+    "reconstruction.json": "poses and tie points",
+    "metrics.json": "all figures",
+    "run.toml": "settings",
+}
+"""Files of a run, in the order of the links."""
 
 
 @dataclass(frozen=True, kw_only=True)

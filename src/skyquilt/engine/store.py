@@ -18,6 +18,7 @@ import numpy as np
 from skyquilt.engine.codec import Registry, decode, encode
 from skyquilt.engine.constants import constants_of
 from skyquilt.engine.folder import refusal
+from skyquilt.engine.kept import Keep
 
 T = TypeVar("T")
 
@@ -148,6 +149,14 @@ class Store:
             value = make()
             self.put(stage, key, value)
         return value
+
+    def parts(self, stage: str, key: str) -> Keep:
+        """Keeps the parts of a result that has this key."""
+
+        def keep(part: str, make: Callable[[], T], /) -> T:
+            return self.get_or(stage, digest(key, part), make)
+
+        return keep
 
     def forget(self, stages: Sequence[str]) -> None:
         """Removes all results of these stages."""

@@ -17,6 +17,13 @@ Linearise = Callable[[State], tuple[float, Callable[[float], State]]]
 the normal equations; LinAlgError where it goes nowhere.
 """
 
+Tried = tuple[float, float, bool, State, float]
+"""One iteration: the cost before and after, whether a step was accepted, the state after it, and
+the next damping.
+"""
+Keep = Callable[[str, Callable[[], Tried[State]]], Tried[State]]
+"""Gives an iteration by its name: the one kept of an interrupted run, or made now."""
+
 _SMALLEST, _LARGEST = 1e-9, 1e8
 
 
@@ -42,6 +49,7 @@ def levenberg_marquardt(
     iterations: int,
     tolerance: float,
     damping: float = 1e-4,
+    keep: Keep[State] | None = None,
 ) -> Descent[State]:
     """The state of a locally least cost.
 
@@ -52,22 +60,36 @@ def levenberg_marquardt(
         iterations: most steps to take.
         tolerance: relative decrease of the cost at which it counts as converged.
         damping: the first one.
+        keep: for descents that resume at an iteration.
     """
     least = np.inf
     for iteration in range(iterations):
-        least, step = linearise(state)
-        new, accepted, candidate = np.inf, False, state
-        while not accepted and damping < _LARGEST:
-            try:
-                candidate = step(damping)
-                new = cost(candidate)
-            except np.linalg.LinAlgError:
-                new = np.inf
-            accepted = bool(new <= least * (1 + 1e-12))
-            damping = max(damping / 4, _SMALLEST) if accepted else damping * 8
+
+        def iterated(state: State = state, damping: float = damping) -> Tried[State]:
+            return _iterated(state, linearise, cost, damping)
+
+        tried = iterated() if keep is None else keep(str(iteration), iterated)
+        least, new, accepted, candidate, damping = tried
         if not accepted:
             return Descent(state=state, cost=least, iterations=iteration, converged=True)
         state = candidate
         if least - new <= tolerance * least:
             return Descent(state=state, cost=new, iterations=iteration + 1, converged=True)
     return Descent(state=state, cost=least, iterations=iterations, converged=False)
+
+
+def _iterated(
+    state: State, linearise: Linearise[State], cost: Callable[[State], float], damping: float
+) -> Tried[State]:
+    """Steps with ever more damping until one does not raise the cost."""
+    least, step = linearise(state)
+    new, accepted, candidate = np.inf, False, state
+    while not accepted and damping < _LARGEST:
+        try:
+            candidate = step(damping)
+            new = cost(candidate)
+        except np.linalg.LinAlgError:
+            new = np.inf
+        accepted = bool(new <= least * (1 + 1e-12))
+        damping = max(damping / 4, _SMALLEST) if accepted else damping * 8
+    return least, new, accepted, candidate, damping

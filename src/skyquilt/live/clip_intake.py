@@ -14,6 +14,7 @@ from skyquilt.engine.error_log import log_error
 from skyquilt.engine.store import Store
 from skyquilt.errors import OutputError, SkyquiltError, UnreadablePhotoError
 from skyquilt.live.failures import of_the_system
+from skyquilt.live.inbox import SEEN
 from skyquilt.live.photo_intake import Accepted, Intake, Refused
 from skyquilt.model.clip import Clip
 from skyquilt.photos.frame_files import frame_jpeg
@@ -25,8 +26,6 @@ from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.survey_input import SurveyInput, read_input
 
-SEEN = "clips"
-"""Folder, beside that of the photos, of what was seen of clips."""
 SLICE_S = 0.1
 """Time in s that may be spent on clips before other work is done."""
 Taking = Iterator[Accepted | Refused | None]

@@ -8,6 +8,7 @@ from skyquilt.engine.error_log import log_error
 from skyquilt.errors import RefusedError, SkyquiltError
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.mission import Mission
+from skyquilt.live.plan_folders import next_folder
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.planning.missing import PLAN
 from skyquilt.planning.plan_file import read_plan
@@ -15,9 +16,6 @@ from skyquilt.planning.records import Plan
 from skyquilt.planning.settings import PlanSettings
 from skyquilt.planning.workflow import Order, iter_plan
 from skyquilt.raster.atomic import mended
-
-PLANS = "plans"
-"""Folder of the plans made while the map grows."""
 
 
 def known_plan(folder: Path, given: Path | None = None) -> Plan | None:
@@ -36,14 +34,6 @@ def known_plan(folder: Path, given: Path | None = None) -> Plan | None:
                 shutil.copyfile(given, kept)
         return plan
     return read_plan(kept) if kept.is_file() else None
-
-
-def next_folder(folder: Path, word: str) -> Path:
-    """A new folder for a plan: `plans/fill-1`, `plans/fill-2` ..."""
-    number = 1
-    while (Path(folder) / PLANS / f"{word}-{number}").exists():
-        number += 1
-    return Path(folder) / PLANS / f"{word}-{number}"
 
 
 def iter_fill(folder: Path, ledger: Ledger, photos: Path) -> Iterator[Event]:

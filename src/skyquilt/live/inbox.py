@@ -28,6 +28,8 @@ ENDINGS = {
     b"\x89PNG": ".png",
 }
 """First bytes of the supported file formats, with the file extension."""
+SEEN = "clips"
+"""Folder, beside that of the photos, of what was seen of clips."""
 
 
 @dataclass(frozen=True, kw_only=True)

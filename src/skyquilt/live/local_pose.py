@@ -56,7 +56,7 @@ class LocalPose:
         self.members, self.settings = members, settings
         self.metadata, self.neighbours, self.live_links = metadata, neighbours, live_links
         self.adjust_locally = LocalAdjustment()
-        self.young = Bundle(per_photo=150, match_observations=None)
+        self.young = Bundle(per_photo=150, match_observations=None, thorough=False)
 
     def refine(self, member: Member) -> Change:
         """Compares a photo with its neighbours and adjusts it together with them; writes

@@ -13,14 +13,17 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from skyquilt.errors import OutputError
-from skyquilt.live.clip_intake import SEEN, Taking, advanced, take_clip
-from skyquilt.live.inbox import is_clip, synced
+from skyquilt.live.inbox import SEEN, is_clip, synced
 from skyquilt.live.photo_intake import Accepted, Intake, Refused, shown_name
 from skyquilt.outside import open_regular, read_bounded
 from skyquilt.video.container import is_video
 from skyquilt.video.tracks import TRACK_ENDINGS
+
+if TYPE_CHECKING:
+    from skyquilt.live.clip_intake import Taking
 
 WAITING = "waiting"
 """Folder, in that of clips, of those whose frames are not accepted yet."""
@@ -77,7 +80,7 @@ class UploadedClips:
 
     intake: Intake
     """Accepts the photos."""
-    growing: dict[Path, Taking | None] = field(default_factory=dict)
+    growing: "dict[Path, Taking | None]" = field(default_factory=dict)
     """Clips whose frames are not all accepted; None before work on one began."""
     _due: float = 0.0
 
@@ -95,6 +98,8 @@ class UploadedClips:
             clip = _clip_in(home)
             if clip is None or (begun is None and not _ready(home, clip)):
                 continue
+            from skyquilt.live.clip_intake import advanced, take_clip  # most surveys have none
+
             about = _about(home)
             taking = begun or take_clip(self.intake, clip, about["source"], about["name"])
             self.growing[home] = None  # begun anew if this fails

@@ -132,14 +132,15 @@ def colour_range(preview: NDArray[Any], shown: NDArray[np.uint8]) -> tuple[float
 class Companions:
     """Provenance, views and preview, assembled from blocks."""
 
-    def __init__(self, grid: Grid, bands: int, dtype: np.dtype) -> None:
+    def __init__(self, grid: Grid, bands: int, dtype: np.dtype, photos: int) -> None:
         self.grid, self.factor = grid, preview_factor(grid)
         self.fine, self.coarse, small = (
             grid.coarser(PROVENANCE),
             grid.coarser(STEP),
             grid.coarser(self.factor),
         )
-        self.provenance = np.zeros((self.fine.height, self.fine.width), np.uint32)
+        numbers = np.uint16 if photos < 2**16 else np.uint32
+        self.provenance = np.zeros((self.fine.height, self.fine.width), numbers)
         self.views = np.zeros((self.coarse.height, self.coarse.width), np.uint16)
         self.preview = np.zeros((small.height, small.width, bands), dtype)
         self.shown = np.zeros((small.height, small.width), np.uint8)

@@ -94,7 +94,10 @@ def robust_differences(
         blocks = pairs.products(weighted / np.sqrt(mass[point])[:, None])
         mean_y = _sums(point, w[:, None] * y, len(mass)) / mass[:, None]
         rhs = -_sums(row, weighted[:, :, None] * (y - mean_y[point])[:, None], count)
-        own = _sums(row, weighted[:, :, None] * terms[:, None], count)
+        own = np.empty((count, terms.shape[1], terms.shape[1]))
+        for i in range(terms.shape[1]):
+            for j in range(i + 1):
+                own[:, i, j] = own[:, j, i] = np.bincount(row, weighted[:, i] * terms[:, j], count)
         before, x = (
             x,
             _solved(own, pairs, blocks, pull, rhs.reshape(len(pull), -1)).reshape(x.shape),

@@ -99,9 +99,10 @@ def nearest_known(z: Float, known: Mask) -> Float:
     """Heights (h, w) with gaps filled by the nearest known one: they end in cliffs. A photo drawn
     on a slope between a crown and the ground beside it would become a streak.
     """
-    _, place = cv2.distanceTransformWithLabels(
-        (~known).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    away, place = cv2.distanceTransformWithLabels(
+        (~known).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
+    del away  # large surveys have rasters of 100 MB
     table = np.zeros(int(place.max()) + 1, np.float32)
     table[place[known]] = z[known]
     return np.asarray(table[place])

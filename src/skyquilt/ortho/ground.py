@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Steps
+from skyquilt.engine.kept import Keep
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import SideFileError, UsageError
 from skyquilt.imaging.nodes import View
@@ -19,9 +20,6 @@ from skyquilt.model.surface import Surface
 from skyquilt.ortho.tie_surface import level
 from skyquilt.settings import PictureSettings
 
-Heights = NDArray[np.float32]
-Keep = Callable[[str, Callable[[], Heights]], Heights]
-"""Gives a part of a result by its name: the one kept of an interrupted run, or made now."""
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image of a photo (index), with at most the given px on its longest side."""
 
@@ -120,9 +118,7 @@ def find_ground(
             limits_for,
         )
 
-        def keep(part: str, make: Callable[[], Heights]) -> Heights:
-            return store.get_or("surface", digest(refined, part), make)
-
+        keep = store.parts("surface", refined)
         surface = store.get_or(
             "surface",
             refined,

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from skyquilt.alignment.heights import VERTICAL_EPSG
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid
+from skyquilt.model.surface import STRIP
 from skyquilt.ortho.bare_ground import bare_ground
 from skyquilt.ortho.companions import Drawn, geotransform
 from skyquilt.ortho.ground import Ground
@@ -36,12 +37,14 @@ def write_heights(
     z = ground.surface.on(cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)))
     known = _shown(drawn, cells)
     datum = {"VERTICAL_DATUM": alignment.frame.vertical_datum, "SOURCE": ground.surface.source}
-    _write(output / "dsm.tif", np.where(known, z, np.float32(np.nan)), cells, alignment, datum)
     shade = hillshade(z, cells.gsd)
-    _write(output / "hillshade.tif", np.where(known, shade, 0), cells, alignment, {})
-    if not settings.dtm and settings.contours_m is None:
-        return
-    bare = np.where(known, bare_ground(z, known, cells.gsd), np.float32(np.nan))
+    shade[~known] = 0
+    _write(output / "hillshade.tif", shade, cells, alignment, {})
+    wanted = settings.dtm or settings.contours_m is not None
+    bare = bare_ground(z, known, cells.gsd) if wanted else z
+    for heights in (z, bare):
+        heights[~known] = np.nan
+    _write(output / "dsm.tif", z, cells, alignment, datum)
     if settings.dtm:
         filter_ = {"FILTER": "simple morphological filter (Pingel et al. 2013)"}
         _write(output / "dtm.tif", bare, cells, alignment, datum | filter_)
@@ -51,6 +54,15 @@ def write_heights(
 
 def hillshade(z: Float, cell: float) -> NDArray[np.uint8]:
     """Brightness (h, w), 1 to 255, of heights under light from the north-west (Horn 1981)."""
+    out = np.empty(z.shape, np.uint8)
+    for row in range(0, len(z), STRIP):
+        above = min(row, 1)  # slopes need the row above and the row below
+        part = _shaded(z[row - above : row + STRIP + 1], cell)
+        out[row : row + STRIP] = part[above : above + STRIP]
+    return out
+
+
+def _shaded(z: Float, cell: float) -> NDArray[np.uint8]:
     down = cv2.Sobel(z, cv2.CV_32F, 0, 1, scale=1 / (8 * cell))
     right = cv2.Sobel(z, cv2.CV_32F, 1, 0, scale=1 / (8 * cell))
     azimuth, elevation = np.radians([AZIMUTH_DEG, ELEVATION_DEG])
@@ -88,7 +100,7 @@ def _write(
         tags={"SOFTWARE": "Skyquilt"} | tags,
         band_units=("m",) if real and alignment.frame.metric else (),
     )
-    write_array(path, values.astype(spec.dtype), spec)
+    write_array(path, values.astype(spec.dtype, copy=False), spec)
 
 
 def _contours(path: Path, z: Float, cells: Grid, alignment: Alignment, step: float) -> None:

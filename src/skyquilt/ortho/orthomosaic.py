@@ -128,7 +128,7 @@ def draw(
     """Writes mosaic.tif, provenance.tif and views.tif; a killed run goes on at the block where it
     stopped.
     """
-    whole = Companions(compose.grid, compose.bands, compose.dtype)
+    whole = Companions(compose.grid, compose.bands, compose.dtype, len(compose.views))
     spec = mosaic_spec(compose, alignment, settings, unit)
     path, spool = output / "mosaic.tif", output / STATE / SPOOL
     keep, table = _keeper(compose, alignment, boundary), shot_numbers(compose)
@@ -233,7 +233,7 @@ def _write_companions(output: Path, whole: Companions, alignment: Alignment) -> 
     ):
         write_array(
             output / name,
-            array.astype(kind),
+            array.astype(kind, copy=False),
             RasterSpec(
                 width=grid.width,
                 height=grid.height,

@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.engine.kept import Keep, made_now
 from skyquilt.imaging.nodes import STEP, View, densify, overlapping, project_all
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import WIDEST, Surface
@@ -91,8 +92,9 @@ class SeamLines:
         grid: Grid,
         grey: GreyPicture,
         exposure: Exposure,
+        keep: Keep = made_now,
     ) -> Labels:
-        """The photo of each cell of a map's grid."""
+        """The photo of each cell of a map's grid; `keep`: each tile is a part."""
         factor = CELL
         wide, high = grid.width, grid.height
         most = max(np.sqrt(wide * high / MOST_CELLS), wide / WIDEST, high / WIDEST)
@@ -114,20 +116,28 @@ class SeamLines:
         hidden = np.zeros(z.shape, np.bool_)
         for row in range(0, cells.height, TILE):
             for column in range(0, cells.width, TILE):
-                self._tile(scene, photo, hidden, row, column)
+                h, w = min(TILE, z.shape[0] - row), min(TILE, z.shape[1] - column)
+                at = (slice(row, row + h), slice(column, column + w))
+                photo[at], hidden[at] = keep(
+                    f"{row} {column}",
+                    lambda: self._tile(scene, photo, row, column),  # noqa: B023 - called at once
+                )
         return Labels(
             cells=cells, factor=factor, photo=photo, hidden=hidden, tall=over > STANDING_M
         )
 
     def _tile(
-        self, scene: "_Scene", photo: NDArray[np.int32], hidden: Mask, row: int, column: int
-    ) -> None:
-        """Finds the labels of a tile, in place; tiles above and to the left are finished."""
+        self, scene: "_Scene", photo: NDArray[np.int32], row: int, column: int
+    ) -> tuple[NDArray[np.int32], Mask]:
+        """The labels (h, w) of a tile, and whether even that photo does not see the place; tiles
+        above and to the left are finished.
+        """
         h, w = min(TILE, photo.shape[0] - row), min(TILE, photo.shape[1] - column)
         top, left = min(row, 1), min(column, 1)
         ranked = np.full((3, h + top, w + left), -1, np.int32)
         sure = np.zeros(ranked.shape[1:], np.bool_)
         height = np.zeros(ranked.shape[1:], np.uint8)
+        hidden = np.zeros((h, w), np.bool_)
         for r in range(0, h, PART):
             for c in range(0, w, PART):
                 size = min(PART, h - r), min(PART, w - c)
@@ -136,15 +146,16 @@ class SeamLines:
                     continue
                 at = (slice(top + r, top + r + size[0]), slice(left + c, left + c + size[1]))
                 ranked[:, *at], sure[at], height[at] = part.ranked, part.sure, part.height
-                hidden[row + r : row + r + size[0], column + c : column + c + size[1]] = part.hidden
+                hidden[r : r + size[0], c : c + size[1]] = part.hidden
         before = photo[row - top : row + h, column - left : column + w]
         ranked[0] = np.where(before >= 0, before, ranked[0])
         sure |= before >= 0
-        if (ranked[0] >= 0).any():
-            found = flooded(ranked[0], sure, height)
-            possible = (found == ranked).any(0)
-            found = np.where(possible, found, ranked[0])
-            photo[row : row + h, column : column + w] = found[top:, left:]
+        if not (ranked[0] >= 0).any():
+            return np.full((h, w), -1, np.int32), hidden
+        found = flooded(ranked[0], sure, height)
+        possible = (found == ranked).any(0)
+        found = np.where(possible, found, ranked[0])
+        return found[top:, left:].astype(np.int32), hidden
 
     def _part(self, scene: "_Scene", row: int, column: int, h: int, w: int) -> _Part | None:
         """Compares the photos over h x w cells."""
@@ -255,11 +266,6 @@ class _Scene:
         self.views, self.cells, self.z, self.over = views, cells, z, over
         self._grey, self._exposure, self._longest = grey, exposure, longest
         self._tall = over > STANDING_M
-        soft = cv2.blur(z, (3, 3))
-        self._slopes = (
-            cv2.Sobel(soft, cv2.CV_32F, 0, 1, scale=1 / (8 * cells.gsd)),
-            cv2.Sobel(soft, cv2.CV_32F, 1, 0, scale=1 / (8 * cells.gsd)),
-        )
         self._shadows: OrderedDict[int, Shadow] = OrderedDict()
 
     def scores(
@@ -291,6 +297,7 @@ class _Scene:
             ]
         )
         part = (slice(row, row + h), slice(column, column + w))
+        slopes = self._slopes(*part)
         for k, n in enumerate(nodes):  # what lies flat yields to sharper photos
             smear = smeared(n, 2 * self.cells.gsd / STEP)
             if smear.any():
@@ -301,19 +308,35 @@ class _Scene:
         for k, view in enumerate(views):
             shadow = self._shadow(view)
             if not shadow.empty:
-                lost = shadow.hides(fx, fy, self.z[part]) | self._grazing(view, part, fx, fy)
+                lost = shadow.hides(fx, fy, self.z[part]) | self._grazing(
+                    view, slopes, self.z[part], fx, fy
+                )
                 behind = cv2.morphologyEx(
                     lost.view(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)
                 )
                 score[k][behind > 0] += HIDDEN
         return views, score, nodes
 
-    def _grazing(self, view: View, part: Any, x: NDArray[Any], y: NDArray[Any]) -> Mask:
+    def _slopes(self, rows: slice, columns: slice) -> tuple[Float, Float]:
+        """Slopes (h, w) of the heights down and to the right."""
+        r, c = max(rows.start - 2, 0), max(columns.start - 2, 0)
+        soft = cv2.blur(self.z[r : rows.stop + 2, c : columns.stop + 2], (3, 3))
+        inner = (slice(rows.start - r, rows.stop - r), slice(columns.start - c, columns.stop - c))
+        down, right = (
+            cv2.Sobel(soft, cv2.CV_32F, *along, scale=1 / (8 * self.cells.gsd))[inner]
+            for along in ((0, 1), (1, 0))
+        )
+        return np.asarray(down, np.float32), np.asarray(right, np.float32)
+
+    @staticmethod
+    def _grazing(
+        view: View, slopes: tuple[Float, Float], z: Float, x: NDArray[Any], y: NDArray[Any]
+    ) -> Mask:
         """Cells (h, w) that a photo sees so flatly that they would be drawn as streaks."""
         cx, cy, cz = view.pose.map_C
-        down, right = self._slopes
-        toward = (x - cx) * right[part] - (y - cy) * down[part]
-        return np.asarray(1 + toward / np.maximum(cz - self.z[part], 0.1) < GRAZING)
+        down, right = slopes
+        toward = (x - cx) * right - (y - cy) * down
+        return np.asarray(1 + toward / np.maximum(cz - z, 0.1) < GRAZING)
 
     def _shadow(self, view: View) -> Shadow:
         found = self._shadows.pop(view.photo, None)

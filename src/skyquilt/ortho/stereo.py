@@ -16,16 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.executor import in_order
+from skyquilt.engine.kept import Keep
 from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid
-from skyquilt.model.surface import WIDEST, Surface
+from skyquilt.model.surface import STRIP, WIDEST, Surface
 from skyquilt.ortho.fill import nearest_known, plateaus, settled
 from skyquilt.ortho.pair_matching import Array, Float, Mask, Pair, matched_points, pair_of
 
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
-Keep = Callable[[str, Callable[[], Float]], Float]
-"""Gives a part of the result by its name: the one kept of an interrupted run, or made now."""
 Cells = tuple[NDArray[np.intp], Float]
 """Numbers (n,) of cells of a grid, row by row, and their heights (n,) in m."""
 MOST_CELLS = 2.4e7
@@ -136,16 +135,17 @@ class Stereo:
             middle=float(np.median(rough.z)),
         )
         z = self._fused(given, views, height, self.relief * height, keep)
-        known = _without_specks(z, 0.01 * height, 6)
+        known = without_specks(z, 0.01 * height, 6)
+        refined = nearest_known(z, known) if known.any() else z
+        del z, given  # large surveys have rasters of 100 MB
+        refined = np.asarray(cv2.medianBlur(refined, 5), np.float32)
+        side = 2 * round(self.whole * height / cells.gsd / 2) + 1
+        firm = cv2.boxFilter(known.astype(np.float32), -1, (side, side)) > FIRM
         x, y = cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height))
         # cliffs stay as steep as the cells allow
         former = np.asarray(cv2.medianBlur(_stepwise(rough, x, y), 5), np.float32)
-        if not known.any():
-            return _surface(former, cells)
-        side = 2 * round(self.whole * height / cells.gsd / 2) + 1
-        firm = cv2.boxFilter(known.astype(np.float32), -1, (side, side)) > FIRM
-        refined = cv2.medianBlur(nearest_known(z, known), 5)
-        return _surface(np.where(firm, refined, former).astype(np.float32), cells)
+        np.copyto(former, refined, where=firm)
+        return surface_of(former, cells)
 
     def _coarse(
         self,
@@ -172,7 +172,7 @@ class Stereo:
             middle=float(np.median(surface.z)),
         )
         z = self._fused(given, views, height, 0.0, keep)
-        known = _without_specks(z, 0.02 * height, 12)
+        known = without_specks(z, 0.02 * height, 12)
         if not known.any():
             return surface, known
         # where only some places agree, as in leaves, heights are those of whole crowns
@@ -190,7 +190,7 @@ class Stereo:
         )
         # at once: photos drawn on a slope between crowns and the plane would become streaks
         whole = settled(np.asarray(whole, np.float32), around > 0, 0.0, 1.0)
-        return _surface(whole, cells), known
+        return surface_of(whole, cells), known
 
     def pairs(self, views: Sequence[View], height: float, wanted: int) -> list[tuple[View, View]]:
         """The pairs that are matched, of photos `height` m above ground: those with good baselines
@@ -258,7 +258,7 @@ def _tile(
         todo, in_order(lambda k: _points(pairs[k], given), todo, jobs=THREADS), strict=True
     ):
         held[k] = points
-    heights = [_splat(held[k], pairs[k].origin, part) for k in near]
+    heights = [splatted(held[k], pairs[k].origin, part) for k in near]
     return _agreed([h for h in heights if len(h[0])], given.agree, (part.height, part.width))
 
 
@@ -300,7 +300,7 @@ def _points(pair: Pair, given: _Round) -> Float:
     return np.asarray(at[(z > given.low.at(x, y)) & (z < given.high.at(x, y))])
 
 
-def _splat(points: Float, origin: Array, part: Grid) -> Cells:
+def splatted(points: Float, origin: Array, part: Grid) -> Cells:
     """Heights of the cells of a grid that points fall in: in each the mean of those near the
     highest one.
     """
@@ -355,7 +355,7 @@ def _stepwise(surface: Surface, x: NDArray[Any], y: NDArray[Any]) -> Float:
     return surface.z[np.clip(row, 0, rows - 1)][:, np.clip(column, 0, columns - 1)]
 
 
-def _without_specks(z: Float, step: float, least: int) -> Mask:
+def without_specks(z: Float, step: float, least: int) -> Mask:
     """Which heights (h, w) are kept: those of patches of at least `least` cells whose neighbours
     differ by less than `step` m.
     """
@@ -364,7 +364,10 @@ def _without_specks(z: Float, step: float, least: int) -> Mask:
         return known
     base = float(np.nanmin(z))
     scale = min(100.0, 30000 / max(float(np.nanmax(z)) - base, 1e-6))
-    levels = np.where(known, (z - base) * scale + 1, -1000).astype(np.int16)
+    levels = np.full(z.shape, -1000, np.int16)
+    for row in range(0, len(z), STRIP):
+        part = slice(row, row + STRIP)
+        levels[part][known[part]] = (z[part][known[part]] - base) * scale + 1
     cv2.filterSpeckles(levels, -1000, least, step * scale)
     return levels >= 0
 
@@ -376,7 +379,8 @@ def _stretched(surface: Surface, reach: float, kind: int, add: float) -> Surface
     return replace(surface, z=np.asarray(z + np.float32(add), np.float32))
 
 
-def _surface(z: Float, cells: Grid) -> Surface:
+def surface_of(z: Float, cells: Grid) -> Surface:
+    """The surface of heights (rows, columns) in m of cells, row 0 in the north, without gaps."""
     return Surface(
         z=np.ascontiguousarray(z[::-1]),
         x0=float(cells.x(np.array(0))),

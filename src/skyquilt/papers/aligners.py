@@ -62,24 +62,33 @@ class ByImage:
 
     method: Chain | DirectChain | ByOverview
     """The search method."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     needs_links: ClassVar[bool] = False
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
-        """Registers the photos in their order."""
+        """Registers the photos in their order.
+
+        Raises:
+            UsageError: a relief is given, but nothing tells the height that it is divided by (4.9).
+        """
         method = self.method
         if not isinstance(method, DirectChain):
             level = method.level
             if isinstance(level, Level) and level.height_m is None:
-                method = replace(method, level=replace(level, height_m=_least_height(inputs)))
-        known = (inputs.photos, inputs.frame, inputs.priors)
-        if isinstance(method, Chain):
-            placed = method(*known, inputs.features, inputs.order)
-        elif isinstance(method, DirectChain):
-            placed = method(*known, inputs.order, inputs.grey)
-        else:
-            placed = method(*known, inputs.features, inputs.order, inputs.grey)
-        return _outside_named(replace(placed, why=REQUESTED), inputs)
+                height = _least_height(inputs)
+                if height is None and level.relief_m is not None:
+                    height = _height_by_scale(replace(method, level=None), inputs)
+                method = replace(method, level=replace(level, height_m=height))
+        return _outside_named(replace(_placed(method, inputs), why=REQUESTED), inputs)
+
+
+def _placed(method: Chain | DirectChain | ByOverview, inputs: AlignmentInputs) -> Alignment:
+    known = (inputs.photos, inputs.frame, inputs.priors)
+    if isinstance(method, Chain):
+        return method(*known, inputs.features, inputs.order)
+    if isinstance(method, DirectChain):
+        return method(*known, inputs.order, inputs.grey)
+    return method(*known, inputs.features, inputs.order, inputs.grey)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,13 +146,14 @@ def image(settings: MosaicSettings) -> ByImage:
         return ByImage(method=_direct_chain(settings))
     order, height = settings.camera.distortion or "6t", settings.camera.height_m
     match = registry.load("matcher", settings.matching.matcher or "mutual")()
-    if settings.image.image_search == "chain":
+    if settings.image.image_search != "overview":
         chain = Chain(
             match=match,
             estimate=_estimator(settings, CHAIN_PX, "similarity"),
             level=_level(settings, WORKING_WIDTH),
             distortion=order,
             height_m=height,
+            loop=settings.image.image_search == "loop",
         )
         return ByImage(method=chain)
     detect = registry.load("detector", settings.matching.detector or "sift")
@@ -239,6 +249,22 @@ def _least_height(inputs: AlignmentInputs) -> float | None:
     plausible = heights[np.isfinite(heights) & (heights > 1)]
     takeoff = inputs.frame.vertical_datum == "takeoff"
     return float(plausible.min()) if takeoff and len(plausible) else None
+
+
+def _height_by_scale(method: Chain | ByOverview, inputs: AlignmentInputs) -> float:
+    """Median height in m above the ground from the scale of the mosaic, made without levelling and
+    laid on the positions.
+
+    Raises:
+        UsageError: there are no positions that give the scale.
+    """
+    rough = _placed(method, inputs)
+    if not rough.frame.metric or not rough.poses:
+        raise UsageError(
+            "--relief is compared with the height above ground (Y 4.9), which neither heights above"
+            " take-off nor positions of these photos give; add --height"
+        )
+    return float(np.median([pose.map_C[2] for pose in rough.poses.values()]))
 
 
 def _outside_named(alignment: Alignment, inputs: AlignmentInputs) -> Alignment:

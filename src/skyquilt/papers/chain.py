@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.inputs import GreyPicture
 from skyquilt.alignment.pose import reported_camera
+from skyquilt.geometry.camera import undistort
 from skyquilt.imaging.plane import to_grid
 from skyquilt.model.camera import Camera
 from skyquilt.model.estimate import NoEstimate
@@ -18,12 +19,14 @@ from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Join, MapFrame, Prior
 from skyquilt.papers.direct import Direct
-from skyquilt.papers.lens_order import of_order, to_working, working_K
+from skyquilt.papers.lens_order import WORKING_WIDTH, of_order, to_working, working_K
+from skyquilt.papers.loop import closed
 from skyquilt.papers.pieces import Piece, lay
 from skyquilt.papers.plane_registration import (
     Estimator,
     Leveller,
     Matcher,
+    at_share,
     implausible,
     plane_alignment,
     registered,
@@ -41,14 +44,16 @@ class Chain:
     match: Matcher
     """Matching."""
     estimate: Estimator
-    """Robust estimation of the transformation, thresholds in px of the working image."""
+    """Robust estimation of the transformation, thresholds in px of a photo 1500 px wide."""
     level: Leveller | None = None
     """Levelled features; None = all inliers are used."""
     distortion: str = "6t"
     """Order of the lens model, which is fitted to the calibration of the photos."""
     height_m: float | None = None
     """Height above ground in m that scales pieces without positions."""
-    version: ClassVar[int] = 1
+    loop: bool = False
+    """Also compare photos where the chain comes back, and spread its closing error [Y 2.3.4]."""
+    version: ClassVar[int] = 2
 
     def __call__(
         self,
@@ -71,6 +76,7 @@ class Chain:
             order,
             cameras,
             self.height_m,
+            loop=self.loop,
         )
 
     def _join(
@@ -82,9 +88,8 @@ class Chain:
         a = to_working(lens[photo], px)
         b = to_working(lens[onto], features[onto].px[matches.index_b])
         centre = working_K(lens[photo])[:2, 2]
-        found = registered(
-            photo, onto, px, a, b, estimate=self.estimate, level=self.level, centre=centre
-        )
+        estimate, level = at_share(self.estimate, self.level, lens[onto].width / WORKING_WIDTH)
+        found = registered(photo, onto, px, a, b, estimate=estimate, level=level, centre=centre)
         if isinstance(found, NoEstimate):
             return found
         H = np.linalg.inv(working_K(lens[onto])) @ found[0] @ working_K(lens[photo])
@@ -165,9 +170,12 @@ def chained(
     order: Sequence[int],
     cameras: dict[str, Camera],
     height_m: float | None,
+    *,
+    loop: bool = False,
 ) -> Alignment:
     """Photos one after the other: `join` gives onto_H_photo (3, 3) between undistorted image planes
-    of a photo and the one before it, or why they do not match: then a new piece begins.
+    of a photo and the one before it, or why they do not match: then a new piece begins. With `loop`
+    the pieces' loops are closed.
     """
     pieces: list[dict[int, Array]] = []
     joins, notes, last = [], [], -1
@@ -182,10 +190,23 @@ def chained(
                 notes.append(broken(photos[photo].name, photos[last].name, joined.reason))
             pieces.append({photo: np.eye(3)})
         last = photo
+    if loop:
+        for k, piece in enumerate(pieces):
+            extent = {i: _corners(cameras[photos[i].camera_key]) for i in piece}
+            pieces[k], more = closed(piece, extent, join)
+            joins += more
+        notes.append(f"{len(joins) + len(pieces) - len(order)} closings of loops were found")
     laid = lay([Piece(plane_H_cam=p) for p in pieces], priors, height_m)
     return plane_alignment(
         "image", frame, photos, laid.poses, laid.metric, cameras, pieces, joins, notes
     )
+
+
+def _corners(camera: Camera) -> Array:
+    """Corners (4, 2) of a photo in its undistorted image plane."""
+    right, low = camera.width - 1.0, camera.height - 1.0
+    px = np.array([[0.0, 0.0], [right, 0.0], [right, low], [0.0, low]])
+    return np.asarray(undistort(camera, px))
 
 
 def broken(photo: str, before: str, reason: str) -> str:

@@ -17,9 +17,10 @@ from skyquilt.engine.folder import STATE
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import AlignmentError, UsageError
 from skyquilt.model.event import Event, Note, Result, StageFinished, StageProgress, StageStarted
-from skyquilt.model.photo import ControlPoint, PointObservation
+from skyquilt.model.photo import ControlPoint
 from skyquilt.model.poses import Alignment
-from skyquilt.papers.compare_state import CompareState, taken_up
+from skyquilt.papers.baselines import REPEATS, baselines, judged, told, unjudged
+from skyquilt.papers.compare_state import taken_up
 from skyquilt.papers.comparison_page import comparison_page
 from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import read_gcp_list
@@ -118,18 +119,10 @@ def iter_compare(
         given = yield from frames_added(given, settings.mosaic, clock)
         given = _first(given, settings.first)
     rows = _Rows(given, output, overwrite=overwrite or goes_on)  # the runs below belong to it
-    base, says = _judged_by(given, output, settings, state)
+    base, says = _judged_by(given, output, settings)
     state.write(output)
-    for name in _in_turn(settings.variants, base.input.distances is None):
+    for name in settings.variants:
         yield from rows.run(name, settings.asked(base, name))
-        if name == "bundle" and base.input.distances is None and rows.made(name):
-            base, says = _by_bundle(given, output, base)
-            if base.input.distances is not None:  # a second run of bundle is checked by them too
-                state.judged_by, state.times = says, rows.times(name)
-                state.write(output)
-                yield from rows.run(name, settings.asked(base, name), again=True)
-        if name == "bundle" and rows.made(name):
-            rows.by_name[name]["metrics"] |= state.times
         if name in TRUSTED and settings.mosaic.input.repair and rows.contradicted(name):
             asked = settings.asked(base, name)
             trusting = asked.changed(repair=False, detector=None, matcher=None, estimator=None)
@@ -137,6 +130,8 @@ def iter_compare(
     order = [n for v in settings.variants for n in (v, f"{v}-trusted") if n in rows.by_name]
     names = [p.name for p in given.survey.photos]
     record = _record({n: rows.by_name[n] for n in order}, names, says, folder)
+    if base.input.distances is None:
+        record = _by_baselines(record, given, output, base.picture.crs)
     write_text(output / "compare.json", json.dumps(record, indent=1, allow_nan=False))
     write_page(output / "report.html", comparison_page(record, _previews(output, order)))
     state.done = True
@@ -151,38 +146,28 @@ class _Rows:
         self.given, self.output, self.overwrite = given, output, overwrite
         self.by_name: dict[str, dict[str, Any]] = {}
 
-    def run(
-        self, name: str, settings: MosaicSettings, *, again: bool = False
-    ) -> Generator[Event, None, None]:
+    def run(self, name: str, settings: MosaicSettings) -> Generator[Event, None, None]:
         """Runs a method; its stages carry its name."""
-        told: list[str] = []
-        given, overwrite = self.given, self.overwrite or again
+        notes: list[str] = []
+        given = self.given
         if settings.input.distances is not None:
             names = [p.name for p in given.survey.photos]
             known = read_distances(settings.input.distances, names, given.control)
             given = replace(given, distances=known)
-        steps = make_map(given, self.output / name, settings, overwrite=overwrite)
+        steps = make_map(given, self.output / name, settings, overwrite=self.overwrite)
         try:
             while True:
                 event = next(steps)
                 if isinstance(event, Note):
-                    told.append(event.text)
+                    notes.append(event.text)
                 elif isinstance(event, StageStarted | StageProgress | StageFinished):
                     yield replace(event, stage=f"{name}: {event.stage}")
         except StopIteration as stop:
             metrics = dict(stop.value.result.metrics)
-            self.by_name[name] = {"metrics": metrics, "notes": told}
+            self.by_name[name] = {"metrics": metrics, "notes": notes}
         except AlignmentError as error:
             yield Note(text=f"{name}: {error}", warning=True)
-            self.by_name[name] = {"refused": str(error), "notes": told}
-
-    def made(self, name: str) -> bool:
-        """Whether a method placed the photos."""
-        return "metrics" in self.by_name[name]
-
-    def times(self, name: str) -> dict[str, Any]:
-        """Times of a run."""
-        return {k: self.by_name[name]["metrics"][k] for k in ("seconds", "cpu_seconds")}
+            self.by_name[name] = {"refused": str(error), "notes": notes}
 
     def contradicted(self, name: str) -> bool:
         """Whether a run found metadata that contradict the image content."""
@@ -202,20 +187,11 @@ def _content(path: Path | None) -> bytes:
     return path.read_bytes() if path is not None and path.is_file() else b""
 
 
-def _in_turn(variants: Sequence[str], needs_bundle: bool) -> list[str]:
-    """Runs bundle first if its points give the distances with which the others are checked."""
-    if needs_bundle and "bundle" in variants:
-        return ["bundle", *(v for v in variants if v != "bundle")]
-    return list(variants)
-
-
 def _judged_by(
-    given: SurveyInput, output: Path, settings: CompareSettings, state: CompareState
+    given: SurveyInput, output: Path, settings: CompareSettings
 ) -> tuple[MosaicSettings, str]:
     """Settings with the known distances for the check, and their source."""
-    base, found = settings.mosaic, output / "distances.csv"
-    if state.judged_by and found.is_file():
-        return base.changed(distances=found), state.judged_by
+    base = settings.mosaic
     if base.input.distances is not None:
         return base, f"known distances of {base.input.distances.name}"
     if settings.known is None:
@@ -224,7 +200,7 @@ def _judged_by(
     seen = [c for c in control if c.observations][:MOST_POINTS]
     if len(seen) < 2:
         return base, f"fewer than two points of {settings.known.name} are visible"
-    path = _write_distances(found, _between(seen))
+    path = _write_distances(output / "distances.csv", _between(seen))
     says = f"distances between {len(seen)} points of {settings.known.name}"
     return base.changed(distances=path), says
 
@@ -269,25 +245,22 @@ def _write_distances(path: Path, rows: Sequence[Row]) -> Path:
     return path
 
 
-def _by_bundle(
-    given: SurveyInput, output: Path, base: MosaicSettings
-) -> tuple[MosaicSettings, str]:
-    """Distances between tie points of the bundle run: from its model, not measured on the
-    ground.
-    """
-    alignment = alignment_of(output / "bundle")
-    points = (
-        tie_targets(alignment, [p.name for p in given.survey.photos])
-        if alignment is not None
-        else []
-    )
-    if len(points) < 2:
-        return base, "no distances are known"
-    path = _write_distances(output / "distances.csv", _between(points))
-    return base.changed(distances=path), (
-        f"distances between {len(points)} tie points of the bundle adjustment:"
-        " from a model, not measured on the ground"
-    )
+def _by_baselines(
+    record: dict[str, Any], given: SurveyInput, output: Path, crs: str | None
+) -> dict[str, Any]:
+    """The record judged by distances between cameras, if the photos have positions."""
+    known = baselines(given.survey.photos, crs)
+    if not known:
+        return record
+    columns = {
+        name: column
+        if "refused" in column
+        else unjudged(column, known)
+        if name in REPEATS
+        else judged(column, output / name, known)
+        for name, column in record["methods"].items()
+    }
+    return record | {"judged_by": told(known), "methods": columns}
 
 
 def alignment_of(run: Path) -> Alignment | None:
@@ -298,45 +271,6 @@ def alignment_of(run: Path) -> Alignment | None:
     )
     kept = store.get("alignment", found[-1].stem) if found else None
     return kept if isinstance(kept, Alignment) else None
-
-
-def tie_targets(alignment: Alignment, names: Sequence[str]) -> list[ControlPoint]:
-    """Tie points on the ground with three or more observations, far from each other, as points with
-    observations.
-
-    Low points are chosen, since a point on a roof or tree crown is displaced in any map over level
-    ground.
-    """
-    ties = alignment.ties
-    count = np.bincount(ties.point, minlength=len(ties.xyz))
-    worst = np.zeros(len(count))
-    np.maximum.at(worst, ties.point, np.linalg.norm(ties.residual_px, axis=1))
-    low = ties.xyz[:, 2] < np.percentile(ties.xyz[:, 2], 40) if len(ties.xyz) else np.zeros(0, bool)
-    good = np.flatnonzero((count >= 3) & (worst < 2) & low)
-    if len(good) < 2:
-        return []
-    xy = ties.xyz[good][:, :2]
-    chosen = [int(np.argmin(np.linalg.norm(xy - np.median(xy, axis=0), axis=1)))]
-    while len(chosen) < min(MOST_POINTS, len(good)):
-        chosen.append(
-            int(np.min([np.linalg.norm(xy - xy[c], axis=1) for c in chosen], axis=0).argmax())
-        )
-    return [
-        ControlPoint(
-            name=f"P{k + 1}",
-            x=float(xy[c, 0]),
-            y=float(xy[c, 1]),
-            z=None,
-            crs=alignment.frame.crs or "",
-            observations=tuple(
-                PointObservation(
-                    photo=names[int(ties.photo[s])], x=float(ties.px[s, 0]), y=float(ties.px[s, 1])
-                )
-                for s in np.flatnonzero(ties.point == good[c])
-            ),
-        )
-        for k, c in enumerate(chosen)
-    ]
 
 
 def _record(

@@ -1,7 +1,7 @@
 """Progress of a comparison, so that the same command continues where it was stopped."""
 
 import json
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from skyquilt.engine.folder import STATE, refusal
@@ -20,10 +20,6 @@ class CompareState:
     """Key of its inputs: photos, side files and settings."""
     done: bool = False
     """Whether it is finished."""
-    judged_by: str = ""
-    """Source of the distances, if they come from the bundle adjustment."""
-    times: dict[str, dict[str, float]] = field(default_factory=dict)
-    """`seconds` and `cpu_seconds` of the bundle run before those distances were known."""
 
     def write(self, output: Path) -> None:
         """Stores it in the comparison's folder."""

@@ -106,8 +106,8 @@ class Surfaces:
     rotations, followed by a local search.
 
     Masked normalised correlation by Fourier transforms (Padfield 2012) gives lambda of all shifts;
-    the best of them are refined on finer levels by a pattern search, which ends with a parabola
-    through the neighbours of the last step.
+    the best of them are refined on finer levels by a pattern search, whose last steps are 0.15 px
+    of each level.
     """
 
     turn_step_deg: float = 2.0
@@ -160,9 +160,7 @@ class Surfaces:
 def _climb(
     objective: Objective, level: int, move: Array, step: Array, limits: tuple[float, float]
 ) -> tuple[Array, float, int]:
-    """Pattern search with halving steps down to a tenth of a pixel: the move, lambda,
-    evaluations.
-    """
+    """Pattern search with steps of 1, 0.4 and 0.15 px: the move, lambda, evaluations."""
     value, spent = objective(move, level), 1
     for scale in (1.0, 0.4, 0.15):
         for _ in range(12):

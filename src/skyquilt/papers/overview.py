@@ -24,6 +24,7 @@ from skyquilt.papers.plane_registration import (
     Estimator,
     Leveller,
     Matcher,
+    at_share,
     plane_alignment,
     registered,
 )
@@ -69,7 +70,7 @@ class ByOverview:
     """Number of features per area of a photo."""
     height_m: float | None = None
     """Height above ground in m that scales pieces without positions."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     name: ClassVar[str] = "image"
 
     def __call__(
@@ -127,9 +128,9 @@ class ByOverview:
         px = features.px[matches.index_a]
         a = undistort(camera, px) * K[0, 0]
         b = known.px[matches.index_b] + (overview.column, overview.row)
-        found = registered(
-            photo, -1, px, a, b, estimate=self.estimate, level=self.level, centre=np.zeros(2)
-        )
+        share = max(camera.width, camera.height) / self.longest
+        estimate, level = at_share(self.estimate, self.level, share)
+        found = registered(photo, -1, px, a, b, estimate=estimate, level=level, centre=np.zeros(2))
         return found if isinstance(found, NoEstimate) else (found[0] @ K, found[1])
 
     def _features(self, overview: Overview) -> Features:

@@ -10,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.geometry.transforms import transfer
+from skyquilt.matching.levelled import Level
+from skyquilt.matching.ransac import Ransac
 from skyquilt.model.camera import Camera
 from skyquilt.model.estimate import Estimate, NoEstimate
 from skyquilt.model.features import Features, Matches
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Join, MapFrame, Pose, no_ties
+from skyquilt.papers.magsac import Magsac
 
 Array = NDArray[np.float64]
 LARGEST_SCALE = 1.7
@@ -62,6 +65,27 @@ class Levelled(Protocol):
     def level(self) -> NDArray[np.bool_]:
         """(M,) those on the dominant plane."""
         ...
+
+
+LEAST_PX = 1.0
+"""Least threshold in px, whatever the width of a photo: keypoints are no more accurate."""
+
+
+def at_share(
+    estimate: Estimator, level: Leveller | None, share: float
+) -> tuple[Estimator, Leveller | None]:
+    """Both for photos narrower than the working width, of which they have this `share`.
+
+    Thresholds in px are for the working width (Y 4.9 for 1500 px). Photos are never enlarged to it,
+    so the thresholds shrink instead. Estimators without a threshold in px are not changed.
+    """
+    if share >= 1:
+        return estimate, level
+    if isinstance(estimate, Ransac | Magsac):
+        estimate = replace(estimate, threshold_px=max(LEAST_PX, estimate.threshold_px * share))
+    if isinstance(level, Level):
+        level = replace(level, width=round(level.width * share))
+    return estimate, level
 
 
 def registered(

@@ -111,7 +111,7 @@ class RansacSte:
     accept_share: ClassVar[float] = 0.75
     retry_ste: ClassVar[float] = 0.5
     tries: ClassVar[int] = 5
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> Estimate | NoEstimate:
         """b_H_a from matches a, b (N, 2) px, or why there is none."""
@@ -120,7 +120,7 @@ class RansacSte:
             return few
         rng = np.random.default_rng(self.seed)
         spent, capped = 0, False
-        for _ in range(self.tries):
+        for attempt in range(self.tries):
             found = self._optimised(self._ransac_1(rng, a, b), a, b)
             if found is None:
                 break
@@ -129,7 +129,8 @@ class RansacSte:
                 return self._told(
                     replace(found, iterations=spent, capped=capped), a, "RANSAC-1-OPT"
                 )
-            if found.ste >= self.retry_ste:
+            # step 2 tests the error of step 1 only; later tries repeat until 2 (a) holds
+            if attempt == 0 and found.ste >= self.retry_ste:
                 break
         return self._second(rng, a, b, spent, capped)
 

@@ -72,6 +72,8 @@ class Variant:
     """Whether only features of the dominant plane are used."""
     model: Model
     """Transformation from photo to photo."""
+    every: int = 1
+    """1 uses every photo, 2 every other one (Y Fig. 4.5)."""
 
 
 VARIANTS = (
@@ -89,8 +91,24 @@ VARIANTS = (
     Variant(
         name="order 6 + tangential, similarity", distortion="6t", levelled=True, model="similarity"
     ),
+    Variant(
+        name="every other photo, homography",
+        distortion="6t",
+        levelled=True,
+        model="homography",
+        every=2,
+    ),
+    Variant(
+        name="every other photo, similarity",
+        distortion="6t",
+        levelled=True,
+        model="similarity",
+        every=2,
+    ),
 )
-"""The seven of Y 6.2; the first five are levelled, with homographies."""
+"""The seven of Y Fig. 6.5, of which the first five are levelled, with homographies, and the two of
+Y Fig. 4.5 with half of the photos.
+"""
 
 
 def calibrated(strip: Strip, settings: StripSettings) -> dict[str, tuple[Camera, float]]:
@@ -102,7 +120,7 @@ def calibrated(strip: Strip, settings: StripSettings) -> dict[str, tuple[Camera,
 
 def chained(strip: Strip, settings: StripSettings, camera: Camera, variant: Variant) -> Doubles:
     """eta (4.7) of the board below each photo (photos,), as mapped into the first photo, against
-    the first one.
+    the first one; NaN for photos that the variant leaves out.
 
     Raises:
         RefusedError: two photos cannot be registered.
@@ -111,21 +129,23 @@ def chained(strip: Strip, settings: StripSettings, camera: Camera, variant: Vari
     level = Level(relief_m=settings.relief, height_m=settings.height, width=settings.lens.width)
     px = [_straight(camera, p) for p in strip.px]
     targets = [_straight(camera, p) for p in strip.targets]
-    first, H, found = four_lengths(targets[0]), np.eye(3), [1.0]
-    for k in range(1, len(px)):
-        _, i, j = np.intersect1d(strip.ids[k], strip.ids[k - 1], return_indices=True)
-        a, b = px[k][i], px[k - 1][j]
+    first, H, found = four_lengths(targets[0]), np.eye(3), np.full(len(px), np.nan)
+    found[0] = 1.0
+    for k in range(variant.every, len(px), variant.every):
+        onto = k - variant.every
+        _, i, j = np.intersect1d(strip.ids[k], strip.ids[onto], return_indices=True)
+        a, b = px[k][i], px[onto][j]
         step = estimate(a, b)
         if isinstance(step, NoEstimate):
             raise RefusedError(
-                f"photos {k} and {k + 1} of the strip do not match ({step.reason}); choose more"
-                " overlap or less noise"
+                f"photos {onto + 1} and {k + 1} of the strip do not match ({step.reason}); choose"
+                " more overlap or less noise"
             )
         if variant.levelled:
             step = level(a, b, step).estimate
         H = H @ step.b_H_a
-        found.append(eta(four_lengths(transfer(H, targets[k])), first))
-    return np.array(found)
+        found[k] = eta(four_lengths(transfer(H, targets[k])), first)
+    return found
 
 
 def _straight(camera: Camera, px: Doubles) -> Doubles:

@@ -10,9 +10,19 @@ from skyquilt.report.page import plain_page
 from skyquilt.report.parts import Figure, LegendItem, Section, Sentences, Table, Tile
 from skyquilt.report.svg import Axes, drawing, polyline
 
-COLOURS = ("#8a8f94", "#b3261e", "#b8602a", "#b08a00", "#1f6f8b", "#6b5ca5", "#2c7a4b")
+COLOURS = (
+    "#8a8f94",
+    "#b3261e",
+    "#b8602a",
+    "#b08a00",
+    "#1f6f8b",
+    "#6b5ca5",
+    "#2c7a4b",
+    "#5a5a5a",
+    "#7fa650",
+)
 """Colour of each variant."""
-DASHES = ("2 3", "6 3", "6 3", "6 3", "", "8 3 2 3", "")
+DASHES = ("2 3", "6 3", "6 3", "6 3", "", "8 3 2 3", "", "1 3", "1 3")
 """Dash pattern of each variant, for readers who cannot distinguish colours."""
 GOOD = 0.97
 """Least eta at the end of a strip without visible deformation."""
@@ -21,14 +31,14 @@ GOOD = 0.97
 def strip_page(found: Mapping[str, Any]) -> str:
     """The page of a strip.json as one self-contained file."""
     variants: Sequence[Mapping[str, Any]] = found["variants"]
-    best, worst = variants[-1], variants[0]
+    best, worst = variants[6], variants[0]
     ends = [float(np.median(v["eta_end"])) for v in variants]
     tiles = [
         Tile(
             label="Similarity, order 6 + tangential",
-            value=f"{ends[-1]:.3f}",
+            value=f"{ends[6]:.3f}",
             unit="eta",
-            verdict="good" if ends[-1] >= GOOD else "poor",
+            verdict="good" if ends[6] >= GOOD else "poor",
             says=f"At the end of the strip, median; {GOOD} and more keeps squares square.",
         ),
         Tile(
@@ -54,7 +64,7 @@ def strip_page(found: Mapping[str, Any]) -> str:
     summary = (
         f"How well a chess-board keeps its shape along {photos} photos that are mosaicked from one"
         " to the next:"
-        f" eta falls from 1 to {ends[0]:.2f} for {worst['name']}, to {ends[-1]:.2f} for"
+        f" eta falls from 1 to {ends[0]:.2f} for {worst['name']}, to {ends[6]:.2f} for"
         f" {best['name']}."
     )
     sections = (_curves(variants, found["flights"]), _table(variants), _how(found))
@@ -102,8 +112,9 @@ def _figure(variants: Sequence[Mapping[str, Any]], low: float, title: str, fligh
     )
 
 
-def _curve(axes: Axes, values: Sequence[float], colour: str, dashes: str) -> Markup:
-    points = axes.points(np.column_stack([np.arange(1, len(values) + 1), values]))
+def _curve(axes: Axes, values: Sequence[float | None], colour: str, dashes: str) -> Markup:
+    shown = [(k, v) for k, v in enumerate(values, 1) if v is not None]
+    points = axes.points(np.array(shown, np.float64))
     return Markup(
         '<path style="fill:none;stroke:{};stroke-width:2;stroke-dasharray:{}" d="{}"/>'
     ).format(colour, dashes or "none", polyline(points))
@@ -112,7 +123,7 @@ def _curve(axes: Axes, values: Sequence[float], colour: str, dashes: str) -> Mar
 def _table(variants: Sequence[Mapping[str, Any]]) -> Section:
     rows = []
     for v in variants:
-        eta, ends = v["eta"], v["eta_end"]
+        eta, ends = [e for e in v["eta"] if e is not None], v["eta_end"]
         middle = eta[(len(eta) - 1) // 2]
         rows.append(
             (
@@ -137,7 +148,7 @@ def _table(variants: Sequence[Mapping[str, Any]]) -> Section:
         "best end",
     )
     table = Table(
-        title="Seven variants",
+        title="Nine variants",
         head=head,
         rows=tuple(rows),
         numeric="tttnnnnn",

@@ -1,4 +1,4 @@
-"""The workflow of `strip-test`: Y Fig. 6.5 reproduced with simulated strips."""
+"""The workflow of `strip-test`: Y Figures 4.5 and 6.5 reproduced with simulated strips."""
 
 import json
 import time
@@ -28,7 +28,7 @@ def iter_strip_test(
     flights: int = 5,
     overwrite: bool = False,
 ) -> Iterator[Event]:
-    """Simulates strips with different seeds, mosaics each in seven variants, writes strip.json and
+    """Simulates strips with different seeds, mosaics each in nine variants, writes strip.json and
     report.html; yields events.
 
     Raises:
@@ -92,8 +92,8 @@ def _figures(
         {
             **asdict(variant),
             "calibration_rms_px": round(float(np.median([r[variant.distortion] for r in rms])), 4),
-            "eta": np.round(np.median(etas[:, j], axis=0), 4).tolist(),
-            "eta_end": np.round(etas[:, j, -1], 4).tolist(),
+            "eta": [None if np.isnan(v) else round(float(v), 4) for v in np.median(etas[:, j], 0)],
+            "eta_end": [round(float(e[np.isfinite(e)][-1]), 4) for e in etas[:, j]],
         }
         for j, variant in enumerate(VARIANTS)
     ]

@@ -11,6 +11,7 @@ import numpy as np
 from skyquilt.errors import SideFileError
 from skyquilt.model.clip import ChosenFrames, Clip, Track
 from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.photos.kept_frames import KEPT_QUALITY
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.video_modes import with_mode
 from skyquilt.video.positions import attitude_at, clip_zero, flight_yaw_at, places_at, position_at
@@ -132,7 +133,7 @@ def frames_of(clip: Clip, chosen: ChosenFrames, *, number: int, use_track: bool)
     photos = []
     for i, frame in enumerate(chosen.chosen):
         when = float(there[i])
-        key = f"{clip.digest}|{frame.time_s:.6f}"
+        key = f"{clip.digest}|{frame.time_s:.6f}|{KEPT_QUALITY}"
         photos.append(
             Photo(
                 name=chosen.name(frame),

@@ -27,6 +27,8 @@ from skyquilt.quality.replay import (
 
 ACROSS = 400
 """Width in px of the photos that are compared: that of the thesis."""
+MOST_PX = 1.2e7
+"""Largest map, in pixels, that they are compared with."""
 
 
 def placement_quality(
@@ -46,8 +48,9 @@ def placement_quality(
     views = {v.photo: v for v in ground.views}
     order = tuple(i for i in order if i in views)
     wide = max(view.camera.width for view in ground.views)
-    gsd = ground.native_gsd * wide / ACROSS
-    seen = replay(view_patch(grey(i, ACROSS), views[i], ground.surface, gsd) for i in order)
+    across = _across(ground, wide)
+    gsd = ground.native_gsd * wide / across
+    seen = replay(view_patch(grey(i, across), views[i], ground.surface, gsd) for i in order)
     off = np.array([np.hypot(*(alignment.poses[i].map_C - priors[i].map_C)[:2]) for i in order])
     figures = _figures(seen, photos, views, ground, known, alpha) | _geolocation(
         alignment, priors, order
@@ -61,6 +64,15 @@ def placement_quality(
     }
     yield 1, 1
     return figures
+
+
+def _across(ground: Ground, wide: int) -> int:
+    """Width in px of the compared photos: `ACROSS`, or less for a map that would have more than
+    `MOST_PX` pixels then.
+    """
+    west, south, east, north = ground.grid.bounds
+    area = (east - west) * (north - south) / (ground.native_gsd * wide / ACROSS) ** 2
+    return max(16, round(ACROSS * min(1.0, float(np.sqrt(MOST_PX / max(area, 1.0))))))
 
 
 def _figures(

@@ -42,12 +42,35 @@ class Part:
     """Size of a pixel in m."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class About:
+    """What a map says of itself."""
+
+    crs: str
+    """Projection; empty where there is none."""
+    bounds: Bounds
+    """Extent in it."""
+    bands: int
+    """1, or 3 for colours."""
+    dtype: str
+    """Type of its pixels."""
+    resolution: float
+    """Size of a pixel."""
+    tags: dict[str, str] = field(default_factory=dict)
+    """Its own tags."""
+    units: tuple[str, ...] = ()
+    """Unit of each band; empty where none is stated."""
+
+
 class MapSource(Protocol):
     """A map that can be read in parts."""
 
     @property
     def crs(self) -> str:
         """Its projection."""
+
+    def about(self) -> About | None:
+        """What it says of itself; None while it is empty."""
 
     def bounds(self) -> Bounds | None:
         """Its extent in its own projection; None while it is empty."""
@@ -70,6 +93,21 @@ class TileSource:
     """Easting and northing of the map frame's origin in m."""
     gsd: float
     """Ground size of a pixel of level 0 in m."""
+
+    def about(self) -> About | None:
+        """Type and extent of the layer's content."""
+        bounds = self.bounds()
+        longest = 0.0 if bounds is None else max(bounds[2] - bounds[0], bounds[3] - bounds[1])
+        part = None if bounds is None else self.part(bounds, longest / SIDE)
+        if bounds is None or part is None:
+            return None
+        return About(
+            crs=self.crs,
+            bounds=bounds,
+            bands=part.pixels.shape[2],
+            dtype=part.pixels.dtype.name,
+            resolution=self.gsd,
+        )
 
     def bounds(self) -> Bounds | None:
         """Extent of the layer's content."""
@@ -116,35 +154,15 @@ class TileSource:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class FileAbout:
-    """What a GeoTIFF says of itself."""
-
-    crs: str
-    """Projection; empty where there is none."""
-    bounds: Bounds
-    """Extent in it."""
-    bands: int
-    """1, or 3 for colours."""
-    dtype: str
-    """Type of its pixels."""
-    resolution: float
-    """Size of a pixel."""
-    tags: dict[str, str]
-    """Its own tags."""
-    units: tuple[str, ...]
-    """Unit of each band; empty where none is stated."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FileSource:
     """A finished map (GeoTIFF)."""
 
     path: Path
     """The file."""
-    _known: dict[str, FileAbout] = field(default_factory=dict)
+    _known: dict[str, About] = field(default_factory=dict)
 
-    def about(self) -> FileAbout:
+    def about(self) -> About:
         """What the file says of itself, read once."""
         import rasterio
 
@@ -153,7 +171,7 @@ class FileSource:
                 bands = 3 if raster.count >= 3 else 1
                 system = raster.crs
                 units = tuple(u or "" for u in raster.units[:bands])
-                self._known["about"] = FileAbout(
+                self._known["about"] = About(
                     crs=_plane(system.to_string()) if system else "",
                     bounds=tuple(raster.bounds),
                     bands=bands,

@@ -10,24 +10,6 @@ from skyquilt.report.parts import Section, Table
 
 MOST_PHOTOS = 3000
 """Rows of the table of photos; the others are in shots.geojson."""
-FILES = {
-    "mosaic.tif": "map",
-    "thermal.tif": "thermal map",
-    "dsm.tif": "heights",
-    "hillshade.tif": "relief",
-    "dtm.tif": "bare ground",
-    "contours.gpkg": "contour lines",
-    "surface.tif": "ground drawn on",
-    "views.tif": "photos per place",
-    "provenance.tif": "photo shown",
-    "shots.geojson": "positions of photos",
-    "footprints.geojson": "footprints",
-    "cameras.json": "cameras",
-    "reconstruction.json": "poses and tie points",
-    "metrics.json": "all figures",
-    "run.toml": "settings",
-}
-"""Files of a run, in the order of the links."""
 
 
 def facts_of(data: ReportInput) -> tuple[tuple[str, str], ...]:

@@ -8,9 +8,10 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from markupsafe import Markup
 
+from skyquilt.engine.folder import FILES
 from skyquilt.errors import OutputError
 from skyquilt.report import headline
-from skyquilt.report.about import FILES, facts_of, photos_section
+from skyquilt.report.about import facts_of, photos_section
 from skyquilt.report.attention import attention
 from skyquilt.report.clips import clips_section
 from skyquilt.report.effort import time_section

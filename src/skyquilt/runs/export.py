@@ -19,7 +19,7 @@ from skyquilt.outside import read_bounded
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.raster.atomic import mended, write_text
 from skyquilt.raster.geopackage import write_polygons
-from skyquilt.raster.map_source import Bounds, FileSource, between, picture, values
+from skyquilt.raster.map_source import Bounds, FileSource, MapSource, between, picture, values
 from skyquilt.raster.picture_files import PngRows, image_bytes
 from skyquilt.runs.grid import ExportGrid, grid_of
 from skyquilt.runs.kmz import write_kmz
@@ -115,7 +115,11 @@ def _one(what: str, folder: Path, layer: RunLayer, wanted: Wanted, target: Path)
     source = FileSource(path=folder / layer.file)
     grid = grid_of(source, wanted.bounds, wanted.crs, wanted.gsd_m)
     if what in ("tif", "heights"):
-        return _tif(source, layer, grid, target / f"{layer.name}.tif", folder)
+        path, figures = target / f"{layer.name}.tif", figures_of(folder)
+        same = grid.crs == source.crs
+        if not write_tif(source, layer, grid, path, vertical_of(layer, figures) if same else None):
+            raise UsageError("the map has no content within --bounds")
+        return Export(path=path, note=unit_of(layer, figures) if layer.measured else "")
     scale = range_of(layer, source)
     note = ""
     if scale is not None and layer.measured:
@@ -164,9 +168,15 @@ def _png(
     return path
 
 
-def _tif(source: FileSource, layer: RunLayer, grid: ExportGrid, path: Path, folder: Path) -> Export:
-    """A Cloud Optimized GeoTIFF of the values themselves."""
+def write_tif(
+    source: MapSource, layer: RunLayer, grid: ExportGrid, path: Path, vertical: int | None = None
+) -> bool:
+    """A Cloud Optimized GeoTIFF of the values themselves; False, and no file, where the map has
+    none. `vertical`: EPSG code of the zero of heights.
+    """
     about = source.about()
+    if about is None:
+        return False
     real = about.dtype.startswith("float")
     colours = about.dtype == "uint8" and not layer.measured
     spec = RasterSpec(
@@ -176,7 +186,7 @@ def _tif(source: FileSource, layer: RunLayer, grid: ExportGrid, path: Path, fold
         dtype=about.dtype,
         transform=(grid.step, 0, grid.west, 0, -grid.step, grid.north),
         crs=grid.crs or None,
-        vertical=vertical_of(layer, figures_of(folder)) if grid.crs == source.crs else None,
+        vertical=vertical,
         nodata=float("nan") if real else None,
         compress="jpeg" if colours else "deflate",
         mask=not real,
@@ -184,18 +194,22 @@ def _tif(source: FileSource, layer: RunLayer, grid: ExportGrid, path: Path, fold
         tags=about.tags,
         band_units=about.units,
     )
+    some = False
     with CogWriter(path, spec) as writer:
         for block in writer.blocks():
             box = grid.bounds(block.row0, block.col0, block.height, block.width)
             found = values(source, grid.crs, box, block.width, block.height)
-            if found is None:
+            if found is None or not found[1].any():
                 writer.finish_block(block)
                 continue
             pixels, shown = found
+            some = True
             if real:
                 pixels = np.where(shown[..., None], pixels, np.float32(np.nan))
             writer.write_block(block, np.ascontiguousarray(pixels), None if real else shown)
-    return Export(path=path, note=unit_of(layer, figures_of(folder)) if layer.measured else "")
+    if not some:
+        path.unlink(missing_ok=True)
+    return some
 
 
 def _tiles(

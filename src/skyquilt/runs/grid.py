@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from skyquilt.errors import UsageError
-from skyquilt.raster.map_source import Bounds, FileSource, between
+from skyquilt.raster.map_source import Bounds, MapSource, between
 
 METRES_PER_DEGREE = 111_320.0
 """Length of a degree of latitude."""
@@ -59,7 +59,7 @@ class ExportGrid:
 
 
 def grid_of(
-    source: FileSource, bounds: Bounds | None, crs: str | None, gsd_m: float | None
+    source: MapSource, bounds: Bounds | None, crs: str | None, gsd_m: float | None
 ) -> ExportGrid:
     """The grid asked for; None = that of the map.
 
@@ -71,14 +71,17 @@ def grid_of(
 
     if crs is not None and not source.crs:
         raise UsageError("the map is not georeferenced, so --crs cannot be given")
-    target, native = crs or source.crs, source.resolution()
-    extent = source.bounds()
-    assert extent is not None
+    about = source.about()
+    if about is None:
+        raise UsageError("the map is empty")
+    target, native, extent = crs or source.crs, about.resolution, about.bounds
     own = target == source.crs or (crs is not None and CRS(crs) == CRS(source.crs))
     if not own:
         extent = between(source.crs, target).transform_bounds(*extent)
     degrees = bool(target) and CRS(target).is_geographic
-    step = (gsd_m or native) / (METRES_PER_DEGREE if degrees else 1.0)
+    around = METRES_PER_DEGREE if source.crs and CRS(source.crs).is_geographic else 1.0
+    metres = gsd_m or native * around
+    step = metres / (METRES_PER_DEGREE if degrees else 1.0)
     west, south, east, north = bounds or extent
     west, south, east, north = (
         max(west, extent[0]),
@@ -100,11 +103,5 @@ def grid_of(
             f"this part has {width} x {height} px; choose a larger --gsd or smaller --bounds"
         )
     return ExportGrid(
-        crs=target,
-        west=west,
-        north=north,
-        step=step,
-        metres=gsd_m or native,
-        width=width,
-        height=height,
+        crs=target, west=west, north=north, step=step, metres=metres, width=width, height=height
     )

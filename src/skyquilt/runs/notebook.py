@@ -59,8 +59,8 @@ def _positions(survey: Survey) -> str:
     line = " ".join(f"{x:.1f},{y:.1f}" for x, y in xy)
     return (
         f'<svg role="img" aria-label="positions of the photos" width="{width:.0f}"'
-        f' height="{height:.0f}"><polyline points="{line}" fill="none" stroke="#89a"/>'
-        f'<g fill="#0047b3">{dots}</g></svg>'
+        f' height="{height:.0f}"><polyline points="{line}" fill="none" stroke="#7d8c9b"/>'
+        f'<g fill="#2f7fe0">{dots}</g></svg>'
     )
 
 
@@ -72,5 +72,5 @@ def _page(picture: str, facts: dict[str, Any]) -> str:
     )
     return (
         '<div style="display:flex;gap:1em;align-items:flex-start;flex-wrap:wrap">'
-        f"{picture}<table>{rows}</table></div>"
+        f'{picture}<table aria-label="what there is">{rows}</table></div>'
     )

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fastapi import FastAPI, Response
 from fastapi.responses import FileResponse, StreamingResponse
@@ -18,7 +19,6 @@ from skyquilt.server.file_endpoints import FileEndpoints
 from skyquilt.server.images import Images
 from skyquilt.server.layer_endpoints import LayerEndpoints
 from skyquilt.server.map_endpoints import STATIC, MapEndpoints
-from skyquilt.server.mission_watch import MissionWatch
 from skyquilt.server.photo_endpoints import PhotoEndpoints
 from skyquilt.server.photo_views import PhotoViews
 from skyquilt.server.plan_endpoints import PlanEndpoints
@@ -28,13 +28,16 @@ from skyquilt.server.upload_endpoints import UploadEndpoints
 from skyquilt.server.wms import WmsEndpoints
 from skyquilt.version import __version__
 
+if TYPE_CHECKING:
+    from skyquilt.server.mission_watch import MissionWatch  # only for live surveys
+
 
 def make_app(
     survey: Survey,
     guard: Guard,
     writer: Writer | None,
     folder: Path,
-    watch: MissionWatch | None = None,
+    watch: "MissionWatch | None" = None,
 ) -> FastAPI:
     """The application; `watch` follows the plan of a live survey."""
     context, images = Context(survey, guard, writer), Images(survey)
@@ -110,6 +113,8 @@ def make_app(
         ("/plan", plans.plan, get),
         ("/plan", plans.new, post),
         ("/plan/missing", plans.missing, post),
+        ("/areas", plans.areas, get),
+        ("/areas", plans.areas_put, {"methods": ["PUT"]}),
         ("/plans/{name}/{file}", plans.plan_file, {**get, "response_class": FileResponse}),
         ("/coverage", plans.coverage, get),
         ("/coverage.png", plans.coverage_picture, {**get, "response_class": Response}),

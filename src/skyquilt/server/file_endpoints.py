@@ -6,9 +6,8 @@ from typing import Any
 from fastapi import HTTPException
 from fastapi.responses import FileResponse
 
-from skyquilt.engine.folder import EXPORTS
+from skyquilt.engine.folder import EXPORTS, FILES
 from skyquilt.outside import open_regular
-from skyquilt.report.about import FILES
 from skyquilt.server.access import Context
 
 REPORT = "report.html"

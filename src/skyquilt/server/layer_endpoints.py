@@ -10,7 +10,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse
 from starlette.requests import ClientDisconnect
 
-from skyquilt.errors import OutputError
+from skyquilt.errors import OutputError, SideFileError
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.photo_intake import shown_name
 from skyquilt.outside import MOST_DIGITS, real
@@ -19,6 +19,8 @@ from skyquilt.server.survey import LiveSurvey
 
 GEOMETRIES = ("Point", "MultiPoint", "LineString", "MultiLineString", "Polygon", "MultiPolygon")
 MOST_NESTED = 8
+SHAPES = (".kml", ".kmz", ".gpkg", ".zip")
+"""Endings of files of GIS programs, beside GeoJSON, that are taken as layers; Shapefiles zipped."""
 
 
 class LayerError(ValueError):
@@ -100,6 +102,15 @@ def _places(value: Any, k: int, depth: int) -> None:
         _places(inner, k, depth + 1)
 
 
+def _shapes(data: bytes, name: str) -> dict[str, Any]:
+    """A FeatureCollection from the content of a file; its ending says which kind."""
+    if not name.lower().endswith(SHAPES):
+        return checked(data)
+    from skyquilt.server.layer_files import layer_of_bytes  # asked for by few
+
+    return checked(json.dumps(layer_of_bytes(data, name)).encode())
+
+
 def put_layer(ledger: Ledger, name: str, layer: dict[str, Any], most: int) -> bool:
     """Stores a layer under a name; False if there are too many layers."""
     with ledger.change() as db:
@@ -146,8 +157,8 @@ class LayerEndpoints:
         return Response(row[0], media_type="application/geo+json")
 
     async def layer_post(self, request: Request, name: str) -> JSONResponse:
-        """Adds GeoJSON (the request's body) as a layer over the map, or replaces the layer of that
-        name.
+        """Adds a layer (the request's body) over the map, or replaces the layer of that name:
+        GeoJSON, or by the ending of its name KML, KMZ, GeoPackage or a zipped Shapefile.
         """
         writer, guard = self.context.writing(request), self.context.guard
         data = bytearray()
@@ -159,11 +170,11 @@ class LayerEndpoints:
         except (ClientDisconnect, TimeoutError) as error:
             raise HTTPException(408, "the connection was lost; send the layer again") from error
         try:
-            layer = await to_thread.run_sync(checked, bytes(data), limiter=self._one)
+            layer = await to_thread.run_sync(_shapes, bytes(data), name, limiter=self._one)
             stored = await run_in_threadpool(
                 put_layer, writer.ledger, shown_name(name), layer, self.context.guard.most_layers
             )
-        except LayerError as error:
+        except (LayerError, SideFileError) as error:
             raise HTTPException(422, f"this is not a layer: {error}") from error
         except OutputError as error:
             raise HTTPException(507, str(error)) from error

@@ -12,12 +12,13 @@ from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
 from skyquilt.engine.free_memory import give_back
+from skyquilt.errors import UsageError
 from skyquilt.outside import real
 from skyquilt.raster.colours import ramp
 from skyquilt.raster.map_source import MapSource, between
 from skyquilt.server.access import Context
 from skyquilt.server.finished_survey import FinishedSurvey
-from skyquilt.server.images import Images, write_cog
+from skyquilt.server.images import Images
 from skyquilt.server.readouts import HEIGHTS
 from skyquilt.server.survey import LiveSurvey
 from skyquilt.version import __version__
@@ -148,25 +149,17 @@ class MapEndpoints:
         if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):
             raise HTTPException(400, "bbox has no area; it is west,south,east,north in degrees")
         bounds = between("EPSG:4326", source.crs).transform_bounds(west, south, east, north)
-        extent = source.bounds()
-        if extent is None:
-            raise HTTPException(404, "the map is empty")
-        bounds = (
-            max(bounds[0], extent[0]),
-            max(bounds[1], extent[1]),
-            min(bounds[2], extent[2]),
-            min(bounds[3], extent[3]),
-        )
+        from skyquilt.server.parts import write_part  # asked for by few
+
         handle, path = tempfile.mkstemp(suffix=".tif")
         os.close(handle)
         gone = BackgroundTask(Path(path).unlink, missing_ok=True)
-        done = (
-            None
-            if bounds[0] >= bounds[2] or bounds[1] >= bounds[3]
-            else write_cog(source, bounds, Path(path), 0.0)
-        )
+        try:
+            some = write_part(source, self.images.style(name), bounds, Path(path))
+        except UsageError:
+            some = False
         give_back()
-        if done is None:
+        if not some:
             Path(path).unlink(missing_ok=True)
             raise HTTPException(404, "the map is empty there")
         return FileResponse(

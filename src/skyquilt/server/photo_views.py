@@ -11,12 +11,14 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import HTTPException, Query, Response
 from numpy.typing import NDArray
 
+from skyquilt.errors import UnreadablePhotoError
 from skyquilt.outside import check_picture
 from skyquilt.raster.map_source import between
 from skyquilt.server.access import Context
 from skyquilt.server.finished_survey import FinishedSurvey
 from skyquilt.server.photo_endpoints import Degrees, Latitude, Number, PhotoEndpoints
 from skyquilt.server.readouts import HEIGHTS, value_at
+from skyquilt.server.survey import LiveSurvey
 
 if TYPE_CHECKING:
     from skyquilt.server.projection import Projection
@@ -121,19 +123,38 @@ class PhotoViews:
         return Response(_jpeg(out), media_type="image/jpeg")
 
     async def place(self, number: Number, lon: Degrees, lat: Latitude) -> dict[str, Any]:
-        """The pixel at which a photo of a finished map shows a place on its surface."""
+        """The pixel at which a photo of the map shows a place on the ground."""
         return await to_thread.run_sync(self._place, number, lon, lat, limiter=self._decoding)
 
     def _place(self, number: int, lon: float, lat: float) -> dict[str, Any]:
         shown = self.context.survey.photo(number)
         if shown is None:
             raise HTTPException(404, f"there is no photo {number}")
+        if isinstance(self.context.survey, LiveSurvey):
+            return self._live_place(self.context.survey, number, lon, lat)
         x, y, z = self.on_ground(lon, lat)
         px = self.projection.pixel(shown.name, (x, y, z))
         if px is None:
             raise HTTPException(404, "the photo does not show this place")
         width, height = self.projection.size(shown.name)
         return {"x": round(px[0], 2), "y": round(px[1], 2), "width": width, "height": height}
+
+    @staticmethod
+    def _live_place(survey: LiveSurvey, number: int, lon: float, lat: float) -> dict[str, Any]:
+        from skyquilt.server.live_projection import LiveProjection  # needed by few, slow to load
+
+        frame = survey.ledger.meta("frame")
+        x, y = between("EPSG:4326", frame["crs"]).transform(lon, lat) if frame else (0.0, 0.0)
+        try:
+            found = LiveProjection(survey).pixel(number, x, y)
+        except UnreadablePhotoError as error:
+            raise HTTPException(404, str(error)) from error
+        if found is None:
+            raise HTTPException(404, "the photo does not show this place")
+        (px, py), camera = found
+        return {
+            "x": round(px, 2), "y": round(py, 2), "width": camera.width, "height": camera.height
+        }  # fmt: skip
 
     def on_ground(self, lon: float, lat: float) -> tuple[float, float, float]:
         """A place in the map's projection with the height of the surface."""

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from fastapi import HTTPException, Query, Request
 from fastapi.responses import FileResponse, JSONResponse, Response
@@ -16,17 +16,20 @@ from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from skyquilt.errors import OutputError
-from skyquilt.live.fill import PLANS, next_folder
 from skyquilt.live.ledger import Ledger
+from skyquilt.live.plan_folders import PLANS, next_folder
 from skyquilt.outside import plain
-from skyquilt.planning.ground_cover import picture_of
-from skyquilt.planning.plan_file import as_record
 from skyquilt.server.access import Context, blocks_of
 from skyquilt.server.layer_endpoints import LayerError, checked
-from skyquilt.server.mission_watch import MissionWatch
+from skyquilt.server.survey import LiveSurvey
+
+if TYPE_CHECKING:
+    from skyquilt.server.mission_watch import MissionWatch  # only for live surveys
 
 MOST_RUNNING = 1
 """Plans that are computed at a time."""
+AREAS = "areas"
+"""Key of the areas that were drawn, in the ledger."""
 MOST_PLANS = 200
 """Plans that a survey keeps."""
 PATIENCE_S = 600.0
@@ -38,17 +41,19 @@ Percent = Annotated[float, Query(ge=0, le=97)]
 class PlanEndpoints:
     """Endpoints of the plan; without a watch (a finished run) there is none."""
 
-    def __init__(self, context: Context, folder: Path, watch: MissionWatch | None) -> None:
+    def __init__(self, context: Context, folder: Path, watch: "MissionWatch | None") -> None:
         self.context, self.folder, self.watch = context, folder, watch
         self._running: subprocess.Popen[str] | None = None
 
-    def _watching(self) -> MissionWatch:
+    def _watching(self) -> "MissionWatch":
         if self.watch is None:
             raise HTTPException(404, "this survey is finished; only a live one knows a plan")
         return self.watch
 
     def plan(self) -> dict[str, Any]:
         """The plan and the state of its points."""
+        from skyquilt.planning.plan_file import as_record  # `view` has no plan
+
         watch = self._watching()
         if watch.plan is None:
             return {"plan": None, "drones": [], "states": {}, "plans": self._names()}
@@ -80,6 +85,8 @@ class PlanEndpoints:
         """The number of views as a picture in Web Mercator: red none, orange too few, green
         enough.
         """
+        from skyquilt.planning.ground_cover import picture_of  # `view` has no plan
+
         state = self._watching().state
         if state is None or state.cover is None or state.counts is None:
             raise HTTPException(404, "there is no coverage yet")
@@ -96,6 +103,37 @@ class PlanEndpoints:
         output = self._room("fill")
         return self._started(writer.ledger, output, [str(self.folder), "-o", str(output)])
 
+    def areas(self) -> dict[str, Any]:
+        """The areas that were drawn in a browser, as GeoJSON; keep-out areas with `keep_out`."""
+        self._watching()
+        survey = self.context.survey
+        kept = survey.ledger.meta(AREAS) if isinstance(survey, LiveSurvey) else None
+        return dict(kept or {"type": "FeatureCollection", "features": []})
+
+    async def areas_put(self, request: Request) -> dict[str, Any]:
+        """Keeps the areas that were drawn (GeoJSON) in place of those kept before."""
+        writer = self.context.writing(request)
+        areas = await self._drawn_areas(request)
+        try:
+            await run_in_threadpool(_keep_areas, writer.ledger, areas)
+        except OutputError as error:
+            raise HTTPException(507, str(error)) from error
+        return {"areas": len(areas["features"])}
+
+    async def _drawn_areas(self, request: Request) -> dict[str, Any]:
+        """The body as GeoJSON."""
+        guard, data = self.context.guard, bytearray()
+        try:
+            async for block in blocks_of(request, guard.upload_stall_s):
+                data += block
+                if len(data) > guard.most_layer_bytes:
+                    raise HTTPException(413, f"areas may have {guard.most_layer_bytes} bytes")
+            return await run_in_threadpool(checked, bytes(data))
+        except (ClientDisconnect, TimeoutError) as error:
+            raise HTTPException(408, "the connection was lost; send the areas again") from error
+        except LayerError as error:
+            raise HTTPException(422, f"these are no areas: {error}") from error
+
     async def new(
         self,
         request: Request,
@@ -109,20 +147,10 @@ class PlanEndpoints:
         width: Annotated[float | None, Query(gt=0, le=10_000)] = None,
     ) -> JSONResponse:
         """Plans areas that were drawn: GeoJSON, keep-out areas with a property `keep_out`."""
-        writer, guard = self.context.writing(request), self.context.guard
+        writer = self.context.writing(request)
         if "/" in camera or ".." in camera:
             raise HTTPException(422, "the camera is a model such as FC6310")
-        data = bytearray()
-        try:
-            async for block in blocks_of(request, guard.upload_stall_s):
-                data += block
-                if len(data) > guard.most_layer_bytes:
-                    raise HTTPException(413, f"areas may have {guard.most_layer_bytes} bytes")
-            areas = await run_in_threadpool(checked, bytes(data))
-        except (ClientDisconnect, TimeoutError) as error:
-            raise HTTPException(408, "the connection was lost; send the areas again") from error
-        except LayerError as error:
-            raise HTTPException(422, f"these are no areas: {error}") from error
+        areas = await self._drawn_areas(request)
         self._free()
         output = self._room("plan")
         try:
@@ -199,6 +227,12 @@ class PlanEndpoints:
         threading.Thread(target=wait, daemon=True, name="planning").start()
         ledger.tell("plan", {"state": "planning", "name": output.name})
         return JSONResponse({"state": "planning", "name": output.name}, 202)
+
+
+def _keep_areas(ledger: Ledger, areas: dict[str, Any]) -> None:
+    with ledger.change():
+        ledger.put_meta(AREAS, areas)
+        ledger.tell("areas", {"areas": len(areas["features"])})
 
 
 def _drawn(record: dict[str, Any]) -> dict[str, Any]:

@@ -50,16 +50,25 @@ class Projection:
         pose, camera = self.run.poses.get(name), self._camera(name)
         if pose is None:
             return None
-        row = (camera.height - 1) / 2
-        px = np.full(2, np.nan)
-        for _ in range(STEPS if pose.motion is not None else 1):
-            local = local_of(pose, camera, np.array(place), row)
-            if local[2] <= 0 or np.hypot(*(local[:2] / local[2])) > monotone_radius(camera):
-                return None
-            px = project(camera, local[None])[0]
-            row = float(px[1])
-        inside = -0.5 <= px[0] <= camera.width - 0.5 and -0.5 <= px[1] <= camera.height - 0.5
-        return (float(px[0]), float(px[1])) if inside or beyond else None
+        return pixel_of(pose, camera, place, beyond=beyond)
+
+
+def pixel_of(
+    pose: Pose, camera: Camera, place: Xyz, *, beyond: bool = False
+) -> tuple[float, float] | None:
+    """The pixel at which a camera shows a place (m, in the frame of its pose); None as in
+    `Projection.pixel`.
+    """
+    row = (camera.height - 1) / 2
+    px = np.full(2, np.nan)
+    for _ in range(STEPS if pose.motion is not None else 1):
+        local = local_of(pose, camera, np.array(place), row)
+        if local[2] <= 0 or np.hypot(*(local[:2] / local[2])) > monotone_radius(camera):
+            return None
+        px = project(camera, local[None])[0]
+        row = float(px[1])
+    inside = -0.5 <= px[0] <= camera.width - 0.5 and -0.5 <= px[1] <= camera.height - 0.5
+    return (float(px[0]), float(px[1])) if inside or beyond else None
 
 
 def local_of(pose: Pose, camera: Camera, place: np.ndarray, row: float) -> np.ndarray:

@@ -11,7 +11,8 @@ from skyquilt.live.ledger import hit
 from skyquilt.raster.map_source import MERCATOR, Bounds, between, mercator, picture
 from skyquilt.raster.mbtiles import touched, write_mbtiles
 from skyquilt.raster.picture_files import image_bytes
-from skyquilt.server.images import TILE, changed_boxes, write_cog
+from skyquilt.server.images import TILE, changed_boxes
+from skyquilt.server.parts import write_part
 from skyquilt.server.survey import LiveSurvey
 
 PAUSE_S = 3.0
@@ -65,9 +66,8 @@ class PublishedFiles:
         if self._stale and (now or time.monotonic() - self._snapshot > SNAPSHOT_S):
             self._snapshot, self._stale = time.monotonic(), False
             source = self.survey.layers()[layer]
-            bounds = source.bounds()
-            if bounds is not None:
-                write_cog(source, bounds, self.folder / "map.tif", 0.0)
+            if source.bounds() is not None:
+                write_part(source, self.survey.styles()[layer], None, self.folder / "map.tif")
         hit("published")
 
     def _look(self, layer: str) -> None:

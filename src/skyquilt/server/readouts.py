@@ -34,13 +34,15 @@ class Readouts:
         self.context, self.images = context, images
         self._reading = CapacityLimiter(2)
 
-    async def at(self, lon: Degrees, lat: Latitude) -> dict[str, Any]:
-        """A place in the map's projection, and the value of every measured layer there, with its
-        unit.
+    async def at(
+        self, lon: Degrees, lat: Latitude, crs: Annotated[str | None, Query(max_length=60)] = None
+    ) -> dict[str, Any]:
+        """A place in the map's projection, or in `crs` (EPSG:...), and the value of every measured
+        layer there, with its unit.
         """
-        return await to_thread.run_sync(self._at, lon, lat, limiter=self._reading)
+        return await to_thread.run_sync(self._at, lon, lat, crs, limiter=self._reading)
 
-    def _at(self, lon: float, lat: float) -> dict[str, Any]:
+    def _at(self, lon: float, lat: float, crs: str | None) -> dict[str, Any]:
         layers = self.context.survey.layers()
         found: dict[str, Any] = {"lon": lon, "lat": lat, "crs": None, "x": None, "y": None}
         told = []
@@ -58,6 +60,8 @@ class Readouts:
                         "unit": self.images.unit(name),
                     }
                 )
+        if crs is not None:
+            found |= _in_crs(crs, lon, lat)
         return found | {"values": told}
 
     async def profile(self, line: Annotated[str, Query(max_length=20_000)]) -> dict[str, Any]:
@@ -155,6 +159,19 @@ def value_at(source: MapSource, x: float, y: float) -> float | None:
     if not (0 <= r < rows and 0 <= c < columns) or not part.shown[r, c]:
         return None
     return float(part.pixels[r, c, 0])
+
+
+def _in_crs(crs: str, lon: float, lat: float) -> dict[str, Any]:
+    """A place in another coordinate system."""
+    from pyproj.exceptions import CRSError
+
+    try:
+        x, y = between("EPSG:4326", crs).transform(lon, lat)
+    except CRSError as error:
+        raise HTTPException(400, "crs is a coordinate system such as EPSG:32633") from error
+    if not (math.isfinite(x) and math.isfinite(y)):
+        raise HTTPException(400, "the place lies outside this coordinate system")
+    return {"crs": crs, "x": round(x, 8), "y": round(y, 8)}
 
 
 def places_in(text: str, least: int) -> list[Place]:

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import BinaryIO
 
 from skyquilt.outside import open_regular
+from skyquilt.video.codec_size import codec_sizes
 
 _INSIDE = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"udta", b"meta", b"ilst")
 _MP4 = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
 _SYNC = 0x47
 """First byte of every packet of an MPEG transport stream, of 188 bytes or 192 with times."""
 _MEDIA = ("vide", "soun", "text", "meta", "sbtl", "tmcd")
-_MOST_BOXES = 4000
+_MOST_BOXES, _MOST_DESCRIPTION = 4000, 1 << 16
 _MODEL = re.compile(rb"(?:DJI|FC|Hasselblad|Autel|Parrot|GoPro|HERO)[ -~]{0,30}")
 _SURE = re.compile(r"^(FC\d{3,4}\w?|DJI ?[A-Za-z0-9 ]{3,25}|L[12]D-20c|HERO\d+ .{3,10})$")
 
@@ -35,6 +36,8 @@ class Container:
     """Camera model as some makers write it; empty where there is none."""
     size: tuple[int, int] | None
     """Width and height in px that its first video track declares."""
+    coded: tuple[tuple[int, int], ...] = ()
+    """The same by the headers of its codecs, by which frames are allocated."""
 
 
 def is_video(head: bytes) -> bool:
@@ -60,6 +63,7 @@ def read_container(path: Path) -> Container | None:
         size = file.seek(0, io.SEEK_END)
         kinds: list[str] = []
         created, whole, model, declared = None, False, "", None
+        coded: list[tuple[int, int]] = []
         for name, body, length in _boxes(file, 0, size):
             whole |= name == b"moov"
             file.seek(body)
@@ -71,10 +75,19 @@ def read_container(path: Path) -> Container | None:
                 created = _created(file.read(min(length, 20)))
             elif name == b"udta" and not model:
                 model = _model(file.read(min(length, 1 << 16)))
-            elif name == b"stsd" and kinds[-1:] == ["vide"] and declared is None:
-                entry = file.read(min(length, 44))
-                declared = struct.unpack(">HH", entry[40:44]) if len(entry) == 44 else None
-    return Container(whole=whole, kinds=tuple(kinds), created=created, model=model, size=declared)
+            elif name == b"stsd" and kinds[-1:] == ["vide"]:
+                entry = file.read(min(length, _MOST_DESCRIPTION))
+                coded += codec_sizes(entry)
+                if declared is None and len(entry) >= 44:
+                    declared = struct.unpack(">HH", entry[40:44])
+    return Container(
+        whole=whole,
+        kinds=tuple(kinds),
+        created=created,
+        model=model,
+        size=declared,
+        coded=tuple(coded),
+    )
 
 
 def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:

@@ -19,7 +19,10 @@ os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # its complaints would go
 # a container that names other files or addresses shall not open any
 os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file")
 _OPEN, _ERRORS = 4, 2
-_AHEAD_S = 3.0
+_AHEAD = 30
+"""Frames up to which it is cheaper to go on than to seek: OpenCV seeks to the key frame before the
+sixteenth frame before, and decodes all from there.
+"""
 _TOLERANCE = 0.4
 _PLANAR = int.from_bytes(b"I420", "little")
 """Pixel format whose first plane is the brightness in 8 bits: 8-bit H.264, H.265 and MPEG-4."""
@@ -68,7 +71,7 @@ class Decoder:
         from `time_s` on; None after the last one.
         """
         near = _TOLERANCE / self.fps
-        if not self._time - near <= time_s <= self._time + _AHEAD_S:
+        if not self._time - near <= time_s <= self._time + _AHEAD / self.fps:
             self._seek(time_s - near)
         while self._time < time_s - near:
             if not self.skip():

@@ -95,8 +95,9 @@ def _check(path: Path, head: bytes, box: Container | None) -> None:
     if box.kinds and "vide" not in box.kinds:
         held = "sound only" if "soun" in box.kinds else "no pictures"
         raise UnreadablePhotoError(f"it is a video file with {held}")
-    if box.size is not None and min(box.size) > 0:
-        _check_size(*box.size)
+    for size in (box.size, *box.coded):
+        if size is not None and min(size) > 0:
+            _check_size(*size)
 
 
 def _check_size(width: int, height: int) -> None:

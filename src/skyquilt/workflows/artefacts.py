@@ -1,5 +1,6 @@
 """What the store of a run may hold."""
 
+from skyquilt.alignment import problem
 from skyquilt.model import camera, clip, features, poses, raster, surface
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.ortho import companions
@@ -24,6 +25,7 @@ REGISTRY = {
         poses.ControlResidual,
         poses.Join,
         surface.Surface,
+        problem.State,
         RejectedPhoto,
         companions.BlockExtras,
         raster.Grid,

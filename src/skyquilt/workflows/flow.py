@@ -8,7 +8,7 @@ command gets at the photos and the ground of a finished map by the same steps.
 """
 
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,10 +30,10 @@ from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.radiometry import balanced
-from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import rejected
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.clip_frames import with_frames
+from skyquilt.workflows.frame_pixels import pixels_of
 from skyquilt.workflows.links import Links, link_photos
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import (
@@ -48,6 +48,8 @@ from skyquilt.workflows.photo_features import (
 from skyquilt.workflows.survey_input import SurveyInput
 
 T = TypeVar("T")
+ADJUSTING = "adjusting"
+"""Folder in the store with the parts of an adjustment that is not finished."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,7 +141,7 @@ def align_photos(
     given = yield from frames_added(given, settings, clock)
     photos = given.survey.photos
     cache = PixelCache(
-        read=lambda i: read_color(photos[i]),
+        read=lambda i: pixels_of(photos[i], store),
         budget_bytes=pixel_budget(settings.running.memory_gb),
         resident_bytes=resident_budget(settings.running.memory_gb),
     )
@@ -269,8 +271,11 @@ def _labels(
         picture_recipe(),
         [p.digest for p in aligned.photos],
     )
+    keep = store.parts("seams", key)
     return store.get_or(
-        "seams", key, lambda: methods.seams(on.views, on.surface, on.grid, aligned.grey, exposure)
+        "seams",
+        key,
+        lambda: methods.seams(on.views, on.surface, on.grid, aligned.grey, exposure, keep),
     )
 
 
@@ -340,7 +345,9 @@ def _align(known: AlignmentInputs, methods: Methods, store: Store) -> Steps[Alig
         list(known.order),
         methods.align,
     )
-    alignment = store.get_or("alignment", key, lambda: methods.align(known))
+    resumable = replace(known, keep=store.parts(ADJUSTING, key))
+    alignment = store.get_or("alignment", key, lambda: methods.align(resumable))
+    store.forget([ADJUSTING])
     yield 1, 1
     return alignment
 

@@ -18,6 +18,7 @@ from skyquilt.alignment.aligners import Auto, ByLinks, ByReport, by_pose
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.inputs import Aligner
 from skyquilt.alignment.pose import ByPosition
+from skyquilt.engine.kept import Keep
 from skyquilt.imaging.nodes import View
 from skyquilt.matching.candidates import Nearest, Pair, Retrieval
 from skyquilt.matching.matchers import Guided
@@ -108,9 +109,12 @@ class SeamMethod(Protocol):
         grid: Grid,
         grey: GreyPicture,
         exposure: Exposure,
+        keep: Keep,
         /,
     ) -> Labels:
-        """The photo of each cell of a map's grid, from grey images of the photos."""
+        """The photo of each cell of a map's grid, from grey images of the photos; `keep`: for
+        methods that resume at a part of their result.
+        """
         ...
 
 

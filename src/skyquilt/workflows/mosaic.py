@@ -37,6 +37,7 @@ from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.clip_frames import frame_methods, write_frames
 from skyquilt.workflows.flow import (
+    ADJUSTING,
     AlignedPhotos,
     DrawnMap,
     Scene,
@@ -341,7 +342,7 @@ def _tone(aligned: AlignedPhotos, ground: Ground, map_: DrawnMap) -> dict[str, A
 def _forget(run: RunFolder, store: Store, rerun_from: str | None) -> None:
     if rerun_from is not None:
         later = STAGES[STAGES.index(rerun_from) :]
-        store.forget([ARTEFACTS[s] for s in later if s in ARTEFACTS])
+        store.forget([ADJUSTING, *(ARTEFACTS[s] for s in later if s in ARTEFACTS)])
         if "mosaic" in later:
             shutil.rmtree(run.path / STATE / SPOOL, ignore_errors=True)
         run.mark("running")

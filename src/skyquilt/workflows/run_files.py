@@ -53,11 +53,12 @@ def seconds_of(time: datetime | None) -> float | None:
     return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
 
 
-def shot_properties(photo: Photo, alignment: Alignment, i: int) -> dict[str, Any]:
+def shot_properties(
+    photo: Photo, alignment: Alignment, i: int, block: int, tie_points: int
+) -> dict[str, Any]:
     """The properties of a photo in shots.geojson."""
     pose, camera = alignment.poses[i], alignment.camera(i)
     yaw, pitch, roll = angles_from_cam_R_map(pose.cam_R_map)
-    block = next((k for k, b in enumerate(alignment.blocks) if i in b), -1)
     return {
         "filename": photo.name,
         "digest": photo.digest,
@@ -73,7 +74,7 @@ def shot_properties(photo: Photo, alignment: Alignment, i: int) -> dict[str, Any
         "pitch": round(pitch, 3),
         "roll": round(roll, 3),
         "block": block,
-        "tie_points": int((alignment.ties.photo == i).sum()),
+        "tie_points": tie_points,
     }
 
 
@@ -93,8 +94,13 @@ def write_shots(
     path: Path, photos: Sequence[Photo], alignment: Alignment, order: Sequence[int]
 ) -> None:
     """shots.geojson: a point per photo; the k-th feature is number k in provenance.tif."""
+    number = np.bincount(alignment.ties.photo, minlength=len(photos)).tolist()
+    block = {i: k for k, b in enumerate(alignment.blocks) for i in b}
     features = [
-        (in_crs(alignment, alignment.poses[i].map_C), shot_properties(photos[i], alignment, i))
+        (
+            in_crs(alignment, alignment.poses[i].map_C),
+            shot_properties(photos[i], alignment, i, block.get(i, -1), number[i]),
+        )
         for i in order
     ]
     vector.points(path, features, crs=alignment.frame.crs)

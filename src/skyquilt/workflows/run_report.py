@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Clock, Steps, peak_memory_mb
+from skyquilt.engine.folder import FILES
 from skyquilt.geometry.frames import angles_from_cam_R_map
 from skyquilt.imaging.nodes import STEP
 from skyquilt.model.event import Note
@@ -21,7 +22,6 @@ from skyquilt.ortho.height_files import write_heights
 from skyquilt.ortho.orthomosaic import used_photos, write_surface
 from skyquilt.quality.seam_measurement import MeasuredSeams
 from skyquilt.raster.atomic import write_text
-from skyquilt.report.about import FILES
 from skyquilt.report.input import CameraResiduals, DepthPicture, ReportInput, SeamMark, Shot
 from skyquilt.report.page import write_report
 from skyquilt.report.parts import UNITS
@@ -195,8 +195,10 @@ def _shots(aligned: AlignedPhotos, ground: Ground) -> list[Shot]:
     outline = {v.photo: v.footprint for v in ground.views}
     block = {i: k for k, b in enumerate(alignment.blocks) for i in b}
     held = set(alignment.held)
-    error = np.linalg.norm(alignment.ties.residual_px, axis=1)
-    tied = {i: error[alignment.ties.photo == i] for i in alignment.poses}
+    order = np.argsort(alignment.ties.photo, kind="stable")
+    error = np.linalg.norm(alignment.ties.residual_px, axis=1)[order]
+    cuts = np.searchsorted(alignment.ties.photo[order], np.arange(len(aligned.photos) + 1)).tolist()
+    tied = {i: error[cuts[i] : cuts[i + 1]] for i in alignment.poses}
     return [
         Shot(
             name=aligned.photos[i].name,
@@ -231,17 +233,19 @@ def _shot_figures(
 
 def _residuals(aligned: AlignedPhotos) -> list[CameraResiduals]:
     alignment, ties = aligned.alignment, aligned.alignment.ties
-    keys = [alignment.camera_of.get(i, "") for i in range(len(aligned.photos))]
-    name = np.array(keys)[ties.photo]
+    keys = sorted({alignment.camera_of[i] for i in np.unique(ties.photo).tolist()})
+    number = {key: k for k, key in enumerate(keys)}
+    of_photo = [number.get(alignment.camera_of.get(i, ""), -1) for i in range(len(aligned.photos))]
+    camera = np.array(of_photo)[ties.photo]
     return [
         CameraResiduals(
             camera=key,
             width=alignment.cameras[key].width,
             height=alignment.cameras[key].height,
-            px=ties.px[name == key],
-            residual_px=ties.residual_px[name == key],
+            px=ties.px[camera == k],
+            residual_px=ties.residual_px[camera == k],
         )
-        for key in sorted(set(name.tolist()))
+        for key, k in number.items()
     ]
 
 

@@ -23,11 +23,13 @@ const writing = (more) => ({ ...more, ...($("token").value ? { "X-Token": $("tok
 // The map shows its focus, and its middle, to those who use the keyboard.
 document.addEventListener("keydown", (e) => { if (e.key === "Tab") document.body.classList.add("keys"); }, true);
 document.addEventListener("pointerdown", () => document.body.classList.remove("keys"), true);
-// An item of a list that can be chosen by mouse and by keyboard.
+// An item of a list that can be chosen: by mouse anywhere, by keyboard and screen reader as the button that its name becomes.
 const choosable = (li, work) => {
-  li.tabIndex = 0;
+  const name = li.querySelector("span"), go = element("button", undefined, "quiet");
+  go.type = "button";
+  go.append(...name.childNodes);
+  name.replaceChildren(go);
   li.onclick = work;
-  li.onkeydown = (e) => { if (e.target === li && (e.key === "Enter" || e.key === " ")) { e.preventDefault(); work(); } };
   return li;
 };
 const asked = async (url, options) => {

@@ -34,15 +34,40 @@ const field = (text, value, kind) => {
   label.append(input);
   return [label, input];
 };
+// A place taken from the map by a click, or by Enter in its middle.
+const picking = (pick) => {
+  const on = Boolean(state.picking);
+  pick.setAttribute("aria-pressed", String(on));
+  map.getContainer().style.cursor = on ? "crosshair" : "";
+  $("cross").hidden = !on;
+  if (on) { if (state.mode) setMode(null); $("cross").hidden = false; say("Click the place on the map; with the keyboard, Enter takes its middle."); }
+};
+const stopPicking = () => { state.picking = null; const pick = $("controlpick"); if (pick) picking(pick); };
 const addForm = () => {
   const form = element("form");
   const [nameBox, name] = field("Name", `P${control.points.length + 1}`), [xBox, x] = field("Easting or longitude", ""), [yBox, y] = field("Northing or latitude", ""), [zBox, z] = field("Height in m, empty if unknown", "");
   const check = element("input"), checkBox = element("label", " Check point: judges the map, is not used");
   check.type = "checkbox"; checkBox.prepend(check);
-  form.append(nameBox, xBox, yBox, zBox, checkBox, element("small", `Coordinates in ${control.crs}.`));
+  const about = element("small", `Coordinates in ${control.crs}.`), pick = button("Take from the map", () => {
+    state.picking = state.picking ? null : async (at) => {
+      try {
+        const said = await asked(`/at?lon=${at.lng}&lat=${at.lat}&crs=${encodeURIComponent(control.crs)}`), digits = Math.abs(said.y) <= 90 && Math.abs(said.x) <= 180 ? 8 : 3;
+        x.value = said.x.toFixed(digits); y.value = said.y.toFixed(digits);
+        about.textContent = `Coordinates in ${control.crs}, as the map shows them: put what was surveyed in their place.`;
+        controlLayer.clearLayers();
+        L.circleMarker(at, { radius: 9, color: "#00a0c8", weight: 4 }).addTo(controlLayer);
+      } catch (error) { say(error.message); }
+      stopPicking();
+      x.focus();
+    };
+    picking(pick);
+  });
+  pick.id = "controlpick";
+  pick.setAttribute("aria-pressed", "false");
+  form.append(nameBox, pick, xBox, yBox, zBox, checkBox, about);
   const done = element("button", "Add");
   done.type = "submit";
-  form.append(done, button("Cancel", () => { control.adding = false; drawControl(); }));
+  form.append(done, button("Cancel", () => { stopPicking(); control.adding = false; drawControl(); }));
   form.onsubmit = (e) => {
     e.preventDefault();
     const label = name.value.replace(/\s+/g, "");
@@ -52,6 +77,7 @@ const addForm = () => {
     keepUndo();
     control.points.push({ name: label, x: numbers[0], y: numbers[1], z: z.value ? numbers[2] : null, check: check.checked });
     Object.assign(control, { adding: false, chosen: label });
+    stopPicking();
     drawControl(); lookUp();
   };
   return form;
@@ -84,15 +110,14 @@ const drawControl = () => {
   });
   const list = element("ul");
   list.append(...rows);
-  const upload = element("label", "Load a list", "button"), input = element("input");
+  const input = element("input"), upload = button("Load a list", () => input.click());
   input.type = "file"; input.accept = ".txt,.csv"; input.hidden = true; input.id = "controlfile";
   input.onchange = () => { handControl(input.files[0]); input.value = ""; };
-  upload.append(input);
   const row = element("div", undefined, "row"), undo = button("Undo", () => { const last = control.undo.pop(); if (last) { [control.points, control.marks] = JSON.parse(last); control.dirty = true; drawControl(); drawLoupes(); } });
   undo.disabled = !control.undo.length; undo.id = "controlundo";
   const save = button("Save", trying(async () => { await saveControl(); drawControl(); say("saved as control/gcp_list.txt in the folder of the run"); }));
   save.id = "controlsave"; save.disabled = !control.dirty;
-  row.append(button("Add a point", () => { control.adding = true; drawControl(); }), upload, undo, save);
+  row.append(button("Add a point", () => { control.adding = true; drawControl(); box.querySelector("form input").focus(); }), upload, input, undo, save);
   if (control.marks.length) row.append(button("Download gcp_list.txt", () => saveText("gcp_list.txt", listText())));
   const parts = [head, element("small", control.photos ? "Choose a point, mark it in two photos or more: control points hold the map, check points judge it." : "The photos are not where they were: start skyquilt view with --photos.")];
   parts.push(control.adding ? addForm() : list, row);

@@ -32,9 +32,9 @@ const showHere = async (file) => {
 };
 const handIn = async (files) => {
   for (const file of files) {
-    const layer = /\.(geo)?json$/i.test(file.name);
+    const plain = /\.(geo)?json$/i.test(file.name), layer = plain || /\.(kml|kmz|gpkg|zip)$/i.test(file.name);
     if (!state.info || !state.info.growing) {
-      if (layer) await showHere(file);
+      if (plain) await showHere(file);
       else if (!(await handControl(file))) say(`${file.name}: here, GeoJSON and lists of control points can be shown`);
       continue;
     }

@@ -110,13 +110,14 @@ $("geojson").onclick = () => saveText("measures.geojson", JSON.stringify({ type:
 // Keyboard: Enter sets a point in the middle of the map, Backspace takes the last one back, Escape ends.
 map.getContainer().addEventListener("keydown", (e) => {
   if (e.target !== map.getContainer()) return;
-  if (e.key === "Enter") { const at = map.getCenter(); state.mode ? addPoint(at) : clicked(at); }
+  if (e.key === "Enter") { chosen(map.getCenter()); }
   if (e.key === "Backspace" && state.mode) undoPoint();
 });
-document.addEventListener("keydown", (e) => { if (e.key === "Escape" && !$("big").open) { if (state.mode) setMode(null); marked.clearLayers(); } });
-map.getContainer().addEventListener("focus", () => { $("cross").hidden = !(state.mode || document.body.classList.contains("keys")); });
-map.getContainer().addEventListener("blur", () => { $("cross").hidden = !state.mode; });
+document.addEventListener("keydown", (e) => { if (e.key === "Escape" && !$("big").open) { if (state.picking) stopPicking(); if (state.mode) setMode(null); marked.clearLayers(); } });
+map.getContainer().addEventListener("focus", () => { $("cross").hidden = !(state.mode || state.picking || document.body.classList.contains("keys")); });
+map.getContainer().addEventListener("blur", () => { $("cross").hidden = !(state.mode || state.picking); });
 const clicked = (at) => {
   photosHere(at).catch((error) => say(error.message));
 };
-map.on("click", (e) => { state.mode ? addPoint(e.latlng) : clicked(e.latlng); });
+const chosen = (at) => { state.picking ? state.picking(at) : state.mode ? addPoint(at) : clicked(at); };
+map.on("click", (e) => chosen(e.latlng));

@@ -32,6 +32,7 @@ const listPhotos = () => {
     const li = element("li"), left = element("span", p.name), right = element("span", p.state, `state ${p.state}`);
     if (p.reason && p.state !== "refined") left.append(element("small", p.reason));
     li.append(left, right);
+    li.dataset.id = p.id;
     if (p.at) choosable(li, () => map.panTo([p.at[1], p.at[0]]));
     rows.push(li);
   }
@@ -41,7 +42,11 @@ const listPhotos = () => {
     li.append(left, element("span", p.state || "refused", "state refused"));
     rows.unshift(li);
   }
+  const held = $("photos").contains(document.activeElement) ? document.activeElement.closest("li").dataset.id : null;
   $("photos").replaceChildren(...rows);
+  const again = held && $("photos").querySelector(`li[data-id="${held}"] button`);
+  if (again) again.focus({ preventScroll: true });  // the list is made anew while the map grows
+  document.dispatchEvent(new Event("photoslisted"));
 };
 let listing = null;
 const listSoon = () => { if (!listing) listing = setTimeout(() => { listing = null; listPhotos(); }, 250); };

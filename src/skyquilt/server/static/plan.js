@@ -85,11 +85,22 @@
   showPoints.onclick = () => { const on = showPoints.getAttribute("aria-pressed") !== "true"; showPoints.setAttribute("aria-pressed", String(on)); for (const l of [points, ways]) on ? l.addTo(map) : l.remove(); };
   showCover.onclick = () => { showCover.setAttribute("aria-pressed", String(showCover.getAttribute("aria-pressed") !== "true")); coverSoon(); };
 
-  // -- areas drawn here; they stay in this browser
-  const KEY = "skyquilt-areas";
+  // -- areas drawn here; they are kept in the survey's folder
   let shapes = [], open = null;
-  const kept = () => { try { shapes = JSON.parse(localStorage.getItem(KEY)) || []; } catch { shapes = []; } };
-  const keep = () => { try { localStorage.setItem(KEY, JSON.stringify(shapes)); } catch { /* private window */ } };
+  const collection = () => ({ type: "FeatureCollection", features: shapes.map((s) => ({ type: "Feature", properties: s.closed ? { keep_out: true } : {}, geometry: { type: "Polygon", coordinates: [[...s.ring, s.ring[0]].map(([y, x]) => [x, y])] } })) });
+  const readAreas = async () => {
+    const answer = await fetch("/areas");
+    if (!answer.ok || open) return;
+    const polygons = (await answer.json()).features.filter((f) => f.geometry.type === "Polygon");
+    shapes = polygons.map((f) => ({ closed: Boolean(f.properties.keep_out), ring: f.geometry.coordinates[0].slice(0, -1).map(([x, y]) => [y, x]) }));
+    show();
+  };
+  const keep = async () => {
+    const answer = await fetch("/areas", { method: "PUT", body: JSON.stringify(collection()), headers: headers({ "Content-Type": "application/json" }) }).catch(() => null);
+    if (answer && answer.ok) return;
+    const told = answer ? await answer.json().catch(() => ({})) : {};
+    said.textContent = `The areas are not kept: ${typeof told.detail === "string" ? told.detail : "the server does not answer"}`;
+  };
   const show = () => {
     sketch.clearLayers();
     for (const s of [...shapes, ...(open ? [open] : [])]) L.polygon(s.ring, { color: s.closed ? "#dc2626" : "#2563eb", weight: 3, dashArray: s === open ? "6 4" : null, interactive: false }).addTo(sketch);
@@ -129,9 +140,8 @@
   };
   go.onclick = () => {
     done();
-    const features = shapes.map((s) => ({ type: "Feature", properties: s.closed ? { keep_out: true } : {}, geometry: { type: "Polygon", coordinates: [[...s.ring, s.ring[0]].map(([y, x]) => [x, y])] } }));
     const value = (id) => encodeURIComponent(document.getElementById(id).value);
-    sent(`/plan?camera=${value("plan-camera")}&height=${value("plan-height")}&drones=${value("plan-drones")}`, JSON.stringify({ type: "FeatureCollection", features }));
+    sent(`/plan?camera=${value("plan-camera")}&height=${value("plan-height")}&drones=${value("plan-drones")}`, JSON.stringify(collection()));
   };
   fill.onclick = () => sent("/plan/missing", "");
   const ready = async (name) => {
@@ -144,12 +154,18 @@
   };
 
   // -- photos placed by their metadata alone: pale, with a dashed outline, until they are refined
-  const provisional = L.layerGroup().addTo(map);
+  const provisional = L.layerGroup().addTo(map), pale = L.layerGroup().addTo(map);
+  const turning = (ring) => ring.reduce((sum, [x, y], k) => { const [u, v] = ring[(k + 1) % ring.length]; return sum + x * v - u * y; }, 0);
   const unsure = () => {
-    provisional.clearLayers();
-    for (const p of state.photos.values()) if (p.state === "placed" && p.ring && p.ring.length > 2) L.polygon(p.ring.map(([x, y]) => [y, x]), { color: "#fff", weight: 2, dashArray: "4 5", fillColor: "#fff", fillOpacity: 0.22, interactive: false }).addTo(provisional);
+    provisional.clearLayers(); pale.clearLayers();
+    const rings = [...state.photos.values()].filter((p) => p.state === "placed" && p.ring && p.ring.length > 2).map((p) => { const ring = p.ring.map(([x, y]) => [y, x]); return turning(ring) < 0 ? ring.reverse() : ring; });
+    if (!rings.length) return;
+    // one shape, so that places that many photos show are no paler than others
+    L.polygon(rings.map((ring) => [ring]), { stroke: false, fillColor: "#fff", fillOpacity: 0.22, fillRule: "nonzero", interactive: false }).addTo(pale);
+    for (const ring of rings) L.polygon(ring, { color: "#fff", weight: 2, dashArray: "4 5", fill: false, interactive: false }).addTo(provisional);
   };
-  const unsureSoon = soon(async () => unsure(), 350);
+  document.addEventListener("photoslisted", unsure);
+  unsure();
 
   // -- news
   const listen = () => {
@@ -163,9 +179,9 @@
       readSoon();
     });
     news.addEventListener("coverage", coverSoon);
-    news.addEventListener("photo", unsureSoon);
+    news.addEventListener("areas", () => readAreas().catch(() => {}));
   };
-  kept(); show();
-  read().then(readCover).catch(() => {}).then(() => { if (!section.hidden) listen(); });
+  show();
+  read().then(readCover).catch(() => {}).then(() => { if (!section.hidden) { readAreas().catch(() => {}); listen(); } });
   window.skyquilt.plan = { shapes: () => shapes, marks, cover: () => sharing, provisional };
 })();

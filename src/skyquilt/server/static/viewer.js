@@ -12,7 +12,7 @@ const readInfo = async () => {
   $("finish").hidden = finished;
   $("finish").disabled = info.finish === "asked" || info.finish === "running";
   $("finish").textContent = $("finish").disabled ? "Final map is being made" : "Finish flight";
-  $("dropwords").textContent = finished ? "Drop or choose GeoJSON" : "Drop GeoJSON or photos, or choose";
+  $("dropwords").textContent = finished ? "Drop or choose GeoJSON" : "Drop photos, GeoJSON, KML, GeoPackage or a zipped Shapefile, or choose";
   $("token").hidden = !(info.token && (info.growing || info.control));
   for (const name of ["profile", "volume"]) $(name).hidden = !info.heights;
   $("counts").textContent = Object.entries(info.counts).filter(([, n]) => n).map(([k, n]) => `${n} ${k}`).join(", ");

@@ -1,0 +1,37 @@
+"""`skyquilt view` answers soon: it loads what its first request needs, and no more."""
+
+import os
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+UNNEEDED = ("scipy", "shapely", "jinja2", "tifffile", "skyquilt.planning", "skyquilt.live.live_map",
+            "skyquilt.alignment", "skyquilt.workflows")  # fmt: skip
+MOST_MODULES = 900
+MOST_CPU_S = 1.5
+"""The limit for the elapsed time on a quiet machine, where nearly all of it is computing."""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="CPU times are read from /proc")
+def test_the_first_answer_waits_for_nothing_it_does_not_need(finished, tmp_path):
+    said = tmp_path / "imports.txt"
+    command = [sys.executable, "-X", "importtime", "-m", "skyquilt", "view", str(finished.output),
+               "--port", "0"]  # fmt: skip
+    with said.open("w") as log:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
+        try:
+            address = process.stdout.readline().split()[0]
+            with urllib.request.urlopen(address, timeout=60) as answer:
+                assert answer.status == 200 and b"<html" in answer.read()
+            words = Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+        finally:
+            process.terminate()
+            process.wait()
+    loaded = [row.rsplit("|", 1)[1].strip() for row in said.read_text().splitlines() if "|" in row]
+    assert "fastapi" in loaded  # the list is what it is taken for
+    assert not [m for m in loaded if m.startswith(UNNEEDED)]
+    assert len(loaded) < MOST_MODULES
+    assert sum(map(int, words[11:13])) / os.sysconf("SC_CLK_TCK") < MOST_CPU_S
