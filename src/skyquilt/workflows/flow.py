@@ -18,7 +18,7 @@ from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.free_memory import give_back
-from skyquilt.engine.pixel_cache import PixelCache, pixel_budget, resident_budget
+from skyquilt.engine.pixel_cache import USUAL_GB, PixelCache, pixel_budget, resident_budget
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import PhotoFailedError
 from skyquilt.model.event import Event, Note
@@ -48,6 +48,8 @@ from skyquilt.workflows.photo_features import (
 from skyquilt.workflows.survey_input import SurveyInput
 
 T = TypeVar("T")
+ADJUSTED_GB, ADJUSTED_PHOTO_GB = 0.8, 0.00022
+"""Memory in GB of an adjustment, and how much more for each photo (measured: docs/scale.md)."""
 ADJUSTING = "adjusting"
 """Folder in the store with the parts of an adjustment that is not finished."""
 
@@ -167,6 +169,8 @@ def align_photos(
         order=_order(found.photos, given.rank),
         grey=grey,
     )
+    if links.links:
+        yield from memory_notes(len(found.photos), settings.running.memory_gb)
     alignment = yield from clock.stage("align", _align(known, methods, store))
     yield from (Note(text=n, warning=True) for n in alignment.notes)
     return AlignedPhotos(
@@ -179,6 +183,19 @@ def align_photos(
         pixels=pixels,
         grey=grey,
     )
+
+
+def memory_notes(photos: int, memory_gb: float | None) -> list[Note]:
+    """A note where the adjustment of so many photos takes more memory than is allowed."""
+    needed, allowed = ADJUSTED_GB + ADJUSTED_PHOTO_GB * photos, memory_gb or USUAL_GB
+    if needed <= allowed:
+        return []
+    return [
+        Note(
+            text=f"the adjustment of {photos:,} photos takes about {needed:.1f} GB, more than"
+            f" --memory {allowed:g}; if that is too much, map parts of the area one by one"
+        )
+    ]
 
 
 def find_ground(
