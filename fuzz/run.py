@@ -24,7 +24,7 @@ HERE = Path(__file__).parent
 SLOW_S, MEMORY_MB = 10, 2500
 JOBS = 2
 """Targets that are fuzzed at a time."""
-START_S = 2.0
+START_S = 4.0
 """Time in s that a target takes to start."""
 
 

@@ -70,6 +70,7 @@ def test_frames_of_one_pose_are_told_from_those_of_another():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_sweeps_of_five_poses_calibrate_the_lens():
     for seed in range(2):
         rng = np.random.default_rng([seed, 5])

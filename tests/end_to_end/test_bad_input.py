@@ -138,9 +138,9 @@ def test_all_kinds_of_bad_at_once(mosaic, photos):
 @pytest.mark.slow
 def test_a_photo_that_cannot_be_read_any_more_when_the_map_is_drawn(mosaic, photos, monkeypatch):
     """A photo goes away in the middle: it is named and left out, and the map is made without it."""
-    from skyquilt.workflows import flow
+    from skyquilt.workflows import flow, photo_features
 
-    read, seen = flow.read_color, set()
+    read, seen = photo_features.read_color, set()
 
     def once(photo):
         if photo.name in seen and photo.name == "SIM_0005.jpg":
@@ -148,7 +148,7 @@ def test_a_photo_that_cannot_be_read_any_more_when_the_map_is_drawn(mosaic, phot
         seen.add(photo.name)
         return read(photo)
 
-    monkeypatch.setattr(flow, "read_color", once)
+    monkeypatch.setattr(photo_features, "read_color", once)
     monkeypatch.setattr(flow, "pixel_budget", lambda memory: 0)
     told = mosaic(photos).made()
     assert told.metrics["photos_used"] == 8

@@ -116,6 +116,7 @@ def test_no_frames_and_wrong_words(tmp_path):
 
 @pytest.mark.real
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_real_thermal_board(tmp_path):
     data = Path(__file__).resolve().parents[3] / "shared" / "data" / "thermal-board"
     if not data.is_dir():

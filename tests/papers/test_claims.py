@@ -49,6 +49,7 @@ def test_with_tilted_cameras_an_affine_transformation_is_better_than_both():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_levelled_features_matter_where_the_lens_model_is_too_simple():
     """Y 4.2.2: with the full model they change nothing in the median, with order 2 very much."""
     level, flat = ends([HOMOGRAPHY, NOT_LEVELLED], order="2")

@@ -17,7 +17,7 @@ from skyquilt.video.looks import Looker, joined
 from skyquilt.video.read import read_clip
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.clip_frames import with_frames
-from skyquilt.workflows.frame_pixels import pixels_of
+from skyquilt.workflows.photo_features import pixels_of
 from skyquilt.workflows.survey_input import read_input
 from tests.video.clips import SIZE, flown, write_clip
 

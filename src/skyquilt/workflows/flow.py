@@ -33,7 +33,6 @@ from skyquilt.ortho.radiometry import balanced
 from skyquilt.photos.read import rejected
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.clip_frames import with_frames
-from skyquilt.workflows.frame_pixels import pixels_of
 from skyquilt.workflows.links import Links, link_photos
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import (
@@ -44,6 +43,7 @@ from skyquilt.workflows.photo_features import (
     find_features,
     of_one_kind,
     picture_recipe,
+    pixels_of,
 )
 from skyquilt.workflows.survey_input import SurveyInput
 

@@ -20,6 +20,8 @@ from skyquilt.errors import NoPhotosError, OutputError
 from skyquilt.imaging.grey import halved, shrink, to_grey8
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.photos.kept_frames import kept_frame
+from skyquilt.photos.pixels import decode_jpeg, read_color
 from skyquilt.photos.read import rejected
 from skyquilt.workflows.methods import Detector
 
@@ -31,6 +33,8 @@ KEPT_BYTES = 150_000_000
 """Bytes of grey images, and of features, kept in memory; the others are read from the store."""
 PhotoPixels = Callable[[int], NDArray[Any]]
 """Full-size pixels of a photo by its index."""
+FRAMES = "looks"
+"""Folder in the store of frames of clips: that of what was seen of their clips."""
 THUMBNAIL = 256
 """Longest side in px of the thumbnails kept for exposure and the report."""
 
@@ -139,6 +143,20 @@ class GreyPictures:
         return self._store.get_or(
             "pictures", picture_key(self._photos[photo]), lambda: picture_of(self._pixels(photo))
         )
+
+
+def pixels_of(photo: Photo, store: Store) -> NDArray[Any]:
+    """Pixels of a photo, as `read_color` gives them. A frame of a clip is decoded from the clip
+    once and then kept in the store: to find one, all since a key frame before it are decoded, which
+    costs as much as several photos.
+
+    Raises:
+        UnreadablePhotoError: they cannot be decoded. OutputError: a frame cannot be stored.
+    """
+    if photo.frame_s is None:
+        return read_color(photo)
+    body = store.get_or(FRAMES, photo.digest, lambda: kept_frame(read_color(photo)))
+    return decode_jpeg(body.tobytes())
 
 
 def features_key(photo: Photo, detector: Detector) -> str:
