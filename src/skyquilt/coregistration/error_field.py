@@ -50,7 +50,7 @@ class Scatter:
 class StateError:
     """The error of a registration from the shifts of its patches."""
 
-    dependence: float = 1.9
+    dependence: float = 2.0
     """Number of patches that weigh like one independent one: neighbours err alike."""
     misfit: float = 0.5
     """Prior of each parameter beyond the model's, at half b's diagonal, in units of the
