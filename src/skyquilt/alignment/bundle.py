@@ -119,11 +119,10 @@ class Bundle:
         setup = setup.moving_as(photos, state.C)
         problem = replace(problem, velocity=setup.base.velocity)
         method = self.match_observations
-        if grey is not None and method is not None:
+        if sharp := grey is not None and method is not None:
             part = within(keep, "sharp")
             used = _sharpened(used, photos, setup, problem, state, method, grey, part)
-            begin = 0
-        if begin != each:
+        if sharp or begin != each:
             problem, _ = setup.problem(thin(used, sizes, per_photo=each, least=least))
             state = triangulated(problem, state)
         problem, state = fine(problem, state, within(keep, "fine"))

@@ -8,8 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.model.raster import Grid
+
 WIDEST = 32_000
 """Most cells of a raster of heights along a side: OpenCV's functions take at most 32,766."""
+MOST_CELLS = 2.4e7
+"""Most cells of a raster of heights, or of what is decided by them."""
 STRIP = 256
 """Rows of a raster that are computed at once."""
 
@@ -97,3 +101,11 @@ class HeightField:
             y0=self.y0 + (size - self.cell) / 2,
             cell=size,
         )
+
+
+def least_cell(grid: Grid) -> int:
+    """The least side of a cell, in map pixels, for which a raster over a map stays below
+    `MOST_CELLS`, and each of its sides below `WIDEST`.
+    """
+    cells = np.sqrt(grid.width * grid.height / MOST_CELLS)
+    return int(np.ceil(max(cells, grid.width / WIDEST, grid.height / WIDEST)))

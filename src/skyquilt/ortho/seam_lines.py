@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from skyquilt.engine.kept import Keep, made_now
 from skyquilt.imaging.nodes import STEP, View, densify, overlapping, project_all
 from skyquilt.model.raster import Grid
-from skyquilt.model.surface import WIDEST, Surface
+from skyquilt.model.surface import Surface, least_cell
 from skyquilt.ortho.bare_ground import bare_ground
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.labels import Labels
@@ -37,8 +37,6 @@ CELL = 8
 """Least number of map pixels along a side of a cell; it grows by powers of two."""
 LEAST_M = 0.2
 """Least side of a cell in m."""
-MOST_CELLS = 2.4e7
-"""Largest number of cells."""
 TILE = 1024
 """Cells along a side of the pieces in which seams are found; the seams of a piece continue those of
 its neighbours.
@@ -96,9 +94,7 @@ class SeamLines:
     ) -> Labels:
         """The photo of each cell of a map's grid; `keep`: each tile is a part."""
         factor = CELL
-        wide, high = grid.width, grid.height
-        most = max(np.sqrt(wide * high / MOST_CELLS), wide / WIDEST, high / WIDEST)
-        while factor * grid.gsd < LEAST_M or factor < most:
+        while factor * grid.gsd < LEAST_M or factor < least_cell(grid):
             factor *= 2
         cells = grid.coarser(factor)
         z = surface.on(cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height)))

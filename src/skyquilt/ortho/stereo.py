@@ -19,7 +19,7 @@ from skyquilt.engine.executor import in_order
 from skyquilt.engine.kept import Keep
 from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid
-from skyquilt.model.surface import STRIP, WIDEST, Surface
+from skyquilt.model.surface import STRIP, Surface, least_cell
 from skyquilt.ortho.fill import nearest_known, plateaus, settled
 from skyquilt.ortho.pair_matching import Array, Float, Mask, Pair, matched_points, pair_of
 
@@ -27,8 +27,6 @@ GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
 Cells = tuple[NDArray[np.intp], Float]
 """Numbers (n,) of cells of a grid, row by row, and their heights (n,) in m."""
-MOST_CELLS = 2.4e7
-"""Largest number of cells of a surface."""
 TILE = 512
 """Cells along a side of the pieces in which heights are fused."""
 NEW = 0.25
@@ -120,7 +118,7 @@ class Stereo:
             return surface
         gsd = max(extent / self.fine.longest, grid.gsd)
         cells = grid.coarser(
-            max(int(np.clip(round(2 * gsd / grid.gsd), *self.cell_px)), _least(grid))
+            max(int(np.clip(round(2 * gsd / grid.gsd), *self.cell_px)), least_cell(grid))
         )
         step = self.agree * height
         given = _Round(
@@ -159,7 +157,7 @@ class Stereo:
     ) -> tuple[Surface, Mask]:
         """Heights from small pictures, without gaps, and the cells that have some of their own."""
         gsd = extent / self.coarse.longest
-        cells = grid.coarser(max(1, round(1.5 * gsd / grid.gsd), _least(grid)))
+        cells = grid.coarser(max(1, round(1.5 * gsd / grid.gsd), least_cell(grid)))
         given = _Round(
             level=self.coarse,
             gsd=gsd,
@@ -388,14 +386,6 @@ def surface_of(z: Float, cells: Grid) -> Surface:
         cell=cells.gsd,
         source="multi-view matching",
     )
-
-
-def _least(grid: Grid) -> int:
-    """The least side of a cell in map pixels for which a surface stays below `MOST_CELLS`, and each
-    of its sides below `WIDEST`.
-    """
-    cells = np.sqrt(grid.width * grid.height / MOST_CELLS)
-    return int(np.ceil(max(cells, grid.width / WIDEST, grid.height / WIDEST)))
 
 
 def _meet(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
