@@ -26,7 +26,7 @@ test-all: $(DEVELOP)
 	@$(BIN)/pytest
 
 check: $(DEVELOP)
-	@$(BIN)/ruff check .
+	@$(BIN)/ruff check --no-cache .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports

@@ -30,7 +30,7 @@ from skyquilt.video.decoder import Decoder
 from skyquilt.video.looks import Looker
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.clip_frames import with_frames
-from skyquilt.workflows.frame_pixels import pixels_of
+from skyquilt.workflows.photo_features import pixels_of
 from skyquilt.workflows.survey_input import read_input
 
 FLIGHT = "--photos 18 --sidelap 40 --speed 4.8 --size 1280x960 --video 5 --gust-blur 9 --quiet"
