@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.engine.executor import in_order
 from skyquilt.engine.kept import Keep
+from skyquilt.engine.workers import Workers
 from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import STRIP, Surface, least_cell
@@ -25,7 +25,7 @@ from skyquilt.ortho.pair_matching import Array, Float, Mask, Pair, matched_point
 
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
-Cells = tuple[NDArray[np.intp], Float]
+Cells = tuple[NDArray[np.int32], Float]
 """Numbers (n,) of cells of a grid, row by row, and their heights (n,) in m."""
 TILE = 512
 """Cells along a side of the pieces in which heights are fused."""
@@ -33,8 +33,6 @@ NEW = 0.25
 """Share of the ground of a pair that must still lack pairs for it to be matched."""
 FIRM = 0.45
 """Share of the cells around with a fine height from which these are believed."""
-THREADS = 2
-"""Pairs matched at a time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,19 +99,27 @@ class Stereo:
     """The ratio that is preferred."""
     cell_px: tuple[int, int] = (4, 8)
     """Least and greatest side of a cell in map pixels."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(
-        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep
+        self,
+        surface: Surface,
+        views: Sequence[View],
+        grid: Grid,
+        grey: GreyPicture,
+        keep: Keep,
+        workers: Workers,
     ) -> Surface:
-        """The surface with the heights found; the former one where the photos give none."""
+        """The surface with the heights found; the former one where the photos give none. `keep`:
+        each tile is a part; `workers` match the pairs.
+        """
         views = [v for v in views if v.pose.cam_H_map is None]
         height = float(np.median([v.pose.map_C[2] for v in views] or [0.0]) - np.median(surface.z))
         if len(views) < 2 or height <= 0:
             return surface
         cameras = [v.camera for v in views]
         extent = height * float(np.median([max(c.width, c.height) / c.focal for c in cameras]))
-        rough, support = self._coarse(surface, views, grid, grey, keep, height, extent)
+        rough, support = self._coarse(surface, views, grid, grey, keep, workers, height, extent)
         if not support.any():
             return surface
         gsd = max(extent / self.fine.longest, grid.gsd)
@@ -132,7 +138,7 @@ class Stereo:
             agree=0.015 * height,
             middle=float(np.median(rough.z)),
         )
-        z = self._fused(given, views, height, self.relief * height, keep)
+        z = self._fused(given, views, height, self.relief * height, keep, workers)
         known = without_specks(z, 0.01 * height, 6)
         refined = nearest_known(z, known) if known.any() else z
         del z, given  # large surveys have rasters of 100 MB
@@ -152,6 +158,7 @@ class Stereo:
         grid: Grid,
         grey: GreyPicture,
         keep: Keep,
+        workers: Workers,
         height: float,
         extent: float,
     ) -> tuple[Surface, Mask]:
@@ -169,7 +176,7 @@ class Stereo:
             agree=0.04 * height,
             middle=float(np.median(surface.z)),
         )
-        z = self._fused(given, views, height, 0.0, keep)
+        z = self._fused(given, views, height, 0.0, keep, workers)
         known = without_specks(z, 0.02 * height, 12)
         if not known.any():
             return surface, known
@@ -216,7 +223,13 @@ class Stereo:
         return chosen
 
     def _fused(
-        self, given: _Round, views: Sequence[View], height: float, relief: float, keep: Keep
+        self,
+        given: _Round,
+        views: Sequence[View],
+        height: float,
+        relief: float,
+        keep: Keep,
+        workers: Workers,
     ) -> Float:
         """Heights (rows, columns) of the cells, row 0 in the north, NaN where no pair gives one."""
         cells = given.cells
@@ -226,7 +239,7 @@ class Stereo:
             if (p := _over(a, b, given)) is not None and _relief(p, given.known) >= relief
         ]
         out = np.full((cells.height, cells.width), np.nan, np.float32)
-        held: dict[int, Float] = {}
+        held: dict[int, Cells] = {}
         for row in range(0, cells.height, TILE):
             for column in range(0, cells.width, TILE):
                 part = replace(
@@ -239,25 +252,40 @@ class Stereo:
                 near = [k for k, p in enumerate(pairs) if _meet(p.bounds, part.bounds)]
                 name = f"{given.level.longest} {row} {column}"
                 inner = (slice(row, row + part.height), slice(column, column + part.width))
-                out[inner] = keep(name, lambda: _tile(pairs, near, held, given, part))  # noqa: B023 - called at once
+                at = (row, column, part.height, part.width)
+                out[inner] = keep(name, lambda: _tile(pairs, near, held, given, at, workers))  # noqa: B023 - called at once
         return out
 
 
 def _tile(
-    pairs: Sequence[Pair], near: Sequence[int], held: dict[int, Float], given: _Round, part: Grid
+    pairs: Sequence[Pair],
+    near: Sequence[int],
+    held: dict[int, Cells],
+    given: _Round,
+    at: tuple[int, int, int, int],
+    workers: Workers,
 ) -> Float:
-    """Heights (h, w) of a part of the cells from the pairs that may see it. `held`: points of the
-    pairs of the part before.
+    """Heights (h, w) of the cells `at` (row, column, h, w) from the pairs that may see them.
+    `held`: heights of the pairs of the part before.
     """
     for k in [k for k in held if k not in near]:
         del held[k]
     todo = [k for k in near if k not in held]
-    for k, points in zip(
-        todo, in_order(lambda k: _points(pairs[k], given), todo, jobs=THREADS), strict=True
-    ):
-        held[k] = points
-    heights = [splatted(held[k], pairs[k].origin, part) for k in near]
-    return _agreed([h for h in heights if len(h[0])], given.agree, (part.height, part.width))
+
+    def matched(pair: Pair) -> Cells:
+        return splatted(_points(pair, given), pair.origin, given.cells)
+
+    for k, heights in zip(todo, workers.each(matched, [pairs[k] for k in todo]), strict=True):
+        held[k] = heights
+    inside = (_inside(held[k], given.cells.width, *at) for k in near)
+    return _agreed([h for h in inside if len(h[0])], given.agree, at[2:])
+
+
+def _inside(heights: Cells, width: int, row: int, column: int, h: int, w: int) -> Cells:
+    """Those heights of a grid `width` cells wide that lie in a part of it, numbered there."""
+    r, c = heights[0] // width - row, heights[0] % width - column
+    mine = (r >= 0) & (r < h) & (c >= 0) & (c < w)
+    return r[mine] * np.int32(w) + c[mine], heights[1][mine]
 
 
 def _over(a: View, b: View, given: _Round) -> Pair | None:
@@ -306,7 +334,7 @@ def splatted(points: Float, origin: Array, part: Grid) -> Cells:
     row = np.floor(((part.north - origin[1]) - points[:, 1]) / part.gsd).astype(np.int32)
     mine = (column >= 0) & (column < part.width) & (row >= 0) & (row < part.height)
     if not mine.any():
-        return np.zeros(0, np.intp), np.zeros(0, np.float32)
+        return np.zeros(0, np.int32), np.zeros(0, np.float32)
     column, row, z = column[mine], row[mine], points[mine, 2]
     # only the rectangle that this pair shows
     west, wide = int(column.min()), int(np.ptp(column)) + 1
@@ -320,7 +348,7 @@ def splatted(points: Float, origin: Array, part: Grid) -> Cells:
     known = np.flatnonzero(number)
     mean = np.bincount(cell, z, minlength=len(top))[known] / number[known]
     at = (known // wide + north) * part.width + known % wide + west
-    return at, (mean + origin[2]).astype(np.float32)
+    return at.astype(np.int32), (mean + origin[2]).astype(np.float32)
 
 
 def _agreed(heights: Sequence[Cells], step: float, shape: tuple[int, int]) -> Float:
