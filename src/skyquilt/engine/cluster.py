@@ -218,8 +218,7 @@ class Cluster:
     def _result(self, future: Any) -> Any:
         while True:
             try:
-                distributed.wait(future, timeout=POLL_S)
-                return future.result()
+                return future.result(timeout=POLL_S)
             except (TimeoutError, distributed.TimeoutError):
                 if future.status == "error":  # the work's own
                     raise
