@@ -16,7 +16,7 @@ from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.free_memory import give_back
-from skyquilt.engine.pixel_cache import USUAL_GB, PixelCache, pixel_budget, resident_budget
+from skyquilt.engine.pixel_cache import PixelCache, pixel_budget, resident_budget
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
 from skyquilt.model.event import Event, Note
@@ -28,7 +28,7 @@ from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.radiometry import balanced
-from skyquilt.settings import MosaicSettings
+from skyquilt.settings import USUAL_GB, MosaicSettings
 from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.links import Links, link_photos
 from skyquilt.workflows.methods import Methods
