@@ -23,8 +23,9 @@ from skyquilt.geometry.levenberg_marquardt import levenberg_marquardt
 
 Array = NDArray[np.float64]
 ALONE = 60_000
-"""Observations up to which one thread computes the equations: sharing them out would cost more. (Threads gain
-nothing: half of the work is Python.)"""
+"""Observations up to which one thread computes the equations: sharing them out would cost more.
+Threads of one process gain nothing, since half of the work is Python.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

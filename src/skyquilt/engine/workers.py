@@ -18,8 +18,10 @@ B = TypeVar("B")
 class Workers(Protocol):
     """Compute the parts of a step; the results come in order, whoever computed them."""
 
-    apart: bool
-    """Whether each has a Python of its own: then work that is mostly Python gains, too."""
+    @property
+    def apart(self) -> bool:
+        """Whether each has a Python of its own: then work that is mostly Python gains, too."""
+        ...
 
     def each(self, work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
         """work(item) for each item, in order, computing at most a few results ahead of the
