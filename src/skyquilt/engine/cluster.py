@@ -140,6 +140,8 @@ class Cluster:
         self._threads = 1
         self._since = time.monotonic()
         self._step: tuple[Any, Path] | None = None
+        self.handed = 0
+        """Number of tasks so far."""
 
     def check(self) -> None:
         """Waits for the first worker, and asks those that are there whether they can take part.
@@ -175,7 +177,7 @@ class Cluster:
         name = f"{getattr(work, '__name__', type(work).__name__)}-{uuid.uuid4().hex[:8]}"
         try:
             for number, item in enumerate(items):
-                path = self._file_of(work)
+                path, self.handed = self._file_of(work), self.handed + 1
                 waiting.append(
                     self._client.submit(_do, str(path), item, key=f"{name}-{number}", pure=False)
                 )

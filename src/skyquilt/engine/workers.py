@@ -23,6 +23,11 @@ class Workers(Protocol):
         """Whether each has a Python of its own: then work that is mostly Python gains, too."""
         ...
 
+    @property
+    def handed(self) -> int:
+        """Number of items given to other processes so far."""
+        ...
+
     def each(self, work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
         """work(item) for each item, in order, computing at most a few results ahead of the
         consumer.
@@ -48,6 +53,7 @@ class Threads:
     number: int = 1
     """How many; 1 = none but the caller's."""
     apart: ClassVar[bool] = False
+    handed: ClassVar[int] = 0
 
     def each(self, work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
         """work(item) for each item, in order."""

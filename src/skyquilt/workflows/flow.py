@@ -245,6 +245,7 @@ def draw_map(
                 settings.picture,
             )
         ),
+        keeps=False,
     )
     labels = yield from clock.stage(
         "seams", _at_once(lambda: _labels(aligned, on, exposure, methods, clock))
