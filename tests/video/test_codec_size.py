@@ -108,9 +108,7 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - first) // 1024)
 
 
 @pytest.mark.parametrize("ending", ["avi", "mkv"])
-def test_jpegs_larger_than_avi_and_matroska_say_allocate_nothing(
-    tmp_path, ending
-):
+def test_jpegs_larger_than_avi_and_matroska_say_allocate_nothing(tmp_path, ending):
     """These containers say 320 x 240, the pictures in them 16384 x 16384."""
     path = write_clip(tmp_path / f"a.{ending}", numbered(3), fourcc="MJPG")
     data = path.read_bytes()
