@@ -18,6 +18,7 @@ without that of decoding the clip once and of 30 ms a look.
 import argparse
 import json
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -161,12 +162,13 @@ def cost(clip: Path, work: Path) -> None:
     spent: dict[str, list[float]] = {"clip": [], "photos": []}
     for _ in range(2):
         for what, source in (("clip", clip), ("photos", work / "once" / "frames")):
+            shutil.rmtree(work / what, ignore_errors=True)  # a finished run is not repeated
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
             skyquilt("mosaic", str(source), "-o", str(work / what), "--overwrite", "-q")
             after = resource.getrusage(resource.RUSAGE_CHILDREN)
             user, system = after.ru_utime - before.ru_utime, after.ru_stime - before.ru_stime
             spent[what].append(user + system)
-    looks = json.loads((work / "clip" / "metrics.json").read_text())["clips"][0]["looked"]
+    looks = json.loads((work / "clip" / "metrics.json").read_text())["clips"][0]["frames_looked_at"]
     whole_, plain = min(spent["clip"]), min(spent["photos"])
     rest = whole_ - decoding - 0.03 * looks
     print(
