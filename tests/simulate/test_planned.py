@@ -84,3 +84,27 @@ def test_wind_that_the_drone_cannot_fly_in_is_refused(tmp_path):
         shots(plan(tmp_path, photo_s=0.0), 16.0, 0.0)
     with pytest.raises(UsageError, match="cannot fly straight in 16 m/s"):
         shots(plan(tmp_path, photo_s=0.0), 16.0, 90.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda q: q["drones"][0]["view"].update(width=90_000, height=90_000), "90000x90000 px"),
+        (lambda q: q["drones"][0]["view"].update(width=10**9), "number from 64 to"),
+        (lambda q: q["drones"][0]["view"].update(focal=float("nan")), "it has nan where"),
+        (lambda q: q["drones"][0]["view"].update(left=1e308), "number from 0.001 to 10"),
+        (lambda q: q["drones"][0].update(speed_ms=-5), "it has -5 where"),
+        (lambda q: q["drones"][0].update(turn_radius_m="x"), "could not convert"),
+        (lambda q: q["points"][3].update(z=1e7), "it has 1e"),
+        (lambda q: q["points"][3].update(ground=float("inf")), "it has inf where"),
+        (lambda q: q["sorties"][0]["way"][3].__setitem__(0, 15.9), "pixels; at most"),
+        (lambda q: q["sorties"][0]["way"][3].__setitem__(3, -1), "it has -1 where"),
+    ],
+)
+def test_plans_that_would_take_the_machine_are_refused(tmp_path, change, words):
+    path = plan(tmp_path)
+    record = json.loads(path.read_text())
+    change(record)
+    path.write_text(json.dumps(record))
+    with pytest.raises(UsageError, match=words):
+        shots(path, 0.0, 0.0)
