@@ -25,6 +25,10 @@ THERMAL_UNITS = ("auto", "celsius", "kelvin", "decikelvin", "centikelvin", "coun
 VERTICAL_DATUMS = ("ellipsoid", "egm96", "takeoff")
 DISTORTIONS = ("none", "2", "4", "6", "6t", "full")
 SHUTTERS = ("global", "rolling")
+USUAL_GB = 1.2
+"""Memory allowed by default."""
+HELD_GB, THREAD_GB = 0.5, 0.06
+"""Memory that a run needs besides its threads, and what each thread may take, about."""
 
 
 def one_of(option: str, value: str, allowed: Iterable[str]) -> None:
@@ -46,6 +50,25 @@ def within(option: str, value: float | None, low: float, high: float) -> None:
     """
     if value is not None and not low <= value <= high:
         raise UsageError(f"{option} {value} lies outside {low} to {high}")
+
+
+def _check_scheduler(scheduler: str | None) -> None:
+    """Refuses what is neither local:N, nor an address, nor a file.
+
+    Raises:
+        UsageError: the sentence says what is expected.
+    """
+    if scheduler is None or "://" in scheduler:
+        return
+    kind, _, number = scheduler.partition(":")
+    if kind == "local":
+        if not (number.isdecimal() and number.isascii() and 1 <= int(number[:5]) <= 1024):
+            raise UsageError(f"--scheduler {scheduler}: local:N starts N processes, 1 to 1024")
+    elif not Path(scheduler).is_file():
+        raise UsageError(
+            f"--scheduler {scheduler} is neither local:N, nor an address such as"
+            " tcp://host:8786, nor a scheduler file that exists"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -235,21 +258,27 @@ class RunningSettings:
     """What a run may use; nothing here but `seed` changes the result."""
 
     jobs: int = 0
-    """Threads; 0 = all processors."""
+    """Threads; 0 = all processors, as far as the memory allows."""
     memory_gb: float | None = None
     """Memory to plan with in GB; None = 1.2."""
     seed: int = 0
     """Of everything random in methods `image`, `hybrid`, `flightline`."""
+    scheduler: str | None = None
+    """Processes that share the work: local:N (N of this machine), the address of a Dask scheduler
+    (tcp://host:8786), or its scheduler file; None = threads of this process.
+    """
 
     @property
     def threads(self) -> int:
         """Threads to use."""
-        return self.jobs or os.cpu_count() or 1
+        room = ((self.memory_gb or USUAL_GB) - HELD_GB) / THREAD_GB
+        return self.jobs or max(1, min(os.cpu_count() or 1, int(room)))
 
     def __post_init__(self) -> None:
         within("--jobs", self.jobs, 0, 1024)
         within("--memory", self.memory_gb, 0.5, 4096)
         within("--seed", self.seed, 0, 2**32 - 1)
+        _check_scheduler(self.scheduler)
 
 
 @dataclass(frozen=True, kw_only=True)
