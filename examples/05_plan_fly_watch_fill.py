@@ -81,11 +81,11 @@ def true_share(live: LiveMap, flights: list[Path]) -> float:
         truth = json.loads((flight / "truth" / "truth.json").read_text())
         with rasterio.open(flight / "truth" / "truth_surface.tif") as surface:
             east, north = map(np.array, rasterio.warp.transform("EPSG:3857", surface.crs, x, y))
-            heights, (r, c) = surface.read(1), surface.index(east, north)
-        inside = (np.array(r) >= 0, np.array(r) < heights.shape[0],
-                  np.array(c) >= 0, np.array(c) < heights.shape[1])  # fmt: skip
-        known = np.flatnonzero(np.logical_and.reduce(inside))
-        z = heights[np.array(r)[known].astype(int), np.array(c)[known].astype(int)]
+            heights = surface.read(1)
+            c, r = (np.floor(v).astype(int) for v in ~surface.transform * (east, north))
+        rows, columns = heights.shape
+        known = np.flatnonzero((r >= 0) & (r < rows) & (c >= 0) & (c < columns))
+        z = heights[r[known], c[known]]
         places = np.column_stack([east[known], north[known], z])
         for photo in truth["photos"]:
             lens = truth["cameras"][photo["camera"]]
