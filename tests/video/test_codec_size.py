@@ -3,9 +3,12 @@ them.
 """
 
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
 from skyquilt.model.photo import RejectedPhoto
@@ -92,3 +95,55 @@ def test_a_codec_that_contradicts_its_container_allocates_nothing(tmp_path, monk
     read = read_clip(path, name="a.mp4")
     assert isinstance(read, RejectedPhoto)
     assert read.reason == "it has 16384x16384 px, and 50 megapixels are the most of a frame"
+
+
+READ = """
+import resource, sys
+from pathlib import Path
+from skyquilt.video.read import read_clip
+first = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+print(getattr(read_clip(Path(sys.argv[1]), name="a"), "reason", "taken"))
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - first) // 1024)
+"""
+
+
+@pytest.mark.parametrize("ending", ["avi", "mkv"])
+def test_jpegs_larger_than_avi_and_matroska_say_allocate_nothing(tmp_path, ending):
+    """These containers say 320 x 240, the pictures in them 16384 x 16384."""
+    path = write_clip(tmp_path / f"a.{ending}", numbered(3), fourcc="MJPG")
+    data = path.read_bytes()
+    was, now = (
+        b"\xff\xc0\x00\x11\x08" + struct.pack(">HH", *s) for s in ((240, 320), (16384,) * 2)
+    )
+    assert data.count(was) == 3
+    path.write_bytes(data.replace(was, now))
+    told = subprocess.run(
+        [sys.executable, "-c", READ, str(path)], capture_output=True, text=True, check=True
+    )
+    reason, grown = told.stdout.splitlines()
+    assert reason == "it is a video without a frame that can be decoded"
+    assert int(grown) < 200  # MB; a frame of them would take 800
+    assert told.stderr == ""
+
+
+@pytest.mark.parametrize(("ending", "fourcc"), [("avi", "XVID"), ("mkv", "mp4v"), ("mts", "mp4v")])
+def test_frames_larger_than_the_container_says_are_refused(tmp_path, ending, fourcc):
+    side = 7104
+    frame = np.full((side, side, 3), 90, np.uint8)
+    written = tmp_path / f"a.{'ts' if ending == 'mts' else ending}"
+    path = write_clip(written, [frame], fourcc=fourcc)
+    data = bytearray(path.read_bytes())
+    if ending == "avi":
+        for name, offset in ((b"avih", 40), (b"strf", 12)):
+            at = data.index(name) + offset
+            assert struct.unpack("<ii", data[at : at + 8]) == (side, side)
+            data[at : at + 8] = struct.pack("<ii", 320, 240)
+    if ending == "mkv":  # PixelWidth and PixelHeight
+        for name, value in ((b"\xb0", 320), (b"\xba", 240)):
+            at = data.index(name + b"\x82" + struct.pack(">H", side))
+            data[at + 2 : at + 4] = struct.pack(">H", value)
+    path = tmp_path / f"b.{ending}"
+    path.write_bytes(data)
+    read = read_clip(path, name=path.name)
+    assert isinstance(read, RejectedPhoto)
+    assert read.reason == f"it has {side}x{side} px, and 50 megapixels are the most of a frame"

@@ -11,6 +11,7 @@ from skyquilt.errors import UsageError
 from skyquilt.geometry.frames import angle_difference_deg
 from skyquilt.model.photo import ControlPoint, Photo
 from skyquilt.model.poses import MapFrame, Prior
+from skyquilt.outside import plain
 
 
 def utm_epsg(latitude_deg: float, longitude_deg: float) -> str:
@@ -70,7 +71,8 @@ def _checked_crs(crs: str) -> str:
         parsed = CRS.from_user_input(crs)
     except CRSError as error:
         raise UsageError(
-            f"--crs {crs!r} is not a coordinate system known to PROJ; try e.g. EPSG:32633"
+            f"--crs '{plain(crs, 80)}' is not a coordinate system known to PROJ; try e.g."
+            " EPSG:32633"
         ) from error
     if not parsed.is_projected or any(
         axis.unit_name not in ("metre", "meter") for axis in parsed.axis_info[:2]

@@ -125,7 +125,10 @@ def command(
         Path | None, typer.Option(help="plan.json to fly: its places, times, camera and site")
     ] = None,
     wind: Annotated[
-        str | None, typer.Option(help="SPEED,FROM in m/s and degrees: pushes photos off places")
+        str | None,
+        typer.Option(
+            help="SPEED,FROM in m/s and degrees: pushes photos off places, drones of a plan lean"
+        ),
     ] = None,
     lost: Annotated[
         float | None, typer.Option(help="photos of the plan lost on the way, percent")

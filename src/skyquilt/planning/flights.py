@@ -14,6 +14,7 @@ from skyquilt.planning.records import Array, Drone, KeepOut, PicturePoint, Sorti
 from skyquilt.planning.settings import PlanSettings
 from skyquilt.planning.terrain import Terrain
 from skyquilt.planning.times import leg_time
+from skyquilt.planning.turns import courses_at, meets, turned_way
 
 SAMPLE_M = 5.0
 """Largest distance of the places on a way whose surface is looked at; half a cell where that is
@@ -24,6 +25,8 @@ MOST_SAMPLES = 20_000
 MOST_DELAY_S = 600.0
 """Longest wait before a take-off for the sake of separation."""
 DELAY_STEP_S = 3.0
+NO_WAY_M = 0.1
+"""Places closer than this are one place."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,25 +108,31 @@ def flown(
     air = surface.least(np.array([drone.start, drone.landing])) if not surface.flat else ground
     up = max(points[route[0]].z, float(air[0]))
     down = max(points[route[-1]].z, float(air[1]))
-    clock = 0.0
-    way = [Waypoint(x=drone.start[0], y=drone.start[1], z=float(ground[0]), time_s=0.0)]
     stops = [(start, up), *((p, points[p].z) for p in route), (landing, down)]
-    clock += (up - float(ground[0])) / drone.climb_ms
-    way.append(Waypoint(x=drone.start[0], y=drone.start[1], z=up, time_s=clock))
+    places, at = [np.array([[*drone.start, up]])], [-1]
     for (a, za), (b, zb) in pairwise(stops):
-        legs = _leg(ways, surface, a, b, za, zb)
-        times = leg_time(drone, settings, legs)
-        for k in range(1, len(legs)):
-            clock += float(times[k - 1])
-            last = k == len(legs) - 1
-            point = points[b].id if last and b < len(points) else None
-            x, y, z = legs[k].tolist()
-            way.append(Waypoint(x=x, y=y, z=z, time_s=clock, point=point))
-        clock += drone.photo_s if b < len(points) else 0.0
+        leg = _leg(ways, surface, a, b, za, zb)
+        places.append(leg[1:])
+        at += [-1] * (len(leg) - 2) + [b if b < len(points) else -1]
+    xyz = np.concatenate(places)
+    if drone.turn_radius_m > 0:
+        yaws = [points[p].yaw if p >= 0 else None for p in at]
+        xyz, kept = in_arcs(xyz, yaws, drone.turn_radius_m, ways, surface)
+        at = [at[k] if k >= 0 else -1 for k in kept]
+    clock = (up - float(ground[0])) / drone.climb_ms
+    way = [
+        Waypoint(x=drone.start[0], y=drone.start[1], z=float(ground[0]), time_s=0.0),
+        Waypoint(x=drone.start[0], y=drone.start[1], z=up, time_s=clock),
+    ]
+    times = leg_time(drone, settings, xyz)
+    for (x, y, z), p, seconds in zip(xyz[1:].tolist(), at[1:], times.tolist(), strict=True):
+        clock += seconds
+        way.append(Waypoint(x=x, y=y, z=z, time_s=clock, point=points[p].id if p >= 0 else None))
+        clock += drone.photo_s if p >= 0 else 0.0
     clock += (down - float(ground[1])) / drone.climb_ms
     way.append(Waypoint(x=drone.landing[0], y=drone.landing[1], z=float(ground[1]),
                         time_s=clock))  # fmt: skip
-    return turning(Sortie(drone=index, number=number, way=tuple(way)), drone)
+    return Sortie(drone=index, number=number, way=tuple(way))
 
 
 def _leg(ways: Ways, surface: Surface, a: int, b: int, za: float, zb: float) -> Array:
@@ -133,28 +142,32 @@ def _leg(ways: Ways, surface: Surface, a: int, b: int, za: float, zb: float) -> 
     return lifted(surface, np.column_stack([flat, z]))
 
 
-def turning(sortie: Sortie, drone: Drone) -> Sortie:
-    """With the time that a drone needs to turn in arcs: the length of an arc of its radius for each
-    change of course, at its speed.
+def in_arcs(
+    xyz: Array, yaws: Sequence[float | None], radius: float, ways: Ways, surface: Surface
+) -> tuple[Array, list[int]]:
+    """The places of a way (n, 3) joined by the shortest curves that turn within a radius, and for
+    each place of the result its index in `xyz`, or -1. `yaws`: directions of the pictures, degrees.
     """
-    if drone.turn_radius_m <= 0 or len(sortie.way) < 3:
-        return sortie
-    xy = np.array([(w.x, w.y) for w in sortie.way])
-    d = np.diff(xy, axis=0)
-    course = np.arctan2(d[:, 0], d[:, 1])
-    moving = np.hypot(d[:, 0], d[:, 1]) > 0.1
-    late, last, delays = 0.0, None, [0.0]
-    for k in range(len(d)):
-        if moving[k]:
-            if last is not None:
-                change = abs((course[k] - last + np.pi) % (2 * np.pi) - np.pi)
-                late += drone.turn_radius_m * float(change) / drone.speed_ms
-            last = float(course[k])
-        delays.append(late)
-    return replace(
-        sortie,
-        way=tuple(replace(w, time_s=w.time_s + t) for w, t in zip(sortie.way, delays, strict=True)),
-    )
+    moves = np.hypot(*np.diff(xyz[:, :2], axis=0).T) > NO_WAY_M
+    stay = [0, *(np.flatnonzero(moves) + 1).tolist()]
+    own = [yaws[k] for k in stay]
+    xy = xyz[stay, :2]
+    if len(xy) < 2:
+        return xyz, list(range(len(xyz)))
+    parts, _ = turned_way(xy, courses_at(xy, own), radius, meets(ways.space.closed))
+    rows, kept = [xyz[:1]], [0]
+    for k, part in enumerate(parts):
+        same = list(range(stay[k] + 1, stay[k + 1]))  # climbs on the spot
+        rows += [xyz[same]] if same else []
+        kept += same
+        s = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(part, axis=0).T))])
+        z = np.interp(s, [0.0, max(float(s[-1]), 1e-9)], [xyz[stay[k + 1] - 1, 2],
+                                                          xyz[stay[k + 1], 2]])  # fmt: skip
+        found = lifted(surface, np.column_stack([part, z]))
+        rows.append(found[1:])
+        kept += [-1] * (len(found) - 2) + [stay[k + 1]]
+    rest = list(range(stay[-1] + 1, len(xyz)))
+    return np.concatenate([*rows, xyz[rest]]), [*kept, *rest]
 
 
 def later(sortie: Sortie, seconds: float) -> Sortie:

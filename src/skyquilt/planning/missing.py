@@ -76,7 +76,7 @@ def read_mission_state(folder: Path) -> FlownMission:
     try:
         record = json.loads(read_bounded(folder / STATE).decode("utf-8"))
         again = frozenset(int(k) for k in record["again"])
-        with rasterio.open(folder / COVERAGE) as raster:
+        with rasterio.open(folder / COVERAGE, driver="GTiff") as raster:
             values = raster.read(1)
             affine = raster.transform
     except (OSError, ValueError, LookupError, TypeError, rasterio.errors.RasterioError) as error:
@@ -116,7 +116,7 @@ def missing_site(folder: Path, views: int, *, keep_out: Path | None = None) -> S
             " areas"
         )
     try:
-        with rasterio.open(folder / name) as raster:
+        with rasterio.open(folder / name, driver="GTiff") as raster:
             if raster.crs is None:
                 raise SideFileError(f"{folder / name} is not georeferenced; give a file with areas")
             scale = max(1.0, max(raster.shape) / MOST_CELLS)

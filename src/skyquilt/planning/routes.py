@@ -16,6 +16,7 @@ from skyquilt.planning.settings import PlanSettings
 from skyquilt.planning.terrain import Terrain
 from skyquilt.planning.times import NEVER, time_matrix
 from skyquilt.planning.tours import Vehicle, tours
+from skyquilt.planning.turns import meets
 
 MOST_SORTIES = 60
 """Largest number of sorties of one drone."""
@@ -73,6 +74,7 @@ def plan_routes(
             sorties += usable < TIGHTER**4
     kept, warnings = apart(flights, settings.separation_m)
     found = tuple(s for own in kept for s in own)
+    warnings += _in_closed_places(found, drones, ways)
     end = max(s.way[-1].time_s for s in found)
     if settings.deadline_s is not None and end > settings.deadline_s:
         warnings.append(
@@ -80,6 +82,23 @@ def plan_routes(
             f" are asked for; no plan for these drones can end before {bound / 60:.1f} min."
         )
     return Routes(sorties=found, bound_s=bound, warnings=tuple(warnings))
+
+
+def _in_closed_places(sorties: Sequence[Sortie], drones: Sequence[Drone], ways: Ways) -> list[str]:
+    """A sentence for each drone that cannot turn clear of keep-out areas; those that turn on the
+    spot always can.
+    """
+    told = []
+    meet = meets(ways.space.closed)
+    for k, drone in enumerate(drones):
+        own = [np.array([(w.x, w.y) for w in s.way]) for s in sorties if s.drone == k]
+        if drone.turn_radius_m > 0 and any(meet(way, 0.0) for way in own):
+            told.append(
+                f"{drone.name} turns within {drone.turn_radius_m:g} m and cannot keep its distance"
+                " from the keep-out areas on all of its way; give a drone that turns closer, or a"
+                " larger keep-out area around narrow places."
+            )
+    return told
 
 
 def free_ways(

@@ -100,7 +100,7 @@ def read_terrain(path: Path, crs: str, area: BaseGeometry, margin: float) -> Ter
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            source = rasterio.open(path)
+            source = rasterio.open(path, driver="GTiff")  # others name files and addresses
         with source:
             if source.crs is None:
                 raise SideFileError(

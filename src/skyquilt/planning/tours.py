@@ -48,8 +48,8 @@ def solver() -> Any:
         from ortools.constraint_solver import pywrapcp
     except ImportError:
         raise UsageError(
-            "planning routes needs OR-tools, which is not installed; install it with"
-            " pip install 'skyquilt[plan]'"
+            "planning routes needs OR-tools, which is not installed; it is the extra `plan`:"
+            " .venv/bin/pip install -c constraints.txt '.[plan]' in the folder of the source"
         ) from None
     return pywrapcp
 

@@ -30,6 +30,8 @@ from skyquilt.raster.vector import lines, points
 
 FILES = ("plan.json", "points.geojson", "routes.geojson", "plan.kml", "plan.html")
 """Files of a plan, besides those of the drones."""
+WASTED = 0.1
+"""Share of ground by which a camera has to see more than all have in common, to be told."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +151,7 @@ def planned(
         terrain=terrain.known,
         proof=proof,
         bound_s=routes.bound_s,
-        warnings=(*warnings, *routes.warnings),
+        warnings=(*warnings, *routes.warnings, *_of_mixed_cameras(drones, view)),
     )
     for text in plan.warnings:
         yield Note(text=text, warning=True)
@@ -160,6 +162,21 @@ def planned(
     names = write_all(output, plan)
     write_plan_page(output / "plan.html", plan, cells, counted(cells, seen), order.base)
     yield Result(output=output, metrics=summary_of(plan, names))
+
+
+def _of_mixed_cameras(drones: Sequence[Drone], view: View) -> list[str]:
+    """What it costs that points are planned for the view that all cameras share."""
+    common = view.along * view.across
+    told = []
+    for own in {d.view.name: d.view for d in drones}.values():
+        more = own.along * own.across / common - 1
+        if more > WASTED:
+            told.append(
+                f"points are planned for what all cameras see; {own.name} alone would need"
+                f" {100 * more / (1 + more):.0f} % fewer photos: plan an area of its own for it if"
+                " that matters."
+            )
+    return told
 
 
 def terrain_of(

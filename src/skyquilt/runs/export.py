@@ -15,7 +15,7 @@ import numpy as np
 
 from skyquilt.engine.folder import EXPORTS
 from skyquilt.errors import SideFileError, UsageError
-from skyquilt.outside import read_bounded
+from skyquilt.outside import plain, read_bounded
 from skyquilt.raster import CogWriter, RasterSpec
 from skyquilt.raster.atomic import mended, write_text
 from skyquilt.raster.geopackage import write_polygons
@@ -278,4 +278,6 @@ def _check_crs(text: str) -> None:
     try:
         CRS(text)
     except CRSError as error:
-        raise UsageError(f"--crs {text!r} is no coordinate system, such as EPSG:32633") from error
+        raise UsageError(
+            f"--crs '{plain(text, 80)}' is no coordinate system, such as EPSG:32633"
+        ) from error

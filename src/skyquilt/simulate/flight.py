@@ -35,6 +35,14 @@ class Waypoint:
     """Height above the base in m, where it is not the route's height above the take-off."""
     point: int | None = None
     """Id of the picture-point of a plan."""
+    above: float = 0.0
+    """Planned height above the ground in m, of the points of a plan."""
+    velocity: tuple[float, float] | None = None
+    """Over ground, m/s; None where the route's speed tells it."""
+    pitch: float = 0.0
+    """Mean pitch there, degrees, positive ahead."""
+    roll: float = 0.0
+    """Mean roll there, degrees, positive right wing down."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,6 +225,7 @@ def fly(points: list[Waypoint], route: Route, takeoff: float, seed: int, prefix:
         east, north = route.pushed(rng)
         course = np.radians(point.heading if point.course is None else point.course)
         speed = 0.0 if route.stops else route.speed
+        over_ground = (float(speed * np.sin(course)), float(speed * np.cos(course)))
         letter = f"{chr(ord('A') + point.drone % 26)}_" if route.drones > 1 else ""
         shot = Shot(
             name=f"{prefix}_{letter}{number + 1:04d}",
@@ -227,9 +236,9 @@ def fly(points: list[Waypoint], route: Route, takeoff: float, seed: int, prefix:
                 (takeoff + route.height if point.z is None else point.z) + 0.6 * dz,
             ),
             yaw=wrap(point.heading + yaw),
-            pitch=float(pitch),
-            roll=float(roll),
-            velocity=(float(speed * np.sin(course)), float(speed * np.cos(course)), 0.0),
+            pitch=point.pitch + float(pitch),
+            roll=point.roll + float(roll),
+            velocity=(*(over_ground if point.velocity is None else point.velocity), 0.0),
             spin=spins[number],
         )
         if number not in lost:

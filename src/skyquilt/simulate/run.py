@@ -17,7 +17,7 @@ from skyquilt.simulate.ground import Ground
 from skyquilt.simulate.noise import Noise
 from skyquilt.simulate.reported import Place, Report, Start, place_at, report_all
 from skyquilt.simulate.scene import Country, Scene, empty_scene
-from skyquilt.simulate.settings import FlightSettings, Thermal, Video
+from skyquilt.simulate.settings import FlightSettings, Pictures, Thermal, Video
 from skyquilt.simulate.truth import (
     Taken,
     TakenClip,
@@ -30,6 +30,8 @@ from skyquilt.simulate.video import ClipWriter, film, gusts, pictures_of, teleme
 from skyquilt.simulate.weather import Weather
 
 _SMOOTH_S = 30.0
+EXPOSURE_S = 1e-3
+"""Time for which the shutter of a planned flight is open."""
 _OURS = ("photos", "thermal", "video", "truth", "gcp_list.txt")
 
 
@@ -288,7 +290,7 @@ def photograph(
     sharp, shake = pictures, replace(pictures, motion_blur=pictures.blurred_px)
     for number, (shot, report) in enumerate(zip(flight.shots, flight.reports, strict=True)):
         rng = np.random.default_rng([world.settings.seed, 51, number])
-        pictures = shake if number in spoilt else sharp
+        pictures = shake if number in spoilt else _moving(sharp, shot, flight.lens)
         gain = float(np.exp(rng.normal(0, pictures.exposure_noise)))
         name = f"{shot.name}.jpg"
         if not (resume and (folder / name).exists()):
@@ -315,6 +317,17 @@ def photograph(
         )
         yield Progress(stage="photos", done=number + 1, total=len(flight.shots), name=name)
     return taken
+
+
+def _moving(pictures: Pictures, shot: Shot, lens: Lens) -> Pictures:
+    """The settings of a photo of a planned flight: blurred by what passes below the drone while the
+    shutter is open.
+    """
+    if shot.waypoint.velocity is None:
+        return pictures
+    passed = float(np.hypot(*shot.waypoint.velocity)) * EXPOSURE_S
+    blur = passed * lens.focal / shot.waypoint.above
+    return replace(pictures, motion_blur=max(pictures.motion_blur, blur))
 
 
 def _roll(

@@ -55,7 +55,8 @@ class Route:
     """Photos planned but not delivered, never two neighbours."""
     wind: float = 0.0
     """Speed of the wind, m/s: it pushes photos off their places, by a tenth of a second's way on
-    average, in gusts by as much more or less.
+    average, in gusts by as much more or less. The drones of a plan lean into it, too, and it
+    changes their ground speed.
     """
     wind_from: float = 0.0
     """Where it comes from, degrees from the map's north."""

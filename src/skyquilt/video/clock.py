@@ -4,7 +4,7 @@ The pictures tell how the ground moved below the camera, up to a rotation and a 
 tell how the drone moved. Both agree at the right offset only, if the flight turns or changes speed.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,38 +47,63 @@ class OffsetSearch:
     """Step of the search."""
     half_s: float = 3.0
     """Displacements are taken from so long before to so long after."""
+    wide_s: float = 8.0
+    """The same for the last step, around the best offset: over a whole turn the drone is displaced
+    by more, and its receiver errs by no more. At most a sixth of the clip.
+    """
     inside: float = 0.6
     """Share of the clip that positions must cover."""
     apart_s: float = 2.0
     """Offsets further apart than this are different answers."""
     certain: float = 18.0
     """Least difference of twice the log-likelihood to any different answer."""
-    version: int = 1
+    version: int = 2
     """Changes when the results do."""
 
     def __call__(self, looks: Looks, track: Track, zero_s: float, reach_s: float) -> Offset | None:
         """The offset within `reach_s` of `zero_s` (track time at which the clip begins); None where
         too little moves or overlaps.
         """
-        t = np.arange(0, float(looks.time_s[-1]) + 1e-9, self.grid_s)
-        path, heading = _image_path(looks)
-        image = np.stack(
-            [_displacements(looks.time_s, p, t, self.half_s) for p in (path, heading)], axis=1
-        )
-        if np.isfinite(image[:, 0]).sum() < 20:
-            return None
-        low, high = float(track.height_time_s[0]), float(track.height_time_s[-1])
-        first = max(zero_s - reach_s, low - t[-1])
-        last = min(zero_s + reach_s, high)
+        last_look = float(looks.time_s[-1])
+        first = max(zero_s - reach_s, float(track.height_time_s[0]) - last_look)
+        last = min(zero_s + reach_s, float(track.height_time_s[-1]))
         if last < first:
             return None
         # the grid holds the offset 0
         steps = np.arange(
             np.ceil((first - zero_s) / self.grid_s), np.floor((last - zero_s) / self.grid_s) + 1
         )
+        near = self._compared(looks, track, zero_s, steps, self.half_s)
+        if near is None:
+            return None
+        found = self._judged(near)
+        around = steps[np.abs(steps * self.grid_s - found.seconds) <= self.apart_s / 2]
+        half = min(self.wide_s, last_look / 6)
+        wide = (
+            self._compared(looks, track, zero_s, around, half)
+            if found.clear and half > self.half_s
+            else None
+        )
+        if wide is None:
+            return found
+        best = int(np.nanargmin(wide.share))
+        seconds, sigma = _parabola(wide.offsets, self._fit(wide), best)
+        return replace(found, seconds=seconds, sigma_s=sigma) if sigma < found.sigma_s else found
+
+    def _compared(
+        self, looks: Looks, track: Track, zero_s: float, steps: Array, half: float
+    ) -> "_Compared | None":
+        """Displacements at offsets of so many steps; None where too little moves or overlaps."""
+        t = np.arange(0, float(looks.time_s[-1]) + 1e-9, self.grid_s)
+        path, heading = _image_path(looks)
+        image = np.stack(
+            [_displacements(looks.time_s, p, t, half) for p in (path, heading)], axis=1
+        )
+        if np.isfinite(image[:, 0]).sum() < 20 or not len(steps):
+            return None
         offsets = steps * self.grid_s
         there = zero_s + np.arange(offsets[0], offsets[-1] + t[-1] + self.grid_s / 2, self.grid_s)
-        moved = _track_displacements(track, there, self.half_s)
+        moved = _track_displacements(track, there, half)
         share = np.array(
             [
                 _misfit(image, moved[k : k + len(t)], self.inside)
@@ -87,17 +112,24 @@ class OffsetSearch:
         )
         if not np.isfinite(share).any():
             return None
-        return self._judged(offsets[: len(share)], share, image, moved)
+        return _Compared(
+            offsets=offsets[: len(share)], share=share, image=image, moved=moved, half=half
+        )
 
-    def _judged(self, offsets: Array, share: Array, image: Complex, moved: Complex) -> Offset:
-        n = max(np.isfinite(image[:, 0]).sum() * self.grid_s / self.half_s * 2, 1.0)
+    def _fit(self, found: "_Compared") -> Array:
+        """Twice the negative logarithm of the likelihood (n,), but for a constant."""
+        known = np.isfinite(found.image[:, 0]).sum()
+        n = max(known * self.grid_s / found.half * 2, 1.0)
+        return np.asarray(n * np.log(np.maximum(found.share, 1e-6)))
+
+    def _judged(self, found: "_Compared") -> Offset:
+        offsets, share, fit = found.offsets, found.share, self._fit(found)
         best = int(np.nanargmin(share))
-        fit = n * np.log(np.maximum(share, 1e-6))
         near, sigma = _parabola(offsets, fit, best)
         others = np.abs(offsets - offsets[best]) > self.apart_s
         rival = float(np.nanmin(fit[others])) if np.isfinite(fit[others]).any() else np.nan
-        part = moved[best : best + len(image)]
-        speed = float(np.sqrt(np.nanmean(np.abs(part) ** 2)) / (2 * self.half_s))
+        part = found.moved[best : best + len(found.image)]
+        speed = float(np.sqrt(np.nanmean(np.abs(part) ** 2)) / (2 * found.half))
         clear = (
             np.isfinite(rival)
             and rival - fit[best] > self.certain
@@ -111,6 +143,22 @@ class OffsetSearch:
             misfit=float(share[best]),
             speed_ms=speed,
         )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Compared:
+    """Displacements of pictures and positions at several offsets."""
+
+    offsets: Array
+    """(n,) s."""
+    share: Array
+    """(n,) share of the motion that the pictures do not explain; NaN where too little is known."""
+    image: Complex
+    """(m, 2) of the picture's middle and of a point fixed to the drone, px."""
+    moved: Complex
+    """(m + n - 1,) of the positions, m."""
+    half: float
+    """Half their duration, s."""
 
 
 def _image_path(looks: Looks) -> tuple[Complex, Complex]:
