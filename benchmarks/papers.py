@@ -17,6 +17,12 @@ NAME:
     mse           registration error before and after undistortion, on pairs of photos (Y 6.3)
     fig-5.12      heights of one pair and of a mosaic of disparities against the truth; with
     fig-5.14      heights of the reconstruction
+    table-6.4     registration of real pairs of two spectra by class and method, with truth; with
+    table-6.5     the mean Q (needs ../shared/data)
+    depth-maps    depth maps of a visual and a thermal flight registered by SURF and RFAE (Y Fig.
+                  5.12c, 5.14c)
+    eq-5.7        the thermal map on the visual one: (5.7) as written beside `pairs`
+    factors       what makes a homography look better than a similarity on photos
     ste           the article's estimator on real pairs, by what the matches are chosen from (A 2.4,
                   2.5; needs ../shared/data)
     article       time and geolocation of six flight lines (A Tables 1 and 2)
@@ -43,11 +49,15 @@ from skyquilt import simulate as sim
 from skyquilt.calibration.assemble import Assemble, bimodality
 from skyquilt.calibration.few_views import FewViews
 from skyquilt.calibration.find_board import FindBoard
+from skyquilt.coregistration.pictures import Source, open_picture
+from skyquilt.coregistration.workflow import outcome_of, within_tolerance
 from skyquilt.depth.workflow import depth
 from skyquilt.engine.clock import Clock
 from skyquilt.engine.store import Store
+from skyquilt.errors import RefusedError
 from skyquilt.geometry.camera import undistort
-from skyquilt.geometry.transforms import transfer
+from skyquilt.geometry.transforms import fit, transfer
+from skyquilt.imaging.plane import view_patch
 from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.matching.matchers import Mutual
 from skyquilt.matching.ransac import Ransac
@@ -58,14 +68,18 @@ from skyquilt.papers.aligners import VLFEAT
 from skyquilt.papers.baselines import baselines
 from skyquilt.papers.best_matches import Best
 from skyquilt.papers.compare import CompareSettings, iter_compare
+from skyquilt.papers.pair_list import overlap_error
+from skyquilt.papers.spectral_bench import iter_spectral_bench
 from skyquilt.papers.ste import RansacSte
 from skyquilt.papers.strip_chain import VARIANTS, board_camera, calibrated, chained
 from skyquilt.papers.surf import Surf
 from skyquilt.quality.registration_quality import eta, four_lengths, mean_squared_error
+from skyquilt.quality.replay import lambda_corr, replay
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate.board import Chessboard, Lamp, Sensor, sweep, tilted
 from skyquilt.simulate.camera import Lens
-from skyquilt.simulate.settings import Control, FlightSettings, Reporting, Route
+from skyquilt.simulate.settings import Control, FlightSettings, Reporting, Route, Thermal
+from skyquilt.thermal.workflow import iter_thermal
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.flow import AlignedPhotos, align_photos
 from skyquilt.workflows.methods import detector_for, methods_for
@@ -401,6 +415,83 @@ def brighton(work: Path, seeds: int) -> None:
     table((*head, "baselines off, median %", "largest %"), rows)
 
 
+FACTORS: dict[str, dict[str, Any]] = {
+    "looking down, 120 m, 70 % overlap, lens known": {},
+    "overlap 50 %": {"overlap": 0.5},
+    "tilt of 3 degrees": {"tilt": 3.0},
+    "lens not known": {"dewarp": None},
+    "height 60 m": {"height": 60.0},
+    "height 30 m: things of up to half of it": {"height": 30.0},
+    "three lines": {"pattern": "block"},
+    "30 m, tilt of 3 degrees, lens not known": {"height": 30.0, "tilt": 3.0, "dewarp": None},
+}
+"""From what the strips of `models` are towards what brighton is, one thing at a time."""
+
+
+def factors(work: Path, seeds: int) -> None:
+    """Photos of a landscape with trees and houses: how well neighbours fit (as in `brighton`), and
+    how true the shape is (as in `models`).
+    """
+    lens = Lens().scaled(800, 600)
+    rows = []
+    for case, more in FACTORS.items():
+        found: dict[str, list[tuple[float, float, float]]] = {}
+        for seed in range(1, seeds + 1):
+            dewarp = more.get("dewarp", (lens.p1, lens.p2))
+            settings = FlightSettings(
+                seed=seed,
+                lens=lens,
+                route=Route(
+                    pattern=more.get("pattern", "strip"),
+                    photos=12,
+                    overlap=more.get("overlap", 0.7),
+                    height=more.get("height", 120.0),
+                    tilt_noise=more.get("tilt", 0.3),
+                ),
+                reporting=Reporting(dewarp=dewarp, focal_error=0.0),
+                control=Control(points=0, checks=0),
+            )
+            folder = simulated(work / f"factors{seed}-{list(FACTORS).index(case)}", settings)
+            photos, truth = sorted((folder / "photos").glob("*.jpg")), truth_of(folder)
+            for model in ("similarity", "homography"):
+                chosen = MosaicSettings(method="image", transform=model, jobs=1)
+                placed, _ = aligned(photos, chosen)
+                found.setdefault(model, []).append(_looks_and_shape(placed, truth))
+        median = [np.median(np.array(found[m]), 0) for m in ("similarity", "homography")]
+        rows.append(
+            (case, *(" / ".join(f"{m[k]:.{d}f}" for m in median) for k, d in enumerate((3, 3, 1))))
+        )
+    head = "lambda corr", "CC with the photo before", "cameras off their true shape, %"
+    table(("photos (similarity / homography)", *head), rows)
+
+
+def _looks_and_shape(placed: AlignedPhotos, truth: dict[str, Any]) -> tuple[float, float, float]:
+    """lambda_corr, CC with the photo before, and the RMS distance of the cameras from their true
+    places after a similarity, in % of the route's extent.
+    """
+    alignment, flat = placed.alignment, level_ground(0.0)
+    views = {v.photo: v for v in make_views(alignment, flat)}
+    chain = sorted(alignment.blocks[0])
+    gsd = np.median([v.pose.map_C[2] / v.camera.focal for v in views.values()])
+    gsd *= views[chain[0]].camera.width / 400
+    patches = []
+    for i in chain:
+        grey = cv2.imread(str(placed.photos[i].path), cv2.IMREAD_REDUCED_GRAYSCALE_2)
+        patches.append(view_patch(grey, views[i], flat, float(gsd)))
+    seen = replay(patches)
+    own = np.array([alignment.poses[i].map_C[:2] for i in chain])
+    true = np.array([truth[placed.photos[i].name]["position"][:2] for i in chain])
+    H = fit("similarity", own, true)
+    assert H is not None
+    off = np.sqrt(((transfer(H, own) - true) ** 2).sum(1).mean())
+    extent = np.linalg.norm(np.ptp(true, axis=0))
+    return (
+        lambda_corr(seen.with_overview),
+        float(np.nanmean(seen.with_last)),
+        float(100 * off / extent),
+    )
+
+
 # ---- Y 5.1, 6.3: calibration
 
 
@@ -590,6 +681,180 @@ def heights(work: Path, seeds: int) -> None:
     )
 
 
+# ---- Y 6.4: two spectra, pair by pair
+
+PRINTED_64 = {
+    "satellite-low": ("24/24, 24/24, 24/24, 24/24, 24/24", "72, 66, 71, 53, 68"),
+    "satellite-high": ("7/10, 6/10, 9/10, 10/10, 10/10", "45, 41, 49, 46, 52"),
+    "human": ("0/16, 0/16, 2/16, 12/16, 12/16", "0, 0, 1, 8, 8"),
+    "surveillance": ("1/14, 2/14, 4/14, 12/14, 12/14", "1, 3, 4, 18, 19"),
+    "uav": ("13/20, 14/20, 2/20, 13/20, 17/20", "9, 10, 1, 6, 11"),
+}
+"""Accepted of all pairs, and mean Q in %, by SIFT, SURF, upright SURF, RFAE, SURF + RFAE."""
+
+
+def table_64(work: Path, seeds: int) -> None:
+    """Accepted is not right: the thesis had no truth."""
+    listed = DATA / "spectral" / "pairs.csv"
+    if not listed.is_file():
+        raise SystemExit("the pairs of images are not beside this checkout")
+    methods = ("sift", "surf", "usurf", "rfae", "surf+rfae", "rfae-refined", "auto")
+    *_, last = iter_spectral_bench(listed, work / "t64", methods, overwrite=True)
+    assert isinstance(last, Result)
+    told = last.metrics["pairs"]
+    head = ("class", "pairs", *methods)
+    for title, cell in (
+        ("right / wrong; printed: accepted", _right_wrong),
+        ("mean Q, %", _mean_q),
+        ("CPU s a pair", lambda of: f"{np.mean([r['seconds'] for r in of]):.2f}"),
+    ):
+        print(title + "\n")
+        rows = []
+        for kind in (*dict.fromkeys(r["class"] for r in told), None):
+            of = [r for r in told if kind in (None, r["class"])]
+            cells = [cell([r for r in of if r["method"] == m]) for m in methods]
+            rows.append((kind or "all", len(of) // len(methods), *cells))
+            if kind in PRINTED_64 and cell in (_right_wrong, _mean_q):
+                printed = PRINTED_64[kind][0 if cell is _right_wrong else 1].split(", ")
+                rows.append(("printed", "", *printed, "", ""))
+        table(head, rows)
+
+
+def _right_wrong(of: Sequence[dict[str, Any]]) -> str:
+    right = sum(r["right"] for r in of)
+    return f"{right} / {sum(r['accepted'] for r in of) - right}"
+
+
+def _mean_q(of: Sequence[dict[str, Any]]) -> str:
+    return f"{100 * np.mean([r['q'] for r in of]):.0f}"
+
+
+# ---- Y 5.2.3: two spectra by depth maps and by carried pairs
+
+
+def two_flights(work: Path, seed: int, gps_noise: float) -> Path:
+    """A visual and a thermal flight over the same small site, at midday and in the afternoon."""
+    settings = FlightSettings(
+        seed=seed,
+        lens=Lens().scaled(800, 600),
+        route=Route(photos=9),
+        reporting=Reporting(gps_noise=gps_noise),
+        control=Control(points=0, checks=0),
+        thermal=Thermal(overlap=0.75, sidelap=0.5),
+    )
+    return simulated(work / f"two{seed}-{gps_noise:g}", settings)
+
+
+def depth_maps(work: Path, seeds: int) -> None:
+    """Errors over the overlap by the georeferences of both maps, whose positions are good to 5 cm;
+    no guess is given.
+    """
+    chosen = MosaicSettings(gsd_cm=25, features=3000, jobs=1)
+    methods = ("surf", "surf-lobe", "rfae", "rfae-refined", "auto")
+    found: dict[str, dict[str, list[str]]] = {}
+    for seed in range(3, 3 + seeds):
+        folder = two_flights(work, seed, 0.05)
+        visual, thermal = (sorted((folder / n).iterdir()) for n in ("photos", "thermal"))
+        at = {k: np.array(p["position"][:2]) for k, p in truth_of(folder).items()}
+        one = visual[3:5]
+        there = (at[one[0].name] + at[one[1].name]) / 2
+        ends = [(at[a.name], at[b.name]) for a, b in itertools.pairwise(thermal)]
+        middles = [
+            np.linalg.norm((a + b) / 2 - there) + (99 if np.linalg.norm(a - b) > 30 else 0)
+            for a, b in ends
+        ]
+        k = int(np.argmin(middles))
+        other = thermal[k : k + 2]
+        for name, photos, route in (
+            ("one pair each, features (Fig. 5.12c)", (one, other), "disparities"),
+            ("one pair each, every pixel", (one, other), "pair"),
+            ("reconstructions (Fig. 5.14c)", (visual, thermal), "reconstruction"),
+        ):
+            sources = []
+            for side, chosen_photos in zip("ab", photos, strict=True):
+                out = work / f"depth-{side}"
+                depth(chosen_photos, out, chosen, route=route, overwrite=True)
+                source = open_picture(out / "depth.tif")
+                assert isinstance(source, Source) and source.place is not None
+                sources.append(source)
+            a, b = sources
+            g, h = a.place.affine, b.place.affine  # type: ignore[union-attr]
+            truth = np.eye(3)
+            truth[:2, 2] = (g[2] - h[2]) / h[0], (g[5] - h[5]) / h[4]
+            row = found.setdefault(name, {})
+            for method in methods:
+                outcome, _ = within_tolerance(outcome_of(a, b, method, None), a, b, None)
+                shapes = (a.height, a.width), (b.height, b.width)
+                off = (
+                    f"{0.25 * overlap_error(outcome.b_H_a, truth, *shapes):.1f}"
+                    if outcome
+                    else "refused"
+                )
+                row.setdefault(method, []).append(off)
+    table(
+        ("depth maps of", *(f"{m}, off by m" for m in methods)),
+        [(n, *(", ".join(row[m]) for m in methods)) for n, row in found.items()],
+    )
+
+
+def eq_57(work: Path, seeds: int) -> None:
+    """Errors of the thermal map on the visual one: the difference of their displacements from the
+    truth; positions good to 2 m.
+    """
+    import sys
+
+    import skyquilt.thermal.by_pairs as module
+
+    sys.path.insert(0, str(Path(__file__).resolve().parent))
+    from thermal_map import displacements, field
+
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    usual = module.MOST_PAIRS
+    for seed in range(3, 3 + seeds):
+        folder = two_flights(work, seed, 2.0)
+        out = work / f"joined{seed}"
+        for name, route, most in (
+            ("pairs", "pairs", usual),
+            ("(5.7) with homographies", "homographies", usual),
+            ("(5.7) with homographies, one pair", "homographies", 1),
+            ("positions alone", "positions", usual),
+        ):
+            module.MOST_PAIRS = most
+            try:
+                *_, last = iter_thermal(
+                    folder / "photos", folder / "thermal", out, MosaicSettings(jobs=1), route=route
+                )
+            except RefusedError as error:
+                print(f"{name}, seed {seed}: {error}")
+                continue
+            assert isinstance(last, Result)
+            truth = folder / "truth"
+            at, off, _ = displacements(out / "thermal.tif", truth / "truth_thermal.tif")
+            there, own, _ = displacements(out / "mosaic.tif", truth / "truth_ortho.tif")
+            error_m = np.linalg.norm(off - field(there, own, at), axis=1)
+            gsd = last.metrics["native_gsd_m"]
+            evidence = last.metrics["thermal"].get("evidence", {})
+            rows.setdefault(name, []).append(
+                (
+                    float(np.median(error_m) / gsd),
+                    float(np.percentile(error_m, 95) / gsd),
+                    float(evidence.get("pairs_registered", np.nan)),
+                )
+            )
+    module.MOST_PAIRS = usual
+    table(
+        ("thermal map by", "median error, visual GSD", "95 % below", "pairs registered"),
+        [
+            (
+                n,
+                *(", ".join(f"{v[k]:.1f}" for v in r) for k in (0, 1)),
+                ", ".join(f"{v[2]:.0f}" for v in r),
+            )
+            for n, r in rows.items()
+        ],
+    )
+
+
 # ---- A
 
 
@@ -657,6 +922,13 @@ NAMES: dict[str, tuple[Callable[[Path, int], None], int]] = {
     "mse": (mse, 2),
     "fig-5.12": (heights, 2),
     "fig-5.14": (heights, 2),
+    "factors": (factors, 1),
+    "table-6.4": (table_64, 1),
+    "table-6.5": (table_64, 1),
+    "depth-maps": (depth_maps, 2),
+    "fig-5.12c": (depth_maps, 2),
+    "fig-5.14c": (depth_maps, 2),
+    "eq-5.7": (eq_57, 1),
     "ste": (ste, 1),
     "article": (article, 1),
 }

@@ -1,16 +1,34 @@
-"""Claims of the thesis that hold here (docs/papers.md), each on simulated strips of known truth."""
+"""Claims of the thesis that hold here (docs/papers.md), each on simulated flights of known truth,
+and on a real survey where no truth is needed.
+"""
 
+import json
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from skyquilt.engine.clock import Clock
+from skyquilt.engine.store import Store
 from skyquilt.geometry.camera import undistort
 from skyquilt.geometry.transforms import fit, transfer
 from skyquilt.matching.ransac import Ransac
+from skyquilt.model.event import Result, StageFinished
+from skyquilt.papers.compare import CompareSettings, iter_compare
 from skyquilt.papers.strip_chain import VARIANTS, board_camera, chained
 from skyquilt.quality.registration_quality import mean_squared_error
-from skyquilt.simulate import StripSettings, fly_strip
+from skyquilt.settings import MosaicSettings
+from skyquilt.simulate import FlightSettings, StripSettings, fly_strip, simulate
+from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.settings import Control, Reporting, Route
+from skyquilt.workflows.artefacts import REGISTRY
+from skyquilt.workflows.flow import align_photos
+from skyquilt.workflows.methods import methods_for
+from skyquilt.workflows.survey_input import read_input
+
+BRIGHTON = Path(__file__).parents[2] / ".." / "shared" / "data" / "brighton"
 
 HOMOGRAPHY, NOT_LEVELLED, SIMILARITY = VARIANTS[4:7]
 
@@ -75,3 +93,128 @@ def test_undistorted_pairs_register_better():
         assert errors[1] < 0.83 * errors[0]
         # what is left is noise of 0.3 px per axis in both photos
         assert errors[1] == pytest.approx(4 * 0.3**2, rel=0.2)
+
+
+def aligned(photos, **asked):
+    """Photos placed by a method of the papers, and the CPU seconds of placing them."""
+    settings = MosaicSettings(jobs=1, **asked)
+    with tempfile.TemporaryDirectory() as folder:
+        clock = Clock(store=Store(folder=Path(folder), registry=REGISTRY), began=Clock.now())
+        given = read_input(list(photos), settings.input)
+        steps, spent = align_photos(given, methods_for(settings), settings, clock), 0.0
+        while True:
+            try:
+                event = next(steps)
+            except StopIteration as stop:
+                return stop.value, spent
+            if isinstance(event, StageFinished) and event.stage == "align":
+                spent = event.cpu_seconds
+
+
+def compared(photos, output, variants, gsd_cm, **more):
+    """The columns of a comparison."""
+    settings = CompareSettings(mosaic=MosaicSettings(gsd_cm=gsd_cm), variants=variants, **more)
+    *_, last = iter_compare(photos, output, settings)
+    assert isinstance(last, Result)
+    return last.metrics["methods"]
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_image_and_hybrid_fit_better_than_position_and_pose(flight, tmp_path):
+    """Y Table 6.1, lambda_corr; that pose is better than position does not hold here."""
+    names = ("position", "pose", "image", "hybrid")
+    found = compared(flight / "photos", tmp_path / "out", names, 12.0)
+    corr = {name: found[name]["lambda_corr"] for name in names}
+    assert min(corr["image"], corr["hybrid"]) > max(corr["position"], corr["pose"]) + 0.03
+
+
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.long
+def test_photos_near_their_positions_fit_better_by_hybrid(tmp_path):
+    """Y Fig. 6.4, on a real survey."""
+    if not BRIGHTON.is_dir():
+        pytest.skip("the survey brighton is not beside this checkout")
+    found = compared(BRIGHTON, tmp_path / "out", ("hybrid",), 10.0)["hybrid"]
+    corr, off = (
+        np.array([np.nan if v is None else v for v in found[k]], float)
+        for k in ("correlation_with_last_of_photo", "off_position_over_width")
+    )
+    both = np.isfinite(corr) & np.isfinite(off)
+    assert both.sum() == 17 and np.corrcoef(corr[both], off[both])[0, 1] < -0.2
+
+
+@pytest.fixture(scope="module")
+def roundtrip(tmp_path_factory):
+    """Thirty photos once around a field."""
+    folder = tmp_path_factory.mktemp("roundtrip")
+    settings = FlightSettings(
+        lens=Lens().scaled(640, 480),
+        route=Route(pattern="roundtrip", photos=30, overlap=0.6),
+        reporting=Reporting(focal_error=0.0),
+        control=Control(points=0, checks=0),
+    )
+    for _ in simulate(settings, folder, overwrite=True):
+        pass
+    return sorted((folder / "photos").glob("*.jpg"))
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_hybrid_saves_time_against_the_search_of_the_whole_overview(roundtrip):
+    """Y 6.5: 'a saving of 70 %' for 37 photos, because the cost of the overview grows as the square
+    of their number, and that of hybrid in proportion to it.
+    """
+    ways = {
+        "overview": {"method": "image", "image_search": "overview"},
+        "hybrid": {"method": "hybrid", "optimiser": "anneal"},
+    }
+    spent = {k: [aligned(roundtrip[:n], **w)[1] for n in (10, 30)] for k, w in ways.items()}
+    growth = {k: np.log(v[1] / v[0]) / np.log(3) for k, v in spent.items()}
+    assert growth["overview"] > 1.5 and growth["hybrid"] < 1.4
+    assert spent["hybrid"][1] < 0.6 * spent["overview"][1]
+
+
+@pytest.fixture(scope="module")
+def strip_of_photos(tmp_path_factory):
+    """Fourteen photos along a line over trees and houses, with their true lens in the files, and
+    the truth.
+    """
+    folder = tmp_path_factory.mktemp("strip")
+    lens = Lens().scaled(800, 600)
+    settings = FlightSettings(
+        seed=1,
+        lens=lens,
+        route=Route(pattern="strip", photos=14, overlap=0.6),
+        reporting=Reporting(dewarp=(lens.p1, lens.p2), focal_error=0.0),
+        control=Control(points=0, checks=0),
+    )
+    for _ in simulate(settings, folder, overwrite=True):
+        pass
+    told = json.loads((folder / "truth" / "truth.json").read_text())["photos"]
+    places = {p["name"]: np.array(p["position"][:2]) for p in told}
+    return sorted((folder / "photos").glob("*.jpg")), places
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_lens_and_transformation_keep_the_shape_of_a_strip_of_photos(strip_of_photos):
+    """Y Fig. 6.6, by the places of the cameras: a lens of order 2 with homographies bends a strip,
+    the full lens bends it less, similarities least.
+    """
+    photos, places = strip_of_photos
+    bent = []
+    for asked in (
+        {"distortion": "2", "levelled": False, "transform": "homography"},
+        {"transform": "homography"},
+        {"transform": "similarity"},
+    ):
+        placed, _ = aligned(photos, method="image", **asked)
+        chain = sorted(placed.alignment.blocks[0])
+        assert len(chain) == len(photos)
+        own = np.array([placed.alignment.poses[i].map_C[:2] for i in chain])
+        true = np.array([places[placed.photos[i].name] for i in chain])
+        off = transfer(fit("similarity", own, true), own) - true
+        bent.append(np.sqrt((off**2).sum(1).mean()) / np.linalg.norm(np.ptp(true, axis=0)))
+    assert bent[0] > bent[1] > bent[2] and bent[2] < 0.03
