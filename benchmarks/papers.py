@@ -9,7 +9,8 @@ NAME:
                   ../shared/data)
     times         CPU time of aligning 9, 18 and 37 photos (Y 6.1.2, 6.1.3, 6.5)
     fig-6.5       eta along a strip (Y 6.2), and with every other photo (Y Fig. 4.5)
-    models        where the similarity keeps the shape better than the homography, and where not
+    models        where the similarity keeps the shape better than the homography, and where not;
+                  and how well neighbours fit
     fig-6.6       the same on simulated photos instead of simulated points
     brighton      the same on a real survey: baselines by GPS (needs ../shared/data)
     eq-5.1        both readings of sigma in the bimodality, and powers of it
@@ -22,7 +23,6 @@ NAME:
     depth-maps    depth maps of a visual and a thermal flight registered by SURF and RFAE (Y Fig.
                   5.12c, 5.14c)
     eq-5.7        the thermal map on the visual one: (5.7) as written beside `pairs`
-    factors       what makes a homography look better than a similarity on photos
     ste           the article's estimator on real pairs, by what the matches are chosen from (A 2.4,
                   2.5; needs ../shared/data)
     article       time and geolocation of six flight lines (A Tables 1 and 2)
@@ -56,8 +56,7 @@ from skyquilt.engine.clock import Clock
 from skyquilt.engine.store import Store
 from skyquilt.errors import RefusedError
 from skyquilt.geometry.camera import undistort
-from skyquilt.geometry.transforms import fit, transfer
-from skyquilt.imaging.plane import view_patch
+from skyquilt.geometry.transforms import transfer
 from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.matching.matchers import Mutual
 from skyquilt.matching.ransac import Ransac
@@ -71,10 +70,9 @@ from skyquilt.papers.compare import CompareSettings, iter_compare
 from skyquilt.papers.pair_list import overlap_error
 from skyquilt.papers.spectral_bench import iter_spectral_bench
 from skyquilt.papers.ste import RansacSte
-from skyquilt.papers.strip_chain import VARIANTS, board_camera, calibrated, chained
+from skyquilt.papers.strip_chain import LOOSE_PX, VARIANTS, board_camera, calibrated, chained
 from skyquilt.papers.surf import Surf
 from skyquilt.quality.registration_quality import eta, four_lengths, mean_squared_error
-from skyquilt.quality.replay import lambda_corr, replay
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate.board import Chessboard, Lamp, Sensor, sweep, tilted
 from skyquilt.simulate.camera import Lens
@@ -275,14 +273,38 @@ CASES: dict[str, dict[str, Any]] = {
     "overlap 85 %": {"overlap": 0.85},
     "things up to 4 m": {"relief": 4.0},
     "things up to 4 m on 60 %": {"relief": 4.0, "things": 0.6},
+    "things up to 10 m on 60 %": {"relief": 10.0, "things": 0.6},
+    "the same, tilt of 3 degrees, overlap 50 %": {
+        "relief": 10.0,
+        "things": 0.6,
+        "tilt": 3.0,
+        "overlap": 0.5,
+    },
     "lens from 6 views": {"views": 6},
     "lens order 2": {"_order": "2"},
     "noise 1 px, lens order 2": {"noise": 1.0, "_order": "2"},
 }
 
 
+def neighbours_px(strip: Any, settings: Any, camera: Any, model: Any) -> float:
+    """Median distance of the points that two neighbours share, in px, each pair registered by
+    itself: what looks, as lambda_corr, judge by.
+    """
+    px = [undistort(camera, p) * camera.focal for p in strip.px]
+    estimate, apart = Ransac(model=model, threshold_px=LOOSE_PX, seed=settings.seed), []
+    for k in range(1, len(px)):
+        _, i, j = np.intersect1d(strip.ids[k], strip.ids[k - 1], return_indices=True)
+        a, b = px[k][i], px[k - 1][j]
+        found = estimate(a, b)
+        if found:
+            apart.append(np.median(np.linalg.norm(transfer(found.b_H_a, a) - b, axis=1)))
+    return float(np.mean(apart))
+
+
 def models(work: Path, seeds: int) -> None:
-    """eta at the end of 21 photos by transformation and by what is wrong with the photos."""
+    """eta at the end of 21 photos, and the fit of neighbours, by transformation and by what is
+    wrong with the photos.
+    """
     ways = {
         "similarity": replace(VARIANTS[6]),
         "affine": replace(VARIANTS[6], model="affine"),
@@ -294,16 +316,23 @@ def models(work: Path, seeds: int) -> None:
         order = more.get("_order", "6t")
         given = {k: v for k, v in more.items() if k != "_order"}
         ends: dict[str, list[float]] = {w: [] for w in ways}
+        apart: dict[str, list[float]] = {"similarity": [], "homography": []}
         for seed in range(1, seeds + 1):
             settings = sim.StripSettings(seed=seed, **given)
             strip = sim.fly_strip(settings)
             size = (settings.lens.width, settings.lens.height)
             camera, _ = board_camera(strip.board, strip.views, size, order)
             for name, way in ways.items():
-                ends[name].append(float(chained(strip, settings, camera, way)[-1]))
+                try:
+                    ends[name].append(float(chained(strip, settings, camera, way)[-1]))
+                except RefusedError:
+                    ends[name].append(np.nan)
+            for model, found in apart.items():
+                found.append(neighbours_px(strip, settings, camera, model))
         median = {w: float(np.median(e)) for w, e in ends.items()}
-        rows.append((case, *(f"{m:.3f}" for m in median.values())))
-    table(("strip", *ways), rows)
+        fits = " / ".join(f"{np.median(v):.2f}" for v in apart.values())
+        rows.append((case, *(f"{m:.3f}" for m in median.values()), fits))
+    table(("strip, eta", *ways, "neighbours apart, px, similarity / homography"), rows)
 
 
 WAYS_66: dict[str, dict[str, Any]] = {
@@ -413,83 +442,6 @@ def brighton(work: Path, seeds: int) -> None:
         rows.append((model, search, "yes" if levelled else "no", *looks, *off))
     head = ("transformation", "search", "levelled", "lambda corr", "CC with the photo before")
     table((*head, "baselines off, median %", "largest %"), rows)
-
-
-FACTORS: dict[str, dict[str, Any]] = {
-    "looking down, 120 m, 70 % overlap, lens known": {},
-    "overlap 50 %": {"overlap": 0.5},
-    "tilt of 3 degrees": {"tilt": 3.0},
-    "lens not known": {"dewarp": None},
-    "height 60 m": {"height": 60.0},
-    "height 30 m: things of up to half of it": {"height": 30.0},
-    "three lines": {"pattern": "block"},
-    "30 m, tilt of 3 degrees, lens not known": {"height": 30.0, "tilt": 3.0, "dewarp": None},
-}
-"""From what the strips of `models` are towards what brighton is, one thing at a time."""
-
-
-def factors(work: Path, seeds: int) -> None:
-    """Photos of a landscape with trees and houses: how well neighbours fit (as in `brighton`), and
-    how true the shape is (as in `models`).
-    """
-    lens = Lens().scaled(800, 600)
-    rows = []
-    for case, more in FACTORS.items():
-        found: dict[str, list[tuple[float, float, float]]] = {}
-        for seed in range(1, seeds + 1):
-            dewarp = more.get("dewarp", (lens.p1, lens.p2))
-            settings = FlightSettings(
-                seed=seed,
-                lens=lens,
-                route=Route(
-                    pattern=more.get("pattern", "strip"),
-                    photos=12,
-                    overlap=more.get("overlap", 0.7),
-                    height=more.get("height", 120.0),
-                    tilt_noise=more.get("tilt", 0.3),
-                ),
-                reporting=Reporting(dewarp=dewarp, focal_error=0.0),
-                control=Control(points=0, checks=0),
-            )
-            folder = simulated(work / f"factors{seed}-{list(FACTORS).index(case)}", settings)
-            photos, truth = sorted((folder / "photos").glob("*.jpg")), truth_of(folder)
-            for model in ("similarity", "homography"):
-                chosen = MosaicSettings(method="image", transform=model, jobs=1)
-                placed, _ = aligned(photos, chosen)
-                found.setdefault(model, []).append(_looks_and_shape(placed, truth))
-        median = [np.median(np.array(found[m]), 0) for m in ("similarity", "homography")]
-        rows.append(
-            (case, *(" / ".join(f"{m[k]:.{d}f}" for m in median) for k, d in enumerate((3, 3, 1))))
-        )
-    head = "lambda corr", "CC with the photo before", "cameras off their true shape, %"
-    table(("photos (similarity / homography)", *head), rows)
-
-
-def _looks_and_shape(placed: AlignedPhotos, truth: dict[str, Any]) -> tuple[float, float, float]:
-    """lambda_corr, CC with the photo before, and the RMS distance of the cameras from their true
-    places after a similarity, in % of the route's extent.
-    """
-    alignment, flat = placed.alignment, level_ground(0.0)
-    views = {v.photo: v for v in make_views(alignment, flat)}
-    chain = sorted(alignment.blocks[0])
-    gsd = np.median([v.pose.map_C[2] / v.camera.focal for v in views.values()])
-    gsd *= views[chain[0]].camera.width / 400
-    patches = []
-    for i in chain:
-        grey = cv2.imread(str(placed.photos[i].path), cv2.IMREAD_REDUCED_GRAYSCALE_2)
-        patches.append(view_patch(grey, views[i], flat, float(gsd)))
-    seen = replay(patches)
-    own = np.array([alignment.poses[i].map_C[:2] for i in chain])
-    true = np.array([truth[placed.photos[i].name]["position"][:2] for i in chain])
-    H = fit("similarity", own, true)
-    assert H is not None
-    off = np.sqrt(((transfer(H, own) - true) ** 2).sum(1).mean())
-    extent = np.linalg.norm(np.ptp(true, axis=0))
-    return (
-        lambda_corr(seen.with_overview),
-        float(np.nanmean(seen.with_last)),
-        float(100 * off / extent),
-    )
 
 
 # ---- Y 5.1, 6.3: calibration
@@ -737,7 +689,7 @@ def two_flights(work: Path, seed: int, gps_noise: float) -> Path:
     settings = FlightSettings(
         seed=seed,
         lens=Lens().scaled(800, 600),
-        route=Route(photos=9),
+        route=Route(photos=6),
         reporting=Reporting(gps_noise=gps_noise),
         control=Control(points=0, checks=0),
         thermal=Thermal(overlap=0.75, sidelap=0.5),
@@ -812,12 +764,11 @@ def eq_57(work: Path, seeds: int) -> None:
     usual = module.MOST_PAIRS
     for seed in range(3, 3 + seeds):
         folder = two_flights(work, seed, 2.0)
-        out = work / f"joined{seed}"
+        out, truth, own = work / f"joined{seed}", folder / "truth", None
         for name, route, most in (
             ("pairs", "pairs", usual),
             ("(5.7) with homographies", "homographies", usual),
             ("(5.7) with homographies, one pair", "homographies", 1),
-            ("positions alone", "positions", usual),
         ):
             module.MOST_PAIRS = most
             try:
@@ -828,10 +779,9 @@ def eq_57(work: Path, seeds: int) -> None:
                 print(f"{name}, seed {seed}: {error}")
                 continue
             assert isinstance(last, Result)
-            truth = folder / "truth"
+            own = own or displacements(out / "mosaic.tif", truth / "truth_ortho.tif")
             at, off, _ = displacements(out / "thermal.tif", truth / "truth_thermal.tif")
-            there, own, _ = displacements(out / "mosaic.tif", truth / "truth_ortho.tif")
-            error_m = np.linalg.norm(off - field(there, own, at), axis=1)
+            error_m = np.linalg.norm(off - field(*own[:2], at), axis=1)
             gsd = last.metrics["native_gsd_m"]
             evidence = last.metrics["thermal"].get("evidence", {})
             rows.setdefault(name, []).append(
@@ -922,7 +872,6 @@ NAMES: dict[str, tuple[Callable[[Path, int], None], int]] = {
     "mse": (mse, 2),
     "fig-5.12": (heights, 2),
     "fig-5.14": (heights, 2),
-    "factors": (factors, 1),
     "table-6.4": (table_64, 1),
     "table-6.5": (table_64, 1),
     "depth-maps": (depth_maps, 2),

@@ -2,6 +2,7 @@
 inliers.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from skyquilt.model.features import DESCRIPTOR_UNIT, Features
 from skyquilt.model.registration import Picture, RefusedRegistration, Registration
 from skyquilt.papers.pair_list import overlap_error, read_pairs
 from skyquilt.papers.rfae import (
+    LOBES,
     BetterByQ,
     Outliers,
     Refined,
@@ -22,6 +24,7 @@ from skyquilt.papers.rfae import (
     binary_edges,
     gradient_magnitude,
     noise_threshold,
+    surf,
 )
 from skyquilt.quality.registration_quality import spread_quality
 from tests.coregistration.scenes import error, layout, spectrum, turned
@@ -137,6 +140,20 @@ def test_q_is_that_of_the_inliers_in_a(alike):
     a, b, _ = alike
     found = registration_method("surf")(Picture(values=a), Picture(values=b))
     assert found.q == spread_quality(found.px_a, 480, 400, delta=48.0)
+
+
+@pytest.mark.slow
+def test_the_lobe_with_the_highest_q_is_used(alike):
+    """Y Fig. 6.11; lobe 1 alone is `surf`."""
+    a, b = (Picture(values=p) for p in alike[:2])
+    each = {}
+    for lobe in LOBES:
+        one = surf()
+        each[lobe] = replace(one, detect=replace(one.detect, lobe=lobe))(a, b)
+    q = {lobe: o.q if o else 0.0 for lobe, o in each.items()}
+    assert len(set(q.values())) > 2
+    assert registration_method("surf-lobe")(a, b).q == max(q.values())
+    assert registration_method("surf")(a, b).q == q[1]
 
 
 def registration(q):
