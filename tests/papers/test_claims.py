@@ -10,6 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from skyquilt.coregistration.pictures import open_picture
+from skyquilt.coregistration.workflow import outcome_of
+from skyquilt.depth.workflow import depth
 from skyquilt.engine.clock import Clock
 from skyquilt.engine.store import Store
 from skyquilt.geometry.camera import undistort
@@ -17,12 +20,13 @@ from skyquilt.geometry.transforms import fit, transfer
 from skyquilt.matching.ransac import Ransac
 from skyquilt.model.event import Result, StageFinished
 from skyquilt.papers.compare import CompareSettings, iter_compare
+from skyquilt.papers.pair_list import overlap_error
 from skyquilt.papers.strip_chain import VARIANTS, board_camera, chained
 from skyquilt.quality.registration_quality import mean_squared_error
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import FlightSettings, StripSettings, fly_strip, simulate
 from skyquilt.simulate.camera import Lens
-from skyquilt.simulate.settings import Control, Reporting, Route
+from skyquilt.simulate.settings import Control, Reporting, Route, Thermal
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.flow import align_photos
 from skyquilt.workflows.methods import methods_for
@@ -218,3 +222,34 @@ def test_lens_and_transformation_keep_the_shape_of_a_strip_of_photos(strip_of_ph
         off = transfer(fit("similarity", own, true), own) - true
         bent.append(np.sqrt((off**2).sum(1).mean()) / np.linalg.norm(np.ptp(true, axis=0)))
     assert bent[0] > bent[1] > bent[2] and bent[2] < 0.03
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_features_register_the_depth_maps_of_two_spectra(tmp_path):
+    """Y Fig. 5.14c: reconstructions of a visual and of a thermal flight; the georeferences of both,
+    good to 5 cm, are the truth.
+    """
+    settings = FlightSettings(
+        seed=3,
+        lens=Lens().scaled(800, 600),
+        route=Route(photos=6),
+        reporting=Reporting(gps_noise=0.05),
+        control=Control(points=0, checks=0),
+        thermal=Thermal(overlap=0.75, sidelap=0.5),
+    )
+    for _ in simulate(settings, tmp_path / "flights", overwrite=True):
+        pass
+    asked, maps = MosaicSettings(gsd_cm=25, features=3000, jobs=1), []
+    for name in ("photos", "thermal"):
+        depth(tmp_path / "flights" / name, tmp_path / name, asked, route="reconstruction")
+        maps.append(open_picture(tmp_path / name / "depth.tif"))
+    a, b = maps
+    g, h = a.place.affine, b.place.affine
+    truth = np.eye(3)
+    truth[:2, 2] = (g[2] - h[2]) / h[0], (g[5] - h[5]) / h[4]
+    for method, most_m in (("surf", 2.0), ("rfae", 1.0)):
+        found = outcome_of(a, b, method, None)
+        assert found
+        off = overlap_error(found.b_H_a, truth, (a.height, a.width), (b.height, b.width))
+        assert 0.25 * off < most_m
