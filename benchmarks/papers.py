@@ -22,7 +22,6 @@ NAME:
     table-6.5     the mean Q (needs ../shared/data)
     depth-maps    depth maps of a visual and a thermal flight registered by SURF and RFAE (Y Fig.
                   5.12c, 5.14c)
-    eq-5.7        the thermal map on the visual one: (5.7) as written beside `pairs`
     ste           the article's estimator on real pairs, by what the matches are chosen from (A 2.4,
                   2.5; needs ../shared/data)
     article       time and geolocation of six flight lines (A Tables 1 and 2)
@@ -77,7 +76,6 @@ from skyquilt.settings import MosaicSettings
 from skyquilt.simulate.board import Chessboard, Lamp, Sensor, sweep, tilted
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, FlightSettings, Reporting, Route, Thermal
-from skyquilt.thermal.workflow import iter_thermal
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.flow import AlignedPhotos, align_photos
 from skyquilt.workflows.methods import detector_for, methods_for
@@ -749,62 +747,6 @@ def depth_maps(work: Path, seeds: int) -> None:
     )
 
 
-def eq_57(work: Path, seeds: int) -> None:
-    """Errors of the thermal map on the visual one: the difference of their displacements from the
-    truth; positions good to 2 m.
-    """
-    import sys
-
-    import skyquilt.thermal.by_pairs as module
-
-    sys.path.insert(0, str(Path(__file__).resolve().parent))
-    from thermal_map import displacements, field
-
-    rows: dict[str, list[tuple[float, float, float]]] = {}
-    usual = module.MOST_PAIRS
-    for seed in range(3, 3 + seeds):
-        folder = two_flights(work, seed, 2.0)
-        out, truth, own = work / f"joined{seed}", folder / "truth", None
-        for name, route, most in (
-            ("pairs", "pairs", usual),
-            ("(5.7) with homographies", "homographies", usual),
-            ("(5.7) with homographies, one pair", "homographies", 1),
-        ):
-            module.MOST_PAIRS = most
-            try:
-                *_, last = iter_thermal(
-                    folder / "photos", folder / "thermal", out, MosaicSettings(jobs=1), route=route
-                )
-            except RefusedError as error:
-                print(f"{name}, seed {seed}: {error}")
-                continue
-            assert isinstance(last, Result)
-            own = own or displacements(out / "mosaic.tif", truth / "truth_ortho.tif")
-            at, off, _ = displacements(out / "thermal.tif", truth / "truth_thermal.tif")
-            error_m = np.linalg.norm(off - field(*own[:2], at), axis=1)
-            gsd = last.metrics["native_gsd_m"]
-            evidence = last.metrics["thermal"].get("evidence", {})
-            rows.setdefault(name, []).append(
-                (
-                    float(np.median(error_m) / gsd),
-                    float(np.percentile(error_m, 95) / gsd),
-                    float(evidence.get("pairs_registered", np.nan)),
-                )
-            )
-    module.MOST_PAIRS = usual
-    table(
-        ("thermal map by", "median error, visual GSD", "95 % below", "pairs registered"),
-        [
-            (
-                n,
-                *(", ".join(f"{v[k]:.1f}" for v in r) for k in (0, 1)),
-                ", ".join(f"{v[2]:.0f}" for v in r),
-            )
-            for n, r in rows.items()
-        ],
-    )
-
-
 # ---- A
 
 
@@ -877,7 +819,6 @@ NAMES: dict[str, tuple[Callable[[Path, int], None], int]] = {
     "depth-maps": (depth_maps, 2),
     "fig-5.12c": (depth_maps, 2),
     "fig-5.14c": (depth_maps, 2),
-    "eq-5.7": (eq_57, 1),
     "ste": (ste, 1),
     "article": (article, 1),
 }
