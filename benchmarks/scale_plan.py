@@ -57,6 +57,8 @@ class Recorder:
     """One thread that writes down what it does, as `engine.workers.Workers`."""
 
     stage: str = ""
+    apart: bool = True
+    handed: int = 0
     tasks: dict[str, list[tuple[float, int]]] = field(default_factory=lambda: defaultdict(list))
     weighing: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     """CPU seconds taken to find the size of results, by stage."""
