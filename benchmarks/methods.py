@@ -34,6 +34,7 @@ from skyquilt.workflows.mosaic import mosaic
 LINES = 6
 METHODS = {
     "flightline": {"method": "flightline"},
+    "flightline-sift-all": {"method": "flightline", "detector": "sift-all"},
     "flightline-similarity": {"method": "flightline", "transform": "similarity"},
     "bundle": {"method": "bundle"},
 }

@@ -8,6 +8,7 @@ from skyquilt.registry import register
 
 DETECTORS = {
     "sift": "skyquilt.matching.sift:Sift",
+    "sift-all": "skyquilt.papers.sift_all:sift_all",
     "surf": "skyquilt.papers.surf:Surf",
     "usurf": "skyquilt.papers.surf:upright_surf",
     "harris": "skyquilt.papers.harris:Harris",
@@ -40,6 +41,7 @@ REGISTRATIONS = {
     "surf-lobe": "skyquilt.papers.rfae:surf_by_lobe",
     "rfae": "skyquilt.papers.rfae:rfae",
     "rfae-sift": "skyquilt.papers.rfae:rfae_sift",
+    "rfae-refined": "skyquilt.papers.rfae:rfae_refined",
     "surf+rfae": "skyquilt.papers.rfae:surf_and_rfae",
     "structure": "skyquilt.coregistration.methods:structure",
     "shapes": "skyquilt.coregistration.methods:shapes",

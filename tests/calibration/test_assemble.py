@@ -46,6 +46,31 @@ def few(pose, rng, frames=24):
     return list(sweep(LENS, CHESS, pose, Lamp(frames=frames, cooling=0.35), Sensor(), rng))
 
 
+def by_variance(cell):
+    """phi of (5.1) with sigma as a variance, as the text of the thesis reads; it has no unit."""
+    below, above = cell[cell < cell.mean()], cell[cell > cell.mean()]
+    if not below.size or not above.size:
+        return np.inf
+    return (below.var() + above.var()) / (below.mean() - above.mean()) ** 2
+
+
+@pytest.mark.slow
+def test_the_printed_weight_does_no_harm_if_sigma_is_a_variance(monkeypatch):
+    """(5.3) weighs by phi itself: with deviations it prefers frames without contrast, with
+    variances it hardly prefers any.
+    """
+    pose, rng = poses()[0], np.random.default_rng(4)
+    frames = few(pose, rng)
+    contrasts = []
+    for phi in (bimodality, by_variance):
+        monkeypatch.setattr("skyquilt.calibration.assemble.bimodality", phi)
+        found = FindBoard()("", Assemble(power=-1.0)(frames, BOARD), BOARD)
+        contrasts.append(found.contrast if found else 0.0)
+    assert contrasts[1] > 2 * contrasts[0]
+    flat = np.random.default_rng(5).normal(20, 0.3, 4000)
+    assert by_variance(flat) == pytest.approx(0.285, abs=0.01)  # of noise: (1 - 2 / pi) / (4 / pi)
+
+
 @pytest.mark.slow
 def test_a_sweep_shows_the_whole_board_though_no_frame_does():
     rng = np.random.default_rng(4)

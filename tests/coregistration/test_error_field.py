@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from skyquilt.coregistration.agreement import Agree
 from skyquilt.coregistration.error_field import FREE, StateError, overlap_corners
 from skyquilt.coregistration.methods import RegisterSettings, registration_method
+from skyquilt.coregistration.orientation import orientation
 from skyquilt.coregistration.stated_error import TOLERANCE, error_map, state_error, tolerated
 from skyquilt.errors import UsageError
 from skyquilt.geometry.transforms import fit, transfer
@@ -53,7 +55,7 @@ def test_bounds_hold_for_drawn_errors(model):
     fitted to them.
     """
     rng = np.random.default_rng(5)
-    state = StateError(dependence=1.0, misfit=1e-3, shared=0.0, blur=0.0)
+    state = StateError(dependence=1.0, misfit=1e-3, shared=0.0, blur=0.0, rarity=0.0, chosen=1.0)
     px = patches(20, 140 if model == "similarity" else 240)
     held = []
     for _ in range(150):
@@ -97,6 +99,40 @@ def test_broad_peaks_widen_the_bound():
         for size in (0.1, 0.5)
     )
     assert broad.bound_px(CORNERS) == pytest.approx(5**0.3 * sharp.bound_px(CORNERS))
+
+
+def test_patches_between_those_of_the_test_are_half_a_patch_off():
+    """They tell the same shift, and leave the test as it was."""
+    a, b = pair(turned(1.0, 0.0, SHAPE, SHAPE, (3.0, 2.0)), seed=14)
+    fields = [orientation(p.astype(np.float32), np.ones(SHAPE, bool), 256.0) for p in (a, b)]
+    agree, there = Agree(), np.eye(3)
+    told = agree(*fields, there)
+    both = agree.between(*fields, told, there)
+    own, more = both.every_px[: len(told.every_px)], both.every_px[len(told.every_px) :]
+    assert (own == told.every_px).all() and both.surprise == told.surprise
+    assert both.px is told.px and len(more) > 0.6 * len(own)
+    assert np.unique((more - own[0]) % 42).tolist() == [21.0]
+    # the picture lies (3, 2) px off, less its reduction
+    shift = np.median(both.every_shift[len(own) :], axis=0)
+    assert shift == pytest.approx(np.array([3.0, 2.0]) * 256 / np.sqrt(400 * 480), abs=0.2)
+
+
+def test_few_matching_patches_and_a_homography_widen_the_bound():
+    """Where half of the patches match anywhere, by the share that matches; where the model was
+    chosen by the same patches, twice.
+    """
+    rng = np.random.default_rng(6)
+    px = np.concatenate([patches(20, 250)] * 4)
+    shift = rng.normal(0, 0.5, px.shape)
+    plain = StateError(rarity=0.0, chosen=1.0)
+    wild = np.arange(len(px)) % 2 == 0
+    shift[wild] = rng.uniform(-12, 12, (wild.sum(), 2))
+    scatter = plain.scatter(px, shift, width(px), free=4, **FRAME)
+    assert scatter.share == pytest.approx(0.5, abs=0.05)
+    fewer, usual = (s(scatter, 4).bound_px(CORNERS) for s in (StateError(), plain))
+    assert fewer / usual == pytest.approx((0.75 / scatter.share) ** 0.3)
+    freer = StateError(rarity=0.0)(scatter, 8).bound_px(CORNERS)
+    assert freer == pytest.approx(2 * plain(scatter, 8).bound_px(CORNERS))
 
 
 def test_the_bound_follows_the_pixels():

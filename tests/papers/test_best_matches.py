@@ -1,11 +1,20 @@
-"""The best and the guided against slow loops over all pairs."""
+"""The best and the guided against slow loops over all pairs; the best of a real pair."""
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
 from skyquilt.matching.matchers import Guided, Mutual
 from skyquilt.model.features import Features
+from skyquilt.papers.aligners import VLFEAT
 from skyquilt.papers.best_matches import Best
+from skyquilt.papers.ste import RansacSte
+from skyquilt.settings import MosaicSettings
+from skyquilt.workflows.methods import detector_for
+
+BRIGHTON = Path(__file__).parents[2] / ".." / "shared" / "data" / "brighton"
 
 
 def features(descriptors, px=None, binary=False):
@@ -102,3 +111,37 @@ def test_nothing_and_kinds():
         Best()(some, features(np.ones((3, 32), np.uint8), binary=True))
     with pytest.raises(ValueError, match="a position for each of 3"):
         Guided()(some, some, np.zeros((2, 2)))
+
+
+def test_sift_all_keeps_the_strongest_wherever_they_are():
+    """Against OpenCV's own detector; `sift` takes the strongest of each of 100 cells."""
+    rng = np.random.default_rng(0)
+    picture = np.full((400, 600), 120, np.float32)
+    picture[:, 300:] += cv2.GaussianBlur(
+        rng.normal(0, 300, (400, 300)).astype(np.float32), (0, 0), 2
+    )
+    picture = np.clip(picture + rng.normal(0, 1.5, picture.shape), 0, 255).astype(np.uint8)
+    settings = MosaicSettings(method="flightline", detector="sift-all")
+    found = detector_for(settings)(picture)
+    every = cv2.SIFT.create(0, contrastThreshold=0.003, enable_precise_upscale=True)
+    points = every.detect(picture)
+    assert 600 < len(found) == len(points)  # fewer than it would keep: all of them
+    assert sorted(found.px[:, 0]) == pytest.approx(sorted(p.pt[0] for p in points), abs=1e-3)
+    assert len(detector_for(settings.changed(detector="sift"))(picture)) < len(found)
+
+
+@pytest.mark.slow
+def test_the_articles_estimator_starves_on_few_spread_keypoints_and_not_on_all():
+    """A 2.4, 2.5 on neighbouring photos of gardens and woods."""
+    if not BRIGHTON.is_dir():
+        pytest.skip("the survey brighton is not beside this checkout")
+    pictures = [cv2.imread(str(p), 0) for p in sorted(BRIGHTON.glob("*.JPG"))[1:3]]
+    told = {}
+    for name in ("sift", "sift-all"):
+        detect = detector_for(MosaicSettings(method="flightline", detector=name))
+        a, b = (detect(p) for p in pictures)
+        best = Best(count=150, ratio=VLFEAT)(a, b)
+        found = RansacSte()(a.px[best.index_a] / a.scale, b.px[best.index_b] / b.scale)
+        told[name] = len(best), found.ste_per_inlier
+    assert told["sift"][0] < 120 and told["sift"][1] > 1e4
+    assert told["sift-all"][0] == 150 and told["sift-all"][1] < 3

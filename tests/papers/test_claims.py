@@ -1,16 +1,35 @@
-"""Claims of the thesis that hold here (docs/papers.md), each on simulated strips of known truth."""
+"""Claims of the thesis that hold here (docs/papers.md), each on simulated flights."""
 
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from skyquilt.coregistration.pictures import open_picture
+from skyquilt.coregistration.workflow import outcome_of
+from skyquilt.depth.workflow import depth
+from skyquilt.engine.clock import Clock
+from skyquilt.engine.store import Store
 from skyquilt.geometry.camera import undistort
 from skyquilt.geometry.transforms import fit, transfer
 from skyquilt.matching.ransac import Ransac
+from skyquilt.model.event import Result, StageFinished
+from skyquilt.papers.compare import CompareSettings, iter_compare
+from skyquilt.papers.pair_list import overlap_error
 from skyquilt.papers.strip_chain import VARIANTS, board_camera, chained
 from skyquilt.quality.registration_quality import mean_squared_error
-from skyquilt.simulate import StripSettings, fly_strip
+from skyquilt.settings import MosaicSettings
+from skyquilt.simulate import FlightSettings, StripSettings, fly_strip, simulate
+from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.settings import Control, Reporting, Route, Thermal
+from skyquilt.workflows.artefacts import REGISTRY
+from skyquilt.workflows.flow import align_photos
+from skyquilt.workflows.methods import methods_for
+from skyquilt.workflows.survey_input import read_input
+
+BRIGHTON = Path(__file__).parents[2] / ".." / "shared" / "data" / "brighton"
 
 HOMOGRAPHY, NOT_LEVELLED, SIMILARITY = VARIANTS[4:7]
 
@@ -75,3 +94,114 @@ def test_undistorted_pairs_register_better():
         assert errors[1] < 0.83 * errors[0]
         # what is left is noise of 0.3 px per axis in both photos
         assert errors[1] == pytest.approx(4 * 0.3**2, rel=0.2)
+
+
+def aligned(photos, **asked):
+    """Photos placed by a method of the papers, and the CPU seconds of placing them."""
+    settings = MosaicSettings(jobs=1, **asked)
+    with tempfile.TemporaryDirectory() as folder:
+        clock = Clock(store=Store(folder=Path(folder), registry=REGISTRY), began=Clock.now())
+        given = read_input(list(photos), settings.input)
+        steps, spent = align_photos(given, methods_for(settings), settings, clock), 0.0
+        while True:
+            try:
+                event = next(steps)
+            except StopIteration as stop:
+                return stop.value, spent
+            if isinstance(event, StageFinished) and event.stage == "align":
+                spent = event.cpu_seconds
+
+
+def compared(photos, output, variants, gsd_cm, **more):
+    """The columns of a comparison."""
+    settings = CompareSettings(mosaic=MosaicSettings(gsd_cm=gsd_cm), variants=variants, **more)
+    *_, last = iter_compare(photos, output, settings)
+    assert isinstance(last, Result)
+    return last.metrics["methods"]
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_image_and_hybrid_fit_better_than_position_and_pose(flight, tmp_path):
+    """Y Table 6.1, lambda_corr; that pose is better than position does not hold here."""
+    names = ("position", "pose", "image", "hybrid")
+    found = compared(flight / "photos", tmp_path / "out", names, 25.0, first=6)
+    corr = {name: found[name]["lambda_corr"] for name in names}
+    assert min(corr["image"], corr["hybrid"]) > max(corr["position"], corr["pose"]) + 0.03
+
+
+@pytest.mark.real
+@pytest.mark.slow
+@pytest.mark.long
+def test_photos_near_their_positions_fit_better_by_hybrid(tmp_path):
+    """Y Fig. 6.4, on a real survey."""
+    if not BRIGHTON.is_dir():
+        pytest.skip("the survey brighton is not beside this checkout")
+    found = compared(BRIGHTON, tmp_path / "out", ("hybrid",), 10.0)["hybrid"]
+    corr, off = (
+        np.array([np.nan if v is None else v for v in found[k]], float)
+        for k in ("correlation_with_last_of_photo", "off_position_over_width")
+    )
+    both = np.isfinite(corr) & np.isfinite(off)
+    assert both.sum() == 17 and np.corrcoef(corr[both], off[both])[0, 1] < -0.2
+
+
+@pytest.fixture(scope="module")
+def roundtrip(tmp_path_factory):
+    """Twenty-four photos once around a field."""
+    folder = tmp_path_factory.mktemp("roundtrip")
+    settings = FlightSettings(
+        lens=Lens().scaled(480, 360),
+        route=Route(pattern="roundtrip", photos=24, overlap=0.6),
+        reporting=Reporting(focal_error=0.0),
+        control=Control(points=0, checks=0),
+    )
+    for _ in simulate(settings, folder, overwrite=True):
+        pass
+    return sorted((folder / "photos").glob("*.jpg"))
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_the_cost_of_hybrid_grows_more_slowly_than_that_of_searching_the_overview(roundtrip):
+    """Y 6.5: 'a saving of 70 %' for 37 photos, because the cost of the overview grows nearly as the
+    square of their number, and that of hybrid in proportion to it. For photos as small as these
+    both cost the same at 24.
+    """
+    ways = {
+        "overview": {"method": "image", "image_search": "overview"},
+        "hybrid": {"method": "hybrid", "optimiser": "anneal"},
+    }
+    spent = {k: [aligned(roundtrip[:n], **w)[1] for n in (8, 24)] for k, w in ways.items()}
+    growth = {k: np.log(v[1] / v[0]) / np.log(3) for k, v in spent.items()}
+    assert growth["overview"] > 1.5 and growth["hybrid"] < 1.4
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_surf_registers_the_depth_maps_of_two_spectra(tmp_path):
+    """Y Fig. 5.14c: reconstructions of a visual and of a thermal flight; the georeferences of both,
+    good to 5 cm, are the truth.
+    """
+    settings = FlightSettings(
+        seed=3,
+        lens=Lens().scaled(800, 600),
+        route=Route(photos=6),
+        reporting=Reporting(gps_noise=0.05),
+        control=Control(points=0, checks=0),
+        thermal=Thermal(overlap=0.75, sidelap=0.5),
+    )
+    for _ in simulate(settings, tmp_path / "flights", overwrite=True):
+        pass
+    asked, maps = MosaicSettings(gsd_cm=25, features=3000, jobs=1), []
+    for name in ("photos", "thermal"):
+        depth(tmp_path / "flights" / name, tmp_path / name, asked, route="reconstruction")
+        maps.append(open_picture(tmp_path / name / "depth.tif"))
+    a, b = maps
+    g, h = a.place.affine, b.place.affine
+    truth = np.eye(3)
+    truth[:2, 2] = (g[2] - h[2]) / h[0], (g[5] - h[5]) / h[4]
+    found = outcome_of(a, b, "surf", None)
+    assert found
+    off = overlap_error(found.b_H_a, truth, (a.height, a.width), (b.height, b.width))
+    assert 0.25 * off < 2.0

@@ -2,21 +2,29 @@
 inliers.
 """
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy import ndimage
 
 from skyquilt.coregistration.methods import registration_method
+from skyquilt.coregistration.pictures import open_picture
 from skyquilt.model.estimate import NoEstimate
 from skyquilt.model.features import DESCRIPTOR_UNIT, Features
 from skyquilt.model.registration import Picture, RefusedRegistration, Registration
+from skyquilt.papers.pair_list import overlap_error, read_pairs
 from skyquilt.papers.rfae import (
+    LOBES,
     BetterByQ,
     Outliers,
+    Refined,
     best,
     binary_edges,
     gradient_magnitude,
     noise_threshold,
+    surf,
 )
 from skyquilt.quality.registration_quality import spread_quality
 from tests.coregistration.scenes import error, layout, spectrum, turned
@@ -93,10 +101,59 @@ def test_sift_of_43_levels(method, alike):
     assert found and error(found.b_H_a, truth) < 1.0
 
 
+REAL = Path(__file__).parents[2].parent / "shared" / "data" / "spectral" / "pairs.csv"
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_rfae_registers_what_surf_cannot_and_patches_mend_what_it_gets_wrong():
+    """Of three real pairs that SURF refuses, RFAE has one right and two several px off (nine
+    inliers in a corner); refined, and confirmed by patches, all three are right.
+    """
+    if not REAL.is_file():
+        pytest.skip(f"real pairs missing: {REAL}")
+    told = {"surf": [], "rfae": [], "rfae-refined": []}
+    for pair in read_pairs(REAL):
+        if pair.source not in ("olinda2-olinda4", "vifb-manWalking", "vifb-manCar"):
+            continue
+        a, b = (open_picture(path).picture for path in (pair.a, pair.b))
+        for method, found in told.items():
+            outcome = registration_method(method)(a, b)
+            off = overlap_error(outcome.b_H_a, pair.b_H_a, a.shape, b.shape) if outcome else None
+            found.append(off is not None and off < pair.tolerance_px)
+            if method == "rfae-refined":
+                assert outcome.error is not None
+    assert told == {"surf": [False] * 3, "rfae": [True, False, False], "rfae-refined": [True] * 3}
+
+
+def test_what_patches_do_not_confirm_is_refused():
+    """Nine inliers of a method, but pictures of nothing in common."""
+    rng = np.random.default_rng(2)
+    a, b = (np.clip(spectrum(layout(seed=seed), 1), 0, 255).astype(np.uint8) for seed in (1, 5))
+    sure = Refined(method=lambda a, b, g=None: registration(0.4))
+    assert not sure(Picture(values=a), Picture(values=b))
+    kept = sure(Picture(values=a), Picture(values=a + rng.integers(0, 3, a.shape, np.uint8)))
+    assert kept and error(kept.b_H_a, np.eye(3)) < 0.1
+
+
 def test_q_is_that_of_the_inliers_in_a(alike):
     a, b, _ = alike
     found = registration_method("surf")(Picture(values=a), Picture(values=b))
     assert found.q == spread_quality(found.px_a, 480, 400, delta=48.0)
+
+
+@pytest.mark.slow
+def test_the_lobe_with_the_highest_q_is_used(alike):
+    """Y Fig. 6.11; lobe 1 alone is `surf`."""
+    a, b = (Picture(values=p) for p in alike[:2])
+    each = {}
+    for lobe in LOBES:
+        one = surf()
+        each[lobe] = replace(one, detect=replace(one.detect, lobe=lobe))(a, b)
+    q = {lobe: o.q if o else 0.0 for lobe, o in each.items()}
+    assert len(set(q.values())) > 2
+    assert registration_method("surf-lobe")(a, b).q == max(q.values())
+    assert registration_method("surf")(a, b).q == q[1]
 
 
 def registration(q):

@@ -97,7 +97,10 @@ def test_flight_lines_by_every_estimator(flight, tmp_path, estimator):
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        ({"detector": "sift2"}, "'sift2' is not one of sift, surf, usurf, harris, orb, akaze"),
+        (
+            {"detector": "sift2"},
+            "'sift2' is not one of sift, sift-all, surf, usurf, harris, orb, akaze",
+        ),
         ({"matcher": "best"}, "'best' is not one of mutual, guided, one-way"),
         ({"estimator": "x"}, "is not one of ransac, lmeds, magsac, ste, ncc, phase, ecc, mi"),
         ({"estimator": "ste"}, "takes --estimator ransac, lmeds, magsac, not ste"),

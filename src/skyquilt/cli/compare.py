@@ -61,7 +61,8 @@ def command(
     detector: Annotated[
         str | None,
         typer.Option(
-            help="Features, in place of each method's own: sift, surf, usurf, harris, orb, akaze.",
+            help="Features, in place of each method's own: sift, sift-all, surf, usurf, harris,"
+            " orb, akaze.",
             show_default="sift",
         ),
     ] = None,

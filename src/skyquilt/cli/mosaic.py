@@ -113,7 +113,12 @@ def command(
     ] = "auto",
     detector: Annotated[
         str | None,
-        option(METHOD, "Features: sift, surf, usurf, harris, orb, akaze.", default="sift"),
+        option(
+            METHOD,
+            "Features: sift, sift-all (at least 12,000 per photo, for method flightline), surf,"
+            " usurf, harris, orb, akaze.",
+            default="sift",
+        ),
     ] = None,
     matcher: Annotated[
         str | None,

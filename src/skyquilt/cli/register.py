@@ -23,7 +23,7 @@ def command(
             help="auto (structure, accepted only where independent patches agree); parts of it or"
             " beside it: structure, shapes (areas and objects); or a published method, which"
             " accepts nine inliers: sift, sift-octave0, surf, surf-lobe, usurf, rfae, rfae-sift,"
-            " surf+rfae."
+            " surf+rfae; rfae-refined: rfae, refined and confirmed by patches."
         ),
     ] = "auto",
     metadata: Annotated[
@@ -37,8 +37,8 @@ def command(
         float | None,
         typer.Option(
             help="Largest error in px of B that is tolerated over the picture: a registration that"
-            " may be further off in a corner (95 %) is refused. For auto, structure and shapes."
-            " Default: 2 % of B's diagonal."
+            " may be further off in a corner (95 %) is refused. For auto, structure, shapes and"
+            " rfae-refined. Default: 2 % of B's diagonal."
         ),
     ] = None,
     overwrite: Overwrite = False,

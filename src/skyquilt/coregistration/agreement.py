@@ -9,7 +9,7 @@ measured on unrelated images (docs/methods.md).
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import cv2
@@ -34,7 +34,7 @@ class Agreement:
     shift: NDArray[np.float64]
     """(n, 2) shift in px at which each patch matches best: b's content is at px + shift."""
     every_px: NDArray[np.float64]
-    """(m, 2) centres of all patches of that size, agreeing or not."""
+    """(m, 2) centres of all patches of that size, agreeing or not; see `Agree.between`."""
     every_shift: NDArray[np.float64]
     """(m, 2) their shifts."""
     every_width: NDArray[np.float64]
@@ -80,18 +80,36 @@ class Agree:
             every_width=table[:, 4],
         )
 
+    def between(
+        self, a: Orientation, b: Orientation, agreement: Agreement, b_H_a: Matrix
+    ) -> Agreement:
+        """The same with the shifts of patches that lie half a patch further right and down, between
+        those of the test: their scatter is known better from both.
+        """
+        fields, valid = warped(a, b_H_a, b.shape)
+        across = self.across[0]
+        half = int(np.sqrt(b.shape[0] * b.shape[1]) / across) // 2
+        found = [f[1:] for f in self._patches(fields, b.fields, valid * b.valid, across, half)]
+        table = np.array(found, np.float64).reshape(-1, 5)
+        return replace(
+            agreement,
+            every_px=np.concatenate([agreement.every_px, table[:, :2]]),
+            every_shift=np.concatenate([agreement.every_shift, table[:, 2:4]]),
+            every_width=np.concatenate([agreement.every_width, table[:, 4]]),
+        )
+
     def _patches(
-        self, fields: Fields, target: Fields, both: NDArray[Any], across: int
+        self, fields: Fields, target: Fields, both: NDArray[Any], across: int, first: int = 0
     ) -> Iterator[tuple[float, float, float, float, float, float]]:
-        """Rank, centre, shift and width of the peak of each patch."""
+        """Rank, centre, shift and width of the peak of each patch, from row and column `first`."""
         height, width = both.shape
         side = int(np.sqrt(height * width) / across)
         reach = self.reach
         padded = cv2.copyMakeBorder(
             fields, reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=(0,) * 4
         )
-        for top in range(0, height - side + 1, side):
-            for left in range(0, width - side + 1, side):
+        for top in range(first, height - side + 1, side):
+            for left in range(first, width - side + 1, side):
                 part = (slice(top, top + side), slice(left, left + side))
                 if both[part].mean() < self.filled:
                     continue

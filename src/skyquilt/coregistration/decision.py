@@ -47,7 +47,7 @@ class Decide:
     """The error over the whole picture."""
     finest: float = 640.0
     """Side in px of the square to whose area larger images are reduced for the final refinement."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def __call__(self, pyramid: Pyramid, fits: Sequence[Fit]) -> Outcome:
         """The decision on transforms in px of the finest level."""
@@ -70,14 +70,15 @@ class Decide:
         a, b = pyramid.at(pyramid.last)
         model: Freedom = "similarity"
         corners = overlap_corners(fit.b_H_a, a.shape, b.shape)
-        scatter = self._scatter(agreement, corners, b.shape, model)
         freer = SubpixelRefinement(freedom="homography")(a, b, fit.b_H_a)
         if freer.correlation > (1 + self.gain) * fit.correlation:
+            scatter = self._scatter(agreement, corners, b.shape, model)
             change = transfer(freer.b_H_a @ np.linalg.inv(fit.b_H_a), corners) - corners
             if self.state.determined(scatter, change, corners) > self.determined:
                 model, fit = "homography", freer
                 agreement = self.agree(a, b, fit.b_H_a)
-                scatter = self._scatter(agreement, corners, b.shape, model)
+        closer = self.agree.between(a, b, agreement, fit.b_H_a)
+        scatter = self._scatter(closer, corners, b.shape, model)
         full = self._finest(pyramid, pyramid.full(fit.b_H_a, pyramid.last), model)
         to_full = np.linalg.inv(b.small_S_full)
         return Registration(

@@ -38,6 +38,8 @@ class Scatter:
     """Standard deviation of a matching patch along one axis, px."""
     width: float
     """Typical width of a matching patch's correlation peak (`agreement.Agreement`)."""
+    share: float
+    """Share of the patches that match near the registered position, not anywhere."""
     information: NDArray[np.float64]
     """(8, 8) of the parameters of `offsets` from the patches, for a sigma of 1 px."""
     centre: NDArray[np.float64]
@@ -50,7 +52,7 @@ class Scatter:
 class StateError:
     """The error of a registration from the shifts of its patches."""
 
-    dependence: float = 2.0
+    dependence: float = 2.3
     """Number of patches that weigh like one independent one: neighbours err alike."""
     misfit: float = 0.5
     """Prior of each parameter beyond the model's, at half b's diagonal, in units of the
@@ -65,11 +67,21 @@ class StateError:
     that two spectra share, the more of the error is common to all patches, and not seen in their
     scatter.
     """
+    usual_share: float = 0.75
+    """Share of patches that match at which all this holds."""
+    rarity: float = 0.3
+    """Exponent of the error in the usual share relative to the share: where few patches match, more
+    of those that seem to are there by chance.
+    """
+    chosen: float = 2.0
+    """Error of a homography relative to that of a similarity with the same scatter: it was taken
+    because it fits these patches, so that their scatter around it tells too little.
+    """
     least_px: float = 0.05
     """Scatter expected without any patch, px; it counts as much as `weight` observations."""
     weight: float = 3.0
     """See `least_px`."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def scatter(
         self,
@@ -107,7 +119,9 @@ class StateError:
             density = share * np.exp(-off / (2 * sigma**2)) / (2 * np.pi * sigma**2)
             likely = density / (density + (1 - share) / (2 * reach + 1) ** 2)
             share = float(np.clip(likely.mean(), 0.05, 0.98))
-        return Scatter(sigma=sigma, width=typical, information=data, centre=centre, unit=unit)
+        return Scatter(
+            sigma=sigma, width=typical, share=share, information=data, centre=centre, unit=unit
+        )
 
     def _prior(self, free: int) -> NDArray[np.float64]:
         """(8, 8) information of the prior for a sigma of 1 px."""
@@ -118,7 +132,10 @@ class StateError:
     def __call__(self, scatter: Scatter, free: int) -> ErrorField:
         """The error over b of a model with so many free parameters."""
         width = max(scatter.width, _NARROWEST) / self.usual_width
-        square = self.dependence * scatter.sigma**2 * width ** (2 * self.blur)
+        rare = self.usual_share / scatter.share
+        square = self.dependence * scatter.sigma**2
+        square *= width ** (2 * self.blur) * rare ** (2 * self.rarity)
+        square *= self.chosen**2 if free == FREE["homography"] else 1.0
         return ErrorField(
             centre=scatter.centre,
             unit=scatter.unit,

@@ -17,7 +17,7 @@ INLIERS = 9
 """Fewest inliers of an accepted registration by the thesis's methods [Y 6.4.1]."""
 
 
-STATING = ("auto", "structure", "shapes")
+STATING = ("auto", "structure", "shapes", "rfae-refined")
 """Methods that state their error over the picture."""
 
 
