@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from skyquilt import simulate as sim
+from skyquilt.alignment.conflicts import conflicts
 from skyquilt.engine.clock import Clock, result_of
 from skyquilt.engine.store import Store
 from skyquilt.model.camera import PARAMETERS
@@ -91,11 +92,21 @@ KINDS = {
         ),
         {"gcp": True, "shutter_readout_ms": 30.0},
     ),
-    "global": (
+    "plain": (
         FlightSettings(route=FAST, control=CONTROL, reporting=PLAIN),
-        {"gcp": True, "shutter_readout_ms": 30.0},
+        {"gcp": True, "shutter": "global"},
     ),
-    "plain": (FlightSettings(route=FAST, control=CONTROL, reporting=PLAIN), {"gcp": True}),
+    "global": (FlightSettings(route=FAST, control=CONTROL, reporting=PLAIN), {"gcp": True}),
+    "global-rolling": (
+        FlightSettings(route=FAST, control=CONTROL, reporting=PLAIN),
+        {"gcp": True, "shutter": "rolling"},
+    ),
+    "stops-plain": (
+        FlightSettings(
+            lens=ROLLING, route=replace(FAST, stops=True), control=CONTROL, reporting=PLAIN
+        ),
+        {"gcp": True, "shutter": "global"},
+    ),
 }
 """Name -> the flight, and the options of its map."""
 
@@ -143,7 +154,8 @@ def flown(kind: str, seed: int, work: Path) -> Path:
     settings = replace(
         settings, seed=seed, reporting=replace(settings.reporting, focal_error=error)
     )
-    folder = work / f"{kind}-{seed}"
+    name = next(k for k, (other, _) in KINDS.items() if other == KINDS[kind][0])  # flown once
+    folder = work / f"{name}-{seed}"
     if not (folder / "truth" / "truth.json").is_file():
         for _ in sim.simulate(settings, folder, overwrite=True):
             pass
@@ -168,8 +180,17 @@ def figures(kind: str, folder: Path, extra: dict[str, str]) -> dict[str, object]
         **_centres(aligned.photos, aligned.alignment, truth),
         **_lens(aligned.alignment, truth),
         **_points(aligned.alignment),
+        **_said(aligned),
         "reprojection_px": float(np.sqrt((aligned.alignment.ties.residual_px**2).sum(1).mean())),
     }
+
+
+def _said(aligned) -> dict[str, object]:
+    """Contradictions that the report names, and whether it warns that the focal length is open."""
+    found = conflicts(aligned.photos, aligned.priors, aligned.alignment)
+    kinds = sorted({c.field for c in found if c.field in ("focal", "lens", "principal_point")})
+    warned = any("does not determine the focal length" in n for n in aligned.alignment.notes)
+    return {"named": ",".join(kinds) or "-", "warned": warned}
 
 
 def _centres(photos, alignment, truth) -> dict[str, object]:

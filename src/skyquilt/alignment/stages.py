@@ -89,14 +89,12 @@ def _standing(problem: Problem, state: State, keep: Keep) -> tuple[Problem, Stat
     """The adjustment as if cameras stood still while they expose, where that explains the photos
     better: drones that stop for each photo have positions and times as if they flew on.
     """
-    still = problem.velocity * 0.0
-    free = problem.free.copy()
-    free[:, READOUT] = False
-    other = replace(problem, velocity=still, free=free)
+    other = replace(problem, velocity=problem.velocity * 0.0)
     K = state.K.copy()
     K[:, READOUT] = problem.K0[:, READOUT]
     begin = replace(state, K=K, turn=np.zeros_like(state.turn))
-    stood = adjust(other, begin, iterations=10, tolerance=1e-3, damping=1e-6, keep=keep)
+    # as far as the other one was, or the two could not be compared
+    stood = adjust(other, begin, iterations=25, tolerance=1e-4, damping=1e-6, keep=keep)
     if stood.cost < robust_cost(problem, state):
         return other, stood.state
     return problem, state
