@@ -206,12 +206,17 @@ def _centres(photos, alignment, truth) -> dict[str, object]:
     if frame.vertical_datum == "takeoff":
         error[:, 2] += truth["vertical"]["takeoff_m"]
     rms = np.sqrt((error**2).mean(0))
+    stated = [p.sigma_m for _, p in sorted(alignment.poses.items())]
+    known = [e / s for e, s in zip(error, stated, strict=True) if s is not None]
+    over = np.array(known).reshape(-1, 3)
     return {
         "photos": len(error),
         "x_cm": float(100 * rms[0]),
         "y_cm": float(100 * rms[1]),
         "z_cm": float(100 * rms[2]),
         "z_mean_cm": float(100 * error[:, 2].mean()),
+        "xy/s": float(np.sqrt((over[:, :2] ** 2).mean())),
+        "z/s": float(np.sqrt((over[:, 2] ** 2).mean())),
     }
 
 
@@ -231,12 +236,17 @@ def _lens(alignment, truth) -> dict[str, object]:
 
 
 def _points(alignment) -> dict[str, object]:
-    """RMS errors of check points in cm."""
+    """RMS errors of check points in cm, and over their stated deviations."""
     error = np.array([c.error_m for c in alignment.control if c.check])
     if not len(error):
         return {}
     flat, up = np.sqrt((error[:, :2] ** 2).mean()), np.sqrt((error[:, 2] ** 2).mean())
-    return {"check_xy_cm": float(100 * flat), "check_z_cm": float(100 * up)}
+    over = np.array([c.error_m / c.sigma_m for c in alignment.control if c.sigma_m is not None])
+    return {
+        "check_xy_cm": float(100 * flat),
+        "check_z_cm": float(100 * up),
+        "checks/s": float(np.sqrt((over**2).mean())) if len(over) else float("nan"),
+    }
 
 
 if __name__ == "__main__":

@@ -346,14 +346,16 @@ def _links(
     return (yield from link_photos(found, frame, reported, methods, store, jobs))
 
 
-def _align(known: AlignmentInputs, methods: Methods, store: Store) -> Steps[Alignment]:
-    yield 0, 1
+def alignment_key(known: AlignmentInputs, methods: Methods) -> str:
+    """Key of an alignment: all that enters it."""
     photos = [
         (p.digest, p.name, p.camera_key, p.focal, p.calibration, p.editor) for p in known.photos
     ]
+    moving = [(p.shutter, p.velocity_ned, p.time and p.time.isoformat()) for p in known.photos]
     held = [(k.a, k.b, k.index_a, k.index_b) for k in known.links]
-    key = digest(
+    return digest(
         photos,
+        moving,
         known.frame,
         list(known.priors),
         held,
@@ -362,6 +364,11 @@ def _align(known: AlignmentInputs, methods: Methods, store: Store) -> Steps[Alig
         list(known.order),
         methods.align,
     )
+
+
+def _align(known: AlignmentInputs, methods: Methods, store: Store) -> Steps[Alignment]:
+    yield 0, 1
+    key = alignment_key(known, methods)
     resumable = replace(known, keep=store.parts(ADJUSTING, key))
     alignment = store.get_or("alignment", key, lambda: methods.align(resumable))
     store.forget([ADJUSTING])
