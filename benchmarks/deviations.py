@@ -54,12 +54,20 @@ KINDS = {
 """Name -> the block, and whether it has control points."""
 
 
+TILT_DEG, YAW_DEG = 0.5, 3.0
+"""Deviations of reported angles."""
+
+
 class Drawn(Flown):
-    """A flight whose lens errs by the deviations that its calibration states."""
+    """A flight whose lens and angles err by the deviations that are stated for them."""
 
     def __init__(self, seed: int, noise: float, **options) -> None:
         free = np.array([1, 1, 1, 1, 1, 1, 1, 1, 1, 0], bool)
-        super().__init__(seed, noise=noise, sigma_k=SIGMA_K, free=free, lens=LENS, **options)
+        options = {"sigma_k": SIGMA_K, "free": free, "lens": LENS, **options}
+        super().__init__(seed, noise=noise, tilt_deg=TILT_DEG, yaw_deg=YAW_DEG, **options)
+        self.priors = [
+            replace(p, sigma_tilt_deg=TILT_DEG, sigma_yaw_deg=YAW_DEG) for p in self.priors
+        ]
         names = dict(zip(PARAMETERS, LENS[:9].tolist(), strict=True))
         told = Camera(width=800, height=600, sigmas=tuple(SIGMA_K[:9].tolist()), **names)
         self.photos = [

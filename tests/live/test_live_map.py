@@ -159,6 +159,24 @@ def test_other_settings_are_refused_on_the_same_folder(small):
         LiveMap(small.folder, LiveSettings(features=300))
 
 
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"shutter": "slow"}, "--shutter 'slow'"),
+        ({"shutter_readout_ms": 0}, "--shutter-readout 0"),
+        ({"shutter_readout_ms": -5}, "--shutter-readout -5"),
+        ({"shutter_readout_ms": 10_000}, "at most 1000 ms"),
+        ({"shutter_readout_ms": float("nan")}, "--shutter-readout nan"),
+        ({"shutter": "global", "shutter_readout_ms": 30}, "no readout"),
+        ({"vertical_datum": "moon"}, "--vertical-datum 'moon'"),
+        ({"max_view_angle": 91}, "--max-view-angle 91"),
+    ],
+)
+def test_settings_that_are_refused(asked, words):
+    with pytest.raises(UsageError, match=words):
+        LiveSettings(**asked)
+
+
 def test_shutter_and_zero_of_heights_are_those_asked_for(flight, tmp_path):
     asked = LiveSettings(shutter_readout_ms=40, vertical_datum="ellipsoid")
     live = LiveMap(tmp_path / "out", asked)

@@ -22,6 +22,11 @@ TURN_RAD_S = np.radians(1.5)
 DOUBTED = 2.5
 """Positions that a block misses by more than this many deviations are not what they claim."""
 
+CONFIRMED = 1.4
+"""A scatter of positions up to so many times what they state confirms it: the scatter of some
+twenty photos is itself known to a fifth.
+"""
+
 
 def rough(problem: Problem, state: State, keep: Keep = made_now) -> tuple[Problem, State]:
     """First stage: intrinsics fixed under a wide loss, then all free under a narrower one; outliers
@@ -124,7 +129,7 @@ def believe_positions(
     """Positions believed as far as the photos confirm them.
 
     The start gave them deviations as wide as their scatter about it, which is coarse. Here they get
-    those that they state, or their scatter between neighbours where that is larger. Only
+    those that they state, or their scatter between neighbours where that is clearly larger. Only
     differences from photo to photo count: a smooth misfit may be a deformation of the block, and
     positions with less weight would permit it. Where a block then still misses its positions by
     more than these deviations allow, they are not what they claim (a drifting barometer, a plain
@@ -138,12 +143,14 @@ def believe_positions(
         for block in setup.block_rows:
             for axes in (slice(0, 2), slice(2, 3)):
                 stated = setup.stated_sigma_C[block][:, axes]
-                wanted = np.maximum(stated, position_noise(error[block][:, axes]))
+                noise = position_noise(error[block][:, axes])
+                wanted = np.maximum(stated, noise if (noise > CONFIRMED * stated).any() else 0.0)
                 trusted = ~doubted[block][:, axes]
                 sigma[block, axes] = np.where(trusted, wanted, sigma[block, axes])
-        if np.allclose(sigma, problem.sigma_C, rtol=0.15, equal_nan=True):
-            break
+        alike = np.allclose(sigma, problem.sigma_C, rtol=0.15, equal_nan=True)
         problem = replace(problem, sigma_C=sigma)
+        if alike:
+            break
         narrow, part = problem.with_loss(2.0), within(keep, str(again))
         state = adjust(narrow, state, iterations=10, tolerance=1e-4, keep=part).state
         misfit = np.abs(state.C - problem.C0) / problem.sigma_C
