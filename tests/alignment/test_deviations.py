@@ -1,11 +1,11 @@
-"""What residuals show of the observations, against errors that were drawn with known correlation."""
+"""What residuals show of observations, against errors that were drawn with known correlation."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from skyquilt.alignment.deviations import HIDDEN, observed_noise
+from skyquilt.alignment.deviations import HIDDEN, MATCHED, observed_noise
 from tests.alignment.blocks import HEIGHT, WIDTH, make_block
 
 
@@ -38,7 +38,8 @@ def test_sharp_observations_tell_less_than_their_residuals_show():
     """An error of so many px that pose and lens take up weighs the more, the sharper they are."""
     blunt, together = noise_of(0.0, sigma=0.2)
     sharp, _ = noise_of(0.0, sigma=0.02)
-    hidden = (HIDDEN * WIDTH) ** 2 * (1 / 0.02**2 - 1 / 0.2**2)
+    assert WIDTH < MATCHED  # or HIDDEN would count in px of a reduced image
+    hidden = HIDDEN**2 * (1 / 0.02**2 - 1 / 0.2**2)
     more = sharp.design_effect - blunt.design_effect
     assert more == pytest.approx(hidden / sharp.variance * (together - 1), rel=0.05)
     assert sharp.variance == pytest.approx(blunt.variance, rel=0.01)

@@ -6,8 +6,8 @@ much as one independent one. Errors of neighbouring observations in a photo are 
 the model is incomplete in the same way for them (lens, air, leaves, relief within a patch).
 Residuals of neighbours show a part of that, which is measured in small cells. The other part is
 hidden: pose and lens take it up. On simulated flights, where errors are known, it amounts to some
-millionths of a photo's width and hardly falls with distance up to a third of a photo; it is what
-limits a focal length. Both are taken to reach over a quarter of a photo.
+thousandths of a pixel and hardly falls with distance up to a third of a photo; it is what limits a
+focal length. Both are taken to reach over a quarter of a photo.
 """
 
 from dataclasses import dataclass, replace
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import Covariance
 from skyquilt.alignment.equations import observation_equations
+from skyquilt.alignment.least_squares_matching import LeastSquaresMatching
 from skyquilt.alignment.problem import CAMERA, Problem, State, residuals_px
 
 Array = NDArray[np.float64]
@@ -25,10 +26,12 @@ CELLS = 8
 REACH = 2
 """Parts of a photo along each side over which a correlation is taken to reach."""
 
-HIDDEN = 5e-6
+HIDDEN = 0.005
 """Deviation of the error that all observations of a part of a photo have in common and that its
-pose takes up, as a share of the photo's longer side.
+pose takes up, in px of an image of `MATCHED` px, or of the photo if that is smaller.
 """
+MATCHED = LeastSquaresMatching.longest
+"""Longest side in px of the images in which observations are refined."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +64,7 @@ def observed_noise(problem: Problem, state: State, size: Array) -> Noise:
     spare = max(2 * len(e) - _unknowns(problem, state), 1)
     # the weights enter the normal equations; their variance and slope tell what these are worth
     variance = float((psi**2).sum()) / spare * float(w.mean()) / float((w**2).mean()) ** 2
-    hidden = HIDDEN * size.max(1)[problem.photo] / problem.sigma_px
+    hidden = HIDDEN * np.maximum(size.max(1) / MATCHED, 1)[problem.photo] / problem.sigma_px
     near = max(_alike(problem, psi, size), 0.0) + float((hidden**2).mean()) / variance
     part = _part(problem, size, REACH)
     crowd = np.bincount(part).astype(float)
