@@ -1,7 +1,7 @@
 """A software bill of materials of the installed program, CycloneDX 1.5 JSON, on standard output.
 
-The packages are those that the project needs with its extras `live` and `plan`, and what these need
-in turn.
+The packages are those that the project needs with its extras `live`, `plan` and `cluster`, and what
+these need in turn.
 """
 
 import json
@@ -9,7 +9,7 @@ import re
 import sys
 from importlib import metadata
 
-EXTRAS = ("live", "plan")
+EXTRAS = ("live", "plan", "cluster")
 
 
 def needed(name="skyquilt", extras=EXTRAS):

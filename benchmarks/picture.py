@@ -38,10 +38,10 @@ from rasterio.enums import Resampling
 from rasterio.vrt import WarpedVRT
 
 from skyquilt import simulate as sim
-from skyquilt.imaging.views import grid_of, make_views
+from skyquilt.imaging.views import make_views
 from skyquilt.model.camera import Camera
 from skyquilt.model.poses import Alignment, MapFrame, Pose, no_ties
-from skyquilt.model.raster import Window
+from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Feather
 from skyquilt.ortho.compose import Composer
@@ -224,8 +224,9 @@ def oracle(flight: Path, truth: Truth, work: Path) -> Floats:
     )
     views = make_views(alignment, surface)
     west, top = at.c - east, at.f - north
-    right, bottom = west + at.a * truth.profile["width"], top - at.a * truth.profile["height"]
-    grid = grid_of(views, at.a, (west, bottom, right, top))
+    # not `grid_of`, which would move the grid by a part of a pixel
+    size = {k: int(truth.profile[k]) for k in ("width", "height")}
+    grid = Grid(west=west, north=top, gsd=at.a, **size)
     kept: dict[int, Any] = {}
 
     def pixels(photo: int) -> Any:

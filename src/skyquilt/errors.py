@@ -56,6 +56,9 @@ class PhotoFailedError(SkyquiltError):
         super().__init__(f"{photo} {reason}")
         self.photo, self.reason = photo, reason
 
+    def __reduce__(self) -> tuple[type["PhotoFailedError"], tuple[str, str]]:
+        return type(self), (self.photo, self.reason)  # so that it comes back from other processes
+
 
 class UnreadablePhotoError(SkyquiltError):
     """One file cannot be used; the message finishes the sentence 'X was left out: ...'.

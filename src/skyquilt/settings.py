@@ -65,6 +65,25 @@ def check_shutter(shutter: str | None, readout_ms: float | None) -> None:
         raise UsageError("--shutter global has no readout; leave --shutter-readout out")
 
 
+def _check_scheduler(scheduler: str | None) -> None:
+    """Refuses what is neither local:N, nor an address, nor a file.
+
+    Raises:
+        UsageError: the sentence says what is expected.
+    """
+    if scheduler is None or "://" in scheduler:
+        return
+    kind, _, number = scheduler.partition(":")
+    if kind == "local":
+        if not (number.isdecimal() and number.isascii() and 1 <= int(number[:5]) <= 1024):
+            raise UsageError(f"--scheduler {scheduler}: local:N starts N processes, 1 to 1024")
+    elif not Path(scheduler).is_file():
+        raise UsageError(
+            f"--scheduler {scheduler} is neither local:N, nor an address such as"
+            " tcp://host:8786, nor a scheduler file that exists"
+        )
+
+
 @dataclass(frozen=True, kw_only=True)
 class InputSettings:
     """Files beside the photos, and how far metadata are believed."""
@@ -249,6 +268,10 @@ class RunningSettings:
     """Memory to plan with in GB; None = 1.2."""
     seed: int = 0
     """Of everything random in methods `image`, `hybrid`, `flightline`."""
+    scheduler: str | None = None
+    """Processes that share the work: local:N (N of this machine), the address of a Dask scheduler
+    (tcp://host:8786), or its scheduler file; None = threads of this process.
+    """
 
     @property
     def threads(self) -> int:
@@ -259,6 +282,7 @@ class RunningSettings:
         within("--jobs", self.jobs, 0, 1024)
         within("--memory", self.memory_gb, 0.5, 4096)
         within("--seed", self.seed, 0, 2**32 - 1)
+        _check_scheduler(self.scheduler)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -62,6 +62,10 @@ IN_NO_KEY = {
         ("SIDES", "SHORTEST", "AZIMUTH_DEG", "ELEVATION_DEG", "CONTOUR_CELL_M"),
         "files of heights are written anew by every run",
     ),
+    **dict.fromkeys(
+        ("POLL_S", "PATIENCE_S", "ANSWER_S", "START_S", "FAILURES", "AHEAD", "STEPS_KEPT"),
+        "who computes does not change what is computed",
+    ),
 }
 """Constants of the stages that no method's key holds, and why that is right."""
 

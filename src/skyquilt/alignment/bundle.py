@@ -19,6 +19,7 @@ from skyquilt.alignment.start import Start, find_start
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
 from skyquilt.engine.kept import Keep, made_now, within
+from skyquilt.engine.workers import HERE, Workers
 from skyquilt.errors import AlignmentError
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
@@ -66,10 +67,11 @@ class Bundle:
         control: Sequence[Control] = (),
         grey: GreyPicture | None = None,
         keep: Keep = made_now,
+        workers: Workers = HERE,
     ) -> Alignment:
         """Aligns the photos that are connected by links; `grey` gives images for the refinement of
         observations. `keep`: parts of the adjustment of more than `many` photos are kept, so that
-        an interrupted run goes on.
+        an interrupted run goes on. `workers` refine the observations.
 
         Raises:
             AlignmentError: no two photos are linked.
@@ -79,7 +81,9 @@ class Bundle:
         def block(aside: frozenset[int]) -> Alignment:
             upright = [k for k in links if k.a not in aside and k.b not in aside]
             part = within(keep, f"{sorted(aside)}") if len(photos) > self.many else made_now
-            return self._block(photos, frame, priors, features, upright, control, grey, part)
+            return self._block(
+                photos, frame, priors, features, upright, control, grey, part, workers
+            )
 
         try:
             found = block(aside)
@@ -100,6 +104,7 @@ class Bundle:
         control: Sequence[Control],
         grey: GreyPicture | None,
         keep: Keep,
+        workers: Workers,
     ) -> Alignment:
         """Adjusts the photos that these links connect."""
         start = find_start(photos, priors, features, links)
@@ -121,7 +126,7 @@ class Bundle:
         method = self.match_observations
         if sharp := grey is not None and method is not None:
             part = within(keep, "sharp")
-            used = _sharpened(used, photos, setup, problem, state, method, grey, part)
+            used = _sharpened(used, photos, setup, problem, state, method, grey, part, workers)
         if sharp or begin != each:
             problem, _ = setup.problem(thin(used, sizes, per_photo=each, least=least))
             state = triangulated(problem, state)
@@ -153,6 +158,7 @@ def _sharpened(
     match_observations: LeastSquaresMatching,
     grey: GreyPicture,
     keep: Keep,
+    workers: Workers,
 ) -> Tracks:
     """Tracks (sensor pixels) with observations refined in larger images."""
     everything, _ = setup.problem(tracks)
@@ -160,9 +166,8 @@ def _sharpened(
     cameras, camera_of = camera_records(photos, setup, state, None)
     poses = pose_records(setup, state)
     filed = replace(tracks, px=setup.file_px(tracks.photo, tracks.px))
-    sharp = match_observations(
-        filed, xyz, poses, {i: cameras[k] for i, k in camera_of.items()}, grey, keep
-    )
+    by_photo = {i: cameras[k] for i, k in camera_of.items()}
+    sharp = match_observations(filed, xyz, poses, by_photo, grey, keep, workers)
     return replace(sharp, px=setup.file_px(sharp.photo, sharp.px))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.kept import Keep, made_now
+from skyquilt.engine.workers import HERE, Workers
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import ControlPoint, Photo
 from skyquilt.model.poses import Alignment, MapFrame, Prior
@@ -38,6 +39,8 @@ class AlignmentInputs:
     """Gives grey images."""
     keep: Keep = made_now
     """Keeps parts of large adjustments."""
+    workers: Workers = HERE
+    """Compute parts of large adjustments."""
 
 
 class Aligner(Protocol):

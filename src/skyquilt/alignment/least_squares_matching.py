@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.engine.kept import Keep, made_now
+from skyquilt.engine.workers import HERE, Workers
 from skyquilt.geometry.camera import pixels
 from skyquilt.imaging.align_patches import translate
 from skyquilt.model.camera import Camera
@@ -26,7 +27,7 @@ GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), with at most the given px on its longest side."""
 MARGIN = 3
 """Largest shift of an observation in patch px."""
-PART = 100_000
+PART = 25_000
 """Observations, about, whose patches are in memory at once (0.5 kB each). Tracks that the same
 photos show follow one another, so a part needs few photos.
 """
@@ -58,17 +59,23 @@ class LeastSquaresMatching:
         cameras: Mapping[int, Camera],
         grey: GreyPicture,
         keep: Keep = made_now,
+        workers: Workers = HERE,
     ) -> Tracks:
         """Tracks (file pixels) with refined observations; `xyz` (count, 3): their points in the map
-        frame. `keep`: each part of some ten thousand observations.
+        frame. `keep`: each part of some ten thousand observations; these are for the
+        `workers`.
         """
         px, sigma = tracks.px.copy(), tracks.sigma_px.copy()
-        for some, points in tracks.parts(PART):
 
-            def part(some: slice = some, points: slice = points) -> tuple[Array, Array]:
-                return self._sharper(tracks.part(some, points), xyz[points], poses, cameras, grey)
+        def part(which: tuple[slice, slice]) -> tuple[Array, Array]:
+            own, points = tracks.part(*which), which[1]
+            return keep(
+                f"{points.start}", lambda: self._sharper(own, xyz[points], poses, cameras, grey)
+            )
 
-            px[some], sigma[some] = keep(f"{points.start}", part)
+        parts = list(tracks.parts(PART))
+        for (some, _), found in zip(parts, workers.each(part, parts), strict=True):
+            px[some], sigma[some] = found
         return replace(tracks, px=px, sigma_px=sigma)
 
     def _sharper(

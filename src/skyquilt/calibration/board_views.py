@@ -12,7 +12,7 @@ from skyquilt.calibration.assemble import Assemble
 from skyquilt.calibration.find_board import FindBoard, grey_float
 from skyquilt.calibration.series import StoodStill, mostly_still, runs
 from skyquilt.engine.clock import Steps
-from skyquilt.engine.executor import in_order
+from skyquilt.engine.workers import Workers
 from skyquilt.errors import RefusedError, UnreadablePhotoError
 from skyquilt.model.board import Board, BoardView, RejectedView
 from skyquilt.model.photo import Photo, RejectedPhoto
@@ -63,7 +63,7 @@ def one_camera(photos: Sequence[Photo]) -> None:
 
 
 def look(
-    photos: Sequence[Photo], board: Board, find: FindBoard, series: str, jobs: int
+    photos: Sequence[Photo], board: Board, find: FindBoard, series: str, workers: Workers
 ) -> Steps[Seen]:
     """Finds the board in every pose."""
     yield 0, len(photos)
@@ -76,7 +76,7 @@ def look(
     def one(pose: Sequence[Photo]) -> tuple[BoardView | RejectedView, NDArray[Any] | None]:
         return _view(pose, board, find)
 
-    for pose, (found, picture) in zip(poses, in_order(one, poses, jobs=jobs), strict=True):
+    for pose, (found, picture) in zip(poses, workers.each(one, poses), strict=True):
         if isinstance(found, BoardView) and picture is not None:
             views.append(found)
             pictures[found.name] = picture

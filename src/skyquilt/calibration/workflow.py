@@ -18,6 +18,7 @@ from skyquilt.calibration.find_board import FindBoard
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.folder import claim
 from skyquilt.engine.store import Store
+from skyquilt.engine.workers import Threads
 from skyquilt.errors import RefusedError, UsageError
 from skyquilt.model.board import Board, RejectedView
 from skyquilt.model.calibration import Calibration
@@ -92,10 +93,14 @@ def iter_calibrate(
     survey = read_survey(frames)
     one_camera(survey.photos)
     claim(output, calibrate_files.CONTRACT, overwrite=overwrite)
-    clock = Clock(store=Store(folder=output, registry={}), began=began)
-    board, jobs = settings.board, settings.jobs or os.cpu_count() or 1
+    clock = Clock(
+        store=Store(folder=output, registry={}),
+        began=began,
+        workers=Threads(settings.jobs or os.cpu_count() or 1),
+    )
+    board = settings.board
     seen = yield from clock.stage(
-        "boards", look(survey.photos, board, FindBoard(), settings.series, jobs)
+        "boards", look(survey.photos, board, FindBoard(), settings.series, clock.workers)
     )
     unread = (RejectedView(name=r.name, reason=r.reason) for r in survey.rejected)
     seen = replace(seen, rejected=(*unread, *seen.rejected))

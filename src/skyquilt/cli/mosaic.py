@@ -236,6 +236,15 @@ def command(
         bool, option(FILES, "Write the frames used of videos to frames/.", "--write-frames")
     ] = False,
     jobs: Annotated[int, option(RUN, "Threads; 0 = all processors.")] = 0,
+    scheduler: Annotated[
+        str | None,
+        option(
+            RUN,
+            "Share the work out to processes: local:N (of this machine), tcp://HOST:PORT (a Dask"
+            " scheduler), or a scheduler file.",
+            default="threads of this process",
+        ),
+    ] = None,
     memory: Annotated[
         float | None, option(RUN, "Memory to stay within, in GB.", default="1.2")
     ] = None,
@@ -344,6 +353,7 @@ def command(
         compress=compress,
         quality=quality,
         jobs=jobs,
+        scheduler=scheduler,
         memory_gb=memory,
         max_mp=max_mp,
         seed=seed,

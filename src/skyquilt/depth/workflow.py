@@ -36,6 +36,7 @@ from skyquilt.depth.pairs import NoField, OnePlane, PairField, pair_field
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.folder import STATE, claim
 from skyquilt.engine.store import Store
+from skyquilt.engine.workers import Threads
 from skyquilt.errors import RefusedError, UsageError
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.model.surface import Surface
@@ -97,7 +98,11 @@ def iter_depth(
     claim(output, FILES, overwrite=overwrite)
     for path in former:
         path.unlink(missing_ok=True)
-    clock = Clock(store=Store(folder=output / STATE / "store", registry=REGISTRY), began=began)
+    clock = Clock(
+        store=Store(folder=output / STATE / "store", registry=REGISTRY),
+        began=began,
+        workers=Threads(settings.running.threads),
+    )
     yield from (Note(text=n) for n in given.survey.notes)
     given = yield from frames_added(given, settings, clock)
     survey = given.survey

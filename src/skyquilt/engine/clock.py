@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.store import Store
+from skyquilt.engine.workers import HERE, Workers
 from skyquilt.model.event import Event, StageFinished, StageProgress, StageStarted
 
 T = TypeVar("T")
@@ -50,6 +51,8 @@ class Clock:
     """Its hits and misses show whether a stage was reused."""
     began: tuple[float, float]
     """Start of the run: wall clock and CPU time in s, as `now` returns them."""
+    workers: Workers = HERE
+    """Who computes the parts of its stages."""
     seconds: dict[str, float] = field(default_factory=dict)
     """Wall-clock time per stage in s."""
     cpu: dict[str, float] = field(default_factory=dict)
@@ -85,6 +88,7 @@ class Clock:
                     if isinstance(step, tuple)
                     else step
                 )
+                yield from self.workers.news()
         except StopIteration as stop:
             result: T = stop.value
         finally:

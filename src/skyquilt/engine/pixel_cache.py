@@ -4,7 +4,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -49,6 +49,17 @@ class PixelCache(Generic[Kept]):
     _kept: OrderedDict[int, Kept] = field(default_factory=OrderedDict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _busy: dict[int, threading.Lock] = field(default_factory=dict)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy in another process begins empty."""
+        return {
+            "read": self.read,
+            "budget_bytes": self.budget_bytes,
+            "resident_bytes": self.resident_bytes,
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)  # type: ignore[misc]
 
     def __call__(self, photo: int) -> Kept:
         """Pixels of a photo, read-only."""

@@ -11,9 +11,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.engine.executor import in_order
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
+from skyquilt.engine.workers import Threads
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.view_limits import COARSEST, ViewLimits, limits_for
 from skyquilt.imaging.views import footprint
@@ -260,7 +260,7 @@ class Canvas:
         A tile is not changed if none of them was or is visible on it. Returns the tiles written;
         `finish` draws the coarser levels.
         """
-        drawn = list(in_order(lambda a: self._drawn(a, dirty[a], rule), list(dirty), jobs=THREADS))
+        drawn = list(Threads(THREADS).each(lambda a: self._drawn(a, dirty[a], rule), list(dirty)))
         for at, drawing, _ in drawn:
             self._keep(at, drawing)
         written = [(at, tile) for at, _, tile in drawn if tile is not None]

@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.model.surface import STRIP
+
 Float = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 COARSE = 64
@@ -104,8 +106,14 @@ def nearest_known(z: Float, known: Mask) -> Float:
     )
     del away  # large surveys have rasters of 100 MB
     table = np.zeros(int(place.max()) + 1, np.float32)
-    table[place[known]] = z[known]
-    return np.asarray(table[place])
+    strips = [slice(row, row + STRIP) for row in range(0, len(z), STRIP)]
+    for rows in strips:
+        table[place[rows][known[rows]]] = z[rows][known[rows]]
+    out = z.copy()
+    for rows in strips:
+        gap = ~known[rows]
+        out[rows][gap] = table[place[rows][gap]]
+    return out
 
 
 def plateaus(z: Float, side: int) -> Float:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from skyquilt.engine.clock import Steps
 from skyquilt.engine.kept import Keep
 from skyquilt.engine.store import Store, digest
+from skyquilt.engine.workers import HERE, Workers
 from skyquilt.errors import SideFileError, UsageError
 from skyquilt.imaging.nodes import View
 from skyquilt.imaging.view_limits import USUAL, ViewLimits, limits_for
@@ -43,10 +44,17 @@ class SurfaceFromPictures(Protocol):
     """Heights refined by image matching."""
 
     def __call__(
-        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep, /
+        self,
+        surface: Surface,
+        views: Sequence[View],
+        grid: Grid,
+        grey: GreyPicture,
+        keep: Keep,
+        workers: Workers,
+        /,
     ) -> Surface:
         """The surface with refined heights where images determine them; `keep`: for methods that
-        resume at a part of their result.
+        resume at a part of their result, `workers`: for those that are made of parts.
         """
         ...
 
@@ -74,6 +82,7 @@ def find_ground(
     sweep: SurfaceFromPictures | None,
     picture: PictureSettings,
     store: Store,
+    workers: Workers = HERE,
     *,
     pictures: tuple[Any, ...] = (),
 ) -> Steps[Ground]:
@@ -122,7 +131,7 @@ def find_ground(
         surface = store.get_or(
             "surface",
             refined,
-            lambda: sweep(known, [v for v in views if v.photo in held], grid, grey, keep),
+            lambda: sweep(known, [v for v in views if v.photo in held], grid, grey, keep, workers),
         )
         views = tuple(make_views(alignment, surface, limits))
     yield 1, 1

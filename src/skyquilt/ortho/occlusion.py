@@ -59,6 +59,11 @@ class Shadow:
         self._buffer = np.asarray(cv2.dilate(self._buffer, np.ones((3, 3), np.uint8)), np.float32)
         self.empty = False
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes in memory."""
+        return int(self._buffer.nbytes)
+
     def _seen_at(
         self, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -3,6 +3,7 @@ shows, how many photos see it, and a preview.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,9 +12,9 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.heights import VERTICAL_EPSG
 from skyquilt.engine.clock import Steps
-from skyquilt.engine.executor import in_order
 from skyquilt.engine.folder import STATE
 from skyquilt.engine.store import Store, digest
+from skyquilt.engine.workers import Workers
 from skyquilt.errors import UsageError
 from skyquilt.imaging.nodes import View
 from skyquilt.model.poses import Alignment
@@ -27,6 +28,7 @@ from skyquilt.ortho.companions import (
     coloured,
     extras_of,
     geotransform,
+    preview_factor,
     shot_numbers,
 )
 from skyquilt.ortho.compose import Composer, PhotoPixels
@@ -114,60 +116,88 @@ def map_key(
     )
 
 
-def draw(
-    output: Path,
-    compose: Composer,
-    alignment: Alignment,
-    settings: OutputSettings,
-    boundary: Path | None,
-    store: Store,
-    key: str,
-    unit: str,
-    jobs: int,
-) -> Steps[Drawn]:
-    """Writes mosaic.tif, provenance.tif and views.tif; a killed run goes on at the block where it
-    stopped.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drawing:
+    """A map while it is drawn: mosaic.tif, then provenance.tif and views.tif; a killed run goes on
+    at the block where it stopped.
     """
-    whole = Companions(compose.grid, compose.bands, compose.dtype, len(compose.views))
-    spec = mosaic_spec(compose, alignment, settings, unit)
-    path, spool = output / "mosaic.tif", output / STATE / SPOOL
-    keep, table = _keeper(compose, alignment, boundary), shot_numbers(compose)
 
-    def one(block: Block) -> tuple[Block, NDArray[Any], NDArray[np.bool_], BlockExtras]:
-        composed = compose(_window(block))
-        valid = composed.photo >= 0
-        if keep is not None:
-            valid &= keep(block)
-        return (
-            block,
-            _blanked(composed.pixels, valid),
-            valid,
-            extras_of(composed, valid, table, whole.factor),
-        )
+    output: Path
+    """Folder of the files."""
+    compose: Composer
+    """Composes the map's blocks."""
+    alignment: Alignment
+    """The photos' poses, and the map's frame."""
+    settings: OutputSettings
+    """How the files are written."""
+    boundary: Path | None
+    """Polygon outside which the map is empty."""
+    unit: str
+    """Unit of the pixels; empty for pictures."""
+    store: Store
+    """Keeps what lies beside the map, by block."""
+    key: str
+    """What the map depends on (`map_key`)."""
 
-    if store.get("blocks", digest(key, "file")) != _stamp(path):
-        with CogWriter(path, spec, spool=spool, digest=key) as writer:
+    def blocks(self, workers: Workers) -> Steps[None]:
+        """Writes mosaic.tif."""
+        path, spool = self.output / "mosaic.tif", self.output / STATE / SPOOL
+        if self.store.get("blocks", digest(self.key, "file")) == _stamp(path):
+            return
+        spec, one = self._spec, self._block()
+        with CogWriter(path, spec, spool=spool, digest=self.key) as writer:
             todo, total = list(writer.blocks()), len(_blocks(spec))
-            for done, (block, pixels, valid, extras) in enumerate(in_order(one, todo, jobs=jobs)):
-                store.put("blocks", digest(key, block.row0, block.col0), extras)
+            for done, (block, drawn) in enumerate(zip(todo, workers.each(one, todo), strict=True)):
+                pixels, valid, extras = drawn
+                self.store.put("blocks", self._block_key(block), extras)
                 writer.write_block(block, pixels, valid)
                 yield total - len(todo) + done + 1, total
-        store.put("blocks", digest(key, "file"), _stamp(path))
-    for block in _blocks(spec):
-        kept = store.get("blocks", digest(key, block.row0, block.col0))
-        whole.add(block.row0, block.col0, kept or one(block)[3])  # none where the store was damaged
-    _write_companions(output, whole, alignment)
-    return Drawn(
-        provenance=whole.provenance,
-        provenance_grid=whole.fine,
-        views=whole.views,
-        views_grid=whole.coarse,
-        preview=coloured(whole.preview, whole.shown),
-        preview_grid=whole.grid.coarser(whole.factor),
-        preview_range=None
-        if whole.preview.dtype == np.uint8
-        else colour_range(whole.preview, whole.shown),
-    )
+        self.store.put("blocks", digest(self.key, "file"), _stamp(path))
+
+    def companions(self) -> Drawn:
+        """Writes provenance.tif and views.tif, and returns them."""
+        compose, one = self.compose, self._block()
+        whole = Companions(compose.grid, compose.bands, compose.dtype, len(compose.views))
+        for block in _blocks(self._spec):
+            kept = self.store.get("blocks", self._block_key(block))
+            # none where the store was damaged
+            whole.add(block.row0, block.col0, kept or one(block)[2])
+        _write_companions(self.output, whole, self.alignment)
+        return Drawn(
+            provenance=whole.provenance,
+            provenance_grid=whole.fine,
+            views=whole.views,
+            views_grid=whole.coarse,
+            preview=coloured(whole.preview, whole.shown),
+            preview_grid=whole.grid.coarser(whole.factor),
+            preview_range=None
+            if whole.preview.dtype == np.uint8
+            else colour_range(whole.preview, whole.shown),
+        )
+
+    @property
+    def _spec(self) -> RasterSpec:
+        return mosaic_spec(self.compose, self.alignment, self.settings, self.unit)
+
+    def _block_key(self, block: Block) -> str:
+        return digest(self.key, block.row0, block.col0)
+
+    def _block(self) -> Callable[[Block], tuple[NDArray[Any], NDArray[np.bool_], BlockExtras]]:
+        """Draws a block: pixels (h, w, bands), where they show a photo (h, w), and what lies
+        beside.
+        """
+        compose, factor = self.compose, preview_factor(self.compose.grid)
+        keep, table = _keeper(compose, self.alignment, self.boundary), shot_numbers(compose)
+
+        def drawn(block: Block) -> tuple[NDArray[Any], NDArray[np.bool_], BlockExtras]:
+            composed = compose(_window(block))
+            valid = composed.photo >= 0
+            if keep is not None:
+                valid &= keep(block)
+            pixels = _blanked(composed.pixels, valid)
+            return pixels, valid, extras_of(composed, valid, table, factor)
+
+        return drawn
 
 
 def _blocks(spec: RasterSpec) -> list[Block]:

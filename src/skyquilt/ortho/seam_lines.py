@@ -10,7 +10,6 @@ meet in the middle, at the most vertical view.
 Places that a photo does not see, because something stands before them, belong to one that does.
 """
 
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -20,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.kept import Keep, made_now
+from skyquilt.engine.pixel_cache import PixelCache
+from skyquilt.engine.workers import HERE, Workers
 from skyquilt.imaging.nodes import STEP, View, densify, overlapping, project_all
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface, least_cell
@@ -49,8 +50,8 @@ GRAZING = 0.3
 """Length of a cell in a photo, over that on level ground, below which it counts as hidden."""
 SMEARED = np.float32(5e2)
 """Added where its pixels are smeared over the ground."""
-KEPT = 64
-"""Photos whose hidden places are kept in memory."""
+SHADOWS_BYTES = 60_000_000
+"""Bytes of hidden places of photos that are kept in memory."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,8 +92,11 @@ class SeamLines:
         grey: GreyPicture,
         exposure: Exposure,
         keep: Keep = made_now,
+        workers: Workers = HERE,
     ) -> Labels:
-        """The photo of each cell of a map's grid; `keep`: each tile is a part."""
+        """The photo of each cell of a map's grid; `keep`: each tile is a part. `workers` compare
+        the photos of a tile.
+        """
         factor = CELL
         while factor * grid.gsd < LEAST_M or factor < least_cell(grid):
             factor *= 2
@@ -116,14 +120,14 @@ class SeamLines:
                 at = (slice(row, row + h), slice(column, column + w))
                 photo[at], hidden[at] = keep(
                     f"{row} {column}",
-                    lambda: self._tile(scene, photo, row, column),  # noqa: B023 - called at once
+                    lambda: self._tile(scene, photo, row, column, workers),  # noqa: B023 - called at once
                 )
         return Labels(
             cells=cells, factor=factor, photo=photo, hidden=hidden, tall=over > STANDING_M
         )
 
     def _tile(
-        self, scene: "_Scene", photo: NDArray[np.int32], row: int, column: int
+        self, scene: "_Scene", photo: NDArray[np.int32], row: int, column: int, workers: Workers
     ) -> tuple[NDArray[np.int32], Mask]:
         """The labels (h, w) of a tile, and whether even that photo does not see the place; tiles
         above and to the left are finished.
@@ -134,15 +138,21 @@ class SeamLines:
         sure = np.zeros(ranked.shape[1:], np.bool_)
         height = np.zeros(ranked.shape[1:], np.uint8)
         hidden = np.zeros((h, w), np.bool_)
-        for r in range(0, h, PART):
-            for c in range(0, w, PART):
-                size = min(PART, h - r), min(PART, w - c)
-                part = self._part(scene, row + r, column + c, *size)
-                if part is None:
-                    continue
-                at = (slice(top + r, top + r + size[0]), slice(left + c, left + c + size[1]))
-                ranked[:, *at], sure[at], height[at] = part.ranked, part.sure, part.height
-                hidden[r : r + size[0], c : c + size[1]] = part.hidden
+        boxes = [
+            (r, c, min(PART, h - r), min(PART, w - c))
+            for r in range(0, h, PART)
+            for c in range(0, w, PART)
+        ]
+
+        def compared(box: tuple[int, int, int, int]) -> _Part | None:
+            return self._part(scene, row + box[0], column + box[1], *box[2:])
+
+        for (r, c, rows, columns), part in zip(boxes, workers.each(compared, boxes), strict=True):
+            if part is None:
+                continue
+            at = (slice(top + r, top + r + rows), slice(left + c, left + c + columns))
+            ranked[:, *at], sure[at], height[at] = part.ranked, part.sure, part.height
+            hidden[r : r + rows, c : c + columns] = part.hidden
         before = photo[row - top : row + h, column - left : column + w]
         ranked[0] = np.where(before >= 0, before, ranked[0])
         sure |= before >= 0
@@ -262,7 +272,8 @@ class _Scene:
         self.views, self.cells, self.z, self.over = views, cells, z, over
         self._grey, self._exposure, self._longest = grey, exposure, longest
         self._tall = over > STANDING_M
-        self._shadows: OrderedDict[int, Shadow] = OrderedDict()
+        self._view = {view.photo: view for view in views}
+        self._shadows = PixelCache(read=self._shadow, budget_bytes=SHADOWS_BYTES)
 
     def scores(
         self, row: int, column: int, h: int, w: int
@@ -302,7 +313,7 @@ class _Scene:
             self.cells.x(np.arange(column, column + w)), self.cells.y(np.arange(row, row + h))
         )
         for k, view in enumerate(views):
-            shadow = self._shadow(view)
+            shadow = self._shadows(view.photo)
             if not shadow.empty:
                 lost = shadow.hides(fx, fy, self.z[part]) | self._grazing(
                     view, slopes, self.z[part], fx, fy
@@ -334,14 +345,8 @@ class _Scene:
         toward = (x - cx) * right - (y - cy) * down
         return np.asarray(1 + toward / np.maximum(cz - z, 0.1) < GRAZING)
 
-    def _shadow(self, view: View) -> Shadow:
-        found = self._shadows.pop(view.photo, None)
-        if found is None:
-            found = Shadow(view, self.cells, self.z, self._tall)
-        self._shadows[view.photo] = found
-        while len(self._shadows) > KEPT:
-            self._shadows.popitem(last=False)
-        return found
+    def _shadow(self, photo: int) -> Shadow:
+        return Shadow(self._view[photo], self.cells, self.z, self._tall)
 
     def greys(
         self, views: Sequence[View], nodes: Sequence[Any], chosen: NDArray[Any], h: int, w: int

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.engine.executor import in_order
 from skyquilt.engine.kept import Keep
+from skyquilt.engine.workers import Workers
 from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import STRIP, Surface, least_cell
@@ -25,16 +25,16 @@ from skyquilt.ortho.pair_matching import Array, Float, Mask, Pair, matched_point
 
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
-Cells = tuple[NDArray[np.intp], Float]
+Cells = tuple[NDArray[np.int32], Float]
 """Numbers (n,) of cells of a grid, row by row, and their heights (n,) in m."""
 TILE = 512
 """Cells along a side of the pieces in which heights are fused."""
 NEW = 0.25
 """Share of the ground of a pair that must still lack pairs for it to be matched."""
+EDGES = 0.003
+"""Share of a pair's ground that has edges where things stand on it."""
 FIRM = 0.45
 """Share of the cells around with a fine height from which these are believed."""
-THREADS = 2
-"""Pairs matched at a time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,14 +53,8 @@ class Level:
 class _Round:
     """What a round of matching works with."""
 
-    level: Level
-    """Its level."""
-    gsd: float
-    """Side in m of a rectified pixel."""
     cells: Grid
     """Cells of its heights."""
-    known: Surface
-    """Heights so far."""
     low: Surface
     """Lowest height searched, by place."""
     high: Surface
@@ -69,8 +63,6 @@ class _Round:
     """Source of the photos' grey images."""
     agree: float
     """Heights of different pairs that agree differ by less than this in m."""
-    middle: float
-    """Median of the heights so far in m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,6 +73,8 @@ class Stereo:
     """Finds objects over the whole range of heights."""
     fine: Level = Level(longest=500, window=5, wanted=3)
     """Refines them."""
+    finest: int = 720
+    """The same where things stand: longest side in px of the photos' images."""
     below: float = 0.03
     """Search range below the lowest tie points around, as a share of the flying height."""
     above: float = 0.4
@@ -92,8 +86,8 @@ class Stereo:
     whole: float = 0.05
     """Size of crowns and of gaps between them, as a share of the flying height."""
     relief: float = 0.02
-    """A pair with less relief than this share of the flying height is not matched finely; 0 = every
-    pair is.
+    """A pair with less relief than this share of the flying height is not matched finely, and
+    things that stand are at least as high; 0 = every pair is.
     """
     base: tuple[float, float] = (0.08, 0.65)
     """Least and greatest ratio of baseline to height of a pair."""
@@ -101,38 +95,44 @@ class Stereo:
     """The ratio that is preferred."""
     cell_px: tuple[int, int] = (4, 8)
     """Least and greatest side of a cell in map pixels."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(
-        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep
+        self,
+        surface: Surface,
+        views: Sequence[View],
+        grid: Grid,
+        grey: GreyPicture,
+        keep: Keep,
+        workers: Workers,
     ) -> Surface:
-        """The surface with the heights found; the former one where the photos give none."""
+        """The surface with the heights found; the former one where the photos give none. `keep`:
+        each tile is a part; `workers` match the pairs.
+        """
         views = [v for v in views if v.pose.cam_H_map is None]
         height = float(np.median([v.pose.map_C[2] for v in views] or [0.0]) - np.median(surface.z))
         if len(views) < 2 or height <= 0:
             return surface
         cameras = [v.camera for v in views]
         extent = height * float(np.median([max(c.width, c.height) / c.focal for c in cameras]))
-        rough, support = self._coarse(surface, views, grid, grey, keep, height, extent)
+        rough, support = self._coarse(surface, views, grid, grey, keep, workers, height, extent)
         if not support.any():
             return surface
-        gsd = max(extent / self.fine.longest, grid.gsd)
+        least = self.relief * height
+        pairs = self._matched(views, rough, extent, height, least, grid)
+        gsd = min((p.gsd for p, _ in pairs), default=extent / self.fine.longest)
         cells = grid.coarser(
             max(int(np.clip(round(2 * gsd / grid.gsd), *self.cell_px)), least_cell(grid))
         )
         step = self.agree * height
         given = _Round(
-            level=self.fine,
-            gsd=gsd,
             cells=cells,
-            known=rough,
             low=_stretched(rough, 3 * gsd, cv2.MORPH_ERODE, -step),
             high=_stretched(rough, 3 * gsd, cv2.MORPH_DILATE, step),
             grey=grey,
             agree=0.015 * height,
-            middle=float(np.median(rough.z)),
         )
-        z = self._fused(given, views, height, self.relief * height, keep)
+        z = _fused(given, pairs, "fine", keep, workers)
         known = without_specks(z, 0.01 * height, 6)
         refined = nearest_known(z, known) if known.any() else z
         del z, given  # large surveys have rasters of 100 MB
@@ -152,6 +152,7 @@ class Stereo:
         grid: Grid,
         grey: GreyPicture,
         keep: Keep,
+        workers: Workers,
         height: float,
         extent: float,
     ) -> tuple[Surface, Mask]:
@@ -159,17 +160,18 @@ class Stereo:
         gsd = extent / self.coarse.longest
         cells = grid.coarser(max(1, round(1.5 * gsd / grid.gsd), least_cell(grid)))
         given = _Round(
-            level=self.coarse,
-            gsd=gsd,
             cells=cells,
-            known=surface,
             low=_stretched(surface, 0.2 * height, cv2.MORPH_ERODE, -self.below * height),
             high=replace(surface, z=surface.z + np.float32(self.above * height)),
             grey=grey,
             agree=0.04 * height,
-            middle=float(np.median(surface.z)),
         )
-        z = self._fused(given, views, height, 0.0, keep)
+        pairs = [
+            (p, self.coarse)
+            for a, b in self.pairs(views, height, self.coarse.wanted)
+            if (p := _over(a, b, surface, gsd)) is not None
+        ]
+        z = _fused(given, pairs, "coarse", keep, workers)
         known = without_specks(z, 0.02 * height, 12)
         if not known.any():
             return surface, known
@@ -215,57 +217,95 @@ class Stereo:
                 chosen.append((views[a], views[b]))
         return chosen
 
-    def _fused(
-        self, given: _Round, views: Sequence[View], height: float, relief: float, keep: Keep
-    ) -> Float:
-        """Heights (rows, columns) of the cells, row 0 in the north, NaN where no pair gives one."""
-        cells = given.cells
-        pairs = [
-            p
-            for a, b in self.pairs(views, height, given.level.wanted)
-            if (p := _over(a, b, given)) is not None and _relief(p, given.known) >= relief
-        ]
-        out = np.full((cells.height, cells.width), np.nan, np.float32)
-        held: dict[int, Float] = {}
-        for row in range(0, cells.height, TILE):
-            for column in range(0, cells.width, TILE):
-                part = replace(
-                    cells,
-                    west=cells.west + column * cells.gsd,
-                    north=cells.north - row * cells.gsd,
-                    width=min(TILE, cells.width - column),
-                    height=min(TILE, cells.height - row),
-                )
-                near = [k for k, p in enumerate(pairs) if _meet(p.bounds, part.bounds)]
-                name = f"{given.level.longest} {row} {column}"
-                inner = (slice(row, row + part.height), slice(column, column + part.width))
-                out[inner] = keep(name, lambda: _tile(pairs, near, held, given, part))  # noqa: B023 - called at once
-        return out
+    def _matched(
+        self,
+        views: Sequence[View],
+        known: Surface,
+        extent: float,
+        height: float,
+        least: float,
+        grid: Grid,
+    ) -> list[tuple[Pair, Level]]:
+        """The pairs that are matched finely, over the heights known, and at which level: those that
+        show things of at least `least` m at the finest.
+        """
+        fine, finest = self.fine, replace(self.fine, longest=max(self.finest, self.fine.longest))
+        gsds = {n.longest: max(extent / n.longest, grid.gsd) for n in (fine, finest)}
+        chosen = []
+        for a, b in self.pairs(views, height, fine.wanted):
+            pair = _over(a, b, known, gsds[fine.longest])
+            if pair is None or _relief(pair, known) < least:
+                continue
+            sharper = (
+                _over(a, b, known, gsds[finest.longest]) if _steps(pair, known, least) else None
+            )
+            chosen.append((pair, fine) if sharper is None else (sharper, finest))
+        return chosen
+
+
+def _fused(
+    given: _Round, pairs: Sequence[tuple[Pair, Level]], name: str, keep: Keep, workers: Workers
+) -> Float:
+    """Heights (rows, columns) of the cells, row 0 in the north, NaN where no pair gives one."""
+    cells = given.cells
+    out = np.full((cells.height, cells.width), np.nan, np.float32)
+    held: dict[int, Cells] = {}
+    for row in range(0, cells.height, TILE):
+        for column in range(0, cells.width, TILE):
+            part = replace(
+                cells,
+                west=cells.west + column * cells.gsd,
+                north=cells.north - row * cells.gsd,
+                width=min(TILE, cells.width - column),
+                height=min(TILE, cells.height - row),
+            )
+            near = [k for k, (p, _) in enumerate(pairs) if _meet(p.bounds, part.bounds)]
+            inner = (slice(row, row + part.height), slice(column, column + part.width))
+            at = (row, column, part.height, part.width)
+            out[inner] = keep(
+                f"{name} {row} {column}",
+                lambda: _tile(pairs, near, held, given, at, workers),  # noqa: B023 - called at once
+            )
+    return out
 
 
 def _tile(
-    pairs: Sequence[Pair], near: Sequence[int], held: dict[int, Float], given: _Round, part: Grid
+    pairs: Sequence[tuple[Pair, Level]],
+    near: Sequence[int],
+    held: dict[int, Cells],
+    given: _Round,
+    at: tuple[int, int, int, int],
+    workers: Workers,
 ) -> Float:
-    """Heights (h, w) of a part of the cells from the pairs that may see it. `held`: points of the
-    pairs of the part before.
+    """Heights (h, w) of the cells `at` (row, column, h, w) from the pairs that may see them.
+    `held`: heights of the pairs of the part before.
     """
     for k in [k for k in held if k not in near]:
         del held[k]
     todo = [k for k in near if k not in held]
-    for k, points in zip(
-        todo, in_order(lambda k: _points(pairs[k], given), todo, jobs=THREADS), strict=True
-    ):
-        held[k] = points
-    heights = [splatted(held[k], pairs[k].origin, part) for k in near]
-    return _agreed([h for h in heights if len(h[0])], given.agree, (part.height, part.width))
+
+    def matched(which: tuple[Pair, Level]) -> Cells:
+        return splatted(_points(*which, given), which[0].origin, given.cells)
+
+    for k, heights in zip(todo, workers.each(matched, [pairs[k] for k in todo]), strict=True):
+        held[k] = heights
+    inside = (_inside(held[k], given.cells.width, *at) for k in near)
+    return _agreed([h for h in inside if len(h[0])], given.agree, at[2:])
 
 
-def _over(a: View, b: View, given: _Round) -> Pair | None:
-    """The pair of two photos over the heights known between them."""
+def _inside(heights: Cells, width: int, row: int, column: int, h: int, w: int) -> Cells:
+    """Those heights of a grid `width` cells wide that lie in a part of it, numbered there."""
+    r, c = heights[0] // width - row, heights[0] % width - column
+    mine = (r >= 0) & (r < h) & (c >= 0) & (c < w)
+    return r[mine] * np.int32(w) + c[mine], heights[1][mine]
+
+
+def _over(a: View, b: View, known: Surface, gsd: float) -> Pair | None:
+    """The pair of two photos over the heights known between them; pixels of gsd m."""
     x, y = ((a.pose.map_C + b.pose.map_C) / 2)[:2]
-    reach = 0.3 * (float(a.pose.map_C[2]) - given.middle)
+    reach = 0.3 * (float(a.pose.map_C[2]) - float(known.at(x, y)))
     gx, gy = np.meshgrid(*(c + reach * np.linspace(-1, 1, 9) for c in (x, y)))
-    return pair_of(a, b, float(np.median(given.known.at(gx, gy))), given.gsd)
+    return pair_of(a, b, float(np.median(known.at(gx, gy))), gsd)
 
 
 def _sampled(pair: Pair, surface: Surface) -> Float:
@@ -283,15 +323,24 @@ def _relief(pair: Pair, surface: Surface) -> float:
     return float(np.ptp(np.percentile(rest, [1, 99])))
 
 
-def _points(pair: Pair, given: _Round) -> Float:
+def _steps(pair: Pair, surface: Surface, least: float) -> bool:
+    """Whether heights under a pair have edges of `least` m: the slope changes by as much from one
+    sample to the next, which hills do not.
+    """
+    z = _sampled(pair, surface)
+    bend = np.maximum(np.abs(np.diff(z, 2, 0)[:, 1:-1]), np.abs(np.diff(z, 2, 1)[1:-1]))
+    return bool((bend > least).mean() >= EDGES)
+
+
+def _points(pair: Pair, level: Level, given: _Round) -> Float:
     """Points (n, 3) in m, relative to the pair's origin, of a round."""
-    side = given.level.longest
+    side = level.longest
     over = float(pair.origin[2])
     tilt = abs(float(pair.along[2])) * pair.gsd * max(pair.size)
     low = float(_sampled(pair, given.low).min()) - over - tilt
     high = float(_sampled(pair, given.high).max()) - over + tilt
     pictures = (given.grey(pair.a.photo, side), given.grey(pair.b.photo, side))
-    at = matched_points(pair, *pictures, low, high, given.level.window)
+    at = matched_points(pair, *pictures, low, high, level.window)
     if not len(at):
         return at
     x, y, z = (at[:, k] + pair.origin[k] for k in range(3))
@@ -306,7 +355,7 @@ def splatted(points: Float, origin: Array, part: Grid) -> Cells:
     row = np.floor(((part.north - origin[1]) - points[:, 1]) / part.gsd).astype(np.int32)
     mine = (column >= 0) & (column < part.width) & (row >= 0) & (row < part.height)
     if not mine.any():
-        return np.zeros(0, np.intp), np.zeros(0, np.float32)
+        return np.zeros(0, np.int32), np.zeros(0, np.float32)
     column, row, z = column[mine], row[mine], points[mine, 2]
     # only the rectangle that this pair shows
     west, wide = int(column.min()), int(np.ptp(column)) + 1
@@ -320,7 +369,7 @@ def splatted(points: Float, origin: Array, part: Grid) -> Cells:
     known = np.flatnonzero(number)
     mean = np.bincount(cell, z, minlength=len(top))[known] / number[known]
     at = (known // wide + north) * part.width + known % wide + west
-    return at, (mean + origin[2]).astype(np.float32)
+    return at.astype(np.int32), (mean + origin[2]).astype(np.float32)
 
 
 def _agreed(heights: Sequence[Cells], step: float, shape: tuple[int, int]) -> Float:

@@ -10,9 +10,7 @@ command gets at the photos and the ground of a finished map by the same steps.
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
-
-from numpy.typing import NDArray
+from typing import TypeVar
 
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.priors import choose_frame, priors
@@ -20,7 +18,7 @@ from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.pixel_cache import USUAL_GB, PixelCache, pixel_budget, resident_budget
 from skyquilt.engine.store import Store, digest
-from skyquilt.errors import PhotoFailedError
+from skyquilt.engine.workers import Workers
 from skyquilt.model.event import Event, Note
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import Alignment, MapFrame, Prior
@@ -30,7 +28,6 @@ from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.radiometry import balanced
-from skyquilt.photos.read import rejected
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.links import Links, link_photos
@@ -38,7 +35,7 @@ from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import (
     FeaturedPhotos,
     GreyPictures,
-    PhotoPixels,
+    PixelsInUse,
     features_recipe,
     find_features,
     of_one_kind,
@@ -72,7 +69,7 @@ class AlignedPhotos:
     """Photos in the order in which they are joined."""
     alignment: Alignment
     """Poses and calibration."""
-    pixels: PhotoPixels
+    pixels: PixelsInUse
     """Full-size pixels of a photo by its index."""
     grey: GreyPictures
     """Gives the grey image of a photo."""
@@ -139,7 +136,7 @@ def align_photos(
         NoPhotosError: no photo can be decoded.
         AlignmentError: the method cannot place the photos.
     """
-    store, jobs = clock.store, settings.running.threads
+    store, workers = clock.store, clock.workers
     given = yield from frames_added(given, settings, clock)
     photos = given.survey.photos
     cache = PixelCache(
@@ -148,16 +145,16 @@ def align_photos(
         resident_bytes=resident_budget(settings.running.memory_gb),
     )
     found = yield from clock.stage(
-        "features", find_features(photos, cache, methods.detector, store, jobs)
+        "features", find_features(photos, cache, methods.detector, store, workers)
     )
     cache.make_room()
     found = of_one_kind(found)
-    pixels = _pixels_of(found.photos, photos, cache)
+    pixels = PixelsInUse(found.photos, found.number, cache)
     grey = GreyPictures(found.photos, pixels, store)
     picture = settings.picture
     frame = choose_frame(found.photos, picture.crs, given.control, picture.vertical_datum)
     reported = priors(found.photos, frame)
-    linking = _links(found, frame, reported, methods, store, jobs)
+    linking = _links(found, frame, reported, methods, store, workers)
     links = yield from clock.stage("links", linking)
     known = AlignmentInputs(
         photos=found.photos,
@@ -168,6 +165,7 @@ def align_photos(
         control=given.control,
         order=_order(found.photos, given.rank),
         grey=grey,
+        workers=workers,
     )
     if links.links:
         yield from memory_notes(len(found.photos), settings.running.memory_gb)
@@ -213,6 +211,7 @@ def find_ground(
         methods.sweep,
         settings.picture,
         clock.store,
+        clock.workers,
         pictures=picture_recipe(),
     )
     return (yield from clock.stage("surface", steps))
@@ -249,7 +248,7 @@ def draw_map(
         ),
     )
     labels = yield from clock.stage(
-        "seams", _at_once(lambda: _labels(aligned, on, exposure, methods, clock.store))
+        "seams", _at_once(lambda: _labels(aligned, on, exposure, methods, clock))
     )
     aligned.found.looks.make_room()
     aligned.grey.make_room()
@@ -257,23 +256,32 @@ def draw_map(
     compose = orthomosaic.composer(
         first.channels, first.dtype, on, exposure, labels, methods.blend, aligned.pixels
     )
-    steps = orthomosaic.draw(
-        output,
-        compose,
-        alignment,
-        settings.output,
-        settings.picture.boundary,
-        clock.store,
-        orthomosaic.map_key(key, alignment, on, exposure, labels),
-        first.unit,
-        settings.running.threads,
+    drawing = orthomosaic.Drawing(
+        output=output,
+        compose=compose,
+        alignment=alignment,
+        settings=settings.output,
+        boundary=settings.picture.boundary,
+        unit=first.unit,
+        store=clock.store,
+        key=orthomosaic.map_key(key, alignment, on, exposure, labels),
     )
-    drawn = yield from clock.stage("mosaic", steps)
+    drawn = yield from clock.stage("mosaic", _drawn(drawing, aligned.pixels, clock.workers))
     return DrawnMap(exposure=exposure, compose=compose, drawn=drawn)
 
 
+def _drawn(
+    drawing: orthomosaic.Drawing, pixels: PixelsInUse, workers: Workers
+) -> Steps[companions.Drawn]:
+    """Draws the map, then the rasters beside it, for which decoded photos make room."""
+    yield from drawing.blocks(workers)
+    pixels.make_room()
+    give_back()
+    return drawing.companions()
+
+
 def _labels(
-    aligned: AlignedPhotos, on: Ground, exposure: Exposure, methods: Methods, store: Store
+    aligned: AlignedPhotos, on: Ground, exposure: Exposure, methods: Methods, clock: Clock
 ) -> Labels | None:
     """Which photo is shown where; None for blending methods with a rule of their own."""
     if methods.blend.seam_px is None:
@@ -288,11 +296,13 @@ def _labels(
         picture_recipe(),
         [p.digest for p in aligned.photos],
     )
-    keep = store.parts("seams", key)
-    return store.get_or(
+    keep = clock.store.parts("seams", key)
+    return clock.store.get_or(
         "seams",
         key,
-        lambda: methods.seams(on.views, on.surface, on.grid, aligned.grey, exposure, keep),
+        lambda: methods.seams(
+            on.views, on.surface, on.grid, aligned.grey, exposure, keep, clock.workers
+        ),
     )
 
 
@@ -305,29 +315,6 @@ def scene_of(
     return Scene(aligned=aligned, ground=on)
 
 
-def _pixels_of(
-    photos: Sequence[Photo], all_photos: Sequence[Photo], cache: PixelCache[NDArray[Any]]
-) -> PhotoPixels:
-    """Pixels of the photos in use, by their indices.
-
-    Raises:
-        PhotoFailedError: a photo that could be read before is lost.
-    """
-    where = {p.name: i for i, p in enumerate(all_photos)}
-    index = [where[p.name] for p in photos]
-
-    def pixels(photo: int) -> NDArray[Any]:
-        try:
-            return cache(index[photo])
-        except Exception as error:  # whatever it is, it concerns this photo alone
-            reason = rejected(photos[photo].name, error).reason
-            raise PhotoFailedError(
-                photos[photo].name, f"could be read before, but now {reason}"
-            ) from error
-
-    return pixels
-
-
 def _order(photos: Sequence[Photo], rank: dict[str, int]) -> list[int]:
     return [i for _, i in sorted((rank[p.name], i) for i, p in enumerate(photos) if p.name in rank)]
 
@@ -338,12 +325,12 @@ def _links(
     reported: Sequence[Prior],
     methods: Methods,
     store: Store,
-    jobs: int,
+    workers: Workers,
 ) -> Steps[Links]:
     """Computes links if the alignment method needs them."""
     if not methods.align.needs_links or len(found.photos) < 2:
         return Links()
-    return (yield from link_photos(found, frame, reported, methods, store, jobs))
+    return (yield from link_photos(found, frame, reported, methods, store, workers))
 
 
 def alignment_key(known: AlignmentInputs, methods: Methods) -> str:

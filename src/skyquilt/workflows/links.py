@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.pose import ByPose
 from skyquilt.engine.clock import Steps
-from skyquilt.engine.executor import in_order
 from skyquilt.engine.store import Store, digest
+from skyquilt.engine.workers import Workers
 from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.matching.candidates import Pair, sequence
@@ -52,10 +52,8 @@ class ExpectedPlaces:
         return np.where((np.abs(places) < 1e6).all(1, keepdims=True), places, np.nan)
 
 
-BATCH = 64
-"""Number of pairs per stored artefact. At most this many pairs must be matched again after a
-kill.
-"""
+BATCH = 8
+"""Number of pairs per stored artefact; a batch is matched by one worker."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,14 +97,17 @@ class _Linker:
         priors: Sequence[Prior],
         methods: Methods,
         store: Store,
-        jobs: int,
     ) -> None:
-        self.found, self.methods, self.store, self.jobs = found, methods, store, jobs
+        self.found, self.methods, self.store = found, methods, store
         self.features = found.features
         self.expected: ExpectedPlaces | None = None
         if isinstance(methods.matcher, Guided):
             height = methods.matcher.height_m
             self.expected = ExpectedPlaces(found.photos, frame, priors, height)
+        by = None if self.expected is None else self.expected.key
+        self._recipe = digest(
+            features_recipe(methods.detector), methods.matcher, methods.verify, by
+        )
 
     def one(self, pair: Pair) -> Link | RejectedLink:
         a, b = pair
@@ -116,13 +117,10 @@ class _Linker:
 
     def batch(self, pairs: Sequence[Pair]) -> list[Link | RejectedLink]:
         """Links of a batch; the indices stored are those of this run."""
-        photos, methods = self.found.photos, self.methods
+        photos = self.found.photos
         names = [(i, j, photos[i].digest, photos[j].digest) for i, j in pairs]
-        by = None if self.expected is None else self.expected.key
-        recipe = features_recipe(methods.detector)
-        key = digest(names, recipe, methods.matcher, methods.verify, by)
         return self.store.get_or(
-            "links", key, lambda: list(in_order(self.one, pairs, jobs=self.jobs))
+            "links", digest(names, self._recipe), lambda: [self.one(pair) for pair in pairs]
         )
 
 
@@ -132,18 +130,18 @@ def link_photos(
     priors: Sequence[Prior],
     methods: Methods,
     store: Store,
-    jobs: int,
+    workers: Workers,
 ) -> Steps[Links]:
     """Links neighbours first; their overlap gives the largest distance of further candidates."""
     n = len(found.photos)
-    linker = _Linker(found, frame, priors, methods, store, jobs)
+    linker = _Linker(found, frame, priors, methods, store)
     xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
     lost = [i for i in range(n) if not np.isfinite(xy[i]).all()]
     # in order of capture, so that the features of a photo are read once for all its pairs
     first = sorted({*sequence(n), *_closest(methods.nearest(xy), n, 2)})
     tried: list[Link | RejectedLink] = []
-    for batch in _batches(first):
-        tried += linker.batch(batch)
+    for batch in workers.each(linker.batch, _batches(first)):
+        tried += batch
         yield len(tried), 2 * len(first)
     reach = overlap_reach_m([k for k in tried if isinstance(k, Link)], found, xy)
     rest = methods.nearest(xy, reach) if n > 2 else []
@@ -151,8 +149,8 @@ def link_photos(
         rest += methods.retrieval(found.features, None if len(lost) == n else lost)
     done = set(first)
     rest = sorted({p for p in rest if p not in done})
-    for batch in _batches(rest):
-        tried += linker.batch(batch)
+    for batch in workers.each(linker.batch, _batches(rest)):
+        tried += batch
         yield len(tried), len(first) + len(rest)
     return Links(
         links=tuple(k for k in tried if isinstance(k, Link)),

@@ -21,6 +21,7 @@ from skyquilt.engine.error_log import log_error
 from skyquilt.engine.folder import STATE, RunFolder, open_run
 from skyquilt.engine.free_memory import return_large_blocks
 from skyquilt.engine.store import Store, digest
+from skyquilt.engine.workers import Threads, workers_for
 from skyquilt.errors import PhotoFailedError, SkyquiltError
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.model.photo import RejectedPhoto
@@ -94,7 +95,8 @@ class FinishedMap:
     def scene(self) -> Scene:
         """The aligned photos and the ground of this map; read from its store by the same steps."""
         store = Store(folder=self.result.output / STATE / "store", registry=REGISTRY)
-        clock = Clock(store=store, began=Clock.now())
+        threads = Threads(self.settings.running.threads)
+        clock = Clock(store=store, began=Clock.now(), workers=threads)
         return result_of(scene_of(self.given, self.methods, self.settings, clock))
 
 
@@ -175,12 +177,15 @@ def make_map(
         result = Result(output=run.path, metrics=former)
         return FinishedMap(result=result, given=given, methods=methods, settings=settings)
     run.mark("running")
-    clock = Clock(store=store, began=began)
-    clock.lap("read", began)
-    yield from (Note(text=n) for n in given.survey.notes)
-    given = yield from frames_added(given, settings, clock)
-    _log(run.path, given.survey.rejected)
-    metrics, given = yield from _without_bad(given, run.path, key, settings, methods, clock)
+    survey = given.survey
+    first = [*(p.path for p in survey.photos), *(c.path for c in survey.clips)][:1]
+    with workers_for(settings.running, run.path / STATE, first) as workers:
+        clock = Clock(store=store, began=began, workers=workers)
+        clock.lap("read", began)
+        yield from (Note(text=n) for n in given.survey.notes)
+        given = yield from frames_added(given, settings, clock)
+        _log(run.path, given.survey.rejected)
+        metrics, given = yield from _without_bad(given, run.path, key, settings, methods, clock)
     run.mark("done")
     result = Result(output=run.path, metrics=metrics)
     return FinishedMap(result=result, given=given, methods=methods, settings=settings)
@@ -260,7 +265,9 @@ def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> s
     the methods, and the constants of all code used.
     """
     shaping = {
-        k: v for k, v in settings.as_table().items() if k not in ("jobs", "memory_gb", "max_mp")
+        k: v
+        for k, v in settings.as_table().items()
+        if k not in ("jobs", "memory_gb", "max_mp", "scheduler")
     }
     files = (settings.picture.boundary, settings.input.distances, Path(settings.input.sequence))
     side = [p.read_bytes().hex() for p in files if p is not None and p.is_file()]

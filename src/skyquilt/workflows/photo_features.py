@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Steps
-from skyquilt.engine.executor import in_order
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store, digest
-from skyquilt.errors import NoPhotosError, OutputError
+from skyquilt.engine.workers import Workers
+from skyquilt.errors import NoPhotosError, OutputError, PhotoFailedError
 from skyquilt.imaging.grey import halved, shrink, to_grey8
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo, RejectedPhoto
@@ -111,6 +111,34 @@ class _ThumbnailsOf(Mapping[int, NDArray[Any]]):
         if photo not in self._photos:
             raise KeyError(photo)
         return self._found.looks(self._found.number[photo]).thumbnail
+
+
+class PixelsInUse:
+    """Full-size pixels of the photos in use, by their index among these."""
+
+    def __init__(
+        self, photos: Sequence[Photo], number: Sequence[int], cache: PixelCache[NDArray[Any]]
+    ) -> None:
+        """`number`: the number of each photo in the cache."""
+        self._names, self._number = tuple(p.name for p in photos), tuple(number)
+        self._cache = cache
+
+    def __call__(self, photo: int) -> NDArray[Any]:
+        """Pixels of a photo (index), read-only.
+
+        Raises:
+            PhotoFailedError: a photo that could be read before is lost.
+        """
+        try:
+            return self._cache(self._number[photo])
+        except Exception as error:  # whatever it is, it concerns this photo alone
+            name = self._names[photo]
+            reason = rejected(name, error).reason
+            raise PhotoFailedError(name, f"could be read before, but now {reason}") from error
+
+    def make_room(self) -> None:
+        """Drops the photos kept in memory where not all fit."""
+        self._cache.make_room()
 
 
 class GreyPictures:
@@ -228,7 +256,7 @@ def _look(photo: Photo, pixels: NDArray[Any], detector: Detector, store: Store) 
 
 
 def find_features(
-    photos: Sequence[Photo], pixels: PhotoPixels, detector: Detector, store: Store, jobs: int
+    photos: Sequence[Photo], pixels: PhotoPixels, detector: Detector, store: Store, workers: Workers
 ) -> Steps[FeaturedPhotos]:
     """Features of every photo that can be decoded.
 
@@ -237,26 +265,26 @@ def find_features(
     """
     cv2.setNumThreads(1)  # photos are processed in parallel instead
 
-    def one(index: int) -> PhotoFeatures | RejectedPhoto:
-        photo = photos[index]
-        try:
-            return photo_features(photo, lambda: pixels(index), detector, store)
-        except OutputError:  # a full disk is no fault of the photo
-            raise
-        except Exception as error:  # whatever it is, it concerns this photo alone
-            return rejected(photo.name, error)
-
     looks = PixelCache(
         read=lambda i: photo_features(photos[i], lambda: pixels(i), detector, store),
         budget_bytes=KEPT_BYTES,
     )
+
+    def failure(index: int) -> RejectedPhoto | None:
+        try:
+            looks(index)
+        except OutputError:  # a full disk is no fault of the photo
+            raise
+        except Exception as error:  # whatever it is, it concerns this photo alone
+            return rejected(photos[index].name, error)
+        return None
+
     good, bad = list[int](), list[RejectedPhoto]()
-    for index, result in enumerate(in_order(one, range(len(photos)), jobs=jobs)):
-        if isinstance(result, RejectedPhoto):
-            bad.append(result)
-        else:
+    for index, failed in enumerate(workers.each(failure, range(len(photos)))):
+        if failed is None:
             good.append(index)
-            looks.put(index, result)
+        else:
+            bad.append(failed)
         yield index + 1, len(photos)
     if not good:
         raise NoPhotosError(

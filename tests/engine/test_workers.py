@@ -3,7 +3,7 @@ import time
 
 import pytest
 
-from skyquilt.engine.executor import in_order
+from skyquilt.engine.workers import Threads
 
 
 @pytest.mark.parametrize("jobs", [0, 1, 2, 7])
@@ -12,11 +12,11 @@ def test_results_come_in_order(jobs):
         time.sleep(0.002 * (item % 3))
         return item * item
 
-    assert list(in_order(work, range(40), jobs=jobs)) == [i * i for i in range(40)]
+    assert list(Threads(jobs).each(work, range(40))) == [i * i for i in range(40)]
 
 
 def test_no_items():
-    assert list(in_order(str, [], jobs=3)) == []
+    assert list(Threads(3).each(str, [])) == []
 
 
 def test_it_never_runs_far_ahead():
@@ -26,7 +26,7 @@ def test_it_never_runs_far_ahead():
         begun.append(item)
         return item
 
-    results = in_order(work, iter(range(1000)), jobs=2)
+    results = Threads(2).each(work, iter(range(1000)))
     next(results)
     time.sleep(0.05)
     assert len(begun) <= 6
@@ -45,7 +45,7 @@ def test_an_exception_arrives_in_its_place_and_stops_the_rest(jobs):
 
     got = []
     with pytest.raises(KeyError, match="five"):
-        for result in in_order(work, range(500), jobs=jobs):
+        for result in Threads(jobs).each(work, range(500)):
             got.append(result)
     assert got == [0, 1, 2, 3, 4]
     assert len(begun) < 20
@@ -59,7 +59,7 @@ def test_an_interrupt_waits_only_for_what_is_under_way():
         time.sleep(0.1)
         return item
 
-    results = in_order(work, range(100), jobs=2)
+    results = Threads(2).each(work, range(100))
     next(results)
     at = time.perf_counter()
     with pytest.raises(KeyboardInterrupt):
@@ -72,7 +72,7 @@ def test_an_interrupt_waits_only_for_what_is_under_way():
 
 
 def test_an_abandoned_generator_leaves_no_threads():
-    results = in_order(lambda item: item, range(100), jobs=3)
+    results = Threads(3).each(lambda item: item, range(100))
     next(results)
     del results
     assert not [t for t in threading.enumerate() if t.name.startswith("ThreadPoolExecutor")]

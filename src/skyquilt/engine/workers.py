@@ -1,0 +1,87 @@
+"""Who computes what can be computed apart: threads of this process, or other processes."""
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from skyquilt.model.event import Note
+from skyquilt.settings import RunningSettings
+
+A = TypeVar("A")
+B = TypeVar("B")
+
+
+class Workers(Protocol):
+    """Compute the parts of a step; the results come in order, whoever computed them."""
+
+    def each(self, work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
+        """work(item) for each item, in order, computing at most a few results ahead of the
+        consumer.
+
+        `work`, items and results may go to other processes: what `work` refers to is copied there,
+        so it gives its results back or puts them into the store, and changes nothing here.
+        """
+        ...
+
+    def news(self) -> Sequence[Note]:
+        """What the user should know since the last call."""
+        ...
+
+
+@dataclass(frozen=True)
+class Threads:
+    """Threads of this process.
+
+    The heavy parts (OpenCV, BLAS, the JPEG codec) release the interpreter lock. An interrupt
+    cancels items that have not started and waits only for those being computed.
+    """
+
+    number: int = 1
+    """How many; 1 = none but the caller's."""
+
+    def each(self, work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
+        """work(item) for each item, in order."""
+        if self.number <= 1:
+            for item in items:
+                yield work(item)
+            return
+        pool = ThreadPoolExecutor(self.number)
+        waiting: deque[Future[B]] = deque()
+        try:
+            for item in items:
+                waiting.append(pool.submit(work, item))
+                if len(waiting) > 2 * self.number:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+    def news(self) -> Sequence[Note]:
+        """Nothing."""
+        return ()
+
+
+HERE = Threads()
+"""One thread: that of the caller."""
+
+
+@contextmanager
+def workers_for(running: RunningSettings, folder: Path, sees: Sequence[Path]) -> Iterator[Workers]:
+    """The workers of a run: threads, or those of `--scheduler`. `folder`: that of the run's state;
+    `sees`: files that all workers must see.
+
+    Raises:
+        UsageError: the scheduler or its workers cannot be used.
+    """
+    if running.scheduler is None:
+        yield Threads(running.threads)
+        return
+    from skyquilt.engine.cluster import cluster  # Dask is an extra
+
+    with cluster(running.scheduler, folder, sees) as found:
+        yield found
