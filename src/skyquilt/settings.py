@@ -25,6 +25,10 @@ THERMAL_UNITS = ("auto", "celsius", "kelvin", "decikelvin", "centikelvin", "coun
 VERTICAL_DATUMS = ("ellipsoid", "egm96", "takeoff")
 DISTORTIONS = ("none", "2", "4", "6", "6t", "full")
 SHUTTERS = ("global", "rolling")
+USUAL_GB = 1.2
+"""Memory allowed by default."""
+HELD_GB, THREAD_GB = 0.5, 0.06
+"""Memory that a run needs besides its threads, and what each thread may take, about."""
 
 
 def one_of(option: str, value: str, allowed: Iterable[str]) -> None:
@@ -263,7 +267,7 @@ class RunningSettings:
     """What a run may use; nothing here but `seed` changes the result."""
 
     jobs: int = 0
-    """Threads; 0 = all processors."""
+    """Threads; 0 = all processors, as far as the memory allows."""
     memory_gb: float | None = None
     """Memory to plan with in GB; None = 1.2."""
     seed: int = 0
@@ -276,7 +280,8 @@ class RunningSettings:
     @property
     def threads(self) -> int:
         """Threads to use."""
-        return self.jobs or os.cpu_count() or 1
+        room = ((self.memory_gb or USUAL_GB) - HELD_GB) / THREAD_GB
+        return self.jobs or max(1, min(os.cpu_count() or 1, int(room)))
 
     def __post_init__(self) -> None:
         within("--jobs", self.jobs, 0, 1024)

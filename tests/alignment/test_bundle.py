@@ -12,7 +12,7 @@ from skyquilt.alignment.control import Control, control_in_frame, fit_similarity
 from skyquilt.alignment.setup import HALF_TURN
 from skyquilt.alignment.stages import position_noise, prune
 from skyquilt.engine.codec import decode, encode
-from skyquilt.engine.kept import made_now
+from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import angles_from_cam_R_map, rotation_from_vector
@@ -90,7 +90,7 @@ class Flown:
     def aligned(self, **options):
         control = options.pop("control", ())
         frame = options.pop("frame", FRAME)
-        keep = options.pop("keep", made_now)
+        keep = options.pop("keep", MADE_NOW)
         return Bundle(**options)(
             self.photos, frame, self.priors, self.features, self.links, control, None, keep
         )
@@ -168,21 +168,21 @@ def test_an_interrupted_adjustment_of_many_photos_goes_on_at_its_iteration(plain
         return decode(kept[part], REGISTRY)
 
     stop = None
-    whole = flown.aligned(many=5, keep=keep)
+    whole = flown.aligned(many=5, keep=Keep(held=keep))
     parts, kept = made, {}
     assert len(parts) == len(set(parts)) > 10
     for stop in (2, 5, len(parts) // 2, len(parts) - 1):
         made = []
         with pytest.raises(StoppedError):
-            flown.aligned(many=5, keep=keep)
+            flown.aligned(many=5, keep=Keep(held=keep))
         stop = None
-        again = flown.aligned(many=5, keep=keep)
+        again = flown.aligned(many=5, keep=Keep(held=keep))
         assert made == parts  # nothing twice
         assert all((p.map_C == again.poses[i].map_C).all() for i, p in whole.poses.items())
         assert (whole.ties.xyz == again.ties.xyz).all()
         kept = {}
     made = []
-    flown.aligned(keep=keep)
+    flown.aligned(keep=Keep(held=keep))
     assert made == []  # few photos are adjusted in a moment
 
 

@@ -86,13 +86,21 @@ def test_relative_paths_are_those_of_the_run(two, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_nothing_is_left_of_a_step(two):
+def test_a_step_is_written_once_and_nothing_is_left_of_it(two):
+    def work(number: int) -> int:
+        return number
+
     folder = two._folder
-    running = two.each(str, range(100))
+    running = two.each(work, range(100))
     next(running)
-    assert len(list(folder.iterdir())) == 1
+    step = list(folder.iterdir())
     running.close()
-    assert list(folder.iterdir()) == []
+    assert list(two.each(work, range(3))) == [0, 1, 2]
+    assert list(folder.iterdir()) == step and len(step) == 1
+    list(two.each(str, [1]))
+    assert len(list(folder.iterdir())) == 1 and list(folder.iterdir()) != step
+    two.close()
+    assert not folder.exists()
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import time
 import pytest
 
 from skyquilt.engine.workers import Threads
+from skyquilt.settings import RunningSettings
 
 
 @pytest.mark.parametrize("jobs", [0, 1, 2, 7])
@@ -76,3 +77,13 @@ def test_an_abandoned_generator_leaves_no_threads():
     next(results)
     del results
     assert not [t for t in threading.enumerate() if t.name.startswith("ThreadPoolExecutor")]
+
+
+def test_a_run_takes_no_more_threads_than_its_memory_bears(monkeypatch):
+    monkeypatch.setattr("os.cpu_count", lambda: 64)
+    assert RunningSettings().threads == 11  # of 1.2 GB, 0.06 each beside 0.5
+    assert RunningSettings(memory_gb=8.0).threads == 64
+    assert RunningSettings(memory_gb=0.5).threads == 1
+    assert RunningSettings(jobs=32).threads == 32  # as asked
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    assert RunningSettings().threads == 2

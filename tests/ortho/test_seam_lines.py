@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from skyquilt.engine.kept import Keep
 from skyquilt.model.raster import Grid, Window
 from skyquilt.ortho.bare_ground import bare_ground
 from skyquilt.ortho.contours import contour_lines
@@ -158,12 +159,12 @@ def test_seams_go_on_at_their_tile(scene, monkeypatch):
 
     grey = lambda photo, side: pictures[photo]  # noqa: E731
     whole = SeamLines()(views, FLAT, GRID, grey, NEUTRAL)
-    first = SeamLines()(views, FLAT, GRID, grey, NEUTRAL, keep)
+    first = SeamLines()(views, FLAT, GRID, grey, NEUTRAL, Keep(held=keep))
     assert len(made) > 3
     for part in made[2:]:
         del kept[part]
     before = len(made)
-    again = SeamLines()(views, FLAT, GRID, grey, NEUTRAL, keep)
+    again = SeamLines()(views, FLAT, GRID, grey, NEUTRAL, Keep(held=keep))
     assert made[before:] == made[2:before]
     for labels in (first, again):
         assert (labels.photo == whole.photo).all() and (labels.hidden == whole.hidden).all()

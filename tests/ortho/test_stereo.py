@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from skyquilt.engine.workers import HERE, Threads
+from skyquilt.engine.kept import MADE_NOW, Keep
+from skyquilt.engine.workers import Threads
 from skyquilt.model.camera import Camera
 from skyquilt.model.raster import Grid
 from skyquilt.ortho.fill import filled, nearest_known, plateaus, settled
@@ -18,10 +19,6 @@ HEIGHT, BOX = 40.0, 6.0
 WIDE = Camera(width=800, height=600, focal=700.0, cx=401.0, cy=298.0)
 HALF = 5.0
 """Half the side of the box in m; it stands at the origin."""
-
-
-def kept(_, make):
-    return make()
 
 
 def picture(shot):
@@ -80,7 +77,7 @@ GRID = Grid(west=-25.0, north=25.0, gsd=0.06, width=834, height=834)
 def test_a_box_stands_up(flight):
     """Roof and ground to 15 cm, and the walls within 60 cm, which is ten map pixels."""
     views, grey = flight
-    found = Stereo()(level(0.0), views, GRID, grey, kept, HERE)
+    found = Stereo()(level(0.0), views, GRID, grey, MADE_NOW)
     x, y = np.meshgrid(np.linspace(-14, 14, 113), np.linspace(-14, 14, 113))
     z = found.at(x, y)
     outside = np.maximum(np.abs(x), np.abs(y)) - HALF
@@ -97,14 +94,16 @@ def test_a_box_stands_up(flight):
 def test_threads_and_parts_do_not_change_the_heights(flight, monkeypatch):
     """Three threads and tiles of 64 cells: the same heights; a kept part is not matched again."""
     views, grey = flight
-    whole = Stereo()(level(0.0), views, GRID, grey, kept, HERE)
+    whole = Stereo()(level(0.0), views, GRID, grey, MADE_NOW)
     monkeypatch.setattr("skyquilt.ortho.stereo.TILE", 64)
     parts = {}
 
-    def keep(name, make):
+    def held(name, make):
         return parts.setdefault(name, make()) if name not in parts else parts[name]
 
-    assert np.array_equal(Stereo()(level(0.0), views, GRID, grey, keep, Threads(3)).z, whole.z)
+    keep = Keep(held=held, workers=Threads(3))
+
+    assert np.array_equal(Stereo()(level(0.0), views, GRID, grey, keep).z, whole.z)
     number = len(parts)
     assert number > 4
 
@@ -112,16 +111,16 @@ def test_threads_and_parts_do_not_change_the_heights(flight, monkeypatch):
         raise AssertionError("matched again")
 
     monkeypatch.setattr("skyquilt.ortho.stereo.matched_points", never)
-    assert np.array_equal(Stereo()(level(0.0), views, GRID, grey, keep, Threads(3)).z, whole.z)
+    assert np.array_equal(Stereo()(level(0.0), views, GRID, grey, keep).z, whole.z)
     assert len(parts) == number
 
 
 def test_level_ground_stays_level(flight):
     views, _ = flight
     blank = np.full((600, 800), 90, np.uint8)
-    found = Stereo()(level(1.5), views, GRID, lambda photo, side: blank, kept, HERE)
+    found = Stereo()(level(1.5), views, GRID, lambda photo, side: blank, MADE_NOW)
     assert found.z == pytest.approx(1.5, abs=0.2)
-    assert Stereo()(found, views[:1], GRID, lambda photo, side: blank, kept, HERE) is found
+    assert Stereo()(found, views[:1], GRID, lambda photo, side: blank, MADE_NOW) is found
 
 
 def test_points_over_the_plane_lie_in_one_row():

@@ -13,14 +13,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.equations import Equations, add_diagonal, sums_by_point
+from skyquilt.alignment.equations import Equations, add_diagonal, points_inverse, sums_by_point
 from skyquilt.alignment.problem import CAMERA, Problem, State, linearised_points
 from skyquilt.alignment.robust import observation_weights, point_terms, robust_cost
-from skyquilt.engine.kept import Keep, made_now
+from skyquilt.engine.kept import MADE_NOW, Keep
+from skyquilt.engine.workers import HERE
 from skyquilt.geometry.block_cholesky import Factor, Index, Matrix
 from skyquilt.geometry.levenberg_marquardt import levenberg_marquardt
 
 Array = NDArray[np.float64]
+ALONE = 60_000
+"""Observations up to which one thread computes the equations: sharing them out would cost more.
+Threads of one process gain nothing, since half of the work is Python.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -98,7 +103,8 @@ def polish_points(problem: Problem, state: State) -> State:
         H = sums[:, :, :3]
         add_diagonal(H, precision + 1e-9)
         g = sums[:, :, 3] + precision * apart
-        X[points] -= np.linalg.solve(H, g[..., None])[..., 0]
+        L_inv = points_inverse(H, 0.0)
+        X[points] -= np.einsum("pji,pj->pi", L_inv, np.einsum("pij,pj->pi", L_inv, g))
     return replace(state, X=X)
 
 
@@ -109,7 +115,7 @@ def adjust(
     iterations: int = 30,
     tolerance: float = 1e-5,
     damping: float = 1e-4,
-    keep: Keep = made_now,
+    keep: Keep = MADE_NOW,
 ) -> Adjusted:
     """Minimises the robust cost.
 
@@ -125,7 +131,8 @@ def adjust(
         damping: first damping, relative to the diagonal of the normal equations.
         keep: keeps each iteration, from where an interrupted run goes on.
     """
-    system = Equations(problem, state)
+    shared = keep.workers.apart and len(problem.px) > ALONE
+    system = Equations(problem, state, keep.workers if shared else HERE)
     last: list[tuple[State, float]] = []
 
     def cost(state: State) -> float:
@@ -157,9 +164,8 @@ def adjust(
 def covariance(problem: Problem, state: State) -> Covariance | None:
     """Covariance of photos and cameras at a minimum; None if some unknowns are not determined."""
     system = Equations(problem, state)
-    matrix, _ = system.reduced(state, 0.0)
     try:
-        factor = Factor(matrix)
+        factor = Factor(system.reduced(state, 0.0)[0])
     except np.linalg.LinAlgError:
         return None
     inverse = factor.selected_inverse()

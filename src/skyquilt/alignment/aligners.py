@@ -49,7 +49,6 @@ class ByLinks:
             control,
             inputs.grey,
             inputs.keep,
-            inputs.workers,
         )
         return replace(with_loose_photos(found, inputs.photos, inputs.priors), why=REQUESTED)
 

@@ -18,8 +18,7 @@ from skyquilt.alignment.stages import believe_positions, fine, plain, rough, wei
 from skyquilt.alignment.start import Start, find_start
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
-from skyquilt.engine.kept import Keep, made_now, within
-from skyquilt.engine.workers import HERE, Workers
+from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.errors import AlignmentError
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
@@ -55,7 +54,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 26
+    version: ClassVar[int] = 27
 
     def __call__(
         self,
@@ -66,12 +65,11 @@ class Bundle:
         links: Sequence[Link],
         control: Sequence[Control] = (),
         grey: GreyPicture | None = None,
-        keep: Keep = made_now,
-        workers: Workers = HERE,
+        keep: Keep = MADE_NOW,
     ) -> Alignment:
         """Aligns the photos that are connected by links; `grey` gives images for the refinement of
         observations. `keep`: parts of the adjustment of more than `many` photos are kept, so that
-        an interrupted run goes on. `workers` refine the observations.
+        an interrupted run goes on. Its workers refine the observations.
 
         Raises:
             AlignmentError: no two photos are linked.
@@ -80,10 +78,12 @@ class Bundle:
 
         def block(aside: frozenset[int]) -> Alignment:
             upright = [k for k in links if k.a not in aside and k.b not in aside]
-            part = within(keep, f"{sorted(aside)}") if len(photos) > self.many else made_now
-            return self._block(
-                photos, frame, priors, features, upright, control, grey, part, workers
+            part = (
+                keep.within(f"{sorted(aside)}")
+                if len(photos) > self.many
+                else Keep(workers=keep.workers)
             )
+            return self._block(photos, frame, priors, features, upright, control, grey, part)
 
         try:
             found = block(aside)
@@ -104,7 +104,6 @@ class Bundle:
         control: Sequence[Control],
         grey: GreyPicture | None,
         keep: Keep,
-        workers: Workers,
     ) -> Alignment:
         """Adjusts the photos that these links connect."""
         start = find_start(photos, priors, features, links)
@@ -120,26 +119,26 @@ class Bundle:
             tracks = thin(tracks, sizes, per_photo=self.ties, least=self.ties // 2)
         used = setup.sensor_tracks(tracks)
         problem, state = setup.problem(thin(used, sizes, per_photo=begin, least=least))
-        problem, state = rough(problem, state, within(keep, "rough"))
+        problem, state = rough(problem, state, keep.within("rough"))
         setup = setup.moving_as(photos, state.C)
         problem = replace(problem, velocity=setup.base.velocity)
         method = self.match_observations
         if sharp := grey is not None and method is not None:
-            part = within(keep, "sharp")
-            used = _sharpened(used, photos, setup, problem, state, method, grey, part, workers)
+            part = keep.within("sharp")
+            used = _sharpened(used, photos, setup, problem, state, method, grey, part)
         if sharp or begin != each:
             problem, _ = setup.problem(thin(used, sizes, per_photo=each, least=least))
             state = triangulated(problem, state)
-        problem, state = fine(problem, state, within(keep, "fine"))
+        problem, state = fine(problem, state, keep.within("fine"))
         setup = setup.moving_as(photos, state.C)
         problem = replace(problem, velocity=setup.base.velocity)
         if self.thorough:
-            problem, state = weighed(problem, state, setup, within(keep, "weighed"))
+            problem, state = weighed(problem, state, setup, keep.within("weighed"))
         else:
-            problem, state = plain(problem, state, within(keep, "plain"))
+            problem, state = plain(problem, state, keep.within("plain"))
         setup = replace(setup, base=replace(setup.base, velocity=problem.velocity))
         if self.repair:
-            part = within(keep, "positions")
+            part = keep.within("positions")
             problem, state = believe_positions(problem, state, setup, part)
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
         done = _outcome(
@@ -158,7 +157,6 @@ def _sharpened(
     match_observations: LeastSquaresMatching,
     grey: GreyPicture,
     keep: Keep,
-    workers: Workers,
 ) -> Tracks:
     """Tracks (sensor pixels) with observations refined in larger images."""
     everything, _ = setup.problem(tracks)
@@ -167,7 +165,7 @@ def _sharpened(
     poses = pose_records(setup, state)
     filed = replace(tracks, px=setup.file_px(tracks.photo, tracks.px))
     by_photo = {i: cameras[k] for i, k in camera_of.items()}
-    sharp = match_observations(filed, xyz, poses, by_photo, grey, keep, workers)
+    sharp = match_observations(filed, xyz, poses, by_photo, grey, keep)
     return replace(sharp, px=setup.file_px(sharp.photo, sharp.px))
 
 

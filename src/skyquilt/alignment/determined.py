@@ -73,9 +73,7 @@ class _Growth:
     def __init__(self, alignment: Alignment, block: Sequence[int], priors: Sequence[Prior]) -> None:
         self.alignment, self.priors = alignment, priors
         ties = alignment.ties
-        order = np.argsort(ties.photo, kind="stable")
-        cuts = np.searchsorted(ties.photo[order], [[i, i + 1] for i in block])
-        self.own = {i: order[a:b] for i, (a, b) in zip(block, cuts.tolist(), strict=True)}
+        self.own = ties.of_photos(block)
         self.first = np.searchsorted(ties.point, np.arange(len(ties.xyz) + 1))
         self.last = max(block)
 

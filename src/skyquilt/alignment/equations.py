@@ -4,6 +4,7 @@ Observations are taken in parts of whole points: what a part says of photos and 
 one sparse matrix, and then forgotten. So memory holds the matrix, not the equations.
 """
 
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.problem import CAMERA, Problem, State, linearise
 from skyquilt.alignment.robust import observation_weights, point_terms, position_terms, prior_terms
+from skyquilt.engine.workers import HERE, Workers
 from skyquilt.geometry.block_cholesky import LEAF, Factor, Index, Matrix, pattern
 
 Array = NDArray[np.float64]
@@ -74,10 +76,24 @@ class PointTies:
     """(N, q, 3) camera-point blocks."""
 
 
-def _ties_of(normal: Normal) -> PointTies:
-    return PointTies(
-        V=normal.V, gv=normal.gv, Wp=normal.Wp.astype(np.float32), Wc=normal.Wc.astype(np.float32)
-    )
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reduced:
+    """What a part's observations say of photos and cameras, its points eliminated. The unknowns of
+    its s photos come first, then those of all m cameras.
+    """
+
+    seen: Index
+    """(s,) the photos."""
+    U: Array
+    """(s, p, p) photo blocks."""
+    Uc: Array
+    """(m, q, q) camera blocks."""
+    tied: Array
+    """(p s + q m, p s + q m) photos with cameras, and what the points tie together, subtracted."""
+    gradient: Array
+    """(p s + q m,) gradient."""
+    ties: PointTies | None
+    """What the step of the points needs, if it is asked for."""
 
 
 def sums_by_point(problem: Problem, values: Array, count: int) -> Array:
@@ -163,8 +179,10 @@ def _together(problem: Problem) -> tuple[Index, Index]:
 class Equations:
     """The equations of one problem, at any state: which photos are coupled is found once."""
 
-    def __init__(self, problem: Problem, state: State) -> None:
-        self.problem = problem
+    def __init__(self, problem: Problem, state: State, workers: Workers = HERE) -> None:
+        """`workers` compute the equations of the parts."""
+        self.problem, self.workers = problem, workers
+        self.kept = len(problem.px) <= KEPT
         self.n, self.m = len(state.C), len(state.K)
         self.p = problem.photo_unknowns
         self.q = CAMERA if problem.free.any() else 0
@@ -172,17 +190,15 @@ class Equations:
         self.pattern = pattern(state.C[:, :2], self.p, border, *_together(problem))
         self._ties: list[tuple[Problem, PointTies]] = []
 
-    def normals(self, state: State) -> Iterator[tuple[Problem, Normal]]:
-        """The equations of each part of the observations."""
-        for part, own, _ in self.problem.parts(state):
-            yield part, observation_equations(part, own)
-
     def _point_ties(self, state: State) -> Iterator[tuple[Problem, PointTies]]:
         """Those of the points of each part, kept since `reduced` unless the problem is large."""
-        if len(self.problem.px) <= KEPT:
+        if self.kept:
             yield from self._ties
-        else:
-            yield from ((part, _ties_of(normal)) for part, normal in self.normals(state))
+            return
+        for part, own, _ in self.problem.parts(state):
+            ties = reduced_part((part, own, 0.0, True)).ties
+            assert ties is not None, "they were asked for"
+            yield part, ties
 
     def step(self, state: State, damping: float) -> tuple[Array, Array, Array]:
         """The Gauss-Newton step of photos (n, p), cameras (m, 10) and points (P, 3).
@@ -221,19 +237,23 @@ class Equations:
         g, gc = priors.photo_gradient[:, :p].copy(), np.zeros(pat.border)
         gc[: q * m] = priors.camera_gradient[:, :q].ravel()
         self._ties.clear()
-        for part, normal in self.normals(state):
-            if len(self.problem.px) <= KEPT:
-                self._ties.append((part, _ties_of(normal)))
-            U[normal.seen] += normal.U
-            Uc += normal.Uc
-            cameras = part.camera[normal.seen]
-            if q:
-                columns = q * cameras[:, None] + np.arange(q)
-                rows = np.arange(p)[None, :, None]
-                out.beside[normal.seen[:, None, None], rows, columns[:, None]] += normal.Upc
-                gc[: q * m] += normal.gc.ravel()
-            g[normal.seen] += normal.gp
-            _eliminate_points(part, normal, damping, out, g, gc)
+        asked: deque[Problem] = deque()
+
+        def parts() -> Iterator[tuple[Problem, State, float, bool]]:
+            for part, own, _ in self.problem.parts(state):
+                asked.append(part)
+                yield part, own, damping, self.kept
+
+        for found in self.workers.each(reduced_part, parts()):
+            part = asked.popleft()
+            if found.ties is not None:
+                self._ties.append((part, found.ties))
+            U[found.seen] += found.U
+            Uc += found.Uc
+            self._add(out, found)
+            s = p * len(found.seen)
+            g[found.seen] += found.gradient[:s].reshape(-1, p)
+            gc[: q * m] += found.gradient[s:]
         add_diagonal(U, priors.photo[:, :p])
         add_diagonal(Uc, np.where(self.problem.free, priors.camera, 1.0)[:, :q])
         add_diagonal(U, np.diagonal(U, axis1=1, axis2=2) * damping + 1e-9)
@@ -246,6 +266,18 @@ class Equations:
             self._share_shift(out, state)
         return out, np.concatenate([g.ravel(), gc])
 
+    def _add(self, out: Matrix, found: Reduced) -> None:
+        """Adds what a part ties together."""
+        p, s = self.p, len(found.seen)
+        i, j = np.triu_indices(s)
+        pair = out.pattern.find(found.seen[i], found.seen[j])
+        tied = pair >= 0  # photos that share no point have nothing in common here, either
+        blocks = found.tied[: p * s, : p * s].reshape(s, p, s, p)
+        out.blocks[pair[tied]] += blocks[i[tied], :, j[tied]]
+        cameras = self.q * self.m
+        out.beside[found.seen, :, :cameras] += found.tied[: p * s, p * s :].reshape(s, p, cameras)
+        out.corner[:cameras, :cameras] += found.tied[p * s :, p * s :]
+
     def _share_shift(self, out: Matrix, state: State) -> None:
         """Couples the measured centres with their common shift, which is at its minimum already."""
         _, precision, _ = position_terms(self.problem, state)
@@ -256,12 +288,31 @@ class Equations:
             out.corner[at, at] = total if total > 0 else 1.0
 
 
-def _points_inverse(blocks: Array, damping: float) -> Array:
-    """L^-1 (P, 3, 3) of the damped point blocks L L^T."""
-    V = blocks.copy()
-    k = np.arange(3)
-    V[:, k, k] = V[:, k, k] * (1 + damping) + 1e-12
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(V)))
+def points_inverse(blocks: Array, damping: float) -> Array:
+    """L^-1 (P, 3, 3) of the damped point blocks L L^T, written out: a library's loop over so many
+    small matrices takes ten times as long.
+
+    Raises:
+        LinAlgError: a block is not positive definite.
+    """
+    (a, b, c), (d, e, f) = (
+        (blocks[:, k, k] * (1 + damping) + 1e-12 for k in range(3)),
+        (blocks[:, 1, 0], blocks[:, 2, 0], blocks[:, 2, 1]),
+    )
+    out = np.zeros_like(blocks)
+    with np.errstate(all="ignore"):
+        l11 = np.sqrt(a)
+        l21, l31 = d / l11, e / l11
+        l22 = np.sqrt(b - l21 * l21)
+        l32 = (f - l31 * l21) / l22
+        l33 = np.sqrt(c - l31 * l31 - l32 * l32)
+        out[:, 0, 0], out[:, 1, 1], out[:, 2, 2] = 1 / l11, 1 / l22, 1 / l33
+        out[:, 1, 0] = -l21 * out[:, 0, 0] * out[:, 1, 1]
+        out[:, 2, 1] = -l32 * out[:, 1, 1] * out[:, 2, 2]
+        out[:, 2, 0] = -(l31 * out[:, 0, 0] + l32 * out[:, 1, 0]) * out[:, 2, 2]
+    if not np.isfinite(out).all():
+        raise np.linalg.LinAlgError("a point is not determined")
+    return out
 
 
 def _points_step(
@@ -271,45 +322,61 @@ def _points_step(
     coupled = np.einsum("nij,ni->nj", ties.Wp, photos[part.photo])
     if ties.Wc.shape[1]:
         coupled += np.einsum("nij,ni->nj", ties.Wc, cameras[part.camera[part.photo]])
-    L_inv = _points_inverse(ties.V, damping)
+    L_inv = points_inverse(ties.V, damping)
     rhs = ties.gv + sums_by_point(part, coupled, len(ties.V))
     half = np.einsum("pij,pj->pi", L_inv, rhs)
     return np.asarray(-np.einsum("pji,pj->pi", L_inv, half))
 
 
-def _eliminate_points(
-    part: Problem, normal: Normal, damping: float, out: Matrix, g: Array, gc: Array
-) -> None:
-    """Takes what the points of a part tie together from matrix and gradients, in place."""
-    L_inv = _points_inverse(normal.V, damping)
+def reduced_part(given: tuple[Problem, State, float, bool]) -> Reduced:
+    """The equations of a part of the observations, its points eliminated: of (part, its state,
+    damping, whether the step of its points will be asked for).
+    """
+    part, state, damping, stepped = given
+    normal = observation_equations(part, state)
+    tied, gradient = _eliminated(part, normal, damping)
+    ties = PointTies(
+        V=normal.V, gv=normal.gv, Wp=normal.Wp.astype(np.float32), Wc=normal.Wc.astype(np.float32)
+    )
+    return Reduced(
+        seen=normal.seen,
+        U=normal.U,
+        Uc=normal.Uc,
+        tied=tied,
+        gradient=gradient,
+        ties=ties if stepped else None,
+    )
+
+
+def _eliminated(part: Problem, normal: Normal, damping: float) -> tuple[Array, Array]:
+    """`tied` and `gradient` of a part."""
+    L_inv = points_inverse(normal.V, damping)
     z = np.einsum("pij,pj->pi", L_inv, normal.gv)
-    p, q = normal.Wp.shape[1], normal.Wc.shape[1]
+    (p, q), (s, m) = (normal.Wp.shape[1], normal.Wc.shape[1]), (len(normal.seen), len(normal.Uc))
+    tied = np.zeros((p * s + q * m,) * 2)
+    gradient = np.concatenate([normal.gp.ravel(), normal.gc.ravel()])
+    camera = part.camera[normal.seen]
+    if q:
+        rows = np.arange(p * s).reshape(s, p, 1)
+        tied[rows, p * s + q * camera[:, None, None] + np.arange(q)] = normal.Upc
     for lo, hi in pairwise(part.cuts(ELIMINATED)):
         point, row = part.point[lo:hi], normal.row[lo:hi]
         first, last = int(point[0]), int(point[-1]) + 1
         some, local = np.unique(row, return_inverse=True)
-        seen = normal.seen[some]
-        cams, cam_of = np.unique(part.camera[seen], return_inverse=True)
+        cams, cam_of = np.unique(camera[some], return_inverse=True)
         T = np.swapaxes(L_inv[point], 1, 2)
-        s, c = len(seen), len(cams) if q else 0
-        rows = np.zeros((p * s + q * c, last - first, 3))
-        photos = rows[: p * s].reshape(s, p, last - first, 3)
+        n, c = len(some), len(cams) if q else 0
+        rows = np.zeros((p * n + q * c, last - first, 3))
+        photos = rows[: p * n].reshape(n, p, last - first, 3)
         photos[local, :, point - first] = normal.Wp[lo:hi] @ T
-        columns = (q * cams[:, None] + np.arange(q)).ravel()
         if q:
-            cameras = rows[p * s :].reshape(c, q, last - first, 3)
+            cameras = rows[p * n :].reshape(c, q, last - first, 3)
             place: Any = (cam_of[local], slice(None), point - first)
             np.add.at(cameras, place, normal.Wc[lo:hi] @ T)
         flat = rows.reshape(len(rows), -1)
-        product, pull = flat @ flat.T, flat @ z[first:last].ravel()
-        i, j = np.triu_indices(s)
-        pair = out.pattern.find(seen[i], seen[j])
-        tied = pair >= 0  # photos that share no point have nothing in common here, either
-        blocks = product[: p * s, : p * s].reshape(s, p, s, p)[i[tied], :, j[tied]]
-        out.blocks[pair[tied]] -= blocks
-        g[seen] -= pull[: p * s].reshape(s, p)
-        if q:
-            beside = product[: p * s, p * s :].reshape(s, p, -1)
-            out.beside[seen[:, None, None], np.arange(p)[None, :, None], columns] -= beside
-            out.corner[columns[:, None], columns] -= product[p * s :, p * s :]
-            gc[columns] -= pull[p * s :]
+        own = (p * some[:, None] + np.arange(p)).ravel()
+        theirs = p * s + (q * cams[:c, None] + np.arange(q)).ravel()
+        at = np.concatenate([own, theirs])
+        tied[at[:, None], at] -= flat @ flat.T
+        gradient[at] -= flat @ z[first:last].ravel()
+    return tied, gradient

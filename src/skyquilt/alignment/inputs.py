@@ -7,8 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.engine.kept import Keep, made_now
-from skyquilt.engine.workers import HERE, Workers
+from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import ControlPoint, Photo
 from skyquilt.model.poses import Alignment, MapFrame, Prior
@@ -37,10 +36,8 @@ class AlignmentInputs:
     """Photos in the order in which they are joined; photos not listed are left out."""
     grey: GreyPicture
     """Gives grey images."""
-    keep: Keep = made_now
-    """Keeps parts of large adjustments."""
-    workers: Workers = HERE
-    """Compute parts of large adjustments."""
+    keep: Keep = MADE_NOW
+    """Keeps parts of large adjustments, and shares them out."""
 
 
 class Aligner(Protocol):

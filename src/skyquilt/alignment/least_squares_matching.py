@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.tracks import Tracks
-from skyquilt.engine.kept import Keep, made_now
-from skyquilt.engine.workers import HERE, Workers
+from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.geometry.camera import pixels
 from skyquilt.imaging.align_patches import translate
 from skyquilt.model.camera import Camera
@@ -60,12 +59,10 @@ class LeastSquaresMatching:
         poses: Mapping[int, Pose],
         cameras: Mapping[int, Camera],
         grey: GreyPicture,
-        keep: Keep = made_now,
-        workers: Workers = HERE,
+        keep: Keep = MADE_NOW,
     ) -> Tracks:
         """Tracks (file pixels) with refined observations; `xyz` (count, 3): their points in the map
-        frame. `keep`: each part of some ten thousand observations; these are for the
-        `workers`.
+        frame. `keep`: each part of some ten thousand observations.
         """
         px, sigma = tracks.px.copy(), tracks.sigma_px.copy()
 
@@ -76,7 +73,7 @@ class LeastSquaresMatching:
             )
 
         parts = list(tracks.parts(PART))
-        for (some, _), found in zip(parts, workers.each(part, parts), strict=True):
+        for (some, _), found in zip(parts, keep.workers.each(part, parts), strict=True):
             px[some], sigma[some] = found
         return replace(tracks, px=px, sigma_px=sigma)
 

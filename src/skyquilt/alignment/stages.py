@@ -12,7 +12,7 @@ from skyquilt.alignment.deviations import believed, observed_noise, robust_scale
 from skyquilt.alignment.problem import READOUT, Problem, State, residuals_px, swept
 from skyquilt.alignment.robust import robust_cost
 from skyquilt.alignment.setup import Setup
-from skyquilt.engine.kept import Keep, made_now, within
+from skyquilt.engine.kept import MADE_NOW, Keep
 
 Array = NDArray[np.float64]
 ROLLS_PX = 0.3
@@ -28,34 +28,34 @@ twenty photos is itself known to a fifth.
 """
 
 
-def rough(problem: Problem, state: State, keep: Keep = made_now) -> tuple[Problem, State]:
+def rough(problem: Problem, state: State, keep: Keep = MADE_NOW) -> tuple[Problem, State]:
     """First stage: intrinsics fixed under a wide loss, then all free under a narrower one; outliers
     are removed in between.
     """
     fixed = replace(problem, free=np.zeros_like(problem.free), loss_px=20.0)
-    part = within(keep, "fixed")
+    part = keep.within("fixed")
     state = adjust(fixed, state, iterations=10, tolerance=3e-2, keep=part).state
     problem, state = prune(problem, state, 40.0)
-    narrow, part = problem.with_loss(6.0), within(keep, "free")
+    narrow, part = problem.with_loss(6.0), keep.within("free")
     state = adjust(narrow, state, iterations=20, tolerance=3e-3, damping=1e-5, keep=part).state
     return prune(problem, state, 12.0)
 
 
-def fine(problem: Problem, state: State, keep: Keep = made_now) -> tuple[Problem, State]:
+def fine(problem: Problem, state: State, keep: Keep = MADE_NOW) -> tuple[Problem, State]:
     """Second stage: all unknowns free under ever narrower losses; outliers are removed in
     between.
     """
     problem, state = prune(problem, state, 20.0)
-    narrow, part = problem.with_loss(2.5), within(keep, "2.5")
+    narrow, part = problem.with_loss(2.5), keep.within("2.5")
     state = adjust(narrow, state, iterations=20, tolerance=2e-3, damping=1e-6, keep=part).state
     problem, state = prune(problem, state, 5.0)
-    narrow, part = problem.with_loss(2.0), within(keep, "2.0")
+    narrow, part = problem.with_loss(2.0), keep.within("2.0")
     state = adjust(narrow, state, iterations=15, tolerance=3e-4, damping=1e-6, keep=part).state
     return problem, state
 
 
 def weighed(
-    problem: Problem, state: State, setup: Setup, keep: Keep = made_now
+    problem: Problem, state: State, setup: Setup, keep: Keep = MADE_NOW
 ) -> tuple[Problem, State]:
     """The adjustment repeated with observations as sharp as their residuals show them to be, and
     with the weight that those are worth; with turns of the cameras where rows were exposed one
@@ -65,16 +65,16 @@ def weighed(
     if rolls:
         readout = np.abs(state.K[problem.camera, READOUT])
         problem = replace(problem, sigma_turn=np.maximum(TURN_RAD_S * readout, 1e-9))
-        part = within(keep, "turns")
+        part = keep.within("turns")
         state = adjust(problem, state, iterations=15, tolerance=1e-3, damping=1e-6, keep=part).state
     for again in range(2):
         scale = robust_scale(problem, state)
         problem = replace(problem, sigma_px=problem.sigma_px * scale)
         noise = observed_noise(problem.with_loss(2.0), state, setup.size[setup.members])
         problem = believed(problem.with_loss(2.0), noise)
-        part = within(keep, str(again))
+        part = keep.within(str(again))
         state = adjust(problem, state, iterations=15, tolerance=3e-4, damping=1e-6, keep=part).state
-    return _standing(problem, state, within(keep, "still")) if rolls else (problem, state)
+    return _standing(problem, state, keep.within("still")) if rolls else (problem, state)
 
 
 def plain(problem: Problem, state: State, keep: Keep) -> tuple[Problem, State]:
@@ -124,7 +124,7 @@ def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]
 
 
 def believe_positions(
-    problem: Problem, state: State, setup: Setup, keep: Keep = made_now
+    problem: Problem, state: State, setup: Setup, keep: Keep = MADE_NOW
 ) -> tuple[Problem, State]:
     """Positions believed as far as the photos confirm them.
 
@@ -151,7 +151,7 @@ def believe_positions(
         problem = replace(problem, sigma_C=sigma)
         if alike:
             break
-        narrow, part = problem.with_loss(2.0), within(keep, str(again))
+        narrow, part = problem.with_loss(2.0), keep.within(str(again))
         state = adjust(narrow, state, iterations=10, tolerance=1e-4, keep=part).state
         misfit = np.abs(state.C - problem.C0) / problem.sigma_C
         for block in setup.block_rows:

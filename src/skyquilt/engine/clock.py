@@ -79,6 +79,7 @@ class Clock:
         stores nothing.
         """
         begun, hits, misses = self.now(), self.store.hits, self.store.misses
+        handed = self.workers.handed
         yield StageStarted(stage=name, total=0)
         try:
             while True:
@@ -100,7 +101,10 @@ class Clock:
             stage=name,
             seconds=self.seconds[name],
             cpu_seconds=round(cpu_seconds() - begun[1], 3),
-            reused=keeps and self.store.misses == misses and self.store.hits > hits,
+            reused=keeps
+            and self.store.misses == misses
+            and self.store.hits > hits
+            and self.workers.handed == handed,
         )
         return result
 

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import BytesIO
 from pathlib import Path, PurePath
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from skyquilt.engine.folder import refusal
 from skyquilt.errors import SkyquiltError, UsageError
@@ -130,6 +130,8 @@ def _address_in(file: Path) -> str:
 class Cluster:
     """Workers of a Dask scheduler, as `engine.workers.Workers`."""
 
+    apart: ClassVar[bool] = True
+
     def __init__(self, client: Any, name: str, folder: Path, sees: Sequence[Path]) -> None:
         self._client, self._name, self._folder = client, name, folder
         self._sees = [str(p.absolute()) for p in sees]
@@ -137,6 +139,9 @@ class Cluster:
         self._workers: set[str] = set()
         self._threads = 1
         self._since = time.monotonic()
+        self._step: tuple[Any, Path] | None = None
+        self.handed = 0
+        """Number of tasks so far."""
 
     def check(self) -> None:
         """Waits for the first worker, and asks those that are there whether they can take part.
@@ -168,12 +173,11 @@ class Cluster:
             SkyquiltError: the scheduler is gone, no worker is left, or a task ends every worker
                 that takes it.
         """
-        path: Path | None = None
         waiting: deque[Any] = deque()
         name = f"{getattr(work, '__name__', type(work).__name__)}-{uuid.uuid4().hex[:8]}"
         try:
             for number, item in enumerate(items):
-                path = path or self._written(work)
+                path, self.handed = self._file_of(work), self.handed + 1
                 waiting.append(
                     self._client.submit(_do, str(path), item, key=f"{name}-{number}", pure=False)
                 )
@@ -184,8 +188,6 @@ class Cluster:
         finally:
             with suppress(Exception):  # the scheduler may be gone
                 self._client.cancel(list(waiting))
-            if path is not None:
-                path.unlink(missing_ok=True)
 
     def news(self) -> Sequence[Note]:
         """Workers that came or went since the last call."""
@@ -194,8 +196,21 @@ class Cluster:
 
     def close(self) -> None:
         """Removes the folder of the steps."""
+        self._forget()
         with suppress(OSError):
             self._folder.rmdir()
+
+    def _file_of(self, work: Any) -> Path:
+        """The file of a step; what was written for the same work before, since workers know it."""
+        if self._step is None or self._step[0] is not work:
+            self._forget()
+            self._step = work, self._written(work)
+        return self._step[1]
+
+    def _forget(self) -> None:
+        if self._step is not None:
+            self._step[1].unlink(missing_ok=True)
+            self._step = None
 
     def _written(self, work: Any) -> Path:
         """The file of a step.
@@ -218,8 +233,7 @@ class Cluster:
     def _result(self, future: Any) -> Any:
         while True:
             try:
-                distributed.wait(future, timeout=POLL_S)
-                return future.result()
+                return future.result(timeout=POLL_S)
             except (TimeoutError, distributed.TimeoutError):
                 if future.status == "error":  # the work's own
                     raise

@@ -1,30 +1,46 @@
-"""Parts of a long step that an interrupted run need not repeat."""
+"""Parts of a long step: kept, so that an interrupted run need not repeat them, and shared out."""
 
 from collections.abc import Callable
-from typing import Protocol, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+from skyquilt.engine.workers import HERE, Workers
 
 T = TypeVar("T")
+Held = Callable[[str, Callable[[], Any]], Any]
+"""Gives what is kept under a name, else what the function makes, which is then kept."""
 
 
-class Keep(Protocol):
-    """Gives a part of a result by its name: the one kept of an interrupted run, or made now."""
+@dataclass(frozen=True, kw_only=True)
+class Keep:
+    """Gives the parts of a step by name: those kept of an interrupted run, or made now."""
+
+    held: Held | None = None
+    """Keeps them; None = nothing is kept."""
+    workers: Workers = HERE
+    """Make parts that do not depend on one another."""
+    prefix: str = ""
+    """Begins the names of all parts."""
 
     def __call__(self, part: str, make: Callable[[], T], /) -> T:
         """The part; `make` computes it."""
-        ...
+        if self.held is None:
+            return make()
+        found: T = self.held(self.prefix + part, make)
+        return found
+
+    def within(self, name: str) -> "Keep":
+        """Gives the parts of a part."""
+        return replace(self, prefix=f"{self.prefix}{name} ")
+
+    def __reduce__(self) -> tuple[Callable[..., "Keep"], tuple[Held | None, str]]:
+        return _elsewhere, (self.held, self.prefix)
 
 
-def made_now(_: str, make: Callable[[], T], /) -> T:
-    """Keeps nothing."""
-    return make()
+def _elsewhere(held: Held | None, prefix: str) -> Keep:
+    """In another process, which is one of the workers: it asks no others."""
+    return Keep(held=held, prefix=prefix)
 
 
-def within(keep: Keep, name: str) -> Keep:
-    """Keeps parts of a part."""
-    if keep is made_now:
-        return keep
-
-    def inner(part: str, make: Callable[[], T], /) -> T:
-        return keep(f"{name} {part}", make)
-
-    return inner
+MADE_NOW = Keep()
+"""Keeps nothing."""

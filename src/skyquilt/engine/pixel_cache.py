@@ -9,9 +9,8 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from skyquilt.engine.memory_watch import resident_bytes
+from skyquilt.settings import USUAL_GB
 
-USUAL_GB = 1.2
-"""Memory allowed by default."""
 LEAST_BYTES = 150_000_000
 """Bytes of decoded photos that are kept whatever else is in memory."""
 

@@ -19,6 +19,7 @@ from skyquilt.engine.codec import Registry, decode, encode
 from skyquilt.engine.constants import constants_of
 from skyquilt.engine.folder import refusal
 from skyquilt.engine.kept import Keep
+from skyquilt.engine.workers import HERE, Workers
 
 T = TypeVar("T")
 
@@ -150,13 +151,13 @@ class Store:
             self.put(stage, key, value)
         return value
 
-    def parts(self, stage: str, key: str) -> Keep:
-        """Keeps the parts of a result that has this key."""
+    def parts(self, stage: str, key: str, workers: Workers = HERE) -> Keep:
+        """Keeps the parts of a result that has this key; `workers` make them."""
 
-        def keep(part: str, make: Callable[[], T], /) -> T:
+        def held(part: str, make: Callable[[], T], /) -> T:
             return self.get_or(stage, digest(key, part), make)
 
-        return keep
+        return Keep(held=held, workers=workers)
 
     def forget(self, stages: Sequence[str]) -> None:
         """Removes all results of these stages."""

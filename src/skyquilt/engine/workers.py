@@ -6,7 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import ClassVar, Protocol, TypeVar
 
 from skyquilt.model.event import Note
 from skyquilt.settings import RunningSettings
@@ -17,6 +17,16 @@ B = TypeVar("B")
 
 class Workers(Protocol):
     """Compute the parts of a step; the results come in order, whoever computed them."""
+
+    @property
+    def apart(self) -> bool:
+        """Whether each has a Python of its own: then work that is mostly Python gains, too."""
+        ...
+
+    @property
+    def handed(self) -> int:
+        """Number of items given to other processes so far."""
+        ...
 
     def each(self, work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
         """work(item) for each item, in order, computing at most a few results ahead of the
@@ -42,6 +52,8 @@ class Threads:
 
     number: int = 1
     """How many; 1 = none but the caller's."""
+    apart: ClassVar[bool] = False
+    handed: ClassVar[int] = 0
 
     def each(self, work: Callable[[A], B], items: Iterable[A]) -> Iterator[B]:
         """work(item) for each item, in order."""

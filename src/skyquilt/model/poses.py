@@ -1,5 +1,6 @@
 """Where photos are: the map frame, poses, and the result of an alignment."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -125,6 +126,12 @@ class TiePoints:
     """(N, 2) observed pixel."""
     residual_px: Array
     """(N, 2) projected minus observed."""
+
+    def of_photos(self, photos: Sequence[int]) -> dict[int, NDArray[np.int64]]:
+        """The observations of each of these photos, as indices in ascending order."""
+        order = np.argsort(self.photo, kind="stable")
+        cuts = np.searchsorted(self.photo[order], [[i, i + 1] for i in photos]).reshape(-1, 2)
+        return {i: order[a:b] for i, (a, b) in zip(photos, cuts.tolist(), strict=True)}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -44,17 +44,11 @@ class SurfaceFromPictures(Protocol):
     """Heights refined by image matching."""
 
     def __call__(
-        self,
-        surface: Surface,
-        views: Sequence[View],
-        grid: Grid,
-        grey: GreyPicture,
-        keep: Keep,
-        workers: Workers,
-        /,
+        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep, /
     ) -> Surface:
         """The surface with refined heights where images determine them; `keep`: for methods that
-        resume at a part of their result, `workers`: for those that are made of parts.
+        resume at a part of their result, and its workers for parts that do not depend
+        on one another.
         """
         ...
 
@@ -127,11 +121,11 @@ def find_ground(
             limits_for,
         )
 
-        keep = store.parts("surface", refined)
+        keep = store.parts("surface", refined, workers)
         surface = store.get_or(
             "surface",
             refined,
-            lambda: sweep(known, [v for v in views if v.photo in held], grid, grey, keep, workers),
+            lambda: sweep(known, [v for v in views if v.photo in held], grid, grey, keep),
         )
         views = tuple(make_views(alignment, surface, limits))
     yield 1, 1

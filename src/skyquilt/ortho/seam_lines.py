@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.engine.kept import Keep, made_now
+from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.engine.pixel_cache import PixelCache
-from skyquilt.engine.workers import HERE, Workers
+from skyquilt.engine.workers import Workers
 from skyquilt.imaging.nodes import STEP, View, densify, overlapping, project_all
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface, least_cell
@@ -91,11 +91,10 @@ class SeamLines:
         grid: Grid,
         grey: GreyPicture,
         exposure: Exposure,
-        keep: Keep = made_now,
-        workers: Workers = HERE,
+        keep: Keep = MADE_NOW,
     ) -> Labels:
-        """The photo of each cell of a map's grid; `keep`: each tile is a part. `workers` compare
-        the photos of a tile.
+        """The photo of each cell of a map's grid; `keep`: each tile is a part; its workers compare
+        the photos.
         """
         factor = CELL
         while factor * grid.gsd < LEAST_M or factor < least_cell(grid):
@@ -112,6 +111,10 @@ class SeamLines:
             exposure=exposure,
             longest=self.longest,
         )
+
+        def compared(box: tuple[int, int, int, int]) -> _Part | None:
+            return self._part(scene, *box)
+
         photo = np.full(z.shape, -1, np.int32)
         hidden = np.zeros(z.shape, np.bool_)
         for row in range(0, cells.height, TILE):
@@ -120,17 +123,22 @@ class SeamLines:
                 at = (slice(row, row + h), slice(column, column + w))
                 photo[at], hidden[at] = keep(
                     f"{row} {column}",
-                    lambda: self._tile(scene, photo, row, column, workers),  # noqa: B023 - called at once
+                    lambda: self._tile(compared, photo, row, column, keep.workers),  # noqa: B023 - called at once
                 )
         return Labels(
             cells=cells, factor=factor, photo=photo, hidden=hidden, tall=over > STANDING_M
         )
 
     def _tile(
-        self, scene: "_Scene", photo: NDArray[np.int32], row: int, column: int, workers: Workers
+        self,
+        compared: Callable[[tuple[int, int, int, int]], _Part | None],
+        photo: NDArray[np.int32],
+        row: int,
+        column: int,
+        workers: Workers,
     ) -> tuple[NDArray[np.int32], Mask]:
-        """The labels (h, w) of a tile, and whether even that photo does not see the place; tiles
-        above and to the left are finished.
+        """The labels (h, w) of a tile from its `compared` parts, and whether even that photo does
+        not see the place; tiles above and to the left are finished.
         """
         h, w = min(TILE, photo.shape[0] - row), min(TILE, photo.shape[1] - column)
         top, left = min(row, 1), min(column, 1)
@@ -139,17 +147,14 @@ class SeamLines:
         height = np.zeros(ranked.shape[1:], np.uint8)
         hidden = np.zeros((h, w), np.bool_)
         boxes = [
-            (r, c, min(PART, h - r), min(PART, w - c))
+            (row + r, column + c, min(PART, h - r), min(PART, w - c))
             for r in range(0, h, PART)
             for c in range(0, w, PART)
         ]
-
-        def compared(box: tuple[int, int, int, int]) -> _Part | None:
-            return self._part(scene, row + box[0], column + box[1], *box[2:])
-
-        for (r, c, rows, columns), part in zip(boxes, workers.each(compared, boxes), strict=True):
+        for box, part in zip(boxes, workers.each(compared, boxes), strict=True):
             if part is None:
                 continue
+            r, c, (rows, columns) = box[0] - row, box[1] - column, box[2:]
             at = (slice(top + r, top + r + rows), slice(left + c, left + c + columns))
             ranked[:, *at], sure[at], height[at] = part.ranked, part.sure, part.height
             hidden[r : r + rows, c : c + columns] = part.hidden

@@ -98,16 +98,10 @@ class Stereo:
     version: ClassVar[int] = 2
 
     def __call__(
-        self,
-        surface: Surface,
-        views: Sequence[View],
-        grid: Grid,
-        grey: GreyPicture,
-        keep: Keep,
-        workers: Workers,
+        self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep
     ) -> Surface:
         """The surface with the heights found; the former one where the photos give none. `keep`:
-        each tile is a part; `workers` match the pairs.
+        each tile is a part; its workers match the pairs.
         """
         views = [v for v in views if v.pose.cam_H_map is None]
         height = float(np.median([v.pose.map_C[2] for v in views] or [0.0]) - np.median(surface.z))
@@ -115,7 +109,7 @@ class Stereo:
             return surface
         cameras = [v.camera for v in views]
         extent = height * float(np.median([max(c.width, c.height) / c.focal for c in cameras]))
-        rough, support = self._coarse(surface, views, grid, grey, keep, workers, height, extent)
+        rough, support = self._coarse(surface, views, grid, grey, keep, height, extent)
         if not support.any():
             return surface
         least = self.relief * height
@@ -132,7 +126,7 @@ class Stereo:
             grey=grey,
             agree=0.015 * height,
         )
-        z = _fused(given, pairs, "fine", keep, workers)
+        z = _fused(given, pairs, "fine", keep)
         known = without_specks(z, 0.01 * height, 6)
         refined = nearest_known(z, known) if known.any() else z
         del z, given  # large surveys have rasters of 100 MB
@@ -152,7 +146,6 @@ class Stereo:
         grid: Grid,
         grey: GreyPicture,
         keep: Keep,
-        workers: Workers,
         height: float,
         extent: float,
     ) -> tuple[Surface, Mask]:
@@ -171,7 +164,7 @@ class Stereo:
             for a, b in self.pairs(views, height, self.coarse.wanted)
             if (p := _over(a, b, surface, gsd)) is not None
         ]
-        z = _fused(given, pairs, "coarse", keep, workers)
+        z = _fused(given, pairs, "coarse", keep)
         known = without_specks(z, 0.02 * height, 12)
         if not known.any():
             return surface, known
@@ -243,13 +236,15 @@ class Stereo:
         return chosen
 
 
-def _fused(
-    given: _Round, pairs: Sequence[tuple[Pair, Level]], name: str, keep: Keep, workers: Workers
-) -> Float:
+def _fused(given: _Round, pairs: Sequence[tuple[Pair, Level]], name: str, keep: Keep) -> Float:
     """Heights (rows, columns) of the cells, row 0 in the north, NaN where no pair gives one."""
     cells = given.cells
     out = np.full((cells.height, cells.width), np.nan, np.float32)
     held: dict[int, Cells] = {}
+
+    def matched(which: tuple[Pair, Level]) -> Cells:
+        return splatted(_points(*which, given), which[0].origin, cells)
+
     for row in range(0, cells.height, TILE):
         for column in range(0, cells.width, TILE):
             part = replace(
@@ -264,7 +259,7 @@ def _fused(
             at = (row, column, part.height, part.width)
             out[inner] = keep(
                 f"{name} {row} {column}",
-                lambda: _tile(pairs, near, held, given, at, workers),  # noqa: B023 - called at once
+                lambda: _tile(pairs, near, held, given, at, matched, keep.workers),  # noqa: B023 - called at once
             )
     return out
 
@@ -275,18 +270,15 @@ def _tile(
     held: dict[int, Cells],
     given: _Round,
     at: tuple[int, int, int, int],
+    matched: Callable[[tuple[Pair, Level]], Cells],
     workers: Workers,
 ) -> Float:
     """Heights (h, w) of the cells `at` (row, column, h, w) from the pairs that may see them.
-    `held`: heights of the pairs of the part before.
+    `held`: heights of the pairs of the part before; `matched` gives those of a pair.
     """
     for k in [k for k in held if k not in near]:
         del held[k]
     todo = [k for k in near if k not in held]
-
-    def matched(which: tuple[Pair, Level]) -> Cells:
-        return splatted(_points(*which, given), which[0].origin, given.cells)
-
     for k, heights in zip(todo, workers.each(matched, [pairs[k] for k in todo]), strict=True):
         held[k] = heights
     inside = (_inside(held[k], given.cells.width, *at) for k in near)

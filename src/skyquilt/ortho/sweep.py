@@ -53,10 +53,9 @@ class Sweep:
         grid: Grid,
         grey: GreyPicture,
         keep: object = None,
-        workers: object = None,
     ) -> Surface:
-        """The surface with the heights found; unchanged where the images do not agree. `keep` and
-        `workers` are not used: a sweep is made in one go.
+        """The surface with the heights found; unchanged where the images do not agree. `keep` is
+        not used: a sweep is made in one go.
         """
         height = float(np.median([v.pose.map_C[2] for v in views]) - np.median(surface.z))
         if len(views) < 2 or height <= 0:

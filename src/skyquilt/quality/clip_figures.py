@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from skyquilt.model.clip import ChosenFrame, ChosenFrames
+from skyquilt.quality.placement import finite
 
 
 def clip_figures(clips: Sequence[ChosenFrames]) -> dict[str, Any]:
@@ -25,7 +26,7 @@ def _clip(clip: ChosenFrames) -> dict[str, Any]:
         "overlap_wanted": clip.overlap,
         "overlap_median": round(float(np.median(overlaps)), 4) if overlaps else None,
         "clock_offset_s": round(clip.offset_s, 3),
-        "clock_offset_sigma_s": _rounded(clip.offset_sigma_s),
+        "clock_offset_sigma_s": finite(clip.offset_sigma_s),
         "clock_offset_source": clip.offset_source,
         "focal_prior_px": round(clip.focal.px, 1),
         "focal_prior_sigma_px": round(clip.focal.sigma_px, 1),
@@ -41,11 +42,7 @@ def _frame(clip: ChosenFrames, frame: ChosenFrame) -> dict[str, Any]:
     return {
         "name": clip.name(frame),
         "time_s": round(frame.time_s, 4),
-        "overlap": _rounded(frame.overlap),
+        "overlap": finite(frame.overlap),
         "sharpness": round(frame.sharp, 3),
         "why": frame.reason,
     }
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None or not np.isfinite(value) else round(value, 4)

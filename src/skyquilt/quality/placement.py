@@ -58,9 +58,9 @@ def placement_quality(
     off = off / (ground.native_gsd * wide)
     figures |= _joins(alignment) | {
         "photos": [photos[i].name for i in order],
-        "correlation_with_last_of_photo": [_short(c) for c in seen.with_last],
-        "correlation_with_map_of_photo": [_short(c) for c in seen.with_overview],
-        "off_position_over_width": [_short(o) for o in off],
+        "correlation_with_last_of_photo": [finite(c) for c in seen.with_last],
+        "correlation_with_map_of_photo": [finite(c) for c in seen.with_overview],
+        "off_position_over_width": [finite(o) for o in off],
     }
     yield 1, 1
     return figures
@@ -86,7 +86,7 @@ def _figures(
     corr = lambda_corr(seen.with_overview)
     out: dict[str, Any] = {
         "alpha": alpha,
-        "lambda_corr": _short(corr),
+        "lambda_corr": finite(corr),
         "lambda_spat": None,
         "lambda_spat_of_table": None,
         "lambda": None,
@@ -102,7 +102,7 @@ def _figures(
         there = [e for e in ends if e is not None]
         metres = float(np.linalg.norm((there[0] - there[1])[:2])) if len(there) == 2 else None
         rows.append(
-            {"a": distance.a, "b": distance.b, "metres": distance.metres, "on_map": _short(metres)}
+            {"a": distance.a, "b": distance.b, "metres": distance.metres, "on_map": finite(metres)}
         )
         if metres is not None:
             actual.append(distance.metres)
@@ -110,9 +110,9 @@ def _figures(
     if actual:
         spat = lambda_spat(actual, found)
         out |= {
-            "lambda_spat": _short(spat),
-            "lambda_spat_of_table": _short(lambda_spat_of_table(actual, found)),
-            "lambda": _short(lambda_quality(spat, corr, alpha=alpha)),
+            "lambda_spat": finite(spat),
+            "lambda_spat_of_table": finite(lambda_spat_of_table(actual, found)),
+            "lambda": finite(lambda_quality(spat, corr, alpha=alpha)),
         }
     return out | ({"distances": rows} if rows else {})
 
@@ -151,8 +151,8 @@ def _geolocation(
     )
     axes = ("x", "y", "z")
     return {
-        "geolocation_mae_m": {a: _short(v) for a, v in zip(axes, errors.mae_m, strict=True)},
-        "geolocation_rms_m": {a: _short(v) for a, v in zip(axes, errors.rms_m, strict=True)},
+        "geolocation_mae_m": {a: finite(v) for a, v in zip(axes, errors.mae_m, strict=True)},
+        "geolocation_rms_m": {a: finite(v) for a, v in zip(axes, errors.rms_m, strict=True)},
     }
 
 
@@ -166,16 +166,17 @@ def _joins(alignment: Alignment) -> dict[str, Any]:
         return {}
     return {
         "ste_per_inlier_px2": {
-            "median": _short(float(np.median(ste))),
-            "worst": _short(float(ste.max())),
+            "median": finite(float(np.median(ste))),
+            "worst": finite(float(ste.max())),
         }
     }
 
 
 def _mean(values: NDArray[np.float64]) -> float | None:
     known = values[np.isfinite(values)]
-    return _short(float(known.mean())) if len(known) else None
+    return finite(float(known.mean())) if len(known) else None
 
 
-def _short(value: float | None) -> float | None:
+def finite(value: float | None) -> float | None:
+    """A figure with four digits for a JSON file; None where there is none."""
     return None if value is None or not np.isfinite(value) else round(value, 4)

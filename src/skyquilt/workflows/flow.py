@@ -16,7 +16,7 @@ from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.free_memory import give_back
-from skyquilt.engine.pixel_cache import USUAL_GB, PixelCache, pixel_budget, resident_budget
+from skyquilt.engine.pixel_cache import PixelCache, pixel_budget, resident_budget
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
 from skyquilt.model.event import Event, Note
@@ -28,7 +28,7 @@ from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.radiometry import balanced
-from skyquilt.settings import MosaicSettings
+from skyquilt.settings import USUAL_GB, MosaicSettings
 from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.links import Links, link_photos
 from skyquilt.workflows.methods import Methods
@@ -165,11 +165,10 @@ def align_photos(
         control=given.control,
         order=_order(found.photos, given.rank),
         grey=grey,
-        workers=workers,
     )
     if links.links:
         yield from memory_notes(len(found.photos), settings.running.memory_gb)
-    alignment = yield from clock.stage("align", _align(known, methods, store))
+    alignment = yield from clock.stage("align", _align(known, methods, clock))
     yield from (Note(text=n, warning=True) for n in alignment.notes)
     return AlignedPhotos(
         given=given,
@@ -246,6 +245,7 @@ def draw_map(
                 settings.picture,
             )
         ),
+        keeps=False,
     )
     labels = yield from clock.stage(
         "seams", _at_once(lambda: _labels(aligned, on, exposure, methods, clock))
@@ -296,13 +296,11 @@ def _labels(
         picture_recipe(),
         [p.digest for p in aligned.photos],
     )
-    keep = clock.store.parts("seams", key)
+    keep = clock.store.parts("seams", key, clock.workers)
     return clock.store.get_or(
         "seams",
         key,
-        lambda: methods.seams(
-            on.views, on.surface, on.grid, aligned.grey, exposure, keep, clock.workers
-        ),
+        lambda: methods.seams(on.views, on.surface, on.grid, aligned.grey, exposure, keep),
     )
 
 
@@ -353,10 +351,10 @@ def alignment_key(known: AlignmentInputs, methods: Methods) -> str:
     )
 
 
-def _align(known: AlignmentInputs, methods: Methods, store: Store) -> Steps[Alignment]:
+def _align(known: AlignmentInputs, methods: Methods, clock: Clock) -> Steps[Alignment]:
     yield 0, 1
-    key = alignment_key(known, methods)
-    resumable = replace(known, keep=store.parts(ADJUSTING, key))
+    store, key = clock.store, alignment_key(known, methods)
+    resumable = replace(known, keep=store.parts(ADJUSTING, key, clock.workers))
     alignment = store.get_or("alignment", key, lambda: methods.align(resumable))
     store.forget([ADJUSTING])
     yield 1, 1

@@ -19,7 +19,6 @@ from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.inputs import Aligner
 from skyquilt.alignment.pose import ByPosition
 from skyquilt.engine.kept import Keep
-from skyquilt.engine.workers import Workers
 from skyquilt.imaging.nodes import View
 from skyquilt.matching.candidates import Nearest, Pair, Retrieval
 from skyquilt.matching.matchers import Guided
@@ -111,11 +110,11 @@ class SeamMethod(Protocol):
         grey: GreyPicture,
         exposure: Exposure,
         keep: Keep,
-        workers: Workers,
         /,
     ) -> Labels:
         """The photo of each cell of a map's grid, from grey images of the photos; `keep`: for
-        methods that resume at a part of their result, `workers`: for those that are made of parts.
+        methods that resume at a part of their result, and its workers for parts that do not
+        depend on one another.
         """
         ...
 

@@ -195,10 +195,8 @@ def _shots(aligned: AlignedPhotos, ground: Ground) -> list[Shot]:
     outline = {v.photo: v.footprint for v in ground.views}
     block = {i: k for k, b in enumerate(alignment.blocks) for i in b}
     held = set(alignment.held)
-    order = np.argsort(alignment.ties.photo, kind="stable")
-    error = np.linalg.norm(alignment.ties.residual_px, axis=1)[order]
-    cuts = np.searchsorted(alignment.ties.photo[order], np.arange(len(aligned.photos) + 1)).tolist()
-    tied = {i: error[cuts[i] : cuts[i + 1]] for i in alignment.poses}
+    error = np.linalg.norm(alignment.ties.residual_px, axis=1)
+    tied = alignment.ties.of_photos(sorted(alignment.poses))
     return [
         Shot(
             name=aligned.photos[i].name,
@@ -207,7 +205,7 @@ def _shots(aligned: AlignedPhotos, ground: Ground) -> list[Shot]:
             block=block.get(i, 0),
             method=alignment.method if i in held else "pose",
             footprint=outline.get(i, np.zeros((0, 2))),
-            **_shot_figures(aligned, ground, i, tied[i]),
+            **_shot_figures(aligned, ground, i, error[tied[i]]),
         )
         for i, pose in sorted(alignment.poses.items())
     ]
