@@ -109,3 +109,27 @@ def test_a_digest_tells_keys_sets_and_bytes_by_value():
 
 def test_a_function_is_known_by_its_name_and_constants():
     assert digest(digest) == digest(digest) != digest(pytest.raises)
+
+
+def test_what_a_killed_process_left_is_removed(store):
+    store.put("stage", "key", [1])
+    left = store.folder / "stage" / "key.elsewhere-77.partial"
+    left.write_bytes(b"torn")
+    store.tidy()
+    assert not left.exists() and store.get("stage", "key") == [1]
+
+
+def test_two_processes_may_make_the_same_result(store, monkeypatch):
+    """The other one finishes while this one writes."""
+    write, other = Path.write_bytes, Store(folder=store.folder, registry={})
+
+    def meanwhile(path, data):
+        monkeypatch.undo()
+        monkeypatch.setattr("os.getpid", lambda: 77)
+        other.put("stage", "key", [1])
+        return write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", meanwhile)
+    store.put("stage", "key", [1])
+    assert store.get("stage", "key") == [1]
+    assert not list(store.folder.rglob("*.partial"))

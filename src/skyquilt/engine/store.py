@@ -5,6 +5,8 @@ key.
 import dataclasses
 import hashlib
 import json
+import os
+import platform
 import shutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -133,7 +135,8 @@ class Store:
         """
         self.misses += 1
         path = self.folder / stage / f"{key}.npz"
-        partial = path.with_suffix(".partial")
+        # another process may make the same at the same time
+        partial = path.with_suffix(f".{platform.node()}-{os.getpid()}.partial")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             partial.write_bytes(encode(value))
@@ -158,6 +161,11 @@ class Store:
             return self.get_or(stage, digest(key, part), make)
 
         return Keep(held=held, workers=workers)
+
+    def tidy(self) -> None:
+        """Removes what processes that were killed left of results."""
+        for partial in self.folder.glob("*/*.partial"):
+            partial.unlink(missing_ok=True)
 
     def forget(self, stages: Sequence[str]) -> None:
         """Removes all results of these stages."""

@@ -91,6 +91,7 @@ class LiveMap:
         self.methods = methods_for(MosaicSettings(features=self.settings.features))
         registry = {c.__name__: c for c in (PhotoFeatures, features.Features, poses.Pose)}
         self.store = Store(folder=self.folder / STORE, registry=registry)
+        self.store.tidy()
         self.background = BackgroundAdjustment()
         self._room = TOGETHER
         self._failures = 0

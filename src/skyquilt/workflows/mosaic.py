@@ -171,6 +171,7 @@ def make_map(
     key = run_key(given, settings, methods)
     run = open_run(output, key, overwrite=overwrite, again=rerun_from is not None)
     store = Store(folder=run.store, registry=REGISTRY)
+    store.tidy()
     _forget(run, store, rerun_from)
     if run.done and (former := _figures(run.path / "metrics.json")):
         yield Note(text=f"{run.path} already contains this mosaic; nothing to do")
