@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from skyquilt import simulate as sim
+from skyquilt.alignment.conflicts import conflicts
 from skyquilt.engine.clock import Clock, result_of
 from skyquilt.engine.store import Store
 from skyquilt.model.camera import PARAMETERS
@@ -91,11 +92,21 @@ KINDS = {
         ),
         {"gcp": True, "shutter_readout_ms": 30.0},
     ),
-    "global": (
+    "plain": (
         FlightSettings(route=FAST, control=CONTROL, reporting=PLAIN),
-        {"gcp": True, "shutter_readout_ms": 30.0},
+        {"gcp": True, "shutter": "global"},
     ),
-    "plain": (FlightSettings(route=FAST, control=CONTROL, reporting=PLAIN), {"gcp": True}),
+    "global": (FlightSettings(route=FAST, control=CONTROL, reporting=PLAIN), {"gcp": True}),
+    "global-rolling": (
+        FlightSettings(route=FAST, control=CONTROL, reporting=PLAIN),
+        {"gcp": True, "shutter": "rolling"},
+    ),
+    "stops-plain": (
+        FlightSettings(
+            lens=ROLLING, route=replace(FAST, stops=True), control=CONTROL, reporting=PLAIN
+        ),
+        {"gcp": True, "shutter": "global"},
+    ),
 }
 """Name -> the flight, and the options of its map."""
 
@@ -143,7 +154,8 @@ def flown(kind: str, seed: int, work: Path) -> Path:
     settings = replace(
         settings, seed=seed, reporting=replace(settings.reporting, focal_error=error)
     )
-    folder = work / f"{kind}-{seed}"
+    name = next(k for k, (other, _) in KINDS.items() if other == KINDS[kind][0])  # flown once
+    folder = work / f"{name}-{seed}"
     if not (folder / "truth" / "truth.json").is_file():
         for _ in sim.simulate(settings, folder, overwrite=True):
             pass
@@ -168,8 +180,17 @@ def figures(kind: str, folder: Path, extra: dict[str, str]) -> dict[str, object]
         **_centres(aligned.photos, aligned.alignment, truth),
         **_lens(aligned.alignment, truth),
         **_points(aligned.alignment),
+        **_said(aligned),
         "reprojection_px": float(np.sqrt((aligned.alignment.ties.residual_px**2).sum(1).mean())),
     }
+
+
+def _said(aligned) -> dict[str, object]:
+    """Contradictions that the report names, and whether it warns that the focal length is open."""
+    found = conflicts(aligned.photos, aligned.priors, aligned.alignment)
+    kinds = sorted({c.field for c in found if c.field in ("focal", "lens", "principal_point")})
+    warned = any("does not determine the focal length" in n for n in aligned.alignment.notes)
+    return {"named": ",".join(kinds) or "-", "warned": warned}
 
 
 def _centres(photos, alignment, truth) -> dict[str, object]:
@@ -185,12 +206,17 @@ def _centres(photos, alignment, truth) -> dict[str, object]:
     if frame.vertical_datum == "takeoff":
         error[:, 2] += truth["vertical"]["takeoff_m"]
     rms = np.sqrt((error**2).mean(0))
+    stated = [p.sigma_m for _, p in sorted(alignment.poses.items())]
+    known = [e / s for e, s in zip(error, stated, strict=True) if s is not None]
+    over = np.array(known).reshape(-1, 3)
     return {
         "photos": len(error),
         "x_cm": float(100 * rms[0]),
         "y_cm": float(100 * rms[1]),
         "z_cm": float(100 * rms[2]),
         "z_mean_cm": float(100 * error[:, 2].mean()),
+        "xy/s": float(np.sqrt((over[:, :2] ** 2).mean())),
+        "z/s": float(np.sqrt((over[:, 2] ** 2).mean())),
     }
 
 
@@ -210,12 +236,17 @@ def _lens(alignment, truth) -> dict[str, object]:
 
 
 def _points(alignment) -> dict[str, object]:
-    """RMS errors of check points in cm."""
+    """RMS errors of check points in cm, and over their stated deviations."""
     error = np.array([c.error_m for c in alignment.control if c.check])
     if not len(error):
         return {}
     flat, up = np.sqrt((error[:, :2] ** 2).mean()), np.sqrt((error[:, 2] ** 2).mean())
-    return {"check_xy_cm": float(100 * flat), "check_z_cm": float(100 * up)}
+    over = np.array([c.error_m / c.sigma_m for c in alignment.control if c.sigma_m is not None])
+    return {
+        "check_xy_cm": float(100 * flat),
+        "check_z_cm": float(100 * up),
+        "checks/s": float(np.sqrt((over**2).mean())) if len(over) else float("nan"),
+    }
 
 
 if __name__ == "__main__":

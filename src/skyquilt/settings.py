@@ -52,6 +52,23 @@ def within(option: str, value: float | None, low: float, high: float) -> None:
         raise UsageError(f"{option} {value} lies outside {low} to {high}")
 
 
+def check_shutter(shutter: str | None, readout_ms: float | None) -> None:
+    """Refuses what cannot be said of a shutter (`--shutter`, `--shutter-readout`).
+
+    Raises:
+        UsageError: an unknown kind, an impossible time, or a global shutter with a readout.
+    """
+    if shutter is not None:
+        one_of("--shutter", shutter, SHUTTERS)
+    if readout_ms is not None and not 0 < readout_ms <= 1000:
+        raise UsageError(
+            f"--shutter-readout {readout_ms:g} is no readout of a camera, which takes more than 0"
+            " and at most 1000 ms; for a global shutter say --shutter global"
+        )
+    if shutter == "global" and readout_ms is not None:
+        raise UsageError("--shutter global has no readout; leave --shutter-readout out")
+
+
 def _check_scheduler(scheduler: str | None) -> None:
     """Refuses what is neither local:N, nor an address, nor a file.
 
@@ -114,17 +131,9 @@ class InputSettings:
         within("--max-mp", self.max_mp, 0.01, 10_000)
         if self.thermal_unit is not None:
             one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
-        if self.shutter is not None:
-            one_of("--shutter", self.shutter, SHUTTERS)
-        if self.shutter_readout_ms is not None and not 0 < self.shutter_readout_ms <= 1000:
-            raise UsageError(
-                f"--shutter-readout {self.shutter_readout_ms:g} is no readout of a camera, which"
-                " takes more than 0 and at most 1000 ms; for a global shutter say --shutter global"
-            )
+        check_shutter(self.shutter, self.shutter_readout_ms)
         within("--frame-overlap", self.frame_overlap, 30, 95)
         within("--clock-offset", self.clock_offset, -1e8, 1e8)
-        if self.shutter == "global" and self.shutter_readout_ms is not None:
-            raise UsageError("--shutter global has no readout; leave --shutter-readout out")
         for value in self.lever_arm or ():
             within("--lever-arm", value, -20, 20)
 

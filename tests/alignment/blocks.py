@@ -27,7 +27,9 @@ class Block:
 
 
 def seen_by(R, C, K, X):
-    """Pixels (n, 2) of points by the textbook formula, apart from the project's own."""
+    """Pixels (n, 2) of points by the textbook formula, apart from the project's own; NaN for those
+    behind, and beyond 45 degrees, where the polynomial folds back into the picture.
+    """
     local = (X - C) @ R.T
     x, y = local[:, 0] / local[:, 2], local[:, 1] / local[:, 2]
     r2 = x * x + y * y
@@ -35,7 +37,11 @@ def seen_by(R, C, K, X):
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
     xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    return np.where(local[:, 2:] > 1, np.stack([f * xd + cx, f * aspect * yd + cy], 1), np.nan)
+    return np.where(
+        (local[:, 2:] > 1) & (r2[:, None] < 1),
+        np.stack([f * xd + cx, f * aspect * yd + cy], 1),
+        np.nan,
+    )
 
 
 def ground(xy):

@@ -96,6 +96,27 @@ def test_tracks_are_the_connected_components(matches):
     assert set(found) == expected and len(found) == len(expected)
 
 
+def test_a_place_described_several_times_is_one_observation():
+    f = [features(4, k) for k in range(3)]
+    for photo in f[:2]:
+        photo.px[3] = photo.px[0]  # one place, two orientations
+    links = [link(0, 1, [(0, 0), (3, 3), (1, 1)]), link(1, 2, [(3, 2), (1, 0)])]
+    tracks = build_tracks(f, links)
+    found = {
+        frozenset(zip(tracks.photo[m].tolist(), map(tuple, tracks.px[m].tolist()), strict=True))
+        for m in (tracks.point == p for p in range(tracks.count))
+    }
+
+    def at(photo, k):
+        return photo, tuple(f[photo].px[k].tolist())
+
+    assert found == {
+        frozenset({at(0, 0), at(1, 0), at(2, 2)}),
+        frozenset({at(0, 1), at(1, 1), at(2, 0)}),
+    }
+    assert len(tracks.point) == 6
+
+
 def test_no_links_no_tracks():
     tracks = build_tracks([features(3)], [])
     assert tracks.count == 0 and len(tracks.px) == 0

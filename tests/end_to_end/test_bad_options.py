@@ -32,6 +32,12 @@ pytestmark = pytest.mark.filterwarnings(
         (("--max-view-angle", "91"), ("--max-view-angle 91", "outside 0 to 90")),
         (("--max-view-angle", "-1"), ("--max-view-angle -1", "outside 0 to 90")),
         (("--max-view-angle", "nan"), ("--max-view-angle nan", "outside 0 to 90")),
+        (("--shutter", "slow"), ("--shutter 'slow'", "global, rolling")),
+        (("--shutter-readout", "0"), ("--shutter-readout 0", "at most 1000 ms")),
+        (("--shutter-readout", "-30"), ("--shutter-readout -30", "more than 0")),
+        (("--shutter-readout", "10000"), ("--shutter-readout 10000", "at most 1000 ms")),
+        (("--shutter-readout", "nan"), ("--shutter-readout nan", "at most 1000 ms")),
+        (("--shutter", "global", "--shutter-readout", "30"), ("--shutter global has no readout",)),
         (("--vertical-datum", "moon"), ("--vertical-datum 'moon'", "ellipsoid, egm96, takeoff")),
         (("--lever-arm", "1,2"), ("--lever-arm", "right,forward,up")),
         (("--lever-arm", "1,2,99"), ("--lever-arm 99", "outside -20 to 20")),
@@ -81,6 +87,24 @@ pytestmark = pytest.mark.filterwarnings(
 def test_a_wrong_option(mosaic, flight, options, words):
     told = mosaic(flight / "photos", *options).refused(2, *words)
     assert not told.output.exists()
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"focal": "NaN"}, "'focal'"),
+        ({"focal": "-0.8"}, "no positive focal length"),
+        ({"k1": "1e308"}, "'k1' is 1e+308"),
+        ({"k1": "Infinity"}, "'k1'"),
+        ({"width": "400", "height": "400"}, "the photos are by"),
+    ],
+)
+def test_a_calibration_that_cannot_be(mosaic, flight, tmp_path, changed, words):
+    record = {"width": "1600", "height": "1200", "focal": "0.85"} | changed
+    body = ", ".join(f'"{name}": {value}' for name, value in record.items())
+    (tmp_path / "cameras.json").write_text(f'{{"all": {{{body}}}}}')
+    told = mosaic(flight / "photos", "--cameras", tmp_path / "cameras.json")
+    assert not told.refused(6, "cameras.json", words).output.exists()
 
 
 @pytest.mark.parametrize("words", [("--gsd", "wide"), ("--nonsense",), ("--jobs", "two"), ()])

@@ -1,5 +1,6 @@
 """The incremental story against simulated truth."""
 
+import re
 import shutil
 import sqlite3
 import time
@@ -10,6 +11,7 @@ import rasterio
 
 from skyquilt.errors import OutputError, UsageError
 from skyquilt.geometry.frames import angle_difference_deg, angles_from_cam_R_map
+from skyquilt.geometry.geoid import geoid_height
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.replay_flight import FlySettings, fly, order_of, preview_of
 from skyquilt.live.settings import LiveSettings
@@ -19,8 +21,9 @@ from skyquilt.photos.survey import read_survey
 from skyquilt.quality.replay import correlation
 from skyquilt.raster.map_source import TileSource
 from skyquilt.raster.tile_store import SIDE
-from tests.end_to_end.conftest import relabel
+from tests.end_to_end.conftest import relabel, taken_apart
 from tests.live.conftest import offsets
+from tests.photos.conftest import with_segment
 
 
 def mapped(folder, paths, **settings):
@@ -154,6 +157,56 @@ def test_other_settings_are_refused_on_the_same_folder(small):
 
     with pytest.raises(UsageError, match="features"):
         LiveMap(small.folder, LiveSettings(features=300))
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"shutter": "slow"}, "--shutter 'slow'"),
+        ({"shutter_readout_ms": 0}, "--shutter-readout 0"),
+        ({"shutter_readout_ms": -5}, "--shutter-readout -5"),
+        ({"shutter_readout_ms": 10_000}, "at most 1000 ms"),
+        ({"shutter_readout_ms": float("nan")}, "--shutter-readout nan"),
+        ({"shutter": "global", "shutter_readout_ms": 30}, "no readout"),
+        ({"vertical_datum": "moon"}, "--vertical-datum 'moon'"),
+        ({"max_view_angle": 91}, "--max-view-angle 91"),
+    ],
+)
+def test_settings_that_are_refused(asked, words):
+    with pytest.raises(UsageError, match=words):
+        LiveSettings(**asked)
+
+
+def test_shutter_and_zero_of_heights_are_those_asked_for(flight, tmp_path):
+    asked = LiveSettings(shutter_readout_ms=40, vertical_datum="ellipsoid")
+    live = LiveMap(tmp_path / "out", asked)
+    path = flight.photos[0]
+    live.add(path)
+    (member,) = live.members.by_id.values()
+    assert (member.photo.shutter.readout_s, member.photo.shutter.source) == (0.04, "option")
+    frame, place = live.members.frame, member.photo.position
+    assert frame.vertical_datum == "ellipsoid"
+    geoid = float(geoid_height(place.latitude_deg, place.longitude_deg))
+    assert abs(geoid) > 5
+    assert member.pose.map_C[2] == pytest.approx(place.sea_level_m + geoid, abs=0.01)
+    live.close()
+    with pytest.raises(UsageError, match="shutter_readout_ms"):
+        LiveMap(tmp_path / "out", LiveSettings(shutter_readout_ms=20))
+
+
+def test_a_datum_that_the_first_photo_does_not_allow_is_said(flight, tmp_path):
+    path = tmp_path / "photo.jpg"
+    _, packet, picture = taken_apart(flight.photos[0].read_bytes())
+    packet, changed = re.subn(r'drone-dji:AbsoluteAltitude="[^"]*"', "", packet)
+    assert changed  # without EXIF and this, only the height above take-off is left
+    segment = b"http://ns.adobe.com/xap/1.0/\x00" + packet.encode()
+    path.write_bytes(with_segment(picture, 0xE1, segment))
+    live = LiveMap(tmp_path / "out", LiveSettings(vertical_datum="ellipsoid"))
+    assert live.intake.take_file(path, "drone")
+    told = " ".join(update.text for update in live.drain())
+    assert "--vertical-datum ellipsoid needs heights" in told
+    assert live.members.frame.vertical_datum == "takeoff"
+    live.close()
 
 
 def test_without_repositioning_placed_photos_stay(flight, tmp_path):

@@ -1,15 +1,24 @@
 """One flow: a finished map gives its photos and its ground without computing anything again."""
 
+from dataclasses import replace
+from datetime import datetime
+
 import numpy as np
 import pytest
 
+from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.engine.clock import result_of
 from skyquilt.engine.store import Store
+from skyquilt.model.photo import Focal, Shutter
+from skyquilt.model.poses import MapFrame
 from skyquilt.settings import MosaicSettings
 from skyquilt.thermal import workflow as thermal
 from skyquilt.workflows import survey_input
+from skyquilt.workflows.flow import alignment_key
+from skyquilt.workflows.methods import methods_for
 from skyquilt.workflows.mosaic import make_map
 from skyquilt.workflows.survey_input import read_input
+from tests.alignment.surveys import photo
 
 QUICK = {"surface": "ties", "gsd_cm": 30.0, "jobs": 2}
 
@@ -48,3 +57,31 @@ def test_both_surveys_of_a_thermal_map_are_read_once(flight, tmp_path, monkeypat
     for _ in thermal.iter_thermal(photos, photos, tmp_path / "out", settings, route="positions"):
         pass
     assert folders == [photos, photos]  # here they are one folder: each role reads it once
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"shutter": Shutter(readout_s=0.03, sigma_s=0.001, source="option")},
+        {"velocity_ned": (3.0, 0.0, 0.0)},
+        {"time": datetime(2024, 5, 1, 12)},
+        {"focal": Focal(px=700.0, sigma_px=7.0, source="sensor")},
+    ],
+    ids=lambda changed: next(iter(changed)),
+)
+def test_an_alignment_is_made_anew_when_anything_that_enters_it_has_changed(changed):
+    def key(one):
+        inputs = AlignmentInputs(
+            photos=(one,),
+            features=(),
+            frame=MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="unknown", metric=False),
+            priors=(),
+            links=(),
+            control=(),
+            order=(0,),
+            grey=lambda *_: np.zeros((1, 1), np.uint8),
+        )
+        return alignment_key(inputs, methods_for(MosaicSettings()))
+
+    assert key(photo()) == key(photo())
+    assert key(photo()) != key(replace(photo(), **changed))

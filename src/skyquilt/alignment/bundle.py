@@ -54,7 +54,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 21
+    version: ClassVar[int] = 27
 
     def __call__(
         self,
@@ -169,6 +169,20 @@ def _sharpened(
     return replace(sharp, px=setup.file_px(sharp.photo, sharp.px))
 
 
+def _nowhere(start: Start) -> dict[int, str]:
+    """Photos of blocks whose place is not known: neither links with the largest block nor positions
+    tell it. Drawn anyway, they would lie across the map wherever their start put them.
+    """
+    first, *others = sorted(start.blocks, key=len, reverse=True)
+    lost = [b for b in others if not start.georeferenced.intersection(b)]
+    return {
+        i: f"it is linked with {len(block) - 1} other photos, but not with the {len(first)} of the"
+        " largest block, and without a position its place is not known"
+        for block in lost
+        for i in block
+    }
+
+
 def _outcome(
     photos: Sequence[Photo],
     frame: MapFrame,
@@ -184,6 +198,8 @@ def _outcome(
     ties = ground_points(tracks, setup, problem, state)
     seen = np.bincount(ties.photo, minlength=len(photos))
     weak = {int(i): f"it has only {seen[i]} tie points" for i in setup.members if seen[i] < 8}
+    if all(c.check for c in control):
+        weak |= _nowhere(start)
     full = covariance(problem, state)
     cameras, camera_of = camera_records(
         photos, setup, state, None if full is None else full.camera_sigmas

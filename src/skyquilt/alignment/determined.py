@@ -24,6 +24,12 @@ LEAST_COVERED = 0.04
 """Least share of the picture that such tie points cover; smaller groups of wrong matches agree by
 chance.
 """
+LEAST_UNTOLD = 0.08
+"""The same for photos that do not report their tilt: a small piece of level ground looks the same
+from two directions, and deviations say nothing of the other one.
+"""
+STATED_DEG = 5.0
+"""Tilts with a larger standard deviation than this are guesses, not reports."""
 AGAIN = 1.2
 """A photo is looked at again when it has this many times as many points as before."""
 GRID = np.stack(np.meshgrid(*2 * [np.linspace(0.02, 0.98, 5)]), -1).reshape(-1, 2)
@@ -119,20 +125,33 @@ class _Growth:
             ties.px[own],
             ties.residual_px[own],
             self.priors[photo],
+            least=least_covered(self.priors[photo]),
         )
 
 
+def least_covered(prior: Prior) -> float:
+    """Least share of a photo's picture that its tie points cover."""
+    return LEAST_COVERED if prior.sigma_tilt_deg <= STATED_DEG else LEAST_UNTOLD
+
+
 def why_weak(
-    pose: Pose, camera: Camera, xyz: Array, px: Array, residual_px: Array, prior: Prior | None
+    pose: Pose,
+    camera: Camera,
+    xyz: Array,
+    px: Array,
+    residual_px: Array,
+    prior: Prior | None,
+    *,
+    least: float,
 ) -> str:
-    """Why tie points (n, 3) observed at px (n, 2) do not determine a pose, alone or with metadata;
-    empty if they do.
+    """Why tie points (n, 3) observed at px (n, 2) do not determine a pose, alone or with metadata,
+    where they shall cover a share `least` of the picture; empty if they do.
     """
     if len(px) < FEWEST:
         return f"it has only {len(px)} tie points"
     wide, share = max(camera.width, camera.height), covered(px, camera)
     alone = deviation_px(pose, camera, xyz, residual_px, None)
-    if alone <= LOOSEST * wide and share >= LEAST_COVERED:
+    if alone <= LOOSEST * wide and share >= least:
         return ""
     if prior is not None and np.isfinite([*prior.map_C[:2], prior.yaw_deg]).all():
         told = deviation_px(pose, camera, xyz, residual_px, prior)
@@ -140,7 +159,7 @@ def why_weak(
             return ""
     return (
         f"it hangs on the other photos by too little: {len(px)} tie points in common cover"
-        f" {share:.1%} of its picture ({LEAST_COVERED:.0%} are needed) and leave its place"
+        f" {share:.1%} of its picture ({least:.0%} are needed) and leave its place"
         f" uncertain by {alone:.1f} px (at most {LOOSEST * wide:.1f})"
     )
 

@@ -4,10 +4,10 @@ Two figures describe the observations. The *variance factor*: how much larger th
 was assumed. The *design effect* (Kish 1965): how many observations with correlated errors tell as
 much as one independent one. Errors of neighbouring observations in a photo are correlated, since
 the model is incomplete in the same way for them (lens, air, leaves, relief within a patch).
-Residuals of neighbours show how strongly; over larger parts of a photo they do not, since its pose
-takes such errors up. On simulated flights, where errors are known, that correlation hardly falls
-with distance up to a third of a photo. So it is measured in small cells and taken to reach over a
-quarter.
+Residuals of neighbours show a part of that, which is measured in small cells. The other part is
+hidden: pose and lens take it up. On simulated flights, where errors are known, it amounts to some
+thousandths of a pixel and hardly falls with distance up to a third of a photo; it is what limits a
+focal length. Both are taken to reach over a quarter of a photo.
 """
 
 from dataclasses import dataclass, replace
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import Covariance
 from skyquilt.alignment.equations import observation_equations
+from skyquilt.alignment.least_squares_matching import LeastSquaresMatching
 from skyquilt.alignment.problem import CAMERA, Problem, State, residuals_px
 
 Array = NDArray[np.float64]
@@ -24,6 +25,13 @@ CELLS = 8
 """Cells of a photo along each side in which residuals of neighbours are compared."""
 REACH = 2
 """Parts of a photo along each side over which a correlation is taken to reach."""
+
+HIDDEN = 0.005
+"""Deviation of the error that all observations of a part of a photo have in common and that its
+pose takes up, in px of an image of `MATCHED` px, or of the photo if that is smaller.
+"""
+MATCHED = LeastSquaresMatching.longest
+"""Longest side in px of the images in which observations are refined."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,11 +64,12 @@ def observed_noise(problem: Problem, state: State, size: Array) -> Noise:
     spare = max(2 * len(e) - _unknowns(problem, state), 1)
     # the weights enter the normal equations; their variance and slope tell what these are worth
     variance = float((psi**2).sum()) / spare * float(w.mean()) / float((w**2).mean()) ** 2
-    near = _alike(problem, psi, size)
+    hidden = HIDDEN * np.maximum(size.max(1) / MATCHED, 1)[problem.photo] / problem.sigma_px
+    near = max(_alike(problem, psi, size), 0.0) + float((hidden**2).mean()) / variance
     part = _part(problem, size, REACH)
     crowd = np.bincount(part).astype(float)
     together = float((crowd**2).sum() / crowd.sum())  # in the part of an observation, on average
-    return Noise(variance=variance, design_effect=1 + max(near, 0.0) * (together - 1))
+    return Noise(variance=variance, design_effect=1 + min(near, 1.0) * (together - 1))
 
 
 def _unknowns(problem: Problem, state: State) -> int:

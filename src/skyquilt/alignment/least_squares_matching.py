@@ -30,6 +30,8 @@ PART = 25_000
 """Observations, about, whose patches are in memory at once (0.5 kB each). Tracks that the same
 photos show follow one another, so a part needs few photos.
 """
+OUTSIDE = 1e6
+"""Places in an image farther from its corner than this, in px, are as good as there."""
 BATCH = 4000
 """Number of observations registered at a time, to bound memory."""
 
@@ -157,7 +159,10 @@ class LeastSquaresMatching:
                 + gx[:, 1, None, None] * step
                 + gy[:, 1, None, None] * step[:, None]
             )
-            flat_u, flat_v = (m.reshape(len(own), -1).astype(np.float32) for m in (u, v))
+            flat_u, flat_v = (
+                np.clip(m, -OUTSIDE, OUTSIDE).reshape(len(own), -1).astype(np.float32)
+                for m in (u, v)
+            )
             for k in range(0, len(own), 30000):
                 part = slice(k, k + 30000)
                 warped = cv2.remap(

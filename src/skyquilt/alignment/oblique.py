@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.determined import weak_photos, why_weak, without
+from skyquilt.alignment.determined import STATED_DEG, least_covered, weak_photos, why_weak, without
 from skyquilt.alignment.pose import reported_camera
 from skyquilt.geometry.camera import project, undistort
 from skyquilt.geometry.frames import cam_R_map_from_angles
@@ -26,8 +26,6 @@ from skyquilt.model.poses import Alignment, Pose, Prior, TiePoints
 Array = NDArray[np.float64]
 OBLIQUE_DEG = 35.0
 """Photos tilted by more than this from the vertical are oblique."""
-STATED_DEG = 5.0
-"""Tilts with a larger standard deviation than this are guesses, not reports."""
 MOST_OBLIQUE = 0.4
 """With a larger share of oblique photos than this the survey itself is oblique, and they are not
 told apart.
@@ -93,7 +91,8 @@ def hung(
         counted = {i: _points_of(i, alignment, features, links) for i in sorted(left)}
         best = max(sorted(left), key=lambda i: len(counted[i][0]))
         left.remove(best)
-        alignment = _placed(alignment, best, photos[best], *counted[best], features[best].scale)
+        least, scale = least_covered(priors[best]), features[best].scale
+        alignment = _placed(alignment, best, photos[best], *counted[best], scale, least)
     return alignment
 
 
@@ -141,6 +140,7 @@ def _placed(
     point: NDArray[np.int64],
     px: Array,
     scale: float,
+    least: float,
 ) -> Alignment:
     """The alignment with one more photo, or with the reason why it is left out."""
     camera = alignment.cameras.get(about.camera_key, reported_camera(about))
@@ -153,7 +153,7 @@ def _placed(
         )
         return replace(alignment, rejected=alignment.rejected | {photo: why})
     error = project(camera, pose.to_camera(xyz)) - px
-    why = why_weak(pose, camera, xyz[good], px[good], error[good], None)
+    why = why_weak(pose, camera, xyz[good], px[good], error[good], None, least=least)
     if why:
         return replace(alignment, rejected=alignment.rejected | {photo: why})
     key = about.camera_key

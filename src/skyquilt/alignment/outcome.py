@@ -17,8 +17,10 @@ from skyquilt.model.poses import Accuracy, TiePoints
 Array = NDArray[np.float64]
 SAMPLED = 400
 """Ground points whose accuracy is predicted, about."""
-UNDETERMINED = 0.7
-"""A focal length whose deviation stays above this share of its prior's is not determined."""
+UNDETERMINED = 0.4
+"""A focal length whose deviation stays above this share of its prior's is not determined: what the
+metadata say of it counts for a sixth or more.
+"""
 
 
 def leave_one_out(
@@ -105,9 +107,9 @@ def undetermined(
         told = float(problem.sigma_K[row, 0] / state.K[row, 0])
         if problem.free[row, 0] and share > UNDETERMINED * told and share * height > 0.01:
             notes.append(
-                f"This flight does not determine the focal length of {key}: it stays as uncertain"
-                f" as its metadata ({100 * share:.1f} %), and heights of the ground with it"
-                f" ({share * height:.2g} m, one standard deviation); control points, oblique photos"
-                " or lines at two heights would."
+                f"This flight does not determine the focal length of {key}: it stays about as"
+                f" uncertain as its metadata ({100 * share:.1f} %), and heights of the ground with"
+                f" it ({share * height:.2g} m, one standard deviation); control points, oblique"
+                " photos or lines at two heights would."
             )
     return tuple(notes)

@@ -22,6 +22,11 @@ TURN_RAD_S = np.radians(1.5)
 DOUBTED = 2.5
 """Positions that a block misses by more than this many deviations are not what they claim."""
 
+CONFIRMED = 1.4
+"""A scatter of positions up to so many times what they state confirms it: the scatter of some
+twenty photos is itself known to a fifth.
+"""
+
 
 def rough(problem: Problem, state: State, keep: Keep = MADE_NOW) -> tuple[Problem, State]:
     """First stage: intrinsics fixed under a wide loss, then all free under a narrower one; outliers
@@ -89,14 +94,12 @@ def _standing(problem: Problem, state: State, keep: Keep) -> tuple[Problem, Stat
     """The adjustment as if cameras stood still while they expose, where that explains the photos
     better: drones that stop for each photo have positions and times as if they flew on.
     """
-    still = problem.velocity * 0.0
-    free = problem.free.copy()
-    free[:, READOUT] = False
-    other = replace(problem, velocity=still, free=free)
+    other = replace(problem, velocity=problem.velocity * 0.0)
     K = state.K.copy()
     K[:, READOUT] = problem.K0[:, READOUT]
     begin = replace(state, K=K, turn=np.zeros_like(state.turn))
-    stood = adjust(other, begin, iterations=10, tolerance=1e-3, damping=1e-6, keep=keep)
+    # as far as the other one was, or the two could not be compared
+    stood = adjust(other, begin, iterations=25, tolerance=1e-4, damping=1e-6, keep=keep)
     if stood.cost < robust_cost(problem, state):
         return other, stood.state
     return problem, state
@@ -126,7 +129,7 @@ def believe_positions(
     """Positions believed as far as the photos confirm them.
 
     The start gave them deviations as wide as their scatter about it, which is coarse. Here they get
-    those that they state, or their scatter between neighbours where that is larger. Only
+    those that they state, or their scatter between neighbours where that is clearly larger. Only
     differences from photo to photo count: a smooth misfit may be a deformation of the block, and
     positions with less weight would permit it. Where a block then still misses its positions by
     more than these deviations allow, they are not what they claim (a drifting barometer, a plain
@@ -140,12 +143,14 @@ def believe_positions(
         for block in setup.block_rows:
             for axes in (slice(0, 2), slice(2, 3)):
                 stated = setup.stated_sigma_C[block][:, axes]
-                wanted = np.maximum(stated, position_noise(error[block][:, axes]))
+                noise = position_noise(error[block][:, axes])
+                wanted = np.maximum(stated, noise if (noise > CONFIRMED * stated).any() else 0.0)
                 trusted = ~doubted[block][:, axes]
                 sigma[block, axes] = np.where(trusted, wanted, sigma[block, axes])
-        if np.allclose(sigma, problem.sigma_C, rtol=0.15, equal_nan=True):
-            break
+        alike = np.allclose(sigma, problem.sigma_C, rtol=0.15, equal_nan=True)
         problem = replace(problem, sigma_C=sigma)
+        if alike:
+            break
         narrow, part = problem.with_loss(2.0), keep.within(str(again))
         state = adjust(narrow, state, iterations=10, tolerance=1e-4, keep=part).state
         misfit = np.abs(state.C - problem.C0) / problem.sigma_C

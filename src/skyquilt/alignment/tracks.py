@@ -1,5 +1,6 @@
 """Tracks: the observations of one ground point in several photos; connected components."""
 
+import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -120,12 +121,14 @@ class Tracks:
 def build_tracks(
     features: Sequence[Features], links: Sequence[Link], *, sigma: float = 0.25
 ) -> Tracks:
-    """Joins matches to tracks. A track with two observations in one photo contains a wrong match
-    and is removed.
+    """Joins matches to tracks. A track with observations in two places of one photo contains a
+    wrong match and is removed.
+
+    Features at one place count as one: a detector describes a place several times where it has
+    several orientations. As observations of several points they would err alike.
 
     `sigma`: standard deviation of a keypoint in px of the image it was found in.
     """
-    offset = np.r_[0, np.cumsum([len(f) for f in features])]
     if not links:
         return Tracks(
             point=np.zeros(0, np.int64),
@@ -133,8 +136,9 @@ def build_tracks(
             px=np.zeros((0, 2)),
             sigma_px=np.zeros(0),
         )
-    a = np.concatenate([offset[k.a] + k.index_a for k in links])
-    b = np.concatenate([offset[k.b] + k.index_b for k in links])
+    offset, place = _places(features)
+    a = place[np.concatenate([offset[k.a] + k.index_a for k in links])]
+    b = place[np.concatenate([offset[k.b] + k.index_b for k in links])]
     total = int(offset[-1])
     label = connected(total, a, b)
     used = np.unique(np.concatenate([a, b]))
@@ -159,6 +163,20 @@ def build_tracks(
     )
 
 
+def _places(features: Sequence[Features]) -> tuple[Index, Index]:
+    """Where each photo's features begin in the list of all (photos + 1,), and for each feature the
+    first one at the same place.
+    """
+    parts, begin = [np.zeros(0, np.int64)], [0]
+    for photo in features:
+        _, first, which = np.unique(
+            photo.px[:, 0] + 1j * photo.px[:, 1], return_index=True, return_inverse=True
+        )
+        parts.append(begin[-1] + first[which])
+        begin.append(begin[-1] + len(photo))
+    return np.array(begin, np.int64), np.concatenate(parts)
+
+
 def _by_photos(track: Index, photo: Index) -> tuple[Index, Index]:
     """The order of observations in which tracks that the same photos show follow one another, and
     the number of each one's track: so neighbouring observations are of few photos.
@@ -180,16 +198,18 @@ def thin(
     sizes: Sequence[tuple[int, int]],
     *,
     per_photo: int,
-    cells: int = 8,
+    cells: int | None = None,
     least: int = 0,
 ) -> Tracks:
     """Selects tracks for an adjustment: long ones first, until every photo has `per_photo`
-    observations spread over its area.
+    observations spread over its area, one in each of as many cells (or in `cells` by `cells` of
+    them): neighbouring ones err alike.
 
     `sizes`: (width, height) of each photo. A photo that would be left with fewer than `least`,
     since its observations lie in few of the cells, keeps all of them.
     """
     length = np.bincount(tracks.point, minlength=tracks.count)
+    cells = cells or max(1, math.isqrt(per_photo))
     size = np.array(sizes)[tracks.photo]
     column, row = ((tracks.px + 0.5) / size * cells).astype(int).clip(0, cells - 1).T
     slot = (tracks.photo * cells + row) * cells + column

@@ -6,7 +6,18 @@ from typing import Annotated
 import typer
 
 from skyquilt.cli.interrupt import ends_at_once
-from skyquilt.cli.options import Features, Json, MaxMemory, MaxMp, MaxViewAngle, Quiet, ThermalUnit
+from skyquilt.cli.options import (
+    VERTICAL_DATUMS,
+    Features,
+    Json,
+    MaxMemory,
+    MaxMp,
+    MaxViewAngle,
+    Quiet,
+    Shutter,
+    ShutterReadout,
+    ThermalUnit,
+)
 from skyquilt.outside import MOST_MP
 
 Output = Annotated[
@@ -74,6 +85,11 @@ def command(
         ),
     ] = False,
     thermal_unit: ThermalUnit = None,
+    shutter: Shutter = None,
+    shutter_readout: ShutterReadout = None,
+    vertical_datum: Annotated[
+        str | None, typer.Option(help=VERTICAL_DATUMS, show_default="what the first photo states")
+    ] = None,
     max_view_angle: MaxViewAngle = 70.0,
     base: Annotated[
         list[Path] | None,
@@ -129,6 +145,9 @@ def command(
         reposition=reposition,
         deterministic=deterministic,
         thermal_unit=thermal_unit,
+        shutter=shutter,
+        shutter_readout_ms=shutter_readout,
+        vertical_datum=vertical_datum,
         max_view_angle=max_view_angle,
         features=features,
         most_bytes=int(max_mb * 1e6),

@@ -10,8 +10,13 @@ from skyquilt.cli.options import (
     MAX_MEMORY,
     MAX_MEMORY_UNSAID,
     MAX_MP,
+    READOUT_UNSAID,
+    READOUTS,
+    SHUTTER_UNSAID,
+    SHUTTERS,
     THERMAL_UNITS,
     UNIT_UNSAID,
+    VERTICAL_DATUMS,
     Photos,
     mode_of,
     parse_bounds,
@@ -157,21 +162,9 @@ def command(
             default="full to calibrate, 6t to keep",
         ),
     ] = None,
-    shutter: Annotated[
-        str | None,
-        option(
-            CAMERA,
-            "How photos are exposed: global (all rows at once) or rolling (one after the other).",
-            default="as metadata and the table of cameras say",
-        ),
-    ] = None,
+    shutter: Annotated[str | None, option(CAMERA, SHUTTERS, default=SHUTTER_UNSAID)] = None,
     shutter_readout: Annotated[
-        float | None,
-        option(
-            CAMERA,
-            "Time in ms in which a rolling shutter reads a photo out.",
-            default="as the table says",
-        ),
+        float | None, option(CAMERA, READOUTS, default=READOUT_UNSAID)
     ] = None,
     height: Annotated[
         float | None, option(CAMERA, "Height above ground in m, for methods that do not find it.")
@@ -183,12 +176,7 @@ def command(
         ),
     ] = "auto",
     vertical_datum: Annotated[
-        str | None,
-        option(
-            PICTURE,
-            "Zero of heights: ellipsoid, egm96 (sea level), takeoff.",
-            default="what most photos state",
-        ),
+        str | None, option(PICTURE, VERTICAL_DATUMS, default="what most photos state")
     ] = None,
     bounds: Annotated[
         str | None, option(PICTURE, "west,south,east,north in the output CRS.")

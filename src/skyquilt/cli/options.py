@@ -25,6 +25,13 @@ Repair = Annotated[
     bool, typer.Option("--repair-metadata/--trust-metadata", help="Whether metadata may be wrong.")
 ]
 Features = Annotated[int, typer.Option(help="Features per photo.")]
+SHUTTERS = "How photos are exposed: global (all rows at once) or rolling (one after the other)."
+SHUTTER_UNSAID = "as metadata and the table of cameras say"
+Shutter = Annotated[str | None, typer.Option(help=SHUTTERS, show_default=SHUTTER_UNSAID)]
+READOUTS = "Time in ms in which a rolling shutter reads a photo out."
+READOUT_UNSAID = "as the table says"
+ShutterReadout = Annotated[float | None, typer.Option(help=READOUTS, show_default=READOUT_UNSAID)]
+VERTICAL_DATUMS = "Zero of heights: ellipsoid, egm96 (sea level), takeoff."
 MaxViewAngle = Annotated[
     float, typer.Option(help="Largest angle from the vertical, in degrees, that photos show.")
 ]

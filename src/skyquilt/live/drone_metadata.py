@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.priors import choose_frame
+from skyquilt.errors import UsageError
 from skyquilt.geometry.frames import (
     angle_difference_deg,
     angles_from_cam_R_map,
@@ -38,11 +39,23 @@ class Metadata:
         for member in sorted(members.by_id.values(), key=lambda m: m.tried):
             self._remember(member)
 
-    def frame_from(self, member: Member) -> bool:
-        """Defines the map's frame from the first photo that has a position."""
-        if self.members.frame is None and member.photo.position is not None:
-            self.members.set_frame(choose_frame([member.photo], self.settings.crs))
-        return self.members.frame is not None
+    def frame_from(self, member: Member) -> str:
+        """Defines the map's frame from a photo that has a position; returns a warning, or nothing.
+
+        Where that photo's height cannot be converted to the datum asked for, the map counts heights
+        as the photo does: a flight is not held up for a datum.
+        """
+        asked, datum = self.settings, self.settings.vertical_datum
+        try:
+            frame, warning = choose_frame([member.photo], asked.crs, (), datum), ""
+        except UsageError as error:
+            if datum is None:
+                raise
+            frame = choose_frame([member.photo], asked.crs)
+            named = frame.vertical_datum.replace("_", " ")
+            warning = f"The growing map counts heights from: {named}. {error}"
+        self.members.set_frame(frame)
+        return warning
 
     def first(self, member: Member) -> Pose | None:
         """A pose from metadata, corrected by the errors found in earlier photos of the same source;

@@ -41,6 +41,9 @@ def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
         features=settings.features,
         crs=settings.crs,
         thermal_unit=settings.thermal_unit,
+        shutter=settings.shutter,
+        shutter_readout_ms=settings.shutter_readout_ms,
+        vertical_datum=settings.vertical_datum,
         max_view_angle=settings.max_view_angle,
     )
     # if the final map is requested again after more photos have arrived, it is made anew; results

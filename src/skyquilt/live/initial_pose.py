@@ -37,8 +37,11 @@ class InitialPose:
 
     def place(self, member: Member) -> Update:
         """Places the photo, which is the first in the queue of received photos."""
-        if self.metadata.frame_from(member) and self.canvas.gsd == 0:
-            self._begin(member)
+        warning = ""
+        if self.members.frame is None and member.photo.position is not None:
+            warning = self.metadata.frame_from(member)
+        if self.members.frame is not None and self.canvas.gsd == 0:
+            self._begin(member, warning)
         preview = self._preview(member)
         known = preview.pose if preview is not None else None
         pose = known if known is not None else self.metadata.first(member)
@@ -58,7 +61,7 @@ class InitialPose:
         self.queues.untried.append(member)
         if pose is not None:
             self.redraw.show(member)
-        return Update(what=member.state, photo=member.id)
+        return Update(what=member.state, photo=member.id, text=warning)
 
     def _preview(self, member: Member) -> Member | None:
         """The preview of the same shot that arrived before this photo; None if there is none."""
@@ -67,8 +70,8 @@ class InitialPose:
         known = (self.members.by_id[i] for i in about.get("preview", ()) if i in self.members.by_id)
         return next(known, None)
 
-    def _begin(self, member: Member) -> None:
-        """Fixes the map's frame and pixel size for the whole survey."""
+    def _begin(self, member: Member, warning: str) -> None:
+        """Fixes the map's frame and pixel size for the whole survey, with a warning, if any."""
         prior, photo, frame = member.prior, member.photo, self.members.frame
         assert frame is not None
         takeoff = frame.vertical_datum == "takeoff"
@@ -86,3 +89,5 @@ class InitialPose:
             self.ledger.put_meta("cell", cell)
             self.ledger.put_meta("ground", ground)
             self.ledger.tell("map", {"crs": frame.crs, "gsd": gsd})
+            if warning:
+                self.ledger.tell("note", {"text": warning})

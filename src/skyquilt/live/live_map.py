@@ -121,9 +121,7 @@ class LiveMap:
         """Rebuilds the state in memory from the durable files, at start and after a failed
         write.
         """
-        self.members = Members(
-            self.ledger, self.inbox, self.settings.thermal_unit, self.settings.most_mp
-        )
+        self.members = Members(self.ledger, self.inbox, self.settings)
         self.queues = Queues(self.members.by_id.values())
         self.schedule = Schedule.read(self.ledger)
         self.full = PixelCache(read=self._pixels, budget_bytes=FULL_BYTES)

@@ -3,7 +3,7 @@
 import json
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,12 @@ from skyquilt.alignment.priors import empty_prior, photo_prior
 from skyquilt.live.failures import concerning
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import Ledger
+from skyquilt.live.settings import LiveSettings
 from skyquilt.model.camera import PARAMETERS, Camera
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import MapFrame, Motion, Pose, Prior
-from skyquilt.outside import MOST_MP
 from skyquilt.photos.read import read_photo
+from skyquilt.photos.shutter import stated_shutter
 
 ON_MAP = ("placed", "refined")
 """States of photos that are drawn."""
@@ -78,18 +79,10 @@ class Members:
     changes.
     """
 
-    def __init__(
-        self,
-        ledger: Ledger,
-        inbox: Inbox,
-        thermal_unit: str | None = None,
-        most_mp: float = MOST_MP,
-    ) -> None:
-        """Reads the ledger; `thermal_unit`: the unit with which the photos were accepted;
-        `most_mp`: the largest area of a photo in megapixels.
-        """
-        self.ledger, self.inbox, self.thermal_unit = ledger, inbox, thermal_unit
-        self.most_mp = most_mp
+    def __init__(self, ledger: Ledger, inbox: Inbox, settings: LiveSettings) -> None:
+        """Reads the ledger; `settings`: those with which the photos were accepted."""
+        self.ledger, self.inbox, self.settings = ledger, inbox, settings
+        self._shutter = stated_shutter(settings.shutter, settings.shutter_readout_ms)
         self.by_id: dict[int, Member] = {}
         self.block_of: dict[int, int] = {}
         self.blocks: dict[int, set[int]] = {}
@@ -128,12 +121,13 @@ class Members:
             photo = read_photo(
                 self.inbox.folder / file,
                 name=name,
-                thermal_unit=self.thermal_unit,
-                most_mp=self.most_mp,
+                thermal_unit=self.settings.thermal_unit,
+                most_mp=self.settings.most_mp,
             )
             if isinstance(photo, RejectedPhoto):
                 self.ledger.set_photo(number, state="refused", reason=photo.reason)
                 continue
+            photo = replace(photo, shutter=self._shutter or photo.shutter)
             member = Member(
                 id=int(number),
                 photo=photo,

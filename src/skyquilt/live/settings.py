@@ -5,7 +5,7 @@ from typing import Any
 
 from skyquilt.errors import UsageError
 from skyquilt.outside import MOST_MP
-from skyquilt.settings import THERMAL_UNITS, one_of
+from skyquilt.settings import THERMAL_UNITS, VERTICAL_DATUMS, check_shutter, one_of
 
 NEIGHBOURS = 8
 """Largest number of placed photos with which a new one is compared."""
@@ -47,6 +47,14 @@ class LiveSettings:
     """One of `THERMAL_UNITS`: the unit of values in single-band TIFFs. None = detected, together
     with whether they are thermal.
     """
+    shutter: str | None = None
+    """One of `settings.SHUTTERS`: how the cameras expose; None = as metadata and table of cameras
+    say.
+    """
+    shutter_readout_ms: float | None = None
+    """Time in ms in which a rolling shutter reads a photo out; None = as the table says."""
+    vertical_datum: str | None = None
+    """One of `VERTICAL_DATUMS`: zero of the map's heights; None = what the first photo states."""
     max_view_angle: float = 70.0
     """Largest angle from the vertical in degrees at which a photo is shown."""
     features: int = 1200
@@ -63,6 +71,9 @@ class LiveSettings:
     def __post_init__(self) -> None:
         if self.thermal_unit is not None:
             one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
+        check_shutter(self.shutter, self.shutter_readout_ms)
+        if self.vertical_datum is not None:
+            one_of("--vertical-datum", self.vertical_datum, VERTICAL_DATUMS)
         for name, value, low, high in (
             ("--gsd", self.gsd_cm, 0.05, 10000),
             ("--features", self.features, 100, 50000),
@@ -82,5 +93,7 @@ class LiveSettings:
             "features": self.features,
             "deterministic": self.deterministic,
             "thermal_unit": self.thermal_unit,
+            "shutter": self.shutter,
+            "shutter_readout_ms": self.shutter_readout_ms,
             "max_view_angle": self.max_view_angle,
         }

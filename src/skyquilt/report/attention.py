@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from skyquilt.alignment.outcome import UNDETERMINED
 from skyquilt.report import headline
 from skyquilt.report.input import ReportInput
 from skyquilt.report.numbers import count, fixed, items, mapping, number, plain
@@ -13,8 +14,6 @@ FEW_VIEWS, FEW_SHARE = 3, 0.1
 """Number of photos that show a place well, and the share of the map with fewer from which this is
 told.
 """
-UNTOLD = 0.9
-"""Share of the focal length's prior deviation that is left, from which the flight told nothing."""
 Sentence = tuple[str, str]
 """A sentence, and the section that shows more."""
 
@@ -122,10 +121,12 @@ def _focal(m: Mapping[str, Any]) -> Iterator[Sentence]:
     accuracy = mapping(m.get("accuracy"))
     share = number(accuracy.get("focal_sigma_after_over_before"))
     up = number(mapping(accuracy.get("vertical_m")).get("median"))
-    if share is not None and share > UNTOLD and not items(m.get("control")):
+    held = any(not mapping(c).get("check") for c in items(m.get("control")))
+    if share is not None and share > UNDETERMINED and not held:
         height = "" if up is None else f"; heights are uncertain by {fixed(up, 1)} m"
         yield (
-            f"The flight does not determine the focal length, which is that of the metadata"
+            f"The flight does not determine the focal length, which stays about that of the"
+            f" metadata"
             f"{height}. Control points, oblique photos or lines at two heights would.",
             "cameras",
         )

@@ -331,15 +331,16 @@ def _links(
     return (yield from link_photos(found, frame, reported, methods, store, workers))
 
 
-def _align(known: AlignmentInputs, methods: Methods, clock: Clock) -> Steps[Alignment]:
-    yield 0, 1
-    store = clock.store
+def alignment_key(known: AlignmentInputs, methods: Methods) -> str:
+    """Key of an alignment: all that enters it."""
     photos = [
         (p.digest, p.name, p.camera_key, p.focal, p.calibration, p.editor) for p in known.photos
     ]
+    moving = [(p.shutter, p.velocity_ned, p.time and p.time.isoformat()) for p in known.photos]
     held = [(k.a, k.b, k.index_a, k.index_b) for k in known.links]
-    key = digest(
+    return digest(
         photos,
+        moving,
         known.frame,
         list(known.priors),
         held,
@@ -348,6 +349,11 @@ def _align(known: AlignmentInputs, methods: Methods, clock: Clock) -> Steps[Alig
         list(known.order),
         methods.align,
     )
+
+
+def _align(known: AlignmentInputs, methods: Methods, clock: Clock) -> Steps[Alignment]:
+    yield 0, 1
+    store, key = clock.store, alignment_key(known, methods)
     resumable = replace(known, keep=store.parts(ADJUSTING, key, clock.workers))
     alignment = store.get_or("alignment", key, lambda: methods.align(resumable))
     store.forget([ADJUSTING])
