@@ -25,6 +25,7 @@ from skyquilt.papers.comparison_page import comparison_page
 from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.raster.atomic import write_text
+from skyquilt.raster.drivers import GEOTIFF
 from skyquilt.report.page import write_page
 from skyquilt.settings import OPTION_OF, MosaicSettings
 from skyquilt.version import __version__
@@ -328,7 +329,7 @@ def _previews(output: Path, names: Sequence[str]) -> dict[str, Any]:
         path = output / name / "mosaic.tif"
         if not path.is_file():
             continue
-        with rasterio.open(path) as source:
+        with rasterio.open(path, driver=GEOTIFF) as source:
             factor = max(1.0, max(source.width, source.height) / 900)
             shape = (max(1, int(source.height / factor)), max(1, int(source.width / factor)))
             bands = source.read(out_shape=(source.count, *shape))

@@ -23,6 +23,7 @@ from skyquilt.planning.points import is_shut
 from skyquilt.planning.records import Plan, Site
 from skyquilt.planning.site import geographic, make_site, read_keep_out
 from skyquilt.planning.terrain import FLAT
+from skyquilt.raster.drivers import GEOTIFF
 
 VIEWS = "views.tif"
 COVERAGE = "coverage.tif"
@@ -76,7 +77,7 @@ def read_mission_state(folder: Path) -> FlownMission:
     try:
         record = json.loads(read_bounded(folder / STATE).decode("utf-8"))
         again = frozenset(int(k) for k in record["again"])
-        with rasterio.open(folder / COVERAGE, driver="GTiff") as raster:
+        with rasterio.open(folder / COVERAGE, driver=GEOTIFF) as raster:
             values = raster.read(1)
             affine = raster.transform
     except (OSError, ValueError, LookupError, TypeError, rasterio.errors.RasterioError) as error:
@@ -116,7 +117,7 @@ def missing_site(folder: Path, views: int, *, keep_out: Path | None = None) -> S
             " areas"
         )
     try:
-        with rasterio.open(folder / name, driver="GTiff") as raster:
+        with rasterio.open(folder / name, driver=GEOTIFF) as raster:
             if raster.crs is None:
                 raise SideFileError(f"{folder / name} is not georeferenced; give a file with areas")
             scale = max(1.0, max(raster.shape) / MOST_CELLS)

@@ -13,6 +13,7 @@ from shapely.geometry.base import BaseGeometry
 from skyquilt.errors import SideFileError
 from skyquilt.outside import plain
 from skyquilt.planning.records import Array
+from skyquilt.raster.drivers import GEOTIFF
 
 MOST_SIDE = 3000
 """Largest number of heights along one side."""
@@ -100,7 +101,7 @@ def read_terrain(path: Path, crs: str, area: BaseGeometry, margin: float) -> Ter
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            source = rasterio.open(path, driver="GTiff")  # others name files and addresses
+            source = rasterio.open(path, driver=GEOTIFF)
         with source:
             if source.crs is None:
                 raise SideFileError(

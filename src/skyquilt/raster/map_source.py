@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from skyquilt.raster.colours import Palette, coloured
+from skyquilt.raster.drivers import open_raster
 from skyquilt.raster.tile_store import LEVELS, SIDE, Address, TileStore
 
 MERCATOR = 20037508.342789244
@@ -164,10 +165,8 @@ class FileSource:
 
     def about(self) -> About:
         """What the file says of itself, read once."""
-        import rasterio
-
         if not self._known:
-            with rasterio.open(self.path) as raster:
+            with open_raster(self.path) as raster:
                 bands = 3 if raster.count >= 3 else 1
                 system = raster.crs
                 units = tuple(u or "" for u in raster.units[:bands])
@@ -197,10 +196,9 @@ class FileSource:
 
     def part(self, bounds: Bounds, gsd: float) -> Part | None:
         """The part, read from a suitable overview of the file."""
-        import rasterio
         from rasterio.windows import from_bounds
 
-        with rasterio.open(self.path) as raster:
+        with open_raster(self.path) as raster:
             left, top = raster.bounds.left, raster.bounds.top
             west, south, east, north = (
                 max(bounds[0], left),

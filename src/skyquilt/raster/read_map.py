@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.raster.drivers import open_raster
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MapFile:
@@ -41,7 +43,7 @@ def open_map(path: Path) -> MapFile | None:
         with warnings.catch_warnings():
             # reported by None
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-            raster = rasterio.open(path)
+            raster = open_raster(path)
         with raster:
             placed = raster.crs is not None or not raster.transform.is_identity
             if not placed:
@@ -92,7 +94,7 @@ def _read(
     from rasterio.enums import Resampling
 
     try:
-        with rasterio.open(source.path) as raster:
+        with open_raster(source.path) as raster:
             values = raster.read(
                 list(range(1, source.bands + 1)),
                 window=window,

@@ -1,0 +1,31 @@
+"""Formats that rasters are read in: those that hold their pixels.
+
+Others, such as VRT, name files and addresses to be read, and any of them may be called `map.tif`.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rasterio.io import DatasetReader
+
+GEOTIFF = "GTiff"
+"""The format of all rasters of a run, and of terrain."""
+MAPS = (GEOTIFF, "MBTiles", "PNG", "JPEG", "JP2OpenJPEG", "WEBP", "BMP", "HFA", "ENVI", "AAIGrid")
+"""Formats of maps that users bring along."""
+
+
+def open_raster(path: Path, **options: Any) -> "DatasetReader":
+    """Opens a map that a user brings along, of whatever format in `MAPS`.
+
+    Raises:
+        rasterio.errors.RasterioIOError: it is none of these.
+    """
+    import rasterio
+
+    for driver in MAPS:
+        try:
+            return rasterio.open(path, driver=driver, **options)
+        except rasterio.errors.RasterioIOError as error:
+            last = error
+    raise last
