@@ -26,6 +26,7 @@ from tests.alignment.blocks import HEIGHT, LENS, WIDTH, make_block, seen_by
 from tests.alignment.surveys import photo, prior
 
 FRAME = MapFrame(crs="EPSG:32630", origin=(500000.0, 5600000.0), vertical_datum="takeoff")
+LOCAL = MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="takeoff")
 
 
 class Flown:
@@ -268,6 +269,22 @@ def test_two_blocks_are_both_kept():
     found = flown.aligned()
     assert found.blocks == (tuple(range(12)), tuple(range(12, 18)))
     assert len(found.poses) == 18
+
+
+@pytest.mark.parametrize("known", [(), (0,), (13,)])
+def test_of_two_blocks_those_are_kept_whose_place_is_known(known):
+    """Positions of a block's photos tell its place; without any, only the largest has one."""
+    flown = Flown(3)
+    flown.links = [k for k in flown.links if (k.a < 12) == (k.b < 12)]
+    bare = without_positions(Flown(3)).priors
+    flown.priors = [flown.priors[i] if i in known else bare[i] for i in range(18)]
+    # without any position the map has a frame of its own
+    found = flown.aligned(frame=FRAME if known else LOCAL)
+    if 13 in known:
+        assert not found.rejected and len(found.poses) == 18
+    else:
+        assert set(found.poses) == set(range(12)) and set(found.rejected) == set(range(12, 18))
+        assert "linked with 5 other photos, but not with the 12" in found.rejected[12]
 
 
 def test_no_links():

@@ -113,6 +113,21 @@ class Served:
             threading.Event().wait(0.05)
         raise AssertionError("it did not happen in time")
 
+    def settle(self) -> None:
+        """Waits until nothing is left to place or to draw and photos stay where they are: pictures
+        fetched one after the other then show one state.
+        """
+
+        def still() -> bool:
+            live = self.live
+            if live.queues.untried or live.redraw.dirty or live.redraw.later:
+                return False
+            before = self.web.get("/photos").json()
+            threading.Event().wait(0.5)
+            return bool(self.web.get("/photos").json() == before)
+
+        self.until(still)
+
     def states(self) -> dict[str, str]:
         return {p["name"]: p["state"] for p in self.web.get("/photos").json()["photos"]}
 

@@ -37,6 +37,7 @@ def site(flight, tmp_path_factory):
             assert site.send(path).status_code == 201
         site.until(lambda: list(site.states().values()) == ["refined"] * 4)
         site.until(lambda: all(p["ring"] for p in site.web.get("/photos").json()["photos"]))
+        site.settle()
         yield site
 
 
