@@ -22,6 +22,7 @@ NAME:
     table-6.5     the mean Q (needs ../shared/data)
     depth-maps    depth maps of a visual and a thermal flight registered by SURF and RFAE (Y Fig.
                   5.12c, 5.14c)
+    eq-5.7        two blocks joined by pairs of photos: homographies as written beside `pairs`
     ste           the article's estimator on real pairs, by what the matches are chosen from (A 2.4,
                   2.5; needs ../shared/data)
     article       time and geolocation of six flight lines (A Tables 1 and 2)
@@ -51,7 +52,7 @@ from skyquilt.calibration.find_board import FindBoard
 from skyquilt.coregistration.pictures import Source, open_picture
 from skyquilt.coregistration.workflow import outcome_of, within_tolerance
 from skyquilt.depth.workflow import depth
-from skyquilt.engine.clock import Clock
+from skyquilt.engine.clock import Clock, result_of
 from skyquilt.engine.store import Store
 from skyquilt.errors import RefusedError
 from skyquilt.geometry.camera import undistort
@@ -76,10 +77,11 @@ from skyquilt.settings import MosaicSettings
 from skyquilt.simulate.board import Chessboard, Lamp, Sensor, sweep, tilted
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, FlightSettings, Reporting, Route, Thermal
+from skyquilt.thermal import by_pairs
 from skyquilt.workflows.artefacts import REGISTRY
-from skyquilt.workflows.flow import AlignedPhotos, align_photos
+from skyquilt.workflows.flow import AlignedPhotos, Scene, align_photos
 from skyquilt.workflows.methods import detector_for, methods_for
-from skyquilt.workflows.mosaic import mosaic
+from skyquilt.workflows.mosaic import make_map, mosaic
 from skyquilt.workflows.survey_input import read_input
 
 DATA = Path(__file__).resolve().parents[1] / ".." / "shared" / "data"
@@ -800,6 +802,62 @@ def article(work: Path, seeds: int) -> None:
     table(("method", "time, 73 photos", "MAE x, y, m", "RMS x, y, m"), rows)
 
 
+def eq_57(work: Path, seeds: int) -> None:
+    """Blocks joined by (5.7) as written and by `pairs`: error at four places of the map."""
+    rows = []
+    for seed in range(1, seeds + 1):
+        lens, route = Lens().scaled(1200, 900), Route(photos=24, overlap=0.85)
+        flight = simulated(
+            work / f"joined-{seed}", FlightSettings(seed=seed, lens=lens, route=route)
+        )
+        settings = MosaicSettings(gsd_cm=10)
+        given = read_input(flight / "photos", settings.input)
+        with tempfile.TemporaryDirectory() as folder:
+            scene = result_of(make_map(given, Path(folder) / "out", settings)).scene()
+            rows += [(seed, *row) for row in _joined(scene)]
+    table(("seed", "method", "pairs", "error, px of 10 cm: median", "largest"), rows)
+
+
+def _joined(scene: Scene) -> list[tuple[str, str, str, str]]:
+    """Every other photo of a flight against those between, in negative and their frame 2.4 m
+    aside.
+    """
+    pixels, frame = scene.aligned.pixels, scene.aligned.alignment.frame
+    x, y = frame.origin
+    scene, other = _of_photos(scene, 0), _of_photos(scene, 1)
+    aside = replace(other.aligned.alignment, frame=replace(frame, origin=(x + 2.1, y - 1.2)))
+    negative = replace(other.aligned, alignment=aside, pixels=lambda i: 255 - pixels(i))
+    other = replace(other, aligned=negative)
+    size = scene.ground.grid.width, scene.ground.grid.height
+    px = np.array([[0.3, 0.3], [0.7, 0.3], [0.3, 0.7], [0.6, 0.6]]) * size
+    usual, rows = by_pairs.MOST_PAIRS, []
+    for name, join in (("pairs", by_pairs.by_pairs), ("homographies", by_pairs.by_homographies)):
+        for most in (usual, 5, 3, 1):
+            by_pairs.MOST_PAIRS = most
+            found = join(scene, other)
+            if not found:
+                rows.append((name, str(most), "refused", ""))
+                continue
+            # both maps have the same grid about their origins: right places are equal pixels
+            off = np.linalg.norm(transfer(found.b_H_a, px) - px, axis=1)
+            registered = str(found.evidence["pairs_registered"])
+            rows.append((name, registered, f"{np.median(off):.2f}", f"{off.max():.2f}"))
+    by_pairs.MOST_PAIRS = usual
+    return rows
+
+
+def _of_photos(scene: Scene, odd: int) -> Scene:
+    """The scene with the photos of even or odd number."""
+    alignment = scene.aligned.alignment
+    poses = {i: pose for i, pose in alignment.poses.items() if i % 2 == odd}
+    views = tuple(v for v in scene.ground.views if v.photo in poses)
+    return replace(
+        scene,
+        aligned=replace(scene.aligned, alignment=replace(alignment, poses=poses)),
+        ground=replace(scene.ground, views=views),
+    )
+
+
 NAMES: dict[str, tuple[Callable[[Path, int], None], int]] = {
     "table-6.1": (table_61, 1),
     "fig-6.4": (fig_64, 1),
@@ -819,6 +877,7 @@ NAMES: dict[str, tuple[Callable[[Path, int], None], int]] = {
     "depth-maps": (depth_maps, 2),
     "fig-5.12c": (depth_maps, 2),
     "fig-5.14c": (depth_maps, 2),
+    "eq-5.7": (eq_57, 3),
     "ste": (ste, 1),
     "article": (article, 1),
 }

@@ -81,6 +81,7 @@ def test_they_are_numbered_without_gaps():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_loop_of_a_mission_closes_all_holes(tmp_path):
     said = run("05_plan_fly_watch_fill.py", tmp_path)
     assert "and 100.00 % have them" in said  # by the true poses

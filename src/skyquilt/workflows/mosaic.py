@@ -179,8 +179,10 @@ def make_map(
         return FinishedMap(result=result, given=given, methods=methods, settings=settings)
     run.mark("running")
     survey = given.survey
-    first = [*(p.path for p in survey.photos), *(c.path for c in survey.clips)][:1]
-    with workers_for(settings.running, run.path / STATE, first) as workers:
+    sees = [*(p.path for p in survey.photos), *(c.path for c in survey.clips)][:1]
+    if settings.running.scheduler is None:
+        sees = []
+    with workers_for(settings.running, run.path / STATE, sees) as workers:
         clock = Clock(store=store, began=began, workers=workers)
         clock.lap("read", began)
         yield from (Note(text=n) for n in given.survey.notes)
