@@ -1,7 +1,9 @@
+import io
 import math
 import os
 import socket
 import time
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -14,6 +16,7 @@ from skyquilt.outside import (
     read_bounded,
     real,
     shown,
+    unzipped,
     walk,
     whole,
 )
@@ -115,3 +118,43 @@ def test_sizes_that_are_taken():
         check_picture(640, 512, 2, file_bytes=10**9)
     with pytest.raises(UnreadablePhotoError, match="--max-mp"):
         check_picture(1000, 1001, 3, most_mp=1)
+
+
+def packed(body: bytes, method: int, change=lambda raw: raw) -> zipfile.ZipFile:
+    """An archive with one file `a.kml`, its bytes changed."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", method) as archive:
+        archive.writestr("a.kml", body)
+    return zipfile.ZipFile(io.BytesIO(change(buffer.getvalue())))
+
+
+METHODS = [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_file_in_an_archive_is_read_up_to_a_bound(method):
+    assert unzipped(packed(b"x" * 1000, method), "a.kml", 1000) == b"x" * 1000
+    with pytest.raises(ValueError, match="unpacks to more than 0.000999 MB"):
+        unzipped(packed(b"x" * 1000, method), "a.kml", 999)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_whatever_is_wrong_with_it_is_one_error(method):
+    """Bytes of the content and of its headers set to others, one at a time; a flag for encryption,
+    a method that nobody has, an archive cut off.
+    """
+    whole = packed(bytes(range(256)) * 20, method).fp.getvalue()
+    wrong = 0
+    for k in range(min(len(whole), 400)):
+        for value in (0, 1, 99, 255):
+            torn = whole[:k] + bytes([value]) + whole[k + 1 :]
+            try:
+                archive = zipfile.ZipFile(io.BytesIO(torn))
+            except (zipfile.BadZipFile, ValueError, NotImplementedError):
+                continue
+            try:
+                for name in archive.namelist():
+                    unzipped(archive, name, 10**6)
+            except ValueError as error:
+                wrong += "damaged or encrypted" in str(error)
+    assert wrong > 50

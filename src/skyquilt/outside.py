@@ -12,9 +12,12 @@ import stat
 import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from skyquilt.errors import UnreadablePhotoError
+
+if TYPE_CHECKING:
+    from zipfile import ZipFile
 
 MOST_MP = 160.0
 """Largest area of a photo in megapixels, unless --max-mp says otherwise: the largest cameras that
@@ -131,6 +134,35 @@ def read_bounded(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
     if len(data) > most:
         raise OSError(errno.EFBIG, f"it has more than {most // 10**6} MB", str(path))
     return data
+
+
+def unzipped(archive: "ZipFile", name: str, most: int) -> bytes:
+    """The content of a file in an archive, of at most `most` bytes whatever it declares.
+
+    Raises:
+        ValueError: it is damaged, encrypted, or larger.
+    """
+    import lzma  # needed by few commands
+    import zlib
+    from zipfile import BadZipFile
+
+    try:
+        with archive.open(name) as member:
+            content = member.read(most + 1)
+    # the decoders' own errors; those of the archive; an encrypted file; an unknown method
+    except (
+        zlib.error,
+        lzma.LZMAError,
+        EOFError,
+        OSError,
+        BadZipFile,
+        RuntimeError,
+        NotImplementedError,
+    ) as error:
+        raise ValueError(f"{plain(name, 80)} in it is damaged or encrypted") from error
+    if len(content) > most:
+        raise ValueError(f"it unpacks to more than {most / 1e6:g} MB")
+    return content
 
 
 def walk(top: Path) -> Iterator[tuple[Path, list[str], list[str]]]:

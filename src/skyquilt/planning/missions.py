@@ -11,7 +11,15 @@ import numpy as np
 from defusedxml.ElementTree import fromstring
 
 from skyquilt.errors import SideFileError
-from skyquilt.outside import MOST_TEXT_BYTES, open_regular, plain, read_bounded, real, whole
+from skyquilt.outside import (
+    MOST_TEXT_BYTES,
+    open_regular,
+    plain,
+    read_bounded,
+    real,
+    unzipped,
+    whole,
+)
 from skyquilt.planning.exports import CAMERA, CAPTURE, LAND, RETURN, TAKE_OFF, WAYPOINT
 from skyquilt.planning.records import Array
 
@@ -225,10 +233,7 @@ def read_wpml(path: Path) -> Mission:
         names = [n for n in archive.namelist() if n.lower().endswith("waylines.wpml")]
         if not names:
             raise ValueError("it holds no waylines.wpml")
-        with archive.open(names[0]) as member:
-            text = member.read(MOST_TEXT_BYTES + 1)
-    if len(text) > MOST_TEXT_BYTES:
-        raise ValueError("it unpacks to too many bytes")
+        text = unzipped(archive, names[0], MOST_TEXT_BYTES)
     root = fromstring(text)
     places, heights, yaws, photos = [], [], [], []
     for mark in root.iterfind(".//{*}Placemark"):

@@ -35,7 +35,7 @@ from shapely.geometry.base import BaseGeometry
 from shapely.prepared import prep
 
 from skyquilt.errors import SideFileError
-from skyquilt.outside import MOST_TEXT_BYTES, open_regular, plain, read_bounded
+from skyquilt.outside import MOST_TEXT_BYTES, open_regular, plain, read_bounded, unzipped
 
 MOST_VERTICES = 200_000
 """Largest number of vertices of a boundary."""
@@ -204,11 +204,8 @@ def kml_texts(path: Path) -> Iterator[bytes]:
     left = MOST_TEXT_BYTES
     with open_regular(path) as file, zipfile.ZipFile(file) as archive:
         for name in [n for n in archive.namelist() if n.lower().endswith(".kml")]:
-            with archive.open(name) as member:  # what it declares may be wrong
-                text = member.read(left + 1)
+            text = unzipped(archive, name, left)
             left -= len(text)
-            if left < 0:
-                raise ValueError(f"it unpacks to more than {MOST_TEXT_BYTES // 10**6} MB")
             yield text
 
 

@@ -13,7 +13,7 @@ from shapely.geometry import mapping
 
 from skyquilt.errors import SideFileError, UsageError
 from skyquilt.live.ledger import Ledger
-from skyquilt.outside import plain
+from skyquilt.outside import plain, unzipped
 from skyquilt.planning.features import read_features
 from skyquilt.server.layer_endpoints import put_layer
 
@@ -65,13 +65,10 @@ def _unzipped(path: Path, name: str) -> Path:
                 inside = known.get(first.removesuffix(".shp") + ending)
                 if inside is None:
                     continue
-                with archive.open(inside) as file:
-                    body = file.read(MOST_UNZIPPED + 1)
-                if len(body) > MOST_UNZIPPED:
-                    raise SideFileError(f"{plain(name, 120)} unpacks to too much")
+                body = unzipped(archive, inside, MOST_UNZIPPED)
                 path.with_suffix(ending).write_bytes(body)
-    except (OSError, zipfile.BadZipFile, RuntimeError, NotImplementedError, ValueError) as error:
-        raise SideFileError(f"{plain(name, 120)} is not a readable zip file") from error
+    except (OSError, zipfile.BadZipFile, NotImplementedError, ValueError) as error:
+        raise SideFileError(f"{plain(name, 120)} is not a readable zip file: {error}") from error
     return path.with_suffix(".shp")
 
 
