@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
+from skyquilt.alignment.aligners import choose_method
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import Control, control_in_frame, fit_similarity_3d
 from skyquilt.alignment.setup import HALF_TURN
@@ -479,3 +480,16 @@ def test_control_points_in_another_crs():
     (found,) = control_in_frame([point, unseen], photos, FRAME)
     assert found.xyz[:2] == pytest.approx([10.0, 20.0], abs=1e-3) and np.isnan(found.xyz[2])
     assert found.photo.tolist() == [1] and found.px.tolist() == [[3.0, 4.0]]
+
+
+@pytest.mark.parametrize(
+    ("positions", "control", "says"),
+    [
+        (9, 0, "30 links connect the photos, and positions place it"),
+        (9, 3, "30 links connect the photos, and control points place it"),
+        (0, 3, "30 links connect the photos, and control points place it"),
+        (0, 0, "30 links connect the photos, but no positions: the map is not georeferenced"),
+    ],
+)
+def test_what_places_the_map_is_said(positions, control, says):
+    assert choose_method(9, 30, positions, control) == ("bundle", says)

@@ -88,7 +88,7 @@ class Auto:
     """For linked photos."""
     pose: ByReport
     """For photos that only have positions."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -98,13 +98,15 @@ class Auto:
             AlignmentError: photos without links and without positions.
         """
         positions = sum(bool(np.isfinite(p.map_C[:2]).all()) for p in inputs.priors)
-        method, why = choose_method(len(inputs.photos), len(inputs.links), positions)
+        control = sum(not point.check for point in inputs.control)
+        method, why = choose_method(len(inputs.photos), len(inputs.links), positions, control)
         chosen = self.bundle if method == "bundle" else self.pose
         return replace(chosen(inputs), why=why)
 
 
-def choose_method(photos: int, links: int, positions: int) -> tuple[str, str]:
-    """`bundle` or `pose`, and the reason as one sentence.
+def choose_method(photos: int, links: int, positions: int, control: int) -> tuple[str, str]:
+    """`bundle` or `pose`, and the reason as one sentence; numbers of photos, links, photos with
+    positions, and control points.
 
     Raises:
         AlignmentError: neither can place the photos.
@@ -112,11 +114,9 @@ def choose_method(photos: int, links: int, positions: int) -> tuple[str, str]:
     if photos == 1:
         return "pose", "a single photo cannot be adjusted"
     if links:
-        where = (
-            "and positions place it"
-            if positions
-            else "but no positions: the map is not georeferenced"
-        )
+        where = "but no positions: the map is not georeferenced"
+        if positions or control:
+            where = f"and {'control points' if control else 'positions'} place it"
         return "bundle", f"{links} links connect the photos, {where}"
     if positions:
         return "pose", "no two photos could be linked, so each is placed by its metadata"
