@@ -147,6 +147,7 @@ def test_auto_on_the_real_pairs(tmp_path):
 
 @pytest.mark.real
 @pytest.mark.slow
+@pytest.mark.long
 def test_mirrored_real_pairs_are_refused():
     """The same pictures and places, but no transform of the family exists."""
     from skyquilt.coregistration.methods import registration_method
