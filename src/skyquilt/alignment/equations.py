@@ -88,8 +88,16 @@ class Reduced:
     """(s, p, p) photo blocks."""
     Uc: Array
     """(m, q, q) camera blocks."""
+    pair: Index
+    """(2, k) pairs of photos, each also with itself, by their places in `seen`, the first not after
+    the second: all that share a point, and some that do not.
+    """
     tied: Array
-    """(p s + q m, p s + q m) photos with cameras, and what the points tie together, subtracted."""
+    """(k, p, p) what the points tie together of each pair, subtracted."""
+    beside: Array
+    """(s, p, q m) the same of photos with cameras, and what observations say of both."""
+    corner: Array
+    """(q m, q m) the same of cameras."""
     gradient: Array
     """(p s + q m,) gradient."""
     ties: PointTies | None
@@ -268,15 +276,12 @@ class Equations:
 
     def _add(self, out: Matrix, found: Reduced) -> None:
         """Adds what a part ties together."""
-        p, s = self.p, len(found.seen)
-        i, j = np.triu_indices(s)
-        pair = out.pattern.find(found.seen[i], found.seen[j])
+        pair = out.pattern.find(*found.seen[found.pair])
         tied = pair >= 0  # photos that share no point have nothing in common here, either
-        blocks = found.tied[: p * s, : p * s].reshape(s, p, s, p)
-        out.blocks[pair[tied]] += blocks[i[tied], :, j[tied]]
+        out.blocks[pair[tied]] += found.tied[tied]
         cameras = self.q * self.m
-        out.beside[found.seen, :, :cameras] += found.tied[: p * s, p * s :].reshape(s, p, cameras)
-        out.corner[:cameras, :cameras] += found.tied[p * s :, p * s :]
+        out.beside[found.seen, :, :cameras] += found.beside
+        out.corner[:cameras, :cameras] += found.corner
 
     def _share_shift(self, out: Matrix, state: State) -> None:
         """Couples the measured centres with their common shift, which is at its minimum already."""
@@ -334,7 +339,10 @@ def reduced_part(given: tuple[Problem, State, float, bool]) -> Reduced:
     """
     part, state, damping, stepped = given
     normal = observation_equations(part, state)
-    tied, gradient = _eliminated(part, normal, damping)
+    pair, tied, gradient = _eliminated(part, normal, damping)
+    (s, p), m = normal.gp.shape, len(normal.gc)
+    q = normal.gc.shape[1]
+    i, j = pair
     ties = PointTies(
         V=normal.V, gv=normal.gv, Wp=normal.Wp.astype(np.float32), Wc=normal.Wc.astype(np.float32)
     )
@@ -342,20 +350,26 @@ def reduced_part(given: tuple[Problem, State, float, bool]) -> Reduced:
         seen=normal.seen,
         U=normal.U,
         Uc=normal.Uc,
-        tied=tied,
+        pair=pair,
+        tied=tied[: p * s, : p * s].reshape(s, p, s, p)[i, :, j],
+        beside=tied[: p * s, p * s :].reshape(s, p, q * m),
+        corner=tied[p * s :, p * s :],
         gradient=gradient,
         ties=ties if stepped else None,
     )
 
 
-def _eliminated(part: Problem, normal: Normal, damping: float) -> tuple[Array, Array]:
-    """`tied` and `gradient` of a part."""
+def _eliminated(part: Problem, normal: Normal, damping: float) -> tuple[Index, Array, Array]:
+    """`pair` of a part, the matrix (p s + q m, p s + q m) of all its photos and cameras, and
+    `gradient`.
+    """
     L_inv = points_inverse(normal.V, damping)
     z = np.einsum("pij,pj->pi", L_inv, normal.gv)
     (p, q), (s, m) = (normal.Wp.shape[1], normal.Wc.shape[1]), (len(normal.seen), len(normal.Uc))
     tied = np.zeros((p * s + q * m,) * 2)
     gradient = np.concatenate([normal.gp.ravel(), normal.gc.ravel()])
     camera = part.camera[normal.seen]
+    together = np.zeros((s, s), np.bool_)
     if q:
         rows = np.arange(p * s).reshape(s, p, 1)
         tied[rows, p * s + q * camera[:, None, None] + np.arange(q)] = normal.Upc
@@ -374,9 +388,10 @@ def _eliminated(part: Problem, normal: Normal, damping: float) -> tuple[Array, A
             place: Any = (cam_of[local], slice(None), point - first)
             np.add.at(cameras, place, normal.Wc[lo:hi] @ T)
         flat = rows.reshape(len(rows), -1)
+        together[some[:, None], some] = True
         own = (p * some[:, None] + np.arange(p)).ravel()
         theirs = p * s + (q * cams[:c, None] + np.arange(q)).ravel()
         at = np.concatenate([own, theirs])
         tied[at[:, None], at] -= flat @ flat.T
         gradient[at] -= flat @ z[first:last].ravel()
-    return tied, gradient
+    return np.stack(np.nonzero(np.triu(together))), tied, gradient
