@@ -61,7 +61,7 @@ from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.matching.matchers import Mutual
 from skyquilt.matching.ransac import Ransac
 from skyquilt.model.board import Board
-from skyquilt.model.event import Result, StageFinished
+from skyquilt.model.event import Result
 from skyquilt.ortho.tie_surface import level as level_ground
 from skyquilt.papers.aligners import VLFEAT
 from skyquilt.papers.baselines import baselines
@@ -119,14 +119,8 @@ def aligned(photos: Sequence[Path], settings: MosaicSettings) -> tuple[AlignedPh
     with tempfile.TemporaryDirectory() as folder:
         clock = Clock(store=Store(folder=Path(folder), registry=REGISTRY), began=Clock.now())
         given = read_input(list(photos), settings.input)
-        steps, spent = align_photos(given, methods_for(settings), settings, clock), 0.0
-        while True:
-            try:
-                event = next(steps)
-            except StopIteration as stop:
-                return stop.value, spent
-            if isinstance(event, StageFinished) and event.stage == "align":
-                spent = event.cpu_seconds
+        found = result_of(align_photos(given, methods_for(settings), settings, clock))
+        return found, clock.cpu["align"]
 
 
 # ---- Y 6.1: position, pose, image, hybrid

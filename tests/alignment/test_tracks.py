@@ -30,6 +30,14 @@ def link(a, b, pairs):
     return Link(a=a, b=b, index_a=pairs[:, 0], index_b=pairs[:, 1], b_S_a=1 + 0j)
 
 
+def observed(tracks):
+    """The observations (photo, px) of each track."""
+    return {
+        frozenset(zip(tracks.photo[m].tolist(), map(tuple, tracks.px[m].tolist()), strict=True))
+        for m in (tracks.point == p for p in range(tracks.count))
+    }
+
+
 def test_chains_become_tracks_and_a_photo_visited_twice_spoils_its_track():
     f = [features(5, k, scale=1.0 + k) for k in range(3)]
     links = [
@@ -40,10 +48,7 @@ def test_chains_become_tracks_and_a_photo_visited_twice_spoils_its_track():
     tracks = build_tracks(f, links)
     # (0,0)-(1,0)-(2,4); (0,1)-(1,1)-(2,3); (0,2)-(1,2)-(2,1) and (2,0): photo 2 twice, dropped;
     # (0,4)-(2,2)
-    found = {
-        frozenset(zip(tracks.photo[m].tolist(), map(tuple, tracks.px[m].tolist()), strict=True))
-        for m in (tracks.point == p for p in range(tracks.count))
-    }
+    found = observed(tracks)
 
     def at(photo, k):
         return photo, tuple(f[photo].px[k].tolist())
@@ -102,10 +107,7 @@ def test_a_place_described_several_times_is_one_observation():
         photo.px[3] = photo.px[0]  # one place, two orientations
     links = [link(0, 1, [(0, 0), (3, 3), (1, 1)]), link(1, 2, [(3, 2), (1, 0)])]
     tracks = build_tracks(f, links)
-    found = {
-        frozenset(zip(tracks.photo[m].tolist(), map(tuple, tracks.px[m].tolist()), strict=True))
-        for m in (tracks.point == p for p in range(tracks.count))
-    }
+    found = observed(tracks)
 
     def at(photo, k):
         return photo, tuple(f[photo].px[k].tolist())

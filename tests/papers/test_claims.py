@@ -10,12 +10,12 @@ import pytest
 from skyquilt.coregistration.pictures import open_picture
 from skyquilt.coregistration.workflow import outcome_of
 from skyquilt.depth.workflow import depth
-from skyquilt.engine.clock import Clock
+from skyquilt.engine.clock import Clock, result_of
 from skyquilt.engine.store import Store
 from skyquilt.geometry.camera import undistort
 from skyquilt.geometry.transforms import fit, transfer
 from skyquilt.matching.ransac import Ransac
-from skyquilt.model.event import Result, StageFinished
+from skyquilt.model.event import Result
 from skyquilt.papers.compare import CompareSettings, iter_compare
 from skyquilt.papers.pair_list import overlap_error
 from skyquilt.papers.strip_chain import VARIANTS, board_camera, chained
@@ -102,14 +102,8 @@ def aligned(photos, **asked):
     with tempfile.TemporaryDirectory() as folder:
         clock = Clock(store=Store(folder=Path(folder), registry=REGISTRY), began=Clock.now())
         given = read_input(list(photos), settings.input)
-        steps, spent = align_photos(given, methods_for(settings), settings, clock), 0.0
-        while True:
-            try:
-                event = next(steps)
-            except StopIteration as stop:
-                return stop.value, spent
-            if isinstance(event, StageFinished) and event.stage == "align":
-                spent = event.cpu_seconds
+        found = result_of(align_photos(given, methods_for(settings), settings, clock))
+        return found, clock.cpu["align"]
 
 
 def compared(photos, output, variants, gsd_cm, **more):

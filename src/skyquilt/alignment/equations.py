@@ -76,6 +76,12 @@ class PointTies:
     """(N, q, 3) camera-point blocks."""
 
 
+def _ties_of(normal: Normal) -> PointTies:
+    return PointTies(
+        V=normal.V, gv=normal.gv, Wp=normal.Wp.astype(np.float32), Wc=normal.Wc.astype(np.float32)
+    )
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Reduced:
     """What a part's observations say of photos and cameras, its points eliminated. The unknowns of
@@ -204,9 +210,7 @@ class Equations:
             yield from self._ties
             return
         for part, own, _ in self.problem.parts(state):
-            ties = reduced_part((part, own, 0.0, True)).ties
-            assert ties is not None, "they were asked for"
-            yield part, ties
+            yield part, _ties_of(observation_equations(part, own))
 
     def step(self, state: State, damping: float) -> tuple[Array, Array, Array]:
         """The Gauss-Newton step of photos (n, p), cameras (m, 10) and points (P, 3).
@@ -343,9 +347,6 @@ def reduced_part(given: tuple[Problem, State, float, bool]) -> Reduced:
     (s, p), m = normal.gp.shape, len(normal.gc)
     q = normal.gc.shape[1]
     i, j = pair
-    ties = PointTies(
-        V=normal.V, gv=normal.gv, Wp=normal.Wp.astype(np.float32), Wc=normal.Wc.astype(np.float32)
-    )
     return Reduced(
         seen=normal.seen,
         U=normal.U,
@@ -355,7 +356,7 @@ def reduced_part(given: tuple[Problem, State, float, bool]) -> Reduced:
         beside=tied[: p * s, p * s :].reshape(s, p, q * m),
         corner=tied[p * s :, p * s :],
         gradient=gradient,
-        ties=ties if stepped else None,
+        ties=_ties_of(normal) if stepped else None,
     )
 
 

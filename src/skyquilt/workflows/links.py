@@ -134,13 +134,13 @@ def link_photos(
 ) -> Steps[Links]:
     """Links neighbours first; their overlap gives the largest distance of further candidates."""
     n = len(found.photos)
-    linker = _Linker(found, frame, priors, methods, store)
+    matched = _Linker(found, frame, priors, methods, store).batch
     xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
     lost = [i for i in range(n) if not np.isfinite(xy[i]).all()]
     # in order of capture, so that the features of a photo are read once for all its pairs
     first = sorted({*sequence(n), *_closest(methods.nearest(xy), n, 2)})
     tried: list[Link | RejectedLink] = []
-    for batch in workers.each(linker.batch, _batches(first)):
+    for batch in workers.each(matched, _batches(first)):
         tried += batch
         yield len(tried), 2 * len(first)
     reach = overlap_reach_m([k for k in tried if isinstance(k, Link)], found, xy)
@@ -149,7 +149,7 @@ def link_photos(
         rest += methods.retrieval(found.features, None if len(lost) == n else lost)
     done = set(first)
     rest = sorted({p for p in rest if p not in done})
-    for batch in workers.each(linker.batch, _batches(rest)):
+    for batch in workers.each(matched, _batches(rest)):
         tried += batch
         yield len(tried), len(first) + len(rest)
     return Links(
