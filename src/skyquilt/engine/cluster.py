@@ -20,6 +20,7 @@ from pathlib import Path, PurePath
 from typing import Any, ClassVar, TypeVar
 
 from skyquilt.engine.folder import refusal
+from skyquilt.engine.free_memory import return_large_blocks
 from skyquilt.errors import SkyquiltError, UsageError
 from skyquilt.model.event import Note
 from skyquilt.version import __version__
@@ -72,6 +73,7 @@ def cluster(scheduler: str, folder: Path, sees: Sequence[Path]) -> Iterator["Clu
                 "distributed.worker.memory.spill": False,
                 "distributed.worker.memory.pause": False,
                 "distributed.worker.memory.terminate": False,
+                "distributed.worker.profile.enabled": False,
             }
         ),
         _client(scheduler) as client,
@@ -318,6 +320,7 @@ def _step(path: str) -> Callable[[Any], Any]:
             if wrong := _unfit(path):
                 raise UsageError(f"the worker {platform.node()} cannot take part: {wrong}")
             cv2.setNumThreads(1)  # as many tasks run as there are threads
+            return_large_blocks()  # Dask has every free give memory back, which costs more time
             with Path(path).open("rb") as file:
                 pickle.load(file)
                 _steps[path] = pickle.load(file)
