@@ -132,7 +132,7 @@ class Stereo:
         del z, given  # large surveys have rasters of 100 MB
         refined = np.asarray(cv2.medianBlur(refined, 5), np.float32)
         side = 2 * round(self.whole * height / cells.gsd / 2) + 1
-        firm = cv2.boxFilter(known.astype(np.float32), -1, (side, side)) > FIRM
+        firm = cv2.boxFilter(known.view(np.uint8), cv2.CV_32F, (side, side)) > FIRM
         x, y = cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height))
         # cliffs stay as steep as the cells allow
         former = np.asarray(cv2.medianBlur(_stepwise(rough, x, y), 5), np.float32)
