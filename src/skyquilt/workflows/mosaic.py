@@ -21,7 +21,7 @@ from skyquilt.engine.error_log import log_error
 from skyquilt.engine.folder import STATE, RunFolder, open_run
 from skyquilt.engine.free_memory import return_large_blocks
 from skyquilt.engine.store import Store, digest
-from skyquilt.engine.workers import Threads, workers_for
+from skyquilt.engine.workers import Threads, Workers, workers_for
 from skyquilt.errors import PhotoFailedError, SkyquiltError
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.model.photo import RejectedPhoto
@@ -247,7 +247,7 @@ def _made(
     if settings.input.write_frames:
         writing = write_frames(output, aligned.photos, aligned.pixels)
         yield from clock.stage("write frames", writing, keeps=False)
-    measuring = _measured(aligned, ground, drawn, settings)
+    measuring = _measured(aligned, ground, drawn, settings, clock.workers)
     seams, quality = yield from clock.stage("measure", measuring, keeps=False)
     metrics = _metrics(aligned, ground, drawn, seams, settings) | {"quality": quality}
     finishing = finish_run(
@@ -290,10 +290,14 @@ def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> s
 
 
 def _measured(
-    aligned: AlignedPhotos, ground: Ground, map_: DrawnMap, settings: MosaicSettings
+    aligned: AlignedPhotos,
+    ground: Ground,
+    map_: DrawnMap,
+    settings: MosaicSettings,
+    workers: Workers,
 ) -> Steps[tuple[MeasuredSeams, dict[str, Any]]]:
     """Measures the seams and the agreement of the placed photos."""
-    seams = yield from measure_seams(map_.compose, map_.drawn, ground)
+    seams = yield from measure_seams(map_.compose, map_.drawn, ground, workers)
     quality = yield from placement_quality(
         aligned.photos,
         aligned.alignment,
@@ -303,6 +307,7 @@ def _measured(
         aligned.given.distances,
         settings.hybrid.alpha,
         aligned.order,
+        workers,
     )
     return seams, quality
 
