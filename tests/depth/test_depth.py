@@ -10,6 +10,7 @@ from rasterio.warp import Resampling, reproject
 
 from skyquilt.depth.workflow import depth, iter_depth
 from skyquilt.errors import OutputError, RefusedError, UsageError
+from skyquilt.model.event import Note
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import FlightSettings, simulate
 from skyquilt.simulate.camera import Lens
@@ -102,8 +103,9 @@ def test_pairs_show_their_heights_where_positions_err_by_two_metres(flight, tmp_
     """
     photos, told = sorted((flight / "photos").glob("*.jpg")), []
     for k in (0, 3, 6):
-        depth(photos[k : k + 2], tmp_path / "out", SETTINGS, overwrite=True)
+        *events, _ = iter_depth(photos[k : k + 2], tmp_path / "out", SETTINGS, overwrite=True)
         told.append(against_truth(tmp_path / "out", flight)[:2])
+    assert any("times that of its positions" in e.text for e in events if isinstance(e, Note))
     r, slope = np.array(told).T
     assert np.median(r) >= 0.9 and r.min() > 0.85
     assert 0.9 <= np.median(slope) <= 1.1 and 0.85 < slope.min() <= slope.max() < 1.1

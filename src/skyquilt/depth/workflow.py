@@ -54,6 +54,8 @@ FEATURE_PX = 640
 """Longest side in px of the images searched for features. Their disparities form the map, so many
 features are needed.
 """
+TOLD = 0.01
+"""Change of a pair's scale from which the user is told."""
 ROUTES = ("auto", "pair", "disparities", "reconstruction")
 """`auto` is `pair` for two photos and `reconstruction` for more."""
 
@@ -188,6 +190,11 @@ def _scene_of_pair(
     aligned = yield from align_photos(given, methods, settings, clock)
     scale = pair_scale(aligned.alignment, aligned.photos, aligned.priors)
     if scale:
+        if abs(scale.factor - 1) > TOLD:
+            yield Note(
+                text=f"the pair's scale is {scale.factor:.3f} times that of its positions,"
+                f" because of the height above take-off (weight {scale.share:.0%})"
+            )
         aligned = replace(aligned, alignment=scaled(aligned.alignment, scale.factor))
     ground = yield from find_ground(aligned, methods, settings, clock)
     return Scene(aligned=aligned, ground=ground), scale
