@@ -19,7 +19,7 @@ from skyquilt.alignment.heights import height_figures
 from skyquilt.engine.clock import Clock, Steps, result_of
 from skyquilt.engine.error_log import log_error
 from skyquilt.engine.folder import STATE, RunFolder, open_run
-from skyquilt.engine.free_memory import return_large_blocks
+from skyquilt.engine.free_memory import give_back, return_large_blocks
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Threads, Workers, workers_for
 from skyquilt.errors import PhotoFailedError, SkyquiltError
@@ -250,6 +250,8 @@ def _made(
     measuring = _measured(aligned, ground, drawn, settings, clock.workers)
     seams, quality = yield from clock.stage("measure", measuring, keeps=False)
     metrics = _metrics(aligned, ground, drawn, seams, settings) | {"quality": quality}
+    aligned.found.looks.make_room()
+    give_back()
     finishing = finish_run(
         output, aligned, ground, drawn.drawn, drawn.compose, seams, metrics, settings, clock
     )
@@ -298,6 +300,7 @@ def _measured(
 ) -> Steps[tuple[MeasuredSeams, dict[str, Any]]]:
     """Measures the seams and the agreement of the placed photos."""
     seams = yield from measure_seams(map_.compose, map_.drawn, ground, workers)
+    aligned.pixels.make_room()
     quality = yield from placement_quality(
         aligned.photos,
         aligned.alignment,
@@ -309,6 +312,7 @@ def _measured(
         aligned.order,
         workers,
     )
+    aligned.grey.make_room()
     return seams, quality
 
 
