@@ -20,6 +20,9 @@ NAME:
     fig-5.14      heights of the reconstruction
     table-6.4     registration of real pairs of two spectra by class and method, with truth; with
     table-6.5     the mean Q (needs ../shared/data)
+    fig-6.11      inliers and Q by SURF's initial lobe, and (Fig. 6.12) by method, on the same pairs
+    spectral-methods  every method of registration by name on the same pairs: accepted, right,
+                  wrong, refused, stated errors (needs ../shared/data)
     depth-maps    depth maps of a visual and a thermal flight registered by SURF and RFAE (Y Fig.
                   5.12c, 5.14c)
     eq-5.7        two blocks joined by pairs of photos: homographies as written beside `pairs`
@@ -45,10 +48,12 @@ from typing import Any
 import cv2
 import numpy as np
 
+from skyquilt import registry
 from skyquilt import simulate as sim
 from skyquilt.calibration.assemble import Assemble, bimodality
 from skyquilt.calibration.few_views import FewViews
 from skyquilt.calibration.find_board import FindBoard
+from skyquilt.coregistration.methods import registration_method
 from skyquilt.coregistration.pictures import Source, open_picture
 from skyquilt.coregistration.workflow import outcome_of, within_tolerance
 from skyquilt.depth.workflow import depth
@@ -57,22 +62,21 @@ from skyquilt.engine.store import Store
 from skyquilt.errors import RefusedError
 from skyquilt.geometry.camera import undistort
 from skyquilt.geometry.transforms import transfer
-from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.matching.matchers import Mutual
 from skyquilt.matching.ransac import Ransac
 from skyquilt.model.board import Board
 from skyquilt.model.event import Result
-from skyquilt.ortho.tie_surface import level as level_ground
 from skyquilt.papers.aligners import VLFEAT
 from skyquilt.papers.baselines import baselines
 from skyquilt.papers.best_matches import Best
 from skyquilt.papers.compare import CompareSettings, iter_compare
-from skyquilt.papers.pair_list import overlap_error
+from skyquilt.papers.pair_list import overlap_error, read_pairs
+from skyquilt.papers.rfae import LOBES, surf
 from skyquilt.papers.spectral_bench import iter_spectral_bench
 from skyquilt.papers.ste import RansacSte
 from skyquilt.papers.strip_chain import LOOSE_PX, VARIANTS, board_camera, calibrated, chained
 from skyquilt.papers.surf import Surf
-from skyquilt.quality.registration_quality import eta, four_lengths, mean_squared_error
+from skyquilt.quality.registration_quality import mean_squared_error
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate.board import Chessboard, Lamp, Sensor, sweep, tilted
 from skyquilt.simulate.camera import Lens
@@ -344,6 +348,11 @@ WAYS_66: dict[str, dict[str, Any]] = {
 
 def fig_66(work: Path, seeds: int) -> None:
     """27 photos of a landscape with trees and houses, 60 % overlap: eta of each photo's square."""
+    import sys
+
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    from tests.papers.test_claims import eta_of_strip
+
     rows: dict[str, list[tuple[float, float]]] = {}
     lens = SMALL
     for seed in range(1, seeds + 1):
@@ -358,7 +367,7 @@ def fig_66(work: Path, seeds: int) -> None:
         photos, truth = sorted((folder / "photos").glob("*.jpg")), truth_of(folder)
         for name, more in WAYS_66.items():
             placed, _ = aligned(photos, MosaicSettings(method="image", jobs=1, **more))
-            rows.setdefault(name, []).append(_eta_of_strip(placed, truth))
+            rows.setdefault(name, []).append(eta_of_strip(placed, truth))
         for every in (1, 2):
             for model in ("homography", "similarity"):
                 if every == 1:
@@ -367,7 +376,7 @@ def fig_66(work: Path, seeds: int) -> None:
                     photos[::every], MosaicSettings(method="image", jobs=1, transform=model)
                 )
                 rows.setdefault(f"every other photo, {model}", []).append(
-                    _eta_of_strip(placed, truth)
+                    eta_of_strip(placed, truth)
                 )
     table(
         ("mosaic", "eta at the end, median", "least", "photos in the first piece"),
@@ -381,29 +390,6 @@ def fig_66(work: Path, seeds: int) -> None:
             for n, r in rows.items()
         ],
     )
-
-
-def _eta_of_strip(placed: AlignedPhotos, truth: dict[str, Any]) -> tuple[float, float]:
-    """eta (4.7) of the last photo's middle square on the map against its true lengths, the first
-    photo's taken as right; and the number of photos that hang together.
-    """
-    alignment, flat = placed.alignment, level_ground(0.0)
-    views = {v.photo: v for v in make_views(alignment, flat)}
-    chain = sorted(alignment.blocks[0])
-    ends = []
-    for i in (chain[0], chain[-1]):
-        camera = views[i].camera
-        side = camera.height / 4
-        middle = np.array([camera.width / 2, camera.height / 2])
-        px = middle + side * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-        found = on_ground(views[i], px, flat)[:, :2]
-        told = truth[placed.photos[i].name]
-        R = np.array(told["cam_R_map"])
-        rays = np.c_[undistort(camera, px), np.ones(4)] @ R
-        true = rays[:, :2] / rays[:, 2:]  # the height above the ground is the same at both ends
-        ends.append((np.array(four_lengths(found)), np.array(four_lengths(true))))
-    ratio = [found / true for found, true in ends]
-    return float(eta(ratio[1], np.full(4, ratio[0].mean()))), float(len(chain))
 
 
 def brighton(work: Path, seeds: int) -> None:
@@ -603,28 +589,40 @@ def heights(work: Path, seeds: int) -> None:
     from tests.depth.test_depth import against_truth
 
     rows: dict[str, list[tuple[float, float, float, float]]] = {}
-    for seed in range(3, 3 + seeds):
+    chosen = MosaicSettings(gsd_cm=25, features=3000, jobs=1)
+    for seed, noise in itertools.product(range(3, 3 + seeds), (2.0, 0.05)):
         settings = FlightSettings(
             seed=seed,
             lens=Lens().scaled(800, 600),
             route=Route(photos=9),
+            reporting=Reporting(gps_noise=noise),
             control=Control(points=5, checks=3),
         )
-        folder = simulated(work / f"heights{seed}", settings)
+        folder = simulated(work / f"heights{seed}-{noise:g}", settings)
         every = sorted((folder / "photos").glob("*.jpg"))
-        for name, photos, route in (
-            ("one pair (Fig. 5.12)", every[:2], "pair"),
-            ("mosaic of disparities", every, "disparities"),
-            ("reconstruction (Fig. 5.14)", every, "reconstruction"),
-        ):
-            chosen = MosaicSettings(gsd_cm=25, features=3000, jobs=1)
+        asked = [("one pair (Fig. 5.12)", every[k : k + 2], "pair") for k in (0, 3, 6)]
+        asked += [("one pair, features", every[k : k + 2], "disparities") for k in (0, 3, 6)]
+        asked += [(f"{r} of nine photos", every, r) for r in ("disparities", "reconstruction")]
+        for name, photos, route in asked:
             result = depth(photos, work / "depth", chosen, route=route, overwrite=True)
             r, slope, share = against_truth(work / "depth", folder)
-            rows.setdefault(name, []).append((r, slope, share, result.metrics["cpu_seconds"]))
+            told = rows.setdefault(f"{name}, positions good to {noise:g} m", [])
+            told.append((r, slope, share, result.metrics["cpu_seconds"]))
     table(
-        ("heights by", "r, median", "slope, median", "share of the map", "CPU s"),
-        [(n, *(f"{v:.2f}" for v in np.median(np.array(r), 0))) for n, r in rows.items()],
+        ("heights by", "n", "r, median (least, best)", "slope", "share of the map", "CPU s"),
+        [
+            (n, len(r), *(_spread(v) for v in np.array(r).T[:2]), *_medians(r))
+            for n, r in rows.items()
+        ],
     )
+
+
+def _spread(values: np.ndarray) -> str:
+    return f"{np.median(values):.2f} ({values.min():.2f}, {values.max():.2f})"
+
+
+def _medians(rows: Sequence[tuple[float, ...]]) -> list[str]:
+    return [f"{v:.2f}" for v in np.median(np.array(rows)[:, 2:], 0)]
 
 
 # ---- Y 6.4: two spectra, pair by pair
@@ -664,6 +662,67 @@ def table_64(work: Path, seeds: int) -> None:
                 printed = PRINTED_64[kind][0 if cell is _right_wrong else 1].split(", ")
                 rows.append(("printed", "", *printed, "", ""))
         table(head, rows)
+
+
+PRINTED_611 = {"lobe 5": (22, 17.2), "lobe 3": (38, 8.0), "lobe 1": (62, 16.6)}
+PRINTED_612 = {"sift": (102, 22.0), "surf": (31, 23.0), "rfae": (59, 12.0)}
+"""Inliers and Q in % of one pair each."""
+
+
+def fig_611(work: Path, seeds: int) -> None:
+    """Do more inliers raise Q? SURF by its initial lobe, and three methods, on the real pairs."""
+    listed = DATA / "spectral" / "pairs.csv"
+    if not listed.is_file():
+        raise SystemExit("the pairs of images are not beside this checkout")
+    one = surf()
+    lobes = {f"lobe {k}": replace(one, detect=replace(one.detect, lobe=k)) for k in LOBES}
+    methods = {m: registration_method(m) for m in PRINTED_612}
+    for title, ways, printed in (
+        ("Fig. 6.11", lobes, PRINTED_611),
+        ("Fig. 6.12", methods, PRINTED_612),
+    ):
+        print(title + ": inliers / Q in % of the accepted, the highest Q in bold\n")
+        rows, several, differ = [], 0, 0
+        for pair in read_pairs(listed):
+            a, b = (open_picture(path) for path in (pair.a, pair.b))
+            assert isinstance(a, Source) and isinstance(b, Source)
+            found = {n: w(a.picture, b.picture) for n, w in ways.items()}
+            told = {n: (len(o.px_a), 100 * o.q) for n, o in found.items() if o}
+            if len(told) < 2:
+                continue
+            highest, most = (max(told, key=lambda n, k=k: told[n][k]) for k in (1, 0))
+            several, differ = several + 1, differ + (highest != most)
+            cells = {n: f"{c} / {q:.0f}" for n, (c, q) in told.items()}
+            cells[highest] = f"**{cells[highest]}**"
+            rows.append((pair.source, *(cells.get(n, "refused") for n in ways)))
+        rows.append(
+            ("printed", *("{} / {:.0f}".format(*printed[n]) if n in printed else "" for n in ways))
+        )
+        table(("pair", *ways), rows)
+        print(f"most inliers, but not the highest Q: {differ} of {several} pairs\n")
+
+
+def spectral_methods(work: Path, seeds: int) -> None:
+    """Every registered method on the real pairs, with truth and, where it states one, its error."""
+    listed = DATA / "spectral" / "pairs.csv"
+    if not listed.is_file():
+        raise SystemExit("the pairs of images are not beside this checkout")
+    methods = registry.names("registration")
+    *_, last = iter_spectral_bench(listed, work / "all", methods, overwrite=True)
+    assert isinstance(last, Result)
+    rows = []
+    for method in methods:
+        of = [r for r in last.metrics["pairs"] if r["method"] == method]
+        taken, right = [r for r in of if r["accepted"]], [r for r in of if r["right"]]
+        stated = [r for r in taken if r["stated_px"] is not None]
+        held = sum(r["corner_px"] <= r["stated_px"] for r in stated)
+        counts = len(taken), len(right), len(taken) - len(right), len(of) - len(taken)
+        off = f"{np.median([r['error_px'] for r in right]):.1f}" if right else "-"
+        seconds = f"{np.mean([r['seconds'] for r in of]):.2f}"
+        told = f"{held} of {len(stated)}" if stated else "states none"
+        rows.append((method, *counts, off, told, _mean_q(of), seconds))
+    head = ("method", "accepted", "right", "wrong", "refused", "right ones off, px, median")
+    table((*head, "stated error holds", "mean Q, %", "CPU s a pair"), rows)
 
 
 def _right_wrong(of: Sequence[dict[str, Any]]) -> str:
@@ -864,13 +923,16 @@ NAMES: dict[str, tuple[Callable[[Path, int], None], int]] = {
     "eq-5.1": (eq_51, 1),
     "table-6.3": (table_63, 5),
     "mse": (mse, 2),
-    "fig-5.12": (heights, 2),
-    "fig-5.14": (heights, 2),
+    "fig-5.12": (heights, 5),
+    "fig-5.14": (heights, 5),
     "table-6.4": (table_64, 1),
     "table-6.5": (table_64, 1),
-    "depth-maps": (depth_maps, 2),
-    "fig-5.12c": (depth_maps, 2),
-    "fig-5.14c": (depth_maps, 2),
+    "fig-6.11": (fig_611, 1),
+    "fig-6.12": (fig_611, 1),
+    "spectral-methods": (spectral_methods, 1),
+    "depth-maps": (depth_maps, 3),
+    "fig-5.12c": (depth_maps, 3),
+    "fig-5.14c": (depth_maps, 3),
     "eq-5.7": (eq_57, 3),
     "ste": (ste, 1),
     "article": (article, 1),

@@ -1,5 +1,6 @@
 """Claims of the thesis that hold here (docs/papers.md), each on simulated flights."""
 
+import json
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -14,12 +15,15 @@ from skyquilt.engine.clock import Clock, result_of
 from skyquilt.engine.store import Store
 from skyquilt.geometry.camera import undistort
 from skyquilt.geometry.transforms import fit, transfer
+from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.matching.ransac import Ransac
 from skyquilt.model.event import Result
+from skyquilt.ortho.tie_surface import level as level_ground
 from skyquilt.papers.compare import CompareSettings, iter_compare
 from skyquilt.papers.pair_list import overlap_error
 from skyquilt.papers.strip_chain import VARIANTS, board_camera, chained
-from skyquilt.quality.registration_quality import mean_squared_error
+from skyquilt.quality.registration_quality import eta as eta_of
+from skyquilt.quality.registration_quality import four_lengths, mean_squared_error
 from skyquilt.settings import MosaicSettings
 from skyquilt.simulate import FlightSettings, StripSettings, fly_strip, simulate
 from skyquilt.simulate.camera import Lens
@@ -169,6 +173,77 @@ def test_the_cost_of_hybrid_grows_more_slowly_than_that_of_searching_the_overvie
     spent = {k: [aligned(roundtrip[:n], **w)[1] for n in (8, 24)] for k, w in ways.items()}
     growth = {k: np.log(v[1] / v[0]) / np.log(3) for k, v in spent.items()}
     assert growth["overview"] > 1.5 and growth["hybrid"] < 1.4
+
+
+def eta_of_strip(placed, truth):
+    """eta (4.7) of the last photo's middle square on the map against its true lengths, the first
+    photo's taken as right; and the number of photos that hang together.
+    """
+    alignment, flat = placed.alignment, level_ground(0.0)
+    views = {v.photo: v for v in make_views(alignment, flat)}
+    chain = sorted(alignment.blocks[0])
+    ends = []
+    for i in (chain[0], chain[-1]):
+        camera = views[i].camera
+        side = camera.height / 4
+        middle = np.array([camera.width / 2, camera.height / 2])
+        px = middle + side * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        found = on_ground(views[i], px, flat)[:, :2]
+        told = truth[placed.photos[i].name]
+        R = np.array(told["cam_R_map"])
+        rays = np.c_[undistort(camera, px), np.ones(4)] @ R
+        true = rays[:, :2] / rays[:, 2:]  # the height above the ground is the same at both ends
+        ends.append((np.array(four_lengths(found)), np.array(four_lengths(true))))
+    ratio = [found / true for found, true in ends]
+    return float(eta_of(ratio[1], np.full(4, ratio[0].mean()))), float(len(chain))
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_lens_levelling_and_transformation_each_keep_the_shape_of_a_mosaic(tmp_path):
+    """Y Fig. 6.6a to c, on photos of a landscape with trees and houses."""
+    lens = Lens().scaled(800, 600)
+    settings = FlightSettings(
+        seed=1,
+        lens=lens,
+        route=Route(pattern="strip", photos=16, overlap=0.6, height=60.0, speed=5.0),
+        reporting=Reporting(dewarp=(lens.p1, lens.p2), focal_error=0.0),
+        control=Control(points=0, checks=0),
+    )
+    for _ in simulate(settings, tmp_path / "strip", overwrite=True):
+        pass
+    told = json.loads((tmp_path / "strip" / "truth" / "truth.json").read_text())
+    truth = {p["name"]: p for p in told["photos"]}
+    photos = sorted((tmp_path / "strip" / "photos").glob("*.jpg"))
+    ways = (
+        {"distortion": "2", "levelled": False, "transform": "homography"},
+        {"transform": "homography"},
+        {"transform": "similarity"},
+    )
+    ends = []
+    for way in ways:
+        eta, together = eta_of_strip(aligned(photos, method="image", **way)[0], truth)
+        assert together == len(photos)
+        ends.append(eta)
+    assert ends[0] + 0.1 < ends[1] < ends[2] - 0.03 < 0.96
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_hybrid_saves_time_against_searching_the_overview(tmp_path):
+    """Y 6.5: 'the computation time for a set of 37 images is reduced by approximately 70 %'."""
+    settings = FlightSettings(
+        lens=Lens().scaled(800, 600),
+        route=Route(pattern="roundtrip", photos=40, overlap=0.6, lost=3),
+        reporting=Reporting(focal_error=0.0),
+        control=Control(points=0, checks=0),
+    )
+    for _ in simulate(settings, tmp_path / "round", overwrite=True):
+        pass
+    photos = sorted((tmp_path / "round" / "photos").glob("*.jpg"))
+    overview = aligned(photos, method="image", image_search="overview")[1]
+    hybrid = aligned(photos, method="hybrid", optimiser="anneal")[1]
+    assert len(photos) == 37 and 0.6 < 1 - hybrid / overview < 0.9
 
 
 @pytest.mark.slow

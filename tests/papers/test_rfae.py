@@ -126,6 +126,43 @@ def test_rfae_registers_what_surf_cannot_and_patches_mend_what_it_gets_wrong():
     assert told == {"surf": [False] * 3, "rfae": [True, False, False], "rfae-refined": [True] * 3}
 
 
+@pytest.mark.real
+@pytest.mark.slow
+def test_more_inliers_need_not_raise_q():
+    """Y Fig. 6.11 (22 inliers with Q 17.2 %, 38 with 8 %): where the inliers lie matters."""
+    if not REAL.is_file():
+        pytest.skip(f"real pairs missing: {REAL}")
+    pair = next(p for p in read_pairs(REAL) if p.source == "nc20-nc30")
+    a, b = (open_picture(path).picture for path in (pair.a, pair.b))
+    told = {}
+    for lobe in LOBES:
+        one = surf()
+        found = replace(one, detect=replace(one.detect, lobe=lobe))(a, b)
+        told[lobe] = len(found.px_a), found.q
+    most, highest = (max(told, key=lambda k, i=i: told[k][i]) for i in (0, 1))
+    assert most != highest and told[most][0] > told[highest][0] > 500
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_other_lobes_register_what_lobe_1_does_not_and_the_first_octave_hardly_matters():
+    """Y Fig. 6.11 and 5.2.1 on real pairs with truth."""
+    if not REAL.is_file():
+        pytest.skip(f"real pairs missing: {REAL}")
+    asked = {
+        "twmm-11-44-43-767": {"surf": False, "surf-lobe": True, "sift": True, "sift-octave0": True},
+        "vifb-running": {"surf": False, "surf-lobe": True},
+        "olinda3-olinda4": {"surf": False, "surf-lobe": False, "sift": True, "sift-octave0": True},
+    }
+    for pair in read_pairs(REAL):
+        a, b = (open_picture(path).picture for path in (pair.a, pair.b))
+        for method, right in asked.pop(pair.source, {}).items():
+            outcome = registration_method(method)(a, b)
+            off = overlap_error(outcome.b_H_a, pair.b_H_a, a.shape, b.shape) if outcome else np.inf
+            assert (off < pair.tolerance_px) == right == bool(outcome), (pair.source, method, off)
+    assert not asked
+
+
 def test_what_patches_do_not_confirm_is_refused():
     """Nine inliers of a method, but pictures of nothing in common."""
     rng = np.random.default_rng(2)

@@ -52,7 +52,7 @@ class Scatter:
 class StateError:
     """The error of a registration from the shifts of its patches."""
 
-    dependence: float = 2.3
+    dependence: float = 2.4
     """Number of patches that weigh like one independent one: neighbours err alike."""
     misfit: float = 0.5
     """Prior of each parameter beyond the model's, at half b's diagonal, in units of the
@@ -81,7 +81,7 @@ class StateError:
     """Scatter expected without any patch, px; it counts as much as `weight` observations."""
     weight: float = 3.0
     """See `least_px`."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def scatter(
         self,
