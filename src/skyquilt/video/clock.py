@@ -263,7 +263,7 @@ def _yaw(track: Track, t: Array, half: float) -> Array:
 
 
 def _risen(track: Track, t: Array, half: float) -> Array:
-    """Change of height (n,) in m from `half` before to `half` after each of t; NaN where unknown."""
+    """Climb (n,) in m from `half` before to `half` after each of t; NaN where unknown."""
     takeoff = track.takeoff_m
     height = takeoff if np.isfinite(takeoff).sum() > 1 else track.sea_level_m
     known = np.isfinite(height)
