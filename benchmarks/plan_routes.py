@@ -106,7 +106,8 @@ def main():
             f"{number:2d}: {len(points)} points, {len(site.keep_out)} keep-outs,"
             f" {len(routes.sorties)} sorties, longest {longest:.0f} s = {ratio:.3f} x bound"
             f" {routes.bound_s:.0f} s, last landing {end:.0f} s; "
-            f" routes {took:.1f} s ({spent:.1f} of CPU); {met} legs meet a keep-out, {over} over endurance,"
+            f" routes {took:.1f} s ({spent:.1f} of CPU);"
+            f" {met} legs meet a keep-out, {over} over endurance,"
             f" all points once: {visited == [p.id for p in points]};"
             f" views {proof.least}/{proof.views} {' '.join((*warnings, *routes.warnings))}",
             flush=True,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from skyquilt.errors import UsageError
+from skyquilt.outside import whole
 
 if TYPE_CHECKING:
     from skyquilt import simulate as sim
@@ -301,10 +302,10 @@ def _lens(settings: "FlightSettings", size: str | None) -> Any:
     """The preset's lens with another number of pixels."""
     if size is None:
         return settings.lens
-    words = size.lower().split("x")
-    if len(words) != 2 or not all(word.isdigit() and 64 <= int(word) <= 12000 for word in words):
+    sides = [whole(word, 64, 12000) for word in size.lower().split("x")]
+    if len(sides) != 2 or sides[0] is None or sides[1] is None:
         raise UsageError(f"--size must look like 1600x1200 (64 to 12000 px each), not '{size}'")
-    return settings.lens.scaled(int(words[0]), int(words[1]))
+    return settings.lens.scaled(sides[0], sides[1])
 
 
 def _pair(option: str, text: str | None) -> tuple[float, float] | None:

@@ -77,7 +77,8 @@ class HeightCells:
         c0, r0, c1, r1 = self._reach(bounds)
         cells, heights = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
         for (C, R), held in self._blocks.items():
-            if C * BLOCK > c1 or R * BLOCK > r1 or (C + 1) * BLOCK <= c0 or (R + 1) * BLOCK <= r0:
+            first, last = np.array([C, R]) * BLOCK, np.array([C, R]) * BLOCK + BLOCK - 1
+            if (first > (c1, r1)).any() or (last < (c0, r0)).any():
                 continue
             row, column = np.nonzero(np.isfinite(held))
             at = np.column_stack([column + C * BLOCK, row + R * BLOCK])
