@@ -1,6 +1,7 @@
 """Simulates large flights in minutes rather than hours.
 
 python benchmarks/large_flight.py FOLDER [--photos 2000]    2 MP photos from three drones
+python benchmarks/large_flight.py FOLDER --kind small       300 photos of 0.3 MP from three drones
 python benchmarks/large_flight.py FOLDER --kind dense       172 photos of 0.5 MP, 87 % overlap
 python benchmarks/large_flight.py FOLDER --kind wing        167 photos of 9.7 MP, 50 % overlap
 
@@ -35,6 +36,7 @@ from skyquilt.simulate.truth import write_truth
 
 KINDS = {
     "large": (Lens(), Route(photos=2000, drones=3)),
+    "small": (Lens(width=640, height=480, focal=533.0), Route(photos=300, drones=3)),
     "dense": (
         Lens(width=816, height=612, focal=680.0),
         Route(photos=172, overlap=0.87, sidelap=0.7, height=40.0),
@@ -46,7 +48,7 @@ KINDS = {
 }
 """Camera and route by name."""
 GSD = 0.1
-"""Cell of the country's raster in m; the photos' own is 0.045 m."""
+"""Least cell of the country's raster in m; the pixels of 2 MP photos are 0.045 m."""
 LAYERS = {"height": ((), np.float32), "rgb": ((3,), np.uint8), "look": ((4,), np.float16)}
 """Rasters of the terrain."""
 OFTEN = 8
@@ -129,12 +131,13 @@ def main() -> None:
     lens, route = KINDS[asked.kind]
     if asked.photos:
         route = replace(route, photos=asked.photos)
+    pixel = route.height / lens.focal
     settings = FlightSettings(
         seed=asked.seed,
         lens=lens,
         route=route,
         control=Control(points=0, checks=0),
-        gsd=min(GSD, 2 * route.height / lens.focal),
+        gsd=min(max(GSD, pixel), 2 * pixel),
     )
     world = prepare(settings)
     began, last = time.process_time(), ("", -1)

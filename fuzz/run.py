@@ -4,12 +4,14 @@ python -m fuzz.run --seconds 10              every target for so long
 python -m fuzz.run --minutes 5               all targets together for so long
 python -m fuzz.run --seeds                   every seed once, without fuzzing
 python -m fuzz.run jpeg --seconds 60
+python -m fuzz.run --minutes 3 --seed 1      the same inputs every time, as far as the time goes
 
 An input on which a target fails is kept in fuzz/found; once the reader is mended, it belongs into
 fuzz/seeds as a regression test.
 """
 
 import argparse
+import os
 import random
 import shutil
 import subprocess
@@ -50,8 +52,8 @@ def seeds() -> int:
     return failed
 
 
-def fuzz_one(name: str, seconds: float, corpus: Path) -> None:
-    """Fuzzes one target in this process; atheris ends it."""
+def fuzz_one(name: str, seconds: float, corpus: Path, seed: int | None) -> None:
+    """Fuzzes one target in this process; atheris ends it. With a seed the inputs are repeatable."""
     import atheris
 
     with atheris.instrument_imports(include=["skyquilt"]):
@@ -81,6 +83,8 @@ def fuzz_one(name: str, seconds: float, corpus: Path) -> None:
         "-max_len=700000",
         f"-artifact_prefix={found}/{name}-",
     ]
+    if seed is not None:
+        options.append(f"-seed={seed}")
     atheris.Setup(options, target.run, custom_mutator=structured)
     atheris.Fuzz()
 
@@ -90,13 +94,14 @@ def main() -> int:
     parser.add_argument("target", nargs="?")
     parser.add_argument("--seconds", type=float)
     parser.add_argument("--minutes", type=float)
+    parser.add_argument("--seed", type=int)
     parser.add_argument("--seeds", action="store_true")
     parser.add_argument("--corpus", type=Path)
     asked = parser.parse_args()
     if asked.seeds:
         return min(seeds(), 1)
     if asked.corpus:
-        fuzz_one(asked.target, asked.seconds, asked.corpus)
+        fuzz_one(asked.target, asked.seconds, asked.corpus, asked.seed)
         return 0
     names = [asked.target] if asked.target else _names()
     seconds = asked.seconds or 60 * (asked.minutes or 5) * JOBS / len(names) - START_S
@@ -105,9 +110,12 @@ def main() -> int:
 
     def one(name: str) -> bool:
         command = [sys.executable, "-m", "fuzz.run", name, "--seconds", str(seconds)]
+        if asked.seed is not None:
+            command += ["--seed", str(asked.seed)]
         began = time.monotonic()
         done = subprocess.run(
             [*command, "--corpus", str(corpora / name)],
+            env={**os.environ, "PYTHONHASHSEED": "0"} if asked.seed is not None else None,
             capture_output=True,
             text=True,
             errors="replace",

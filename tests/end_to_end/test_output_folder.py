@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import rasterio
 
+from skyquilt.engine import codec
 from skyquilt.engine.folder import CONTRACT
 from skyquilt.workflows.mosaic import STAGES
 from tests.end_to_end.conftest import leftovers, named
@@ -155,15 +156,14 @@ def test_a_full_disk(mosaic, flight, small_disk, finished, size):
 def test_a_disk_that_fills_up_while_intermediate_results_are_stored(
     mosaic, flight, finished, monkeypatch, stage
 ):
-    write = Path.write_bytes
-
-    def full(path, data):
-        if path.parent.name == stage:
-            write(path, data[: len(data) // 2])
+    def full(file, value):
+        data = codec.encode(value)
+        if Path(file.name).parent.name == stage:
+            file.write(data[: len(data) // 2])
             raise OSError(errno.ENOSPC, "No space left on device")
-        return write(path, data)
+        file.write(data)
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr("skyquilt.engine.store.write", full)
     told = mosaic(flight / "photos").refused(5, "disk is full", "make room", "same command again")
     monkeypatch.undo()
     same_result(mosaic(flight / "photos", output=told.output).made().output, finished)

@@ -63,7 +63,8 @@ IN_NO_KEY = {
         "files of heights are written anew by every run",
     ),
     **dict.fromkeys(
-        ("POLL_S", "PATIENCE_S", "ANSWER_S", "START_S", "FAILURES", "AHEAD", "STEPS_KEPT"),
+        ("POLL_S", "PATIENCE_S", "ANSWER_S", "START_S", "FAILURES", "AHEAD", "STEPS_KEPT")
+        + ("TASK_S", "MOST_ITEMS", "LOOKED"),
         "who computes does not change what is computed",
     ),
 }

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from skyquilt.engine import codec
 from skyquilt.engine.store import Store, digest
 from skyquilt.errors import OutputError
 from skyquilt.settings import MosaicSettings
@@ -48,13 +49,12 @@ def test_values_that_count_as_nothing_are_kept(store):
 
 def test_a_full_disk_leaves_the_former_artefact(store, monkeypatch):
     store.put("stage", "key", [1])
-    write = Path.write_bytes
 
-    def full(path, data):
-        write(path, data[:10])
+    def full(file, value):
+        file.write(b"PK")
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr("skyquilt.engine.store.write", full)
     with pytest.raises(OutputError, match=r"disk is full.*same command again"):
         store.put("stage", "key", [2])
     monkeypatch.undo()
@@ -121,15 +121,15 @@ def test_what_a_killed_process_left_is_removed(store):
 
 def test_two_processes_may_make_the_same_result(store, monkeypatch):
     """The other one finishes while this one writes."""
-    write, other = Path.write_bytes, Store(folder=store.folder, registry={})
+    other = Store(folder=store.folder, registry={})
 
-    def meanwhile(path, data):
+    def meanwhile(file, value):
         monkeypatch.undo()
         monkeypatch.setattr("os.getpid", lambda: 77)
         other.put("stage", "key", [1])
-        return write(path, data)
+        codec.write(file, value)
 
-    monkeypatch.setattr(Path, "write_bytes", meanwhile)
+    monkeypatch.setattr("skyquilt.engine.store.write", meanwhile)
     store.put("stage", "key", [1])
     assert store.get("stage", "key") == [1]
     assert not list(store.folder.rglob("*.partial"))

@@ -8,6 +8,7 @@ from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.engine.workers import Threads
 from skyquilt.model.camera import Camera
 from skyquilt.model.raster import Grid
+from skyquilt.ortho import fill
 from skyquilt.ortho.fill import filled, nearest_known, plateaus, settled
 from skyquilt.ortho.pair_matching import pair_of
 from skyquilt.ortho.stereo import Stereo
@@ -154,6 +155,28 @@ def test_beyond_the_support_lies_the_plane():
     far = out[20:180, 95:120]
     assert np.abs(far - (0.1 * x)[20:180, 95:120]).max() < 3.5
     assert np.abs(np.diff(out[20:180, 100:], axis=1)).max() < 0.3
+
+
+def test_gaps_of_tall_rasters_are_filled_in_bands_as_in_one(monkeypatch):
+    """Exactly as the whole raster within the rows that a band looks beyond; from roughly there
+    further away, and where nothing is known at all for many bands.
+    """
+    rng = np.random.default_rng(3)
+    x, y = np.meshgrid(np.arange(120.0), np.arange(900.0))
+    z = (0.05 * y + np.sin(x / 9)).astype(np.float32)
+    known = rng.random(z.shape) < 0.03
+    known[300:560] = False
+    spoilt = np.where(known, z, -99).astype(np.float32)
+    whole = nearest_known(spoilt, known)
+    monkeypatch.setattr(fill, "WHOLE", 128)
+    monkeypatch.setattr(fill, "BEYOND", 40)
+    bands = nearest_known(spoilt, known)
+    away = cv2.distanceTransform((~known).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    assert np.array_equal(bands[away <= 40], whole[away <= 40])
+    assert (away > 40).sum() > 10_000
+    assert bands.min() >= z[known].min()
+    apart = np.abs(bands - whole)[away > 40]  # the gap's sides differ by 13 m
+    assert np.median(apart) < 1 and np.mean(apart < 2.5) > 0.95
 
 
 def test_gaps_are_filled_from_their_sides():

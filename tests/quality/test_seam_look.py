@@ -9,6 +9,7 @@ from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.tie_surface import level
 from skyquilt.quality.seam_look import cut_objects, seam_colours
 from skyquilt.quality.seam_points import SeamPoint
+from skyquilt.quality.seam_views import Look, views_at
 from tests.ortho.scenes import view
 
 GSD = 0.05
@@ -39,7 +40,10 @@ def colours(first, second, exposure=NEUTRAL, apart=1.0):
     views = {0: view(0, 0.0, 0.0), 1: view(1, apart, 0.0)}
     camera = views[0].camera
     shown = [np.full((camera.height, camera.width, 3), c, np.uint8) for c in (first, second)]
-    return seam_colours(POINTS, GRID, views, level(0.0), exposure, lambda i: shown[i], GSD)
+    look = Look(
+        surface=level(0.0), pixels=lambda i: shown[i], exposure=exposure, native_gsd=GSD, gsd=GSD
+    )
+    return seam_colours(views_at(POINTS, GRID, views, look).lab)
 
 
 @pytest.mark.parametrize(

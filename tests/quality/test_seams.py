@@ -100,8 +100,12 @@ def shifted(s, *, flat=0, unrelated=0, unseen=0, gain=0.8):
     return cut
 
 
+def disparity(points, source, **settings):
+    return seam_disparity(points, source(points), **settings)
+
+
 def test_known_disparity_is_measured():
-    report = seam_disparity(points_of(60), shifted((6, -8)), gsd_m=0.02)  # 1.5 px south, 2 px west
+    report = disparity(points_of(60), shifted((6, -8)), gsd_m=0.02)  # 1.5 px south, 2 px west
     assert (report.measured, report.attempted) == (60, 60)
     assert report.median_px == pytest.approx(2.5, abs=0.03)
     assert report.p95_px == pytest.approx(2.5, abs=0.1)
@@ -112,13 +116,13 @@ def test_known_disparity_is_measured():
 
 
 def test_a_good_mosaic_is_not_flattered_below_what_noise_allows():
-    report = seam_disparity(points_of(60), shifted((0, 0)), gsd_m=0.02)
+    report = disparity(points_of(60), shifted((0, 0)), gsd_m=0.02)
     assert 0.001 < report.median_px < 0.05
 
 
 def test_failures_are_attempted_and_blind_points_are_not():
     source = shifted((4, 4), flat=10, unrelated=15, unseen=5)
-    report = seam_disparity(points_of(60), source, gsd_m=0.02)
+    report = disparity(points_of(60), source, gsd_m=0.02)
     assert report.attempted == 60 - 10 - 5
     assert report.measured == report.attempted - 15
     assert sum(not s.ok for s in report.samples) == 15
@@ -128,16 +132,16 @@ def test_failures_are_attempted_and_blind_points_are_not():
 
 
 def test_a_disparity_beyond_the_search_is_a_failure_not_a_small_figure():
-    report = seam_disparity(points_of(40), shifted((0, 4 * 10)), gsd_m=0.02)
+    report = disparity(points_of(40), shifted((0, 4 * 10)), gsd_m=0.02)
     assert report.attempted == 40
     assert report.measured <= 1
     assert not report.stands
 
 
 def test_no_seams_no_figures():
-    report = seam_disparity([], shifted((0, 0)), gsd_m=0.02)
+    report = seam_disparity([], shifted((0, 0))(points_of(1)), gsd_m=0.02)
     assert (report.median_px, report.p95_px, report.median_cm, report.p95_cm) == (None,) * 4
     assert (report.measured, report.attempted, report.samples) == (0, 0, ())
     assert not report.stands
-    blind = seam_disparity(points_of(3), shifted((0, 0), unseen=3), gsd_m=0.02)
+    blind = disparity(points_of(3), shifted((0, 0), unseen=3), gsd_m=0.02)
     assert (blind.median_px, blind.attempted) == (None, 0)

@@ -62,6 +62,8 @@ def _left_out(
     while rest:
         groups.append(rest - whole.grown(rest).keys())
         rest -= groups[-1]
+        if not rest and len(groups) == 1:
+            return {}
         if len(rest) <= max(map(len, groups)):
             break
     return whole.grown(set(block), max(groups, key=len))
@@ -179,7 +181,8 @@ def deviation_px(
     spread = max(0.5, float(np.median(np.linalg.norm(residual_px, axis=1))) / 1.18)
     weight = min(1.0, INDEPENDENT / len(xyz)) / spread**2
     J = pose_derivatives(pose, camera, xyz)
-    normal = weight * np.einsum("nki,nkj->ij", J, J)
+    flat = J.reshape(-1, 6)
+    normal = weight * (flat.T @ flat)
     if prior is not None:
         normal += _known(prior)
     places = _ground_places(pose, camera, float(np.median(xyz[:, 2])))

@@ -303,9 +303,10 @@ def _lens(settings: "FlightSettings", size: str | None) -> Any:
     if size is None:
         return settings.lens
     sides = [whole(word, 64, 12000) for word in size.lower().split("x")]
-    if len(sides) != 2 or sides[0] is None or sides[1] is None:
-        raise UsageError(f"--size must look like 1600x1200 (64 to 12000 px each), not '{size}'")
-    return settings.lens.scaled(sides[0], sides[1])
+    match sides:
+        case [int(width), int(height)]:
+            return settings.lens.scaled(width, height)
+    raise UsageError(f"--size must look like 1600x1200 (64 to 12000 px each), not '{size}'")
 
 
 def _pair(option: str, text: str | None) -> tuple[float, float] | None:

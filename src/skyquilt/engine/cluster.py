@@ -13,13 +13,15 @@ import threading
 import time
 import uuid
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import contextmanager, suppress
 from io import BytesIO
+from itertools import islice
 from pathlib import Path, PurePath
 from typing import Any, ClassVar, TypeVar
 
 from skyquilt.engine.folder import refusal
+from skyquilt.engine.free_memory import return_large_blocks
 from skyquilt.errors import SkyquiltError, UsageError
 from skyquilt.model.event import Note
 from skyquilt.version import __version__
@@ -29,6 +31,7 @@ try:
     import cv2
     import dask
     import distributed
+    import numpy as np
     from distributed.comm.core import CommClosedError
 except ImportError as error:
     raise UsageError("--scheduler needs Dask: install skyquilt with its extra `cluster`") from error
@@ -49,6 +52,10 @@ FAILURES = 5
 """Workers that may die of one task before the run ends with an error."""
 AHEAD = 3
 """Tasks that are handed out at a time for each thread of the workers."""
+TASK_S, MOST_ITEMS, LOOKED = 0.4, 64, 50
+"""Seconds that a task shall take, most items in one, and the number of the last items that tell how
+long one takes.
+"""
 STEPS_KEPT = 2
 """Steps that a worker keeps in memory."""
 
@@ -72,6 +79,7 @@ def cluster(scheduler: str, folder: Path, sees: Sequence[Path]) -> Iterator["Clu
                 "distributed.worker.memory.spill": False,
                 "distributed.worker.memory.pause": False,
                 "distributed.worker.memory.terminate": False,
+                "distributed.worker.profile.enabled": False,
             }
         ),
         _client(scheduler) as client,
@@ -175,19 +183,28 @@ class Cluster:
         """
         waiting: deque[Any] = deque()
         name = f"{getattr(work, '__name__', type(work).__name__)}-{uuid.uuid4().hex[:8]}"
+        rest, number, spent_s = iter(items), 0, list[float]()
+        share = len(items) // (AHEAD * self._threads) if isinstance(items, Sized) else MOST_ITEMS
         try:
-            for number, item in enumerate(items):
-                path, self.handed = self._file_of(work), self.handed + 1
+            while some := list(islice(rest, max(1, min(_size(spent_s), share)))):
+                path, number = self._file_of(work), number + 1
                 waiting.append(
-                    self._client.submit(_do, str(path), item, key=f"{name}-{number}", pure=False)
+                    self._client.submit(_do, str(path), some, key=f"{name}-{number}", pure=False)
                 )
+                self.handed += len(some)
                 if len(waiting) > AHEAD * self._threads:
-                    yield self._result(waiting.popleft())
+                    yield from self._taken(waiting.popleft(), spent_s)
             while waiting:
-                yield self._result(waiting.popleft())
+                yield from self._taken(waiting.popleft(), spent_s)
         finally:
             with suppress(Exception):  # the scheduler may be gone
                 self._client.cancel(list(waiting))
+
+    def _taken(self, future: Any, spent_s: list[float]) -> list[Any]:
+        """The results of a task; adds the seconds that its items took."""
+        results, seconds = self._result(future)
+        spent_s += seconds
+        return results  # type: ignore[no-any-return]
 
     def news(self) -> Sequence[Note]:
         """Workers that came or went since the last call."""
@@ -318,6 +335,7 @@ def _step(path: str) -> Callable[[Any], Any]:
             if wrong := _unfit(path):
                 raise UsageError(f"the worker {platform.node()} cannot take part: {wrong}")
             cv2.setNumThreads(1)  # as many tasks run as there are threads
+            return_large_blocks()  # Dask has every free give memory back, which costs more time
             with Path(path).open("rb") as file:
                 pickle.load(file)
                 _steps[path] = pickle.load(file)
@@ -327,6 +345,20 @@ def _step(path: str) -> Callable[[Any], Any]:
         return _steps[path]
 
 
-def _do(path: str, item: Any) -> Any:
-    """One task."""
-    return _step(path)(item)
+def _size(spent_s: list[float]) -> int:
+    """How many items the next task gets, so that it takes about `TASK_S`: neighbours use the same
+    photos, and handing out a task costs milliseconds.
+    """
+    if not spent_s:
+        return 1
+    return max(1, min(MOST_ITEMS, round(TASK_S / max(float(np.mean(spent_s[-LOOKED:])), 1e-6))))
+
+
+def _do(path: str, items: list[Any]) -> tuple[list[Any], list[float]]:
+    """One task: the results of its items, and the seconds that each took."""
+    work, results, seconds = _step(path), [], []
+    for item in items:
+        began = time.monotonic()
+        results.append(work(item))
+        seconds.append(time.monotonic() - began)
+    return results, seconds

@@ -7,7 +7,7 @@ import io
 import json
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -16,11 +16,16 @@ Registry = Mapping[str, type]
 
 def encode(value: Any) -> bytes:
     """Encodes dataclasses, tuples, lists, dicts, sets, arrays and scalars as bytes."""
+    buffer = io.BytesIO()
+    write(buffer, value)
+    return buffer.getvalue()
+
+
+def write(file: BinaryIO, value: Any) -> None:
+    """The same into a file, one array after another: large ones are not copied as a whole."""
     arrays: dict[str, Any] = {}
     tree = _down(value, arrays)
-    buffer = io.BytesIO()
-    np.savez(buffer, __tree__=np.frombuffer(json.dumps(tree).encode(), np.uint8), **arrays)
-    return buffer.getvalue()
+    np.savez(file, __tree__=np.frombuffer(json.dumps(tree).encode(), np.uint8), **arrays)
 
 
 def decode(data: bytes, registry: Registry) -> Any:
@@ -29,8 +34,17 @@ def decode(data: bytes, registry: Registry) -> Any:
     Raises:
         ValueError: the bytes are damaged, or name an unknown record.
     """
+    return read(io.BytesIO(data), registry)
+
+
+def read(file: BinaryIO, registry: Registry) -> Any:
+    """The same from a file.
+
+    Raises:
+        ValueError: it is damaged, or names an unknown record.
+    """
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        with np.load(file, allow_pickle=False) as arrays:
             tree = json.loads(bytes(arrays["__tree__"]).decode())
             return _up(tree, arrays, registry)
     except (

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from skyquilt.engine.codec import Registry, decode, encode
+from skyquilt.engine.codec import Registry, read, write
 from skyquilt.engine.constants import constants_of
 from skyquilt.engine.folder import refusal
 from skyquilt.engine.kept import Keep
@@ -121,7 +121,8 @@ class Store:
         """The stored result, or None when there is none or the file is damaged."""
         path = self.folder / stage / f"{key}.npz"
         try:
-            value = decode(path.read_bytes(), self.registry)
+            with path.open("rb") as file:
+                value = read(file, self.registry)
         except (OSError, ValueError, TypeError):
             return None
         self.hits += 1
@@ -139,7 +140,8 @@ class Store:
         partial = path.with_suffix(f".{platform.node()}-{os.getpid()}.partial")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            partial.write_bytes(encode(value))
+            with partial.open("wb") as file:
+                write(file, value)
             partial.replace(path)
         except OSError as error:
             with suppress(OSError):

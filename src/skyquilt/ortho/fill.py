@@ -12,6 +12,10 @@ Float = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 COARSE = 64
 """Cells along the longer side of the raster in which planes are fitted."""
+WHOLE, BEYOND, COARSER = 2048, 512, 8
+"""Rows of heights filled at a time, those looked at beyond them, and the step of the rows and
+columns that fill what is further away.
+"""
 STIFF = 0.002
 """Weight of a prior of zero for the slope of a plane."""
 
@@ -100,11 +104,37 @@ def _planes(z: Float, support: Mask) -> Float:
 def nearest_known(z: Float, known: Mask) -> Float:
     """Heights (h, w) with gaps filled by the nearest known one: they end in cliffs. A photo drawn
     on a slope between a crown and the ground beside it would become a streak.
+
+    Heights of more than `WHOLE` rows are filled in bands: cells from which nothing is known within
+    `BEYOND` rows take what is nearest of every `COARSER`-th row and column.
     """
+    if len(z) <= WHOLE:
+        return _nearest(z, known)[0]
+    rough_known = known[::COARSER, ::COARSER]
+    if not rough_known.any():
+        return _nearest(z, known)[0]
+    rough = _nearest(z[::COARSER, ::COARSER], rough_known)[0]
+    out = np.empty_like(z)
+    columns = np.arange(z.shape[1]) // COARSER
+    for row in range(0, len(z), WHOLE // 2):
+        first, last = max(0, row - BEYOND), min(len(z), row + WHOLE // 2 + BEYOND)
+        rows = slice(row - first, min(row + WHOLE // 2, len(z)) - first)
+        band, far = z[first:last], np.ones((rows.stop - rows.start, z.shape[1]), np.bool_)
+        inner = out[row : row + WHOLE // 2]
+        if known[first:last].any():
+            whole, away = _nearest(band, known[first:last])
+            inner[:] = whole[rows]
+            far = away[rows] > BEYOND
+        if far.any():
+            inner[far] = rough[np.arange(row, row + len(inner)) // COARSER][:, columns][far]
+    return out
+
+
+def _nearest(z: Float, known: Mask) -> tuple[Float, Float]:
+    """The same of a raster as a whole, and the distances in cells."""
     away, place = cv2.distanceTransformWithLabels(
         (~known).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
-    del away  # large surveys have rasters of 100 MB
     table = np.zeros(int(place.max()) + 1, np.float32)
     strips = [slice(row, row + STRIP) for row in range(0, len(z), STRIP)]
     for rows in strips:
@@ -113,7 +143,7 @@ def nearest_known(z: Float, known: Mask) -> Float:
     for rows in strips:
         gap = ~known[rows]
         out[rows][gap] = table[place[rows][gap]]
-    return out
+    return out, np.asarray(away, np.float32)
 
 
 def plateaus(z: Float, side: int) -> Float:

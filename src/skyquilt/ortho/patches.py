@@ -1,6 +1,5 @@
 """Small orthorectified pieces of single photos."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -60,33 +59,3 @@ def _cut_out(
             borderMode=cv2.BORDER_REPLICATE,
         )
     )
-
-
-def grey_pairs(
-    first: Sequence[View],
-    second: Sequence[View],
-    xy: NDArray[Any],
-    surface: Surface,
-    pixels: PhotoPixels,
-    gsd: float,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Patches (n, 64, 64) of two photos each around map points (n, 2), and whether both photos
-    cover them completely.
-    """
-    patches = np.zeros((2, len(xy), SIDE, SIDE), np.float32)
-    seen = np.zeros((2, len(xy)), bool)
-    sides: dict[int, list[tuple[int, int]]] = {}
-    views = (first, second)
-    for which, row in enumerate(views):
-        for k, view in enumerate(row):
-            sides.setdefault(view.photo, []).append((which, k))
-    for asked in (
-        sides.values()
-    ):  # all patches of a photo together, so that it is decoded and projected once
-        which, k = asked[0]
-        at = np.array([place for _, place in asked])
-        found = grey_patches(views[which][k], surface, pixels, xy[at], gsd)
-        for (which, k), patch in zip(asked, found, strict=True):
-            if patch is not None:
-                patches[which, k], seen[which, k] = patch, True
-    return patches[0], patches[1], np.asarray(seen.all(0))

@@ -141,7 +141,7 @@ def from_record(record: Mapping[str, Any]) -> Plan:
     if not isinstance(record, Mapping) or record.get("skyquilt_plan") != SCHEMA:
         raise SideFileError(f"it is no plan of version {SCHEMA}")
     crs = str(record["crs"])
-    if not (crs.startswith(("EPSG:326", "EPSG:327")) and len(crs) == 10 and crs[5:].isdigit()):
+    if not (len(crs) == 10 and crs.startswith(("EPSG:326", "EPSG:327")) and whole(crs[8:], 1, 60)):
         raise SideFileError(f"its zone '{plain(crs, 40)}' is no UTM zone")
     if max(len(record["points"]), sum(len(s["way"]) for s in record["sorties"])) > MOST_POINTS:
         raise SideFileError(f"it has more than {MOST_POINTS} points")

@@ -3,17 +3,20 @@ belong to it (Y 6.1).
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Steps
+from skyquilt.engine.workers import HERE, Workers
 from skyquilt.imaging.nodes import View
-from skyquilt.imaging.plane import view_patch
+from skyquilt.imaging.plane import Patch, view_patch
 from skyquilt.imaging.views import on_ground
 from skyquilt.model.photo import KnownDistance, Photo, PointObservation
 from skyquilt.model.poses import Alignment, Prior
+from skyquilt.model.surface import Surface
 from skyquilt.ortho.ground import GreyPicture, Ground
 from skyquilt.quality.geolocation import geolocation_errors
 from skyquilt.quality.replay import (
@@ -31,6 +34,20 @@ MOST_PX = 1.2e7
 """Largest map, in pixels, that they are compared with."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Patched:
+    """Orthorectifies placed photos."""
+
+    grey: GreyPicture
+    surface: Surface
+    across: int
+    gsd: float
+
+    def __call__(self, view: View) -> Patch | None:
+        """A photo on the map's grid at the ground size of the comparison."""
+        return view_patch(self.grey(view.photo, self.across), view, self.surface, self.gsd)
+
+
 def placement_quality(
     photos: Sequence[Photo],
     alignment: Alignment,
@@ -40,6 +57,7 @@ def placement_quality(
     known: Sequence[KnownDistance],
     alpha: float,
     order: Sequence[int],
+    workers: Workers = HERE,
 ) -> Steps[dict[str, Any]]:
     """Replays the placements in the given order at one ground resolution, and measures known
     distances.
@@ -50,7 +68,8 @@ def placement_quality(
     wide = max(view.camera.width for view in ground.views)
     across = _across(ground, wide)
     gsd = ground.native_gsd * wide / across
-    seen = replay(view_patch(grey(i, across), views[i], ground.surface, gsd) for i in order)
+    patch = _Patched(grey=grey, surface=ground.surface, across=across, gsd=gsd)
+    seen = replay(workers.each(patch, [views[i] for i in order]))
     off = np.array([np.hypot(*(alignment.poses[i].map_C - priors[i].map_C)[:2]) for i in order])
     figures = _figures(seen, photos, views, ground, known, alpha) | _geolocation(
         alignment, priors, order

@@ -8,14 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Steps
+from skyquilt.engine.workers import HERE, Workers
 from skyquilt.ortho.companions import Drawn
 from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.orthomosaic import used_photos
-from skyquilt.ortho.patches import grey_pairs
 from skyquilt.quality.seam_look import cut_objects, seam_colours
 from skyquilt.quality.seam_points import SeamPoint, seam_points
-from skyquilt.quality.seams import PatchPairs, SeamReport, seam_disparity
+from skyquilt.quality.seam_views import Look, views_at
+from skyquilt.quality.seams import SeamReport, seam_disparity
 
 SHOWN, APART = 3, 100
 """Number of the worst places that are shown, and their least distance in px of the provenance."""
@@ -37,37 +38,31 @@ class MeasuredSeams:
     """Points with the largest steps of colour, the worst first."""
 
 
-def measure_seams(compose: Composer, drawn: Drawn, ground: Ground) -> Steps[MeasuredSeams]:
+def measure_seams(
+    compose: Composer, drawn: Drawn, ground: Ground, workers: Workers = HERE
+) -> Steps[MeasuredSeams]:
     """Registers the two photos beside each other at points along all seams."""
     yield 0, 1
     shown = used_photos(ground.views)
     views = {k + 1: next(v for v in ground.views if v.photo == i) for k, i in enumerate(shown)}
     points = seam_points(drawn.provenance, limit=SEAM_POINTS)
-    grid = drawn.provenance_grid
-
-    def patches(at: Sequence[SeamPoint]) -> PatchPairs:
-        xy = np.array([(grid.x(np.array(p.column)), grid.y(np.array(p.row))) for p in at])
-        a, b, seen = grey_pairs(
-            [views[p.a] for p in at],
-            [views[p.b] for p in at],
-            xy,
-            ground.surface,
-            compose.pixels,
-            ground.native_gsd,
-        )
-        return PatchPairs(a=a, b=b, seen=seen)
-
-    report = seam_disparity(points, patches, gsd_m=ground.native_gsd)
+    look = Look(
+        surface=ground.surface,
+        pixels=compose.pixels,
+        exposure=compose.exposure if compose.dtype == np.uint8 else None,
+        native_gsd=ground.native_gsd,
+        gsd=ground.grid.gsd,
+    )
+    found = views_at(points, drawn.provenance_grid, views, look, workers)
+    report = seam_disparity(points, found.pairs, gsd_m=ground.native_gsd)
     looks: dict[str, Any] = {"seam_colour_step": None, "seam_cut_objects": None, "hidden_m2": None}
     worst: list[SeamPoint] = []
-    if compose.dtype == np.uint8 and points:
-        colours = seam_colours(
-            points, grid, views, ground.surface, compose.exposure, compose.pixels, ground.grid.gsd
-        )
+    if found.lab is not None and points:
+        colours = seam_colours(found.lab)
         looks["seam_colour_step"] = colours.figures
         worst = _apart(points, colours.at)
     if (labels := compose.labels) is not None:
-        share = cut_objects(drawn.provenance, grid, labels)
+        share = cut_objects(drawn.provenance, drawn.provenance_grid, labels)
         looks["seam_cut_objects"] = None if share is None else round(share, 4)
         looks["hidden_m2"] = round(float(labels.hidden.sum()) * labels.cells.gsd**2, 1)
     yield 1, 1

@@ -4,7 +4,6 @@ other.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,13 +28,6 @@ class PatchPairs:
     """(n, S, S) of their second photos, on the same ground."""
     seen: NDArray[np.bool_]
     """(n,) whether both photos see the whole patch."""
-
-
-class PatchSource(Protocol):
-    """An object that orthorectifies: cuts both photos' patches around points of a seam."""
-
-    def __call__(self, points: Sequence[SeamPoint], /) -> PatchPairs:
-        """The patches, centred on the points, in their order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,13 +79,13 @@ class SeamReport:
 
 def seam_disparity(
     points: Sequence[SeamPoint],
-    patches: PatchSource,
+    pairs: PatchPairs,
     *,
     gsd_m: float,
     radius: int = RADIUS,
     noise: float = NOISE,
 ) -> SeamReport:
-    """Measures the displacement at points of seams.
+    """Measures the displacement at points of seams, from the pairs of patches centred on them.
 
     `gsd_m` is the ground size of a patch's pixel in m, `radius` the largest displacement searched
     in px and `noise` the standard deviation of a value in the patches' unit. A weak correlation
@@ -101,7 +93,6 @@ def seam_disparity(
     """
     if not points:
         return _report([], gsd_m)
-    pairs = patches(points)
     attempt = np.flatnonzero(pairs.seen)
     attempt = attempt[
         has_texture(pairs.a[attempt], noise=noise) & has_texture(pairs.b[attempt], noise=noise)

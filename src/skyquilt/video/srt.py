@@ -124,7 +124,8 @@ def _blocks(text: str) -> Iterator[tuple[int, str]]:
         and ("-->" in lines[i + 1] or _CLOCK.match(lines[i + 1].strip() + " "))
     ]
     for start, end in zip(starts, [*starts[1:], len(lines)], strict=False):
-        yield int(lines[start]), "".join(lines[start + 1 : min(end, start + 40)])[:_MOST_BLOCK]
+        block = "".join(lines[start + 1 : min(end, start + 40)])
+        yield int(lines[start].strip()), block[:_MOST_BLOCK]
 
 
 def _sample(index: int, text: str) -> Sample:

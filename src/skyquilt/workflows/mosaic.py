@@ -19,9 +19,9 @@ from skyquilt.alignment.heights import height_figures
 from skyquilt.engine.clock import Clock, Steps, result_of
 from skyquilt.engine.error_log import log_error
 from skyquilt.engine.folder import STATE, RunFolder, open_run
-from skyquilt.engine.free_memory import return_large_blocks
+from skyquilt.engine.free_memory import give_back, return_large_blocks
 from skyquilt.engine.store import Store, digest
-from skyquilt.engine.workers import Threads, workers_for
+from skyquilt.engine.workers import Threads, Workers, workers_for
 from skyquilt.errors import PhotoFailedError, SkyquiltError
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.model.photo import RejectedPhoto
@@ -247,9 +247,11 @@ def _made(
     if settings.input.write_frames:
         writing = write_frames(output, aligned.photos, aligned.pixels)
         yield from clock.stage("write frames", writing, keeps=False)
-    measuring = _measured(aligned, ground, drawn, settings)
+    measuring = _measured(aligned, ground, drawn, settings, clock.workers)
     seams, quality = yield from clock.stage("measure", measuring, keeps=False)
     metrics = _metrics(aligned, ground, drawn, seams, settings) | {"quality": quality}
+    aligned.found.looks.make_room()
+    give_back()
     finishing = finish_run(
         output, aligned, ground, drawn.drawn, drawn.compose, seams, metrics, settings, clock
     )
@@ -290,10 +292,15 @@ def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> s
 
 
 def _measured(
-    aligned: AlignedPhotos, ground: Ground, map_: DrawnMap, settings: MosaicSettings
+    aligned: AlignedPhotos,
+    ground: Ground,
+    map_: DrawnMap,
+    settings: MosaicSettings,
+    workers: Workers,
 ) -> Steps[tuple[MeasuredSeams, dict[str, Any]]]:
     """Measures the seams and the agreement of the placed photos."""
-    seams = yield from measure_seams(map_.compose, map_.drawn, ground)
+    seams = yield from measure_seams(map_.compose, map_.drawn, ground, workers)
+    aligned.pixels.make_room()
     quality = yield from placement_quality(
         aligned.photos,
         aligned.alignment,
@@ -303,7 +310,9 @@ def _measured(
         aligned.given.distances,
         settings.hybrid.alpha,
         aligned.order,
+        workers,
     )
+    aligned.grey.make_room()
     return seams, quality
 
 
