@@ -41,6 +41,15 @@ def test_a_torn_artefact_is_made_again(store, size):
     assert store.get("stage", "key") == [7]
 
 
+def test_what_is_there_is_told_without_reading_it(store):
+    assert not store.has("stage", "key")
+    store.put("stage", "key", [1])
+    hits = store.hits
+    assert store.has("stage", "key") and store.hits == hits + 1
+    (store.folder / "stage" / "key.npz").write_bytes(b"")
+    assert not store.has("stage", "key")
+
+
 def test_values_that_count_as_nothing_are_kept(store):
     for value in ([], 0, "", {}):
         store.put("stage", "key", value)

@@ -106,10 +106,10 @@ class Bundle:
         keep: Keep,
     ) -> Alignment:
         """Adjusts the photos that these links connect."""
-        start = find_start(photos, priors, features, links)
+        start = _kept_start(photos, priors, features, links, keep)
         if not start.blocks:
             raise AlignmentError(f"none of {len(photos)} photos could be linked to another one")
-        tracks = build_tracks(features, start.links)
+        tracks = keep("tracks", lambda: build_tracks(features, start.links))
         setup = set_up(photos, priors, start, distortion=self.distortion, repair=self.repair)
         sizes = [(p.width, p.height) for p in photos]
         begin = each = self.per_photo
@@ -146,6 +146,24 @@ class Bundle:
         )
         held = setup.georeferenced or any(not c.check for c in reports)
         return done if held or tilts_reported(priors) else levelled(done)
+
+
+def _kept_start(
+    photos: Sequence[Photo],
+    priors: Sequence[Prior],
+    features: Sequence[Features],
+    links: Sequence[Link],
+    keep: Keep,
+) -> Start:
+    """The start of an interrupted run, or found now; its links are kept by their photos."""
+
+    def found() -> tuple[Start, list[tuple[int, int]]]:
+        start = find_start(photos, priors, features, links)
+        return replace(start, links=()), [(k.a, k.b) for k in start.links]
+
+    start, pairs = keep("start", found)
+    chosen = set(pairs)
+    return replace(start, links=tuple(k for k in links if (k.a, k.b) in chosen))
 
 
 def _sharpened(

@@ -128,6 +128,15 @@ class Store:
         self.hits += 1
         return value
 
+    def has(self, stage: str, key: str) -> bool:
+        """Whether there is a stored result; one that is damaged is made again when it is read."""
+        try:
+            there = (self.folder / stage / f"{key}.npz").stat().st_size > 0
+        except OSError:
+            return False
+        self.hits += there
+        return there
+
     def put(self, stage: str, key: str, value: Any) -> None:
         """Stores a result atomically: the file appears complete or not at all.
 

@@ -1,6 +1,6 @@
 """What the store of a run may hold."""
 
-from skyquilt.alignment import problem
+from skyquilt.alignment import problem, start, tracks
 from skyquilt.model import camera, clip, features, poses, raster, surface
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.ortho import companions
@@ -26,6 +26,8 @@ REGISTRY = {
         poses.Join,
         surface.Surface,
         problem.State,
+        start.Start,
+        tracks.Tracks,
         RejectedPhoto,
         companions.BlockExtras,
         raster.Grid,

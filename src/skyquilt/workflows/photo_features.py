@@ -272,7 +272,8 @@ def find_features(
 
     def failure(index: int) -> RejectedPhoto | None:
         try:
-            looks(index)
+            if not store.has("features", features_key(photos[index], detector)):
+                looks(index)
         except OutputError:  # a full disk is no fault of the photo
             raise
         except Exception as error:  # whatever it is, it concerns this photo alone
