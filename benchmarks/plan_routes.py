@@ -1,6 +1,7 @@
-"""Routes of 3 drones through 300 points around keep-outs: ten stated instances.
+"""Routes of 3 drones through 300 points around keep-outs: ten stated instances,
+or others by their numbers.
 
-python benchmarks/plan_routes.py [SECONDS]
+python benchmarks/plan_routes.py [SECONDS [FIRST LAST]]
 
 For each: the longest route over the lower bound, the time that planning took, and whether any leg
 meets a keep-out (exact intersection), or any sortie needs more than its endurance less the
@@ -82,13 +83,14 @@ def instance(number, scale):
 
 def main():
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else PlanSettings().seconds
+    first, last = (int(sys.argv[2]), int(sys.argv[3])) if len(sys.argv) > 3 else (1, 10)
     worst = 0.0
-    for number in range(1, 11):
+    for number in range(first, last + 1):
         site, settings, drones, points, proof, warnings = sized(number)
         settings = type(settings)(**{**vars(settings), "seconds": seconds})
-        middle = time.monotonic()
+        middle, spent = time.monotonic(), time.process_time()
         routes = plan_routes(site, points, drones, settings, FLAT, height_of(settings, VIEW))
-        took = time.monotonic() - middle
+        took, spent = time.monotonic() - middle, time.process_time() - spent
         visited = sorted(w.point for s in routes.sorties for w in s.way if w.point is not None)
         met = sum(
             k.shape.intersects(LineString([(w.x, w.y) for w in s.way]))
@@ -104,7 +106,8 @@ def main():
             f"{number:2d}: {len(points)} points, {len(site.keep_out)} keep-outs,"
             f" {len(routes.sorties)} sorties, longest {longest:.0f} s = {ratio:.3f} x bound"
             f" {routes.bound_s:.0f} s, last landing {end:.0f} s; "
-            f" routes {took:.1f} s; {met} legs meet a keep-out, {over} over endurance,"
+            f" routes {took:.1f} s ({spent:.1f} of CPU);"
+            f" {met} legs meet a keep-out, {over} over endurance,"
             f" all points once: {visited == [p.id for p in points]};"
             f" views {proof.least}/{proof.views} {' '.join((*warnings, *routes.warnings))}",
             flush=True,

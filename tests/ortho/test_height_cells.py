@@ -47,3 +47,15 @@ def test_any_part_of_the_cells_is_what_was_put_there(entries, corner, size):
     inside = expected[np.isfinite(expected)]
     middle = cells.median((c0 + 0.5, r0 + 0.5, c1 + 0.5, r1 + 0.5))
     assert middle == (pytest.approx(np.median(inside)) if len(inside) else None)
+
+
+def test_what_is_known_within_absurd_bounds_is_found_at_once():
+    """Positions across the globe, in photos of one place, make one map of their size."""
+    cells = HeightCells(cell=1.0)
+    places = np.array([(0, 0), (-5, 3), (31, 32), (10**8, -(10**8))])
+    cells.put(places, np.array([1.0, 2.0, 3.0, 4.0]))
+    everywhere = (-2e9, -2e9, 2e9, 2e9)
+    assert cells.median(everywhere) == 2.5
+    order = np.lexsort(places.T)
+    assert cells.places(everywhere).tolist() == (places[order] + 0.5).tolist()
+    assert cells.places((-5.0, 0.0, 31.0, 31.9)).tolist() == [[0.5, 0.5], [-4.5, 3.5]]

@@ -10,6 +10,8 @@ from shapely import box
 from shapely.affinity import rotate, translate
 
 from skyquilt.errors import RefusedError
+from skyquilt.planning.check import _proof
+from skyquilt.planning.coverage import all_seen, counted, make_cells, seen_cells
 from skyquilt.planning.lattice import needed, placed, steps_of
 from skyquilt.planning.points import place_points
 from skyquilt.planning.records import KeepOut
@@ -135,3 +137,25 @@ def test_what_would_need_too_many_photos_is_refused():
     closed = KeepOut(shape=area.buffer(5))
     with pytest.raises(RefusedError, match="close the whole area"):
         place_points(make_site(area, (closed,), ZONE), VIEW, PlanSettings(height_m=300), FLAT)
+
+
+def test_thousands_of_photos_of_one_place_cost_little():
+    """They share what they see, and the more photos there are the larger the cells become."""
+    area = translate(box(0, 0, 400, 300), EAST, NORTH)
+    rng = np.random.default_rng(1)
+    xyz = np.array([EAST + 200.0, NORTH + 150.0, 80.0]) + rng.integers(0, 2, (20_000, 3)) / 1000
+    cells = make_cells(area, 0.0, 2.0, FLAT)
+    seen = all_seen(cells, VIEW, xyz, np.zeros(len(xyz)), blocked=False)
+    assert len({id(s) for s in seen}) == 8
+    alone = [seen_cells(cells, VIEW, p, 0.0, blocked=False) for p in xyz[:50]]
+    assert all((a == b).all() for a, b in zip(seen, alone, strict=False))
+    assert (counted(cells, seen) == np.bincount(np.concatenate(seen),
+                                                minlength=cells.inside.size)).all()  # fmt: skip
+    site = make_site(area, (), ZONE)
+    few, many = (
+        _proof(site, VIEW, places, np.zeros(len(places)), FLAT, 1)
+        for places in (xyz[:500] + [0, 0, 20.0], xyz + [0, 0, 20.0])
+    )
+    assert few.cell_m == pytest.approx(100 * min(VIEW.along, VIEW.across) / 48, rel=1e-3)
+    assert many.cell_m > few.cell_m
+    assert many.cells < few.cells

@@ -66,26 +66,48 @@ def test_ways_meet_no_keep_out_and_are_as_short_as_any_way_over_corners():
     assert (ways.length <= via + 1e-6).all()
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(16))
 def test_the_bound_is_below_the_best_plan(seed):
-    """All orders and divisions of six points among two drones are tried."""
+    """All orders and divisions of six points among two drones are tried, from one place or two,
+    points in clusters or not.
+    """
     rng = np.random.default_rng(seed)
-    xy, start = rng.uniform(0, 500, (6, 2)), rng.uniform(-200, 700, 2)
+    xy, starts = rng.uniform(0, 500, (6, 2)), rng.uniform(-200, 700, (2, 2))
+    if seed % 2:
+        starts[1] = starts[0]
+    if seed % 4 > 1:
+        xy = rng.uniform(0, 500, (2, 2))[rng.integers(0, 2, 6)] + rng.normal(0, 15, (6, 2))
     times = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1)) / 8
-    ground = np.hypot(*(xy - start).T) / 8 + 20
-    work = Work(times=times, out=ground, home=ground, photo=2.0, drones=2, usable=1e6, swap=60.0)
+    legs = np.array([np.hypot(*(xy - start).T) / 8 + 20 for start in starts])
+    work = Work(times=times, out=legs, home=legs, places=xy, photo=2.0, usable=1e6, swap=60.0)
     best = np.inf
     for order in itertools.permutations(range(6)):
-        for cut in range(1, 7):
+        for cut in range(7):
             parts = [order[:cut], order[cut:]]
             ends = [
                 ground[p[0]] + ground[p[-1]] + 2 * len(p)
                 + sum(times[a, b] for a, b in itertools.pairwise(p))
-                for p in parts if p
+                for ground, p in zip(legs, parts, strict=True) if p
             ]  # fmt: skip
             best = min(best, max(ends))
     bound = lower_bound(work, 2)
     assert 0.6 * best < bound <= best + 1e-9
+
+
+def test_what_several_drones_must_visit_they_fly_to():
+    """A far cluster that takes one drone longer than both: both fly there, whereas the shortest
+    forest is one flight there and a short one.
+    """
+    rng = np.random.default_rng(1)
+    far = np.array([[1000.0, 0.0]]) + rng.uniform(0, 100, (60, 2))
+    xy = np.concatenate([[[10.0, 0.0], [0.0, 10.0]], far])
+    times = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1)) / 8
+    legs = np.stack([np.hypot(*xy.T) / 8] * 2)
+    work = Work(times=times, out=legs, home=legs, places=xy, photo=10.0, usable=1e6, swap=60.0)
+    there = np.hypot(*far.T).min() / 8
+    bound = lower_bound(work, 2)
+    assert 60 * 10 / 2 + 1.2 * there < bound  # without sets, there and back once: 0.6
+    assert bound <= 62 * 10 / 2 + 2 * there + 30 * 40 / 8
 
 
 def test_routes_visit_every_point_once_clear_of_keep_outs_and_near_the_bound():

@@ -106,6 +106,31 @@ def test_the_order_of_latitude_and_longitude(tmp_path, text, place):
     assert (track.latitude_deg[0], track.longitude_deg[0]) == place
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2024-05-01 12:00:00,123\n[latitude: 46,500123] [longitude: 14,300456]"
+        " [rel_alt: 5,400 abs_alt: 100,250]",
+        "GPS(14,300456,46,500123,16) BAROMETER:5,4",
+        "GPS(14.300456,46.500123,16) BAROMETER:5,4",
+        "F/5,6, GPS (14,300456, 46,500123, 15), D 150,00m, H 5,40m, H.S 6,00m/s,"
+        " F.PRY (0,0°, 0,0°, 9,5°), G.PRY (-89,5°, 0,0°, 10,5°)",
+    ],
+)
+def test_decimal_commas_are_read(tmp_path, text):
+    path = tmp_path / "a.srt"
+    path.write_text(f"1\n00:00:00,000 --> 00:00:01,000\n{text}\n")
+    track = read_track(path)
+    assert (track.latitude_deg[0], track.longitude_deg[0]) == (46.500123, 14.300456)
+    assert track.takeoff_m[0] == 5.4
+    if "PRY" in text:
+        assert track.gimbal_deg[0].tolist() == [10.5, -89.5, 0.0]
+        assert track.flight_yaw_deg[0] == 9.5
+    if "abs_alt" in text:
+        assert track.sea_level_m[0] == 100.25
+        assert str(track.start) == "2024-05-01 12:00:00.123000"
+
+
 def test_a_number_torn_off_at_the_end_is_not_a_position(tmp_path):
     whole = "1\n00:00:00,000 --> 00:00:01,000\n[latitude: 46.5] [longitude: 14.3] \n\n"
     path = tmp_path / "a.srt"

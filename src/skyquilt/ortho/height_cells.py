@@ -63,15 +63,31 @@ class HeightCells:
         """Median height inside bounds (west, south, east, north) in m; None if there is no
         point.
         """
-        z = self._part(*self._reach(bounds))
-        found = z[np.isfinite(z)]
-        return float(np.median(found)) if len(found) else None
+        z = self._known(bounds)[1]
+        return float(np.median(z)) if len(z) else None
 
     def places(self, bounds: Iterable[float]) -> NDArray[np.float64]:
         """Centres (k, 2) in m of the cells with a height inside bounds (m, map frame)."""
+        return np.asarray((self._known(bounds)[0] + 0.5) * self.cell, np.float64)
+
+    def _known(self, bounds: Iterable[float]) -> tuple[Cells, NDArray[np.float64]]:
+        """Cells (k, 2) with a height inside bounds, row by row, and their heights (k,); whatever
+        the bounds, no more is looked at than what is stored.
+        """
         c0, r0, c1, r1 = self._reach(bounds)
-        row, column = np.nonzero(np.isfinite(self._part(c0, r0, c1, r1)))
-        return np.asarray((np.column_stack([column + c0, row + r0]) + 0.5) * self.cell, np.float64)
+        cells, heights = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
+        for (C, R), held in self._blocks.items():
+            first, last = np.array([C, R]) * BLOCK, np.array([C, R]) * BLOCK + BLOCK - 1
+            if (first > (c1, r1)).any() or (last < (c0, r0)).any():
+                continue
+            row, column = np.nonzero(np.isfinite(held))
+            at = np.column_stack([column + C * BLOCK, row + R * BLOCK])
+            inside = ((at >= (c0, r0)) & (at <= (c1, r1))).all(axis=1)
+            cells.append(at[inside])
+            heights.append(held[row, column][inside])
+        found, z = np.concatenate(cells), np.concatenate(heights)
+        order = np.lexsort(found.T)
+        return found[order], z[order]
 
     def _reach(self, bounds: Iterable[float]) -> tuple[int, int, int, int]:
         c0, r0, c1, r1 = (int(np.floor(b / self.cell)) for b in bounds)

@@ -22,6 +22,8 @@ from skyquilt.planning.terrain import Terrain
 
 PER_FOOTPRINT = 48
 """Cells along the shorter side of a footprint."""
+MOST_SEEN = 60_000_000
+"""Cells seen by all photos together beyond which cells are larger."""
 INSIDE = 0.003
 """Cells end so far inside a photo, m: files round places to millimetres."""
 
@@ -129,8 +131,10 @@ def _proof(site: Site, view: View, xyz: Array, yaw: Array, terrain: Terrain, vie
             f"{int((heights <= 0.5).sum())} photos would be taken on or below the ground; give the"
             " terrain of the place, or a mission with other heights"
         )
-    short = float(np.median(heights)) * min(view.along, view.across)
-    size = max(short / PER_FOOTPRINT, float(np.sqrt(site.observe.area / 2e6)))
+    wide, short = sorted((view.along, view.across), reverse=True)
+    finest = min(PER_FOOTPRINT, float(np.sqrt(MOST_SEEN / len(xyz) * short / wide)))
+    high = float(np.median(heights))
+    size = max(high * short / finest, float(np.sqrt(site.observe.area / 2e6)))
     cuts = _window_edges(view, xyz, yaw) if not terrain.known else ((), ())
     cells = make_cells(site.observe, float(yaw[0]), size, terrain, cuts)
     blocked = sight_may_be_blocked(view, terrain)

@@ -20,6 +20,8 @@ from skyquilt.planning.terrain import Terrain
 
 Cuts = tuple[Sequence[float], Sequence[float]]
 """Edges along a heading and to its right, m."""
+TOGETHER = 1000
+"""Photos whose cells are counted at once."""
 SAMPLES = 24
 """Places along a line of sight whose heights are compared with it."""
 
@@ -174,14 +176,18 @@ def sight_may_be_blocked(view: View, terrain: Terrain) -> bool:
 def all_seen(
     cells: Cells, view: View, xyz: Array, yaw: Array, *, blocked: bool
 ) -> list[NDArray[np.int32]]:
-    """The cells that each of n photos sees."""
-    return [
-        seen_cells(cells, view, p, float(a), blocked=blocked) for p, a in zip(xyz, yaw, strict=True)
-    ]
+    """The cells that each of n photos sees; photos of one place share them."""
+    if not len(xyz):
+        return []
+    poses, which = np.unique(np.column_stack([xyz, yaw]), axis=0, return_inverse=True)
+    found = [seen_cells(cells, view, p[:3], float(p[3]), blocked=blocked) for p in poses]
+    return [found[k] for k in which.ravel().tolist()]
 
 
 def counted(cells: Cells, seen: Sequence[NDArray[np.int32]]) -> NDArray[np.int32]:
     """Number of views of every cell, flat."""
-    if not seen:
-        return np.zeros(cells.inside.size, np.int32)
-    return np.bincount(np.concatenate(seen), minlength=cells.inside.size).astype(np.int32)
+    count = np.zeros(cells.inside.size, np.int32)
+    for start in range(0, len(seen), TOGETHER):
+        some = np.concatenate(seen[start : start + TOGETHER])
+        count += np.bincount(some, minlength=len(count)).astype(np.int32)
+    return count

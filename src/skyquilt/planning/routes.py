@@ -208,6 +208,7 @@ def _bound(
         [v.times - p for v, p in zip(vehicles, photo, strict=True)],
         [v.out - p for v, p in zip(vehicles, photo, strict=True)],
         [v.home for v in vehicles],
+        np.array([(p.x, p.y) for p in points]),
         photo,
         [v.usable for v in vehicles],
         [d.swap_s for d in drones],

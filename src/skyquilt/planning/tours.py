@@ -2,6 +2,7 @@
 route.
 """
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,10 @@ UNIT = 100
 GOAL = 0.97
 """The goal of every route's duration, in shares of the mean that the search starts with: what a
 route exceeds it by counts once more, which is smoother than the longest route alone.
+"""
+LONGEST = 1.6
+"""Longest time of a search over the time of the processor that it may use: beside other work a
+search goes on for longer, so that its routes are as good.
 """
 MOST_SEARCHED = 1500
 """Points beyond which a divided tour is taken as it is."""
@@ -58,7 +63,7 @@ def tours(vehicles: Sequence[Vehicle], seconds: float) -> list[list[int]] | None
     """The order of points (0 to n - 1) of each vehicle; None where their means do not suffice.
 
     A tour through all points is divided among the vehicles; from there the search goes on for
-    `seconds`.
+    `seconds` of the processor's time.
     """
     library = solver()
     n = len(vehicles[0].out)
@@ -88,7 +93,8 @@ def _one_tour(library: Any, vehicle: Vehicle, seconds: float) -> list[int]:
     model = library.RoutingModel(manager)
     whole = np.rint(np.minimum(vehicle.times, vehicle.times.T) * UNIT).astype(np.int64)
     model.SetArcCostEvaluatorOfAllVehicles(model.RegisterTransitMatrix(whole.tolist()))
-    found = model.SolveWithParameters(_parameters(library, seconds, guided=n <= MOST_SEARCHED))
+    parameters = _parameters(library, model, seconds, guided=n <= MOST_SEARCHED)
+    found = model.SolveWithParameters(parameters)
     if found is None:
         return list(range(n))
     order, at = [], model.Start(0)
@@ -152,14 +158,17 @@ def _filled(
     return routes if at == len(sequence) else None
 
 
-def _parameters(library: Any, seconds: float, *, guided: bool) -> Any:
+def _parameters(library: Any, model: Any, seconds: float, *, guided: bool) -> Any:
     from ortools.constraint_solver import routing_enums_pb2 as names
 
     parameters = library.DefaultRoutingSearchParameters()
     parameters.first_solution_strategy = names.FirstSolutionStrategy.PATH_CHEAPEST_ARC
     if guided:
         parameters.local_search_metaheuristic = names.LocalSearchMetaheuristic.GUIDED_LOCAL_SEARCH
-    parameters.time_limit.FromMilliseconds(int(max(seconds, 0.05) * 1000))
+    seconds = max(seconds, 0.05)
+    end = time.process_time() + seconds
+    model.AddSearchMonitor(model.solver().CustomLimit(lambda: time.process_time() > end))
+    parameters.time_limit.FromMilliseconds(int(LONGEST * seconds * 1000))
     return parameters
 
 
@@ -183,11 +192,11 @@ def _searched(
         model.SetArcCostEvaluatorOfVehicle(evaluator, number)
     limits = [int(v.usable * UNIT) for v in vehicles]
     model.AddDimensionWithVehicleTransitAndCapacity(evaluators, 0, limits, True, "time")
-    time = model.GetDimensionOrDie("time")
+    duration = model.GetDimensionOrDie("time")
     goal = int(UNIT * GOAL * sum(v.length(r) for v, r in zip(vehicles, start, strict=True)) / k)
     for number in range(k):
-        time.SetCumulVarSoftUpperBound(model.End(number), goal, 1)
-    parameters = _parameters(library, seconds, guided=True)
+        duration.SetCumulVarSoftUpperBound(model.End(number), goal, 1)
+    parameters = _parameters(library, model, seconds, guided=True)
     model.CloseModelWithParameters(parameters)
     first = model.ReadAssignmentFromRoutes(start, True)
     found = (

@@ -179,8 +179,8 @@ def telemetry(
     shown = np.arange(0.0, times[-1] + 1e-9, each) if layout.per_second else times
     for number, at in enumerate(shown, 1):
         fixed = np.floor(at * rate + 1e-6) / rate
-        # the fix shown is of the moment at which it was taken
-        report = reports[min(round(fixed * video.fps), len(reports) - 1)]
+        # a fix is of the moment of the frame that shows it first
+        report = reports[min(int(np.ceil(fixed * video.fps - 1e-6)), len(reports) - 1)]
         index = min(round(at * video.fps), len(reports) - 1)
         here = reports[index]
         clock = start + timedelta(seconds=float(at - times[index]) + here.clock)

@@ -5,6 +5,7 @@ tell how the drone moved. Both agree at the right offset only, if the flight tur
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,8 @@ from skyquilt.video.positions import METRES_PER_DEGREE, places_at
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+LEAST_SHARE = 1e-4
+"""Smallest share of a motion that counts as noise: times of rows are rounded."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +43,10 @@ class OffsetSearch:
     pictures times one complex factor (rotation and scale), and by those of a point fixed to the
     drone: the middle of a picture is not the point below the drone where the camera is tilted. The
     share of the track's motion that is left, with n independent displacements, gives n ln(share)
-    as twice the negative logarithm of the likelihood.
+    as twice the negative logarithm of the likelihood. Turns of the picture against the headings
+    that the track tells, and changes of scale against its heights, add theirs: at constant speed a
+    camera that looks ahead by a second's flight cannot be told from a clock that is a second late,
+    by positions alone.
     """
 
     grid_s: float = 0.2
@@ -51,13 +57,15 @@ class OffsetSearch:
     """The same for the last step, around the best offset: over a whole turn the drone is displaced
     by more, and its receiver errs by no more. At most a sixth of the clip.
     """
+    short_s: float = 1.5
+    """The same for headings and heights, which are known better and change faster."""
     inside: float = 0.6
     """Share of the clip that positions must cover."""
     apart_s: float = 2.0
     """Offsets further apart than this are different answers."""
     certain: float = 18.0
     """Least difference of twice the log-likelihood to any different answer."""
-    version: int = 2
+    version: int = 3
     """Changes when the results do."""
 
     def __call__(self, looks: Looks, track: Track, zero_s: float, reach_s: float) -> Offset | None:
@@ -77,55 +85,54 @@ class OffsetSearch:
         if near is None:
             return None
         found = self._judged(near)
+        if not found.clear:
+            return found
         around = steps[np.abs(steps * self.grid_s - found.seconds) <= self.apart_s / 2]
         half = min(self.wide_s, last_look / 6)
-        wide = (
-            self._compared(looks, track, zero_s, around, half)
-            if found.clear and half > self.half_s
-            else None
-        )
-        if wide is None:
-            return found
-        best = int(np.nanargmin(wide.share))
-        seconds, sigma = _parabola(wide.offsets, self._fit(wide), best)
-        return replace(found, seconds=seconds, sigma_s=sigma) if sigma < found.sigma_s else found
+        wide = self._compared(looks, track, zero_s, around, half) if half > self.half_s else None
+        options = [_nearest(c) for c in (near, wide) if c is not None]
+        seconds, sigma = min(options, key=lambda o: o[1])
+        return replace(found, seconds=seconds, sigma_s=sigma)
 
     def _compared(
         self, looks: Looks, track: Track, zero_s: float, steps: Array, half: float
     ) -> "_Compared | None":
         """Displacements at offsets of so many steps; None where too little moves or overlaps."""
         t = np.arange(0, float(looks.time_s[-1]) + 1e-9, self.grid_s)
-        path, heading = _image_path(looks)
+        path, heading, climb = _image_path(looks)
         image = np.stack(
             [_displacements(looks.time_s, p, t, half) for p in (path, heading)], axis=1
         )
-        if np.isfinite(image[:, 0]).sum() < 20 or not len(steps):
+        known = int(np.isfinite(image[:, 0]).sum())
+        if known < 20 or not len(steps):
             return None
-        offsets = steps * self.grid_s
-        there = zero_s + np.arange(offsets[0], offsets[-1] + t[-1] + self.grid_s / 2, self.grid_s)
-        moved = _track_displacements(track, there, half)
-        share = np.array(
-            [
-                _misfit(image, moved[k : k + len(t)], self.inside)
-                for k in range(min(len(offsets), len(moved) - len(t) + 1))
-            ]
+        there = zero_s + np.arange(
+            steps[0] * self.grid_s, steps[-1] * self.grid_s + t[-1] + self.grid_s / 2, self.grid_s
         )
+        moved = _track_displacements(track, there, half)
+        offsets = steps[: len(moved) - len(t) + 1] * self.grid_s
+        parts = [slice(k, k + len(t)) for k in range(len(offsets))]
+        share = np.array([_misfit(image, moved[p], self.inside) for p in parts])
         if not np.isfinite(share).any():
             return None
+        shares, weights = [share], [max(known * self.grid_s / half * 2, 1.0)]
+        short = self.short_s
+        for seen, told, apart in (
+            (_angle(heading), _yaw(track, there, short), 2 * short),
+            (climb, _risen(track, there, short), 4 * short),  # a tilt looks like a climb for long
+        ):
+            x = _displacements(looks.time_s, seen, t, short)
+            shares.append(np.array([_unlike(x, told[p], self.inside) for p in parts]))
+            weights.append(max(known * self.grid_s / apart, 1.0))
         return _Compared(
-            offsets=offsets[: len(share)], share=share, image=image, moved=moved, half=half
-        )
-
-    def _fit(self, found: "_Compared") -> Array:
-        """Twice the negative logarithm of the likelihood (n,), but for a constant."""
-        known = np.isfinite(found.image[:, 0]).sum()
-        n = max(known * self.grid_s / found.half * 2, 1.0)
-        return np.asarray(n * np.log(np.maximum(found.share, 1e-6)))
+            offsets=offsets, shares=np.stack(shares), weights=np.array(weights),
+            image=image, moved=moved, half=half,
+        )  # fmt: skip
 
     def _judged(self, found: "_Compared") -> Offset:
-        offsets, share, fit = found.offsets, found.share, self._fit(found)
-        best = int(np.nanargmin(share))
-        near, sigma = _parabola(offsets, fit, best)
+        offsets, share, fit = found.offsets, found.shares[0], found.fit
+        best = int(np.nanargmin(fit))
+        near, sigma = _nearest(found)
         others = np.abs(offsets - offsets[best]) > self.apart_s
         rival = float(np.nanmin(fit[others])) if np.isfinite(fit[others]).any() else np.nan
         part = found.moved[best : best + len(found.image)]
@@ -151,8 +158,12 @@ class _Compared:
 
     offsets: Array
     """(n,) s."""
-    share: Array
-    """(n,) share of the motion that the pictures do not explain; NaN where too little is known."""
+    shares: Array
+    """(3, n) shares of the motion, the heading and the height that the pictures do not explain; NaN
+    where too little is known of the motion, 1 where nothing is of the others.
+    """
+    weights: Array
+    """(3,) number of independent differences of each."""
     image: Complex
     """(m, 2) of the picture's middle and of a point fixed to the drone, px."""
     moved: Complex
@@ -160,32 +171,51 @@ class _Compared:
     half: float
     """Half their duration, s."""
 
+    @property
+    def fit(self) -> Array:
+        """Twice the negative logarithm of the likelihood (n,), but for a constant."""
+        return np.asarray(self.weights @ np.log(np.maximum(self.shares, LEAST_SHARE)))
 
-def _image_path(looks: Looks) -> tuple[Complex, Complex]:
+
+def _nearest(found: _Compared) -> tuple[float, float]:
+    """The best offset and its deviation: shares are parabolas there, their logarithms are not."""
+    best = int(np.nanargmin(found.fit))
+    noise = np.maximum(found.shares[:, best], LEAST_SHARE)
+    return _parabola(found.offsets, (found.weights / noise) @ found.shares, best)
+
+
+def _image_path(looks: Looks) -> tuple[Complex, Complex, Array]:
     """Path (n,) of the middle of the picture on the ground, in px of the first picture, x to the
-    right and y up; and the direction of the picture there, of length 1. NaN outside the longest
-    unbroken run of looks.
+    right and y up; the direction of the picture there, of length 1; and the logarithm of the height
+    above the ground, from 0. NaN outside the longest unbroken run of looks.
 
-    Changes of scale are not accumulated: flights that map keep their height, and the small errors
+    Changes of scale do not enter the path: flights that map keep their height, and the small errors
     of many looks would add up.
     """
     path = np.zeros(len(looks.time_s), np.complex128)
     heading = np.ones(len(path), np.complex128)
+    climb = np.zeros(len(path))
     run = np.zeros(len(path), np.int64)
-    turn, at = 1 + 0j, 0j
+    turn, at, high = 1 + 0j, 0j, 0.0
     for i in range(1, len(path)):
         if not looks.linked[i]:
-            turn, at = 1 + 0j, 0j
+            turn, at, high = 1 + 0j, 0j, 0.0
             run[i:] += 1
         at += turn * looks.shift[i]
-        turn *= looks.turn[i] / abs(looks.turn[i])
-        path[i], heading[i] = at, turn
+        size = abs(looks.turn[i])
+        turn *= looks.turn[i] / size
+        high += float(np.log(size))
+        path[i], heading[i], climb[i] = at, turn, high
     longest = np.bincount(run).argmax() if len(run) else 0
     known = run == longest
-    return np.where(known, path.conj(), np.nan), np.where(known, heading.conj(), np.nan)
+    return (
+        np.where(known, path.conj(), np.nan),
+        np.where(known, heading.conj(), np.nan),
+        np.where(known, climb, np.nan),
+    )
 
 
-def _displacements(time: Array, path: Complex, t: Array, half: float) -> Complex:
+def _displacements(time: Array, path: Any, t: Array, half: float) -> Any:
     """Displacements (n,) from `half` before to `half` after each of t; NaN where unknown."""
     out = np.interp(t + half, time, path, np.nan, np.nan) - np.interp(
         t - half, time, path, np.nan, np.nan
@@ -207,6 +237,55 @@ def _track_displacements(track: Track, t: Array, half: float) -> Complex:
         )
 
     return at(t + half) - at(t - half)
+
+
+def _angle(heading: Complex) -> Array:
+    """Angles (n,) of directions without jumps; NaN stays."""
+    angle = np.angle(heading)
+    known = np.isfinite(angle)
+    angle[known] = np.unwrap(angle[known])
+    return np.asarray(angle)
+
+
+def _yaw(track: Track, t: Array, half: float) -> Array:
+    """Turn (n,) of the picture, else of the aircraft, from `half` before to `half` after each of t,
+    degrees counted anticlockwise; NaN where unknown.
+    """
+    yaw, pitch, roll = np.radians(track.gimbal_deg.T)
+    # the top of the picture is opposite to the gimbal's downward axis, as in `belly_from_gimbal`:
+    # where it looks down, its yaw and roll alone are arbitrary
+    north = -np.cos(yaw) * np.sin(pitch) * np.cos(roll) - np.sin(yaw) * np.sin(roll)
+    east = -np.sin(yaw) * np.sin(pitch) * np.cos(roll) + np.cos(yaw) * np.sin(roll)
+    top = np.degrees(np.arctan2(east, north))
+    top = top if np.isfinite(top).sum() > 1 else track.flight_yaw_deg
+    known = np.isfinite(top)
+    return -_differences(track.height_time_s[known], np.unwrap(top[known], period=360), t, half)
+
+
+def _risen(track: Track, t: Array, half: float) -> Array:
+    """Climb (n,) in m from `half` before to `half` after each of t; NaN where unknown."""
+    takeoff = track.takeoff_m
+    height = takeoff if np.isfinite(takeoff).sum() > 1 else track.sea_level_m
+    known = np.isfinite(height)
+    return _differences(track.height_time_s[known], height[known], t, half)
+
+
+def _differences(time: Array, value: Array, t: Array, half: float) -> Array:
+    if len(time) < 2:
+        return np.full(len(t), np.nan)
+    return np.asarray(_displacements(time, value, t, half))
+
+
+def _unlike(seen: Array, told: Array, inside: float) -> float:
+    """Share of what is `told` (n,) that a positive multiple of what is `seen` (n,) leaves; 1 where
+    too little is known.
+    """
+    known = np.isfinite(seen) & np.isfinite(told)
+    if known.sum() < max(inside * np.isfinite(seen).sum(), 15):
+        return 1.0
+    x, y = seen[known], told[known]
+    both, power = float(x @ y), float(x @ x) * float(y @ y)
+    return 1.0 - both**2 / power if both > 0 and power > 0 else 1.0
 
 
 def _misfit(image: Complex, moved: Complex, inside: float) -> float:

@@ -33,6 +33,20 @@ _CLOCK = re.compile(
     re.ASCII,
 )
 _SPAN = re.compile(r"(\d{1,3}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->", re.ASCII)
+_COMMAS = (
+    # `: 46,5001]`, `: 5,4 abs_alt`, `BAROMETER:20,5`; times keep their meaning
+    (re.compile(r"(:\s*[-+]?[0-9]{1,15}),([0-9]{1,20})(?=[\]\smM°%<]|$)"), r"\1.\2"),
+    # `H 85,80m`, `(-24,4°, 1,5°`
+    (re.compile(r"(?<![0-9.,])([0-9]{1,6}),([0-9]{1,3})(?=\s?(?:m\b|m/s|°))"), r"\1.\2"),
+    # `GPS(14,3004,46,5001,16)`
+    (
+        re.compile(
+            r"(GPS\s*\(\s*[-+]?[0-9]{1,3}),([0-9]{3,15})(,\s*[-+]?[0-9]{1,3}),([0-9]{3,15})(?=[,)])"
+        ),
+        r"\1.\2\3.\4",
+    ),
+)
+"""Decimal commas, as programs in other languages write them, and what they are replaced with."""
 _FOCAL_MM = (5.0, 2000.0)
 _INDEX = re.compile(r"[0-9]{1,18}")
 _MOST_BLOCK = 4000
@@ -115,6 +129,8 @@ def _blocks(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _sample(index: int, text: str) -> Sample:
+    for commas, points in _COMMAS:
+        text = commas.sub(points, text)
     said: dict[str, tuple[str, float]] = {}
     for name, number in _FIELD.findall(text):
         said.setdefault(name.lower(), (number, float(number)))

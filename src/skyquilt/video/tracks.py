@@ -276,6 +276,8 @@ def _read_csv(path: Path) -> Track:
         )
     at = words.index(clock)
     fixes, seconds = [], []
+    if delimiter != ",":  # then commas are those of decimals
+        table = [table[0], *([c.replace(",", ".") for c in cells] for cells in table[1:])]
     for cells in table[1:]:
         time = _cell_time(cells[at] if at < len(cells) else "", milli="milli" in clock)
         if time is None:
