@@ -16,8 +16,8 @@ from skyquilt.alignment.similarity_graph import (
     solve_block,
     tie_to_positions,
 )
-from skyquilt.alignment.start import NOMINAL_HEIGHT_M, _consistent_blocks, georeference
-from skyquilt.model.poses import Prior
+from skyquilt.alignment.start import NOMINAL_HEIGHT_M, _consistent_blocks, georeference, ground_of
+from skyquilt.model.poses import MapFrame, Prior
 
 
 def plane(seed=0, lines=4, per_line=6, height=60.0):
@@ -205,6 +205,20 @@ def test_no_positions_and_no_height_is_not_metric():
     found, spread, metric = georeference(solution, links, priors_at(np.full(len(a), np.nan)))
     assert np.isnan(spread) and not metric
     assert np.median(np.abs(found.a)) == pytest.approx(NOMINAL_HEIGHT_M)
+
+
+def test_heights_above_the_sea_are_no_heights_above_ground():
+    """The scale comes from the height above the take-off point, wherever that lies."""
+    a, _, links, solution = solved(7)
+    nowhere = priors_at(np.full(len(a), np.nan), z=560.0)
+    found, _, metric = georeference(solution, links, nowhere, 500.0)
+    assert metric and np.median(np.abs(found.a)) == pytest.approx(60.0)
+    found, _, metric = georeference(solution, links, nowhere, np.nan)
+    assert not metric and np.median(np.abs(found.a)) == pytest.approx(NOMINAL_HEIGHT_M)
+    frame = MapFrame(crs="EPSG:32632", origin=(0.0, 0.0), vertical_datum="egm96")
+    assert np.isnan(ground_of(frame))
+    assert ground_of(replace(frame, takeoff_m=500.0)) == 500.0
+    assert ground_of(replace(frame, vertical_datum="takeoff")) == 0.0
 
 
 @pytest.mark.parametrize("known", [[4], list(range(24))])

@@ -13,6 +13,7 @@ from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.oblique import tilted
 from skyquilt.alignment.pose import ByMetadata, ByPose, reported_camera
 from skyquilt.alignment.repair import Repaired, repair
+from skyquilt.alignment.start import ground_of
 from skyquilt.errors import AlignmentError
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.model.photo import Photo
@@ -136,7 +137,8 @@ def repaired_metadata(inputs: AlignmentInputs) -> Repaired | None:
     if not inputs.links:
         return None
     convergence = inputs.frame.convergence_deg
-    return repair(inputs.photos, inputs.priors, inputs.features, inputs.links, convergence)
+    ground = ground_of(inputs.frame)
+    return repair(inputs.photos, inputs.priors, inputs.features, inputs.links, convergence, ground)
 
 
 def placed_by_metadata(

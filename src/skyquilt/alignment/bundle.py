@@ -15,7 +15,7 @@ from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, u
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
 from skyquilt.alignment.stages import believe_positions, fine, plain, rough, weighed
-from skyquilt.alignment.start import Start, find_start
+from skyquilt.alignment.start import Start, find_start, ground_of
 from skyquilt.alignment.tracks import Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
 from skyquilt.engine.kept import MADE_NOW, Keep
@@ -106,7 +106,7 @@ class Bundle:
         keep: Keep,
     ) -> Alignment:
         """Adjusts the photos that these links connect."""
-        start = _kept_start(photos, priors, features, links, keep)
+        start = _kept_start(photos, priors, features, links, ground_of(frame), keep)
         if not start.blocks:
             raise AlignmentError(f"none of {len(photos)} photos could be linked to another one")
         tracks = keep("tracks", lambda: build_tracks(features, start.links))
@@ -153,12 +153,13 @@ def _kept_start(
     priors: Sequence[Prior],
     features: Sequence[Features],
     links: Sequence[Link],
+    ground_m: float,
     keep: Keep,
 ) -> Start:
     """The start of an interrupted run, or found now; its links are kept by their photos."""
 
     def found() -> tuple[Start, list[tuple[int, int]]]:
-        start = find_start(photos, priors, features, links)
+        start = find_start(photos, priors, features, links, ground_m)
         return replace(start, links=()), [(k.a, k.b) for k in start.links]
 
     start, pairs = keep("start", found)

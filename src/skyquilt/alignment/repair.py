@@ -41,14 +41,15 @@ def repair(
     features: Sequence[Features],
     links: Sequence[Link],
     convergence_deg: float = 0.0,
+    ground_m: float = 0.0,
 ) -> Repaired:
     """Replaces headings that contradict the links, fills in missing ones, and computes heights
     above ground from image scale.
 
     Positions are not changed; their deviation is set to their scatter in the block where that is
-    larger than stated.
+    larger than stated. `ground_m`: see `find_start`.
     """
-    start = find_start(photos, priors, features, links)
+    start = find_start(photos, priors, features, links, ground_m)
     repaired, notes = list(priors), []
     heights = np.full(len(photos), np.nan)
     for i, (a, _) in sorted(start.placed.items()):

@@ -19,7 +19,7 @@ from skyquilt.alignment.similarity_graph import (
 )
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Prior
+from skyquilt.model.poses import MapFrame, Prior
 
 NOMINAL_HEIGHT_M = 50.0
 """Height above ground in m assumed if no data determine the scale; the result is then marked as not
@@ -70,9 +70,10 @@ def find_start(
     priors: Sequence[Prior],
     features: Sequence[Features],
     links: Sequence[Link],
+    ground_m: float = 0.0,
 ) -> Start:
     """Solves every block, removes links that contradict it, and georeferences it by its
-    positions.
+    positions. `ground_m`: height of the take-off point in the map's frame, NaN = not known.
     """
     plane = {(k.a, k.b): plane_link(k, photos, features) for k in links}
     solutions, kept = _consistent_blocks(len(photos), plane)
@@ -84,7 +85,7 @@ def find_start(
         members = set(solution.members.tolist())
         inner = [plane[key] for key in kept if key[0] in members]
         solution, spread, scaled = georeference(
-            solution, inner, [priors[m] for m in solution.members]
+            solution, inner, [priors[m] for m in solution.members], ground_m
         )
         metric &= scaled
         for m, a, t in zip(solution.members.tolist(), solution.a, solution.t, strict=True):
@@ -128,17 +129,20 @@ def _consistent_blocks(
 
 
 def georeference(
-    solution: PlaneSolution, links: Sequence[PlaneLink], priors: Sequence[Prior]
+    solution: PlaneSolution,
+    links: Sequence[PlaneLink],
+    priors: Sequence[Prior],
+    ground_m: float = 0.0,
 ) -> tuple[PlaneSolution, float, bool]:
     """The block in map metres, the scatter of its positions in m (NaN without positions), and
-    whether its scale is known.
+    whether its scale is known. `ground_m`: see `find_start`.
     """
     position = np.array([complex(p.map_C[0], p.map_C[1]) for p in priors])
     sigma = np.array([p.sigma_C[0] for p in priors])
     known = np.isfinite(position)
     if not known.any():
         turn = _turn(solution.a, priors)
-        height, metric = _scale_by_height(solution.a, priors)
+        height, metric = _scale_by_height(solution.a, priors, ground_m)
         scaled = replace(solution, a=solution.a * height * turn, t=solution.t * height * turn)
         return scaled, np.nan, metric
     where = position[known]
@@ -147,7 +151,7 @@ def georeference(
         g, c, scatter = fit_similarity(solution.t[known], where, sigma[known])
         metric = True
     else:
-        height, metric = _scale_by_height(solution.a, priors)
+        height, metric = _scale_by_height(solution.a, priors, ground_m)
         g = height * _turn(solution.a, priors)
         c, scatter = complex(np.mean(where - g * solution.t[known])), 0.0
     placed = replace(solution, a=solution.a * g, t=solution.t * g + c)
@@ -169,11 +173,20 @@ def _turn(a: NDArray[np.complex128], priors: Sequence[Prior]) -> complex:
     return complex(chosen / abs(chosen))
 
 
-def _scale_by_height(a: NDArray[np.complex128], priors: Sequence[Prior]) -> tuple[float, bool]:
+def ground_of(frame: MapFrame) -> float:
+    """Height of the take-off point in a frame in m; NaN where nothing tells it."""
+    if frame.vertical_datum in ("takeoff", "unknown", "control"):
+        return 0.0
+    return np.nan if frame.takeoff_m is None else frame.takeoff_m
+
+
+def _scale_by_height(
+    a: NDArray[np.complex128], priors: Sequence[Prior], ground_m: float
+) -> tuple[float, bool]:
     """Metres per block unit from heights above take-off, taken as heights above ground; otherwise
     from a nominal height.
     """
-    height = np.array([p.map_C[2] for p in priors])
+    height = np.array([p.map_C[2] for p in priors]) - ground_m
     ratio = (height / np.abs(a))[np.isfinite(height) & (height > 1)]
     if len(ratio):
         return float(np.median(ratio)), True

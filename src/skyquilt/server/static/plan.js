@@ -14,7 +14,7 @@
   const section = make("section"); section.id = "mission";
   const share = make("p", "", "share"), drones = make("ul"), legend = make("p", "", "plan-legend"), plans = make("ul");
   share.id = "coverage-share"; drones.id = "drones"; plans.id = "plans";
-  for (const [kind, colour] of Object.entries(colours)) { const dot = make("i"); dot.style.background = colour; legend.append(dot, `${words[kind]} `); }
+  for (const [kind, colour] of Object.entries(colours)) { const dot = make("i"); dot.style.background = colour; const entry = make("span"); entry.append(dot, words[kind]); legend.append(entry, " "); }
   const showPoints = button("Points", "plan-points"), showCover = button("Coverage", "plan-coverage"), fill = button("Plan what is missing", "plan-fill");
   const drawArea = button("Draw area", "draw-area"), drawClosed = button("Draw keep-out", "draw-closed"), clear = button("Clear", "draw-clear"), go = button("Plan these", "plan-go");
   for (const [b, on] of [[showPoints, true], [showCover, false], [drawArea, false], [drawClosed, false]]) b.setAttribute("aria-pressed", String(on));
