@@ -6,8 +6,10 @@ import json
 import math
 import re
 import sqlite3
+import time
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from urllib.parse import parse_qsl
 
 import cv2
@@ -21,6 +23,7 @@ from PIL import Image
 
 from skyquilt.errors import UsageError
 from skyquilt.live.settings import LiveSettings
+from skyquilt.server import published_files
 from skyquilt.server.access import Guard
 from skyquilt.server.published_files import PublishedFiles
 from skyquilt.server.survey import LiveSurvey
@@ -240,6 +243,50 @@ def test_export_is_a_georeferenced_cog(site, tmp_path):
         assert raster.dataset_mask().mean() > 50
     assert site.web.get("/export", params={"bbox": "1,2,3"}).status_code == 400
     assert site.web.get("/export", params={"bbox": "10,10,11,11"}).status_code == 404
+
+
+def test_an_error_of_one_step_does_not_end_publishing(site, tmp_path, monkeypatch):
+    """Whatever it is, it is logged once, and the files follow when the next step succeeds."""
+    steps = []
+
+    def step(self, *, now=False):
+        steps.append(now)
+        if len(steps) < 4:
+            raise ValueError("of one kind")
+
+    monkeypatch.setattr(published_files, "PAUSE_S", 0.01)
+    monkeypatch.setattr(PublishedFiles, "step", step)
+    with PublishedFiles(LiveSurvey(site.folder), tmp_path):
+        deadline = time.monotonic() + 20
+        while len(steps) < 6 and time.monotonic() < deadline:
+            time.sleep(0.01)
+    assert len(steps) >= 6
+    assert (tmp_path / "errors.log").read_text().count("ValueError: of one kind") == 1
+
+
+def test_a_map_without_a_picture_is_not_published(tmp_path):
+    """A layer that tells its bounds but shows nothing yet."""
+
+    class Empty:
+        crs = "EPSG:32632"
+
+        def bounds(self):
+            return (0.0, 0.0, 1.0, 1.0)
+
+        def about(self):
+            return None
+
+    class Survey:
+        ledger = SimpleNamespace(told=lambda known: [])
+
+        def layers(self):
+            return {"visible": Empty()}
+
+        def styles(self):
+            return {"visible": None}
+
+    PublishedFiles(Survey(), tmp_path).step(now=True)
+    assert not list(tmp_path.iterdir())
 
 
 def test_files_for_other_programs(site):

@@ -6,6 +6,7 @@ import threading
 import time
 from pathlib import Path
 
+from skyquilt.engine.error_log import log_error
 from skyquilt.errors import OutputError
 from skyquilt.live.ledger import hit
 from skyquilt.raster.map_source import MERCATOR, Bounds, between, mercator, picture
@@ -35,6 +36,7 @@ class PublishedFiles:
         self._known = 0
         self._boxes: list[Bounds] = []
         self._snapshot, self._stale = 0.0, True
+        self._failed = ""
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True, name="publishing")
 
@@ -53,6 +55,10 @@ class PublishedFiles:
             except OutputError:
                 # the disk is full: retry later; the mapping reports it to the user
                 continue
+            except Exception as error:  # whatever it is, later maps are still to be published
+                if repr(error) != self._failed:
+                    log_error(self.folder, "the files for other programs", error)
+                self._failed = repr(error)
 
     def step(self, *, now: bool = False) -> None:
         """Updates both files; the snapshot at most every `SNAPSHOT_S` seconds, unless `now`."""
@@ -66,7 +72,7 @@ class PublishedFiles:
         if self._stale and (now or time.monotonic() - self._snapshot > SNAPSHOT_S):
             self._snapshot, self._stale = time.monotonic(), False
             source = self.survey.layers()[layer]
-            if source.bounds() is not None:
+            if source.about() is not None:
                 write_part(source, self.survey.styles()[layer], None, self.folder / "map.tif")
         hit("published")
 
