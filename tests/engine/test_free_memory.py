@@ -33,3 +33,15 @@ def test_holes_are_given_back():
     alone, asked = map(int, done.stdout.split())
     assert alone < 20e6  # of 120 MB freed, hardly anything went back by itself
     assert asked > 80e6
+
+
+def test_a_process_does_not_tell_the_memory_of_the_one_that_started_it():
+    inner = "from skyquilt.engine.clock import peak_memory_mb; print(peak_memory_mb())"
+    outer = f"""
+import subprocess, sys
+held = bytearray(500_000_000)
+held[::4096] = b"1" * len(held[::4096])
+print(subprocess.run([sys.executable, "-c", {inner!r}], capture_output=True, text=True).stdout)
+"""
+    told = subprocess.run([sys.executable, "-c", outer], capture_output=True, text=True, check=True)
+    assert 10 < float(told.stdout) < 300
