@@ -161,3 +161,18 @@ def test_gpx_and_logs_are_read(tmp_path):
     log.write_text("time,latitude\n1,2\n")
     with pytest.raises(SideFileError, match="expected columns time, latitude and longitude"):
         read_track(log)
+
+
+@pytest.mark.parametrize("between", [";", "\t"])
+def test_logs_with_decimal_commas_say_the_same(tmp_path, between):
+    rows = [("time", "latitude", "longitude", "altitude", "heading")]
+    rows += [
+        (f"2024-05-01T08:00:{i:02d}.{i}Z", f"46.6{i}01", f"14.3{i}02", f"50{i}.5", f"{i}.25")
+        for i in range(9)
+    ]
+    log, other = tmp_path / "points.csv", tmp_path / "commas.csv"
+    log.write_text("\n".join(",".join(r) for r in rows))
+    other.write_text("\n".join(between.join(r).replace(".", ",") for r in rows))
+    told, same = read_track(log), read_track(other)
+    assert told.latitude_deg[3] == 46.6301 and told.sea_level_m[3] == 503.5
+    assert told.digest == same.digest
