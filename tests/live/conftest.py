@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import httpx
 import numpy as np
 import pytest
 
+from skyquilt.live.adjustment_schedule import QUIET_S
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.workflow import iter_live
@@ -120,7 +122,14 @@ class Served:
 
         def still() -> bool:
             live = self.live
-            if live.queues.untried or live.redraw.dirty or live.redraw.later:
+            redraw, schedule = live.redraw, live.schedule
+            if live.queues.untried or redraw.urgent or redraw.pending:
+                return False
+            if redraw.dirty or redraw.later or live.background.busy or schedule.under_way:
+                return False
+            # a quiet moment begins an adjustment of what was refined since the last one
+            quiet_s = time.monotonic() - live.blocks.last_arrival
+            if schedule.since and live.settings.reposition and quiet_s < QUIET_S + 1:
                 return False
             before = self.web.get("/photos").json()
             threading.Event().wait(0.5)
