@@ -13,7 +13,7 @@ import threading
 import time
 import uuid
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence, Sized
 from contextlib import contextmanager, suppress
 from io import BytesIO
 from itertools import islice
@@ -31,7 +31,6 @@ try:
     import cv2
     import dask
     import distributed
-    import numpy as np
     from distributed.comm.core import CommClosedError
 except ImportError as error:
     raise UsageError("--scheduler needs Dask: install skyquilt with its extra `cluster`") from error
@@ -183,7 +182,7 @@ class Cluster:
         """
         waiting: deque[Any] = deque()
         name = f"{getattr(work, '__name__', type(work).__name__)}-{uuid.uuid4().hex[:8]}"
-        rest, number, spent_s = iter(items), 0, list[float]()
+        rest, number, spent_s = iter(items), 0, deque[float](maxlen=LOOKED)
         share = len(items) // (AHEAD * self._threads) if isinstance(items, Sized) else MOST_ITEMS
         try:
             while some := list(islice(rest, max(1, min(_size(spent_s), share)))):
@@ -200,7 +199,7 @@ class Cluster:
             with suppress(Exception):  # the scheduler may be gone
                 self._client.cancel(list(waiting))
 
-    def _taken(self, future: Any, spent_s: list[float]) -> list[Any]:
+    def _taken(self, future: Any, spent_s: deque[float]) -> list[Any]:
         """The results of a task; adds the seconds that its items took."""
         results, seconds = self._result(future)
         spent_s += seconds
@@ -345,13 +344,13 @@ def _step(path: str) -> Callable[[Any], Any]:
         return _steps[path]
 
 
-def _size(spent_s: list[float]) -> int:
-    """How many items the next task gets, so that it takes about `TASK_S`: neighbours use the same
-    photos, and handing out a task costs milliseconds.
+def _size(spent_s: Collection[float]) -> int:
+    """How many items the next task gets, so that it takes about `TASK_S` if they take as long as
+    the last ones: neighbours use the same photos, and handing out a task costs milliseconds.
     """
     if not spent_s:
         return 1
-    return max(1, min(MOST_ITEMS, round(TASK_S / max(float(np.mean(spent_s[-LOOKED:])), 1e-6))))
+    return max(1, min(MOST_ITEMS, round(TASK_S * len(spent_s) / max(sum(spent_s), 1e-6))))
 
 
 def _do(path: str, items: list[Any]) -> tuple[list[Any], list[float]]:

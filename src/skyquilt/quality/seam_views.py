@@ -1,6 +1,6 @@
 """What both photos show at points of seams: patches, and colours at and beside the seam."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,7 @@ from skyquilt.engine.workers import HERE, Workers
 from skyquilt.imaging.nodes import View, inside, project_nodes
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
+from skyquilt.ortho.compose import PhotoPixels
 from skyquilt.ortho.exposure import Exposure, image_place
 from skyquilt.ortho.patches import SIDE, grey_patches
 from skyquilt.quality.seam_points import SeamPoint
@@ -23,8 +24,6 @@ BESIDE = 30
 """Distance in map px of the places beside the seam."""
 PLACES = np.array([(0, 0), (BESIDE, 0), (-BESIDE, 0), (0, BESIDE), (0, -BESIDE)])
 """(5, 2) places east and north of a point in map px whose colours are compared."""
-PhotoPixels = Callable[[int], NDArray[Any]]
-"""Full-size pixels of a photo by its index."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
