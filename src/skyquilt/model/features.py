@@ -82,6 +82,10 @@ class Link:
     b_S_a: complex
     """Scale and rotation from a to b: p_b = b_S_a * p_a + t for image points as x - iy (y up)."""
 
+    def other(self, photo: int) -> int:
+        """The other one of its two photos."""
+        return self.b if self.a == photo else self.a
+
     def __len__(self) -> int:
         return len(self.index_a)
 

@@ -7,6 +7,7 @@ from skyquilt.model.event import Note
 from skyquilt.ortho.earlier import same_pose
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.orthomosaic import used_photos
+from skyquilt.report.tables import added_sentence
 from skyquilt.workflows.finished import Finished, photo_key, stamps
 from skyquilt.workflows.flow import AlignedPhotos, DrawnMap
 
@@ -56,9 +57,5 @@ def added_note(aligned: AlignedPhotos, ground: Ground) -> Note:
     """The same in a sentence."""
     found = added_figures(aligned, ground).get("added")
     if not found:
-        return Note(text="the map could not be continued, so all of it is made anew")
-    more, moved, share = found["photos"], found["moved"], found["share_made_anew"]
-    kept = "all of the map is" if share == 1 else f"{100 * share:.0f} % of the map are"
-    return Note(
-        text=f"{more} photos were added to {found['to']}, {moved} of which moved; {kept} made anew"
-    )
+        return Note(text="The map could not be continued, so all of it is made anew.")
+    return Note(text=added_sentence(found))
