@@ -50,6 +50,23 @@ def test_a_raster_that_grows_keeps_its_tiles_bit_for_bit(tmp_path, kind):
         assert np.isfinite(small[130:380, 130:380]).any()
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_pixels_are_those_that_rasterio_reads(tmp_path, kind):
+    options, dtype = KINDS[kind]
+    array, valid = picture(1500, 1300).astype(dtype), disc(1500, 1300)
+    if dtype == np.float32:
+        array[~valid] = np.nan
+    write_array(tmp_path / "a.tif", array, spec_for(array, **options), valid)
+    with FormerRaster(tmp_path / "a.tif") as former, rasterio.open(tmp_path / "a.tif") as file:
+        pixels, shown = former.pixels(512, 512, 900, 788)
+        theirs = np.moveaxis(file.read(), 0, 2)[512:1412, 512:1300]
+        seen = file.dataset_mask()[512:1412, 512:1300] > 0
+    assert np.array_equal(shown, seen) and 0.2 < seen.mean() < 1
+    off = np.abs(pixels[seen].astype(float) - theirs[seen])
+    # two programs decode colours of JPEG at half the size a little differently
+    assert off.max() <= (4 if kind == "jpeg" else 0) and off.mean() < 0.5
+
+
 def test_a_file_that_was_written_otherwise_gives_no_tiles(tmp_path):
     array = picture(600, 600)
     write_array(tmp_path / "a.tif", array, spec_for(array, compress="zstd"))

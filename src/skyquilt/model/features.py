@@ -1,6 +1,6 @@
 """Keypoints of one photo, and what two photos have in common."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,15 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.px)
+
+    def followed_by(self, more: "Features") -> "Features":
+        """These, then others of the same kind in the same photo."""
+        return replace(
+            self,
+            px=np.concatenate([self.px, more.px]),
+            size=np.concatenate([self.size, more.size]),
+            descriptors=np.concatenate([self.descriptors, more.descriptors]),
+        )
 
     @property
     def unit(self) -> NDArray[np.float32]:

@@ -151,19 +151,19 @@ class Drawing:
         spec, one = self._spec, self._block()
         with CogWriter(path, spec, spool=spool, digest=self.key) as writer:
             todo, total = list(writer.blocks()), len(_blocks(spec))
-            done, stay = total - len(todo), self._staying(todo)
-            if stay:
-                for block, kept in self._former(stay, spec):
-                    self.store.put("blocks", self._block_key(block), kept.extras)
-                    writer.write_block(block, kept.pixels, kept.valid, kept.encoded)
-                    done += 1
-                    yield done, total
-            todo = [b for b in todo if b not in stay]
-            for block, (pixels, valid, extras) in zip(todo, workers.each(one, todo), strict=True):
+            stay = self._staying(todo)
+            kept = self._former(stay, spec)
+            drawn = workers.each(one, [b for b in todo if b not in stay])
+            for done, block in enumerate(todo):  # in this order few overview tiles are open
+                if block in stay:
+                    former = next(kept)
+                    pixels, valid, extras = former.pixels, former.valid, former.extras
+                    encoded = former.encoded
+                else:
+                    (pixels, valid, extras), encoded = next(drawn), None
                 self.store.put("blocks", self._block_key(block), extras)
-                writer.write_block(block, pixels, valid)
-                done += 1
-                yield done, total
+                writer.write_block(block, pixels, valid, encoded)
+                yield total - len(todo) + done + 1, total
         self.store.put("blocks", digest(self.key, "file"), _stamp(path))
 
     def _staying(self, todo: Sequence[Block]) -> dict[Block, Window]:
@@ -174,16 +174,15 @@ class Drawing:
         found = ((b, grows.stays(_window(b), grid)) for b in todo)
         return {b: old for b, old in found if old is not None}
 
-    def _former(
-        self, stay: Mapping[Block, Window], spec: RasterSpec
-    ) -> Iterator[tuple[Block, FormerBlock]]:
+    def _former(self, stay: Mapping[Block, Window], spec: RasterSpec) -> Iterator[FormerBlock]:
         """These blocks, from the files of the earlier map."""
-        assert self.growth is not None
+        if self.growth is None or not stay:
+            return
         table, factor = shot_numbers(self.compose), preview_factor(self.compose.grid)
         names = np.array([0, *(table[i] for i in self.growth.earlier.shown)], np.uint32)
         with FormerFiles(self.output) as files:
             for block, old in stay.items():
-                yield block, files.block(block, old, spec, names, factor)
+                yield files.block(block, old, spec, names, factor)
 
     def companions(self) -> Drawn:
         """Writes provenance.tif and views.tif, and returns them."""

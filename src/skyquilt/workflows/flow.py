@@ -46,6 +46,7 @@ from skyquilt.workflows.photo_features import (
     picture_recipe,
     pixels_of,
 )
+from skyquilt.workflows.second_look import connect
 from skyquilt.workflows.survey_input import SurveyInput
 
 T = TypeVar("T")
@@ -176,8 +177,8 @@ def align_photos(
     else:
         frame = choose_frame(found.photos, picture.crs, given.control, picture.vertical_datum)
     reported = priors(found.photos, frame)
-    linking = _links(found, frame, reported, methods, store, workers)
-    links = yield from clock.stage("links", linking)
+    linking = _links(found, frame, reported, grey, methods, store, workers)
+    found, links = yield from clock.stage("links", linking)
     known = AlignmentInputs(
         photos=found.photos,
         features=found.features,
@@ -368,14 +369,18 @@ def _links(
     found: FeaturedPhotos,
     frame: MapFrame,
     reported: Sequence[Prior],
+    grey: GreyPictures,
     methods: Methods,
     store: Store,
     workers: Workers,
-) -> Steps[Links]:
-    """Computes links if the alignment method needs them."""
+) -> Steps[tuple[FeaturedPhotos, Links]]:
+    """Computes links if the alignment method needs them; the photos with the features that these
+    refer to.
+    """
     if not methods.align.needs_links or len(found.photos) < 2:
-        return Links()
-    return (yield from link_photos(found, frame, reported, methods, store, workers))
+        return found, Links()
+    links = yield from link_photos(found, frame, reported, methods, store, workers)
+    return (yield from connect(found, links, reported, grey, methods, store, workers))
 
 
 def alignment_key(known: AlignmentInputs, methods: Methods) -> str:
@@ -393,6 +398,7 @@ def alignment_key(known: AlignmentInputs, methods: Methods) -> str:
         held,
         list(known.control),
         features_recipe(methods.detector),
+        connect,
         list(known.order),
         methods.align,
     )
