@@ -80,8 +80,8 @@ def to_grey8(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 def stretched(*images: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
     """Grey images (h, w), those of dusk, fog or haze with the contrast of others: where the values
-    of all of them together, but for one in a thousand at either end, span less than `LEAST_SPAN`, they
-    are stretched to `GOOD_SPAN`.
+    of all of them together, but for one in a thousand at either end, span less than `LEAST_SPAN`,
+    they are stretched to `GOOD_SPAN`.
     """
     sample = np.concatenate([i[::SAMPLED, ::SAMPLED].ravel() for i in images])
     low, high = np.percentile(sample, [0.1, 99.9]) if sample.size else (0.0, 255.0)
