@@ -241,7 +241,7 @@ def test_rerun_from_each_stage(mosaic, flight, finished, stage):
     output = mosaic(flight / "photos").made().output
     told = mosaic(flight / "photos", "--rerun-from", stage, "--json").made()
     reused = {e["stage"]: e["reused"] for e in told.events if e["event"] == "StageFinished"}
-    stored = {"features", "links", "align", "surface", "mosaic"}
+    stored = {"features", "links", "align", "surface", "seams", "mosaic"}
     first = STAGES.index(stage)
     assert reused == {
         s: s in stored and k + 1 < first for k, s in enumerate(STAGES[1:]) if s != "frames"

@@ -170,7 +170,13 @@ def test_every_number_of_the_stages_is_in_a_key():
 
 def _of_a_stage(module: str) -> bool:
     """Whether a module belongs to a method, and not to the workflow that draws the map."""
-    drawing = module.split(".")[-1] in ("ground", "orthomosaic", "companions", "radiometry")
+    drawing = module.split(".")[-1] in (
+        "ground",
+        "orthomosaic",
+        "companions",
+        "radiometry",
+        "earlier",
+    )
     return module.split(".")[1] in STAGES and not drawing
 
 

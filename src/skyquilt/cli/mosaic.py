@@ -65,15 +65,6 @@ def command(
     overwrite: Annotated[
         bool, option(COMMON, "Replace the results of another run in OUTPUT.", "--overwrite")
     ] = False,
-    add: Annotated[
-        bool,
-        option(
-            COMMON,
-            "Add photos that joined the folder to the map in OUTPUT; what they do not change"
-            " stays.",
-            "--add",
-        ),
-    ] = False,
     geo: Annotated[
         Path | None,
         option(
@@ -265,6 +256,15 @@ def command(
     max_mp: Annotated[float, option(RUN, MAX_MP)] = MOST_MP,
     max_memory: Annotated[float | None, option(RUN, MAX_MEMORY, default=MAX_MEMORY_UNSAID)] = None,
     seed: Annotated[int, option(RUN, "Of everything random; equal seeds give equal maps.")] = 0,
+    add: Annotated[
+        bool,
+        option(
+            RUN,
+            "Add photos that joined the folder to the map in OUTPUT; what they do not change"
+            " stays.",
+            "--add",
+        ),
+    ] = False,
     rerun_from: Annotated[
         str | None,
         option(

@@ -5,15 +5,17 @@ encoded tiles themselves, so that nothing is compressed twice.
 import contextlib
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 
 from skyquilt.errors import OutputError
 from skyquilt.raster.assemble import CODES
 from skyquilt.raster.spec import RasterSpec
+
+if TYPE_CHECKING:
+    from tifffile import TiffPage
 
 
 class FormerRaster:
@@ -25,6 +27,8 @@ class FormerRaster:
         Raises:
             OutputError: it cannot be read.
         """
+        import tifffile  # most runs add nothing
+
         try:
             self._file = tifffile.TiffFile(path)
             pages = [p for p in self._file.pages if isinstance(p, tifffile.TiffPage)]
@@ -90,7 +94,7 @@ class FormerRaster:
         mask = b"" if self._mask is None else self._bytes(self._mask, row, column)
         return (image, mask) if image and (mask or not spec.mask) else None
 
-    def _decoded(self, page: tifffile.TiffPage, row: int, column: int) -> NDArray[Any] | None:
+    def _decoded(self, page: "TiffPage", row: int, column: int) -> NDArray[Any] | None:
         """The pixels of a whole tile; None where it is empty."""
         data = self._bytes(page, row, column)
         if not data:
@@ -99,7 +103,7 @@ class FormerRaster:
         pixels = page.decode(data, number, jpegtables=page.jpegtables, _fullsize=True)[0]
         return None if pixels is None else np.asarray(pixels)
 
-    def _bytes(self, page: tifffile.TiffPage, row: int, column: int) -> bytes:
+    def _bytes(self, page: "TiffPage", row: int, column: int) -> bytes:
         number = self._number(page, row, column)
         with contextlib.suppress(IndexError):
             offset, size = page.dataoffsets[number], page.databytecounts[number]
@@ -109,5 +113,5 @@ class FormerRaster:
         return b""
 
     @staticmethod
-    def _number(page: tifffile.TiffPage, row: int, column: int) -> int:
+    def _number(page: "TiffPage", row: int, column: int) -> int:
         return int(row * -(-page.imagewidth // page.tilewidth) + column)

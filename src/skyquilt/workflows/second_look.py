@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from skyquilt.alignment.tracks import connected
 from skyquilt.engine.clock import Steps
@@ -140,5 +139,7 @@ def _numbers(features: Features, more: Features) -> NDArray[np.int64]:
     own = len(features) + np.arange(len(more))
     if not len(features):
         return own
+    from scipy.spatial import cKDTree  # most surveys need it for nothing else
+
     distance, nearest = cKDTree(features.px).query(more.px)
     return np.where(distance < SAME_PX * more.scale, nearest, own)
