@@ -150,7 +150,7 @@ def _parts(shapes: Iterable[BaseGeometry]) -> list[BaseGeometry]:
 def _side(a: Places, b: Places, c: Places) -> NDArray[np.float64]:
     """On which side of the lines from a to b the points c lie (n,)."""
     (x, y), (u, v) = (b - a).T, (c - a).T
-    return np.sign(x * v - y * u)
+    return np.asarray(np.sign(x * v - y * u))
 
 
 def inside(
@@ -226,6 +226,7 @@ Shapes = tuple[list[BaseGeometry], str | None]
 """Two-dimensional shapes and their CRS as pyproj reads it; None = the output's CRS."""
 
 WGS84 = "EPSG:4326"
+_TABLES = ("gpkg_geometry_columns", "gpkg_spatial_ref_sys")
 
 
 def read_geojson(path: Path) -> Shapes:
@@ -316,11 +317,14 @@ def geopackage_rows(
         pass  # it exists, and is a file
     with closing(sqlite3.connect(path.absolute().as_uri() + "?mode=ro", uri=True)) as base:
         end = time.thread_time() + MOST_QUERY_S
-        # each table may be a view of any query
+        # a column may be any formula
         base.set_progress_handler(lambda: time.thread_time() > end, 1000)
         base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_TEXT_BYTES)
         found = "SELECT table_name, column_name, srs_id FROM gpkg_geometry_columns LIMIT 1"
+        for name in _TABLES:
+            _is_table(base, name)
         table, column, srs = base.execute(found).fetchone()
+        _is_table(base, table)
         columns = "organization, organization_coordsys_id, definition"
         naming = f"SELECT {columns} FROM gpkg_spatial_ref_sys WHERE srs_id = ?"
         authority, code, definition = base.execute(naming, (srs,)).fetchone()
@@ -339,6 +343,14 @@ def geopackage_rows(
                 }
                 kept.append((blob, words))
     return kept, f"{authority}:{code}" if authority.upper() == "EPSG" else definition
+
+
+def _is_table(base: sqlite3.Connection, name: str) -> None:
+    """Refuses views, which may be any query: without end, or sorting more than the disk holds."""
+    kinds = "SELECT type, sql FROM sqlite_master WHERE lower(name) = lower(?)"
+    kind, made = base.execute(kinds, (name,)).fetchone() or ("missing", "")
+    if kind != "table" or "virtual" in made[:30].lower():
+        raise ValueError(f"its table '{plain(str(name), 60)}' is a {kind}; export it as a layer")
 
 
 def gpkg_header(blob: bytes) -> int:
