@@ -37,8 +37,8 @@ def test_the_same_flight_at_any_frame_rate_gives_the_same_frames(tmp_path, fps):
     assert clip.looked == pytest.approx(5 * seconds, rel=0.05)
     at = np.array([p.frame_s for p in found.survey.photos])
     shared = 1 - np.diff(at) * SPEED / SIZE[1]
-    assert (shared[:-1] > 0.75 - 0.04).all() and (shared[:-1] < 0.75 + 0.25 * 0.32).all()
-    assert len(at) <= 1.2 * (1 + along[-1] / SIZE[1] / 0.25) + 1
+    assert (shared[:-1] > 0.78 - 0.04).all() and (shared[:-1] < 0.78 + 0.22 * 0.32 + 0.025).all()
+    assert len(at) <= 1.2 * (1 + along[-1] / SIZE[1] / 0.22) + 1
 
 
 @pytest.mark.parametrize("stated", ["its own", "that of the first"])
@@ -90,4 +90,4 @@ def test_an_hour_of_hovering_gives_one_frame_and_costs_little(tmp_path):
     hovering = [f for f in chosen.chosen if 200 <= f.look < 200 + count]
     assert len(hovering) <= 2
     flown_px = 2 * away[-1]
-    assert len(chosen.chosen) <= 1.2 * (1 + flown_px / SIZE[0] / 0.25) + 2
+    assert len(chosen.chosen) <= 1.2 * (1 + flown_px / SIZE[0] / 0.22) + 2
