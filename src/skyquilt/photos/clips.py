@@ -120,7 +120,7 @@ def after_others(clips: Sequence[Clip]) -> list[float]:
     """Seconds by which each clip begins after the start that it states: of a recording that the
     camera divided into files, each may state the time at which the first began.
     """
-    late = []
+    late: list[float] = []
     for k, clip in enumerate(clips):
         same = [
             late[j] + c.duration_s
