@@ -118,7 +118,7 @@ class InputSettings:
     """One of `SHUTTERS`: how the cameras expose; None = as metadata and table of cameras say."""
     shutter_readout_ms: float | None = None
     """Time in ms in which a rolling shutter reads a photo out; None = as the table says."""
-    frame_overlap: float = 75.0
+    frame_overlap: float = 78.0
     """Overlap in percent wanted between frames that are chosen from a clip."""
     clock_offset: float | None = None
     """Seconds to add to a clip's time to get the time of its positions; None = found from the

@@ -18,7 +18,10 @@ import rasterio
 
 from skyquilt.engine import codec
 from skyquilt.engine.folder import CONTRACT
-from skyquilt.workflows.mosaic import STAGES
+from skyquilt.model.event import StageStarted
+from skyquilt.settings import MosaicSettings
+from skyquilt.workflows import flow
+from skyquilt.workflows.mosaic import STAGES, iter_mosaic
 from tests.end_to_end.conftest import leftovers, named
 from tests.interrupts import hears_interrupts
 
@@ -471,3 +474,65 @@ def test_photos_that_come_later_are_added_without_looking_at_the_others_again(mo
     assert told.code == 5
     assert "other photos or other settings" in told.err
     assert mosaic(photos, "--overwrite").made().metrics["photos_used"] == 9
+
+
+# what is there was spoiled between two runs, or while one ran
+
+
+def _pipe(path):
+    path.unlink()
+    os.mkfifo(path)
+
+
+def _loop(path):
+    path.unlink()
+    path.symlink_to(path)
+
+
+def _deep(path):
+    path.write_bytes(b"[" * 200_000)
+
+
+def _half(path):
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spoil", [_pipe, _deep])
+def test_what_is_spoiled_between_runs_is_made_again_or_named(mosaic, flight, finished, spoil):
+    """Every file of the run, one kind of artefact at a time; a pipe must not be waited for."""
+    files = [p.relative_to(finished) for p in sorted(finished.rglob("*")) if p.is_file()]
+    inner = [f for f in files if f.parts[0] == ".skyquilt"]
+    assert len({f.parent for f in inner}) > 5
+    for folder in sorted({f.parent for f in inner} | {Path("metrics.json")}):
+        output = finished.parent / "spoiled"
+        shutil.rmtree(output, ignore_errors=True)
+        shutil.copytree(finished, output)
+        for file in [f for f in inner if f.parent == folder] or [folder]:
+            spoil(output / file)
+        told = mosaic(flight / "photos", output=output)
+        if told.code == 5:  # without run.json nobody knows whose files these are
+            assert folder == Path(".skyquilt")
+            assert "already holds other files" in told.err
+        else:
+            same_result(told.made().output, finished)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("stage", "spoil"),
+    [("features", _loop), ("links", Path.unlink), ("mosaic", _half), ("report", _pipe)],
+)
+def test_a_photo_spoiled_while_a_map_is_made_is_left_out(
+    photos, tmp_path, monkeypatch, stage, spoil
+):
+    """It is missed where its pixels are needed again, whatever the stage."""
+    monkeypatch.setattr(flow, "pixel_budget", lambda memory: 0)
+    bad = named(photos)[4]
+    settings = MosaicSettings(features=300, surface="ties", gsd_cm=30.0, jobs=2)
+    for event in iter_mosaic(photos, tmp_path / "out", settings):
+        if isinstance(event, StageStarted) and event.stage == stage and bad.is_file():
+            spoil(bad)
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics["photos_used"] == 8
+    assert list(metrics["photos_rejected"]) == [bad.name]

@@ -5,6 +5,7 @@ and the server goes on.
 import gzip
 import io
 import json
+import math
 import sqlite3
 import time
 import zipfile
@@ -34,7 +35,10 @@ def _geopackage(change):
         "PRAGMA application_id = 1196444487; CREATE TABLE gpkg_contents (table_name TEXT,"
         " data_type TEXT, identifier TEXT, srs_id INTEGER); CREATE TABLE gpkg_geometry_columns"
         " (table_name TEXT, column_name TEXT, geometry_type_name TEXT, srs_id INTEGER, z INTEGER,"
-        " m INTEGER); CREATE TABLE a (fid INTEGER PRIMARY KEY, geom BLOB);"
+        " m INTEGER); CREATE TABLE gpkg_spatial_ref_sys (srs_name TEXT, srs_id INTEGER,"
+        " organization TEXT, organization_coordsys_id INTEGER, definition TEXT);"
+        " INSERT INTO gpkg_spatial_ref_sys VALUES ('WGS 84', 4326, 'EPSG', 4326, '');"
+        " CREATE TABLE a (fid INTEGER PRIMARY KEY, geom BLOB);"
         " INSERT INTO gpkg_contents VALUES ('a', 'features', 'a', 4326);"
         " INSERT INTO gpkg_geometry_columns VALUES ('a', 'geom', 'POLYGON', 4326, 0, 0);"
     )
@@ -68,6 +72,10 @@ ENDLESS = (
     "WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM c WHERE n < 4000000000)"
     " SELECT n AS fid, zeroblob(n) AS geom FROM c"
 )
+STAR = [[round(math.sin(k * 2.7), 6), round(math.cos(k * 2.7), 6)] for k in range(3000)]
+STAR += STAR[:1]
+TEETH = [[k / 1e4, 1 if k % 4 in (1, 2) else 0.01] for k in range(9000)]
+COMB = [*TEETH, [0.9, 0], [0, 0], [0, 0.01]]
 BODIES = {
     "nothing": b"",
     "a zero": b"\x00",
@@ -130,6 +138,42 @@ BODIES = {
         "UPDATE gpkg_geometry_columns SET table_name = 'a\"; DROP TABLE a; --',"
         " column_name = zeroblob(100), srs_id = 'x';"
     ),
+    "a database of one huge blob": _geopackage(
+        "DROP TABLE a; CREATE VIEW a AS SELECT 1 AS fid, zeroblob(900000000) AS geom;"
+    ),
+    "a database of huge text": _geopackage(
+        "DROP TABLE a; CREATE VIEW a AS SELECT 1 AS fid,"
+        " replace(hex(zeroblob(200000000)), '0', 'aa') AS geom;"
+    ),
+    "a database that is sorted": _geopackage(
+        "DROP TABLE a; CREATE VIEW a AS WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1"
+        " FROM c WHERE n < 300000) SELECT n AS fid, zeroblob(2000) AS geom FROM c ORDER BY"
+        " random();"
+    ),
+    "a database of endless tables": _geopackage(
+        "DROP TABLE gpkg_geometry_columns; CREATE VIEW gpkg_geometry_columns AS WITH RECURSIVE"
+        " c(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM c) SELECT 'a' AS table_name, 'geom' AS"
+        " column_name, n AS srs_id FROM c WHERE n < 0;"
+    ),
+    "a database of endless systems": _geopackage(
+        "DROP TABLE gpkg_spatial_ref_sys; CREATE VIEW gpkg_spatial_ref_sys AS WITH RECURSIVE c(n)"
+        " AS (SELECT 1 UNION ALL SELECT n + 1 FROM c) SELECT n AS srs_id, 'EPSG' AS organization,"
+        " n AS organization_coordsys_id, '' AS definition FROM c WHERE n < 0;"
+    ),
+    "a star of 3,000 corners": _feature(type="Polygon", coordinates=[STAR]),
+    "two combs": json.dumps(
+        {
+            "type": "FeatureCollection",
+            "features": [
+                {
+                    "type": "Feature",
+                    "properties": {},
+                    "geometry": {"type": "Polygon", "coordinates": [[p[::way] for p in COMB]]},
+                }
+                for way in (1, -1)
+            ],
+        }
+    ).encode(),
     "half a database": _geopackage("INSERT INTO a VALUES (1, zeroblob(9000));")[:-5000],
     "a megabyte of one letter": b"a" * 1_000_000,
 }
@@ -147,9 +191,14 @@ PLACES = (
     ("POST", "/photos?name=a.srt"),
     ("PUT", "/control"),
     ("POST", "/control/read?crs=EPSG:32633"),
-    ("PATCH", "/uploads/1"),
+    ("POST", "/control/run"),
+    ("POST", "/plan/missing"),
+    ("POST", "/photos/uploads"),
+    ("PATCH", "/photos/uploads/1"),
+    ("DELETE", "/photos/uploads/1"),
     ("DELETE", "/layers/a"),
     ("POST", "/nothing"),
+    ("POST", "/finish"),  # last, since it ends the flight
 )
 TYPES = ("application/json", "multipart/form-data; boundary=x", "text/\u00e9; charset=utf-99", "")
 SLOWEST_S = 5.0

@@ -1,9 +1,13 @@
 """What the viewer of a finished run says of a place, against the run's own rasters."""
 
 import io
+import os
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
 import rasterio
@@ -11,7 +15,10 @@ from pyproj import Transformer
 
 from skyquilt.raster.map_source import FileSource
 from skyquilt.runs.layers import RunLayer
+from skyquilt.server.access import Guard
 from skyquilt.server.parts import write_part
+from skyquilt.server.server_thread import ServerThread
+from skyquilt.server.survey import open_survey
 
 
 @pytest.fixture(scope="module")
@@ -184,3 +191,37 @@ def test_the_viewer_starts_at_once(finished):
         for _ in range(3)
     ]
     assert 0.2 < min(used) < 1.5
+
+
+def _piped(path):
+    path.unlink()
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize("spoil", [Path.unlink, _piped, lambda p: p.write_bytes(b"II*\0" * 99)])
+def test_rasters_replaced_while_they_are_served(finished, tmp_path, spoil):
+    """A layer that cannot be read any more gets a status, the others go on; a pipe is not waited
+    for.
+    """
+    folder = tmp_path / "run"
+    shutil.copytree(finished.output, folder, ignore=shutil.ignore_patterns(".skyquilt"))
+    survey = open_survey(folder)
+    with (
+        ServerThread(survey=survey, guard=Guard(), folder=folder) as serving,
+        httpx.Client(base_url=serving.url, timeout=20) as web,
+    ):
+        spoil(folder / "hillshade.tif")
+        offered = web.get("/wms?SERVICE=WMS&REQUEST=GetCapabilities")
+        assert offered.status_code == 200
+        assert "<Name>hillshade</Name>" not in offered.text
+        assert "<Name>mosaic</Name>" in offered.text
+        with rasterio.open(folder / "mosaic.tif") as file:
+            box = ",".join(map(str, file.bounds))
+        for layer, status in (("hillshade", 503), ("mosaic", 200)):
+            request = {
+                "service": "WMS", "version": "1.1.1", "request": "GetMap", "layers": layer,
+                "styles": "", "srs": "EPSG:32633", "bbox": box, "width": 64, "height": 64,
+                "format": "image/png",
+            }  # fmt: skip
+            answer = web.get("/wms", params=request)
+            assert answer.status_code == status, answer.text

@@ -76,7 +76,7 @@ def command(
     ] = None,
     frame_overlap: Annotated[
         float, option(INPUT, "Overlap in percent wanted between frames chosen from videos.")
-    ] = 75.0,
+    ] = 78.0,
     clock_offset: Annotated[
         float | None,
         option(

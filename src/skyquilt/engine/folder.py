@@ -9,6 +9,7 @@ from pathlib import Path
 
 from skyquilt.engine import error_log
 from skyquilt.errors import OutputError
+from skyquilt.outside import read_bounded
 
 CONTRACT = (
     "mosaic.tif",
@@ -80,9 +81,9 @@ class RunFolder:
 
 def _state(path: Path) -> tuple[str, str]:
     try:
-        found = json.loads((path / STATE / "run.json").read_text())
+        found = json.loads(read_bounded(path / STATE / "run.json"))
         return str(found["key"]), str(found["state"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return "", ""
 
 

@@ -22,6 +22,7 @@ from skyquilt.engine.constants import constants_of
 from skyquilt.engine.folder import refusal
 from skyquilt.engine.kept import Keep
 from skyquilt.engine.workers import HERE, Workers
+from skyquilt.outside import open_regular
 
 T = TypeVar("T")
 
@@ -121,7 +122,7 @@ class Store:
         """The stored result, or None when there is none or the file is damaged."""
         path = self.folder / stage / f"{key}.npz"
         try:
-            with path.open("rb") as file:
+            with open_regular(path) as file:
                 value = read(file, self.registry)
         except (OSError, ValueError, TypeError):
             return None

@@ -18,6 +18,7 @@ from skyquilt.video.positions import attitude_at, clip_zero, flight_yaw_at, plac
 from skyquilt.video.read import read_clip
 from skyquilt.video.tracks import TRACK_ENDINGS, Fix, is_timed_csv, merged, read_track, track_of
 
+_SAME_START_S = 2.0
 _PHOTOS = frozenset({".jpg", ".jpeg", ".tif", ".tiff", ".png"})
 
 
@@ -115,11 +116,32 @@ def _number(value: float | None) -> float:
     return np.nan if value is None else value
 
 
-def frames_of(clip: Clip, chosen: ChosenFrames, *, number: int, use_track: bool) -> list[Photo]:
+def after_others(clips: Sequence[Clip]) -> list[float]:
+    """Seconds by which each clip begins after the start that it states: of a recording that the
+    camera divided into files, each may state the time at which the first began.
+    """
+    late: list[float] = []
+    for k, clip in enumerate(clips):
+        same = [
+            late[j] + c.duration_s
+            for j, c in enumerate(clips[:k])
+            if c.camera_key == clip.camera_key
+            and c.start is not None
+            and clip.start is not None
+            and abs((c.start - clip.start).total_seconds()) <= _SAME_START_S
+        ]
+        late.append(max(same, default=0.0))
+    return late
+
+
+def frames_of(
+    clip: Clip, chosen: ChosenFrames, *, number: int, use_track: bool, late_s: float = 0.0
+) -> list[Photo]:
     """The chosen frames of a clip as photos, with positions and angles of its track at their times.
 
     `number`: of the clip in the survey. A clip that does not tell when it was filmed is filed under
-    a day of its own, so that its frames keep their order and distances in time.
+    a day of its own, so that its frames keep their order and distances in time. `late_s`: how much
+    later than its start it begins.
     """
     times = np.array([f.time_s for f in chosen.chosen])
     track = clip.track if use_track else None
@@ -150,7 +172,7 @@ def frames_of(clip: Clip, chosen: ChosenFrames, *, number: int, use_track: bool)
                 position=position_at(track, places, i, when) if track and places else None,
                 attitude=attitude_at(track, when) if track else None,
                 flight_yaw_deg=flight_yaw_at(track, when) if track else None,
-                time=start + timedelta(seconds=frame.time_s),
+                time=start + timedelta(seconds=frame.time_s + late_s),
                 rolling_shutter=True,
                 shutter=clip.shutter,
             )

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from defusedxml.ElementTree import fromstring
-from shapely import MultiLineString, force_2d, from_wkb
+from shapely import MultiLineString, force_2d
 from shapely.geometry import shape as from_geojson
 from shapely.geometry.base import BaseGeometry
 
 from skyquilt.errors import SideFileError
 from skyquilt.outside import plain, read_bounded
 from skyquilt.raster import boundary
+from skyquilt.raster.well_known import of_wkb
 
 MOST_FEATURES = 2000
 """Largest number of shapes of a file."""
@@ -122,9 +123,7 @@ def read_geopackage(path: Path) -> Found:
     """The first feature table."""
     rows, crs = boundary.geopackage_rows(path, everything=True)
     return [
-        Feature(
-            shape=force_2d(from_wkb(blob[boundary.gpkg_header(blob) :])), properties=_words(words)
-        )
+        Feature(shape=of_wkb(blob[boundary.gpkg_header(blob) :]), properties=_words(words))
         for blob, words in rows
     ], crs
 

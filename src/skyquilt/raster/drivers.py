@@ -6,6 +6,8 @@ Others, such as VRT, name files and addresses to be read, and any of them may be
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from skyquilt.outside import open_regular
+
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
 
@@ -19,10 +21,15 @@ def open_raster(path: Path, **options: Any) -> "DatasetReader":
     """Opens a map that a user brings along, of whatever format in `MAPS`.
 
     Raises:
-        rasterio.errors.RasterioIOError: it is none of these.
+        rasterio.errors.RasterioIOError: it is none of these, or no regular file.
     """
     import rasterio
 
+    try:
+        with open_regular(path):
+            pass  # GDAL would wait for the other end of a pipe
+    except OSError as error:
+        raise rasterio.errors.RasterioIOError(f"{path}: {error.strerror}") from error
     for driver in MAPS:
         try:
             return rasterio.open(path, driver=driver, **options)

@@ -1,19 +1,26 @@
 """Images of any part of a map, in any projection, from any kind of source."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
 
+from skyquilt.errors import SideFileError
+from skyquilt.outside import plain
 from skyquilt.raster.colours import Palette, coloured
 from skyquilt.raster.drivers import open_raster
 from skyquilt.raster.tile_store import LEVELS, SIDE, Address, TileStore
+
+if TYPE_CHECKING:
+    from rasterio.io import DatasetReader
 
 MERCATOR = 20037508.342789244
 """Half the width of the Web Mercator square in m."""
@@ -163,10 +170,27 @@ class FileSource:
     """The file."""
     _known: dict[str, About] = field(default_factory=dict)
 
-    def about(self) -> About:
-        """What the file says of itself, read once."""
-        if not self._known:
+    @contextmanager
+    def _opened(self) -> "Iterator[DatasetReader]":
+        """The file; it may be damaged, or have been replaced since it was opened first."""
+        from rasterio.errors import RasterioError
+
+        try:
             with open_raster(self.path) as raster:
+                yield raster
+        except (RasterioError, UnicodeDecodeError) as error:
+            raise SideFileError(
+                f"{self.path.name} cannot be read as a map: {plain(str(error), 150)}"
+            ) from error
+
+    def about(self) -> About:
+        """What the file says of itself, read once.
+
+        Raises:
+            SideFileError: it cannot be read.
+        """
+        if not self._known:
+            with self._opened() as raster:
                 bands = 3 if raster.count >= 3 else 1
                 system = raster.crs
                 units = tuple(u or "" for u in raster.units[:bands])
@@ -195,10 +219,14 @@ class FileSource:
         return self.about().resolution
 
     def part(self, bounds: Bounds, gsd: float) -> Part | None:
-        """The part, read from a suitable overview of the file."""
+        """The part, read from a suitable overview of the file.
+
+        Raises:
+            SideFileError: it cannot be read.
+        """
         from rasterio.windows import from_bounds
 
-        with open_raster(self.path) as raster:
+        with self._opened() as raster:
             left, top = raster.bounds.left, raster.bounds.top
             west, south, east, north = (
                 max(bounds[0], left),

@@ -13,6 +13,7 @@ import zlib
 from pathlib import Path
 from typing import IO
 
+from skyquilt.outside import open_regular
 from skyquilt.raster.atomic import CHUNK, mended
 
 _HEAD = struct.Struct("<IIQ")
@@ -32,7 +33,8 @@ class Spool:
             self.folder.mkdir(parents=True, exist_ok=True)
             heap.touch()
             journal.touch()
-            found = _whole_records(journal.read_bytes(), heap.stat().st_size)
+            with open_regular(heap), open_regular(journal) as file:  # not pipes
+                found = _whole_records(file.read(), heap.stat().st_size)
             if fresh or not found or found[0][0] != key.encode():
                 found = []
             self.records = tuple(payload for payload, _, _ in found[1:])

@@ -8,10 +8,11 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fastapi import FastAPI, Response
-from fastapi.responses import FileResponse, StreamingResponse
+from fastapi import FastAPI, Request, Response
+from fastapi.responses import FileResponse, JSONResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
 
+from skyquilt.errors import SideFileError
 from skyquilt.server.access import RESUMABLE, Context, Guard, Guarded, Writer
 from skyquilt.server.control_endpoints import ControlEndpoints
 from skyquilt.server.event_endpoints import EventEndpoints
@@ -30,6 +31,11 @@ from skyquilt.version import __version__
 
 if TYPE_CHECKING:
     from skyquilt.server.mission_watch import MissionWatch  # only for live surveys
+
+
+def _damaged(_: Request, error: Exception) -> Response:
+    """A file of the map that could be read when it was opened."""
+    return JSONResponse({"detail": str(error)}, 503)
 
 
 def make_app(
@@ -120,6 +126,7 @@ def make_app(
         ("/coverage.png", plans.coverage_picture, {**get, "response_class": Response}),
     ):
         app.add_api_route(path, work, **options)
+    app.add_exception_handler(SideFileError, _damaged)
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     app.add_middleware(Guarded, guard=guard, log=None if writer is None else folder)
     return app

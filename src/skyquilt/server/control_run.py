@@ -111,7 +111,7 @@ class ControlRun:
 
     def _log(self) -> list[Any]:
         try:
-            text = (self.folder / FOLDER / LOG).read_bytes()[-20_000:].decode("utf-8", "replace")
+            text = read_bounded(self.folder / FOLDER / LOG)[-20_000:].decode("utf-8", "replace")
         except OSError:
             return []
         found: list[Any] = []

@@ -15,6 +15,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from skyquilt.engine.free_memory import give_back
+from skyquilt.errors import SideFileError
 from skyquilt.outside import real, whole
 from skyquilt.raster.map_source import Bounds, MapSource, between, picture
 from skyquilt.raster.picture_files import image_bytes
@@ -230,13 +231,14 @@ def northing_first(crs: str) -> bool:
 
 def supported(known: Mapping[str, MapSource]) -> list[str]:
     """CRSs in which images are offered."""
-    own = [s.crs for s in known.values() if s.crs.startswith("EPSG:")]
+    own = [s.crs for s in known.values() if _readable(s) and s.crs.startswith("EPSG:")]
     return list(dict.fromkeys(["EPSG:3857", "EPSG:4326", "CRS:84", *own]))
 
 
 def capabilities(known: Mapping[str, MapSource], url: str, version: str) -> str:
     """The capabilities document of the service."""
     old = version.startswith("1.1")
+    known = {name: source for name, source in known.items() if _readable(source)}
     crs_tag = "SRS" if old else "CRS"
     layers = "".join(_layer(n, s, known, old=old) for n, s in known.items())
     crs = "".join(
@@ -279,6 +281,15 @@ def capabilities(known: Mapping[str, MapSource], url: str, version: str) -> str:
         + f"<Layer><Title>Skyquilt</Title>{crs}{layers}</Layer></Capability>"
         + end
     )
+
+
+def _readable(source: MapSource) -> bool:
+    """False for a file that is damaged: the others are offered."""
+    try:
+        source.about()
+    except SideFileError:
+        return False
+    return True
 
 
 def _layer(name: str, source: MapSource, known: Mapping[str, MapSource], *, old: bool) -> str:

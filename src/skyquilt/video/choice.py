@@ -24,7 +24,7 @@ class FrameChoice:
     `around` looks before and after, which allows for ground with more or less detail.
     """
 
-    overlap: float = 0.75
+    overlap: float = 0.78
     """Wanted share of a frame that the frame before shows too."""
     earliest: float = 0.72
     """As share of the wanted advance."""

@@ -11,7 +11,7 @@ from skyquilt.errors import NoPhotosError, UnreadablePhotoError
 from skyquilt.model.clip import ChosenFrames, Clip, Looks
 from skyquilt.model.event import Note
 from skyquilt.model.photo import Photo, RejectedPhoto
-from skyquilt.photos.clips import frames_of
+from skyquilt.photos.clips import after_others, frames_of
 from skyquilt.photos.frame_files import frame_jpeg
 from skyquilt.photos.survey import placed_plausibly
 from skyquilt.settings import InputSettings
@@ -62,7 +62,7 @@ def with_frames(given: SurveyInput, settings: InputSettings, store: Store) -> St
     notes: list[str] = []
     clips = given.survey.clips
     total = sum(_looks_in(c, methods.look) for c in clips)
-    before = 0
+    before, late = 0, after_others(clips)
     for number, clip in enumerate(clips):
         try:
             looks = yield from _seen(clip, methods.look, store, before, total)
@@ -76,7 +76,7 @@ def with_frames(given: SurveyInput, settings: InputSettings, store: Store) -> St
             continue
         chosen = methods.choose(clip, looks)
         chosen, use_track, said = _timed(clip, looks, chosen, methods, settings.clock_offset)
-        frames = frames_of(clip, chosen, number=number, use_track=use_track)
+        frames = frames_of(clip, chosen, number=number, use_track=use_track, late_s=late[number])
         chosen = replace(chosen, placed=sum(f.position is not None for f in frames))
         photos += frames
         told.append(chosen)

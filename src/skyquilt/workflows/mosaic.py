@@ -28,6 +28,8 @@ from skyquilt.model.photo import RejectedPhoto
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.orthomosaic import SPOOL
 from skyquilt.ortho.radiometry import value_figures
+from skyquilt.outside import read_bounded
+from skyquilt.photos.headers import content_digest
 from skyquilt.quality.clip_figures import clip_figures
 from skyquilt.quality.placement import placement_quality
 from skyquilt.quality.run_metrics import figures
@@ -317,10 +319,10 @@ def recipe_of(given: SurveyInput, settings: MosaicSettings, methods: Methods) ->
         if k not in ("jobs", "memory_gb", "max_mp", "scheduler")
     }
     files = (settings.picture.boundary, settings.input.distances, Path(settings.input.sequence))
-    side = [p.read_bytes().hex() for p in files if p is not None and p.is_file()]
+    side = [content_digest(p) for p in files if p is not None and p.is_file()]
     if given.survey.clips:  # control points are read when the frames are known
         gcp = settings.input.gcp or Path(str(given.source)) / "gcp_list.txt"
-        side += [gcp.read_bytes().hex()] if gcp.is_file() else []
+        side += [content_digest(gcp)] if gcp.is_file() else []
         side.append(digest(frame_methods(settings.input)))
     return digest(list(given.control), shaping, side, methods, make_map, __version__)
 
@@ -404,6 +406,6 @@ def _forget(run: RunFolder, store: Store, rerun_from: str | None) -> None:
 def _figures(path: Path) -> dict[str, Any]:
     """The metrics of a finished run; empty if the file is damaged."""
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
+        return dict(json.loads(read_bounded(path)))
+    except (OSError, ValueError, TypeError, RecursionError):
         return {}
