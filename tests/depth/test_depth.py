@@ -20,10 +20,17 @@ SETTINGS = MosaicSettings(gsd_cm=25, features=3000, jobs=2)
 
 
 def against_truth(output, flight):
-    """Correlation with the true heights and the slope of the found ones over them, both without a
-    general slope, where they fit best within 3 m: photos are placed by positions that are off by as
-    much.
+    """Correlation with the true heights, the slope of the found ones over them, and the share of
+    the map; without a general slope, where they fit best by shift and turn: two positions and a
+    compass tell place and heading of a pair to metres and degrees, whatever its heights are.
     """
+    z, true = maps(output, flight)
+    fitted = fits_best(z, true)
+    return (*agreement(z, placed(true, *fitted)), np.isfinite(z).mean())
+
+
+def maps(output, flight):
+    """The heights found, and the true ones on the same grid."""
     truth_file = flight / "truth" / "truth_surface.tif"
     with rasterio.open(output / "depth.tif") as found, rasterio.open(truth_file) as truth:
         z, true = found.read(1), np.full(found.shape, np.nan, np.float32)
@@ -35,9 +42,36 @@ def against_truth(output, flight):
             dst_nodata=np.nan,
             resampling=Resampling.average,
         )
-    near = range(-12, 13, 2)  # px of 25 cm
-    tried = [agreement(z, np.roll(true, (dy, dx), (0, 1))) for dy in near for dx in near]
-    return (*max(tried), np.isfinite(z).mean())
+    return z, true
+
+
+def fits_best(z, true):
+    """The shift (x and y, px) and the turn in degrees about the middle of the map, within 12 px and
+    5 degrees of none, by which both correlate best.
+    """
+    best, score = (0, 0, 0.0), agreement(z, true)[0]
+    whole = [(dx, dy, 0.0) for dy in range(-12, 13, 2) for dx in range(-12, 13, 2)]
+    turns = [(0, 0, t) for t in np.arange(-5, 5.1, 0.5)]
+    near = [(dx, dy, 0.0) for dy in (-2, -1, 0, 1, 2) for dx in (-2, -1, 0, 1, 2)]
+    for steps in (whole, turns, near, turns, near):
+        start = best
+        for step in steps:
+            tried = tuple(np.add(start, step))
+            if abs(tried[0]) > 12 or abs(tried[1]) > 12 or abs(tried[2]) > 5:
+                continue
+            if (r := agreement(z, placed(true, *tried))[0]) > score:
+                best, score = tried, r
+    return best
+
+
+def placed(true, dx, dy, turn_deg):
+    """A map (H, W) shifted by so many px and turned about its middle."""
+    height, width = true.shape
+    change = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), turn_deg, 1.0)
+    change[:, 2] += dx, dy
+    return cv2.warpAffine(
+        true, change, (width, height), borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
+    )
 
 
 def agreement(z, true):
