@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from skyquilt.coregistration.agreement import Agree, Agreement, Shifts
 from skyquilt.coregistration.error_field import FREE, Scatter, StateError, overlap_corners
 from skyquilt.coregistration.orientation import (
+    BLUR,
     Orientation,
     Pyramid,
     between,
@@ -48,10 +49,12 @@ class Decide:
     state: StateError = field(default_factory=StateError)
     """The error over the whole picture."""
     finer: float = 400.0
-    """Side in px of the square to whose area larger images are reduced for the final refinement."""
+    """Side in px of the square to whose area images are reduced for the final refinement."""
+    finest: float = 640.0
+    """The same for images at least as large; they are refined at it by coarser structure first."""
     sharper: float = 0.5
     """Smoothing of its gradients in px, half of that of all before: finer structure."""
-    fine: float = 1 / 3
+    fine: float = 1 / 4
     """Weight of finer structure, the rest is that of coarser one. Alone it is the more exact where
     the bands are alike, and the less exact where they are not, and its error is less certain.
     """
@@ -101,8 +104,14 @@ class Decide:
         in px of the images. How far they are apart tells of the error what the scatter of the
         patches does not.
         """
-        a, b = pyramid.finer(self.finer, self.sharper)
-        begun = between(a, b, pyramid.full(coarse.b_H_a, pyramid.last))
+        full, side = pyramid.full(coarse.b_H_a, pyramid.last), self.finer
+        if pyramid.least >= self.finest**2:
+            side = self.finest
+            a, b = pyramid.finer(side, BLUR)
+            nearer = SubpixelRefinement(freedom=model, steps=3)(a, b, between(a, b, full))
+            full = full_size(a, b, nearer.b_H_a)
+        a, b = pyramid.finer(side, self.sharper)
+        begun = between(a, b, full)
         fine = SubpixelRefinement(freedom=model, steps=8)(a, b, begun).b_H_a
         scatter = self._scatter(
             self.agree.shifts(a, b, fine), overlap_corners(fine, a.shape, b.shape), b.shape, model

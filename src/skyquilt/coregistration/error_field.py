@@ -3,10 +3,10 @@ confirm it.
 
 Patches that are matched one by one lie off their registered position by their own errors. Their
 scatter gives the covariance of a homography fitted to them, and with it the error at any place,
-which grows away from the patches. What no scatter can show is added with priors in units of the
-scatter: the part of the true transform that the chosen model cannot follow (parallax, lens,
-perspective), and an error that all patches share, since the same edge does not lie at quite the
-same place in two spectra.
+which grows away from the patches. What no scatter can show is added: along the difference of the
+registrations by coarse and by fine structure, since the same edge does not lie at quite the same
+place in two spectra; and with priors in units of the scatter, the part of the true transform that
+the chosen model cannot follow (parallax, lens, perspective), and an error that all patches share.
 """
 
 from dataclasses import dataclass
@@ -85,7 +85,7 @@ class StateError:
     """Error of a homography relative to that of a similarity with the same scatter: it was taken
     because it fits these patches, so that their scatter around it tells too little.
     """
-    apart: float = 0.6
+    apart: float = 0.65
     """Standard deviation of the error along the difference of the registrations by coarse and by
     fine structure, of which the mean is taken, relative to it.
     """

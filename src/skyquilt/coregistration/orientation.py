@@ -168,6 +168,11 @@ class Pyramid:
         self._pictures, self._sides = (a, b), tuple(sides)
         self._levels: dict[int, tuple[Orientation, Orientation]] = {}
 
+    @property
+    def least(self) -> int:
+        """Pixels of the smaller image."""
+        return min(p.grey.size for p in self._pictures)
+
     def finer(self, side: float, blur: float) -> tuple[Orientation, Orientation]:
         """a and b at another resolution than those of the levels, smoothed otherwise."""
         a, b = (orientation(p.grey, p.valid, side, blur) for p in self._pictures)
