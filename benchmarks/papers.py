@@ -582,8 +582,8 @@ def _camera_of(lens: Lens) -> Any:
 
 
 def heights(work: Path, seeds: int) -> None:
-    """r and slope against the true heights, by the shift and turn where they fit best, and what
-    these are: heights are one claim, where their map lies is another.
+    """r and slope against the true heights where both fit best by a similarity on the ground, and
+    what this is: heights are one claim, where their map lies is another.
     """
     import sys
 
@@ -608,15 +608,23 @@ def heights(work: Path, seeds: int) -> None:
         for name, photos, route in asked:
             result = depth(photos, work / "depth", chosen, route=route, overwrite=True)
             z, true = maps(work / "depth", folder)
-            dx, dy, turn = fits_best(z, true)
-            r, slope = agreement(z, placed(true, dx, dy, turn))
+            dx, dy, turn, scale = fits_best(z, true)
+            r, slope = agreement(z, placed(true, dx, dy, turn, scale))
             there = agreement(z, true)[0]
             shift = 0.25 * float(np.hypot(dx, dy))
             told = rows.setdefault(f"{name}, positions good to {noise:g} m", [])
             spent = result.metrics["cpu_seconds"]
-            told.append((r, slope, there, shift, abs(turn), np.isfinite(z).mean(), spent))
+            seen = np.isfinite(z).mean()
+            told.append((r, slope, there, shift, abs(turn), 100 * abs(scale), seen, spent))
     head = ("heights by", "n", "r, median (least, best)", "slope", "both within 0.9 to 1.1")
-    rest = ("r where placed", "off by, m", "turned by, degrees", "share of the map", "CPU s")
+    rest = (
+        "r where placed",
+        "off by, m",
+        "turned by, degrees",
+        "scale, %",
+        "share of the map",
+        "CPU s",
+    )
     table(
         (*head, *rest),
         [
