@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from skyquilt.imaging.grey import full_px, halved, shrink, to_grey8
+from skyquilt.imaging.grey import full_px, halved, shrink, stretched, to_grey8
 from skyquilt.matching.keypoints import spread
 from skyquilt.matching.matchers import Mutual
 from skyquilt.matching.sift import Sift
@@ -200,3 +200,34 @@ def test_halving_first_changes_nothing(size):
         max(rough.shape) >= min(400, max(size))
         and (shrink(rough, 400)[0] == shrink(image, 400)[0]).all()
     )
+
+
+@pytest.mark.parametrize(("share", "haze"), [(0.12, 0), (0.12, 150), (0.2, 40)])
+def test_dusk_and_haze_hide_few_features(picture, share, haze):
+    """A photo with an eighth of the contrast: most of its features are those of the clear one."""
+    dim = np.clip(np.rint(picture * share + haze), 0, 255).astype(np.uint8)
+    clear, found = Sift(count=400)(picture), Sift(count=400)(dim)
+    assert len(found) > 0.8 * len(clear)
+    apart = np.hypot(*(found.px[:, None] - clear.px[None]).transpose(2, 0, 1)).min(1)
+    assert (apart < 1.0).mean() > 0.6
+    matched = Mutual()(clear, found)
+    off = np.hypot(*(clear.px[matched.index_a] - found.px[matched.index_b]).T)
+    assert len(matched) > 0.4 * len(clear) and (off < 1.0).mean() > 0.95
+
+
+def test_ordinary_contrast_is_left_alone_and_two_pictures_are_stretched_alike(picture):
+    (same,) = stretched(picture)
+    assert same is picture
+    a, b = (picture * 0.12 + 30).astype(np.uint8), (picture * 0.1 + 34).astype(np.uint8)
+    x, y = stretched(a, b)
+    for old, new in ((a, x), (b, y)):  # one line through the values of both
+        inside = (new > 0) & (new < 255)
+        slope, level = np.polyfit(
+            np.r_[a[(x > 0) & (x < 255)], b[(y > 0) & (y < 255)]].astype(float),
+            np.r_[x[(x > 0) & (x < 255)], y[(y > 0) & (y < 255)]].astype(float),
+            1,
+        )
+        assert np.abs(slope * old[inside] + level - new[inside]).max() < 1.01
+    assert 100 < np.ptp(np.percentile(np.r_[x, y], [1, 99])) < 160
+    flat = np.full((20, 20), 90, np.uint8)
+    assert np.ptp(stretched(flat)[0]) == 0

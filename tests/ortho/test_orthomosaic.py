@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skyquilt.model.raster import Grid
-from skyquilt.ortho.companions import PROVENANCE, _reduced, _thinned, preview_factor
+from skyquilt.ortho.companions import PROVENANCE, _thinned, preview_factor, reduced
 from skyquilt.ortho.ground import round_gsd
 
 
@@ -23,7 +23,7 @@ def test_previews_average_what_is_valid():
     pixels = np.zeros((4, 4, 1), np.uint8)
     pixels[:, :, 0] = [[100, 0, 10, 30], [0, 0, 50, 70], [0, 0, 0, 0], [0, 0, 0, 0]]
     valid = np.array([[1, 0, 1, 1], [0, 0, 1, 1], [0, 0, 0, 0], [0, 0, 0, 0]], bool)
-    mean, share = _reduced(pixels, valid, 2)
+    mean, share = reduced(pixels, valid, 2)
     assert share.tolist() == [[64, 255], [0, 0]]
     assert mean[0, 1, 0] == 40 and mean[0, 0, 0] == pytest.approx(100, abs=2) and not mean[1].any()
 

@@ -7,6 +7,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.addition import added, median_offset
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import control_in_frame
 from skyquilt.alignment.inputs import AlignmentInputs
@@ -40,6 +41,8 @@ class ByLinks:
         Raises:
             AlignmentError: no two photos are linked.
         """
+        if inputs.former is not None and (grown := added(inputs, self.bundle)) is not None:
+            return with_loose_photos(grown, inputs.photos, inputs.priors)
         control = control_in_frame(inputs.control, inputs.photos, inputs.frame)
         found = self.bundle(
             inputs.photos,
@@ -160,7 +163,7 @@ def with_loose_photos(
     poses, cameras = dict(alignment.poses), dict(alignment.cameras)
     camera_of, rejected = dict(alignment.camera_of), dict(alignment.rejected)
     blocks, notes = list(alignment.blocks), list(alignment.notes)
-    offset = _median_offset(alignment, priors)
+    offset = median_offset(alignment, priors)
     for i, photo in enumerate(photos):
         if i in poses:
             continue
@@ -190,14 +193,6 @@ def with_loose_photos(
         blocks=tuple(blocks),
         notes=tuple(notes),
     )
-
-
-def _median_offset(alignment: Alignment, priors: Sequence[Prior]) -> NDArray[np.float64]:
-    """(3,) offset in m from reported to adjusted positions; 0 where it is unknown."""
-    apart = np.array([p.map_C - priors[i].map_C for i, p in alignment.poses.items()])
-    columns = apart.reshape(-1, 3).T
-    known = [c[np.isfinite(c)] for c in columns]
-    return np.array([np.median(c) if len(c) else 0.0 for c in known])
 
 
 def _lacking(C: NDArray[np.float64], prior: Prior) -> str:

@@ -125,7 +125,7 @@ class Bundle:
         method = self.match_observations
         if sharp := grey is not None and method is not None:
             part = keep.within("sharp")
-            used = _sharpened(used, photos, setup, problem, state, method, grey, part)
+            used = sharpened(used, photos, setup, problem, state, method, grey, part)
         if sharp or begin != each:
             problem, _ = setup.problem(thin(used, sizes, per_photo=each, least=least))
             state = triangulated(problem, state)
@@ -167,7 +167,7 @@ def _kept_start(
     return replace(start, links=tuple(k for k in links if (k.a, k.b) in chosen))
 
 
-def _sharpened(
+def sharpened(
     tracks: Tracks,
     photos: Sequence[Photo],
     setup: Setup,

@@ -78,7 +78,7 @@ def control_in_frame(
     return tuple(found)
 
 
-def _placed(control: Control, setup: Setup) -> tuple[NDArray[np.int64], Array]:
+def placed_in(control: Control, setup: Setup) -> tuple[NDArray[np.int64], Array]:
     """Rows and sensor pixels of the observations in placed photos."""
     mine = np.isin(control.photo, setup.members)
     photo = control.photo[mine]
@@ -89,7 +89,7 @@ def _observations(
     control: Sequence[Control], setup: Setup
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Point numbers, rows and sensor pixels of all observations."""
-    parts = [_placed(c, setup) for c in control]
+    parts = [placed_in(c, setup) for c in control]
     point = np.repeat(np.arange(len(parts)), [len(row) for row, _ in parts])
     row = np.concatenate([row for row, _ in parts] or [np.zeros(0, int)])
     return point, row, np.concatenate([px for _, px in parts] or [np.zeros((0, 2))])
@@ -163,7 +163,7 @@ def hold_to_control(
     Raises:
         AlignmentError: no position and fewer than three usable control points.
     """
-    usable = [c for c in control if len(_placed(c, setup)[0]) >= 2]
+    usable = [c for c in control if len(placed_in(c, setup)[0]) >= 2]
     fit = [c for c in usable if not c.check]
     if not setup.georeferenced and frame.crs is not None and len(fit) < 3:
         raise AlignmentError(
@@ -183,7 +183,7 @@ def hold_to_control(
     else:
         shift = np.nan_to_num(np.nanmedian(surveyed - seen, axis=0))
         problem, state = _moved(problem, state, 1.0, np.eye(3), shift)
-    problem, state = _with_points(problem, state, setup, fit)
+    problem, state = with_points(problem, state, setup, fit)
     if not setup.georeferenced:
         problem = replace(problem, sigma_C=np.full_like(problem.sigma_C, 1e4))
     problem = replace(problem, offset=setup.georeferenced)
@@ -197,7 +197,7 @@ def hold_to_control(
     )
 
 
-def _with_points(
+def with_points(
     problem: Problem, state: State, setup: Setup, fit: Sequence[Control]
 ) -> tuple[Problem, State]:
     """The problem with tie points and control points."""
@@ -247,7 +247,7 @@ def residuals_of_control(
             check=c.check,
             error_m=x - c.xyz,
             reprojection_px=float(r),
-            observations=len(_placed(c, setup)[0]),
+            observations=len(placed_in(c, setup)[0]),
             sigma_m=None if not c.check or np.isnan(s).any() else s,
         )
         for c, x, r, s in zip(control, X, rms, sigma, strict=True)

@@ -38,6 +38,10 @@ class AlignmentInputs:
     """Gives grey images."""
     keep: Keep = MADE_NOW
     """Keeps parts of large adjustments, and shares them out."""
+    former: Alignment | None = None
+    """An alignment of some of these photos that the others are added to; None = all are aligned
+    anew. Methods that cannot add photos align all anew.
+    """
 
 
 class Aligner(Protocol):

@@ -92,7 +92,9 @@ class LeastSquaresMatching:
         first = anchor[tracks.point[others]]
         shift, score = self._registered(patches, first, others)
         moved = self._on_image(tracks, xyz, poses, cameras, others, shift, scale)
-        good = np.nan_to_num(score) > self.agree
+        # a point that its rays do not determine may lie anywhere, and a step on the ground be wide
+        far = np.linalg.norm(moved - tracks.px[others], axis=1) / scale[others]
+        good = (np.nan_to_num(score) > self.agree) & (far < 4 * MARGIN)
         px, sigma = tracks.px.copy(), tracks.sigma_px.copy()
         px[others[good]] = moved[good]
         sharp = np.maximum(self.sigma * scale[others[good]], 0.2)

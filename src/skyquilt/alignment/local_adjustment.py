@@ -107,7 +107,7 @@ class LocalAdjustment:
 
     def __call__(self, window: Window) -> AdjustedWindow | NotAdjusted:
         """Places the new photo and refines the free ones."""
-        plane = {i: _similarity(window, i) for i in window.poses}
+        plane = {i: similarity_of(window, i) for i in window.poses}
         dropped: tuple[tuple[int, int], ...] = ()
         if window.new not in window.poses:
             guess = _guess(window, plane, self.disagree)
@@ -117,8 +117,8 @@ class LocalAdjustment:
             own = [(k.a, k.b) for k in window.links if window.new in (k.a, k.b)]
             dropped = tuple(key for key in own if key not in agreeing)
         links = [k for k in window.links if (k.a, k.b) not in dropped]
-        setup = _setup(window, plane, links)
-        tracks = _useful(setup.sensor_tracks(build_tracks(window.features, links)), window)
+        setup = held_setup(window, plane, links)
+        tracks = useful(setup.sensor_tracks(build_tracks(window.features, links)), window)
         sizes = [(p.width, p.height) for p in window.photos]
         problem, state = setup.problem(thin(tracks, sizes, per_photo=self.per_photo))
         if not len(problem.px):
@@ -139,7 +139,7 @@ class LocalAdjustment:
         )
 
 
-def _useful(tracks: Tracks, window: Window) -> Tracks:
+def useful(tracks: Tracks, window: Window) -> Tracks:
     """Tracks with an observation in a photo that may move; tracks in held photos only have no
     effect.
     """
@@ -165,7 +165,7 @@ def _adjusted(problem: Problem, state: State, new: int) -> tuple[Problem, State]
     ).state
 
 
-def _similarity(window: Window, i: int) -> tuple[complex, complex]:
+def similarity_of(window: Window, i: int) -> tuple[complex, complex]:
     """a and t of the similarity x + iy = a p + t that approximates a placed photo near its centre
     (see `similarity_graph`).
     """
@@ -228,11 +228,15 @@ def _guess(
     return (a * found[group[0]][0], t), {found[n][3] for n in group}
 
 
-def _setup(
-    window: Window, plane: Mapping[int, tuple[complex, complex]], links: Sequence[Link]
+def held_setup(
+    window: Window,
+    plane: Mapping[int, tuple[complex, complex]],
+    links: Sequence[Link],
+    *,
+    distortion: str = "none",
 ) -> Setup:
-    """The arrays of the adjustment: placed photos start at their poses, held ones are fixed
-    there.
+    """The arrays of the adjustment: placed photos start at their poses, held ones are fixed there,
+    and so are known calibrations; `distortion`: what may change of other cameras.
     """
     members = tuple(sorted(plane))
     start = Start(
@@ -243,7 +247,7 @@ def _setup(
         georeferenced=frozenset(members),
         metric=True,
     )
-    setup = set_up(window.photos, window.priors, start, distortion="none", repair=True)
+    setup = set_up(window.photos, window.priors, start, distortion=distortion, repair=True)
     turned = setup.turned.copy()
     for i in window.poses:  # a placed photo keeps its detected orientation
         turned[i] = window.camera_of.get(i, "").endswith(TURNED)
@@ -263,14 +267,15 @@ def _setup(
             C[row] = pose.map_C
         if i in window.held:
             R0[row], C0[row], sigma_R[row], sigma_C[row] = R[row], C[row], HELD_RAD, HELD_M
-    K0 = base.K0.copy()
+    K0, free = base.K0.copy(), base.free.copy()
+    if distortion == "none":
+        free[:] = False
     for row, key in enumerate(setup.camera_keys):
         if key in window.cameras:
             known = window.cameras[key]
             K0[row] = np.r_[known.vector, known.readout_s]
+            free[row] = False
     placed = [window.photos[i] for i in setup.members.tolist()]
     base = replace(base, velocity=velocities(placed, C))
-    base = replace(
-        base, R0=R0, C0=C0, sigma_R=sigma_R, sigma_C=sigma_C, K0=K0, free=np.zeros_like(base.free)
-    )
+    base = replace(base, R0=R0, C0=C0, sigma_R=sigma_R, sigma_C=sigma_C, K0=K0, free=free)
     return replace(setup, base=base, start_R=R, start_C=C, turned=turned, z_ground=window.ground)

@@ -65,6 +65,15 @@ def command(
     overwrite: Annotated[
         bool, option(COMMON, "Replace the results of another run in OUTPUT.", "--overwrite")
     ] = False,
+    add: Annotated[
+        bool,
+        option(
+            COMMON,
+            "Add photos that joined the folder to the map in OUTPUT; what they do not change"
+            " stays.",
+            "--add",
+        ),
+    ] = False,
     geo: Annotated[
         Path | None,
         option(
@@ -317,6 +326,13 @@ def command(
 
     if rerun_from is not None and rerun_from not in STAGES[1:]:
         raise UsageError(f"--rerun-from {rerun_from!r} is not one of {', '.join(STAGES[1:])}")
+    for other, given in (
+        ("--overwrite", overwrite),
+        ("--rerun-from", rerun_from is not None),
+        ("--thermal", thermal is not None),
+    ):
+        if add and given:
+            raise UsageError(f"--add and {other} exclude one another")
     mode = mode_of(quiet=quiet, json=json, verbose=verbose)
     exporting = _exporting(export, output)
     settings = MosaicSettings(
@@ -370,7 +386,9 @@ def command(
         lines=lines,
     )
     if thermal is None:
-        events = iter_mosaic(photos, output, settings, overwrite=overwrite, rerun_from=rerun_from)
+        events = iter_mosaic(
+            photos, output, settings, overwrite=overwrite, rerun_from=rerun_from, add=add
+        )
     else:
         from skyquilt.thermal.workflow import iter_thermal
 

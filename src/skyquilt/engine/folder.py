@@ -86,10 +86,13 @@ def _state(path: Path) -> tuple[str, str]:
         return "", ""
 
 
-def open_run(path: Path, key: str, *, overwrite: bool, again: bool = False) -> RunFolder:
+def open_run(
+    path: Path, key: str, *, overwrite: bool, again: bool = False, grows: bool = False
+) -> RunFolder:
     """Opens a folder for a run: new, empty, the same run again (resumed), or overwritten.
 
     With `again`, another run's results may be replaced, but nothing is written among other files.
+    With `grows`, the run continues the one that is there, whose files stay until they are replaced.
 
     Raises:
         OutputError: it holds something else, or cannot be written.
@@ -101,15 +104,16 @@ def open_run(path: Path, key: str, *, overwrite: bool, again: bool = False) -> R
         taken = (
             path.is_dir() and any(p.name != STATE or known for p in path.iterdir()) and known != key
         )
-        if taken and not overwrite and not (again and known):
+        if taken and not overwrite and not ((again or grows) and known):
             what = "another run (other photos or other settings)" if known else "other files"
             raise OutputError(
                 f"{path} already holds {what}; add --overwrite to replace its results,"
                 " or choose another folder"
             )
-        if taken:
+        if taken and not grows:
             for name in (*CONTRACT, error_log.NAME):
                 (path / name).unlink(missing_ok=True)
+        if taken:
             shutil.rmtree(path / EXPORTS, ignore_errors=True)  # of the map that is replaced
         (path / STATE).mkdir(parents=True, exist_ok=True)
         probe = path / STATE / "probe"

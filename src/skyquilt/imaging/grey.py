@@ -6,6 +6,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+LEAST_SPAN, GOOD_SPAN = 75.0, 150.0
+"""Grey values that a photo of ordinary contrast spans at least, and mostly."""
+MOST_STRETCHED = 8.0
+"""Most by which contrast is stretched: more would be noise."""
+SAMPLED = 4
+"""Every so many rows and columns tell the contrast."""
+
 
 def shrink(image: NDArray[Any], longest: int) -> tuple[NDArray[Any], float]:
     """The image area-averaged so that its longest side is at most `longest` px, and the scale
@@ -69,6 +76,22 @@ def to_grey8(image: NDArray[Any]) -> NDArray[np.uint8]:
     stretched = np.nan_to_num((values - low) / max(float(high - low), 1e-6) * 255, nan=0.0)
     grey = np.clip(stretched, 0, 255).astype(np.uint8)
     return np.asarray(cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(grey))
+
+
+def stretched(*images: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], ...]:
+    """Grey images (h, w), those of dusk, fog or haze with the contrast of others: where the values
+    of all of them together, but for one in a thousand at either end, span less than `LEAST_SPAN`,
+    they are stretched to `GOOD_SPAN`.
+    """
+    sample = np.concatenate([i[::SAMPLED, ::SAMPLED].ravel() for i in images])
+    low, high = np.percentile(sample, [0.1, 99.9]) if sample.size else (0.0, 255.0)
+    span = max(float(high - low), 1.0)
+    if span >= LEAST_SPAN:
+        return images
+    factor = min(GOOD_SPAN / span, MOST_STRETCHED)
+    values = (np.arange(256) - (low + high) / 2) * factor + 128
+    table = np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    return tuple(np.asarray(cv2.LUT(i, table), np.uint8) for i in images)
 
 
 def full_px(px: NDArray[Any], shape: tuple[int, int], full: tuple[int, int]) -> NDArray[np.float64]:

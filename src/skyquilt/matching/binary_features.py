@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.grey import full_px, shrink, to_grey8
+from skyquilt.imaging.grey import full_px, shrink, stretched, to_grey8
 from skyquilt.matching.keypoints import spread
 from skyquilt.model.features import Features
 
@@ -66,7 +66,8 @@ class Orb:
         detector = cv2.ORB.create(
             2 * self.count, scaleFactor=self.factor, nlevels=self.levels, fastThreshold=self.corner
         )
-        return binary_features(detector, to_grey8(small), full, count=self.count, cells=self.cells)
+        (grey,) = stretched(to_grey8(small))
+        return binary_features(detector, grey, full, count=self.count, cells=self.cells)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,4 +106,5 @@ class Akaze:
         detector = x.AKAZE_create(
             descriptor_type=kind, threshold=self.threshold, nOctaves=self.octaves
         )
-        return binary_features(detector, to_grey8(small), full, count=self.count, cells=self.cells)
+        (grey,) = stretched(to_grey8(small))
+        return binary_features(detector, grey, full, count=self.count, cells=self.cells)

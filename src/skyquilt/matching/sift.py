@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.grey import full_px, shrink, to_grey8
+from skyquilt.imaging.grey import full_px, shrink, stretched, to_grey8
 from skyquilt.matching.keypoints import spread
 from skyquilt.model.features import DESCRIPTOR_UNIT, Features
 
@@ -52,7 +52,7 @@ class Sift:
         """Features of an image shrunken beforehand; `full` is the (H, W) that the keypoints refer
         to.
         """
-        grey = to_grey8(small)
+        (grey,) = stretched(to_grey8(small))
         if self.first_octave > -1:  # OpenCV's first octave doubles whatever it is given
             part = 2 ** (self.first_octave + 1)
             size = (max(1, grey.shape[1] // part), max(1, grey.shape[0] // part))

@@ -1,6 +1,6 @@
 """Keypoints of one photo, and what two photos have in common."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,15 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.px)
+
+    def followed_by(self, more: "Features") -> "Features":
+        """These, then others of the same kind in the same photo."""
+        return replace(
+            self,
+            px=np.concatenate([self.px, more.px]),
+            size=np.concatenate([self.size, more.size]),
+            descriptors=np.concatenate([self.descriptors, more.descriptors]),
+        )
 
     @property
     def unit(self) -> NDArray[np.float32]:
@@ -81,6 +90,10 @@ class Link:
     """(M,) keypoints of b."""
     b_S_a: complex
     """Scale and rotation from a to b: p_b = b_S_a * p_a + t for image points as x - iy (y up)."""
+
+    def other(self, photo: int) -> int:
+        """The other one of its two photos."""
+        return self.b if self.a == photo else self.a
 
     def __len__(self) -> int:
         return len(self.index_a)

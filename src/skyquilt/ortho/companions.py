@@ -69,7 +69,7 @@ def extras_of(
     """The additional data of a composed block; `table`: shot numbers by photo, `factor`: reduction
     of the preview.
     """
-    preview, shown = _reduced(composed.pixels, valid, factor)
+    preview, shown = reduced(composed.pixels, valid, factor)
     numbers = table[np.where(_thinned(valid), _thinned(composed.photo), -1)]
     return BlockExtras(provenance=numbers, views=composed.views, preview=preview, shown=shown)
 
@@ -93,7 +93,7 @@ def preview_factor(grid: Grid) -> int:
     return factor
 
 
-def _reduced(
+def reduced(
     pixels: NDArray[Any], valid: NDArray[np.bool_], factor: int
 ) -> tuple[NDArray[Any], NDArray[np.uint8]]:
     """Area averages of the valid pixels (h, w, bands), and how much of each cell is valid (0 to

@@ -18,6 +18,7 @@ from skyquilt.imaging.views import grid_of, make_views, native_gsd
 from skyquilt.model.poses import Alignment
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
+from skyquilt.ortho.earlier import Bounds, EarlierMap, Growth, growth
 from skyquilt.ortho.tie_surface import level
 from skyquilt.settings import PictureSettings
 
@@ -67,6 +68,10 @@ class Ground:
     """Median ground size of a photo pixel in m."""
     limits: ViewLimits = USUAL
     """What the photos may show."""
+    growth: Growth | None = None
+    """The earlier map that it continues; None = all is made anew."""
+    key: str = ""
+    """Key of the surface in the store."""
 
 
 def find_ground(
@@ -79,10 +84,12 @@ def find_ground(
     workers: Workers = HERE,
     *,
     pictures: tuple[Any, ...] = (),
+    earlier: EarlierMap | None = None,
 ) -> Steps[Ground]:
     """Heights from tie points (level ground if there are none), refined by the sweep if one is
     given, and the grid of the map. `pictures` describes how the grey images are made; it is part of
-    the key under which a swept surface is stored.
+    the key under which a swept surface is stored. Away from photos that changed, the heights of an
+    `earlier` map stay.
 
     Raises:
         UsageError: the map would have no pixels, or far too many.
@@ -99,6 +106,7 @@ def find_ground(
         )
     native = native_gsd(rough, flat)
     gsd = picture.gsd_cm / 100 if picture.gsd_cm else round_gsd(native)
+    gsd = gsd if earlier is None else earlier.grid.gsd
     bounds = _local_bounds(picture, alignment)
     _check_place(bounds, rough, picture, alignment)
     wide = grid_of(rough, gsd, bounds)
@@ -108,9 +116,14 @@ def find_ground(
     surface = store.get_or("surface", key, lambda: ties(xyz, area) if len(xyz) > 3 else flat)
     views = tuple(make_views(alignment, surface, limits))
     grid = grid_of(views, gsd, bounds)
-    if sweep is not None and len(xyz) > 3:
+    grows = None
+    if earlier is not None:
+        before = make_views(earlier.alignment, earlier.surface, limits)
+        grows = growth(earlier, alignment, views, before)
+        grid = grid if grows is None else grows.grown(grid)
+    if len(xyz) > 3 and (sweep is not None or grows is not None):
         held, known = set(alignment.held), surface
-        refined = digest(
+        key = digest(
             key,
             poses_digest(alignment),
             grid,
@@ -119,17 +132,34 @@ def find_ground(
             pictures,
             picture.max_view_angle,
             limits_for,
+            *(() if grows is None else grows.key),
         )
+        keep, tied = store.parts("surface", key, workers), [v for v in views if v.photo in held]
 
-        keep = store.parts("surface", refined, workers)
-        surface = store.get_or(
-            "surface",
-            refined,
-            lambda: sweep(known, [v for v in views if v.photo in held], grid, grey, keep),
-        )
+        def refined() -> Surface:
+            if grows is None:
+                return known if sweep is None else sweep(known, tied, grid, grey, keep)
+
+            def made(area: Bounds, part: Grid) -> Surface:
+                near = grows.near(tied, area)
+                if sweep is None:
+                    return known
+                return sweep(known, near, part, grey, keep.within(f"{area}"))
+
+            return grows.surface(grid, made)
+
+        surface = store.get_or("surface", key, refined)
         views = tuple(make_views(alignment, surface, limits))
     yield 1, 1
-    return Ground(surface=surface, views=views, grid=grid, native_gsd=native, limits=limits)
+    return Ground(
+        surface=surface,
+        views=views,
+        grid=grid,
+        native_gsd=native,
+        limits=limits,
+        growth=grows,
+        key=key,
+    )
 
 
 def view_limits(alignment: Alignment, flat: Surface, angle_deg: float) -> ViewLimits:

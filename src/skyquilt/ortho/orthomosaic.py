@@ -2,7 +2,7 @@
 shows, how many photos see it, and a preview.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -32,7 +32,9 @@ from skyquilt.ortho.companions import (
     shot_numbers,
 )
 from skyquilt.ortho.compose import Composer, PhotoPixels
+from skyquilt.ortho.earlier import Growth
 from skyquilt.ortho.exposure import Exposure
+from skyquilt.ortho.former_files import FormerBlock, FormerFiles
 from skyquilt.ortho.ground import Ground, poses_digest
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.radiometry import value_tags
@@ -138,6 +140,8 @@ class Drawing:
     """Keeps what lies beside the map, by block."""
     key: str
     """What the map depends on (`map_key`)."""
+    growth: Growth | None = None
+    """The earlier map that it continues: blocks away from what changed are those of its files."""
 
     def blocks(self, workers: Workers) -> Steps[None]:
         """Writes mosaic.tif."""
@@ -147,12 +151,38 @@ class Drawing:
         spec, one = self._spec, self._block()
         with CogWriter(path, spec, spool=spool, digest=self.key) as writer:
             todo, total = list(writer.blocks()), len(_blocks(spec))
-            for done, (block, drawn) in enumerate(zip(todo, workers.each(one, todo), strict=True)):
-                pixels, valid, extras = drawn
+            stay = self._staying(todo)
+            kept = self._former(stay, spec)
+            drawn = workers.each(one, [b for b in todo if b not in stay])
+            for done, block in enumerate(todo):  # in this order few overview tiles are open
+                if block in stay:
+                    former = next(kept)
+                    pixels, valid, extras = former.pixels, former.valid, former.extras
+                    encoded = former.encoded
+                else:
+                    (pixels, valid, extras), encoded = next(drawn), None
                 self.store.put("blocks", self._block_key(block), extras)
-                writer.write_block(block, pixels, valid)
+                writer.write_block(block, pixels, valid, encoded)
                 yield total - len(todo) + done + 1, total
         self.store.put("blocks", digest(self.key, "file"), _stamp(path))
+
+    def _staying(self, todo: Sequence[Block]) -> dict[Block, Window]:
+        """Blocks that the earlier map has already, and where."""
+        if self.growth is None:
+            return {}
+        grid, grows = self.compose.grid, self.growth
+        found = ((b, grows.stays(_window(b), grid)) for b in todo)
+        return {b: old for b, old in found if old is not None}
+
+    def _former(self, stay: Mapping[Block, Window], spec: RasterSpec) -> Iterator[FormerBlock]:
+        """These blocks, from the files of the earlier map."""
+        if self.growth is None or not stay:
+            return
+        table, factor = shot_numbers(self.compose), preview_factor(self.compose.grid)
+        names = np.array([0, *(table[i] for i in self.growth.earlier.shown)], np.uint32)
+        with FormerFiles(self.output) as files:
+            for block, old in stay.items():
+                yield files.block(block, old, spec, names, factor)
 
     def companions(self) -> Drawn:
         """Writes provenance.tif and views.tif, and returns them."""

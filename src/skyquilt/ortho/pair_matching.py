@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.imaging.grey import stretched
 from skyquilt.imaging.nodes import STEP, View, densify, inside_everywhere, project_nodes
 
 Float = NDArray[np.float32]
@@ -116,6 +117,7 @@ def matched_points(
     """Points (n, 3) in m, relative to the pair's origin, between the heights low and high in m over
     the plane, from the grey images of a and b; windows of `window` px are compared.
     """
+    left, right = stretched(left, right)
     d, good = _disparities(pair, left, right, low, min(high, TALLEST * pair.height), window)
     rows, columns = np.nonzero(good)
     along = pair.gsd * d[rows, columns]

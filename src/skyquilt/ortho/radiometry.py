@@ -3,6 +3,7 @@ reported.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from skyquilt.imaging.nodes import View
 from skyquilt.model.photo import Photo
 from skyquilt.model.surface import Surface
+from skyquilt.ortho.earlier import complete, part_of, with_new
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.settings import PictureSettings
@@ -78,6 +80,29 @@ def balanced(
     if not settings.balance or dtype != "uint8":
         return NEUTRAL
     return balance(ground.views, thumbnails, ground.surface, bounds)
+
+
+def continued(
+    unit: str,
+    dtype: str,
+    thumbnails: Mapping[int, NDArray[Any]],
+    ground: Ground,
+    balance: BalanceMethod,
+    drift: DriftMethod,
+    settings: PictureSettings,
+) -> Exposure:
+    """The same for a map that continues an earlier one: photos that were there keep their
+    corrections, new ones are brought to their level.
+    """
+    if (grows := ground.growth) is None:
+        return balanced(unit, dtype, thumbnails, ground, balance, drift, settings)
+    exposure = grows.earlier.exposure
+    for area in grows.areas:
+        near = grows.near(ground.views, area)
+        there = replace(ground, views=tuple(near), grid=part_of(ground.grid, area), growth=None)
+        fresh = balanced(unit, dtype, thumbnails, there, balance, drift, settings)
+        exposure = with_new(exposure, fresh)
+    return complete(exposure, ground.views)
 
 
 def drift_of(

@@ -1,7 +1,7 @@
 """Writes a Cloud Optimized GeoTIFF tile by tile, with overviews, in little memory, resumable."""
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -40,6 +40,10 @@ class Block:
             for col in range(0, self.width, self.tile):
                 rows, cols = slice(row, row + self.tile), slice(col, col + self.tile)
                 yield (self.row0 + row) // self.tile, (self.col0 + col) // self.tile, rows, cols
+
+
+Encoded = Mapping[tuple[int, int], tuple[bytes, bytes]]
+"""Row and column of tiles -> bytes of image and mask."""
 
 
 def morton(row: int, col: int) -> int:
@@ -110,9 +114,15 @@ class CogWriter:
                 yield self._block(row, col)
 
     def write_tile(
-        self, tile_row: int, tile_col: int, pixels: Pixels, valid: Valid | None = None
+        self,
+        tile_row: int,
+        tile_col: int,
+        pixels: Pixels,
+        valid: Valid | None = None,
+        encoded: tuple[bytes, bytes] | None = None,
     ) -> None:
-        """Encodes and spools one tile of the full resolution; thread-safe.
+        """Encodes and spools one tile of the full resolution; thread-safe. `encoded`: bytes of its
+        image and of its mask, where another file with this specification has them.
 
         Pixels are (h, w, bands), or (h, w) for one band, cut at the raster's edge. `valid` is (h,
         w), None = all (or, with a nodata value, all pixels that differ from it). Each tile is
@@ -120,15 +130,25 @@ class CogWriter:
         """
         part = self._checked(tile_row, tile_col, pixels, valid)
         self._claim(tile_row, tile_col)
-        self._pyramid.store(0, tile_row, tile_col, part)
+        self._pyramid.store(0, tile_row, tile_col, part, encoded)
 
-    def write_block(self, block: Block, pixels: Pixels, valid: Valid | None = None) -> None:
+    def write_block(
+        self,
+        block: Block,
+        pixels: Pixels,
+        valid: Valid | None = None,
+        encoded: Encoded | None = None,
+    ) -> None:
         """Writes and finishes a whole block: pixels (height, width, bands), valid (height,
-        width).
+        width); `encoded`: the bytes of its tiles, see `write_tile`.
         """
         for row, col, rows, cols in block.tiles():
             self.write_tile(
-                row, col, pixels[rows, cols], None if valid is None else valid[rows, cols]
+                row,
+                col,
+                pixels[rows, cols],
+                None if valid is None else valid[rows, cols],
+                None if encoded is None else encoded.get((row, col)),
             )
         self.finish_block(block)
 

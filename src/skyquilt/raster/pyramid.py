@@ -57,11 +57,20 @@ class Pyramid:
         self._halves: dict[tuple[int, int], tuple[int, int]] = {}
         self._lock = threading.Lock()
 
-    def store(self, level: int, row: int, col: int, part: Part | None) -> None:
-        """Encodes one whole tile, and passes its half to the level above."""
+    def store(
+        self,
+        level: int,
+        row: int,
+        col: int,
+        part: Part | None,
+        encoded: tuple[bytes, bytes] | None = None,
+    ) -> None:
+        """Encodes one whole tile, unless it is `encoded` already, and passes its half to the level
+        above.
+        """
         half = None
         if part is not None:
-            image, mask = self._encoder(*part)
+            image, mask = encoded or self._encoder(*part)
             self.indices[level][row, col] = self._spool.append(image + mask), len(image), len(mask)
             if level + 1 < len(self.indices):
                 half = halve(*part, self.spec.overviews)

@@ -233,9 +233,22 @@ def _cut(n: int) -> str:
     return f"{n - MOST_ROWS} more in metrics.json." if n > MOST_ROWS else ""
 
 
+def added_sentence(added: Mapping[str, Any]) -> str:
+    """What became of photos that were added to a map: the entry `added` of metrics.json."""
+    more, before = number(added.get("photos")) or 0, number(added.get("to")) or 0
+    moved, share = number(added.get("moved")) or 0, number(added.get("share_made_anew")) or 0
+    were = "was" if more == 1 else "were"
+    return (
+        f"{count(more, 'photo')} {were} added to a map of {fixed(before, 0)}, {fixed(moved, 0)} of"
+        f" which moved; {fixed(100 * share, 0)} % of the map is made anew."
+    )
+
+
 def notes_section(data: ReportInput) -> Section:
     """Notes of the stages."""
     notes = tuple(plain(v) for v in items(data.metrics.get("notes")))[:MOST_ROWS]
+    if added := mapping(data.metrics.get("added")):
+        notes = (added_sentence(added), *notes)
     blocks: tuple[Block, ...] = (
         (Sentences(items=notes),) if notes else (Missing(why="No stage left a note."),)
     )

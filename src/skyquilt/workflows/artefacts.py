@@ -3,7 +3,8 @@
 from skyquilt.alignment import problem, start, tracks
 from skyquilt.model import camera, clip, features, poses, raster, surface
 from skyquilt.model.photo import RejectedPhoto
-from skyquilt.ortho import companions
+from skyquilt.ortho import companions, exposure, labels
+from skyquilt.workflows.finished import Finished
 from skyquilt.workflows.photo_features import PhotoFeatures
 
 REGISTRY = {
@@ -31,6 +32,9 @@ REGISTRY = {
         RejectedPhoto,
         companions.BlockExtras,
         raster.Grid,
+        exposure.Exposure,
+        labels.Labels,
+        Finished,
     )
 }
 """Records that the store may hold."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
+from skyquilt.alignment.addition import added
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
@@ -22,14 +23,17 @@ from skyquilt.engine.workers import Workers
 from skyquilt.model.event import Event, Note
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import Alignment, MapFrame, Prior
+from skyquilt.model.raster import Grid
 from skyquilt.ortho import companions, ground, orthomosaic
 from skyquilt.ortho.compose import Composer
+from skyquilt.ortho.earlier import Bounds
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.labels import Labels
-from skyquilt.ortho.radiometry import balanced
+from skyquilt.ortho.radiometry import continued
 from skyquilt.settings import USUAL_GB, MosaicSettings
 from skyquilt.workflows.clip_frames import with_frames
+from skyquilt.workflows.finished import Earlier
 from skyquilt.workflows.links import Links, link_photos
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import (
@@ -42,6 +46,7 @@ from skyquilt.workflows.photo_features import (
     picture_recipe,
     pixels_of,
 )
+from skyquilt.workflows.second_look import connect
 from skyquilt.workflows.survey_input import SurveyInput
 
 T = TypeVar("T")
@@ -59,6 +64,8 @@ class AlignedPhotos:
     """The survey as it was read."""
     found: FeaturedPhotos
     """Photos that take part, with features; all indices refer to these."""
+    frame: MapFrame
+    """The frame that the metadata were read in."""
     priors: tuple[Prior, ...]
     """Pose priors from the metadata, one per photo."""
     links: Links
@@ -73,6 +80,10 @@ class AlignedPhotos:
     """Full-size pixels of a photo by its index."""
     grey: GreyPictures
     """Gives the grey image of a photo."""
+    key: str
+    """Key of the alignment in the store."""
+    earlier: Earlier | None = None
+    """The finished map that the others of these photos are added to."""
 
     @property
     def photos(self) -> tuple[Photo, ...]:
@@ -111,6 +122,8 @@ class DrawnMap:
     """The composer that drew the rasters."""
     drawn: companions.Drawn
     """The additional rasters: provenance, views, preview."""
+    key: str
+    """Key of the labels in the store; empty where there are none."""
 
 
 def frames_added(
@@ -128,9 +141,14 @@ def frames_added(
 
 
 def align_photos(
-    given: SurveyInput, methods: Methods, settings: MosaicSettings, clock: Clock
+    given: SurveyInput,
+    methods: Methods,
+    settings: MosaicSettings,
+    clock: Clock,
+    earlier: Earlier | None = None,
 ) -> Generator[Event, None, AlignedPhotos]:
-    """Features, links and poses of a survey.
+    """Features, links and poses of a survey; poses of an `earlier` map stay where new photos do not
+    change them.
 
     Raises:
         NoPhotosError: no photo can be decoded.
@@ -152,10 +170,15 @@ def align_photos(
     pixels = PixelsInUse(found.photos, found.number, cache)
     grey = GreyPictures(found.photos, pixels, store)
     picture = settings.picture
-    frame = choose_frame(found.photos, picture.crs, given.control, picture.vertical_datum)
+    if earlier is not None and not earlier.complete(found.photos):
+        earlier = None
+    if earlier is not None:
+        frame = earlier.finished.frame
+    else:
+        frame = choose_frame(found.photos, picture.crs, given.control, picture.vertical_datum)
     reported = priors(found.photos, frame)
-    linking = _links(found, frame, reported, methods, store, workers)
-    links = yield from clock.stage("links", linking)
+    linking = _links(found, frame, reported, grey, methods, store, workers)
+    found, links = yield from clock.stage("links", linking)
     known = AlignmentInputs(
         photos=found.photos,
         features=found.features,
@@ -165,20 +188,25 @@ def align_photos(
         control=given.control,
         order=_order(found.photos, given.rank),
         grey=grey,
+        former=None if earlier is None else earlier.alignment_of(found.photos),
     )
-    if links.links:
+    if links.links and earlier is None:
         yield from memory_notes(len(found.photos), settings.running.memory_gb)
-    alignment = yield from clock.stage("align", _align(known, methods, clock))
+    key = alignment_key(known, methods) if earlier is None else _key_with(earlier, known, methods)
+    alignment = yield from clock.stage("align", _align(known, key, methods, clock))
     yield from (Note(text=n, warning=True) for n in alignment.notes)
     return AlignedPhotos(
         given=given,
         found=found,
+        frame=frame,
         priors=tuple(reported),
         links=links,
         order=tuple(known.order),
         alignment=alignment,
         pixels=pixels,
         grey=grey,
+        key=key,
+        earlier=earlier,
     )
 
 
@@ -196,13 +224,20 @@ def memory_notes(photos: int, memory_gb: float | None) -> list[Note]:
 
 
 def find_ground(
-    aligned: AlignedPhotos, methods: Methods, settings: MosaicSettings, clock: Clock
+    aligned: AlignedPhotos,
+    methods: Methods,
+    settings: MosaicSettings,
+    clock: Clock,
+    output: Path | None = None,
 ) -> Generator[Event, None, Ground]:
-    """Heights and the map's grid.
+    """Heights and the map's grid; those of the earlier map in `output` stay where nothing changed.
 
     Raises:
         UsageError: the map would have no pixels, or far too many.
     """
+    earlier = None
+    if aligned.earlier is not None and output is not None:
+        earlier = aligned.earlier.map_of(aligned.photos, clock.store, output)
     steps = ground.find_ground(
         aligned.alignment,
         aligned.grey,
@@ -212,6 +247,7 @@ def find_ground(
         clock.store,
         clock.workers,
         pictures=picture_recipe(),
+        earlier=earlier,
     )
     return (yield from clock.stage("surface", steps))
 
@@ -235,7 +271,7 @@ def draw_map(
     exposure = yield from clock.stage(
         "balance",
         _at_once(
-            lambda: balanced(
+            lambda: continued(
                 first.unit,
                 first.dtype,
                 thumbnails,
@@ -247,7 +283,7 @@ def draw_map(
         ),
         keeps=False,
     )
-    labels = yield from clock.stage(
+    labels, labelled = yield from clock.stage(
         "seams", _at_once(lambda: _labels(aligned, on, exposure, methods, clock))
     )
     aligned.found.looks.make_room()
@@ -265,9 +301,10 @@ def draw_map(
         unit=first.unit,
         store=clock.store,
         key=orthomosaic.map_key(key, alignment, on, exposure, labels),
+        growth=on.growth,
     )
     drawn = yield from clock.stage("mosaic", _drawn(drawing, aligned.pixels, clock.workers))
-    return DrawnMap(exposure=exposure, compose=compose, drawn=drawn)
+    return DrawnMap(exposure=exposure, compose=compose, drawn=drawn, key=labelled)
 
 
 def _drawn(
@@ -282,10 +319,12 @@ def _drawn(
 
 def _labels(
     aligned: AlignedPhotos, on: Ground, exposure: Exposure, methods: Methods, clock: Clock
-) -> Labels | None:
-    """Which photo is shown where; None for blending methods with a rule of their own."""
+) -> tuple[Labels | None, str]:
+    """Which photo is shown where, and its key in the store; None for blending methods with a rule
+    of their own.
+    """
     if methods.blend.seam_px is None:
-        return None
+        return None, ""
     key = digest(
         ground.poses_digest(aligned.alignment),
         on.surface.z,
@@ -295,13 +334,22 @@ def _labels(
         methods.seams,
         picture_recipe(),
         [p.digest for p in aligned.photos],
+        *(() if on.growth is None else on.growth.key),
     )
     keep = clock.store.parts("seams", key, clock.workers)
-    return clock.store.get_or(
-        "seams",
-        key,
-        lambda: methods.seams(on.views, on.surface, on.grid, aligned.grey, exposure, keep),
-    )
+    grows = on.growth
+
+    def made(area: Bounds, part: Grid) -> Labels:
+        assert grows is not None
+        near = grows.near(on.views, area)
+        within = keep.within(f"{area}")
+        return methods.seams(near, on.surface, part, aligned.grey, exposure, within)
+
+    def whole() -> Labels:
+        kept = None if grows is None else grows.labels(on.grid, made)
+        return kept or methods.seams(on.views, on.surface, on.grid, aligned.grey, exposure, keep)
+
+    return clock.store.get_or("seams", key, whole), key
 
 
 def scene_of(
@@ -321,14 +369,18 @@ def _links(
     found: FeaturedPhotos,
     frame: MapFrame,
     reported: Sequence[Prior],
+    grey: GreyPictures,
     methods: Methods,
     store: Store,
     workers: Workers,
-) -> Steps[Links]:
-    """Computes links if the alignment method needs them."""
+) -> Steps[tuple[FeaturedPhotos, Links]]:
+    """Computes links if the alignment method needs them; the photos with the features that these
+    refer to.
+    """
     if not methods.align.needs_links or len(found.photos) < 2:
-        return Links()
-    return (yield from link_photos(found, frame, reported, methods, store, workers))
+        return found, Links()
+    links = yield from link_photos(found, frame, reported, methods, store, workers)
+    return (yield from connect(found, links, reported, grey, methods, store, workers))
 
 
 def alignment_key(known: AlignmentInputs, methods: Methods) -> str:
@@ -346,14 +398,20 @@ def alignment_key(known: AlignmentInputs, methods: Methods) -> str:
         held,
         list(known.control),
         features_recipe(methods.detector),
+        connect,
         list(known.order),
         methods.align,
     )
 
 
-def _align(known: AlignmentInputs, methods: Methods, clock: Clock) -> Steps[Alignment]:
+def _key_with(earlier: Earlier, known: AlignmentInputs, methods: Methods) -> str:
+    """Key of an alignment that continues an earlier one."""
+    return digest(alignment_key(known, methods), earlier.key, added)
+
+
+def _align(known: AlignmentInputs, key: str, methods: Methods, clock: Clock) -> Steps[Alignment]:
     yield 0, 1
-    store, key = clock.store, alignment_key(known, methods)
+    store = clock.store
     resumable = replace(known, keep=store.parts(ADJUSTING, key, clock.workers))
     alignment = store.get_or("alignment", key, lambda: methods.align(resumable))
     store.forget([ADJUSTING])

@@ -1,7 +1,8 @@
 """Finds photos that show the same ground: candidate pairs, matches, verified links."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,8 +53,8 @@ class ExpectedPlaces:
         return np.where((np.abs(places) < 1e6).all(1, keepdims=True), places, np.nan)
 
 
-BATCH = 8
-"""Number of pairs per stored artefact; a batch is matched by one worker."""
+BATCH = 24
+"""Most pairs of a stored artefact: those of one photo with later ones, which one worker matches."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,12 +117,15 @@ class _Linker:
         return link_pair(a, b, two, self.found.photos[a], self.methods, places)
 
     def batch(self, pairs: Sequence[Pair]) -> list[Link | RejectedLink]:
-        """Links of a batch; the indices stored are those of this run."""
+        """Links of a batch. They are stored by content: photos that join the survey later change
+        the indices, but not what is stored of other photos.
+        """
         photos = self.found.photos
-        names = [(i, j, photos[i].digest, photos[j].digest) for i, j in pairs]
-        return self.store.get_or(
+        names = [(photos[i].digest, photos[j].digest) for i, j in pairs]
+        kept = self.store.get_or(
             "links", digest(names, self._recipe), lambda: [self.one(pair) for pair in pairs]
         )
+        return [replace(k, a=i, b=j) for k, (i, j) in zip(kept, pairs, strict=True)]
 
 
 def link_photos(
@@ -196,4 +200,6 @@ def overlap_reach_m(
 
 
 def _batches(pairs: Sequence[Pair]) -> list[Sequence[Pair]]:
-    return [pairs[k : k + BATCH] for k in range(0, len(pairs), BATCH)]
+    """Sorted pairs, those of each first photo by themselves."""
+    of_photo = [list(own) for _, own in groupby(pairs, key=lambda pair: pair[0])]
+    return [own[k : k + BATCH] for own in of_photo for k in range(0, len(own), BATCH)]

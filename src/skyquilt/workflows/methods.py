@@ -9,7 +9,7 @@ interface:
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from numpy.typing import NDArray
 
@@ -51,6 +51,20 @@ class Detector(Protocol):
         """Features of an image (h, w[, bands]) reduced to `longest`, in px of the full photo, whose
         height and width are `full`.
         """
+        ...
+
+
+@runtime_checkable
+class Countable(Detector, Protocol):
+    """A detector that can be asked for more features."""
+
+    @property
+    def count(self) -> int:
+        """Number of features at most."""
+        ...
+
+    def counted(self, count: int) -> "Countable":
+        """The same with another number."""
         ...
 
 

@@ -37,6 +37,8 @@ from skyquilt.settings import MosaicSettings
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.clip_frames import frame_methods, write_frames
+from skyquilt.workflows.finished import NAME, STAGE, Earlier, earlier_map, photo_key
+from skyquilt.workflows.finishing import added_figures, added_note, finished
 from skyquilt.workflows.flow import (
     ADJUSTING,
     AlignedPhotos,
@@ -108,10 +110,12 @@ def iter_mosaic(
     methods: Methods | None = None,
     overwrite: bool = False,
     rerun_from: str | None = None,
+    add: bool = False,
 ) -> Iterator[Event]:
     """Makes a mosaic and yields its progress; the last event is the `Result`.
 
-    `methods` replace those selected by the settings, see `methods_for`.
+    `methods` replace those selected by the settings, see `methods_for`. With `add`, photos that
+    joined the folder are added to the map that is in `output`: what they do not change stays.
 
     Raises:
         SkyquiltError: any error that the user can correct: no photos, an output folder in use, a
@@ -127,6 +131,7 @@ def iter_mosaic(
         began=began,
         overwrite=overwrite,
         rerun_from=rerun_from,
+        add=add,
     )
     yield made.result
 
@@ -159,8 +164,10 @@ def make_map(
     began: tuple[float, float] | None = None,
     overwrite: bool = False,
     rerun_from: str | None = None,
+    add: bool = False,
 ) -> Generator[Event, None, FinishedMap]:
     """Makes the map of a survey that was read; `began`: time at which reading began (`Clock.now`).
+    `add`: the map that `output` holds is continued where it can be.
 
     Raises:
         SkyquiltError: any error that the user can correct.
@@ -168,8 +175,10 @@ def make_map(
     return_large_blocks()
     began, methods = began or Clock.now(), methods or methods_for(settings)
     check_input(given, output, settings)
-    key = run_key(given, settings, methods)
-    run = open_run(output, key, overwrite=overwrite, again=rerun_from is not None)
+    key, recipe = run_key(given, settings, methods), recipe_of(given, settings, methods)
+    earlier = _earlier(given, output, recipe) if add else None
+    again = rerun_from is not None
+    run = open_run(output, key, overwrite=overwrite, again=again, grows=add)
     store = Store(folder=run.store, registry=REGISTRY)
     store.tidy()
     _forget(run, store, rerun_from)
@@ -187,20 +196,44 @@ def make_map(
         clock.lap("read", began)
         yield from (Note(text=n) for n in given.survey.notes)
         given = yield from frames_added(given, settings, clock)
+        if earlier is not None:
+            earlier.check(given.survey.photos, run.path)
         _log(run.path, given.survey.rejected)
-        metrics, given = yield from _without_bad(given, run.path, key, settings, methods, clock)
+        make = _Making(run.path, key, recipe, settings, methods, clock, earlier)
+        metrics, given = yield from _without_bad(given, make)
     run.mark("done")
     result = Result(output=run.path, metrics=metrics)
     return FinishedMap(result=result, given=given, methods=methods, settings=settings)
 
 
+def _earlier(given: SurveyInput, output: Path, recipe: str) -> Earlier | None:
+    """The map in `output` that photos are added to; None where there is none.
+
+    Raises:
+        OutputError: it was made otherwise, or of photos that are gone.
+    """
+    store = Store(folder=output / STATE / "store", registry=REGISTRY)
+    found = earlier_map(store, recipe, output)
+    if found is not None and not given.survey.clips:  # frames of clips are not known yet
+        found.check(given.survey.photos, output)
+    return found
+
+
+@dataclass(frozen=True)
+class _Making:
+    """How a map is made."""
+
+    output: Path
+    key: str
+    recipe: str
+    settings: MosaicSettings
+    methods: Methods
+    clock: Clock
+    earlier: Earlier | None
+
+
 def _without_bad(
-    given: SurveyInput,
-    output: Path,
-    key: str,
-    settings: MosaicSettings,
-    methods: Methods,
-    clock: Clock,
+    given: SurveyInput, make: _Making
 ) -> Generator[Event, None, tuple[dict[str, Any], SurveyInput]]:
     """Metrics of the map, and the survey that it shows: a photo on which a step fails, or whose
     file disappears, is left out, and the steps are repeated without it; results that do not depend
@@ -212,11 +245,11 @@ def _without_bad(
     most = max(1, len(given.survey.photos) // 2)
     for _ in range(most):
         try:
-            metrics = yield from _made(given, output, key, settings, methods, clock)
+            metrics = yield from _made(given, make)
             return metrics, given
         except PhotoFailedError as error:
             failed = RejectedPhoto(name=error.photo, reason=error.reason)
-            log_error(output, str(error), error)
+            log_error(make.output, str(error), error)
         gone = [p for p in given.survey.photos if p.name != failed.name and not p.path.is_file()]
         lost = [failed, *(RejectedPhoto(name=p.name, reason="its file is gone") for p in gone)]
         if len(lost) > most:
@@ -231,31 +264,30 @@ def _without_bad(
     )
 
 
-def _made(
-    given: SurveyInput,
-    output: Path,
-    key: str,
-    settings: MosaicSettings,
-    methods: Methods,
-    clock: Clock,
-) -> Generator[Event, None, dict[str, Any]]:
+def _made(given: SurveyInput, make: _Making) -> Generator[Event, None, dict[str, Any]]:
     """Makes the map and its files; returns the metrics."""
-    aligned = yield from align_photos(given, methods, settings, clock)
+    output, settings, methods, clock = make.output, make.settings, make.methods, make.clock
+    aligned = yield from align_photos(given, methods, settings, clock, make.earlier)
     _log(output, aligned.found.rejected)
-    ground = yield from find_ground(aligned, methods, settings, clock)
-    drawn = yield from draw_map(aligned, ground, methods, settings, clock, output, key)
+    ground = yield from find_ground(aligned, methods, settings, clock, output)
+    if make.earlier is not None:
+        yield added_note(aligned, ground)
+    drawn = yield from draw_map(aligned, ground, methods, settings, clock, output, make.key)
     if settings.input.write_frames:
         writing = write_frames(output, aligned.photos, aligned.pixels)
         yield from clock.stage("write frames", writing, keeps=False)
     measuring = _measured(aligned, ground, drawn, settings, clock.workers)
     seams, quality = yield from clock.stage("measure", measuring, keeps=False)
     metrics = _metrics(aligned, ground, drawn, seams, settings) | {"quality": quality}
+    metrics |= added_figures(aligned, ground) if make.earlier is not None else {}
     aligned.found.looks.make_room()
     give_back()
     finishing = finish_run(
         output, aligned, ground, drawn.drawn, drawn.compose, seams, metrics, settings, clock
     )
-    return (yield from clock.stage("report", finishing))
+    metrics = yield from clock.stage("report", finishing)
+    clock.store.put(STAGE, NAME, finished(aligned, ground, drawn, make.recipe, output))
+    return metrics
 
 
 def _log(output: Path, rejected: Sequence[RejectedPhoto]) -> None:
@@ -266,8 +298,18 @@ def _log(output: Path, rejected: Sequence[RejectedPhoto]) -> None:
 
 
 def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> str:
-    """Key of a run: content and metadata of its photos, side files, settings that affect results,
-    the methods, and the constants of all code used.
+    """Key of a run: its photos, and everything else that affects results."""
+    photos = [photo_key(p) for p in given.survey.photos]
+    films = [
+        (c.name, c.digest, c.track and c.track.digest, c.start and c.start.isoformat(), c.focal)
+        for c in given.survey.clips
+    ]
+    return digest(photos, films, recipe_of(given, settings, methods))
+
+
+def recipe_of(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> str:
+    """What a map is made with beside its photos: settings that affect results, side files, control
+    points, the methods, and the constants of all code used.
     """
     shaping = {
         k: v
@@ -276,19 +318,11 @@ def run_key(given: SurveyInput, settings: MosaicSettings, methods: Methods) -> s
     }
     files = (settings.picture.boundary, settings.input.distances, Path(settings.input.sequence))
     side = [p.read_bytes().hex() for p in files if p is not None and p.is_file()]
-    photos = [
-        (p.name, p.digest, p.position, p.attitude, p.focal, p.calibration)
-        for p in given.survey.photos
-    ]
-    films = [
-        (c.name, c.digest, c.track and c.track.digest, c.start and c.start.isoformat(), c.focal)
-        for c in given.survey.clips
-    ]
-    if films:  # control points are read when the frames are known
+    if given.survey.clips:  # control points are read when the frames are known
         gcp = settings.input.gcp or Path(str(given.source)) / "gcp_list.txt"
         side += [gcp.read_bytes().hex()] if gcp.is_file() else []
-        films.append(frame_methods(settings.input))  # type: ignore[arg-type]
-    return digest(photos, films, list(given.control), shaping, side, methods, make_map, __version__)
+        side.append(digest(frame_methods(settings.input)))
+    return digest(list(given.control), shaping, side, methods, make_map, __version__)
 
 
 def _measured(

@@ -66,6 +66,10 @@ class FeaturedPhotos:
     """Features and thumbnail of a photo by its number, from the store unless used lately."""
     rejected: tuple[RejectedPhoto, ...]
     """Photos that cannot be used, with reasons."""
+    closer: Callable[[int], Features] | None = None
+    """Gives the features found in a second look (`workflows.second_look`)."""
+    again: frozenset[int] = frozenset()
+    """Photos that were looked at twice."""
 
     @property
     def features(self) -> Sequence[Features]:
@@ -91,7 +95,11 @@ class _FeaturesOf(Sequence[Features]):
     def __getitem__(self, photo: int | slice) -> Features | Sequence[Features]:
         if isinstance(photo, slice):
             return [self[i] for i in range(*photo.indices(len(self)))]
-        return self._found.looks(self._found.number[photo]).features
+        found = self._found
+        features = found.looks(found.number[photo]).features
+        if found.closer is None or photo not in found.again:
+            return features
+        return features.followed_by(found.closer(photo))
 
 
 class _ThumbnailsOf(Mapping[int, NDArray[Any]]):

@@ -1,0 +1,61 @@
+"""What a run tells about photos that were added, and what it leaves for more of them."""
+
+from pathlib import Path
+from typing import Any
+
+from skyquilt.model.event import Note
+from skyquilt.ortho.earlier import same_pose
+from skyquilt.ortho.ground import Ground
+from skyquilt.ortho.orthomosaic import used_photos
+from skyquilt.report.tables import added_sentence
+from skyquilt.workflows.finished import Finished, photo_key, stamps
+from skyquilt.workflows.flow import AlignedPhotos, DrawnMap
+
+
+def finished(
+    aligned: AlignedPhotos, ground: Ground, drawn: DrawnMap, recipe: str, output: Path
+) -> Finished:
+    """The record of a map in `output`; its results are in the store."""
+    return Finished(
+        recipe=recipe,
+        photos=tuple(photo_key(p) for p in aligned.photos),
+        names=tuple(p.name for p in aligned.photos),
+        frame=aligned.frame,
+        alignment=aligned.key,
+        surface=ground.key,
+        labels=drawn.key,
+        grid=ground.grid,
+        exposure=drawn.exposure,
+        shown=tuple(used_photos(ground.views)),
+        files=stamps(output),
+    )
+
+
+def added_figures(aligned: AlignedPhotos, ground: Ground) -> dict[str, Any]:
+    """The entry `added` of metrics.json."""
+    earlier = aligned.earlier
+    if earlier is None:
+        return {}
+    before, now = earlier.alignment_of(aligned.photos).poses, aligned.alignment.poses
+    moved = sum(i in now and not same_pose(now[i], p) for i, p in before.items())
+    west, south, east, north = ground.grid.bounds
+    share = 1.0
+    if ground.growth is not None:
+        size = sum((a[2] - a[0]) * (a[3] - a[1]) for a in ground.growth.areas)
+        share = min(1.0, size / ((east - west) * (north - south)))
+    return {
+        "added": {
+            "photos": len(aligned.photos) - len(earlier.finished.photos),
+            "to": len(earlier.finished.photos),
+            "moved": moved,
+            "share_made_anew": round(share, 4),
+        }
+    }
+
+
+def added_note(aligned: AlignedPhotos, ground: Ground) -> Note:
+    """The same in a sentence."""
+    found = added_figures(aligned, ground).get("added")
+    if not found:
+        return Note(text="The map could not be continued, so all of it is made anew.")
+    return Note(text=added_sentence(found))

@@ -1,0 +1,144 @@
+"""A second look at photos that no link connects with the others: with many more features.
+
+Forests, crops and water have few features that are alike in two photos, and the strongest ones of a
+photo are rarely those of its neighbour. Among five times as many there mostly are enough; to look
+for so many in all photos would be a waste.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from skyquilt.alignment.tracks import connected
+from skyquilt.engine.clock import Steps
+from skyquilt.engine.store import Store, digest
+from skyquilt.engine.workers import Workers
+from skyquilt.imaging.grey import shrink
+from skyquilt.matching.candidates import Pair
+from skyquilt.matching.matchers import Guided
+from skyquilt.model.features import Features, Link, RejectedLink
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Prior
+from skyquilt.workflows.links import Links, link_pair
+from skyquilt.workflows.methods import Countable, Methods
+from skyquilt.workflows.photo_features import PICTURE, FeaturedPhotos, GreyPictures, features_recipe
+
+MORE = 5
+"""How many times as many features are looked for."""
+TRIED = 6
+"""Pairs that are compared again for each of these photos."""
+SAME_PX = 0.5
+"""Features closer to one another than this, in px of the image that is searched, are the same."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CloserLook:
+    """Gives many features of photos, and compares these."""
+
+    photos: Sequence[Photo]
+    """The photos."""
+    grey: GreyPictures
+    """Their grey images."""
+    methods: Methods
+    """Finds, matches and verifies features."""
+    store: Store
+    """Keeps the features."""
+
+    def __call__(self, photo: int) -> Features:
+        """Features of a photo (index)."""
+        detector, one = self.methods.detector, self.photos[photo]
+        key = digest(one.digest, "closer", features_recipe(detector))
+
+        def found() -> Features:
+            small, _ = shrink(self.grey(photo, PICTURE), detector.longest)
+            return detector.of_shrunken(small, (one.height, one.width))
+
+        return self.store.get_or("features", key, found)
+
+    def pair(self, pair: Pair) -> Link | RejectedLink:
+        """The link of two photos, or the reason why there is none."""
+        a, b = pair
+        names = (self.photos[a].digest, self.photos[b].digest)
+        recipe = (features_recipe(self.methods.detector), self.methods.matcher, self.methods.verify)
+
+        def compared() -> Link | RejectedLink:
+            return link_pair(a, b, (self(a), self(b)), self.photos[a], self.methods)
+
+        found = self.store.get_or("links", digest(names, "closer", recipe), compared)
+        return replace(found, a=a, b=b)
+
+
+def connect(
+    found: FeaturedPhotos,
+    links: Links,
+    priors: Sequence[Prior],
+    grey: GreyPictures,
+    methods: Methods,
+    store: Store,
+    workers: Workers,
+) -> Steps[tuple[FeaturedPhotos, Links]]:
+    """The photos and their links after the second look: pairs that failed and would connect photos
+    with the largest block are compared again. New features follow those found before.
+    """
+    yield 0, 1
+    pairs, detector = unconnected(len(found.photos), links, priors), methods.detector
+    if not pairs or isinstance(methods.matcher, Guided) or not isinstance(detector, Countable):
+        return found, links
+    more = replace(methods, detector=detector.counted(MORE * detector.count))
+    look = CloserLook(photos=found.photos, grey=grey, methods=more, store=store)
+    better = list[Link]()
+    for done, link in enumerate(workers.each(look.pair, pairs)):
+        yield done + 1, len(pairs)
+        if isinstance(link, Link):
+            better.append(link)
+    if not better:
+        return found, links
+    again = frozenset(i for k in better for i in (k.a, k.b))
+    names = {i: _numbers(found.features[i], look(i)) for i in sorted(again)}
+    joined = {
+        (k.a, k.b): replace(k, index_a=names[k.a][k.index_a], index_b=names[k.b][k.index_b])
+        for k in better
+    }
+    whole = sorted([*links.links, *joined.values()], key=lambda k: (k.a, k.b))
+    rest = tuple(k for k in links.rejected if (k.a, k.b) not in joined)
+    return replace(found, closer=look, again=again), Links(links=tuple(whole), rejected=rest)
+
+
+def unconnected(count: int, links: Links, priors: Sequence[Prior]) -> list[Pair]:
+    """Pairs that failed, of photos that links do not connect: for each photo outside the largest
+    block those nearest to it.
+    """
+    a, b = ([getattr(k, name) for k in links.links] for name in ("a", "b"))
+    block = connected(count, np.array(a, np.int64), np.array(b, np.int64))
+    largest = int(np.bincount(block).argmax()) if count else 0
+    xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
+
+    def away(pair: Pair) -> tuple[float, int]:
+        apart = float(np.hypot(*(xy[pair[0]] - xy[pair[1]])))
+        return (apart if np.isfinite(apart) else np.inf), abs(pair[0] - pair[1])
+
+    failed = sorted(
+        ((k.a, k.b) for k in links.rejected if block[k.a] != block[k.b]),
+        key=lambda pair: (*away(pair), pair),
+    )
+    tried, chosen = np.zeros(count, int), set[Pair]()
+    for pair in failed:
+        outside = [i for i in pair if block[i] != largest]
+        if any(tried[i] < TRIED for i in outside):
+            tried[outside] += 1
+            chosen.add(pair)
+    return sorted(chosen)
+
+
+def _numbers(features: Features, more: Features) -> NDArray[np.int64]:
+    """The number of each of the second features among both: that of the first one at its place, or
+    its own after all of these.
+    """
+    own = len(features) + np.arange(len(more))
+    if not len(features):
+        return own
+    distance, nearest = cKDTree(features.px).query(more.px)
+    return np.where(distance < SAME_PX * more.scale, nearest, own)
