@@ -110,7 +110,10 @@ def test_reasons():
     few = verified(pa[:14], pb[:14])
     assert isinstance(few, RejectedLink) and not few and few.reason == "too few matches (14 of 15)"
     pa, pb, _ = view_pair(1, height=(1.0, 2.0), base=(3.0, 2.0), outliers=0.0)
-    assert verified(pa, pb).reason.startswith("implausible scale (0.5")
+    assert verified(pa[:18], pb[:18]).reason.startswith("implausible scale (0.")
+    assert len(verified(pa, pb)) > 100  # so many tell another height from a mistake
+    far = pb * 0.2 + 200
+    assert verified(pa, far).reason.startswith("implausible scale (0.1")
     rng = np.random.default_rng(2)
     loose = pa * 1.0 + rng.normal(
         0, 6, pa.shape
@@ -127,3 +130,29 @@ def test_the_threshold_counts_pixels_of_the_picture_searched():
     small = Verify()(0, 1, features(pa, 4.0), features(pb, 4.0), m, WIDTH)
     assert len(small) > 0.75 * len(pa)
     assert not full or len(full) < 0.8 * len(small)
+
+
+def test_photos_of_different_numbers_of_pixels():
+    """Photo b has half as many pixels along a side, of the same view: nothing is another scale, and
+    it takes as much relief and tilt.
+    """
+    for seed in range(5):
+        pa, pb, right = view_pair(seed, outliers=0.3)
+        n = np.arange(len(pa))
+        m = Matches(index_a=n, index_b=n)
+        same = Verify()(0, 1, features(pa), features(pb), m, WIDTH)
+        half = Verify()(0, 1, features(pa, 2.0), features((pb + 0.5) / 2 - 0.5, 1.0), m, WIDTH)
+        back = Verify()(0, 1, features((pa + 0.5) / 2 - 0.5, 1.0), features(pb, 2.0), m, WIDTH // 2)
+        for link, factor in ((half, 0.5), (back, 2.0)):
+            assert isinstance(link, Link)
+            assert len(link) == pytest.approx(len(same), rel=0.1)
+            assert link.b_S_a == pytest.approx(factor * same.b_S_a, rel=0.01)
+
+
+def test_many_matches_at_one_spot_are_no_link():
+    """A repeated thing in photo b that all of photo a is alike to."""
+    for seed in range(50):
+        rng = np.random.default_rng(seed)
+        pa = rng.uniform(0, (WIDTH, HEIGHT), (80, 2))
+        pb = np.array([300.0, 200.0]) + rng.normal(0, 4, (80, 2))
+        assert not verified(pa, pb)

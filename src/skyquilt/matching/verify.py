@@ -29,8 +29,16 @@ class Verify:
     minimum: int = 15
     """Fewest inliers of a link."""
     scale: float = 1.7
-    """Largest factor between the ground resolutions of two photos."""
-    version: ClassVar[int] = 1
+    """Largest factor between the scales of two photos, as they were searched for features: between
+    their flying heights where their lenses see the same angle.
+    """
+    sure: int = 20
+    """Inliers from which `most_scale` holds instead."""
+    most_scale: float = 4.0
+    """The same for photos that evidently show the same ground: two flying heights, or a wide lens
+    and a long one.
+    """
+    version: ClassVar[int] = 2
 
     def __call__(
         self,
@@ -42,7 +50,7 @@ class Verify:
         width: int,
     ) -> Link | RejectedLink:
         """The link of photos a and b (indices), or the reason why there is none. `width`: image
-        width in px.
+        width of a in px.
         """
         if len(matches) < self.minimum:
             return RejectedLink(
@@ -50,19 +58,22 @@ class Verify:
             )
         pa = features_a.px[matches.index_a]
         pb = features_b.px[matches.index_b]
-        tolerance = self.similarity_share * width
+        # photos may have different numbers of pixels; distances are those in b
+        finer = features_a.scale / features_b.scale
+        tolerance = self.similarity_share * width / finer
         model, inliers = cv2.estimateAffinePartial2D(
             pa, pb, ransacReprojThreshold=tolerance, maxIters=2000, confidence=0.999, refineIters=5
         )
         if model is None:
             return RejectedLink(a=a, b=b, reason="no common similarity")
         keep = np.flatnonzero(inliers.ravel())
-        scale = float(np.hypot(model[0, 0], model[1, 0]))
+        scale = float(np.hypot(model[0, 0], model[1, 0])) * finer
         if len(keep) < self.minimum:
             return RejectedLink(
                 a=a, b=b, reason=f"weak inliers ({len(keep)} of {len(matches)} matches)"
             )
-        if not 1 / self.scale < scale < self.scale:
+        limit = self.most_scale if len(keep) >= self.sure else self.scale
+        if not 1 / limit < scale < limit:
             return RejectedLink(a=a, b=b, reason=f"implausible scale ({scale:.2f})")
         keep = self._epipolar(pa, pb, keep, max(features_a.scale, features_b.scale))
         if len(keep) < self.minimum:
