@@ -97,3 +97,15 @@ def test_without_georeference_only_yaw_and_focal_are_judged():
     photos, told = survey()
     told[1] = prior((500, 500, 200), yaw=80)
     assert named(conflicts(photos, told, alignment(crs=None))) == [("1.jpg", "yaw")]
+
+
+def test_a_calibration_that_no_lens_has_is_named_once_for_each_camera():
+    photos, told = survey()
+    photos[2], photos[5] = (
+        photo(f"{i}.jpg", unusable_calibration="DewarpData: a focal length of -100, -100 px")
+        for i in (2, 5)
+    )
+    (found,) = conflicts(photos, told, alignment(focal=740.0))
+    assert (found.photo, found.field, found.reported) == ("2.jpg", "calibration", None)
+    assert found.estimated == 740.0
+    assert "DewarpData: a focal length of -100" in found.meaning and "ignored" in found.meaning

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skyquilt.coregistration.agreement import Agree
+from skyquilt.coregistration.agreement import Agree, Shifts
 from skyquilt.coregistration.error_field import FREE, StateError, overlap_corners
 from skyquilt.coregistration.methods import RegisterSettings, registration_method
 from skyquilt.coregistration.orientation import orientation
@@ -30,8 +30,8 @@ def patches(low, high):
     return np.c_[x.ravel(), y.ravel()]
 
 
-def width(px):
-    return np.full(len(px), 0.3)
+def patched(px, shift, width=0.3):
+    return Shifts(px=px, shift=shift, width=np.full(len(px), width))
 
 
 def test_offsets_are_the_derivatives_of_a_homography():
@@ -61,7 +61,7 @@ def test_bounds_hold_for_drawn_errors(model):
     for _ in range(150):
         shift = rng.normal(0, 0.7, px.shape)
         error = transfer(fit(model, px, px + shift), CORNERS) - CORNERS
-        scatter = state.scatter(px, shift, width(px), free=FREE[model], **FRAME)
+        scatter = state.scatter(patched(px, shift), free=FREE[model], **FRAME)
         held.append(np.linalg.norm(error, axis=1) <= state(scatter, FREE[model]).bound_px(CORNERS))
     assert 0.91 < np.mean(held) < 0.99
 
@@ -72,7 +72,7 @@ def test_patches_that_match_anywhere_are_left_out():
     shift = rng.normal(0, 0.5, px.shape)
     wild = rng.random(len(px)) < 0.4
     shift[wild] = rng.uniform(-12, 12, (wild.sum(), 2))
-    scatter = StateError().scatter(px, shift, width(px), free=4, **FRAME)
+    scatter = StateError().scatter(patched(px, shift), free=4, **FRAME)
     assert scatter.sigma == pytest.approx(0.5, rel=0.15)
     assert scatter.information[0, 0] == pytest.approx((~wild).sum(), rel=0.1)
 
@@ -83,7 +83,7 @@ def test_the_bound_grows_away_from_the_patches_and_with_their_scatter():
     unit = rng.normal(0, 1, px.shape)
     state = StateError()
     one, three = (
-        state(state.scatter(px, size * unit, width(px), free=4, **FRAME), 4).bound_px(CORNERS)
+        state(state.scatter(patched(px, size * unit), free=4, **FRAME), 4).bound_px(CORNERS)
         for size in (0.3, 0.9)
     )
     assert (one[[1, 2]] > 1.25 * one[[0, 3]]).all()
@@ -95,26 +95,37 @@ def test_broad_peaks_widen_the_bound():
     shift = np.random.default_rng(4).normal(0, 0.5, px.shape)
     state = StateError()
     sharp, broad = (
-        state(state.scatter(px, shift, size * np.ones(len(px)), free=4, **FRAME), 4)
-        for size in (0.1, 0.5)
+        state(state.scatter(patched(px, shift, size), free=4, **FRAME), 4) for size in (0.1, 0.5)
     )
     assert broad.bound_px(CORNERS) == pytest.approx(5**0.3 * sharp.bound_px(CORNERS))
 
 
 def test_patches_between_those_of_the_test_are_half_a_patch_off():
-    """They tell the same shift, and leave the test as it was."""
+    """They tell the same shift."""
     a, b = pair(turned(1.0, 0.0, SHAPE, SHAPE, (3.0, 2.0)), seed=14)
     fields = [orientation(p.astype(np.float32), np.ones(SHAPE, bool), 256.0) for p in (a, b)]
     agree, there = Agree(), np.eye(3)
-    told = agree(*fields, there)
-    both = agree.between(*fields, told, there)
-    own, more = both.every_px[: len(told.every_px)], both.every_px[len(told.every_px) :]
-    assert (own == told.every_px).all() and both.surprise == told.surprise
-    assert both.px is told.px and len(more) > 0.6 * len(own)
-    assert np.unique((more - own[0]) % 42).tolist() == [21.0]
+    told, both = agree(*fields, there).every, agree.shifts(*fields, there)
+    own, more = both.px[: len(told.px)], both.px[len(told.px) :]
+    assert (own == told.px).all() and (both.shift[: len(own)] == told.shift).all()
+    assert len(more) > 0.6 * len(own) and np.unique((more - own[0]) % 42).tolist() == [21.0]
     # the picture lies (3, 2) px off, less its reduction
-    shift = np.median(both.every_shift[len(own) :], axis=0)
+    shift = np.median(both.shift[len(own) :], axis=0)
     assert shift == pytest.approx(np.array([3.0, 2.0]) * 256 / np.sqrt(400 * 480), abs=0.2)
+
+
+def test_two_registrations_that_differ_widen_the_bound_along_their_difference():
+    """A shift widens it everywhere alike, a turn at the corners, by the stated share each."""
+    px = patches(20, 250)
+    state = StateError()
+    still = state.scatter(patched(px, np.zeros_like(px)), free=4, **FRAME)
+    for k, size in ((0, 3.0), (3, 2.0)):
+        change = offsets(CORNERS, FRAME["centre"], FRAME["unit"])[:, :, k] * size
+        apart = still.parameters(CORNERS, change)
+        assert apart[k] == pytest.approx(size)
+        wide = state(still, 4, apart).bound_px(CORNERS)
+        expected = 1.96 * state.apart * np.linalg.norm(change, axis=1)
+        assert wide == pytest.approx(expected, rel=0.02)
 
 
 def test_few_matching_patches_and_a_homography_widen_the_bound():
@@ -127,7 +138,7 @@ def test_few_matching_patches_and_a_homography_widen_the_bound():
     plain = StateError(rarity=0.0, chosen=1.0)
     wild = np.arange(len(px)) % 2 == 0
     shift[wild] = rng.uniform(-12, 12, (wild.sum(), 2))
-    scatter = plain.scatter(px, shift, width(px), free=4, **FRAME)
+    scatter = plain.scatter(patched(px, shift), free=4, **FRAME)
     assert scatter.share == pytest.approx(0.5, abs=0.05)
     fewer, usual = (s(scatter, 4).bound_px(CORNERS) for s in (StateError(), plain))
     assert fewer / usual == pytest.approx((0.75 / scatter.share) ** 0.3)
@@ -139,7 +150,7 @@ def test_the_bound_follows_the_pixels():
     state = StateError()
     px = patches(20, 140)
     shift = np.random.default_rng(1).normal(0, 1, px.shape)
-    field = state(state.scatter(px, shift, width(px), free=4, **FRAME), 4)
+    field = state(state.scatter(patched(px, shift), free=4, **FRAME), 4)
     moved = field.moved(2.5, np.array([7.0, -3.0]))
     assert moved.bound_px(2.5 * CORNERS + [7, -3]) == pytest.approx(2.5 * field.bound_px(CORNERS))
 

@@ -20,10 +20,18 @@ SETTINGS = MosaicSettings(gsd_cm=25, features=3000, jobs=2)
 
 
 def against_truth(output, flight):
-    """Correlation with the true heights and the slope of the found ones over them, both without a
-    general slope, where they fit best within 3 m: photos are placed by positions that are off by as
-    much.
+    """Correlation with the true heights, the slope of the found ones over them, and the share of
+    the map; without a general slope, where both fit best by a similarity on the ground: two
+    positions and a compass tell place, heading and scale of a pair to metres, degrees and some
+    per cent. A wrong scale remains in the slope.
     """
+    z, true = maps(output, flight)
+    fitted = fits_best(z, true)
+    return (*agreement(z, placed(true, *fitted)), np.isfinite(z).mean())
+
+
+def maps(output, flight):
+    """The heights found, and the true ones on the same grid."""
     truth_file = flight / "truth" / "truth_surface.tif"
     with rasterio.open(output / "depth.tif") as found, rasterio.open(truth_file) as truth:
         z, true = found.read(1), np.full(found.shape, np.nan, np.float32)
@@ -35,9 +43,42 @@ def against_truth(output, flight):
             dst_nodata=np.nan,
             resampling=Resampling.average,
         )
-    near = range(-12, 13, 2)  # px of 25 cm
-    tried = [agreement(z, np.roll(true, (dy, dx), (0, 1))) for dy in near for dx in near]
-    return (*max(tried), np.isfinite(z).mean())
+    return z, true
+
+
+REACH = (20, 20, 5.0, 0.1)
+"""Largest shifts in px, turn in degrees and change of scale that are tried."""
+
+
+def fits_best(z, true):
+    """The shift (x and y, px), the turn in degrees and the change of scale about the middle of the
+    map by which both correlate best.
+    """
+    best, score = (0, 0, 0.0, 0.0), agreement(z, true)[0]
+    whole = [(x, y, 0, 0) for y in range(-20, 21, 4) for x in range(-20, 21, 4)]
+    turns = [(0, 0, t, 0) for t in (-2, -1, -0.5, -0.25, 0.25, 0.5, 1, 2)]
+    scales = [(0, 0, 0, s) for s in (-0.04, -0.02, -0.01, -0.005, 0.005, 0.01, 0.02, 0.04)]
+    near = [(x, y, 0, 0) for y in range(-2, 3) for x in range(-2, 3)]
+    for steps in (whole, near, *(turns, scales, near) * 3):
+        start = best
+        for step in steps:
+            tried = tuple(np.add(start, step))
+            if (np.abs(tried) > REACH).any():
+                continue
+            if (r := agreement(z, placed(true, *tried))[0]) > score:
+                best, score = tried, r
+    return best
+
+
+def placed(true, dx, dy, turn_deg, scale):
+    """A map (H, W) shifted by so many px, turned and enlarged by a share about its middle."""
+    height, width = true.shape
+    middle = ((width - 1) / 2, (height - 1) / 2)
+    change = cv2.getRotationMatrix2D(middle, turn_deg, 1 + scale)
+    change[:, 2] += dx, dy
+    return cv2.warpAffine(
+        true, change, (width, height), borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
+    )
 
 
 def agreement(z, true):
@@ -98,24 +139,21 @@ def test_a_pair_shows_the_heights_of_what_stands_there(known_places, tmp_path, f
 
 @pytest.mark.slow
 def test_pairs_show_their_heights_where_positions_err_by_two_metres(flight, tmp_path):
-    """By positions alone, which put the last pair 23 % too near, r is 0.89, 0.97 and 0.52, the
-    slope 0.86, 0.96 and 0.41.
-    """
+    """Positions alone put the last pair 23 % too near, and its heights are as much too low."""
     photos, told = sorted((flight / "photos").glob("*.jpg")), []
     for k in (0, 3, 6):
         *events, _ = iter_depth(photos[k : k + 2], tmp_path / "out", SETTINGS, overwrite=True)
         told.append(against_truth(tmp_path / "out", flight)[:2])
     assert any("times that of its positions" in e.text for e in events if isinstance(e, Note))
     r, slope = np.array(told).T
-    assert np.median(r) >= 0.9 and r.min() > 0.85
-    assert 0.9 <= np.median(slope) <= 1.1 and 0.85 < slope.min() <= slope.max() < 1.1
+    assert r.min() >= 0.9 and 0.9 <= slope.min() <= slope.max() <= 1.1, told
 
 
 def test_two_photos_show_their_heights_and_their_field(flight, tmp_path):
     photos = sorted((flight / "photos").glob("*.jpg"))[:2]
     result = depth(photos, tmp_path / "out", SETTINGS)
     r, slope, _ = against_truth(tmp_path / "out", flight)
-    assert result.metrics["route"] == "pair" and r >= 0.88 and 0.85 < slope < 1.1
+    assert result.metrics["route"] == "pair" and r >= 0.9 and 0.9 <= slope <= 1.1
     assert 0.25 < result.metrics["pair_scale"]["of_height"] < 0.9
     (pair,) = json.loads((tmp_path / "out" / "depth.json").read_text())["pairs"]
     field = cv2.imread(str(tmp_path / "out" / "pairs" / pair["field"]))

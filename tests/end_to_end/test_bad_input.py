@@ -13,6 +13,9 @@ import tifffile
 from PIL import Image
 
 from skyquilt.errors import UnreadablePhotoError
+from skyquilt.simulate import FlightSettings, simulate
+from skyquilt.simulate.camera import Lens
+from skyquilt.simulate.settings import Control, Reporting, Route
 from tests.end_to_end.conftest import (
     HIGH,
     WIDE,
@@ -370,6 +373,33 @@ def test_all_positions_the_same(mosaic, photos):
     assert told.metrics["photos_used"] == 9
     assert told.metrics["crs"] is None
     assert "All 9 positions are identical" in told.notes
+
+
+# calibrations
+
+
+@pytest.mark.slow
+def test_a_calibration_that_no_lens_has_is_ignored_and_named(mosaic, tmp_path):
+    """The factory calibration of all photos has the sign of its focal lengths wrong."""
+    settings = FlightSettings(
+        seed=7,
+        lens=Lens().scaled(800, 600),
+        route=Route(photos=4),
+        reporting=Reporting(dewarp=(0.0, 0.0)),
+        control=Control(points=0, checks=0),
+    )
+    for _ in simulate(settings, tmp_path / "flight", overwrite=True):
+        pass
+    for path in named(tmp_path / "flight" / "photos"):
+        held = path.read_bytes()
+        assert held.count(b"2026-01-01;6") == 1
+        path.write_bytes(held.replace(b"2026-01-01;6", b"2026-01-01;-"))
+    told = mosaic(tmp_path / "flight" / "photos").made()
+    assert told.metrics["photos_used"] == 4
+    (found,) = (c for c in told.metrics["metadata_conflicts"] if c["field"] == "calibration")
+    assert found["reported"] is None and found["estimated"] == pytest.approx(666, rel=0.05)
+    assert "DewarpData: a focal length of -" in found["meaning"]
+    assert found["meaning"].split(" (")[0] in (told.output / "report.html").read_text()
 
 
 # heights

@@ -139,7 +139,10 @@ def test_strips_that_unpack_to_more_than_they_hold(tmp_path):
             {"GpsLatitude": "52", "GpsLongitude": "13", "RtkFlag": "50", "RtkStdLon": "-3"},
             "accuracy",
         ),
-        ({"DewarpData": "x;" + ",".join(["1e308"] * 9), "CalibratedFocalLength": "1e308"}, ""),
+        (
+            {"DewarpData": "x;" + ",".join(["1e308"] * 9), "CalibratedFocalLength": "1e308"},
+            "calibration",
+        ),
     ],
 )
 def test_impossible_metadata_are_ignored_and_named(tmp_path, values, word):

@@ -63,14 +63,14 @@ def test_an_absurd_focal_length_is_passed_over(make_jpeg):
 
 
 def test_dewarp_data(make_jpeg):
-    data = "2018-09-04;100.0,100.4,2.0,-1.0,-0.26,0.11,0.0002,-0.0001,-0.05"
+    data = "2018-09-04;75.0,75.3,2.0,-1.0,-0.26,0.11,0.0002,-0.0001,-0.05"
     photo = read_photo(
         make_jpeg(
             image=pixels(120, 90), exif=dji_exif(), xmp=dji_xmp(DewarpData=data, DewarpFlag="0")
         )
     )
     camera = photo.calibration
-    assert camera.focal == pytest.approx(100.0) and camera.aspect == pytest.approx(1.004)
+    assert camera.focal == pytest.approx(75.0) and camera.aspect == pytest.approx(1.004)
     assert (camera.cx, camera.cy) == (pytest.approx(61.5), pytest.approx(43.5))
     assert (camera.k1, camera.k2, camera.k3, camera.p1, camera.p2) == (
         -0.26,
@@ -84,18 +84,52 @@ def test_dewarp_data(make_jpeg):
     assert read_photo(make_jpeg(image=pixels(120, 90), xmp=flagged)).calibration.k1 == 0
 
 
+@pytest.mark.parametrize(
+    ("numbers", "word"),
+    [
+        ("nan,75,0,0,0,0,0,0,0", "not 9 finite numbers"),
+        ("75,75,0,0,0,0", "not 9 finite numbers"),
+        ("a lens", "not 9 finite numbers"),
+        ("-100,-100,0,0,0,0,0,0,0", "focal length of -100"),
+        ("1e308,1e308,0,0,0,0,0,0,0", "focal length of 1e+308 px in a picture of 120 x 90"),
+        ("75,75,80,0,0,0,0,0,0", "principal point at 140"),
+        ("75,112.5,0,0,0,0,0,0,0", "factor 1.5"),
+        ("75,75,0,0,1e308,0,0,0,0", "distortion that no lens has"),
+        # the sensor of an FC300S is 6.25 mm long, its lens 3.61 mm
+        ("500,500,0,0,0,0,0,0,0", "of another size; the camera has 69.31 px"),
+    ],
+)
+def test_a_calibration_that_no_lens_has_is_ignored_and_named(make_jpeg, numbers, word):
+    xmp = dji_xmp(DewarpData=f"2018-09-04;{numbers}")
+    photo = read_photo(make_jpeg(image=pixels(120, 90), exif=dji_exif(), xmp=xmp))
+    assert photo.calibration is None and photo.focal.source == "sensor"
+    assert photo.unusable_calibration.startswith("DewarpData: ")
+    assert word in photo.unusable_calibration
+    assert f"Its calibration was ignored: {photo.unusable_calibration}." in photo.notes
+
+
+def test_a_usable_calibration_is_taken_where_another_one_is_not(make_jpeg):
+    xmp = dji_xmp(DewarpData="d;-1,-1,0,0,0,0,0,0,0", CalibratedFocalLength="70")
+    photo = read_photo(make_jpeg(image=pixels(120, 90), exif=dji_exif(), xmp=xmp))
+    assert photo.calibration.focal == pytest.approx(70)
+    assert "focal length of -1" in photo.unusable_calibration
+    untold = dji_xmp(DewarpData="d;" + ",".join(["0.0"] * 9))
+    none = read_photo(make_jpeg(image=pixels(120, 90), exif=dji_exif(), xmp=untold))
+    assert none.calibration is None and not none.unusable_calibration
+
+
 def test_calibrated_focal_length_of_a_reduced_copy(make_jpeg):
-    size = {piexif.ExifIFD.PixelXDimension: 4000, piexif.ExifIFD.PixelYDimension: 3000}
+    exif = exif_of("FC6310", PixelXDimension=5472, PixelYDimension=3648)
     xmp = dji_xmp(
         CalibratedFocalLength="3666.67",
-        CalibratedOpticalCenterX="2000.0",
-        CalibratedOpticalCenterY="1500.0",
+        CalibratedOpticalCenterX="2736.0",
+        CalibratedOpticalCenterY="1824.0",
     )
-    photo = read_photo(make_jpeg(image=pixels(120, 90), exif=dji_exif(Exif=size), xmp=xmp))
-    assert photo.calibration.focal == pytest.approx(3666.67 * 0.03)
+    photo = read_photo(make_jpeg(image=pixels(120, 80), exif=exif, xmp=xmp))
+    assert photo.calibration.focal == pytest.approx(3666.67 * 120 / 5472)
     assert (photo.calibration.cx, photo.calibration.cy) == (
         pytest.approx(59.5),
-        pytest.approx(44.5),
+        pytest.approx(39.5),
     )
 
 

@@ -29,7 +29,25 @@ def conflicts(
         found += _altitudes(photos, priors, alignment, held) + _positions(
             photos, priors, alignment, held
         )
+    found += _unusable(photos, alignment)
     return found + _focals(photos, alignment, held) + _lenses(photos, alignment, held)
+
+
+def _unusable(photos: Sequence[Photo], alignment: Alignment) -> list[MetadataConflict]:
+    """Calibrations that no lens can have, once for each camera."""
+    out: dict[str, MetadataConflict] = {}
+    for i in sorted(alignment.poses):
+        photo = photos[i]
+        if photo.unusable_calibration and photo.camera_key not in out:
+            out[photo.camera_key] = MetadataConflict(
+                photo=photo.name,
+                field="calibration",
+                reported=None,
+                estimated=round(alignment.camera(i).focal, 1),
+                meaning="the calibration in the metadata is not that of a lens"
+                f" ({photo.unusable_calibration}) and was ignored",
+            )
+    return list(out.values())
 
 
 def _yaw(photo: Photo, prior: Prior, alignment: Alignment, i: int) -> list[MetadataConflict]:

@@ -9,7 +9,7 @@ measured on unrelated images (docs/methods.md).
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import cv2
@@ -19,6 +19,25 @@ from scipy.special import gammaln, logsumexp
 
 from skyquilt.coregistration.orientation import Fields, Orientation, warped
 from skyquilt.model.registration import Matrix
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shifts:
+    """Where each of n patches matches best, in px of b at the resolution of the test."""
+
+    px: NDArray[np.float64]
+    """(n, 2) centres of the patches."""
+    shift: NDArray[np.float64]
+    """(n, 2) b's content is at px + shift."""
+    width: NDArray[np.float64]
+    """(n,) height of each correlation peak `_BESIDE` px beside it, as a share of its height: 0 for
+    a needle, 1 for a plateau.
+    """
+
+    @classmethod
+    def of(cls, table: NDArray[np.float64]) -> "Shifts":
+        """From rows of x, y, shift along x, along y, width."""
+        return cls(px=table[:, :2], shift=table[:, 2:4], width=table[:, 4])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,14 +52,8 @@ class Agreement:
     """(n, 2) centres of the patches that agree, in px of b at the resolution of the test."""
     shift: NDArray[np.float64]
     """(n, 2) shift in px at which each patch matches best: b's content is at px + shift."""
-    every_px: NDArray[np.float64]
-    """(m, 2) centres of all patches of that size, agreeing or not; see `Agree.between`."""
-    every_shift: NDArray[np.float64]
-    """(m, 2) their shifts."""
-    every_width: NDArray[np.float64]
-    """(m,) height of each correlation peak `_BESIDE` px beside it, as a share of its height: 0 for
-    a needle, 1 for a plateau.
-    """
+    every: "Shifts"
+    """Of all patches of that size, agreeing or not."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,28 +88,22 @@ class Agree:
             patches=count,
             px=near[:, :2],
             shift=near[:, 2:4],
-            every_px=table[:, :2],
-            every_shift=table[:, 2:4],
-            every_width=table[:, 4],
+            every=Shifts.of(table),
         )
 
-    def between(
-        self, a: Orientation, b: Orientation, agreement: Agreement, b_H_a: Matrix
-    ) -> Agreement:
-        """The same with the shifts of patches that lie half a patch further right and down, between
-        those of the test: their scatter is known better from both.
+    def shifts(self, a: Orientation, b: Orientation, b_H_a: Matrix) -> Shifts:
+        """The shifts of the patches of the smaller size, and of those that lie half a patch further
+        right and down, between them: their scatter is known better from both.
         """
         fields, valid = warped(a, b_H_a, b.shape)
         across = self.across[0]
         half = int(np.sqrt(b.shape[0] * b.shape[1]) / across) // 2
-        found = [f[1:] for f in self._patches(fields, b.fields, valid * b.valid, across, half)]
-        table = np.array(found, np.float64).reshape(-1, 5)
-        return replace(
-            agreement,
-            every_px=np.concatenate([agreement.every_px, table[:, :2]]),
-            every_shift=np.concatenate([agreement.every_shift, table[:, 2:4]]),
-            every_width=np.concatenate([agreement.every_width, table[:, 4]]),
-        )
+        found = [
+            f[1:]
+            for first in (0, half)
+            for f in self._patches(fields, b.fields, valid * b.valid, across, first)
+        ]
+        return Shifts.of(np.array(found, np.float64).reshape(-1, 5))
 
     def _patches(
         self, fields: Fields, target: Fields, both: NDArray[Any], across: int, first: int = 0

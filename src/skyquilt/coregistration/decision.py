@@ -8,9 +8,10 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from skyquilt.coregistration.agreement import Agree, Agreement
+from skyquilt.coregistration.agreement import Agree, Agreement, Shifts
 from skyquilt.coregistration.error_field import FREE, Scatter, StateError, overlap_corners
 from skyquilt.coregistration.orientation import (
+    BLUR,
     Orientation,
     Pyramid,
     between,
@@ -18,9 +19,11 @@ from skyquilt.coregistration.orientation import (
     spectra,
     warped,
 )
+from skyquilt.coregistration.refine_registration import grid
 from skyquilt.coregistration.subpixel import Fit, Freedom, SubpixelRefinement
+from skyquilt.geometry.transforms import fit as fitted
 from skyquilt.geometry.transforms import transfer
-from skyquilt.model.registration import Matrix, RefusedRegistration, Registration
+from skyquilt.model.registration import ErrorField, Matrix, RefusedRegistration, Registration
 
 Outcome = Registration | RefusedRegistration
 
@@ -45,9 +48,17 @@ class Decide:
     """
     state: StateError = field(default_factory=StateError)
     """The error over the whole picture."""
+    finer: float = 400.0
+    """Side in px of the square to whose area images are reduced for the final refinement."""
     finest: float = 640.0
-    """Side in px of the square to whose area larger images are reduced for the final refinement."""
-    version: ClassVar[int] = 3
+    """The same for images at least as large; they are refined at it by coarser structure first."""
+    sharper: float = 0.5
+    """Smoothing of its gradients in px, half of that of all before: finer structure."""
+    fine: float = 1 / 4
+    """Weight of finer structure, the rest is that of coarser one. Alone it is the more exact where
+    the bands are alike, and the less exact where they are not, and its error is less certain.
+    """
+    version: ClassVar[int] = 4
 
     def __call__(self, pyramid: Pyramid, fits: Sequence[Fit]) -> Outcome:
         """The decision on transforms in px of the finest level."""
@@ -72,14 +83,12 @@ class Decide:
         corners = overlap_corners(fit.b_H_a, a.shape, b.shape)
         freer = SubpixelRefinement(freedom="homography")(a, b, fit.b_H_a)
         if freer.correlation > (1 + self.gain) * fit.correlation:
-            scatter = self._scatter(agreement, corners, b.shape, model)
+            scatter = self._scatter(agreement.every, corners, b.shape, model)
             change = transfer(freer.b_H_a @ np.linalg.inv(fit.b_H_a), corners) - corners
             if self.state.determined(scatter, change, corners) > self.determined:
                 model, fit = "homography", freer
                 agreement = self.agree(a, b, fit.b_H_a)
-        closer = self.agree.between(a, b, agreement, fit.b_H_a)
-        scatter = self._scatter(closer, corners, b.shape, model)
-        full = self._finest(pyramid, pyramid.full(fit.b_H_a, pyramid.last), model)
+        full, error = self._closer(pyramid, fit, model)
         to_full = np.linalg.inv(b.small_S_full)
         return Registration(
             model=model,
@@ -87,37 +96,45 @@ class Decide:
             evidence=_evidence(agreement, fit),
             px_a=_apply(np.linalg.inv(full) @ to_full, agreement.px),
             px_b=_apply(to_full, agreement.px + agreement.shift),
-            error=self.state(scatter, FREE[model]).moved(
-                float(to_full[0, 0]), np.asarray(to_full[:2, 2], np.float64)
-            ),
+            error=error,
+        )
+
+    def _closer(self, pyramid: Pyramid, coarse: Fit, model: Freedom) -> tuple[Matrix, ErrorField]:
+        """The weighted mean of the transforms by coarse and by finer structure, and its error, both
+        in px of the images. How far they are apart tells of the error what the scatter of the
+        patches does not.
+        """
+        full, side = pyramid.full(coarse.b_H_a, pyramid.last), self.finer
+        if pyramid.least >= self.finest**2:
+            side = self.finest
+            a, b = pyramid.finer(side, BLUR)
+            nearer = SubpixelRefinement(freedom=model, steps=3)(a, b, between(a, b, full))
+            full = full_size(a, b, nearer.b_H_a)
+        a, b = pyramid.finer(side, self.sharper)
+        begun = between(a, b, full)
+        fine = SubpixelRefinement(freedom=model, steps=8)(a, b, begun).b_H_a
+        scatter = self._scatter(
+            self.agree.shifts(a, b, fine), overlap_corners(fine, a.shape, b.shape), b.shape, model
+        )
+        px = grid(b.shape)
+        apart = transfer(begun @ np.linalg.inv(fine), px) - px
+        back = fitted(model, px, px + (1 - self.fine) * apart)
+        to_full = np.linalg.inv(b.small_S_full)
+        error = self.state(scatter, FREE[model], scatter.parameters(px, apart))
+        return full_size(a, b, fine if back is None else back @ fine), error.moved(
+            float(to_full[0, 0]), np.asarray(to_full[:2, 2], np.float64)
         )
 
     def _scatter(
-        self,
-        agreement: Agreement,
-        corners: NDArray[np.float64],
-        shape: tuple[int, int],
-        model: Freedom,
+        self, patches: Shifts, corners: NDArray[np.float64], shape: tuple[int, int], model: Freedom
     ) -> Scatter:
         return self.state.scatter(
-            agreement.every_px,
-            agreement.every_shift,
-            agreement.every_width,
+            patches,
             centre=corners.mean(0),
             unit=float(np.hypot(*shape)) / 2,
             reach=float(self.agree.reach),
             free=FREE[model],
         )
-
-    def _finest(self, pyramid: Pyramid, full: Matrix, model: Freedom) -> Matrix:
-        """The transform refined again at a finer level if the images are much larger than the
-        decision level.
-        """
-        larger = pyramid.finest(self.finest)
-        if larger is None:
-            return full
-        fit = SubpixelRefinement(freedom=model, steps=3)(*larger, between(*larger, full))
-        return full_size(*larger, fit.b_H_a)
 
 
 def _apply(matrix: NDArray[Any], px: NDArray[Any]) -> NDArray[Any]:

@@ -3,10 +3,10 @@ confirm it.
 
 Patches that are matched one by one lie off their registered position by their own errors. Their
 scatter gives the covariance of a homography fitted to them, and with it the error at any place,
-which grows away from the patches. What no scatter can show is added with priors in units of the
-scatter: the part of the true transform that the chosen model cannot follow (parallax, lens,
-perspective), and an error that all patches share, since the same edge does not lie at quite the
-same place in two spectra.
+which grows away from the patches. What no scatter can show is added: along the difference of the
+registrations by coarse and by fine structure, since the same edge does not lie at quite the same
+place in two spectra; and with priors in units of the scatter, the part of the true transform that
+the chosen model cannot follow (parallax, lens, perspective), and an error that all patches share.
 """
 
 from dataclasses import dataclass
@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.coregistration.agreement import Shifts
 from skyquilt.geometry.transforms import transfer
 from skyquilt.model.registration import ErrorField, Matrix, offsets
 
@@ -47,18 +48,25 @@ class Scatter:
     unit: float
     """Unit of length of `offsets`, px of b."""
 
+    def parameters(
+        self, px: NDArray[np.float64], change: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """The (8,) parameters of `offsets` nearest to a change (n, 2) of places (n, 2), px of b."""
+        J = offsets(px, self.centre, self.unit).reshape(-1, 8)
+        return np.asarray(np.linalg.lstsq(J, change.ravel(), rcond=None)[0], np.float64)
+
 
 @dataclass(frozen=True, kw_only=True)
 class StateError:
     """The error of a registration from the shifts of its patches."""
 
-    dependence: float = 2.4
+    dependence: float = 3.5
     """Number of patches that weigh like one independent one: neighbours err alike."""
     misfit: float = 0.5
     """Prior of each parameter beyond the model's, at half b's diagonal, in units of the
     scatter.
     """
-    shared: float = 0.6
+    shared: float = 0.8
     """Error that all patches share, in units of the scatter."""
     usual_width: float = 0.3
     """Width of correlation peaks at which all this holds."""
@@ -77,31 +85,27 @@ class StateError:
     """Error of a homography relative to that of a similarity with the same scatter: it was taken
     because it fits these patches, so that their scatter around it tells too little.
     """
+    apart: float = 0.65
+    """Standard deviation of the error along the difference of the registrations by coarse and by
+    fine structure, of which the mean is taken, relative to it.
+    """
     least_px: float = 0.05
     """Scatter expected without any patch, px; it counts as much as `weight` observations."""
     weight: float = 3.0
     """See `least_px`."""
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
 
     def scatter(
-        self,
-        px: NDArray[np.float64],
-        shift: NDArray[np.float64],
-        width: NDArray[np.float64],
-        *,
-        centre: NDArray[np.float64],
-        unit: float,
-        reach: float,
-        free: int,
+        self, patches: Shifts, *, centre: NDArray[np.float64], unit: float, reach: float, free: int
     ) -> Scatter:
         """Separates patches that match near the registered position from those that match anywhere
         (by expectation maximisation of a normal and a uniform distribution), and measures the
         scatter of the former around a common transform.
 
-        px (n, 2) centres of patches, shift (n, 2) the shifts at which each matches best, both px of
-        b, width (n,) of its correlation peak; reach: largest shift compared; free: parameters of
-        the model.
+        patches: in px of b; centre, unit: of `offsets`; reach: largest shift compared; free:
+        parameters of the model.
         """
+        px, shift, width = patches.px, patches.shift, patches.width
         J = offsets(px, centre, unit)
         prior = self._prior(free)
         near = np.hypot(shift[:, 0], shift[:, 1]) < reach / 4
@@ -129,19 +133,24 @@ class StateError:
         deviation[:free] = _FLAT
         return np.diag(1 / deviation**2)
 
-    def __call__(self, scatter: Scatter, free: int) -> ErrorField:
-        """The error over b of a model with so many free parameters."""
+    def __call__(
+        self, scatter: Scatter, free: int, apart: NDArray[np.float64] | None = None
+    ) -> ErrorField:
+        """The error over b of a model with so many free parameters; `apart` (8,): the parameters by
+        which two registrations differ whose mean it is.
+        """
         width = max(scatter.width, _NARROWEST) / self.usual_width
         rare = self.usual_share / scatter.share
         square = self.dependence * scatter.sigma**2
         square *= width ** (2 * self.blur) * rare ** (2 * self.rarity)
         square *= self.chosen**2 if free == FREE["homography"] else 1.0
+        covariance = square * np.linalg.inv(scatter.information + self._prior(free))
+        if apart is not None:
+            covariance = covariance + self.apart**2 * np.outer(apart, apart)
         return ErrorField(
             centre=scatter.centre,
             unit=scatter.unit,
-            covariance=np.asarray(
-                square * np.linalg.inv(scatter.information + self._prior(free)), np.float64
-            ),
+            covariance=np.asarray(covariance, np.float64),
             shared=self.shared**2 * square,
         )
 

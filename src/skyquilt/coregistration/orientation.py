@@ -53,15 +53,19 @@ class Orientation:
         return self.fields.shape[0], self.fields.shape[1]
 
 
-def orientation(grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float) -> Orientation:
+def orientation(
+    grey: NDArray[np.float32], valid: NDArray[np.bool_], side: float, blur: float = BLUR
+) -> Orientation:
     """Fields of an image (H, W) reduced to the area of a square of `side` px (never enlarged)."""
     small, whole, small_S_full = shrunken(grey, valid, side)
-    return of_bands(small, whole, small_S_full)
+    return of_bands(small, whole, small_S_full, blur)
 
 
-def of_bands(small: NDArray[Any], whole: NDArray[np.bool_], small_S_full: Matrix) -> Orientation:
+def of_bands(
+    small: NDArray[Any], whole: NDArray[np.bool_], small_S_full: Matrix, blur: float = BLUR
+) -> Orientation:
     """Fields of an image (h, w) or (h, w, bands) at its own resolution; `whole` (h, w): its valid
-    pixels.
+    pixels; `blur`: standard deviation in px of the smoothing before gradients are taken.
 
     Gradients g of several bands add up as g^2: the direction along which all of them together
     change most (Di Zenzo 1986), whichever way each of them changes.
@@ -72,7 +76,7 @@ def of_bands(small: NDArray[Any], whole: NDArray[np.bool_], small_S_full: Matrix
         borderType=cv2.BORDER_CONSTANT,
         borderValue=0,
     )
-    smooth = np.asarray(cv2.GaussianBlur(small, (0, 0), BLUR))
+    smooth = np.asarray(cv2.GaussianBlur(small, (0, 0), blur))
     return Orientation(fields=_fields(smooth, inner), valid=inner, small_S_full=small_S_full)
 
 
@@ -164,13 +168,14 @@ class Pyramid:
         self._pictures, self._sides = (a, b), tuple(sides)
         self._levels: dict[int, tuple[Orientation, Orientation]] = {}
 
-    def finest(self, side: float) -> tuple[Orientation, Orientation] | None:
-        """a and b at a finer resolution than the last level; None if one of them is not large
-        enough.
-        """
-        if any(one.grey.size < side**2 for one in self._pictures):
-            return None
-        a, b = (orientation(p.grey, p.valid, side) for p in self._pictures)
+    @property
+    def least(self) -> int:
+        """Pixels of the smaller image."""
+        return min(p.grey.size for p in self._pictures)
+
+    def finer(self, side: float, blur: float) -> tuple[Orientation, Orientation]:
+        """a and b at another resolution than those of the levels, smoothed otherwise."""
+        a, b = (orientation(p.grey, p.valid, side, blur) for p in self._pictures)
         return a, b
 
     @property

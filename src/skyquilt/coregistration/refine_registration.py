@@ -107,7 +107,7 @@ class RefineRegistration:
             freer = self.free(fields, target, found.b_H_a)
             if freer.correlation > (1 + self.gain) * found.correlation:
                 found, way = freer, self.free
-        px = _grid(fields.shape)
+        px = grid(fields.shape)
         moved = transfer(found.b_H_a, px) - transfer(begun, px)
         furthest = self.reach * max(target.shape)
         return (found, way) if np.sqrt((moved**2).sum(1).mean()) <= furthest else None
@@ -132,12 +132,12 @@ def _placed(
 
 def stiff(b_H_a: Matrix, shape: tuple[int, int]) -> Matrix:
     """The similarity (3, 3) nearest to a transform over an image (H, W)."""
-    px = _grid(shape)
+    px = grid(shape)
     found = fit("similarity", px, transfer(b_H_a, px))
     return b_H_a if found is None else found
 
 
-def _grid(shape: tuple[int, int]) -> np.ndarray:
+def grid(shape: tuple[int, int]) -> np.ndarray:
     """(25, 2) px distributed over an image (H, W)."""
     x, y = (np.linspace(0, n - 1, 5) for n in (shape[1], shape[0]))
     return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)

@@ -96,10 +96,12 @@ class MetadataConflict:
     photo: str
     """Photo.name."""
     field: str
-    """`yaw`, `altitude`, `position`, `focal`, `lens` or `principal_point`."""
-    reported: float
-    """Value in the metadata: degrees, m above the datum, m off, px."""
+    """`yaw`, `altitude`, `position`, `focal`, `lens`, `principal_point`, or `calibration`, one that
+    no lens can have.
+    """
+    reported: float | None
+    """Value in the metadata: degrees, m above the datum, m off, px; None of a `calibration`."""
     estimated: float
-    """Value estimated from all photos, same unit."""
+    """Value estimated from all photos, same unit; the focal length for a `calibration`."""
     meaning: str
     """A plain sentence."""

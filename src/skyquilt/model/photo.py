@@ -135,6 +135,8 @@ class Photo:
     """Photos with equal keys share their intrinsics: make, model, serial, lens, size."""
     calibration: Camera | None = None
     """Intrinsics that metadata or a side file give, distortion included."""
+    unusable_calibration: str = ""
+    """A phrase on what its metadata give as a calibration and no lens can have; it is ignored."""
     focal: Focal
     """Always present; a guess with a large standard deviation where nothing is known."""
     position: GeoPosition | None

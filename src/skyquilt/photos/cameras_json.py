@@ -81,4 +81,4 @@ def _calibrated(photo: Photo, camera: Camera | None) -> Photo:
     sigma = own.sigmas[0] if own.sigmas else _SIGMA_SHARE * own.focal
     notes = tuple(n for n in photo.notes if "focal length" not in n)
     focal = Focal(px=own.focal, sigma_px=sigma, source="calibrated")
-    return replace(photo, calibration=own, focal=focal, notes=notes)
+    return replace(photo, calibration=own, unusable_calibration="", focal=focal, notes=notes)

@@ -3,7 +3,7 @@
 import csv
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -202,44 +202,89 @@ _UNTOLD = (0.1, 0.1, 0.05, 0.002, 0.002, 0.003)
 """Deviations of k1, k2, k3, p1, p2 and the ratio where a calibration gives only lengths."""
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FoundCalibration:
+    """The calibration that a photo's metadata give, if any."""
+
+    camera: Camera | None = None
+    """None where there is none, or none that a lens can have."""
+    nonsense: tuple[str, ...] = ()
+    """Phrases on calibrations that are there and cannot be meant."""
+
+
 def read_calibration(
     *, exif: Exif, xmp: Xmp, sensor: Sensor | None, width: int, height: int, scale: float
-) -> Camera | None:
+) -> FoundCalibration:
     """The first of DJI's `DewarpData` or `DewarpDataK6`, Pix4D's `Camera:Perspective*` and DJI's
-    `CalibratedFocalLength`.
+    `CalibratedFocalLength` that a lens can have.
 
     `scale` is this file's px per px as captured (`lens.native_scale`): the calibration refers to
     the latter.
     """
     native = (round(width / scale), round(height / scale))
-    found = (
-        _dewarp(xmp, native)
-        or _perspective(exif, xmp, sensor, native)
-        or _calibrated_focal(xmp, native)
+    readers: tuple[tuple[str, Callable[[], Camera | str | None]], ...] = (
+        ("DewarpData", lambda: _dewarp(xmp, native)),
+        ("Camera:Perspective...", lambda: _perspective(exif, xmp, sensor, native)),
+        ("CalibratedFocalLength", lambda: _calibrated_focal(xmp, native)),
     )
-    return found and found.rescaled(width, height)
+    other = None if digital_zoom(exif) > 1 else _on_sensor(exif, sensor, *native)
+    nonsense: list[str] = []
+    for name, read in readers:
+        found = read()
+        if isinstance(found, Camera):
+            found = _of_this_size(found, other)
+        if isinstance(found, Camera):
+            return FoundCalibration(camera=found.rescaled(width, height), nonsense=tuple(nonsense))
+        if found:
+            nonsense.append(f"{name}: {found}")
+    return FoundCalibration(nonsense=tuple(nonsense))
 
 
-def _dewarp(xmp: Xmp, size: tuple[int, int]) -> Camera | None:
+_ANOTHER_SIZE = 1.3
+"""A calibrated focal length that differs from the camera's own by more than this factor belongs to
+a picture of another size.
+"""
+
+
+def _of_this_size(camera: Camera, sensor: Focal | None) -> Camera | str:
+    """The camera, or why it cannot be that of a photo with this focal length by its sensor."""
+    if sensor is None or 1 / _ANOTHER_SIZE < camera.focal / sensor.px < _ANOTHER_SIZE:
+        return camera
+    return (
+        f"its focal length of {camera.focal:.4g} px is that of a picture of another size; the"
+        f" camera has {sensor.px:.4g} px"
+    )
+
+
+def _dewarp(xmp: Xmp, size: tuple[int, int]) -> Camera | str | None:
     """`DewarpData`: `date;fx,fy,cx,cy,k1,k2,p1,p2,k3`, cx and cy from the image centre;
-    `DewarpDataK6` has k4, k5, k6 besides. Flag 1: already undistorted.
+    `DewarpDataK6` has k4, k5, k6 besides. Flag 1: already undistorted. Zeros alone tell nothing.
     """
+    found: Camera | str | None = None
     for name, count in (("DewarpData", 9), ("DewarpDataK6", 12)):
         _, _, text = xmp.text(name).partition(";")
+        if not text.strip():
+            continue
         try:
             numbers = tuple(float(n) for n in text.split(","))
         except ValueError:
-            continue
-        if len(numbers) == count and all(math.isfinite(n) for n in numbers):
+            numbers = ()
+        if len(numbers) != count or not all(math.isfinite(n) for n in numbers):
+            found = found or f"it is not {count} finite numbers"
+        elif any(numbers):
+            found = _dewarped(numbers, xmp.number("DewarpFlag") == 1, size)
+        if isinstance(found, Camera):
             break
-    else:
-        return None
+    return found
+
+
+def _dewarped(numbers: Sequence[float], flat: bool, size: tuple[int, int]) -> Camera | str:
     fx, fy, cx, cy, k1, k2, p1, p2, k3, *rational = numbers
     if not (fx > 0 and fy > 0):
-        return None
+        return f"a focal length of {fx:.4g}, {fy:.4g} px"
     if any(rational):
         k1, k2, k3 = _polynomial((k1, k2, k3), rational, math.hypot(*size) / 2 / fx)
-    if xmp.number("DewarpFlag") == 1:
+    if flat:
         k1 = k2 = k3 = p1 = p2 = 0.0
     centre = (cx + size[0] / 2, cy + size[1] / 2)
     return _camera(size, fx, centre, (k1, k2, k3, p1, p2), aspect=fy / fx)
@@ -262,7 +307,7 @@ def _polynomial(
 
 def _perspective(
     exif: Exif, xmp: Xmp, sensor: Sensor | None, size: tuple[int, int]
-) -> Camera | None:
+) -> Camera | str | None:
     """Lengths in mm on the sensor, from its corner; distortion as OpenCV's k1, k2, k3, p1, p2."""
     mm = xmp.number("Camera:PerspectiveFocalLength")
     if not mm or xmp.text("Camera:ModelType").lower() == "fisheye":
@@ -290,7 +335,7 @@ def _px_per_mm(exif: Exif, sensor: Sensor | None, size: tuple[int, int]) -> floa
     return max(size) / sensor.width_mm if sensor else None
 
 
-def _calibrated_focal(xmp: Xmp, size: tuple[int, int]) -> Camera | None:
+def _calibrated_focal(xmp: Xmp, size: tuple[int, int]) -> Camera | str | None:
     """DJI's value in px; its optical centre is counted from the image's corner."""
     focal = xmp.number("CalibratedFocalLength")
     x, y = xmp.number("CalibratedOpticalCenterX"), xmp.number("CalibratedOpticalCenterY")
@@ -305,19 +350,20 @@ def _camera(
     distortion: tuple[float, ...] | None,
     *,
     aspect: float = 1.0,
-) -> Camera | None:
-    """A camera from px counted from the corner; None where the numbers are not plausible for a
-    lens.
-    """
+) -> Camera | str:
+    """A camera from px counted from the corner, or why the numbers are not those of a lens."""
     long = max(size)
-    inside = all(0.25 * s < c < 0.75 * s for c, s in zip(centre, size, strict=True))
-    if not (
-        0.2 * long < focal < 60 * long
-        and inside
-        and 0.9 < aspect < 1.1
-        and all(abs(k) < 10 for k in distortion or ())
-    ):
-        return None
+    if not _PLAUSIBLE[0] * long < focal < _PLAUSIBLE[1] * long:
+        return f"a focal length of {focal:.4g} px in a picture of {size[0]} x {size[1]} px"
+    if not all(0.25 * s < c < 0.75 * s for c, s in zip(centre, size, strict=True)):
+        return (
+            f"a principal point at {centre[0]:.4g}, {centre[1]:.4g} px in a picture of"
+            f" {size[0]} x {size[1]} px"
+        )
+    if not 0.9 < aspect < 1.1:
+        return f"focal lengths along columns and rows that differ by the factor {aspect:.4g}"
+    if not all(abs(k) < 10 for k in distortion or ()):
+        return "a distortion that no lens has"
     k1, k2, k3, p1, p2 = distortion or (0.0,) * 5
     shape = _SIGMA_ASPECT if aspect != 1 else _UNTOLD[-1]
     told = (*(_SIGMA_RADIAL,) * 3, *(_SIGMA_TANGENTIAL,) * 2, shape)

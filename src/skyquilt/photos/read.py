@@ -87,6 +87,7 @@ class _Lens:
     sensor: Sensor | None
     thermal: bool
     calibration: Camera | None
+    nonsense: tuple[str, ...]
     focal: Focal
     captured_mp: float
     notes: tuple[str, ...]
@@ -128,6 +129,7 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         stored=frame.stored if frame else "",
         camera_key=_camera_key(header, width, height),
         calibration=lens.calibration,
+        unusable_calibration=" and ".join(lens.nonsense),
         focal=lens.focal,
         position=position,
         attitude=attitude,
@@ -167,22 +169,24 @@ def _lens(header: Header, width: int, height: int, *, thermal: bool) -> _Lens:
     scale, note = native_scale(exif, width, height)
     sensor = find_sensor(model=exif.text(tag.MODEL), long_side=round(max(width, height) / scale))
     thermal = thermal or (sensor is not None and sensor.band == "thermal") or _is_lwir(header)
-    calibration = read_calibration(
+    found = read_calibration(
         exif=exif, xmp=header.xmp, sensor=sensor, width=width, height=height, scale=scale
     )
     focal = find_focal(
         exif=exif,
         sensor=sensor,
-        calibration=calibration,
+        calibration=found.camera,
         width=width,
         height=height,
         thermal=thermal,
     )
-    notes = (note, *focal_notes(exif, sensor, width, height))
+    told = tuple(f"Its calibration was ignored: {n}." for n in found.nonsense)
+    notes = (note, *focal_notes(exif, sensor, width, height), *told)
     return _Lens(
         sensor=sensor,
         thermal=thermal,
-        calibration=calibration,
+        calibration=found.camera,
+        nonsense=found.nonsense,
         focal=focal,
         captured_mp=width * height / scale**2 / 1e6,
         notes=notes,

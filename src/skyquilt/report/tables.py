@@ -36,7 +36,7 @@ MEANINGS = {
 FAR = 3.0
 """Number of standard deviations of the prior from which a parameter counts as far from it."""
 UNITS = {"yaw": "\u00b0", "altitude": " m", "position": " m", "focal": " px"} | dict.fromkeys(
-    ("lens", "principal_point"), " px"
+    ("lens", "principal_point", "calibration"), " px"
 )
 
 
