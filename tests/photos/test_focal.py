@@ -108,6 +108,17 @@ def test_a_calibration_that_no_lens_has_is_ignored_and_named(make_jpeg, numbers,
     assert f"Its calibration was ignored: {photo.unusable_calibration}." in photo.notes
 
 
+def test_a_calibration_that_agrees_with_the_35_mm_equivalent_is_believed(make_jpeg):
+    """A model with a long lens beside that of the table: 500 px of 120 x 90 are 144 mm."""
+    exif = exif_of("FC300S", FocalLengthIn35mmFilm=144)
+    xmp = dji_xmp(DewarpData="2018-09-04;500,500,0,0,0,0,0,0,0")
+    photo = read_photo(make_jpeg(image=pixels(120, 90), exif=exif, xmp=xmp))
+    assert photo.calibration.focal == pytest.approx(500) and not photo.unusable_calibration
+    short = exif_of("FC300S", FocalLengthIn35mmFilm=20)
+    photo = read_photo(make_jpeg(image=pixels(120, 90), exif=short, xmp=xmp))
+    assert photo.calibration is None and "of another size" in photo.unusable_calibration
+
+
 def test_a_usable_calibration_is_taken_where_another_one_is_not(make_jpeg):
     xmp = dji_xmp(DewarpData="d;-1,-1,0,0,0,0,0,0,0", CalibratedFocalLength="70")
     photo = read_photo(make_jpeg(image=pixels(120, 90), exif=dji_exif(), xmp=xmp))

@@ -227,12 +227,13 @@ def read_calibration(
         ("Camera:Perspective...", lambda: _perspective(exif, xmp, sensor, native)),
         ("CalibratedFocalLength", lambda: _calibrated_focal(xmp, native)),
     )
-    other = None if digital_zoom(exif) > 1 else _on_sensor(exif, sensor, *native)
+    found_otherwise = (_on_sensor(exif, sensor, *native), _from_35mm(exif, *native))
+    others = () if digital_zoom(exif) > 1 else tuple(f for f in found_otherwise if f is not None)
     nonsense: list[str] = []
     for name, read in readers:
         found = read()
         if isinstance(found, Camera):
-            found = _of_this_size(found, other)
+            found = _of_this_size(found, others)
         if isinstance(found, Camera):
             return FoundCalibration(camera=found.rescaled(width, height), nonsense=tuple(nonsense))
         if found:
@@ -246,13 +247,17 @@ a picture of another size.
 """
 
 
-def _of_this_size(camera: Camera, sensor: Focal | None) -> Camera | str:
-    """The camera, or why it cannot be that of a photo with this focal length by its sensor."""
-    if sensor is None or 1 / _ANOTHER_SIZE < camera.focal / sensor.px < _ANOTHER_SIZE:
+def _of_this_size(camera: Camera, others: Sequence[Focal]) -> Camera | str:
+    """The camera, or why it cannot be that of a photo with these focal lengths by its sensor and
+    its 35 mm equivalent. One that agrees is enough: a model's lenses may be confused.
+    """
+    if not any(f.source == "sensor" for f in others) or any(
+        1 / _ANOTHER_SIZE < camera.focal / f.px < _ANOTHER_SIZE for f in others
+    ):
         return camera
     return (
         f"its focal length of {camera.focal:.4g} px is that of a picture of another size; the"
-        f" camera has {sensor.px:.4g} px"
+        f" camera has {others[0].px:.4g} px"
     )
 
 
