@@ -493,6 +493,11 @@ def _deep(path):
     path.write_bytes(b"[" * 200_000)
 
 
+def _other(path):
+    """Another photo of the same size takes its place."""
+    path.write_bytes(named(path.parent)[0].read_bytes())
+
+
 def _half(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -521,7 +526,13 @@ def test_what_is_spoiled_between_runs_is_made_again_or_named(mosaic, flight, fin
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("stage", "spoil"),
-    [("features", _loop), ("links", Path.unlink), ("mosaic", _half), ("report", _pipe)],
+    [
+        ("features", _loop),
+        ("links", Path.unlink),
+        ("mosaic", _half),
+        ("mosaic", _other),
+        ("report", _pipe),
+    ],
 )
 def test_a_photo_spoiled_while_a_map_is_made_is_left_out(
     photos, tmp_path, monkeypatch, stage, spoil

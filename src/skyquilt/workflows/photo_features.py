@@ -16,10 +16,11 @@ from skyquilt.engine.clock import Steps
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
-from skyquilt.errors import NoPhotosError, OutputError, PhotoFailedError
+from skyquilt.errors import NoPhotosError, OutputError, PhotoFailedError, UnreadablePhotoError
 from skyquilt.imaging.grey import halved, shrink, to_grey8
 from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo, RejectedPhoto
+from skyquilt.photos.headers import content_digest
 from skyquilt.photos.kept_frames import kept_frame
 from skyquilt.photos.pixels import decode_jpeg, read_color
 from skyquilt.photos.read import rejected
@@ -187,10 +188,13 @@ def pixels_of(photo: Photo, store: Store) -> NDArray[Any]:
     costs as much as several photos.
 
     Raises:
-        UnreadablePhotoError: they cannot be decoded. OutputError: a frame cannot be stored.
+        UnreadablePhotoError: they cannot be decoded, or its file holds another photo. OutputError: a frame cannot be stored.
     """
     if photo.frame_s is None:
-        return read_color(photo)
+        pixels = read_color(photo)
+        if content_digest(photo.path) != photo.digest:
+            raise UnreadablePhotoError("is another photo than the one that was read before")
+        return pixels
     body = store.get_or(FRAMES, photo.digest, lambda: kept_frame(read_color(photo)))
     return decode_jpeg(body.tobytes())
 
