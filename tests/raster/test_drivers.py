@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import rasterio
 
-from skyquilt.errors import UsageError
+from skyquilt.errors import SideFileError, UsageError
 from skyquilt.raster.map_source import FileSource
 from skyquilt.raster.read_map import open_map
 from skyquilt.server.shown import base_map
@@ -41,7 +41,7 @@ def test_a_map_is_read(tmp_path):
 
 def test_a_file_that_names_others_is_not(lure):
     assert open_map(lure) is None
-    with pytest.raises(rasterio.errors.RasterioIOError):
+    with pytest.raises(SideFileError, match="cannot be read as a map"):
         FileSource(path=lure).about()
     with pytest.raises(UsageError, match="not a georeferenced map"):
         base_map(lure)
