@@ -54,3 +54,8 @@ def finished(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished
     events = list(iter_mosaic(flight / "photos", output, settings))
     assert isinstance(events[-1], Result)
     return Finished(output=output, events=events)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest test begins first, so that it does not run alone after all others."""
+    items.sort(key=lambda item: "test_large_survey" not in item.nodeid)
