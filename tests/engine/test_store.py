@@ -1,4 +1,6 @@
 import errno
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -141,4 +143,20 @@ def test_two_processes_may_make_the_same_result(store, monkeypatch):
     monkeypatch.setattr("skyquilt.engine.store.write", meanwhile)
     store.put("stage", "key", [1])
     assert store.get("stage", "key") == [1]
+    assert not list(store.folder.rglob("*.partial"))
+
+
+def test_threads_that_make_the_same_do_not_take_it_from_one_another(store):
+    """Eight threads store one key at a time, a hundred times."""
+    meet = threading.Barrier(8, timeout=30)
+
+    def put(k):
+        for n in range(100):
+            meet.wait()
+            store.put("stage", f"{n}", [n] * 200)
+        return k
+
+    with ThreadPoolExecutor(8) as pool:
+        assert list(pool.map(put, range(8))) == list(range(8))
+    assert all(store.get("stage", f"{n}") == [n] * 200 for n in range(100))
     assert not list(store.folder.rglob("*.partial"))

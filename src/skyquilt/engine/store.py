@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import shutil
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -146,8 +147,9 @@ class Store:
         """
         self.misses += 1
         path = self.folder / stage / f"{key}.npz"
-        # another process may make the same at the same time
-        partial = path.with_suffix(f".{platform.node()}-{os.getpid()}.partial")
+        # another process or thread may make the same at the same time
+        maker = f"{platform.node()}-{os.getpid()}-{threading.get_ident()}"
+        partial = path.with_suffix(f".{maker}.partial")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with partial.open("wb") as file:

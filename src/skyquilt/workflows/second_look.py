@@ -57,6 +57,10 @@ class CloserLook:
 
         return self.store.get_or("features", key, found)
 
+    def prepare(self, photo: int) -> None:
+        """Finds the features of a photo (index), so that its pairs need not."""
+        self(photo)
+
     def pair(self, pair: Pair) -> Link | RejectedLink:
         """The link of two photos, or the reason why there is none."""
         a, b = pair
@@ -88,9 +92,12 @@ def connect(
         return found, links
     more = replace(methods, detector=detector.counted(MORE * detector.count))
     look = CloserLook(photos=found.photos, grey=grey, methods=more, store=store)
-    better = list[Link]()
+    photos = sorted({i for pair in pairs for i in pair})
+    total, better = len(photos) + len(pairs), list[Link]()
+    for done, _ in enumerate(workers.each(look.prepare, photos)):
+        yield done + 1, total
     for done, link in enumerate(workers.each(look.pair, pairs)):
-        yield done + 1, len(pairs)
+        yield len(photos) + done + 1, total
         if isinstance(link, Link):
             better.append(link)
     if not better:
