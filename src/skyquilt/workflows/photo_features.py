@@ -188,7 +188,8 @@ def pixels_of(photo: Photo, store: Store) -> NDArray[Any]:
     costs as much as several photos.
 
     Raises:
-        UnreadablePhotoError: they cannot be decoded, or its file holds another photo. OutputError: a frame cannot be stored.
+        UnreadablePhotoError: they cannot be decoded, or its file holds another photo.
+        OutputError: a frame cannot be stored.
     """
     if photo.frame_s is None:
         pixels = read_color(photo)
