@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyquilt.model.raster import Grid, Window
+from skyquilt.model.raster import Grid, Window, meet
 from skyquilt.model.surface import Surface
 from skyquilt.ortho import earlier
-from skyquilt.ortho.earlier import ALIGNED, EarlierMap, Growth, meet, with_new
+from skyquilt.ortho.earlier import ALIGNED, EarlierMap, Growth, with_new
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.labels import Labels
 

@@ -6,6 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+Bounds = tuple[float, float, float, float]
+"""West, south, east and north in m in the map frame."""
+
+
+def meet(a: Bounds, b: Bounds) -> bool:
+    """Whether two rectangles share ground."""
+    return a[0] < b[2] and a[2] > b[0] and a[1] < b[3] and a[3] > b[1]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Grid:

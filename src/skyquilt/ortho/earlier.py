@@ -8,13 +8,11 @@ from numpy.typing import NDArray
 
 from skyquilt.imaging.nodes import View
 from skyquilt.model.poses import Alignment, Pose
-from skyquilt.model.raster import Grid, Window
+from skyquilt.model.raster import Bounds, Grid, Window, meet
 from skyquilt.model.surface import Surface, least_cell
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.labels import Labels
 
-Bounds = tuple[float, float, float, float]
-"""West, south, east and north in m in the map frame."""
 MARGIN = 0.25
 """Ground around the photos that changed which is made anew, too, as a share of their width: what is
 found there depends on what lies beside it.
@@ -62,6 +60,12 @@ class Growth:
     def key(self) -> tuple[str, tuple[Bounds, ...]]:
         """What a result made with it depends on, beside what is made anew."""
         return self.earlier.key, self.areas
+
+    def share(self, grid: Grid) -> float:
+        """The part of a map that is made anew; above 1 where areas reach beyond it."""
+        west, south, east, north = grid.bounds
+        size = sum((a[2] - a[0]) * (a[3] - a[1]) for a in self.areas)
+        return size / ((east - west) * (north - south))
 
     def near(self, views: Sequence[View], area: Bounds) -> list[View]:
         """Views that show a part of an area."""
@@ -236,11 +240,9 @@ def growth(
     boxes = [_widened(v.footprint, margin) for v in changed]
     areas = tuple(sorted(_joined(boxes)))
     found = Growth(earlier=earlier, areas=areas, margin=margin)
-    west, south, east, north = found.grown(_around(views, earlier.grid)).bounds
-    size = sum((a[2] - a[0]) * (a[3] - a[1]) for a in areas)
     wide = found.grown(_around(views, earlier.grid))
     finer = earlier.labels is not None and earlier.labels.factor < least_cell(wide)
-    if size > MOST * (east - west) * (north - south) or finer:
+    if found.share(wide) > MOST or finer:
         return None
     if earlier.surface.source == "plane":  # there was nothing to make heights of
         return None
@@ -258,11 +260,6 @@ def same_pose(a: Pose, b: Pose) -> bool:
         (p is None and q is None) or (p is not None and q is not None and np.array_equal(p, q))
         for p, q in pairs
     )
-
-
-def meet(a: Bounds, b: Bounds) -> bool:
-    """Whether two rectangles share ground."""
-    return a[0] < b[2] and a[2] > b[0] and a[1] < b[3] and a[3] > b[1]
 
 
 def _around(views: Sequence[View], grid: Grid) -> Grid:

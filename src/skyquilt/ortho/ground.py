@@ -16,9 +16,9 @@ from skyquilt.imaging.nodes import View
 from skyquilt.imaging.view_limits import USUAL, ViewLimits, limits_for
 from skyquilt.imaging.views import grid_of, make_views, native_gsd
 from skyquilt.model.poses import Alignment
-from skyquilt.model.raster import Grid
+from skyquilt.model.raster import Bounds, Grid
 from skyquilt.model.surface import Surface
-from skyquilt.ortho.earlier import Bounds, EarlierMap, Growth, growth
+from skyquilt.ortho.earlier import EarlierMap, Growth, growth
 from skyquilt.ortho.tie_surface import level
 from skyquilt.settings import PictureSettings
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from skyquilt.engine.kept import Keep
 from skyquilt.engine.workers import Workers
 from skyquilt.imaging.nodes import View
-from skyquilt.model.raster import Grid
+from skyquilt.model.raster import Grid, meet
 from skyquilt.model.surface import STRIP, Surface, least_cell
 from skyquilt.ortho.fill import nearest_known, plateaus, settled
 from skyquilt.ortho.pair_matching import Array, Float, Mask, Pair, matched_points, pair_of
@@ -254,7 +254,7 @@ def _fused(given: _Round, pairs: Sequence[tuple[Pair, Level]], name: str, keep: 
                 width=min(TILE, cells.width - column),
                 height=min(TILE, cells.height - row),
             )
-            near = [k for k, (p, _) in enumerate(pairs) if _meet(p.bounds, part.bounds)]
+            near = [k for k, (p, _) in enumerate(pairs) if meet(p.bounds, part.bounds)]
             inner = (slice(row, row + part.height), slice(column, column + part.width))
             at = (row, column, part.height, part.width)
             out[inner] = keep(
@@ -427,10 +427,6 @@ def surface_of(z: Float, cells: Grid) -> Surface:
         cell=cells.gsd,
         source="multi-view matching",
     )
-
-
-def _meet(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
-    return a[0] < b[2] and a[2] > b[0] and a[1] < b[3] and a[3] > b[1]
 
 
 Covered = tuple[slice, slice, Mask]

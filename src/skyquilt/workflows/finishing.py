@@ -1,5 +1,6 @@
 """What a run tells about photos that were added, and what it leaves for more of them."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -38,11 +39,7 @@ def added_figures(aligned: AlignedPhotos, ground: Ground) -> dict[str, Any]:
         return {}
     before, now = earlier.alignment_of(aligned.photos).poses, aligned.alignment.poses
     moved = sum(i in now and not same_pose(now[i], p) for i, p in before.items())
-    west, south, east, north = ground.grid.bounds
-    share = 1.0
-    if ground.growth is not None:
-        size = sum((a[2] - a[0]) * (a[3] - a[1]) for a in ground.growth.areas)
-        share = min(1.0, size / ((east - west) * (north - south)))
+    share = 1.0 if ground.growth is None else min(1.0, ground.growth.share(ground.grid))
     return {
         "added": {
             "photos": len(aligned.photos) - len(earlier.finished.photos),
@@ -53,9 +50,8 @@ def added_figures(aligned: AlignedPhotos, ground: Ground) -> dict[str, Any]:
     }
 
 
-def added_note(aligned: AlignedPhotos, ground: Ground) -> Note:
+def added_note(figures: Mapping[str, Any]) -> Note:
     """The same in a sentence."""
-    found = added_figures(aligned, ground).get("added")
-    if not found:
+    if not figures:
         return Note(text="The map could not be continued, so all of it is made anew.")
-    return Note(text=added_sentence(found))
+    return Note(text=added_sentence(figures["added"]))

@@ -23,10 +23,9 @@ from skyquilt.engine.workers import Workers
 from skyquilt.model.event import Event, Note
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import Alignment, MapFrame, Prior
-from skyquilt.model.raster import Grid
+from skyquilt.model.raster import Bounds, Grid
 from skyquilt.ortho import companions, ground, orthomosaic
 from skyquilt.ortho.compose import Composer
-from skyquilt.ortho.earlier import Bounds
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.labels import Labels

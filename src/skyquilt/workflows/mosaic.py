@@ -272,8 +272,9 @@ def _made(given: SurveyInput, make: _Making) -> Generator[Event, None, dict[str,
     aligned = yield from align_photos(given, methods, settings, clock, make.earlier)
     _log(output, aligned.found.rejected)
     ground = yield from find_ground(aligned, methods, settings, clock, output)
+    added = added_figures(aligned, ground)
     if make.earlier is not None:
-        yield added_note(aligned, ground)
+        yield added_note(added)
     drawn = yield from draw_map(aligned, ground, methods, settings, clock, output, make.key)
     if settings.input.write_frames:
         writing = write_frames(output, aligned.photos, aligned.pixels)
@@ -281,7 +282,7 @@ def _made(given: SurveyInput, make: _Making) -> Generator[Event, None, dict[str,
     measuring = _measured(aligned, ground, drawn, settings, clock.workers)
     seams, quality = yield from clock.stage("measure", measuring, keeps=False)
     metrics = _metrics(aligned, ground, drawn, seams, settings) | {"quality": quality}
-    metrics |= added_figures(aligned, ground) if make.earlier is not None else {}
+    metrics |= added
     aligned.found.looks.make_room()
     give_back()
     finishing = finish_run(
