@@ -114,9 +114,26 @@ def variations(pairs: tuple[Pair, ...], rounds: int, rng: np.random.Generator) -
     )
 
 
+Row = tuple[str, float, float, bool, str]
+"""Class, stated and actual error in px, whether the stated one is tolerated, what is beside it."""
+
+
 def stated(pairs: tuple[Pair, ...], count: int, corners: float, rng: np.random.Generator) -> None:
+    """Prints how far stated errors hold."""
+    rows = stated_errors(pairs, count, corners, rng)
+    for kind in dict.fromkeys(r[0] for r in rows):
+        print(f"  {kind:16} {held([r for r in rows if r[0] == kind])}")
+    for how in dict.fromkeys(r[4] for r in rows):
+        print(f"  {how:16} {held([r for r in rows if r[4] == how])}")
+    print(f"stated: {held(rows)}")
+    print(f"of these within the default tolerance: {held([r for r in rows if r[3]])}")
+
+
+def stated_errors(
+    pairs: tuple[Pair, ...], count: int, corners: float, rng: np.random.Generator
+) -> list[Row]:
     """Stated errors of `count` accepted registrations of pictures that are blank in part."""
-    rows: list[tuple[str, float, float, bool, str]] = []
+    rows: list[Row] = []
     tried = 0
     while len(rows) < count:
         for pair, picture, truth, _ in varied(pairs, rng, 30.0):
@@ -133,15 +150,10 @@ def stated(pairs: tuple[Pair, ...], count: int, corners: float, rng: np.random.G
             actual = corner_error(found.b_H_a, truth, a.shape[:2], b.shape[:2])
             rows.append((pair.kind, told.error_px, actual, told.error_px <= told.tolerance_px, how))
         print(f"  {len(rows)} of {tried} accepted", flush=True)
-    for kind in dict.fromkeys(r[0] for r in rows):
-        print(f"  {kind:16} {held([r for r in rows if r[0] == kind])}")
-    for how in dict.fromkeys(r[4] for r in rows):
-        print(f"  {how:16} {held([r for r in rows if r[4] == how])}")
-    print(f"stated: {held(rows)}")
-    print(f"of these within the default tolerance: {held([r for r in rows if r[3]])}")
+    return rows
 
 
-def held(rows: list[tuple[str, float, float, bool, str]]) -> str:
+def held(rows: list[Row]) -> str:
     told, actual = np.array([r[1] for r in rows]), np.array([r[2] for r in rows])
     if not len(rows):
         return "none"

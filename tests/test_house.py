@@ -242,3 +242,20 @@ def test_few_files_lie_on_the_way_of_a_photo_and_of_an_upload():
     # six files have outgrown 300 lines and wait to be divided; none may grow beyond this
     long = [int(n) for n in re.findall(r"\((\d+)\)", said)]
     assert max(long, default=0) <= 430, said
+
+
+def test_the_page_on_the_papers_names_tests_and_commands_that_there_are():
+    """docs/papers.md: every test that it says holds a claim, and every command that remakes one."""
+    text = (ROOT / "docs" / "papers.md").read_text()
+    named = re.findall(r"`(?:tests/)?([a-z]+/test_\w+\.py)?(?:::)?(test_\w+)?`", text)
+    named = [(file, test) for file, test in named if file or test]
+    assert len(named) > 40
+    for file, test in named:
+        files = [ROOT / "tests" / file] if file else list((ROOT / "tests").rglob("test_*.py"))
+        assert any(f"def {test}" in f.read_text() for f in files), (file, test)
+    rows = re.search(r"## Every table and figure(.*?)\n## ", text, re.S)
+    listed = re.search(r"^NAMES.*?^}", (ROOT / "benchmarks" / "papers.py").read_text(), re.S | re.M)
+    assert rows is not None and listed is not None
+    commands = set(re.findall(r"`((?:table|fig|eq)-[0-9a-z.]+|depth-maps|models|mse)`", rows[1]))
+    assert len(commands) >= 12
+    assert commands <= set(re.findall(r'^    "([^"]+)":', listed[0], re.M))

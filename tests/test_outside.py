@@ -16,6 +16,7 @@ from skyquilt.outside import (
     read_bounded,
     real,
     shown,
+    text_of,
     unzipped,
     walk,
     whole,
@@ -52,6 +53,15 @@ def test_text_cannot_steer_a_terminal():
     assert "\n" not in plain(name) and plain(name).encode()
     assert shown("Straße 測 é") == "Straße 測 é"
     assert len(shown("x" * 10_000)) < 5000
+
+
+def test_text_is_read_as_editors_save_it():
+    for encoding in ("utf-8", "utf-8-sig", "utf-16"):
+        assert text_of("Höhe, é\n".encode(encoding)) == "Höhe, é\n"
+    assert text_of(b"\xfe\xff" + "Höhe".encode("utf-16-be")) == "Höhe"
+    assert text_of(b"H\xf6he") == "Höhe"
+    assert text_of(b"\xff\xfeH\0o") == "H\ufffd"  # torn
+    assert text_of(b"") == ""
 
 
 @pytest.mark.parametrize("kind", ["fifo", "socket", "folder", "device"])

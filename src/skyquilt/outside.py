@@ -4,11 +4,14 @@ Readers and endpoints use these functions and no others for the purpose, so that
 one place. docs/security.md lists the limits.
 """
 
+import codecs
 import errno
 import math
 import os
 import re
+import sqlite3
 import stat
+import time
 import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +28,10 @@ drones carry have 150.
 """
 BUDGET_PER_PX = 4
 """Bytes per pixel of the largest allowed area that decoding one photo may need."""
+MOST_VALUE_BYTES = 256_000_000
+"""Largest value of a row: a layer as text has some 100 MB."""
+MOST_QUERY_S = 60.0
+"""CPU time after which a query is given up."""
 MOST_ASPECT = 20
 """Largest ratio of a photo's sides."""
 LEAST_SIDE = 32
@@ -136,6 +143,18 @@ def read_bounded(path: Path, most: int = MOST_TEXT_BYTES) -> bytes:
     return data
 
 
+def text_of(data: bytes) -> str:
+    """A text file's content: UTF-16 where it begins with that mark, as Windows programs save it,
+    else UTF-8, else Latin-1, of which any bytes are.
+    """
+    if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        return data.decode("utf-16", "replace")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
 def unzipped(archive: "ZipFile", name: str, most: int) -> bytes:
     """The content of a file in an archive, of at most `most` bytes whatever it declares.
 
@@ -225,3 +244,24 @@ def check_picture(
             f"its file of {file_bytes // 10**6} MB is far larger than its {width}x{height} px can"
             " need"
         )
+
+
+class Database(sqlite3.Connection):
+    """A connection whose queries end; those of several threads follow one another."""
+
+    _end = float("inf")
+
+    def limit(self) -> None:
+        """Sets the limits."""
+        self.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MOST_VALUE_BYTES)
+        self.set_progress_handler(lambda: time.thread_time() > self._end, 100_000)
+
+    def execute(self, *query: Any) -> sqlite3.Cursor:
+        """As `sqlite3.Connection.execute`, for so much CPU time until its last row."""
+        self._end = time.thread_time() + MOST_QUERY_S
+        return super().execute(*query)
+
+    def executemany(self, *query: Any) -> sqlite3.Cursor:
+        """The same for many rows of values."""
+        self._end = time.thread_time() + MOST_QUERY_S
+        return super().executemany(*query)

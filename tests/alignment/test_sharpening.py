@@ -36,15 +36,19 @@ def scene():
 
 
 def sharpened(scene, px):
+    found = matched(scene, px)
+    return found.px, found.sigma_px
+
+
+def matched(scene, px):
     views, pictures, xyz, tracks = scene
-    found = LeastSquaresMatching()(
+    return LeastSquaresMatching()(
         Tracks(point=tracks.point, photo=tracks.photo, px=px, sigma_px=tracks.sigma_px),
         xyz,
         {i: v.pose for i, v in views.items()},
         {i: v.camera for i, v in views.items()},
         lambda photo, _: pictures[photo],
     )
-    return found.px, found.sigma_px
 
 
 def disturbed(scene):
@@ -68,6 +72,32 @@ def test_observations_move_to_where_the_central_one_looks(scene):
     before, after = (np.linalg.norm(p[moved] - truth[moved], axis=1) for p in (px, found))
     assert np.median(before) > 0.8 and np.median(after) < 0.1
     assert np.percentile(after, 95) < 0.4
+
+
+def test_where_photos_differ_observations_are_known_to_be_blunter(scene):
+    """In the western half each photo sees its own noise, as in leaves that move."""
+    views, pictures, xyz, tracks = scene
+    rng = np.random.default_rng(8)
+    west = xyz[tracks.point, 0] < 0
+    noisy = {}
+    for i, view in views.items():
+        height, width = pictures[i].shape
+        v, u = np.mgrid[:height, :width]
+        local = np.stack([(u - view.camera.cx), (v - view.camera.cy)], 2) / view.camera.focal
+        ray = np.concatenate([local, np.ones((height, width, 1))], 2) @ view.pose.cam_R_map
+        ground = view.pose.map_C[0] - ray[..., 0] / ray[..., 2] * view.pose.map_C[2]
+        level = np.where(ground < 0, 12.0, 0.0)
+        noisy[i] = np.clip(pictures[i] + rng.normal(0, 1, level.shape) * level, 0, 255).astype(
+            np.uint8
+        )
+    px, wrong = disturbed(scene)
+    found = matched((views, noisy, xyz, tracks), px)
+    moved = wrong & (found.sigma_px < 0.5)
+    error = np.linalg.norm(found.px - tracks.px, axis=1)
+    told = [np.median(found.relative[moved & side]) for side in (west, ~west)]
+    actual = [np.median(error[moved & side]) for side in (west, ~west)]
+    assert actual[0] > 1.5 * actual[1]
+    assert 0.6 < (told[0] / told[1]) / (actual[0] / actual[1]) < 1.6
 
 
 def test_what_does_not_look_alike_stays(scene):

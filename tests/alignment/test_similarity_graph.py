@@ -2,6 +2,7 @@
 are wrong.
 """
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -281,3 +282,17 @@ def test_tying_to_exact_positions_of_an_exact_block_changes_nothing():
     again = tie_to_positions(exact, links, t, np.full(len(t), 1.5))
     assert again.t == pytest.approx(t, abs=1e-5)
     assert (again.a == exact.a).all()
+
+
+def test_a_similarity_of_many_positions_needs_no_list_of_all_pairs():
+    rng = np.random.default_rng(5)
+    x = rng.normal(0, 500, 6000) + 1j * rng.normal(0, 500, 6000)
+    g, c = 2 * np.exp(0.3j), 40 - 7j
+    y = g * x + c + rng.normal(0, 1, 6000) + 1j * rng.normal(0, 1, 6000)
+    y[rng.random(6000) < 0.4] += 700
+    tracemalloc.start()
+    found = fit_similarity(x, y, np.ones(6000))
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert abs(found[0] - g) < 1e-3 and abs(found[1] - c) < 0.2
+    assert most < 150e6  # all pairs take 800 MB

@@ -1,4 +1,5 @@
 import json
+import os
 
 import pytest
 from typer.testing import CliRunner
@@ -42,6 +43,20 @@ def test_inspect_json(folder):
     assert record["photos"][0]["position"]["takeoff_m"] == 40
     assert record["rejected"] == [{"name": "bad.jpg", "reason": "it is empty (0 bytes)"}]
     assert record["contradictions"]
+
+
+def test_inspect_waits_for_no_pipe_and_shows_no_control_bytes(folder):
+    """Nor does it take words in brackets for colours."""
+    os.mkfifo(folder / "pipe.jpg")
+    (folder / "\x1b[31mred.jpg").write_bytes(b"\xff\xd8\xff no photo")
+    (folder / "[").mkdir()
+    (folder / "[" / "y][bold].jpg").write_bytes(b"\xff\xd8\xff no photo")
+    (folder / os.fsdecode(b"\xff\x9b.jpg")).write_bytes(b"")
+    result = CliRunner().invoke(app, ["inspect", str(folder)])
+    assert result.exit_code == 0, result.output
+    assert "DJI_0.JPG" in result.output
+    assert "\\x1b[31mred.jpg" in result.output and "[/y][bold].jpg" in result.output
+    assert not {"\x1b", "\x9b"} & set(result.output)
 
 
 def test_inspect_nothing(tmp_path):

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ import rasterio
 
 from skyquilt.engine import codec
 from skyquilt.engine.folder import CONTRACT
+from skyquilt.errors import OutputError
 from skyquilt.model.event import StageStarted
 from skyquilt.settings import MosaicSettings
 from skyquilt.workflows import flow
@@ -170,6 +172,39 @@ def test_a_disk_that_fills_up_while_intermediate_results_are_stored(
     told = mosaic(flight / "photos").refused(5, "disk is full", "make room", "same command again")
     monkeypatch.undo()
     same_result(mosaic(flight / "photos", output=told.output).made().output, finished)
+
+
+@pytest.mark.slow
+def test_a_disk_that_is_full_from_each_stage_on(flight, small_disk, finished):
+    """A sentence at each, or the stage needs no room; with room again the same command goes on."""
+    disk, said = small_disk("60m"), {}
+    settings = MosaicSettings(features=300, surface="ties", gsd_cm=30.0, jobs=2)
+    for stage in [*STAGES, ""]:
+        filler = disk / "filler"
+        try:
+            for event in iter_mosaic(flight / "photos", disk / "out", settings):
+                if isinstance(event, StageStarted) and event.stage == stage:
+                    fill(filler)
+            said[stage] = "finished"
+        except OutputError as error:
+            assert "disk is full" in str(error), stage
+            assert error.exit_code == 5
+            said[stage] = "full"
+        filler.unlink(missing_ok=True)
+        if said[stage] == "finished" and stage:
+            shutil.rmtree(disk / "out")
+    assert list(said.values()).count("full") >= len(STAGES) - 2, said
+    assert said[""] == "finished"
+    same_result(disk / "out", finished)
+
+
+def fill(path: Path) -> None:
+    """Leaves no byte on the disk of a file."""
+    with path.open("wb", buffering=0) as file, suppress(OSError):
+        for size in (1 << 20, 4096, 1):
+            with suppress(OSError):
+                while file.write(bytes(size)) == size:
+                    pass
 
 
 @pytest.mark.slow

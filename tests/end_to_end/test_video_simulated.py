@@ -1,6 +1,7 @@
 """A simulated clip becomes a map: poses against the truth, with positions and without."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -116,3 +117,27 @@ def test_other_maps_take_videos_or_say_that_they_do_not(flight, mixed, tmp_path)
     assert len(last.metrics["photos"]) > 4
     with pytest.raises(UsageError, match="holds only videos"):
         list(iter_thermal(flight[0] / "photos", flight[0] / "video", tmp_path / "thermal"))
+
+
+def test_a_clip_with_a_rolling_shutter(tmp_path):
+    """Rows are exposed over 25 ms while the drone flies and its camera sways: the map is as that of
+    a clip without, and the readout is found from a guess.
+    """
+    settings = sim.FlightSettings(
+        lens=replace(Lens().scaled(480, 360), readout=0.025),
+        route=Route(photos=6, sidelap=0.4, speed=8.0),
+        video=Video(fps=5.0),
+    )
+    for _ in sim.simulate(settings, tmp_path / "flight"):
+        pass
+    truth = json.loads((tmp_path / "flight" / "truth" / "truth.json").read_text())
+    frames = truth["clips"][0]["frames"]
+    result = skyquilt.mosaic(tmp_path / "flight" / "video" / "FLIGHT.MP4", tmp_path / "map")
+    solved, true, numbers = centres(tmp_path / "map", frames)
+    off = solved - true
+    assert result.metrics["photos_used"] == len(numbers)
+    assert (off - off.mean(axis=0))[:, :2].std() < 1.0
+    assert result.metrics["seam_disparity_px"]["median"] < 0.3
+    (told,) = result.metrics["shutter"].values()
+    assert told["source"] == "guess"
+    assert abs(told["readout_ms"] - 25) < 2 * told["sigma_ms"] < 25

@@ -1,5 +1,7 @@
 """The factor of a matrix of blocks against dense linear algebra."""
 
+from io import BytesIO
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -103,3 +105,41 @@ def test_what_is_not_positive_definite_is_refused():
     m.blocks[:] *= -1
     with pytest.raises(np.linalg.LinAlgError):
         Factor(m)
+
+
+def test_a_factor_in_a_file_is_the_one_in_memory(monkeypatch):
+    m = matrix(*grid(14, 14, 2))
+    rhs = np.random.default_rng(2).normal(0, 1, 14 * 14 * 3 + 2)
+    held = Factor(m)
+    monkeypatch.setattr(block_cholesky, "HELD", 0)
+    filed = Factor(m)
+    assert filed._parts._file is not None and not filed._parts._held
+    assert np.array_equal(filed.solve(rhs), held.solve(rhs))
+    a, b = filed.selected_inverse(), held.selected_inverse()
+    assert np.array_equal(a.blocks, b.blocks) and np.array_equal(a.corner, b.corner)
+
+
+def test_a_factor_for_which_the_disk_is_too_full_stays_in_memory(monkeypatch):
+    class Full:
+        """A file that takes three writes."""
+
+        def __init__(self, dir=None):
+            self.file, self.left = BytesIO(), 3
+
+        def writelines(self, parts):
+            self.left -= 1
+            if self.left < 0:
+                raise OSError(28, "No space left on device")
+            self.file.writelines(parts)
+
+        def __getattr__(self, name):
+            return getattr(self.file, name)
+
+    m = matrix(*grid(14, 14, 2))
+    rhs = np.ones(14 * 14 * 3 + 2)
+    held = Factor(m).solve(rhs)
+    monkeypatch.setattr(block_cholesky, "HELD", 0)
+    monkeypatch.setattr(block_cholesky, "TemporaryFile", Full)
+    factor = Factor(m)
+    assert factor._parts._file is None and len(factor._parts._held) == len(m.pattern.fronts) > 4
+    assert np.array_equal(factor.solve(rhs), held)

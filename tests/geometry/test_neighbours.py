@@ -1,10 +1,10 @@
-"""Nearest points against SciPy's k-d tree."""
+"""Nearest points and pairs against SciPy's k-d tree."""
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from skyquilt.geometry.neighbours import nearest
+from skyquilt.geometry.neighbours import nearest, pairs_within
 
 
 @pytest.mark.parametrize(
@@ -32,3 +32,18 @@ def test_points_at_one_place_are_all_found():
 def test_more_neighbours_than_points_are_refused(k):
     with pytest.raises(ValueError, match="1 to 3 neighbours"):
         nearest(np.zeros((3, 2)), np.zeros((1, 2)), k)
+
+
+@pytest.mark.parametrize("stretch", [(1.0, 1.0), (30.0, 0.1), (0.1, 30.0), (0.0, 0.0)])
+@pytest.mark.parametrize("count", [2, 7, 400])
+def test_pairs_within_reach_are_those_of_scipy(count, stretch):
+    points = np.random.default_rng(count).uniform(-50, 50, (count, 2)) * stretch
+    i, j = pairs_within(points, 12.0)
+    expected = sorted(cKDTree(points).query_pairs(12.0))
+    assert list(zip(i.tolist(), j.tolist(), strict=True)) == expected
+    assert count < 400 or expected
+
+
+def test_one_place_has_no_pairs():
+    assert not len(pairs_within(np.zeros((1, 2)), 5.0)[0])
+    assert not len(pairs_within(np.zeros((0, 2)), 5.0)[0])

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -206,5 +207,54 @@ def test_a_real_full_disk_refuses_and_loses_nothing(flight, small_disk):
     other = LiveMap(small_disk / "undisturbed", settings)
     for name in order:
         other.add(flight.folder / "photos" / name, "drone")
+    assert {m.photo.name: m.pose.map_C.tolist() for m in other.members.on_map()} == poses
+    other.close()
+
+
+@pytest.mark.slow
+def test_a_disk_that_is_full_from_each_write_point_on(drones, small_disk):
+    """No byte is left from the moment on at which a photo passes the point; with room again it goes
+    on, and poses are those of a map that was never disturbed.
+    """
+    from skyquilt.errors import OutputError
+    from skyquilt.live import ledger as points
+    from skyquilt.live.live_map import LiveMap
+    from skyquilt.live.settings import LiveSettings
+
+    bigger = ["-o", "remount,size=60m", str(small_disk)]
+    subprocess.run([shutil.which("mount"), *bigger], check=True)
+    settings = LiveSettings(features=300, deterministic=True)
+    live, filler, met = LiveMap(small_disk / "out", settings), small_disk / "filler", {}
+    photos = drones.photos[: len(points.POINTS)]
+    for name, photo in zip(points.POINTS, photos, strict=True):
+
+        def full(here, name=name):
+            if here == name and name not in met:
+                met[name] = ""
+                with filler.open("wb", buffering=0) as file, suppress(OSError):
+                    while file.write(bytes(1 << 20)):
+                        pass
+
+        points.watcher = full
+        for _ in range(2):
+            try:
+                live.add(photo, "drone")
+                break
+            except OutputError as error:
+                assert "full" in str(error) or "disk" in str(error)
+                met[name] = str(error)
+                filler.unlink()
+        points.watcher = points._nothing
+        filler.unlink(missing_ok=True)
+    for _ in live.drain():
+        pass
+    assert len(met) >= 7  # those that a folder and a viewer pass are not met here
+    assert sum(bool(said) for said in met.values()) >= 5, met
+    poses = {m.photo.name: m.pose.map_C.tolist() for m in live.members.on_map()}
+    assert set(poses) == {p.name for p in photos}
+    live.close()
+    other = LiveMap(small_disk / "undisturbed", settings)
+    for photo in photos:
+        other.add(photo, "drone")
     assert {m.photo.name: m.pose.map_C.tolist() for m in other.members.on_map()} == poses
     other.close()

@@ -341,6 +341,27 @@ def test_layers_that_are_refused(tmp_path, body):
             assert site.web.get("/layers").json() == {"layers": []}
 
 
+def test_a_layer_is_made_into_text_before_the_mapping_must_wait_for_it(tmp_path, monkeypatch):
+    """A large one takes a second, in which no photo could be stored."""
+    from types import SimpleNamespace
+
+    from skyquilt.live.ledger import Ledger
+    from skyquilt.server import layer_endpoints
+
+    ledger, locked = Ledger(tmp_path, write=True), []
+
+    def dumps(value):
+        locked.append(ledger.db.in_transaction)
+        return json.dumps(value)
+
+    monkeypatch.setattr(layer_endpoints, "json", SimpleNamespace(dumps=dumps))
+    layer = {"type": "FeatureCollection", "features": []}
+    assert layer_endpoints.put_layer(ledger, "a", layer, 9)
+    assert locked == [False]
+    assert [n for (n,) in ledger.rows("select name from layer")] == ["a"]
+    ledger.close()
+
+
 def test_a_full_disk_is_507_for_every_request_that_writes(tmp_path, monkeypatch):
     from skyquilt.live.ledger import Ledger
 

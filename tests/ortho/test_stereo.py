@@ -8,7 +8,7 @@ from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.engine.workers import Threads
 from skyquilt.model.camera import Camera
 from skyquilt.model.raster import Grid
-from skyquilt.ortho import fill
+from skyquilt.ortho import fill, stereo
 from skyquilt.ortho.fill import filled, nearest_known, plateaus, settled
 from skyquilt.ortho.pair_matching import pair_of
 from skyquilt.ortho.stereo import Stereo
@@ -167,7 +167,7 @@ def test_gaps_of_tall_rasters_are_filled_in_bands_as_in_one(monkeypatch):
     known = rng.random(z.shape) < 0.03
     known[300:560] = False
     spoilt = np.where(known, z, -99).astype(np.float32)
-    whole = nearest_known(spoilt, known)
+    whole = nearest_known(spoilt.copy(), known)
     monkeypatch.setattr(fill, "WHOLE", 128)
     monkeypatch.setattr(fill, "BEYOND", 40)
     bands = nearest_known(spoilt, known)
@@ -189,3 +189,17 @@ def test_gaps_are_filled_from_their_sides():
     soft = filled(np.where(known, z, 0), known)
     assert soft.min() >= 0 and soft.max() <= 10 and 3 < soft[20, 19] < 7
     assert plateaus(z, 7) == pytest.approx(z, abs=0.04)
+
+
+def test_heights_joined_in_bands_are_those_joined_at_once(monkeypatch):
+    rng = np.random.default_rng(1)
+    cells = Grid(west=0.0, north=60.0, gsd=0.2, width=150, height=300)
+    z = rng.normal(5, 1, (300, 150)).astype(np.float32)
+    known = rng.random(z.shape) < np.linspace(0, 0.6, 300)[:, None]
+    rough = stereo.surface_of(np.full((60, 30), 2.0, np.float32), cells.coarser(5))
+    whole = stereo._with_coarse(z, known, rough, cells, 15)
+    monkeypatch.setattr(stereo, "BAND", 37)
+    bands = stereo._with_coarse(z, known, rough, cells, 15)
+    assert np.array_equal(whole, bands)
+    share = (whole == 2.0).mean(1)
+    assert share[:60].min() > 0.9 and share[240:].max() < 0.1

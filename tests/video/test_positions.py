@@ -1,5 +1,6 @@
 """Timed positions and clocks, against flights whose truth is known."""
 
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -9,7 +10,10 @@ from skyquilt.errors import SideFileError
 from skyquilt.model.clip import Looks
 from skyquilt.video.clock import OffsetSearch
 from skyquilt.video.positions import METRES_PER_DEGREE, places_at, position_at
+from skyquilt.video.read import read_clip
 from skyquilt.video.tracks import Fix, read_track, track_of
+from skyquilt.workflows.clip_frames import FrameMethods, timed
+from tests.video.clips import filmed
 
 LAT, LON = 46.6, 14.3
 SHRINK = np.cos(np.radians(LAT))
@@ -103,6 +107,18 @@ def test_an_offset_is_found_where_the_flight_turns(shift, seed):
     assert found.clear
     assert found.seconds == pytest.approx(shift, abs=0.2)
     assert abs(found.seconds - shift) < 3 * found.sigma_s
+
+
+def test_a_clip_that_begins_after_its_positions_end_is_found_in_them(tmp_path):
+    """Positions two minutes late: further off than clocks usually are."""
+    times = np.arange(0, 60, 0.2)
+    late = track((0, 60), shift=120.0, noise=0.7)
+    clip = replace(read_clip(filmed(tmp_path, 2), name="A.MP4"), track=late)
+    seen, methods = looks_of(times, drift=1e-4), FrameMethods()
+    chosen, used, said = timed(clip, seen, methods.choose(clip, seen), methods, None)
+    assert used
+    assert chosen.offset_s == pytest.approx(120.0, abs=0.2)
+    assert "+120" in said[0] or "+119" in said[0]
 
 
 def test_a_straight_flight_does_not_tell_the_offset():

@@ -45,14 +45,14 @@ def lens_size(lens):
     return lens.width, lens.height
 
 
-def found_for(seed, layout, smooth_s, folder):
+def found_for(seed, layout, smooth_s, folder, *, noise=2.0, fps=5.0, fixes=2.0, **route):
     """The offset found for a flight, and its deviation."""
     settings = sim.FlightSettings(
         seed=seed,
         lens=Lens().scaled(1280, 960),
-        route=Route(photos=18, sidelap=0.4, speed=4.8),
-        reporting=Reporting(gps_correlation=smooth_s),
-        video=Video(fps=5.0, shift=LATE_S, layout=layout),
+        route=Route(**{"photos": 18, "sidelap": 0.4, "speed": 4.8, **route}),
+        reporting=Reporting(gps_correlation=smooth_s, gps_noise=noise),
+        video=Video(fps=fps, shift=LATE_S, layout=layout, fixes_per_second=fixes),
     )
     world = sim.prepare(settings)
     times = np.array([s.waypoint.time for s in world.video.shots])
@@ -81,3 +81,21 @@ def test_headings_tell_the_offset_ten_times_better(tmp_path):
     off, sigma = np.abs(found).T
     assert (off < 0.05).all()
     assert (sigma < 0.05).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"fixes": 1.0},
+        {"fixes": 10.0, "fps": 10.0},
+        {"noise": 5.0},
+        {"speed": 10.0},
+        {"fixed_yaw": True},
+    ],
+    ids=str,
+)
+def test_rates_noise_speed_and_a_fixed_heading_are_within_the_stated_deviation(tmp_path, more):
+    found = [found_for(seed, "mavic3", 300.0, tmp_path, **more) for seed in (101, 104)]
+    for off, sigma in found:
+        assert abs(off) < 3 * sigma < 0.9

@@ -6,6 +6,7 @@ import pytest
 
 from skyquilt.errors import SideFileError
 from skyquilt.video.tracks import read_track
+from tests.video.clips import SRT
 
 SAMPLES = Path(__file__).parents[2] / ".." / "shared" / "data" / "srt"
 NAN = "nan"
@@ -138,3 +139,18 @@ def test_a_number_torn_off_at_the_end_is_not_a_position(tmp_path):
         path.write_text(whole + "2\n00:00:01,000 --> 00:00:02,000\n" + torn)
         track = read_track(path)
         assert (track.rows, track.zeros, track.longitude_deg.tolist()) == (2, 1, [14.3])
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "latin-1"])
+@pytest.mark.parametrize("ends", ["\n", "\r\n", "\r"])
+def test_encodings_and_line_ends_change_nothing(tmp_path, encoding, ends):
+    text = "".join(
+        SRT.format(n=i + 1, a=i / 5, b=(i + 1) / 5, lat=46.6 + 1e-5 * i).replace("88.0", "88.0°")
+        for i in range(9)
+    )
+    (tmp_path / "a.SRT").write_text(text, encoding="utf-8")
+    (tmp_path / "b.SRT").write_bytes(text.replace("\n", ends).encode(encoding))
+    plain, other = (read_track(tmp_path / f"{name}.SRT") for name in "ab")
+    assert len(plain.time_s) == 9
+    assert other.digest == plain.digest
+    assert other.start == plain.start

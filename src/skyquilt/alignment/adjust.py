@@ -163,7 +163,7 @@ def adjust(
 
 def covariance(problem: Problem, state: State) -> Covariance | None:
     """Covariance of photos and cameras at a minimum; None if some unknowns are not determined."""
-    system = Equations(problem, state)
+    system = Equations(problem, state, steps=False)
     try:
         factor = Factor(system.reduced(state, 0.0)[0])
     except np.linalg.LinAlgError:

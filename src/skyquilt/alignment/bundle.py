@@ -22,7 +22,7 @@ from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.errors import AlignmentError
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Alignment, MapFrame, Prior
+from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
 
 ROUGHLY = 64
 """Observations per photo of the first stage, which only removes outliers and sets out."""
@@ -54,7 +54,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 27
+    version: ClassVar[int] = 28
 
     def __call__(
         self,
@@ -118,6 +118,7 @@ class Bundle:
             begin, each, least = ROUGHLY, self.per_photo // 3, ROUGHLY
             tracks = thin(tracks, sizes, per_photo=self.ties, least=self.ties // 2)
         used = setup.sensor_tracks(tracks)
+        del tracks
         problem, state = setup.problem(thin(used, sizes, per_photo=begin, least=least))
         problem, state = rough(problem, state, keep.within("rough"))
         setup = setup.moving_as(photos, state.C)
@@ -141,8 +142,10 @@ class Bundle:
             part = keep.within("positions")
             problem, state = believe_positions(problem, state, setup, part)
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
+        ties = ground_points(used, setup, state)
+        del used
         done = _outcome(
-            photos, frame, setup, start, used, problem, state, reports, predicted=self.thorough
+            photos, frame, setup, start, ties, problem, state, reports, predicted=self.thorough
         )
         held = setup.georeferenced or any(not c.check for c in reports)
         return done if held or tilts_reported(priors) else levelled(done)
@@ -178,8 +181,8 @@ def sharpened(
     keep: Keep,
 ) -> Tracks:
     """Tracks (sensor pixels) with observations refined in larger images."""
-    everything, _ = setup.problem(tracks)
-    xyz = triangulated(everything, state).X
+    parts = [triangulated(p, state).X for p in setup.problems(tracks)]
+    xyz = np.concatenate(parts or [np.zeros((0, 3))])
     cameras, camera_of = camera_records(photos, setup, state, None)
     poses = pose_records(setup, state)
     filed = replace(tracks, px=setup.file_px(tracks.photo, tracks.px))
@@ -207,14 +210,13 @@ def _outcome(
     frame: MapFrame,
     setup: Setup,
     start: Start,
-    tracks: Tracks,
+    ties: TiePoints,
     problem: Problem,
     state: State,
     control: Sequence[Control],
     *,
     predicted: bool,
 ) -> Alignment:
-    ties = ground_points(tracks, setup, problem, state)
     seen = np.bincount(ties.photo, minlength=len(photos))
     weak = {int(i): f"it has only {seen[i]} tie points" for i in setup.members if seen[i] < 8}
     if all(c.check for c in control):

@@ -109,6 +109,7 @@ def _alone(
         photo=row,
         px=px,
         sigma_px=np.ones(len(px)),
+        relative=1.0,
         share=setup.share(row, px),
         X0=empty,
         sigma_X=np.ones_like(empty),
@@ -211,6 +212,9 @@ def with_points(
         photo=np.concatenate([problem.photo, row]),
         px=np.concatenate([problem.px, px]),
         sigma_px=np.concatenate([problem.sigma_px, np.full(len(px), MARKED_PX)]),
+        relative=np.concatenate(
+            [np.broadcast_to(problem.relative, len(problem.px)), np.ones(len(px))]
+        ),
         share=np.concatenate([problem.share, setup.share(row, px)]),
         # what was marked in photos by hand errs independently of the tie points
         trust=np.concatenate([np.broadcast_to(problem.trust, len(problem.px)), np.ones(len(px))]),

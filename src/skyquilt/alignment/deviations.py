@@ -26,7 +26,7 @@ CELLS = 8
 REACH = 2
 """Parts of a photo along each side over which a correlation is taken to reach."""
 
-HIDDEN = 0.005
+HIDDEN = 0.004
 """Deviation of the error that all observations of a part of a photo have in common and that its
 pose takes up, in px of an image of `MATCHED` px, or of the photo if that is smaller.
 """
@@ -52,6 +52,8 @@ def robust_scale(problem: Problem, state: State) -> float:
     """
     e = residuals_px(problem, state) / problem.sigma_px[:, None]
     left = max(1 - _unknowns(problem, state) / (2 * len(e)), 0.05)
+    if not np.isfinite(e).any():  # photos of one place: no ray has a point on it
+        return float("nan")
     return float(1.48 * np.nanmedian(np.abs(e)) / np.sqrt(left))
 
 

@@ -193,10 +193,12 @@ def _together(problem: Problem) -> tuple[Index, Index]:
 class Equations:
     """The equations of one problem, at any state: which photos are coupled is found once."""
 
-    def __init__(self, problem: Problem, state: State, workers: Workers = HERE) -> None:
-        """`workers` compute the equations of the parts."""
+    def __init__(
+        self, problem: Problem, state: State, workers: Workers = HERE, *, steps: bool = True
+    ) -> None:
+        """`workers` compute the equations of the parts. `steps`: steps will be computed, too."""
         self.problem, self.workers = problem, workers
-        self.kept = len(problem.px) <= KEPT
+        self.kept = steps and len(problem.px) <= KEPT
         self.n, self.m = len(state.C), len(state.K)
         self.p = problem.photo_unknowns
         self.q = CAMERA if problem.free.any() else 0

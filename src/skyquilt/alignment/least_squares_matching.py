@@ -4,6 +4,10 @@ larger images.
 With approximately correct poses, the patches around all observations of a point show the same
 ground. Rectified to the ground they differ by a translation only, and this translation is the error
 of the observation. One observation per point is kept and the others are registered to it.
+
+How much both patches still differ then, and how much texture they have, tells how accurate each
+observation is: on open ground ten times as accurate as in the crown of a tree, where each photo
+sees other leaves. Those crowns decide a focal length, since they stand above the ground.
 """
 
 from collections.abc import Callable, Mapping
@@ -34,6 +38,8 @@ OUTSIDE = 1e6
 """Places in an image farther from its corner than this, in px, are as good as there."""
 BATCH = 4000
 """Number of observations registered at a time, to bound memory."""
+LEAST = 1e-3
+"""Least deviation in patch px: equal patches do not tell a smaller one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +55,12 @@ class LeastSquaresMatching:
     deviation.
     """
     sigma: float = 0.12
-    """Standard deviation of a refined observation in px of the image."""
-    version: ClassVar[int] = 1
+    """Standard deviation of a usual refined observation in px of the image."""
+    sharpest: float = 0.5
+    """Least standard deviation of a refined observation, in usual ones."""
+    bluntest: float = 4.0
+    """Largest, likewise."""
+    version: ClassVar[int] = 2
 
     def __call__(
         self,
@@ -65,8 +75,9 @@ class LeastSquaresMatching:
         frame. `keep`: each part of some ten thousand observations.
         """
         px, sigma = tracks.px.copy(), tracks.sigma_px.copy()
+        told = np.full(len(sigma), np.nan)
 
-        def part(which: tuple[slice, slice]) -> tuple[Array, Array]:
+        def part(which: tuple[slice, slice]) -> tuple[Array, Array, Array]:
             own, points = tracks.part(*which), which[1]
             return keep(
                 f"{points.start}", lambda: self._sharper(own, xyz[points], poses, cameras, grey)
@@ -74,8 +85,10 @@ class LeastSquaresMatching:
 
         parts = list(tracks.parts(PART))
         for (some, _), found in zip(parts, keep.workers.each(part, parts), strict=True):
-            px[some], sigma[some] = found
-        return replace(tracks, px=px, sigma_px=sigma)
+            px[some], sigma[some], told[some] = found
+        usual = float(np.nanmedian(told)) if np.isfinite(told).any() else 1.0
+        relative = np.nan_to_num((told / usual).clip(self.sharpest, self.bluntest), nan=1.0)
+        return replace(tracks, px=px, sigma_px=sigma, relative=relative)
 
     def _sharper(
         self,
@@ -84,13 +97,15 @@ class LeastSquaresMatching:
         poses: Mapping[int, Pose],
         cameras: Mapping[int, Camera],
         grey: GreyPicture,
-    ) -> tuple[Array, Array]:
-        """Refined observations (N, 2), and their deviations (N,)."""
+    ) -> tuple[Array, Array, Array]:
+        """Refined observations (N, 2), their usual deviation (N,) or that of keypoints, and the
+        deviation (N,) in patch px that the patches tell; NaN where an observation was not refined.
+        """
         anchor = self._anchors(tracks, cameras)
         patches, scale = self._patches(tracks, xyz, poses, cameras, grey)
         others = np.flatnonzero(anchor[tracks.point] != np.arange(len(tracks.point)))
         first = anchor[tracks.point[others]]
-        shift, score = self._registered(patches, first, others)
+        shift, score, told = self._registered(patches, first, others)
         moved = self._on_image(tracks, xyz, poses, cameras, others, shift, scale)
         # a point that its rays do not determine may lie anywhere, and a step on the ground be wide
         far = np.linalg.norm(moved - tracks.px[others], axis=1) / scale[others]
@@ -100,13 +115,13 @@ class LeastSquaresMatching:
         sharp = np.maximum(self.sigma * scale[others[good]], 0.2)
         sigma[others[good]] = sharp
         sigma[first[good]] = np.maximum(self.sigma * scale[first[good]], 0.2)
-        return px, sigma
+        return px, sigma, _of_observations(np.maximum(told, LEAST), others, first, good, len(px))
 
     def _registered(
         self, patches: NDArray[np.uint8], first: NDArray[np.int64], others: NDArray[np.int64]
-    ) -> tuple[Array, Array]:
-        """Shifts (m, 2) in patch px and correlations (m,), computed for some thousand pairs at a
-        time.
+    ) -> tuple[Array, Array, Array]:
+        """Shifts (m, 2) in patch px, correlations (m,) and deviations (m,) in patch px, computed
+        for some thousand pairs at a time.
         """
         inner = slice(MARGIN, -MARGIN)
         parts = []
@@ -117,8 +132,9 @@ class LeastSquaresMatching:
                 translate(reference, patches[others[part]].astype(np.float32), margin=MARGIN)
             )
         if not parts:
-            return np.zeros((0, 2)), np.zeros(0)
-        return np.concatenate([s for s, _ in parts]), np.concatenate([c for _, c in parts])
+            return np.zeros((0, 2)), np.zeros(0), np.zeros(0)
+        shifts, scores, told = (np.concatenate(found) for found in zip(*parts, strict=True))
+        return shifts, scores, told
 
     def _anchors(self, tracks: Tracks, cameras: Mapping[int, Camera]) -> NDArray[np.int64]:
         """The most central observation of each track (count,)."""
@@ -195,6 +211,26 @@ class LeastSquaresMatching:
             gx, gy = ground_axes(xyz[tracks.point[rows[own]]], poses[photo], cameras[photo], s)
             moved[own] += s * (gx * shift[own, :1] + gy * shift[own, 1:])
         return moved
+
+
+def _of_observations(
+    told: Array,
+    others: NDArray[np.int64],
+    first: NDArray[np.int64],
+    good: NDArray[np.bool_],
+    count: int,
+) -> Array:
+    """The deviation (count,) of each observation from those of pairs (m,): of `others` their own,
+    of the `first` ones, to which they were registered, the geometric mean of theirs. NaN for pairs
+    that are not good.
+    """
+    out = np.full(count, np.nan)
+    out[others[good]] = told[good]
+    number = np.bincount(first[good], minlength=count)
+    total = np.bincount(first[good], np.log(told[good]), count)
+    seen = number > 0
+    out[seen] = np.exp(total[seen] / number[seen])
+    return out
 
 
 def ground_axes(X: Array, pose: Pose, camera: Camera, scale: float) -> tuple[Array, Array]:

@@ -111,7 +111,7 @@ def adjusted_near(
     control = control_in_frame(inputs.control, window.photos, base.frame)
     setup, problem, state, tracks = _solved(inputs, window, control, members, bundle)
     full = covariance(problem, state)
-    found = ground_points(tracks, setup, problem, state)
+    found = ground_points(tracks, setup, state)
     numbers = np.array(members)
     found = replace(found, photo=numbers[found.photo])
     if _misfit(found, base.ties, numbers[tracks.photo], placed):

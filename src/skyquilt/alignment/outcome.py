@@ -1,6 +1,6 @@
 """What an adjustment tells: ground points, predicted accuracy, and what a flight leaves open."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from skyquilt.alignment.setup import Setup
 from skyquilt.alignment.stages import heights_above, prune
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.alignment.triangulate import polish, triangulated
-from skyquilt.model.poses import Accuracy, TiePoints
+from skyquilt.model.poses import Accuracy, TiePoints, no_ties
 
 Array = NDArray[np.float64]
 SAMPLED = 400
@@ -51,25 +51,37 @@ def leave_one_out(
     return float(rms[0]), float(rms[1]), float(rms[2])
 
 
-def ground_points(tracks: Tracks, setup: Setup, problem: Problem, state: State) -> TiePoints:
+def ground_points(tracks: Tracks, setup: Setup, state: State) -> TiePoints:
     """All tracks triangulated with the final poses; outliers and unstable points are removed."""
-    everything, _ = setup.problem(tracks)
+    found = [_ground_part(part, state) for part in setup.problems(tracks)]
+    z = np.concatenate([whole.X[:, 2] for _, whole, _ in found] or [np.zeros(0)])
+    height = abs(float(np.median(state.C[:, 2]) - np.median(z))) if len(z) else 0.0
+    parts, first = [no_ties()], 0
+    for everything, whole, sigma_z in found:
+        keep = (sigma_z < 0.05 * height)[everything.point]
+        points, renumbered = np.unique(everything.point[keep], return_inverse=True)
+        photo = setup.members[everything.photo[keep]]
+        parts.append(
+            TiePoints(
+                xyz=whole.X[points],
+                point=first + renumbered.astype(np.int64),
+                photo=photo,
+                px=setup.file_px(photo, everything.px[keep]),
+                residual_px=residuals_px(everything, whole)[keep] * setup.file_sign(photo),
+            )
+        )
+        first += len(points)
+    names = [f.name for f in fields(TiePoints)]
+    return TiePoints(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
+
+
+def _ground_part(everything: Problem, state: State) -> tuple[Problem, State, Array]:
+    """The sound observations of some tracks, their points, and how well each height is known."""
     everything = replace(everything, loss_px=2.0)
-    whole = triangulated(everything, state)
-    whole, _ = polish(everything, whole, iterations=3)
+    whole, _ = polish(everything, triangulated(everything, state), iterations=3)
     everything, whole = prune(everything, whole, 5.0)
     whole, sigma_z = polish(everything, whole, iterations=2)
-    height = float(np.median(state.C[:, 2]) - np.median(whole.X[:, 2]))
-    keep = (sigma_z < 0.05 * abs(height))[everything.point]
-    points, renumbered = np.unique(everything.point[keep], return_inverse=True)
-    photo = setup.members[everything.photo[keep]]
-    return TiePoints(
-        xyz=whole.X[points],
-        point=renumbered.astype(np.int64),
-        photo=photo,
-        px=setup.file_px(photo, everything.px[keep]),
-        residual_px=residuals_px(everything, whole)[keep] * setup.file_sign(photo),
-    )
+    return everything, whole, sigma_z
 
 
 def accuracy(setup: Setup, problem: Problem, state: State, covariance: Covariance) -> Accuracy:

@@ -23,6 +23,11 @@ large the survey.
 """
 
 
+def of_some(values: Array | float, some: NDArray[np.bool_] | Index | slice) -> Array | float:
+    """What belongs to some observations, of a value for all or of one for each."""
+    return values[some] if isinstance(values, np.ndarray) else values
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class State:
     """The unknowns: n photos, m cameras, P points."""
@@ -100,6 +105,10 @@ class Problem:
     """Factor on the cost of observations, of all or of each (N,): the reciprocal of their design
     effect and of their variance over the assumed one (`alignment.deviations`).
     """
+    relative: Array | float = 1.0
+    """Deviation of all observations or of each (N,) over that of a usual one. What is too far off
+    is judged by `sigma_px` alone; `alignment.stages.weighed` multiplies it in.
+    """
     offset: bool = False
     """Whether all measured centres share an unknown shift (height datum, base station), as where
     control points tie the block to the ground. It is estimated along with the other unknowns.
@@ -129,7 +138,8 @@ class Problem:
             px=self.px[observations],
             sigma_px=self.sigma_px[observations],
             share=self.share[observations],
-            trust=self.trust[observations] if isinstance(self.trust, np.ndarray) else self.trust,
+            trust=of_some(self.trust, observations),
+            relative=of_some(self.relative, observations),
         )
 
     def only(self, observations: NDArray[np.bool_]) -> tuple["Problem", Index]:

@@ -1,6 +1,6 @@
 """Photos, priors and a start as the arrays of an adjustment, and its results as records."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.motion import velocities
-from skyquilt.alignment.problem import READOUT, Problem, State
+from skyquilt.alignment.problem import PART, READOUT, Problem, State
 from skyquilt.alignment.start import Start
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.geometry.frames import angle_difference_deg, cam_R_map_from_angles
@@ -24,6 +24,8 @@ SIGMA_ASPECT = 3e-3
 """Deviation from 1 of the ratio of focal lengths along columns and rows, where no calibration gives
 it; factory calibrations of drones show 0.2 to 0.5 %.
 """
+TOGETHER = 500_000
+"""Observations, about, of the parts in which those of all tracks are computed."""
 YAW_LIE_DEG = 20.0
 """A reported yaw further than this, in degrees, from that of the links is a gross error."""
 
@@ -96,6 +98,34 @@ class Setup:
         plane.
         """
         row = np.searchsorted(self.members, tracks.photo)
+        X = np.empty((tracks.count, 3))
+        for some, points in tracks.parts(PART):
+            X[points] = self._on_plane(tracks.part(some, points), row[some])
+        problem = replace(
+            self.base,
+            point=tracks.point,
+            photo=row,
+            px=tracks.px,
+            sigma_px=tracks.sigma_px,
+            relative=tracks.relative,
+            share=self.share(row, tracks.px),
+            X0=np.broadcast_to(np.nan, X.shape),
+            sigma_X=np.broadcast_to(1.0, X.shape),
+            trust=min(1.0, INDEPENDENT * len(self.members) / max(len(row), 1)),
+        )
+        turn = np.zeros(self.start_C.shape)
+        K = self.base.K0.copy()
+        return problem, State(R=self.start_R, C=self.start_C, K=K, X=X, turn=turn)
+
+    def problems(self, tracks: Tracks) -> Iterator[Problem]:
+        """The problems of parts of the tracks, in their order: of large surveys, all at once take
+        more memory than all else.
+        """
+        for some, points in tracks.parts(TOGETHER):
+            yield self.problem(tracks.part(some, points))[0]
+
+    def _on_plane(self, tracks: Tracks, row: NDArray[np.int64]) -> Array:
+        """Points (P, 3) of tracks on the plane of the start, `row` (N,) being their photos'."""
         K = self.base.K0[self.camera[row]]
         p = ((tracks.px[:, 0] - K[:, 1]) - 1j * (tracks.px[:, 1] - K[:, 2])) / K[:, 0]
         p = np.where(self.turned[tracks.photo], -p, p)
@@ -104,20 +134,7 @@ class Setup:
         number = np.bincount(tracks.point, minlength=tracks.count)
         X[:, 0] = np.bincount(tracks.point, ground.real, tracks.count) / number
         X[:, 1] = np.bincount(tracks.point, ground.imag, tracks.count) / number
-        problem = replace(
-            self.base,
-            point=tracks.point,
-            photo=row,
-            px=tracks.px,
-            sigma_px=tracks.sigma_px,
-            share=self.share(row, tracks.px),
-            X0=np.full(X.shape, np.nan),
-            sigma_X=np.ones(X.shape),
-            trust=min(1.0, INDEPENDENT * len(self.members) / max(len(row), 1)),
-        )
-        turn = np.zeros(self.start_C.shape)
-        K = self.base.K0.copy()
-        return problem, State(R=self.start_R, C=self.start_C, K=K, X=X, turn=turn)
+        return X
 
 
 def set_up(

@@ -18,9 +18,12 @@ from skyquilt.alignment.tracks import connected, outwards, spanning_tree
 
 DENSE = 300
 """Largest number of photos for which the normal equations are solved as a full matrix."""
+MOST_PAIRED = 1500
+"""Points of which all pairs are listed."""
 MOST_PAIRS = 600
 """Largest number of pairs of positions tried as a start."""
 Complex = NDArray[np.complex128]
+Index = NDArray[np.int64]
 Array = NDArray[np.float64]
 
 
@@ -201,7 +204,7 @@ def _least_median(x: Complex, y: Complex) -> tuple[complex, complex]:
     """g and c through two of the points, of several hundred pairs the one with the least median of
     squares.
     """
-    k, m = np.triu_indices(len(x), 1)
+    k, m = _pairs(len(x))
     reach = np.abs(x[k] - x[m])
     if len(k) > MOST_PAIRS:  # pairs far apart are the most informative
         far = np.flatnonzero(reach >= np.median(reach))
@@ -213,10 +216,19 @@ def _least_median(x: Complex, y: Complex) -> tuple[complex, complex]:
     k, m = k[apart], m[apart]
     g = (y[k] - y[m]) / (x[k] - x[m])
     c = y[k] - g * x[k]
-    misfit = np.abs(y[None] - g[:, None] * x[None] - c[:, None])
     rank = min(len(x), max(3, len(x) // 2 + 1)) - 1
-    best = int(np.partition(misfit, rank, axis=1)[:, rank].argmin())
+    middle = [np.partition(np.abs(y - u * x - v), rank)[rank] for u, v in zip(g, c, strict=True)]
+    best = int(np.argmin(middle))
     return complex(g[best]), complex(c[best])
+
+
+def _pairs(count: int) -> tuple[Index, Index]:
+    """Indices k < m of all pairs of so many points; of many points, of some of them."""
+    if count <= MOST_PAIRED:
+        return np.triu_indices(count, 1)
+    drawn = np.random.default_rng(0).integers(0, count, (2, MOST_PAIRED**2 // 2))
+    k, m = drawn.min(0), drawn.max(0)
+    return k[k < m], m[k < m]
 
 
 def tie_to_positions(

@@ -57,10 +57,11 @@ def fine(problem: Problem, state: State, keep: Keep = MADE_NOW) -> tuple[Problem
 def weighed(
     problem: Problem, state: State, setup: Setup, keep: Keep = MADE_NOW
 ) -> tuple[Problem, State]:
-    """The adjustment repeated with observations as sharp as their residuals show them to be, and
-    with the weight that those are worth; with turns of the cameras where rows were exposed one
-    after the other.
+    """The adjustment repeated with observations as sharp as their patches and their residuals show
+    them to be, and with the weight that those are worth; with turns of the cameras where rows were
+    exposed one after the other.
     """
+    problem = replace(problem, sigma_px=problem.sigma_px * problem.relative, relative=1.0)
     rolls = _rolls(problem, state)
     if rolls:
         readout = np.abs(state.K[problem.camera, READOUT])

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.alignment.problem import of_some
 from skyquilt.model.features import Features, Link
 
 Index = NDArray[np.int64]
@@ -83,6 +84,10 @@ class Tracks:
     """(N, 2) px."""
     sigma_px: NDArray[np.float64]
     """(N,) standard deviation in px."""
+    relative: NDArray[np.float64] | float = 1.0
+    """Deviation of all or of each (N,) over that of a usual one of its kind, as far as it is known
+    (`alignment.least_squares_matching`).
+    """
 
     @property
     def count(self) -> int:
@@ -103,6 +108,7 @@ class Tracks:
             photo=self.photo[observations],
             px=self.px[observations],
             sigma_px=self.sigma_px[observations],
+            relative=of_some(self.relative, observations),
         )
 
     def only(self, observation: NDArray[np.bool_]) -> "Tracks":
@@ -115,6 +121,7 @@ class Tracks:
             photo=self.photo[keep],
             px=self.px[keep],
             sigma_px=self.sigma_px[keep],
+            relative=of_some(self.relative, keep),
         )
 
 
@@ -137,15 +144,15 @@ def build_tracks(
             sigma_px=np.zeros(0),
         )
     offset, place = _places(features)
-    a = place[np.concatenate([offset[k.a] + k.index_a for k in links])]
-    b = place[np.concatenate([offset[k.b] + k.index_b for k in links])]
-    total = int(offset[-1])
-    label = connected(total, a, b)
-    used = np.unique(np.concatenate([a, b]))
+    a = np.concatenate([offset[k.a] + place[k.a][k.index_a] for k in links])
+    b = np.concatenate([offset[k.b] + place[k.b][k.index_b] for k in links])
+    del place
+    used = np.unique(np.concatenate([a, b]))  # most features are in no link
+    label = connected(len(used), np.searchsorted(used, a), np.searchsorted(used, b))
+    del a, b
     photo = np.searchsorted(offset, used, "right") - 1
-    order = np.lexsort((photo, label[used]))
-    used, photo = used[order], photo[order]
-    track = label[used]
+    order = np.lexsort((photo, label))
+    used, photo, track = used[order], photo[order], label[order]
     repeated = np.flatnonzero((np.diff(track) == 0) & (np.diff(photo) == 0))
     good = ~np.isin(track, track[repeated])
     used, photo, track = used[good], photo[good], track[good]
@@ -163,18 +170,18 @@ def build_tracks(
     )
 
 
-def _places(features: Sequence[Features]) -> tuple[Index, Index]:
-    """Where each photo's features begin in the list of all (photos + 1,), and for each feature the
-    first one at the same place.
+def _places(features: Sequence[Features]) -> tuple[Index, list[NDArray[np.int32]]]:
+    """Where each photo's features begin in the list of all (photos + 1,), and of each photo for
+    every feature the first one at the same place.
     """
-    parts, begin = [np.zeros(0, np.int64)], [0]
+    parts, begin = list[NDArray[np.int32]](), [0]
     for photo in features:
         _, first, which = np.unique(
             photo.px[:, 0] + 1j * photo.px[:, 1], return_index=True, return_inverse=True
         )
-        parts.append(begin[-1] + first[which])
+        parts.append(first.astype(np.int32)[which])
         begin.append(begin[-1] + len(photo))
-    return np.array(begin, np.int64), np.concatenate(parts)
+    return np.array(begin, np.int64), parts
 
 
 def _by_photos(track: Index, photo: Index) -> tuple[Index, Index]:

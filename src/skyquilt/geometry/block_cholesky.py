@@ -7,8 +7,11 @@ matrices. For a survey of n photos the cost grows as n^1.5 and the memory as n l
 and n^2. Unknowns that are coupled with all others, the *border* (cameras), are eliminated last.
 """
 
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from tempfile import TemporaryFile
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +22,10 @@ LEAF = 40
 """Blocks that are eliminated together without another division."""
 WORTHWHILE = 0.35
 """A division is taken when its line holds at most this share of the blocks."""
+STRIP = 256
+"""Rows of a front that are added or taken at a time."""
+HELD = 128 * 2**20
+"""Bytes of a factor that are held in memory; larger ones lie in a temporary file."""
 SMALL = 500
 """Largest system that NumPy solves. SciPy's triangular solver takes less time, but loading it takes
 longer than it saves on small systems.
@@ -199,6 +206,46 @@ def _parents(below: list[int]) -> list[int]:
     return parents
 
 
+class _Parts:
+    """Of each front of a factor: L (e, e) of the eliminated rows, and M (c, e) below it, S = L M^T;
+    in a file beside the memory where they are large.
+    """
+
+    def __init__(self, fronts: Sequence[Front]) -> None:
+        self._shapes = [(f.eliminated, len(f.unknowns) - f.eliminated) for f in fronts]
+        sizes = [8 * e * (e + c) for e, c in self._shapes]
+        self._starts = np.cumsum([0, *sizes]).tolist()
+        self._held = list[tuple[Array, Array]]()
+        self._file: IO[bytes] | None = None
+        if self._starts[-1] > HELD:
+            self._file = TemporaryFile(dir=_on_disk())  # noqa: SIM115 - closed with the factor
+        self._added = 0
+
+    def add(self, L: Array, M: Array) -> None:
+        """Keeps those of the next front."""
+        if self._file is not None:
+            try:
+                self._file.writelines(np.ascontiguousarray(part).data for part in (L.T, M))
+            except OSError:  # a full disk
+                self._held, self._file = [self[k] for k in range(self._added)], None
+        if self._file is None:
+            self._held.append((L, M))
+        self._added += 1
+
+    def __getitem__(self, k: int) -> tuple[Array, Array]:
+        if self._file is None:
+            return self._held[k]
+        e, c = self._shapes[k]
+        self._file.seek(self._starts[k])
+        both = np.frombuffer(self._file.read(8 * e * (e + c)))
+        return both[: e * e].reshape(e, e).T, both[e * e :].reshape(c, e)
+
+
+def _on_disk() -> str | None:
+    """A folder for temporary files that is not memory itself, as `/tmp` is on some systems."""
+    return "/var/tmp" if os.access("/var/tmp", os.W_OK) else None
+
+
 class Factor:
     """The Cholesky factor of a matrix.
 
@@ -210,31 +257,34 @@ class Factor:
         self.pattern = matrix.pattern
         self.total = matrix.pattern.count * matrix.pattern.size + matrix.pattern.border
         self._plain = self.total <= SMALL
-        self._parts = list[tuple[Array, Array]]()
-        """Of each front: L (e, e) of the eliminated rows, and M (c, e) below it, S = L M^T."""
+        self._parts = _Parts(self.pattern.fronts)
         left = dict[int, list[tuple[Index, Array]]]()
         for k, front in enumerate(self.pattern.fronts):
             whole = _assembled(matrix, front)
-            for unknowns, rest in left.pop(k, []):
+            waiting = left.pop(k, [])
+            while waiting:
+                unknowns, rest = waiting.pop(0)
                 at = _places(front.unknowns, unknowns, self.total)
-                whole[at[:, None], at] += rest
+                for some in _strips(len(at)):
+                    whole[at[some, None], at] += rest[some]
             e = front.eliminated
             L = self._cholesky(whole[:e, :e])
             M = self._forward(L, whole[:e, e:]).T if e < len(whole) else np.zeros((0, e))
-            self._parts.append((L, M))
+            self._parts.add(L, M)
             if front.parent >= 0:
-                rest = whole[e:, e:] - M @ M.T
+                rest = M @ M.T
+                np.subtract(whole[e:, e:], rest, out=rest)
                 left.setdefault(front.parent, []).append((front.unknowns[e:], rest))
 
     def solve(self, rhs: Array) -> Array:
         """The matrix's inverse times rhs (total,) or (total, k)."""
         x = np.array(rhs, float)
-        for front, (L, M) in zip(self.pattern.fronts, self._parts, strict=True):
-            e = front.eliminated
+        for k, front in enumerate(self.pattern.fronts):
+            e, (L, M) = front.eliminated, self._parts[k]
             x[front.unknowns[:e]] = half = self._forward(L, x[front.unknowns[:e]])
             x[front.unknowns[e:]] -= M @ half
-        for front, (L, M) in zip(self.pattern.fronts[::-1], self._parts[::-1], strict=True):
-            e = front.eliminated
+        for k, front in reversed(list(enumerate(self.pattern.fronts))):
+            e, (L, M) = front.eliminated, self._parts[k]
             rest = x[front.unknowns[:e]] - M.T @ x[front.unknowns[e:]]
             x[front.unknowns[:e]] = self._backward(L, rest)
         return x
@@ -259,9 +309,10 @@ class Factor:
                 corner = Z[e - pattern.border :, e - pattern.border :].copy()
             else:
                 at = _places(pattern.fronts[front.parent].unknowns, front.unknowns[e:], self.total)
-                beyond = known[front.parent][at[:, None], at]
+                beyond = Z[e:, e:]
+                for some in _strips(len(at)):
+                    beyond[some] = known[front.parent][at[some, None], at]
                 down = M @ inverse_L
-                Z[e:, e:] = beyond
                 Z[e:, :e] = -beyond @ down
                 Z[:e, e:] = Z[e:, :e].T
                 Z[:e, :e] = inverse_L.T @ inverse_L - down.T @ Z[e:, :e]
@@ -314,6 +365,12 @@ def _assembled(matrix: Matrix, front: Front) -> Array:
     if front.parent < 0:
         whole[size - b :, size - b :] = matrix.corner
     return whole
+
+
+def _strips(count: int) -> Iterator[slice]:
+    """Rows of a square matrix, few at a time: the large ones of a survey take 300 MB each."""
+    for low in range(0, count, STRIP):
+        yield slice(low, low + STRIP)
 
 
 def _places(among: Index, wanted: Index, total: int) -> Index:

@@ -1,5 +1,5 @@
-"""Exact nearest neighbours in the plane, by OpenCV: for few photos, loading SciPy's tree takes
-longer than the search.
+"""Exact nearest neighbours in the plane, by OpenCV, and pairs within reach: for few photos, loading
+SciPy's tree takes longer than the search.
 """
 
 from typing import Any
@@ -41,6 +41,29 @@ def nearest(
         distances[some] = np.take_along_axis(distance, order, 1)
         indices[some] = np.take_along_axis(index, order, 1)
     return distances, indices
+
+
+def pairs_within(points: NDArray[Any], reach: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Indices i (n,) and j (n,) of all pairs i < j of points (m, 2) at most `reach` apart, in
+    order of i and j; in memory of the pairs found, not of all pairs.
+    """
+    points = np.asarray(points, np.float64)
+    if len(points) < 2:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    longer = np.ptp(points, axis=0).argmax()
+    order = np.argsort(points[:, longer], kind="stable")
+    xy = points[order]
+    along = xy[:, longer]
+    last = np.searchsorted(along, along + reach * (1 + 1e-9), side="right")
+    found = []
+    for k, end in enumerate(last.tolist()):
+        apart = np.hypot(*(xy[k + 1 : end] - xy[k]).T)
+        found.append(k + 1 + np.flatnonzero(apart <= reach))
+    a = order[np.repeat(np.arange(len(xy)), [len(f) for f in found])]
+    b = order[np.concatenate(found)]
+    i, j = np.minimum(a, b), np.maximum(a, b)
+    by = np.lexsort((j, i))
+    return i[by], j[by]
 
 
 def _single(xy: NDArray[Any]) -> NDArray[np.float32]:

@@ -10,6 +10,7 @@ the process there.
 """
 
 import json
+import re
 import sqlite3
 import threading
 import time
@@ -19,6 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from skyquilt.errors import OutputError
+from skyquilt.outside import plain, real
+from skyquilt.raster.database import open_database
 
 POINTS = (
     "photo file synced",
@@ -48,6 +51,8 @@ def hit(name: str) -> None:
     watcher(name)
 
 
+DAMAGED = (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError)
+"""What reading a record raises that nobody of ours has written."""
 NAME = "live.db"
 """Name of the file in the survey's folder."""
 FORMAT = 1
@@ -76,31 +81,6 @@ create index if not exists photo_state on photo(state);
 create index if not exists photo_shot on photo(shot);
 create index if not exists link_b on link(b);
 """
-
-
-def connected(path: Path, *, write: bool) -> sqlite3.Connection:
-    """A connection to a database that other threads and processes can read while one writes.
-
-    Raises:
-        OutputError: it cannot be opened.
-    """
-    try:
-        mode = "rwc" if write else "ro"
-        uri = f"{path.absolute().as_uri()}?mode={mode}"
-        db = sqlite3.connect(
-            uri, uri=True, timeout=30, check_same_thread=False, isolation_level=None
-        )
-        if write:
-            db.execute("pragma journal_mode=wal")
-            db.execute("pragma synchronous=full")
-            db.execute("begin immediate")  # fails where the file is read-only
-            db.execute("rollback")
-        db.execute("select count(*) from sqlite_master").fetchone()
-    except sqlite3.Error as error:
-        raise OutputError(
-            f"{path} cannot be opened ({error}); choose another output folder"
-        ) from error
-    return db
 
 
 @contextmanager
@@ -143,10 +123,12 @@ class Ledger:
         """
         self.path = Path(folder) / NAME
         self.lock = threading.RLock()
-        self.db = connected(self.path, write=write)
-        if write:
-            self.db.executescript(TABLES)
-        found = self.meta("format", FORMAT if write else None)
+        self.db = open_database(self.path, TABLES, write=write)
+        try:
+            self._check()
+            found = self.meta("format", FORMAT if write else None)
+        except sqlite3.Error as error:
+            raise self.damaged(plain(str(error), 100)) from error
         if found != FORMAT:
             raise OutputError(
                 f"{self.path} has format {found}, this version reads {FORMAT}; choose another"
@@ -156,6 +138,27 @@ class Ledger:
             with self.change():
                 self.put_meta("format", FORMAT)
                 self.put_meta("began", time.time())
+
+    def _check(self) -> None:
+        """Refuses a survey whose values as a whole cannot be: all else depends on them.
+
+        Raises:
+            OutputError: it is damaged.
+        """
+        frame = self.meta("frame")
+        if frame is not None and not _is_frame(frame):
+            raise self.damaged("its frame is no place on Earth")
+        for key, low, high in NUMBERS:
+            value = self.meta(key)
+            if value is not None and real(value, low, high) is None:
+                raise self.damaged(f"{key} is {plain(repr(value), 40)}")
+        for key in ("settings", "schedule"):
+            if not isinstance(self.meta(key, {}), dict):
+                raise self.damaged(f"{key} is no record")
+
+    def damaged(self, why: str) -> OutputError:
+        """The error that ends what uses this survey."""
+        return OutputError(f"{self.path} is damaged ({why}); use another folder")
 
     @contextmanager
     def change(self) -> Iterator[sqlite3.Connection]:
@@ -196,12 +199,16 @@ class Ledger:
     def meta(self, key: str, default: Any = None) -> Any:
         """A value of the survey as a whole."""
         found = self.row("select value from meta where key = ?", key)
-        return default if found is None else json.loads(found[0])
+        try:
+            return default if found is None else json.loads(found[0])
+        except DAMAGED as error:
+            raise self.damaged(f"{key} is not JSON") from error
 
     def put_meta(self, key: str, value: Any) -> None:
         """Sets a value of the survey as a whole."""
+        text = json.dumps(value)
         with self.change() as db:
-            db.execute("insert or replace into meta values (?, ?)", (key, json.dumps(value)))
+            db.execute("insert or replace into meta values (?, ?)", (key, text))
 
     def tell(self, kind: str, body: dict[str, Any]) -> None:
         """Appends an event for viewers."""
@@ -216,7 +223,7 @@ class Ledger:
         found = self.rows(
             "select seq, kind, body from event where seq > ? order by seq limit ?", after, limit
         )
-        return [(int(n), str(k), str(b)) for n, k, b in found]
+        return [(int(n), *_event(k, b)) for n, k, b in found]
 
     def stamp(self) -> int:
         """A number that changes when another connection has written. Reading it is much faster than
@@ -263,3 +270,62 @@ class Ledger:
         """Closes the file."""
         with self.lock:
             self.db.close()
+
+
+_KIND = re.compile("[a-z]{1,20}")
+_CRS = re.compile(r"EPSG:[0-9]{4,6}")
+NUMBERS = (("gsd", 1e-4, 1e3), ("cell", 1e-2, 1e4), ("ground", -1e5, 1e5), ("began", 0, 1e11))
+"""Numbers of the survey as a whole, and what they can be."""
+
+
+def _event(kind: Any, body: Any) -> tuple[str, str]:
+    """An event as it is sent to viewers; an empty note where it is none of ours."""
+    try:
+        said = json.loads(body)
+        if kind == "tiles":
+            boxes = [*said.get("boxes", ()), said["bounds"]]
+            known = isinstance(said["layer"], str) and all(
+                len(box) == 4 and all(real(v, -360, 360) is not None for v in box) for box in boxes
+            )
+        else:
+            known = isinstance(said, dict) and _KIND.fullmatch(kind) is not None
+        if known and "\n" not in body and "\r" not in body:
+            return kind, body
+    except DAMAGED:
+        pass
+    return "note", "{}"
+
+
+def _is_frame(said: Any) -> bool:
+    """Whether a record can be that of a `MapFrame` with a place on Earth."""
+    if not isinstance(said, dict) or not isinstance(said.get("origin"), list):
+        return False
+    origin = [real(v, -1e8, 1e8) for v in said["origin"]]
+    crs = said.get("crs")
+    numbers = (said.get("takeoff_m"), said.get("convergence_deg", 0.0))
+    return (
+        len(origin) == 2
+        and None not in origin
+        and isinstance(crs, str)
+        and _CRS.fullmatch(crs) is not None
+        and all(v is None or real(v, -1e6, 1e6) is not None for v in numbers)
+    )
+
+
+def footprint_from(body: str) -> dict[str, Any] | None:
+    """Where a photo lies, as it was drawn: `ring` (n, 2) and `at` (2,), longitude and latitude in
+    degrees, `at` None where it is not known; None where the record is damaged.
+    """
+    try:
+        said = json.loads(body)
+        ring = [_place(p) for p in said.get("ring", ())]
+        return {"ring": ring, "at": _place(said["at"]) if said.get("at") is not None else None}
+    except DAMAGED:
+        return None
+
+
+def _place(values: Any) -> list[float]:
+    lon, lat = (real(v, -360, 360) for v in values)
+    if lon is None or lat is None:
+        raise ValueError("it is no place")
+    return [lon, lat]

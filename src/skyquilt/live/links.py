@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from typing import Any
 
@@ -12,6 +13,7 @@ from skyquilt.engine.codec import decode, encode
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
 from skyquilt.live.failures import concerning
+from skyquilt.live.ledger import DAMAGED
 from skyquilt.live.members import Member, Members
 from skyquilt.model.features import Features, Link
 from skyquilt.workflows.links import link_pair
@@ -84,7 +86,8 @@ class LiveLinks:
         for i, j in ((a, b), (b, a)):
             row = self.members.ledger.row("select body from link where a = ? and b = ?", i, j)
             if row is not None and row[0] is not None:
-                return link_from(row[0])
+                with suppress(*DAMAGED):  # then it counts as none
+                    return link_from(row[0])
         return None
 
 

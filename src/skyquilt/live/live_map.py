@@ -5,6 +5,7 @@ the next unit begins, everything that must survive is in the ledger, the tile st
 of photos. A restart reads these and continues.
 """
 
+import sqlite3
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -29,7 +30,7 @@ from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.failures import MemberFailedError, concerning, of_the_system
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.initial_pose import InitialPose
-from skyquilt.live.ledger import Ledger
+from skyquilt.live.ledger import DAMAGED, Ledger
 from skyquilt.live.links import LiveLinks
 from skyquilt.live.local_pose import LocalPose
 from skyquilt.live.lock import FolderLock
@@ -95,7 +96,11 @@ class LiveMap:
         self.background = BackgroundAdjustment()
         self._room = TOGETHER
         self._failures = 0
-        self._reload()
+        try:
+            self._reload()
+        except (*DAMAGED, sqlite3.Error) as error:
+            log_error(self.folder, "opening the survey", error)
+            raise self.ledger.damaged(f"{type(error).__name__}; see {ERRORS}") from error
 
     def _same_settings(self) -> None:
         known, asked = self.ledger.meta("settings"), self.settings.shaping()

@@ -4,6 +4,7 @@ import json
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,14 +13,17 @@ from pyproj import Transformer
 from skyquilt.alignment.priors import empty_prior, photo_prior
 from skyquilt.live.failures import concerning
 from skyquilt.live.inbox import Inbox
-from skyquilt.live.ledger import Ledger
+from skyquilt.live.ledger import DAMAGED, Ledger
 from skyquilt.live.settings import LiveSettings
 from skyquilt.model.camera import PARAMETERS, Camera
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import MapFrame, Motion, Pose, Prior
+from skyquilt.outside import real, whole
 from skyquilt.photos.read import read_photo
 from skyquilt.photos.shutter import stated_shutter
 
+MOST_M = 1e9
+"""Largest coordinate in the map's frame."""
 ON_MAP = ("placed", "refined")
 """States of photos that are drawn."""
 
@@ -94,7 +98,8 @@ class Members:
         if found := ledger.meta("frame"):
             self.set_frame(MapFrame(**{**found, "origin": tuple(found["origin"])}))
         for key, body in ledger.rows("select key, body from camera order by key"):
-            self.cameras[str(key)] = Camera(**json.loads(body))
+            if camera := camera_from(body):
+                self.cameras[str(key)] = camera
         self.take_up()
         for a, b in ledger.rows("select a, b from link where body is not null order by a, b"):
             self.joined(int(a), int(b))
@@ -119,23 +124,30 @@ class Members:
         ):
             self._last = int(number)
             photo = read_photo(
-                self.inbox.folder / file,
-                name=name,
+                self.inbox.folder / Path(str(file)).name,
+                name=str(name),
                 thermal_unit=self.settings.thermal_unit,
                 most_mp=self.settings.most_mp,
             )
             if isinstance(photo, RejectedPhoto):
                 self.ledger.set_photo(number, state="refused", reason=photo.reason)
                 continue
+            try:
+                known = pose_from(json.loads(pose)) if pose else None
+                more = _about(json.loads(about) if about else {})
+            except DAMAGED:
+                why = "what is stored of it is damaged"
+                self.ledger.set_photo(number, state="refused", reason=why, pose=None, footprint="")
+                continue
             photo = replace(photo, shutter=self._shutter or photo.shutter)
             member = Member(
                 id=int(number),
                 photo=photo,
-                source=source,
-                state=state,
-                camera=camera or "",
-                pose=pose_from(json.loads(pose)) if pose else None,
-                **_about(json.loads(about) if about else {}),
+                source=str(source),
+                state=str(state),
+                camera=str(camera or ""),
+                pose=known,
+                **more,
             )
             if self.frame is not None and state != "refused":
                 with concerning(member.id):
@@ -240,9 +252,31 @@ def pose_record(pose: Pose) -> dict[str, list[float]]:
 
 
 def pose_from(record: dict[str, list[float]]) -> Pose:
-    """Reads a pose from its JSON record."""
+    """Reads a pose from its JSON record; raises one of `DAMAGED` where it is none."""
     motion = None
     if "shift" in record:
-        motion = Motion(shift_m=np.array(record["shift"]), turn_rad=np.array(record["turn"]))
-    R, C = np.array(record["R"]).reshape(3, 3), np.array(record["C"])
-    return Pose(cam_R_map=R, map_C=C, motion=motion)
+        shift, turn = (_numbers(record[k], 3) for k in ("shift", "turn"))
+        motion = Motion(shift_m=shift, turn_rad=turn)
+    R = _numbers(record["R"], 9).reshape(3, 3)
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3:
+        raise ValueError("it is no rotation")
+    return Pose(cam_R_map=R, map_C=_numbers(record["C"], 3), motion=motion)
+
+
+def _numbers(values: list[float], count: int) -> np.ndarray:
+    found = np.array([real(v, -MOST_M, MOST_M) for v in values[: count + 1]], float)
+    if len(found) != count or not np.isfinite(found).all():
+        raise ValueError("it is no list of numbers")
+    return found
+
+
+def camera_from(body: str) -> Camera | None:
+    """Reads a calibration from its JSON record; None where it is damaged."""
+    try:
+        said = json.loads(body)
+        focal = real(said["focal"], 10, 1e6)
+        size = [whole(said[k], 1, 10**5) for k in ("width", "height")]
+        rest = [real(said[k], -1e6, 1e6) for k in (*PARAMETERS, "readout_s")]
+        return None if None in (focal, *size, *rest) else Camera(**said)
+    except DAMAGED:
+        return None

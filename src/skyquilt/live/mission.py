@@ -17,7 +17,7 @@ from shapely import Polygon, union_all
 
 from skyquilt.alignment.priors import utm_epsg
 from skyquilt.errors import UnreadablePhotoError
-from skyquilt.live.ledger import Ledger
+from skyquilt.live.ledger import Ledger, footprint_from
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.photos.pixels import read_color
 from skyquilt.photos.read import read_photo
@@ -109,7 +109,8 @@ class Mission:
         known = [v for v in levels if np.isfinite(v)]
         limit = float(np.median(known)) - BLURRED if len(known) >= FEWEST else -np.inf
         blurred = frozenset(n for (n, _, _), v in zip(rows, levels, strict=True) if v < limit)
-        placed = {n: json.loads(place) for n, _, place in rows}
+        places = ((n, footprint_from(place)) for n, _, place in rows)
+        placed = {n: place for n, place in places if place is not None}
         cover = self._area({n: p for n, p in placed.items() if n not in blurred})
         counts = None
         if cover is not None:

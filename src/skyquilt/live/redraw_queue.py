@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from skyquilt.live.events import MapEvents, Update
 from skyquilt.live.failures import concerning
-from skyquilt.live.ledger import hit
+from skyquilt.live.ledger import DAMAGED, hit
 from skyquilt.live.members import Member, Members, pose_from, pose_record
 from skyquilt.live.tile_drawing import LEAST_MOVE, NEWEST, Canvas
 from skyquilt.model.poses import Pose
@@ -45,11 +45,11 @@ class RedrawQueue:
 
     def _take_up(self) -> None:
         rows = self.ledger.rows("select id, footprint from photo where footprint != ''")
-        drawn = {int(i): json.loads(d)["pose"] for i, d in rows}
+        drawn = {int(i): _drawn(d) for i, d in rows}
         for member in self.members.on_map():
             with concerning(member.id):
                 addresses = self.canvas.place(member, self.members.camera(member))
-            pose = pose_from(drawn[member.id]) if member.id in drawn else None
+            pose = drawn.get(member.id)
             rim = self.canvas.outline(member.id)
             if pose is not None and rim is not None and not self.canvas.moved(member, pose):
                 self._drawn[member.id], self._rims[member.id] = pose, rim
@@ -174,3 +174,11 @@ class RedrawQueue:
 def _add(queue: Queue, addresses: Iterable[Address], number: int) -> None:
     for address in addresses:
         queue.setdefault(address, set()).add(number)
+
+
+def _drawn(footprint: str) -> Pose | None:
+    """The pose with which a photo was drawn; None where it is not known, then it is drawn again."""
+    try:
+        return pose_from(json.loads(footprint)["pose"])
+    except DAMAGED:
+        return None

@@ -103,31 +103,30 @@ def _planes(z: Float, support: Mask) -> Float:
 
 def nearest_known(z: Float, known: Mask) -> Float:
     """Heights (h, w) with gaps filled by the nearest known one: they end in cliffs. A photo drawn
-    on a slope between a crown and the ground beside it would become a streak.
+    on a slope between a crown and the ground beside it would become a streak. The array itself is
+    filled, and returned.
 
     Heights of more than `WHOLE` rows are filled in bands: cells from which nothing is known within
     `BEYOND` rows take what is nearest of every `COARSER`-th row and column.
     """
-    if len(z) <= WHOLE:
-        return _nearest(z, known)[0]
     rough_known = known[::COARSER, ::COARSER]
-    if not rough_known.any():
-        return _nearest(z, known)[0]
+    if len(z) <= WHOLE or not rough_known.any():
+        z[:] = _nearest(z, known)[0]
+        return z
     rough = _nearest(z[::COARSER, ::COARSER], rough_known)[0]
-    out = np.empty_like(z)
     columns = np.arange(z.shape[1]) // COARSER
     for row in range(0, len(z), WHOLE // 2):
         first, last = max(0, row - BEYOND), min(len(z), row + WHOLE // 2 + BEYOND)
         rows = slice(row - first, min(row + WHOLE // 2, len(z)) - first)
         band, far = z[first:last], np.ones((rows.stop - rows.start, z.shape[1]), np.bool_)
-        inner = out[row : row + WHOLE // 2]
+        inner = z[row : row + WHOLE // 2]
         if known[first:last].any():
             whole, away = _nearest(band, known[first:last])
             inner[:] = whole[rows]
             far = away[rows] > BEYOND
         if far.any():
             inner[far] = rough[np.arange(row, row + len(inner)) // COARSER][:, columns][far]
-    return out
+    return z
 
 
 def _nearest(z: Float, known: Mask) -> tuple[Float, Float]:

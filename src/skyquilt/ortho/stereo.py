@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from skyquilt.engine.kept import Keep
 from skyquilt.engine.workers import Workers
+from skyquilt.geometry.neighbours import pairs_within
 from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid, meet
 from skyquilt.model.surface import STRIP, Surface, least_cell
@@ -27,13 +28,15 @@ GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
 Cells = tuple[NDArray[np.int32], Float]
 """Numbers (n,) of cells of a grid, row by row, and their heights (n,) in m."""
+BAND = 1024
+"""Rows of cells whose fine and coarse heights are joined at a time."""
 TILE = 512
 """Cells along a side of the pieces in which heights are fused."""
 NEW = 0.25
 """Share of the ground of a pair that must still lack pairs for it to be matched."""
 EDGES = 0.003
 """Share of a pair's ground that has edges where things stand on it."""
-FIRM = 0.45
+FIRM = 0.25
 """Share of the cells around with a fine height from which these are believed."""
 
 
@@ -69,9 +72,9 @@ class _Round:
 class Stereo:
     """Coarse-to-fine semi-global matching of pairs, fused by medians."""
 
-    coarse: Level = Level(longest=250, window=9, wanted=6)
+    coarse: Level = Level(longest=250, window=7, wanted=6)
     """Finds objects over the whole range of heights."""
-    fine: Level = Level(longest=500, window=5, wanted=3)
+    fine: Level = Level(longest=500, window=3, wanted=3)
     """Refines them."""
     finest: int = 720
     """The same where things stand: longest side in px of the photos' images."""
@@ -95,7 +98,7 @@ class Stereo:
     """The ratio that is preferred."""
     cell_px: tuple[int, int] = (4, 8)
     """Least and greatest side of a cell in map pixels."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def __call__(
         self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep
@@ -128,16 +131,11 @@ class Stereo:
         )
         z = _fused(given, pairs, "fine", keep)
         known = without_specks(z, 0.01 * height, 6)
-        refined = nearest_known(z, known) if known.any() else z
-        del z, given  # large surveys have rasters of 100 MB
-        refined = np.asarray(cv2.medianBlur(refined, 5), np.float32)
+        del given  # large surveys have rasters of 100 MB
+        if known.any():
+            z = nearest_known(z, known)
         side = 2 * round(self.whole * height / cells.gsd / 2) + 1
-        firm = cv2.boxFilter(known.view(np.uint8), cv2.CV_32F, (side, side)) > FIRM
-        x, y = cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height))
-        # cliffs stay as steep as the cells allow
-        former = np.asarray(cv2.medianBlur(_stepwise(rough, x, y), 5), np.float32)
-        np.copyto(former, refined, where=firm)
-        return surface_of(former, cells)
+        return surface_of(_with_coarse(z, known, rough, cells, side), cells)
 
     def _coarse(
         self,
@@ -190,9 +188,11 @@ class Stereo:
         first, until every place is seen by `wanted` of them.
         """
         centre = np.array([v.pose.map_C[:2] for v in views])
-        ratio = np.hypot(*(centre[:, None] - centre[None]).transpose(2, 0, 1)) / height
-        i, j = np.nonzero(np.triu((ratio >= self.base[0]) & (ratio <= self.base[1])))
-        order = np.lexsort((j, i, np.round(np.abs(np.log(ratio[i, j] / self.best_base)), 1)))
+        i, j = pairs_within(centre, self.base[1] * height)
+        ratio = np.hypot(*(centre[j] - centre[i]).T) / height
+        apart = ratio >= self.base[0]
+        i, j, ratio = i[apart], j[apart], ratio[apart]
+        order = np.lexsort((j, i, np.round(np.abs(np.log(ratio / self.best_base)), 1)))
         outline = np.concatenate([v.footprint for v in views])
         corner, far = outline.min(0), outline.max(0)
         side = max(height / 20, float((far - corner).max()) / 4000)
@@ -384,6 +384,24 @@ def _agreed(heights: Sequence[Cells], step: float, shape: tuple[int, int]) -> Fl
         close = (np.abs(ordered - z) < step).sum(0)
     z = np.where((number > 1) & (close < 2), np.float32(np.nan), z)
     return np.asarray(z.reshape(shape))
+
+
+def _with_coarse(z: Float, known: Mask, rough: Surface, cells: Grid, side: int) -> Float:
+    """Fine heights (h, w), smoothed, where enough of the window of `side` cells around has some of
+    its own; the coarse ones elsewhere. Cliffs of these stay as steep as the cells allow.
+    """
+    x, y = cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height))
+    out = np.empty((cells.height, cells.width), np.float32)[::-1]  # as `surface_of` turns it
+    halo = side // 2 + 1
+    for row in range(0, cells.height, BAND):
+        first = max(0, row - halo)
+        around = slice(first, row + BAND + halo)
+        inner = slice(row - first, min(row + BAND, cells.height) - first)
+        share = cv2.boxFilter(known[around].view(np.uint8), cv2.CV_32F, (side, side))
+        former = cv2.medianBlur(_stepwise(rough, x, y[around]), 3)
+        fine = cv2.medianBlur(z[around], 3)
+        out[row : row + BAND] = np.where(share > FIRM, fine, former)[inner]
+    return out
 
 
 def _stepwise(surface: Surface, x: NDArray[Any], y: NDArray[Any]) -> Float:

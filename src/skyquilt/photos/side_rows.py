@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from skyquilt.errors import SideFileError
 from skyquilt.geometry.frames import belly_from_gimbal
 from skyquilt.model.photo import Attitude, Datum, GeoPosition, Photo
-from skyquilt.outside import plain, read_bounded, real
+from skyquilt.outside import plain, read_bounded, real, text_of
 from skyquilt.photos.metadata import why_void
 
 _LOOKS_DOWN_AT_MINUS_90 = -45.0
@@ -196,7 +196,7 @@ def _clean(line: str) -> str:
 def read_text(path: Path) -> str:
     """A side file as text; raises `SideFileError` where it cannot be read, or is too large."""
     try:
-        return read_bounded(path).decode("utf-8-sig", "replace")
+        return text_of(read_bounded(path))
     except OSError as error:
         raise SideFileError(
             f"{path} cannot be read ({error.strerror or error}); check the path and its"

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from skyquilt.errors import OutputError
 from skyquilt.model.raster import Grid
+from skyquilt.outside import whole
+from skyquilt.raster.database import open_database
 from skyquilt.raster.halving import halve
 
 SIDE = 256
@@ -24,15 +26,18 @@ SIDE = 256
 LEVELS = 10
 """Number of levels, each with pixels twice as large as the one before."""
 QUALITY = 90
+MOST_BANDS = 4
+"""Largest number of values of a pixel."""
+FARTHEST = 2**31
+"""Largest row and column of a tile."""
 KEPT = 256
 """Number of decoded tiles that are cached."""
-TABLES = (
-    "create table if not exists tile(layer text, level integer, row integer, col integer, version"
-    " integer not null,"
-    " body blob not null, primary key(layer, level, row, col)) without rowid",
-    "create table if not exists owed(layer text, level integer, row integer, col integer,"
-    " primary key(layer, level, row, col)) without rowid",
-)
+TABLES = """
+create table if not exists tile(layer text, level integer, row integer, col integer, version
+  integer not null, body blob not null, primary key(layer, level, row, col)) without rowid;
+create table if not exists owed(layer text, level integer, row integer, col integer,
+  primary key(layer, level, row, col)) without rowid;
+"""
 PUT = (
     "insert into tile values (?, ?, ?, ?, 1, ?) on conflict do update set version = version + 1,"
     " body = excluded.body"
@@ -104,14 +109,29 @@ def encoded(tile: Tile) -> bytes:
 
 
 def decoded(body: bytes) -> Tile:
-    """Decodes a tile."""
+    """Decodes a tile; raises ValueError where it is none, whatever size it declares."""
     n = int.from_bytes(body[1:5], "little")
-    mask = np.frombuffer(zlib.decompress(body[5 : 5 + n]), np.uint8)
+    mask = np.frombuffer(_inflated(body[5 : 5 + n], SIDE * SIDE // 8), np.uint8)
     shown = np.unpackbits(mask)[: SIDE * SIDE].reshape(SIDE, SIDE).astype(bool)
+    rest = body[5 + n :]
     if body[:1] == b"J":
-        return Tile(pixels=np.asarray(simplejpeg.decode_jpeg(body[5 + n :])), shown=shown)
-    values = np.frombuffer(zlib.decompress(body[5 + n :]), np.float32).reshape(SIDE, SIDE, -1)
-    return Tile(pixels=values, shown=shown)
+        if tuple(simplejpeg.decode_jpeg_header(rest)[:2]) != (SIDE, SIDE):
+            raise ValueError("a tile of another size")
+        return Tile(pixels=np.asarray(simplejpeg.decode_jpeg(rest)), shown=shown)
+    values = np.frombuffer(_inflated(rest, 4 * SIDE * SIDE * MOST_BANDS), np.float32)
+    return Tile(pixels=values.reshape(SIDE, SIDE, -1), shown=shown)
+
+
+def _inflated(data: bytes, most: int) -> bytes:
+    """What `zlib.compress` made smaller, of at most so many bytes; raises ValueError."""
+    stream = zlib.decompressobj()
+    try:
+        found = stream.decompress(data, most + 1)
+    except zlib.error as error:
+        raise ValueError("a damaged tile") from error
+    if len(found) > most or not stream.eof:
+        raise ValueError("a tile that is torn or too large")
+    return found
 
 
 class TileStore:
@@ -128,21 +148,11 @@ class TileStore:
             str, tuple[tuple[int, int], tuple[float, float, float, float] | None]
         ] = {}
         self._kept: OrderedDict[Address, tuple[int, Tile]] = OrderedDict()
-        try:
-            uri = f"{self.path.absolute().as_uri()}?mode={'rwc' if write else 'ro'}"
-            self._db = sqlite3.connect(
-                uri, uri=True, timeout=30, check_same_thread=False, isolation_level=None
-            )
-            if write:
-                self._db.execute("pragma journal_mode=wal")
-                self._db.execute("pragma synchronous=full")
-                if not self._db.execute("pragma schema_version").fetchone()[0]:
-                    self._db.execute(f"pragma user_version={SIDE}")
-                for table in TABLES:
-                    self._db.execute(table)
-            side = int(self._db.execute("pragma user_version").fetchone()[0])
-        except sqlite3.Error as error:
-            raise OutputError(f"{path} cannot be opened ({error})") from error
+        self._db = open_database(self.path, TABLES, write=write)
+        side = int(self._db.execute("pragma user_version").fetchone()[0])
+        if write and not side:
+            self._db.execute(f"pragma user_version={SIDE}")
+            side = SIDE
         if side != SIDE:
             self._db.close()
             raise OutputError(
@@ -159,7 +169,7 @@ class TileStore:
         return int(found[0]) if found else 0
 
     def get(self, address: Address) -> Tile | None:
-        """The tile, or None."""
+        """The tile; None where there is none, or it is damaged."""
         with self._lock:
             found = self._db.execute(
                 "select version, body from tile where layer=? and level=? and row=? and col=?",
@@ -171,7 +181,10 @@ class TileStore:
             if kept is not None and kept[0] == found[0]:
                 self._kept.move_to_end(address)
                 return kept[1]
-        tile = decoded(found[1])
+        try:
+            tile = decoded(found[1])
+        except (ValueError, TypeError):  # it is drawn again when a photo on it changes
+            return None
         with self._lock:
             self._keep(address, int(found[0]), tile)
         return tile
@@ -219,7 +232,12 @@ class TileStore:
         """Tiles of other layers that are still to be drawn, in order."""
         with self._lock:
             found = self._db.execute("select layer, level, row, col from owed").fetchall()
-        return [Address(str(layer), int(z), int(r), int(c)) for layer, z, r, c in found]
+        return [
+            Address(str(layer), z, r, c)
+            for layer, z, r, c in found
+            if whole(z, 0, LEVELS - 1) is not None
+            and None not in (whole(r, -FARTHEST, FARTHEST), whole(c, -FARTHEST, FARTHEST))
+        ]
 
     def raise_levels(self, changed: Iterable[Address], *, drawn: Iterable[Address] = ()) -> int:
         """Updates every coarser tile above those of level 0 that changed; returns how many.

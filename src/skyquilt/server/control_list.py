@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from skyquilt.errors import SideFileError
-from skyquilt.outside import plain, read_bounded, real
+from skyquilt.outside import plain, read_bounded, real, text_of
 from skyquilt.photos.gcp import read_gcp_list
 from skyquilt.photos.side_rows import read_crs
 from skyquilt.raster.atomic import mended, write_text
@@ -102,7 +102,7 @@ def read_list(path: Path, photos: list[str], crs: str) -> Control:
     Raises:
         SideFileError: it is neither.
     """
-    text = read_bounded(path, MOST_BYTES).decode("utf-8-sig", "replace")
+    text = text_of(read_bounded(path, MOST_BYTES))
     rows = [line.strip() for line in text.splitlines() if line.strip()[:1] not in ("", "#")]
     if rows and "," in rows[0] and rows[0].count(",") >= 2 and not rows[0].startswith("+"):
         return checked({"crs": crs, "points": _csv(rows), "marks": []}, set(photos))

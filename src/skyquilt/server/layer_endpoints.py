@@ -113,13 +113,12 @@ def _shapes(data: bytes, name: str) -> dict[str, Any]:
 
 def put_layer(ledger: Ledger, name: str, layer: dict[str, Any], most: int) -> bool:
     """Stores a layer under a name; False if there are too many layers."""
+    text = json.dumps(layer)  # seconds for the largest ones, and the mapping waits for the ledger
     with ledger.change() as db:
         count = ledger.row("select count(*) from layer where name != ?", name)
         if count is not None and count[0] >= most:
             return False
-        db.execute(
-            "insert or replace into layer values (?, ?, ?)", (name, json.dumps(layer), time.time())
-        )
+        db.execute("insert or replace into layer values (?, ?, ?)", (name, text, time.time()))
         ledger.tell("layer", {"name": name, "features": len(layer["features"])})
     return True
 

@@ -5,7 +5,8 @@ import json
 import numpy as np
 
 from skyquilt.errors import UnreadablePhotoError
-from skyquilt.live.members import pose_from
+from skyquilt.live.ledger import DAMAGED
+from skyquilt.live.members import camera_from, pose_from
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Photo
 from skyquilt.ortho.height_cells import HeightCells
@@ -38,7 +39,11 @@ class LiveProjection:
             return None
         place = self._on_ground(x - frame["origin"][0], y - frame["origin"][1])
         camera = self._camera(number, str(row[1] or ""))
-        px = pixel_of(pose_from(json.loads(row[0])), camera, place)
+        try:
+            pose = pose_from(json.loads(row[0]))
+        except DAMAGED as error:
+            raise UnreadablePhotoError("what is stored of it is damaged") from error
+        px = pixel_of(pose, camera, place)
         return None if px is None else (px, camera)
 
     def _camera(self, number: int, name: str) -> Camera:
@@ -48,8 +53,9 @@ class LiveProjection:
         if not isinstance(photo, Photo):
             raise UnreadablePhotoError("its file cannot be read")
         for key in (name, photo.camera_key):
-            if found := self.ledger.row("select body from camera where key = ?", key):
-                return Camera(**json.loads(found[0]))
+            found = self.ledger.row("select body from camera where key = ?", key)
+            if found and (camera := camera_from(found[0])):
+                return camera
         ideal = Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
         return photo.calibration or ideal
 

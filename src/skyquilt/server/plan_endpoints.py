@@ -230,9 +230,8 @@ class PlanEndpoints:
 
 
 def _keep_areas(ledger: Ledger, areas: dict[str, Any]) -> None:
-    with ledger.change():
-        ledger.put_meta(AREAS, areas)
-        ledger.tell("areas", {"areas": len(areas["features"])})
+    ledger.put_meta(AREAS, areas)
+    ledger.tell("areas", {"areas": len(areas["features"])})
 
 
 def _drawn(record: dict[str, Any]) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """Opens what the server shows: a growing survey, read from its folder, or a finished run."""
 
-import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -9,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from skyquilt.errors import UsageError
-from skyquilt.live.ledger import NAME, Ledger
+from skyquilt.live.ledger import NAME, Ledger, footprint_from
+from skyquilt.outside import real
 from skyquilt.raster.map_source import FileSource, MapSource, TileSource
 from skyquilt.raster.tile_store import TileStore
 from skyquilt.runs.layers import RunLayer, figures_of, is_tiff, layers_in
@@ -116,7 +116,8 @@ class LiveSurvey:
             "select id, name, source, state, reason, footprint, file, received, digest, shot"
             " from photo order by id"
         )
-        return [self._shown(row) for row in self.ledger.rows(query)]
+        found = (self._shown(row) for row in self.ledger.rows(query))
+        return [photo for photo in found if photo is not None]
 
     def photo(self, number: int) -> Shown | None:
         """One accepted photo."""
@@ -127,10 +128,14 @@ class LiveSurvey:
         row = self.ledger.row(query, number)
         return None if row is None else self._shown(row)
 
-    def _shown(self, row: tuple[Any, ...]) -> Shown:
-        number, name, source, state, reason, place, file, received, digest, shot = row
-        held = json.loads(place) if place else {}
-        ring = tuple((float(a), float(b)) for a, b in held.get("ring", ()))
+    def _shown(self, row: tuple[Any, ...]) -> Shown | None:
+        """A photo; None where what is stored of it is damaged."""
+        number, _, _, _, _, place, file, received, digest, shot = row
+        name, source, state, reason = (str(v) for v in row[1:5])
+        held = footprint_from(place or "{}")
+        if held is None or real(received) is None:
+            return None
+        ring = tuple((lon, lat) for lon, lat in held["ring"])
         record = {
             "id": number,
             "name": name,
@@ -138,7 +143,7 @@ class LiveSurvey:
             "state": state,
             "reason": "" if state in ("refined", "superseded") else reason,
             "time": _taken(str(shot)),
-            "at": held.get("at"),
+            "at": held["at"],
             "ring": [list(p) for p in ring],
             "received": received,
         }
@@ -160,7 +165,7 @@ class LiveSurvey:
             "select name, source, reason, at from refused order by id desc limit 200"
         )
         return [
-            {"name": n, "source": s, "reason": r, "at": a, "state": "refused"}
+            {"name": str(n), "source": str(s), "reason": str(r), "at": real(a), "state": "refused"}
             for n, s, r, a in rows
         ]
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
 from skyquilt.errors import OutputError
 from skyquilt.simulate.camera import Lens, wrap
@@ -44,7 +45,6 @@ def film(
     rng = np.random.default_rng([settings.seed, 61])
     sway = _wander(t, _SWAY_S, rng, 3) * route.jitter * [1, 1, 0.6]
     shake = _wander(t, _SHAKE_S, rng, 3) * [route.yaw_noise, route.tilt_noise, route.tilt_noise]
-    velocity = speed * np.stack([np.sin(course), np.cos(course), 0 * course], axis=1)
     shots = []
     for i, when in enumerate(t):
         heading = route.heading if route.fixed_yaw else float(np.degrees(course[i]))
@@ -68,10 +68,26 @@ def film(
                 yaw=wrap(heading + float(shake[i, 0])),
                 pitch=float(shake[i, 1]),
                 roll=float(shake[i, 2]),
-                velocity=(float(velocity[i, 0]), float(velocity[i, 1]), 0.0),
             )
         )
-    return shots
+    return _moving(shots, t)
+
+
+def _moving(shots: list[Shot], t: Doubles) -> list[Shot]:
+    """Frames with the velocities and rates of rotation at which a rolling shutter meets them, by
+    the poses before and after each; the first and the last have one of these.
+    """
+    last = len(shots) - 1
+    moving = []
+    for i, shot in enumerate(shots):
+        a, b = max(i - 1, 0), min(i + 1, last)
+        gap = float(t[b] - t[a]) or 1.0
+        velocity = (shots[b].place - shots[a].place) / gap
+        turn = Rotation.from_matrix(shots[b].rotation @ shots[a].rotation.T).as_rotvec()
+        x, y, z = (float(v) for v in velocity)
+        u, v, w = (float(v) for v in np.degrees(turn) / gap)
+        moving.append(replace(shot, velocity=(x, y, z), spin=(u, v, w)))
+    return moving
 
 
 def _path(points: list[Waypoint]) -> tuple[Doubles, NDArray[np.int64], Doubles]:

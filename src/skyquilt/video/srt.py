@@ -14,7 +14,7 @@ from datetime import datetime
 from pathlib import Path
 
 from skyquilt.errors import SideFileError
-from skyquilt.outside import read_bounded
+from skyquilt.outside import read_bounded, text_of
 
 MOST_TELEMETRY_BYTES = 300_000_000
 """Largest file of positions: an hour at 60 frames per second has 100 MB."""
@@ -103,7 +103,7 @@ def read_samples(path: Path) -> tuple[Sample, ...]:
 def side_text(path: Path) -> str:
     """A side file as text; raises `SideFileError` where it cannot be read, or is too large."""
     try:
-        return read_bounded(path, MOST_TELEMETRY_BYTES).decode("utf-8-sig", "replace")
+        return text_of(read_bounded(path, MOST_TELEMETRY_BYTES))
     except OSError as error:
         raise SideFileError(
             f"{path} cannot be read ({error.strerror or error}); check the path and its"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from skyquilt.errors import SideFileError
 from skyquilt.model.clip import Track
-from skyquilt.outside import open_regular, plain, real
+from skyquilt.outside import open_regular, plain, real, text_of
 from skyquilt.video.srt import Sample, read_samples, side_text
 
 Array = NDArray[np.float64]
@@ -228,7 +228,7 @@ def is_timed_csv(path: Path) -> bool:
     """Whether a CSV has a column of times and positions, but none that names photos."""
     try:
         with open_regular(path) as file:
-            first = file.readline(10_000).decode("utf-8-sig", "replace")
+            first = text_of(file.read(10_000)).partition("\n")[0]
     except OSError:
         return False
     heads = [_plain(h)[0] for h in re.split(r"[,;\t]", first.strip())]

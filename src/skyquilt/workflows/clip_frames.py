@@ -29,6 +29,8 @@ _UNLIKE = 0.35
 _MOVES_MS = 3.0
 _LEAST_SPAN = 0.6
 """Telemetry that lasts a smaller share of its clip, or the clip of it, belongs to another one."""
+_SPAN_S = 1.0
+"""Unless they differ by no more than this: rows may be a second apart."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +77,7 @@ def with_frames(given: SurveyInput, settings: InputSettings, store: Store) -> St
             rejected.append(RejectedPhoto(name=clip.name, reason="none of its frames decodes"))
             continue
         chosen = methods.choose(clip, looks)
-        chosen, use_track, said = _timed(clip, looks, chosen, methods, settings.clock_offset)
+        chosen, use_track, said = timed(clip, looks, chosen, methods, settings.clock_offset)
         frames = frames_of(clip, chosen, number=number, use_track=use_track, late_s=late[number])
         chosen = replace(chosen, placed=sum(f.position is not None for f in frames))
         photos += frames
@@ -148,7 +150,7 @@ def _seen(clip: Clip, look: Looker, store: Store, before: int, total: int) -> St
     return joined(parts)
 
 
-def _timed(
+def timed(
     clip: Clip, looks: Looks, chosen: ChosenFrames, methods: FrameMethods, stated: float | None
 ) -> tuple[ChosenFrames, bool, list[str]]:
     """The choice with the offset of its clock, whether the positions can be used, and notes."""
@@ -159,7 +161,8 @@ def _timed(
         return replace(chosen, offset_s=stated, offset_source="option"), True, []
     zero = clip_zero(track, clip)
     reach = _REACH_S if track.source == "srt" and track.on_clip else _ALL_S
-    found = methods.search(looks, track, zero, reach)
+    # where the two do not meet within reach, no time is as good as another
+    found = methods.search(looks, track, zero, reach) or methods.search(looks, track, zero, _ALL_S)
     if found is not None and found.clear:
         seconds = 0.0 if abs(found.seconds) < 2 * found.sigma_s else found.seconds
         said = []
@@ -184,7 +187,8 @@ def _timed(
     if track.source == "srt" and track.on_clip:
         told = float(track.height_time_s[-1] - track.height_time_s[0])
         lasts = max(clip.duration_s, float(looks.time_s[-1]))
-        if not _LEAST_SPAN * lasts <= told <= lasts / _LEAST_SPAN:
+        alike = _LEAST_SPAN * lasts <= told <= lasts / _LEAST_SPAN
+        if not alike and abs(lasts - told) > _SPAN_S:
             return (
                 chosen,
                 False,

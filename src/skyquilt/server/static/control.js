@@ -189,6 +189,8 @@ const drawLoupes = () => {
   const rows = control.rows.map((r) => loupe(point, r));
   box.replaceChildren(row, ...(rows.length ? rows : [element("p", "No photo of the map shows this place; check its coordinates.")]));
 };
+// Browsers tell a click in whole pixels of the screen: what was meant is the middle of one.
+const middle = (at) => (Number.isInteger(at) ? at + 0.5 : at);
 const loupe = (point, r) => {
   const mark = markIn(point.name, r.name), about = mark || r, k = control.zoom / VIEW;
   const figure = element("figure"), stage = element("div", undefined, "loupe"), img = element("img");
@@ -197,7 +199,7 @@ const loupe = (point, r) => {
   img.loading = "lazy";
   stage.append(img, element("i", undefined, mark ? "mark" : "guess"));
   const put = (x, y) => { keepUndo(); control.marks = control.marks.filter((m) => m !== mark); control.marks.push({ point: point.name, photo: r.name, x, y }); const first = marksOf(point.name).length === 1; drawControl(); if (first) lookUp(); };
-  stage.onclick = (e) => { const b = img.getBoundingClientRect(); put(about.x + ((e.clientX - b.left) * VIEW / b.width - VIEW / 2) * k, about.y + ((e.clientY - b.top) * VIEW / b.height - VIEW / 2) * k); };
+  stage.onclick = (e) => { const b = img.getBoundingClientRect(); put(about.x + ((middle(e.clientX) - b.left) * VIEW / b.width - VIEW / 2) * k, about.y + ((middle(e.clientY) - b.top) * VIEW / b.height - VIEW / 2) * k); };
   stage.tabIndex = 0;
   stage.setAttribute("role", "button");
   stage.setAttribute("aria-label", `${r.name}: click where ${point.name} is; Enter marks the middle, arrow keys move the mark by a quarter of a pixel`);
