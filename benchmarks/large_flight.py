@@ -1,6 +1,7 @@
 """Simulates large flights in minutes rather than hours.
 
 python benchmarks/large_flight.py FOLDER [--photos 2000]    2 MP photos from three drones
+                                          [--jobs 2]         by two processes
 python benchmarks/large_flight.py FOLDER --kind small       300 photos of 0.3 MP from three drones
 python benchmarks/large_flight.py FOLDER --kind dense       172 photos of 0.5 MP, 87 % overlap
 python benchmarks/large_flight.py FOLDER --kind wing        167 photos of 9.7 MP, 50 % overlap
@@ -19,7 +20,9 @@ import json
 import mmap
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +56,8 @@ LAYERS = {"height": ((), np.float32), "rgb": ((3,), np.uint8), "look": ((4,), np
 """Rasters of the terrain."""
 OFTEN = 8
 """Steps after which what was drawn is put away."""
+DRAWN: list[tuple[World, Path]] = []
+"""What a process draws, and the folder of its terrain."""
 
 
 def smooth_hits(surface: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
@@ -85,24 +90,58 @@ def put_away(scene: Scene) -> None:
         raster._mmap.madvise(mmap.MADV_DONTNEED)
 
 
-def draw(world: World, scene: Scene, folder: Path) -> Iterator[Progress]:
-    """Draws what is not drawn yet."""
+def draw(world: World, scene: Scene, folder: Path, jobs: int) -> Iterator[Progress]:
+    """Draws what is not drawn yet: all surfaces, then their light, which needs those around."""
     note = folder / "done.json"
     done = json.loads(note.read_text()) if note.exists() else 0
-    steps = world.country.draw(scene, world.settings.weather, scratch=folder, done=done)
-    for done, total in steps:
-        if done % OFTEN == 0 or done == total:
-            for raster in (scene.height, scene.rgb, scene.look):
-                raster.flush()
+    blocks = world.country.blocks(scene)
+    total = 2 * blocks
+    world.country.layout  # noqa: B018  computed before the processes part
+    drawing = {"initializer": DRAWN.append, "initargs": ((world, folder),)}
+    with ProcessPoolExecutor(jobs, mp_context=get_context("fork"), **drawing) as pool:
+        while done < total:
+            end = min(done + OFTEN * jobs, blocks if done < blocks else total)
+            parts = [range(done + k, end, jobs) for k in range(jobs)]
+            for part in [pool.submit(draw_steps, p) for p in parts]:
+                part.result()
+            done = end
             note.write_text(json.dumps(done))
+            yield Progress(stage="terrain", done=done, total=total)
+
+
+def draw_steps(steps: range) -> None:
+    """Draws some blocks into the terrain's files, in a process of its own."""
+    world, folder = DRAWN[-1]
+    scene = open_terrain(world, folder)
+    for step in steps:
+        world.country.draw_step(scene, world.settings.weather, step)
+    for raster in (scene.height, scene.rgb, scene.look):
+        raster.flush()
+    put_away(scene)
+
+
+def take(world: World, folder: Path, share: tuple[int, int]) -> None:
+    """Takes a share of the photos."""
+    scene = open_terrain(world, folder / ".terrain")
+    for step in photograph(world, scene, folder, resume=True, share=share):
+        if step.done % OFTEN == 0:
             put_away(scene)
-        yield Progress(stage="terrain", done=done, total=total)
 
 
-def run(world: World, folder: Path) -> Iterator[Progress]:
+def run(world: World, folder: Path, jobs: int) -> Iterator[Progress]:
     """The whole flight."""
     scene = open_terrain(world, folder / ".terrain")
-    yield from draw(world, scene, folder / ".terrain")
+    yield from draw(world, scene, folder / ".terrain", jobs)
+    others = [
+        get_context("fork").Process(target=take, args=(world, folder, (k, jobs)))
+        for k in range(1, jobs)
+    ]
+    for other in others:
+        other.start()
+    if others:
+        take(world, folder, (0, jobs))
+    for other in others:
+        other.join()
     photos = photograph(world, scene, folder, resume=True)
     while True:
         try:
@@ -126,6 +165,7 @@ def main() -> None:
     parser.add_argument("--kind", choices=KINDS, default="large")
     parser.add_argument("--photos", type=int, help="instead of the kind's own number")
     parser.add_argument("--seed", type=int, default=2)
+    parser.add_argument("--jobs", type=int, default=1, help="processes at work")
     asked = parser.parse_args()
     expose.first_hits = smooth_hits
     lens, route = KINDS[asked.kind]
@@ -141,7 +181,7 @@ def main() -> None:
     )
     world = prepare(settings)
     began, last = time.process_time(), ("", -1)
-    for step in run(world, asked.folder):
+    for step in run(world, asked.folder, max(asked.jobs, 1)):
         if last != (step.stage, step.done * 10 // step.total):
             last = step.stage, step.done * 10 // step.total
             spent = time.process_time() - began

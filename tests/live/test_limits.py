@@ -20,6 +20,7 @@ from skyquilt.errors import OutputError, SideFileError, UsageError
 from skyquilt.live.live_map import LiveMap
 from skyquilt.live.settings import LiveSettings
 from skyquilt.raster import RasterSpec, write_array
+from skyquilt.raster.map_source import FileSource
 from skyquilt.server import connections
 from skyquilt.server.access import Guard
 from skyquilt.server.server_process import ServerConfig, ServerProcess
@@ -210,6 +211,42 @@ def test_a_damaged_run_ends_in_a_sentence(tmp_path, text):
     (run / "shots.geojson").write_text(text)
     with pytest.raises(SideFileError, match="damaged"):
         open_survey(run)
+
+
+def test_a_final_map_that_is_being_replaced_is_not_shown_for_that_time(run, tmp_path, monkeypatch):
+    live = LiveMap(tmp_path / "out", QUICK)
+    home = tmp_path / "out" / "finished"
+    home.mkdir()
+    final = home / "mosaic.tif"
+    with ServerThread(
+        survey=open_survey(tmp_path / "out"), guard=Guard(), folder=tmp_path / "out"
+    ) as serving:
+
+        def layers():
+            answer = httpx.get(serving.url + "info")
+            assert answer.status_code == 200
+            return [layer["name"] for layer in answer.json()["layers"]]
+
+        for begun in (b"", b"II*\0", (run / "mosaic.tif").read_bytes()[:40]):
+            final.write_bytes(begun)
+            assert layers() == []
+            capabilities = httpx.get(serving.url + "wms?REQUEST=GetCapabilities")
+            assert capabilities.status_code == 200
+            assert b"finished" not in capabilities.content
+            assert httpx.get(serving.url + "at?lon=15&lat=52").status_code == 200
+        shutil.copy(run / "mosaic.tif", final)
+        assert layers() == ["finished"]
+        final.unlink()
+        assert layers() == []
+        shutil.copy(run / "mosaic.tif", final)
+
+        # after it was found, before it is read
+        def gone(source):
+            raise SideFileError("mosaic.tif cannot be read as a map")
+
+        monkeypatch.setattr(FileSource, "bounds", gone)
+        assert layers() == []
+    live.close()
 
 
 def test_a_map_that_names_other_files_is_not_opened(tmp_path):

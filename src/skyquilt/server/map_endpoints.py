@@ -2,7 +2,6 @@
 
 import os
 import tempfile
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
 from skyquilt.engine.free_memory import give_back
-from skyquilt.errors import UsageError
+from skyquilt.errors import SideFileError, UsageError
 from skyquilt.outside import real
 from skyquilt.raster.colours import ramp
 from skyquilt.raster.map_source import MapSource, between
@@ -46,7 +45,7 @@ class MapEndpoints:
         """
         found = []
         for name, source in self.context.survey.layers().items():
-            with suppress(OSError):  # a final map is just being replaced
+            try:
                 bounds = source.bounds()
                 box = (
                     None
@@ -54,7 +53,11 @@ class MapEndpoints:
                     else between(source.crs, "EPSG:4326").transform_bounds(*bounds)
                 )
                 look = self._look(name, source)
-                found.append({"name": name, "crs": source.crs, "bounds": box, **look})
+            except SideFileError:
+                if isinstance(self.context.survey, FinishedSurvey):
+                    raise
+                continue  # a final map is just being replaced
+            found.append({"name": name, "crs": source.crs, "bounds": box, **look})
         counts = (
             self.context.survey.ledger.counts()
             if isinstance(self.context.survey, LiveSurvey)

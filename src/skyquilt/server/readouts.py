@@ -1,7 +1,6 @@
 """What a map says at a place: coordinates and values; heights along a line; volumes."""
 
 import math
-from contextlib import suppress
 from typing import Annotated, Any
 
 import cv2
@@ -46,7 +45,7 @@ class Readouts:
         layers = self.context.survey.layers()
         found: dict[str, Any] = {"lon": lon, "lat": lat, "crs": None, "x": None, "y": None}
         told = []
-        for name, source in _readable(layers).items():
+        for name, source in layers.items():
             x, y = between("EPSG:4326", source.crs).transform(lon, lat)
             if found["crs"] is None and math.isfinite(x) and math.isfinite(y):
                 found |= {"crs": source.crs, "x": round(x, 3), "y": round(y, 3)}
@@ -128,21 +127,11 @@ class Readouts:
         }
 
     def _heights(self) -> tuple[str, MapSource]:
-        layers = _readable(self.context.survey.layers())
+        layers = self.context.survey.layers()
         for name in HEIGHTS:
             if name in layers:
                 return name, layers[name]
         raise HTTPException(404, "this map has no heights; the final map of a flight has")
-
-
-def _readable(layers: dict[str, MapSource]) -> dict[str, MapSource]:
-    """Those whose file is there: a final map may just be replaced."""
-    found = {}
-    for name, source in layers.items():
-        with suppress(OSError):
-            source.bounds()
-            found[name] = source
-    return found
 
 
 def value_at(source: MapSource, x: float, y: float) -> float | None:

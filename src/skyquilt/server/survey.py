@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from skyquilt.errors import UsageError
+from skyquilt.errors import SideFileError, UsageError
 from skyquilt.live.ledger import NAME, Ledger, footprint_from
 from skyquilt.outside import real
 from skyquilt.raster.map_source import FileSource, MapSource, TileSource
@@ -63,6 +63,7 @@ class LiveSurvey:
         self.folder, self.base = folder, base_map(base)
         self.ledger = Ledger(folder, write=False)
         self.tiles = TileStore(folder / TILES, write=False)
+        self._sources: dict[Path, tuple[tuple[int, int, int], FileSource]] = {}
 
     def layers(self) -> dict[str, MapSource]:
         """Layers of the tiles, and the final map if there is one."""
@@ -76,10 +77,25 @@ class LiveSurvey:
                 found[layer] = TileSource(
                     tiles=self.tiles, layer=layer, crs=frame["crs"], origin=(x, y), gsd=gsd
                 )
-        home = self.folder / FINISHED
         for name, final in self._final().items():
-            found[name] = FileSource(path=home / final.file)
+            with suppress(OSError, SideFileError):  # it is just being replaced
+                found[name] = self._source(self.folder / FINISHED / final.file)
         return found | self.base
+
+    def _source(self, path: Path) -> FileSource:
+        """A file of the final map, opened anew where it has been replaced.
+
+        Raises:
+            OSError: it is not there. SideFileError: it cannot be read.
+        """
+        info = path.stat()
+        stamp = (info.st_ino, info.st_mtime_ns, info.st_size)
+        known = self._sources.get(path)
+        if known is None or known[0] != stamp:
+            source = FileSource(path=path)
+            source.about()
+            known = self._sources[path] = (stamp, source)
+        return known[1]
 
     def _final(self) -> dict[str, RunLayer]:
         """Layers of the final map, if there is one."""

@@ -77,8 +77,17 @@ class Canvas:
         if self.grid.width == 0 or self.grid.height == 0:
             return False
         low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
-        xs, ys = self.grid.xs, self.grid.ys
-        return bool(low[0] <= xs[-1] and high[0] >= xs[0] and low[1] <= ys[0] and high[1] >= ys[-1])
+        x0, x1, y0, y1 = self.grid.span
+        return bool(low[0] <= x1 and high[0] >= x0 and low[1] <= y0 and high[1] >= y1)
+
+    def near(self, places: Doubles, reach: float) -> NDArray[np.bool_]:
+        """(n,) which of map points (n, 2) may have cells of the block within `reach` m; some have
+        none.
+        """
+        x0, x1, y0, y1 = self.grid.span
+        far = reach + 4 * self.grid.res
+        x, y = places[:, 0], places[:, 1]
+        return np.asarray((x > x0 - far) & (x < x1 + far) & (y > y1 - far) & (y < y0 + far))
 
     def part(self, x: float, y: float, reach: float) -> "Canvas":
         """A canvas with views of the cells within `reach` m of a map point; may be empty."""

@@ -70,6 +70,20 @@ class Grid:
         rows = self.row + 0.5 + np.arange(self.height, dtype=np.float64)
         return np.asarray(self.top - rows * self.res)
 
+    @property
+    def span(self) -> tuple[float, float, float, float]:
+        """Map x of the first and the last column's centres and y of the first and the last row's,
+        m.
+        """
+        first, last = self.col + 0.5, self.col + 0.5 + (self.width - 1)
+        upper, lower = self.row + 0.5, self.row + 0.5 + (self.height - 1)
+        return (
+            self.left + first * self.res,
+            self.left + last * self.res,
+            self.top - upper * self.res,
+            self.top - lower * self.res,
+        )
+
     def pixels(self, xy: Doubles) -> Doubles:
         """Pixel coordinates (..., 2) as (column, row), centres at integers, of map points (...,
         2).

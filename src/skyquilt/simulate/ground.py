@@ -30,12 +30,14 @@ class Basin:
 
     def weight(self, grid: Grid) -> Floats | None:
         """The weight on a window; None where the pond is far away."""
-        corner = self.grid.pixels(np.array([[grid.xs[0], grid.ys[0]], [grid.xs[-1], grid.ys[-1]]]))
-        if (
-            (corner[1] < 0).any()
-            or corner[0, 0] > self.grid.width
-            or corner[0, 1] > self.grid.height
-        ):
+        own, (x0, x1, y0, y1) = self.grid, grid.span  # plain numbers: most ponds are far away
+        if (x1 - own.left) / own.res - 0.5 - own.col < 0:
+            return None
+        if (own.top - y1) / own.res - 0.5 - own.row < 0:
+            return None
+        if (x0 - own.left) / own.res - 0.5 - own.col > own.width:
+            return None
+        if (own.top - y0) / own.res - 0.5 - own.row > own.height:
             return None
         u = self.grid.pixels(np.stack([grid.xs, np.full(grid.width, grid.ys[0])], axis=1))[:, 0]
         v = self.grid.pixels(np.stack([np.full(grid.height, grid.xs[0]), grid.ys], axis=1))[:, 1]

@@ -20,6 +20,13 @@ def _lattice(seed: int, key: int, size: int) -> Floats:
     return rng.standard_normal((size, size), dtype=np.float32)
 
 
+def _weights(t: float) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Cubic B-spline weights of four neighbours at `t` (0 to 1) between the middle two."""
+    weights = (1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3
+    a, b, c, d = (np.float32(w / 6) for w in weights)
+    return a, b, c, d
+
+
 def _spline(positions: Doubles) -> tuple[sparse.csr_matrix, NDArray[np.int64]]:
     """Cubic B-spline weights as a sparse matrix, and the lattice indices of its columns."""
     base = np.floor(positions).astype(np.int64)
@@ -48,11 +55,27 @@ class Noise:
         """A field (height, width) with zero mean, unit standard deviation and no features below the
         wavelength (m).
         """
+        if grid.width == grid.height == 1:
+            return self._at_point(grid.xs[0] / wavelength, grid.ys[0] / wavelength, key)
         down, rows = _spline(grid.ys / wavelength)
         across, cols = _spline(grid.xs / wavelength)
         lattice = _lattice(self.seed, key, _LATTICE)[np.ix_(rows % _LATTICE, cols % _LATTICE)]
         field = across @ (down @ lattice).T
         return np.ascontiguousarray(field.T) * np.float32(1 / _SPREAD)
+
+    def _at_point(self, u: float, v: float, key: int) -> Floats:
+        """The field (1, 1) at one place of the lattice; the same number, without matrices."""
+        columns, rows = int(np.floor(u)), int(np.floor(v))
+        lattice = _lattice(self.seed, key, _LATTICE)
+        down, across = _weights(v - rows), _weights(u - columns)
+        total = np.float32(0)
+        for k in range(4):
+            column = np.float32(0)
+            for j in range(4):
+                place = (rows - 1 + j) % _LATTICE, (columns - 1 + k) % _LATTICE
+                column += down[j] * lattice[place]
+            total += across[k] * column
+        return np.array([[total * np.float32(1 / _SPREAD)]])
 
     def fractal(self, grid: Grid, longest: float, shortest: float, gain: float, key: int) -> Floats:
         """Sum of octaves from the longest wavelength down to the shortest (m), each with `gain`

@@ -278,10 +278,15 @@ def _drawn(
 
 
 def photograph(
-    world: World, scene: Scene, output: Path, *, resume: bool = False
+    world: World,
+    scene: Scene,
+    output: Path,
+    *,
+    resume: bool = False,
+    share: tuple[int, int] = (0, 1),
 ) -> Generator[Progress, None, list[Taken]]:
     """Takes and writes the visible photos; returns what was taken. `resume`: files that are there
-    already are kept.
+    already are kept. `share`: (k, n), only the k-th, counted from 0, of every n photos.
     """
     pictures, flight = world.settings.pictures, world.visible
     camera = exposer(scene, flight.lens)
@@ -292,6 +297,8 @@ def photograph(
     spoilt = set(shaken[: pictures.blurred].tolist())
     sharp, shake = pictures, replace(pictures, motion_blur=pictures.blurred_px)
     for number, (shot, report) in enumerate(zip(flight.shots, flight.reports, strict=True)):
+        if number % share[1] != share[0]:
+            continue
         rng = np.random.default_rng([world.settings.seed, 51, number])
         pictures = shake if number in spoilt else _moving(sharp, shot, flight.lens)
         gain = float(np.exp(rng.normal(0, pictures.exposure_noise)))

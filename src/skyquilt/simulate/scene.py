@@ -1,7 +1,7 @@
 """The whole terrain as rasters: colours and temperatures under sunlight, and surface heights."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -140,15 +140,30 @@ class Country:
         looks = scene.look
         if looks is None:
             looks = _room(scene.grid, (4,), np.float16, scratch / "look")
+        scene, total = replace(scene, look=looks), 2 * self.blocks(scene)
+        for step in range(done, total):
+            self.draw_step(scene, weather, step)
+            yield step + 1, total
+
+    def blocks(self, scene: Scene) -> int:
+        """Number of blocks in which a scene is drawn, each in two steps."""
+        return len(scene.grid.blocks(_BLOCK))
+
+    def draw_step(self, scene: Scene, weather: Weather, step: int) -> None:
+        """Draws one block: its surface or, when all surfaces are drawn, its light. Steps of the
+        same half may be done in any order.
+
+        Raises ValueError for a scene without `look`.
+        """
+        if scene.look is None:
+            raise ValueError("surfaces need a place for their look until light falls on them")
         blocks = scene.grid.blocks(_BLOCK)
-        for step in range(done, 2 * len(blocks)):
-            block = blocks[step % len(blocks)]
-            if step < len(blocks):
-                canvas = self.paint(block, weather)
-                scene.height[block.slices], looks[block.slices] = canvas.height, canvas.look
-            else:
-                _light(scene, looks, block, weather, flat=self.settings.kind == "chessboard")
-            yield step + 1, 2 * len(blocks)
+        block = blocks[step % len(blocks)]
+        if step < len(blocks):
+            canvas = self.paint(block, weather)
+            scene.height[block.slices], scene.look[block.slices] = canvas.height, canvas.look
+        else:
+            _light(scene, scene.look, block, weather, flat=self.settings.kind == "chessboard")
 
 
 def empty_scene(grid: Grid, *, thermal: bool, scratch: Path, hours: bool = False) -> Scene:

@@ -1,5 +1,8 @@
 """Painters of objects: houses, trees, cars."""
 
+from collections.abc import Sequence
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,15 +12,23 @@ from skyquilt.simulate.grid import Floats
 from skyquilt.simulate.ground import Ground
 from skyquilt.simulate.layout import Car, House, Layout, Tree
 
+Thing = TypeVar("Thing", Car, House, Tree)
+
 
 def paint_things(canvas: Canvas, layout: Layout, ground: Ground) -> None:
     """Paints everything that rises above the ground, in the order cars, houses, trees."""
-    for car in layout.cars:
+    for car in _near(canvas, layout.cars, 4.0):
         _car(canvas.part(car.x, car.y, 4.0), car, ground)
-    for house in layout.houses:
+    for house in _near(canvas, layout.houses, 14.0):
         _house(canvas.part(house.x, house.y, 14.0), house, ground)
-    for tree in layout.trees:
+    largest = max((1.3 * tree.radius for tree in layout.trees), default=0.0)
+    for tree in _near(canvas, layout.trees, largest):
         _tree(canvas.part(tree.x, tree.y, 1.3 * tree.radius), tree, ground)
+
+
+def _near(canvas: Canvas, things: Sequence[Thing], reach: float) -> list[Thing]:
+    places = np.array([(t.x, t.y) for t in things]).reshape(-1, 2)
+    return [things[i] for i in np.flatnonzero(canvas.near(places, reach))]
 
 
 def _empty(canvas: Canvas) -> bool:
