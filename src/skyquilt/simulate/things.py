@@ -28,7 +28,7 @@ def paint_things(canvas: Canvas, layout: Layout, ground: Ground) -> None:
 
 def _near(canvas: Canvas, things: Sequence[Thing], reach: float) -> list[Thing]:
     places = np.array([(t.x, t.y) for t in things]).reshape(-1, 2)
-    return [things[i] for i in np.flatnonzero(canvas.near(places, reach))]
+    return [things[int(i)] for i in np.flatnonzero(canvas.near(places, reach))]
 
 
 def _empty(canvas: Canvas) -> bool:
