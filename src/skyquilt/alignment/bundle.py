@@ -16,7 +16,7 @@ from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
 from skyquilt.alignment.stages import believe_positions, fine, plain, rough, weighed
 from skyquilt.alignment.start import Start, find_start, ground_of
-from skyquilt.alignment.tracks import Tracks, build_tracks, thin
+from skyquilt.alignment.tracks import Thinning, Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.errors import AlignmentError
@@ -109,14 +109,15 @@ class Bundle:
         start = _kept_start(photos, priors, features, links, ground_of(frame), keep)
         if not start.blocks:
             raise AlignmentError(f"none of {len(photos)} photos could be linked to another one")
-        tracks = keep("tracks", lambda: build_tracks(features, start.links))
-        setup = set_up(photos, priors, start, distortion=self.distortion, repair=self.repair)
         sizes = [(p.width, p.height) for p in photos]
+        large = len(start.placed) > self.many
+        some = Thinning(sizes=sizes, per_photo=self.ties, least=self.ties // 2) if large else None
+        tracks = keep("tracks", lambda: build_tracks(features, start.links, thinning=some))
+        setup = set_up(photos, priors, start, distortion=self.distortion, repair=self.repair)
         begin = each = self.per_photo
         least = 0
-        if len(start.placed) > self.many:
+        if large:
             begin, each, least = ROUGHLY, self.per_photo // 3, ROUGHLY
-            tracks = thin(tracks, sizes, per_photo=self.ties, least=self.ties // 2)
         used = setup.sensor_tracks(tracks)
         del tracks
         problem, state = setup.problem(thin(used, sizes, per_photo=begin, least=least))

@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -14,6 +14,8 @@ from skyquilt.alignment.problem import of_some
 from skyquilt.model.features import Features, Link
 
 Index = NDArray[np.int64]
+TOGETHER = 1_000_000
+"""Edges or observations that are looked at at once."""
 
 
 def connected(count: int, a: NDArray[Any], b: NDArray[Any]) -> Index:
@@ -23,14 +25,29 @@ def connected(count: int, a: NDArray[Any], b: NDArray[Any]) -> Index:
     Each node takes the smallest label among its neighbours; each round then follows the labels to
     their roots (Shiloach and Vishkin 1982).
     """
-    label = np.arange(count)
-    while (label[a] != label[b]).any():
-        least = np.minimum(label[a], label[b])
-        np.minimum.at(label, label[a], least)
-        np.minimum.at(label, label[b], least)
+    label = np.arange(count, dtype=_index_type(count))
+    edges = [slice(k, k + TOGETHER) for k in range(0, len(a), TOGETHER)]
+    moved = True
+    while moved:
+        moved = False
+        for some in edges:
+            of_a, of_b = label[a[some]], label[b[some]]
+            differ = of_a != of_b
+            if differ.any():
+                of_a, of_b = of_a[differ], of_b[differ]
+                least = np.minimum(of_a, of_b)
+                np.minimum.at(label, of_a, least)
+                np.minimum.at(label, of_b, least)
+                moved = True
         while (label[label] != label).any():
             label = label[label]
-    return np.asarray(np.unique(label, return_inverse=True)[1], np.int64)
+    first = label == np.arange(count, dtype=label.dtype)
+    return np.asarray(np.cumsum(first)[label] - 1, np.int64)
+
+
+def _index_type(count: int) -> type[np.int32 | np.int64]:
+    """The smaller type that numbers so many: of large surveys, lists of numbers fill the memory."""
+    return np.int32 if count < 2**31 else np.int64
 
 
 def spanning_tree(count: int, a: NDArray[Any], b: NDArray[Any], cost: NDArray[Any]) -> list[int]:
@@ -115,9 +132,8 @@ class Tracks:
         """The selected observations, without tracks left with one observation; renumbered."""
         point = self.point[observation]
         keep = np.flatnonzero(observation)[np.bincount(point, minlength=self.count)[point] >= 2]
-        _, renumbered = np.unique(self.point[keep], return_inverse=True)
         return Tracks(
-            point=renumbered.astype(np.int64),
+            point=_renumbered(self.point[keep]),
             photo=self.photo[keep],
             px=self.px[keep],
             sigma_px=self.sigma_px[keep],
@@ -125,8 +141,74 @@ class Tracks:
         )
 
 
+@dataclass(frozen=True, kw_only=True)
+class Thinning:
+    """How many tracks are kept: long ones first, until every photo has enough observations spread
+    over its area, one in each of as many cells: neighbouring ones err alike.
+    """
+
+    sizes: Sequence[tuple[int, int]]
+    """(width, height) of each photo in px."""
+    per_photo: int
+    """Observations wanted of a photo."""
+    cells: int | None = None
+    """Cells along a side instead of the root of `per_photo`."""
+    least: int = 0
+    """A photo that would be left with fewer, since its observations lie in few of the cells, keeps
+    all of them.
+    """
+
+    def chosen(
+        self, point: Index, photo: Index, px_of: Callable[[Index], NDArray[np.float64]]
+    ) -> NDArray[np.bool_]:
+        """(tracks,) which tracks are kept.
+
+        `point`, `photo` (N,): track, ascending, and photo of each observation. `px_of` gives the
+        pixels (n, 2) of some of them, sorted by photo: of large surveys those of all would fill
+        the memory.
+        """
+        count = int(point[-1]) + 1 if len(point) else 0
+        length = np.bincount(point, minlength=count)
+        chosen = np.zeros(count, bool)
+        by_photo = np.argsort(photo, kind="stable")
+        cuts = np.searchsorted(photo[by_photo], np.arange(len(self.sizes) + 1))
+        for lo, hi in _grouped(cuts, TOGETHER):
+            own = by_photo[lo:hi]
+            chosen[point[self._best(photo[own], length[point[own]], px_of(own), own)]] = True
+        if self.least:
+            number = np.bincount(photo[chosen[point]], minlength=len(self.sizes))
+            chosen[point[number[photo] < self.least]] = True
+        return chosen
+
+    def _best(
+        self, photo: Index, length: Index, px: NDArray[np.float64], own: Index
+    ) -> NDArray[np.int64]:
+        """Those of some photos' observations `own` that are the best ones of their cells."""
+        cells = self.cells or max(1, math.isqrt(self.per_photo))
+        size = np.array(self.sizes)[photo]
+        column, row = ((px + 0.5) / size * cells).astype(int).clip(0, cells - 1).T
+        slot = (photo.astype(np.int64) * cells + row) * cells + column
+        order = np.lexsort((px[:, 0], -length, slot))
+        starts = np.flatnonzero(np.r_[True, np.diff(slot[order]) != 0])
+        rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
+        return own[order[rank < max(1, self.per_photo // cells**2)]]
+
+
+def _grouped(cuts: Index, about: int) -> Iterator[tuple[int, int]]:
+    """Ranges of whole photos of about so many observations; `cuts` (photos + 1,) ascending."""
+    lo = 0
+    for hi, following in pairwise([*cuts[1:].tolist(), math.inf]):
+        if following - lo > about and hi > lo:
+            yield lo, hi
+            lo = hi
+
+
 def build_tracks(
-    features: Sequence[Features], links: Sequence[Link], *, sigma: float = 0.25
+    features: Sequence[Features],
+    links: Sequence[Link],
+    *,
+    sigma: float = 0.25,
+    thinning: Thinning | None = None,
 ) -> Tracks:
     """Joins matches to tracks. A track with observations in two places of one photo contains a
     wrong match and is removed.
@@ -134,40 +216,70 @@ def build_tracks(
     Features at one place count as one: a detector describes a place several times where it has
     several orientations. As observations of several points they would err alike.
 
-    `sigma`: standard deviation of a keypoint in px of the image it was found in.
+    `sigma`: standard deviation of a keypoint in px of the image it was found in. `thinning`: only
+    some of the tracks are wanted.
     """
-    if not links:
-        return Tracks(
-            point=np.zeros(0, np.int64),
-            photo=np.zeros(0, np.int64),
-            px=np.zeros((0, 2)),
-            sigma_px=np.zeros(0),
-        )
+    used, photo, point, offset = _joined(features, links)
+
+    def px_of(some: Index) -> NDArray[np.float64]:
+        """Of observations sorted by photo."""
+        px, whose = np.empty((len(some), 2)), photo[some]
+        starts = np.flatnonzero(np.r_[True, np.diff(whose) != 0])[: len(whose)]
+        for lo, hi in pairwise([*starts.tolist(), len(whose)]):
+            i = int(whose[lo])
+            px[lo:hi] = features[i].px[used[some[lo:hi]] - offset[i]]
+        return px
+
+    if thinning is not None:
+        keep = thinning.chosen(point, photo, px_of)[point]
+        used, photo, point = used[keep], photo[keep], _renumbered(point[keep])
+    by_photo = np.argsort(photo, kind="stable")
+    px = np.empty((len(used), 2))
+    px[by_photo] = px_of(by_photo)
+    scales = np.array([f.scale for f in features])
+    return Tracks(
+        point=point.astype(np.int64),
+        photo=photo.astype(np.int64),
+        px=px,
+        sigma_px=np.maximum(sigma * scales[photo], 0.3),
+    )
+
+
+def _joined(features: Sequence[Features], links: Sequence[Link]) -> tuple[Index, ...]:
+    """Observations by track, as `build_tracks` describes: the feature of each in the list of all
+    (N,), its photo (N,), its track (N,) ascending; and where each photo's features begin in that
+    list (photos + 1,).
+    """
     offset, place = _places(features)
-    a = np.concatenate([offset[k.a] + place[k.a][k.index_a] for k in links])
-    b = np.concatenate([offset[k.b] + place[k.b][k.index_b] for k in links])
+    kind = _index_type(int(offset[-1]))
+    ends = np.cumsum([0, *(len(k) for k in links)])
+    a, b = np.empty(ends[-1], kind), np.empty(ends[-1], kind)
+    for link, (lo, hi) in zip(links, pairwise(ends.tolist()), strict=True):
+        a[lo:hi] = offset[link.a] + place[link.a][link.index_a]
+        b[lo:hi] = offset[link.b] + place[link.b][link.index_b]
     del place
-    used = np.unique(np.concatenate([a, b]))  # most features are in no link
-    label = connected(len(used), np.searchsorted(used, a), np.searchsorted(used, b))
-    del a, b
-    photo = np.searchsorted(offset, used, "right") - 1
-    order = np.lexsort((photo, label))
+    linked = np.zeros(offset[-1], bool)  # most features are in no link
+    linked[a] = linked[b] = True
+    used = np.flatnonzero(linked).astype(kind)
+    number: NDArray[Any] = np.cumsum(linked, dtype=kind)
+    number -= 1
+    label = connected(len(used), number[a], number[b]).astype(kind)
+    del a, b, linked, number
+    photo = (np.searchsorted(offset, used, "right") - 1).astype(kind)
+    order = np.argsort(label, kind="stable")  # within a track they are in order of photos
     used, photo, track = used[order], photo[order], label[order]
     repeated = np.flatnonzero((np.diff(track) == 0) & (np.diff(photo) == 0))
-    good = ~np.isin(track, track[repeated])
+    wrong = np.zeros(int(track[-1]) + 1 if len(track) else 0, bool)
+    wrong[track[repeated]] = True
+    good = ~wrong[track]
     used, photo, track = used[good], photo[good], track[good]
     order, point = _by_photos(track, photo)
-    used, photo = used[order], photo[order]
-    px, scale = np.empty((len(used), 2)), np.empty(len(used))
-    by_photo = np.argsort(photo, kind="stable")
-    cuts = np.searchsorted(photo[by_photo], np.arange(len(features) + 1))
-    for i, (lo, hi) in enumerate(pairwise(cuts.tolist())):
-        if lo < hi:
-            own = by_photo[lo:hi]
-            px[own], scale[own] = features[i].px[used[own] - offset[i]], features[i].scale
-    return Tracks(
-        point=point.astype(np.int64), photo=photo, px=px, sigma_px=np.maximum(sigma * scale, 0.3)
-    )
+    return used[order], photo[order], point.astype(kind), offset
+
+
+def _renumbered(point: Index) -> Index:
+    """Numbers without gaps of ascending ones (n,)."""
+    return np.cumsum(np.r_[False, np.diff(point) != 0])[: len(point)]
 
 
 def _places(features: Sequence[Features]) -> tuple[Index, list[NDArray[np.int32]]]:
@@ -208,24 +320,7 @@ def thin(
     cells: int | None = None,
     least: int = 0,
 ) -> Tracks:
-    """Selects tracks for an adjustment: long ones first, until every photo has `per_photo`
-    observations spread over its area, one in each of as many cells (or in `cells` by `cells` of
-    them): neighbouring ones err alike.
-
-    `sizes`: (width, height) of each photo. A photo that would be left with fewer than `least`,
-    since its observations lie in few of the cells, keeps all of them.
-    """
-    length = np.bincount(tracks.point, minlength=tracks.count)
-    cells = cells or max(1, math.isqrt(per_photo))
-    size = np.array(sizes)[tracks.photo]
-    column, row = ((tracks.px + 0.5) / size * cells).astype(int).clip(0, cells - 1).T
-    slot = (tracks.photo * cells + row) * cells + column
-    order = np.lexsort((tracks.px[:, 0], -length[tracks.point], slot))
-    starts = np.flatnonzero(np.r_[True, np.diff(slot[order]) != 0])
-    rank = np.arange(len(order)) - np.repeat(starts, np.diff(np.r_[starts, len(order)]))
-    chosen = np.zeros(tracks.count, bool)
-    chosen[tracks.point[order[rank < max(1, per_photo // cells**2)]]] = True
-    if least:
-        number = np.bincount(tracks.photo[chosen[tracks.point]], minlength=len(sizes))
-        chosen[tracks.point[number[tracks.photo] < least]] = True
+    """Selects tracks for an adjustment, as `Thinning` describes."""
+    rule = Thinning(sizes=sizes, per_photo=per_photo, cells=cells, least=least)
+    chosen = rule.chosen(tracks.point, tracks.photo, lambda some: tracks.px[some])
     return tracks.only(chosen[tracks.point])

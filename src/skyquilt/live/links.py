@@ -15,7 +15,7 @@ from skyquilt.engine.store import Store
 from skyquilt.live.failures import concerning
 from skyquilt.live.ledger import DAMAGED
 from skyquilt.live.members import Member, Members
-from skyquilt.model.features import Features, Link
+from skyquilt.model.features import Features, Link, numbers
 from skyquilt.workflows.links import link_pair
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import photo_features
@@ -109,9 +109,5 @@ def link_from(body: bytes) -> Link:
     """Decodes a link. Cached, since each new photo needs the same links of its surroundings."""
     d = decode(body, {})
     return Link(
-        a=d["a"],
-        b=d["b"],
-        index_a=d["ia"].astype(np.int64),
-        index_b=d["ib"].astype(np.int64),
-        b_S_a=d["s"],
+        a=d["a"], b=d["b"], index_a=numbers(d["ia"]), index_b=numbers(d["ib"]), b_S_a=d["s"]
     )

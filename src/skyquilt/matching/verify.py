@@ -8,7 +8,7 @@ from typing import ClassVar
 import cv2
 import numpy as np
 
-from skyquilt.model.features import Features, Link, Matches, RejectedLink
+from skyquilt.model.features import Features, Link, Matches, RejectedLink, numbers
 
 EPIPOLAR = {"magsac": cv2.USAC_MAGSAC, "ransac": cv2.FM_RANSAC, "lmeds": cv2.FM_LMEDS}
 """OpenCV's estimators of a fundamental matrix, by name."""
@@ -82,8 +82,8 @@ class Verify:
         return Link(
             a=a,
             b=b,
-            index_a=matches.index_a[keep],
-            index_b=matches.index_b[keep],
+            index_a=numbers(matches.index_a[keep]),
+            index_b=numbers(matches.index_b[keep]),
             b_S_a=complex(model[0, 0], -model[1, 0]),
         )
 

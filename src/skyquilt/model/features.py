@@ -1,6 +1,7 @@
 """Keypoints of one photo, and what two photos have in common."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,14 @@ class Features:
         return self.px.nbytes + self.size.nbytes + self.descriptors.nbytes
 
 
+def numbers(index: NDArray[Any]) -> NDArray[np.integer[Any]]:
+    """Numbers of keypoints (M,) as the smallest type that has room for them: links of thousands of
+    photos stay in memory.
+    """
+    largest = int(index.max(initial=0))
+    return index.astype(np.uint16 if largest < 2**16 else np.int64)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Matches:
     """Putative correspondences of two photos."""
@@ -84,9 +93,9 @@ class Link:
     """Index of the first photo."""
     b: int
     """Index of the second photo."""
-    index_a: NDArray[np.int64]
-    """(M,) keypoints of a among its features."""
-    index_b: NDArray[np.int64]
+    index_a: NDArray[np.integer[Any]]
+    """(M,) keypoints of a among its features, as `numbers` gives them."""
+    index_b: NDArray[np.integer[Any]]
     """(M,) keypoints of b."""
     b_S_a: complex
     """Scale and rotation from a to b: p_b = b_S_a * p_a + t for image points as x - iy (y up)."""

@@ -18,7 +18,7 @@ from skyquilt.engine.workers import Workers
 from skyquilt.imaging.grey import shrink
 from skyquilt.matching.candidates import Pair
 from skyquilt.matching.matchers import Guided
-from skyquilt.model.features import Features, Link, RejectedLink
+from skyquilt.model.features import Features, Link, RejectedLink, numbers
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Prior
 from skyquilt.workflows.links import Links, link_pair
@@ -105,7 +105,9 @@ def connect(
     again = frozenset(i for k in better for i in (k.a, k.b))
     names = {i: _numbers(found.features[i], look(i)) for i in sorted(again)}
     joined = {
-        (k.a, k.b): replace(k, index_a=names[k.a][k.index_a], index_b=names[k.b][k.index_b])
+        (k.a, k.b): replace(
+            k, index_a=numbers(names[k.a][k.index_a]), index_b=numbers(names[k.b][k.index_b])
+        )
         for k in better
     }
     whole = sorted([*links.links, *joined.values()], key=lambda k: (k.a, k.b))
