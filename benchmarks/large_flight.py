@@ -30,8 +30,12 @@ import cv2
 import numpy as np
 
 from skyquilt.simulate import FlightSettings, Progress, expose, prepare
+from skyquilt.simulate import run as run_module
 from skyquilt.simulate.camera import Lens
-from skyquilt.simulate.raycast import Rays, sample
+from skyquilt.simulate.expose import Exposer, exposer
+from skyquilt.simulate.flight import Shot
+from skyquilt.simulate.grid import Grid
+from skyquilt.simulate.raycast import rays_of, sample
 from skyquilt.simulate.run import World, photograph
 from skyquilt.simulate.scene import Scene
 from skyquilt.simulate.settings import Control, Route
@@ -54,19 +58,47 @@ GSD = 0.1
 """Least cell of the country's raster in m; the pixels of 2 MP photos are 0.045 m."""
 LAYERS = {"height": ((), np.float32), "rgb": ((3,), np.uint8), "look": ((4,), np.float16)}
 """Rasters of the terrain."""
+NODES = 8
+"""Spacing in px of the rays that are cast."""
 OFTEN = 8
 """Steps after which what was drawn is put away."""
 DRAWN: list[tuple[World, Path]] = []
 """What a process draws, and the folder of its terrain."""
 
 
-def smooth_hits(surface: np.ndarray, rays: Rays) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays meet the smoothed ground: two steps of the fixed point, ample for gentle hills."""
-    ground = cv2.blur(surface, (101, 101))
-    height = np.full(rays.start.shape[:2], np.float32(np.median(ground)))
-    for _ in range(2):
-        height = sample(ground, rays.at(height))
-    return rays.at(height), height
+class LevelExposer(Exposer):
+    """Takes photos of the smoothed ground, quickly: rays are cast at nodes, and nothing has flanks
+    or a horizon.
+    """
+
+    def pixels(self, shot: Shot) -> tuple[np.ndarray, np.ndarray, Grid]:
+        """Where rays meet the ground: two steps of the fixed point, ample for gentle hills."""
+        window = self.window(shot)
+        ground = cv2.blur(self.scene.height[window.slices], (101, 101))
+        rows, columns = (
+            np.unique(np.r_[0:n:NODES, n - 1]) for n in (self.lens.height, self.lens.width)
+        )
+        directions = np.ascontiguousarray(self.directions[np.ix_(rows, columns)])
+        corner = np.array([window.xs[0], window.ys[0]])
+        rays = rays_of(directions, shot.rotation, shot.place, corner, window.res)
+        height = np.full(rays.start.shape[:2], np.float32(np.median(ground)))
+        for _ in range(2):
+            height = sample(ground, rays.at(height))
+        u, v = (
+            np.interp(np.arange(n), at, np.arange(len(at))).astype(np.float32)
+            for n, at in ((self.lens.width, columns), (self.lens.height, rows))
+        )
+        hits = cv2.remap(rays.at(height), *np.meshgrid(u, v), cv2.INTER_LINEAR)
+        return hits, height, window
+
+    def flanks(self, hits: np.ndarray, heights: np.ndarray, window: Grid) -> np.ndarray:
+        return np.ones((1, 1), np.float32)
+
+
+def level_exposer(scene: Scene, lens: Lens) -> Exposer:
+    """Prepares a camera over a scene."""
+    plain = exposer(scene, lens)
+    return LevelExposer(scene=scene, lens=lens, directions=plain.directions, lowest=plain.lowest)
 
 
 def open_terrain(world: World, folder: Path) -> Scene:
@@ -167,7 +199,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=2)
     parser.add_argument("--jobs", type=int, default=1, help="processes at work")
     asked = parser.parse_args()
-    expose.first_hits = smooth_hits
+    run_module.exposer, expose.with_horizon = level_exposer, lambda seen, *_: seen
     lens, route = KINDS[asked.kind]
     if asked.photos:
         route = replace(route, photos=asked.photos)

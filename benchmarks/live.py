@@ -6,6 +6,8 @@ python benchmarks/live.py viewers SURVEY [--viewers 20]           the same with 
 python benchmarks/live.py cost SURVEY                             CPU seconds per photo and step,
                                                                   and the longest step
 python benchmarks/live.py seams SURVEY [--gsd 5]                  seam disparity, live and batch
+python benchmarks/live.py tone SURVEY [--gsd 5]                   how evenly the balanced photos
+                                                                  show the ground, live and batch
 
 `live_scaling.py` measures whether the work per photo stays bounded.
 """
@@ -26,6 +28,24 @@ from pathlib import Path
 
 import numpy as np
 from live_viewers import Browser
+
+from skyquilt.engine.pixel_cache import PixelCache
+from skyquilt.engine.store import Store
+from skyquilt.imaging.views import grid_of, make_views, native_gsd
+from skyquilt.live.live_map import LiveMap
+from skyquilt.live.settings import LiveSettings
+from skyquilt.model.poses import Alignment, no_ties
+from skyquilt.ortho import orthomosaic
+from skyquilt.ortho.exposure import NEUTRAL, Exposure
+from skyquilt.ortho.ground import Ground, round_gsd
+from skyquilt.photos.pixels import read_color
+from skyquilt.quality.seam_measurement import measure_seams
+from skyquilt.quality.tone import tone_residual
+from skyquilt.settings import MosaicSettings
+from skyquilt.workflows.artefacts import REGISTRY
+from skyquilt.workflows.methods import methods_for
+from skyquilt.workflows.mosaic import mosaic
+from skyquilt.workflows.photo_features import thumbnail_of
 
 
 @contextmanager
@@ -166,23 +186,9 @@ def watch(url: str, visible: dict[str, float]) -> None:
                             visible[said["name"]] = time.time()
 
 
-def seams(survey: Path, gsd: float) -> None:
-    from skyquilt.engine.pixel_cache import PixelCache
-    from skyquilt.engine.store import Store
-    from skyquilt.imaging.views import grid_of, make_views, native_gsd
-    from skyquilt.live.live_map import LiveMap
-    from skyquilt.live.settings import LiveSettings
-    from skyquilt.model.poses import Alignment, no_ties
-    from skyquilt.ortho import orthomosaic
-    from skyquilt.ortho.exposure import NEUTRAL
-    from skyquilt.ortho.ground import Ground, round_gsd
-    from skyquilt.photos.pixels import read_color
-    from skyquilt.quality.seam_measurement import measure_seams
-    from skyquilt.settings import MosaicSettings
-    from skyquilt.workflows.artefacts import REGISTRY
-    from skyquilt.workflows.methods import methods_for
-    from skyquilt.workflows.mosaic import mosaic
-
+@contextmanager
+def mapped(survey: Path, gsd: float) -> Iterator[tuple[LiveMap, Alignment, Ground]]:
+    """A live map of all photos of a survey, and its poses and heights as a batch run's."""
     home = Path(tempfile.mkdtemp())
     live = LiveMap(home / "live", LiveSettings(gsd_cm=gsd))
     for path in sorted(
@@ -193,11 +199,6 @@ def seams(survey: Path, gsd: float) -> None:
     for _ in live.drain_all():
         pass
     members = list(live.members.on_map())
-    photos = tuple(m.photo for m in members)
-    store = Store(folder=home / "store", registry=REGISTRY)
-    cache = PixelCache(read=lambda i: read_color(photos[i]), budget_bytes=600_000_000)
-    settings = MosaicSettings(balance=False)
-    methods = methods_for(settings)
     alignment = Alignment(
         method="live",
         why="",
@@ -209,26 +210,53 @@ def seams(survey: Path, gsd: float) -> None:
         ties=no_ties(),
     )
     rough = make_views(alignment, live.canvas.surface((-1, -1, 1, 1)))
-    bounds = grid_of(rough, 1.0).bounds
-    surface = live.canvas.surface(bounds)
+    surface = live.canvas.surface(grid_of(rough, 1.0).bounds)
     views = make_views(alignment, surface)
     native = native_gsd(views, surface)
-    ground = Ground(
-        surface=surface,
-        views=tuple(views),
-        grid=grid_of(views, round_gsd(native)),
-        native_gsd=native,
-    )
-    compose = orthomosaic.composer(3, "uint8", ground, NEUTRAL, None, methods.blend, cache)
-    steps = orthomosaic.draw(
-        home, compose, alignment, settings.output, None, store, "live", photos[0].unit, 2
-    )
-    of_live = drain(measure_seams(compose, drain(steps), ground)).figures
+    grid = grid_of(views, round_gsd(native))
+    yield live, alignment, Ground(surface=surface, views=tuple(views), grid=grid, native_gsd=native)
+    live.close()
+    shutil.rmtree(home, ignore_errors=True)
+
+
+def seams(survey: Path, gsd: float) -> None:
+    home = Path(tempfile.mkdtemp())
+    with mapped(survey, gsd) as (live, alignment, ground):
+        photos = tuple(m.photo for m in live.members.on_map())
+        store = Store(folder=home / "store", registry=REGISTRY)
+        cache = PixelCache(read=lambda i: read_color(photos[i]), budget_bytes=600_000_000)
+        settings = MosaicSettings(balance=False)
+        methods = methods_for(settings)
+        compose = orthomosaic.composer(3, "uint8", ground, NEUTRAL, None, methods.blend, cache)
+        steps = orthomosaic.draw(
+            home, compose, alignment, settings.output, None, store, "live", photos[0].unit, 2
+        )
+        of_live = drain(measure_seams(compose, drain(steps), ground)).figures
     of_batch = mosaic(survey, home / "batch").metrics["seam_disparity_px"]
     print("live: ", of_live)
     print("batch:", of_batch)
-    live.close()
     shutil.rmtree(home, ignore_errors=True)
+
+
+def tone(survey: Path, gsd: float) -> None:
+    with mapped(survey, gsd) as (live, _, ground):
+        members = list(live.members.on_map())
+        small = {k: thumbnail_of(read_color(m.photo)) for k, m in enumerate(members)}
+        settled = live.canvas.exposure
+        exposure = Exposure(
+            gains={k: settled.gains[m.id] for k, m in enumerate(members)},
+            fields={k: settled.fields[m.id] for k, m in enumerate(members)},
+            offsets={},
+        )
+        place = ground.views, small, ground.surface, ground.grid.bounds
+        of_live, of_none = (tone_residual(*place, e) for e in (exposure, NEUTRAL))
+    home = Path(tempfile.mkdtemp())
+    of_batch = mosaic(survey, home).metrics["tone_residual"]
+    shutil.rmtree(home, ignore_errors=True)
+    print("spread of balanced photos over shared cells, grey values")
+    for what, found in (("live", of_live), ("batch", of_batch), ("not balanced", of_none)):
+        print(f"{what:13} {found}")
+    print(f"live over batch: {of_live['median'] / of_batch['median']:.2f}")
 
 
 def drain(steps):
@@ -243,7 +271,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("latency", "browser", "viewers", "cost", "seams"))
+    parser.add_argument("what", choices=("latency", "browser", "viewers", "cost", "seams", "tone"))
     parser.add_argument("of", type=Path)
     parser.add_argument("--rate", type=float, default=1.0)
     parser.add_argument("--gsd", type=float, default=5.0)
@@ -257,5 +285,7 @@ if __name__ == "__main__":
         with_viewers(asked.of, asked.rate, asked.gsd, asked.viewers)
     elif asked.what == "cost":
         cost(asked.of, asked.gsd)
-    else:
+    elif asked.what == "seams":
         seams(asked.of, asked.gsd)
+    else:
+        tone(asked.of, asked.gsd)

@@ -28,6 +28,7 @@ from skyquilt.model.raster import Window
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Blend, Feather, First, Float, Layer, Order
 from skyquilt.ortho.compose import Composed, Composer
+from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.height_cells import HeightCells
 from skyquilt.ortho.plan import Plan
 from skyquilt.raster.tile_store import SIDE, Address, Tile, TileStore, covering
@@ -160,6 +161,11 @@ class Canvas:
             measured=measured(member),
             drift=member.photo.unit == "celsius",
         )
+
+    @property
+    def exposure(self) -> Exposure:
+        """How the photos are balanced so far, by their numbers."""
+        return self._tone.exposure
 
     def remove(self, number: int) -> set[Address]:
         """Removes a photo; returns the tiles that may look different."""
@@ -348,7 +354,7 @@ class Canvas:
             pixels=self._pictures,
             bands=1 if values else 3,
             dtype=np.dtype(np.float32 if values else np.uint8),
-            exposure=self._tone.exposure,
+            exposure=self.exposure,
         )
 
     @staticmethod

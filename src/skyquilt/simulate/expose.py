@@ -62,7 +62,7 @@ class Exposer:
         hits, heights = first_hits(np.ascontiguousarray(self.scene.height[window.slices]), rays)
         return hits, heights, window
 
-    def _flanks(self, hits: Floats, heights: Floats, window: Grid) -> Floats:
+    def flanks(self, hits: Floats, heights: Floats, window: Grid) -> Floats:
         """Brightness (h, w) of leaves and plaster on steep flanks, a texture of x, y and z.
 
         A raster has no texture along the vertical: without this, flanks would show streaks.
@@ -115,7 +115,7 @@ class Exposer:
             else self.scene.at_hour(window, weather)
         )
         seen = sample(np.ascontiguousarray(colours), hits).astype(np.float32)
-        seen *= self._flanks(hits, heights, window)[..., None]
+        seen *= self.flanks(hits, heights, window)[..., None]
         seen = with_horizon(seen, self.scene, self.directions, shot)
         seen = _blurred(seen, settings)
         seen *= (np.float32(gain) * falloff(self.lens, settings.vignetting))[..., None]
