@@ -17,7 +17,10 @@ Figures: SSIM (Wang et al. 2004; grey, windows of 7 x 7 px, range 255, after one
 the whole map) within 1.5 m of a height step of more than 1 m, and elsewhere; local displacement
 (phase correlation of windows of 64 px, after one shift of the whole map), median and 90th
 percentile in px; gradient energy on open ground over that of the truth; heights against the true
-surface, in GSD: NMAD on open ground and on objects 1 m inside their edges.
+surface, in GSD: NMAD on open ground and on objects 1 m inside their edges; share of the edges'
+length (where the surface crosses half of an object's height) that lie within 4 GSD of the true
+ones; share of the cells shown by two photos or more that had a height of their own before gaps
+were filled.
 """
 
 import argparse
@@ -55,7 +58,25 @@ WINDOW = 64
 """Side in px of the windows whose displacement is measured."""
 LEAST_RESPONSE = 0.03
 """Least response of a phase correlation to be counted."""
-COMMAND = "import sys; from skyquilt.cli.main import run; sys.argv[0] = 'skyquilt'; run()"
+NEAR_EDGE_GSD = 4.0
+"""Largest displacement of an edge that is found."""
+COMMAND = """
+import sys
+import numpy as np
+from skyquilt.cli.main import run
+from skyquilt.ortho import stereo
+
+whole, kept = stereo._with_coarse, sys.argv.pop(1)
+
+def noted(z, known, rough, cells, side):
+    np.savez(kept, known=known)
+    return whole(z, known, rough, cells, side)
+
+stereo._with_coarse = noted
+sys.argv[0] = "skyquilt"
+run()
+"""
+"""The product's command; which cells had a height of their own is kept in a file."""
 Floats = NDArray[np.float32]
 
 
@@ -169,10 +190,25 @@ def product(flight: Path, truth: Truth, out: Path, words: list[str]) -> dict[str
     shutil.rmtree(out, ignore_errors=True)
     control = ["--gcp", str(flight / "gcp_list.txt")]
     told = ["mosaic", str(flight / "photos"), "-o", str(out), *control, "--quiet", *words]
-    cpu, _, peak = run_process([sys.executable, "-c", COMMAND, *told])
+    kept = out.with_suffix(".npz")
+    kept.unlink(missing_ok=True)
+    cpu, _, peak = run_process([sys.executable, "-c", COMMAND, str(kept), *told])
     figures = picture_figures(on_grid(out / "mosaic.tif", truth), truth)
     heights = out / "dsm.tif" if (out / "dsm.tif").is_file() else out / "surface.tif"
-    return {**figures, **height_figures(heights, truth), "cpu_s": cpu, "peak_mb": peak}
+    found = {**figures, **height_figures(heights, truth)}
+    if kept.is_file():
+        found["measured"] = measured_share(kept, out / "views.tif")
+    return {**found, "cpu_s": cpu, "peak_mb": peak}
+
+
+def measured_share(kept: Path, views: Path) -> float:
+    """Share of the cells that two photos or more show which had a height of their own; cells begin
+    at the corner of the map, of which `views` gives the number of photos per place.
+    """
+    known = np.load(kept)["known"]
+    with rasterio.open(views) as source:
+        number = source.read(1, out_shape=known.shape, resampling=Resampling.nearest)
+    return float(known[number >= 2].mean())
 
 
 def on_grid(path: Path, truth: Truth) -> Floats:
@@ -328,7 +364,26 @@ def height_figures(path: Path, truth: Truth) -> dict[str, float]:
         "z_open_gsd": nmad(open_),
         "z_inner_gsd": nmad(truth.inner),
         "z_inner_bias_m": float(np.median(inner)) if inner.size else float("nan"),
+        "edges": edges_found(truth.height + error, known, truth),
     }
+
+
+def edges_found(z: Floats, known: NDArray[np.bool_], truth: Truth) -> float:
+    """Share of the length of objects' edges near which the surface `z` (h, w) has one too."""
+    side = disc(2.0 / truth.gsd)
+    low, high = cv2.erode(truth.height, side), cv2.dilate(truth.height, side)
+    half = (low + high) / 2
+    objects = cv2.dilate(truth.inner.astype(np.uint8), disc(1.5 / truth.gsd)) > 0
+    tall = objects & (high - low > 2 * STEP_M) & (cv2.erode(known.astype(np.uint8), side) > 0)
+    cross = np.ones((3, 3), np.uint8)
+
+    def edge(surface: Floats) -> NDArray[np.bool_]:
+        above = (np.nan_to_num(surface) > half).astype(np.uint8)
+        return (above > 0) & (cv2.erode(above, cross) == 0)
+
+    found = cv2.distanceTransform((~edge(z)).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    at = edge(truth.height) & tall
+    return float((found[at] <= NEAR_EDGE_GSD).mean())
 
 
 if __name__ == "__main__":
