@@ -1,5 +1,7 @@
 """Gains of known size are found again; black and white stay; two gains are one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -8,28 +10,37 @@ from hypothesis import strategies as st
 from skyquilt.geometry import block_cholesky
 from skyquilt.model.raster import Window
 from skyquilt.ortho import differences
-from skyquilt.ortho.exposure import NEUTRAL, Balance, Exposure, image_place, odds_table, with_odds
+from skyquilt.ortho.earlier import complete, with_new
+from skyquilt.ortho.exposure import (
+    NEUTRAL,
+    WHITES,
+    Balance,
+    Exposure,
+    image_place,
+    odds_table,
+    with_odds,
+)
+from skyquilt.quality.tone import tone_residual
 from tests.ortho.scenes import FLAT, GRID, block, composer, photograph
 
 gains = st.floats(-1.5, 1.5)
 
 
-def odds_scaled(x, g):
-    """Value 0..255 with its odds multiplied by exp(g), by the definition."""
-    x = np.asarray(x, float) / 255
+def odds_scaled(x, g, white=255.0):
+    """Value 0..255 with its odds to `white` multiplied by exp(g), by the definition."""
+    x = np.asarray(x, float) / white
     with np.errstate(divide="ignore"):
-        return 255 / (1 + (1 - x) / np.maximum(x, 1e-300) * np.exp(-g))
+        return np.minimum(white / (1 + (1 - x) / np.maximum(x, 1e-300) * np.exp(-g)), 255)
 
 
-@given(st.lists(gains, min_size=1, max_size=4))
-def test_tables_scale_the_odds(g):
-    table = odds_table(np.array(g, np.float32))
+@given(st.lists(gains, min_size=1, max_size=4), st.sampled_from(WHITES))
+def test_tables_scale_the_odds(g, white):
+    table = odds_table(np.array(g, np.float32), white)
     assert table.shape == (1, 256, len(g)) and table.dtype == np.uint8
     for band, gain in enumerate(g):
-        assert (
-            np.abs(table[0, :, band] - odds_scaled(np.arange(256), np.float32(gain))).max() <= 0.51
-        )
-        assert table[0, 0, band] == 0 and table[0, 255, band] == 255
+        expected = odds_scaled(np.arange(256), np.float32(gain), white)
+        assert np.abs(table[0, :, band] - expected).max() <= 0.51
+        assert table[0, 0, band] == 0 and (table[0, 255, band] == 255 or white > 255)
         assert (np.diff(table[0, :, band].astype(int)) >= 0).all()
 
 
@@ -43,16 +54,16 @@ def test_two_gains_are_one(g, h):
     assert np.abs(two[one].astype(int) - both).max() <= 1 + 0.5 * slope
 
 
-@given(st.integers(0, 10**6), st.sampled_from([1, 3]))
-def test_fields_of_odds_are_the_tables_pixel_by_pixel(seed, bands):
+@given(st.integers(0, 10**6), st.sampled_from([1, 3]), st.sampled_from(WHITES))
+def test_fields_of_odds_are_the_tables_pixel_by_pixel(seed, bands, white):
     rng = np.random.default_rng(seed)
     pixels = rng.integers(0, 256, (20, 30, bands)).astype(np.uint8)
     pixels[0], pixels[1] = 0, 255
     g = rng.uniform(-1, 1, (20, 30, bands)).astype(np.float32)
-    out = with_odds(pixels, np.exp(g))
+    out = with_odds(pixels, np.exp(g), white)
     assert out.dtype == np.uint8 and out.shape == pixels.shape
-    assert np.abs(out - odds_scaled(pixels, g)).max() <= 0.51
-    assert not out[0].any() and (out[1] == 255).all()
+    assert np.abs(out - odds_scaled(pixels, g, white)).max() <= 0.51
+    assert not out[0].any() and ((out[1] == 255).all() or white > 255)
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +92,36 @@ def test_gains_are_found_again(lit):
     assert np.median(mine, axis=0) == pytest.approx(0, abs=1e-6)
     assert np.abs(expected).max() > 0.2  # there was something to find
     assert not any(found.uneven(v.photo) for v in views)
+
+
+def test_values_in_proportion_to_the_light_are_told_from_curved_ones(lit):
+    """Photos of a linear sensor, each with its own factor: odds to the far white bring them
+    together, odds to 255 do not.
+    """
+    views, curved, true = lit
+    factors = {k: float(np.exp(g.mean())) for k, g in true.items()}
+    straight = {
+        v.photo: np.rint(np.clip(photograph(v), 12, 180)[..., None] * factors[v.photo]).astype(
+            np.uint8
+        )
+        for v in views
+    }
+    assert Balance()(views, curved, FLAT, GRID.bounds).white == WHITES[0]
+    found = Balance()(views, straight, FLAT, GRID.bounds)
+    assert found.white == WHITES[1]
+    old = Balance().under(WHITES[0])(views, straight, FLAT, GRID.bounds)
+    assert old.white == WHITES[0]
+
+    def residual(exposure):
+        told = tone_residual(views, straight, FLAT, GRID.bounds, exposure)
+        return told["median"]
+
+    assert residual(found) < 0.7 * residual(old)
+    # photos that are added are corrected as those that are there
+    first = views[0].photo
+    more = {"gains": {**old.gains, 99: old.gains[first]}, "fields": {**old.fields, 99: np.zeros(6)}}
+    grown = with_new(found, replace(old, **more))
+    assert grown.white == found.white and complete(grown, views).white == found.white
 
 
 def test_the_map_loses_its_patches(lit):

@@ -277,6 +277,7 @@ class Composer:
             return with_odds(
                 warped,
                 densify(odds, warped.shape[0], warped.shape[1], n.step).reshape(warped.shape),
+                self.exposure.white,
             )
         table = self.exposure.table(photo)
         return warped if table is None else np.asarray(cv2.LUT(warped, table)).reshape(warped.shape)

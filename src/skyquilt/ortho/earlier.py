@@ -202,7 +202,7 @@ def with_new(old: Exposure, fresh: Exposure) -> Exposure:
     if same := sorted(old.offsets.keys() & fresh.offsets.keys()):
         level = float(np.median([old.offsets[i] - fresh.offsets[i] for i in same]))
         offsets |= {i: o + level for i, o in fresh.offsets.items() if i not in offsets}
-    return Exposure(gains=gains, fields=fields, offsets=offsets)
+    return replace(old, gains=gains, fields=fields, offsets=offsets)
 
 
 def complete(exposure: Exposure, views: Sequence[View]) -> Exposure:
@@ -212,7 +212,8 @@ def complete(exposure: Exposure, views: Sequence[View]) -> Exposure:
         return exposure
     bands = len(next(iter(exposure.gains.values())))
     none = np.zeros(bands, np.float32), np.zeros(6, np.float32)
-    return Exposure(
+    return replace(
+        exposure,
         gains={i: exposure.gains.get(i, none[0]) for i in photos},
         fields={i: exposure.fields.get(i, none[1]) for i in photos},
         offsets={i: o for i, o in exposure.offsets.items() if i in set(photos)},

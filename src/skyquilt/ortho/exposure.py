@@ -4,11 +4,13 @@ Per camera a radial fall of light (vignetting, in even powers of the radius, as 
 others), per photo a gain for each band and a smooth field over the image (a cloud's shadow, the
 sun's hot spot). Gains act on the odds x / (1 - x) of a pixel value x in (0, 1), not on the value:
 black stays black and white stays white, so nothing clips or turns purple, and two gains in a row
-are one gain.
+are one gain. Where a survey's overlaps show that its values follow the light in proportion (as
+those of linear sensors), they act on x / (3 - x), which nearly is a factor on x.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, ClassVar
 
 import cv2
@@ -28,6 +30,10 @@ from skyquilt.ortho.differences import (
 
 Float = NDArray[np.float32]
 
+WHITES = (255.0, 765.0)
+"""Values at which a camera's response may end: gains act on the odds x / (white - x)."""
+STRAIGHTER = 0.05
+"""A larger one is taken if it makes photos differ less by this share."""
 ROUNDS = 8
 """Rounds in which photos' gains and cameras' radial terms are solved for in turn, at most."""
 
@@ -44,6 +50,8 @@ class Exposure:
     """Photo -> (6,) in log odds, for x, y and r from the image's centre, 1 in its corners."""
     offsets: Mapping[int, float] = field(default_factory=dict)
     """Photo -> offset added to measured values, in their unit."""
+    white: float = WHITES[0]
+    """Value at which the response ends: gains act on the odds x / (white - x)."""
 
     def uneven(self, photo: int) -> bool:
         """Whether the photo needs more than one gain per band."""
@@ -60,21 +68,29 @@ class Exposure:
         if photo not in self.gains:
             return np.asarray(value, np.float32)
         field = _basis(*image_place(view, u, v)) @ self.fields[photo]
-        g = np.exp(field + self.gains[photo].mean())
-        return np.asarray(255 * g * value / (255 + (g - 1) * value), np.float32)
+        return np.asarray(
+            self.brightened(value, np.exp(field + self.gains[photo].mean())), np.float32
+        )
+
+    def brightened(self, value: NDArray[Any], odds: NDArray[Any]) -> NDArray[Any]:
+        """Values with their odds multiplied."""
+        found: NDArray[Any] = self.white * odds * value / (self.white + (odds - 1) * value)
+        return found if self.white <= WHITES[0] else np.minimum(found, WHITES[0])
 
     def table(self, photo: int) -> NDArray[np.uint8] | None:
         """Lookup table (1, 256, bands) of a photo with gains only; None if nothing changes."""
         gains = self.gains[photo]
-        return odds_table(gains) if float(np.abs(gains).max()) >= 0.005 else None
+        return odds_table(gains, self.white) if float(np.abs(gains).max()) >= 0.005 else None
 
 
-def with_odds(pixels: NDArray[np.uint8], odds: Float) -> NDArray[np.uint8]:
+def with_odds(
+    pixels: NDArray[np.uint8], odds: Float, white: float = WHITES[0]
+) -> NDArray[np.uint8]:
     """Pixels (h, w, bands) with their odds multiplied by odds (h, w, bands)."""
     brighter = cv2.multiply(pixels, odds, dtype=cv2.CV_32F).reshape(pixels.shape)
-    level: Any = (255.0,) * 4  # a scalar for each band: OpenCV's type stubs accept arrays only
-    white = cv2.add(cv2.subtract(brighter, pixels, dtype=cv2.CV_32F), level).reshape(pixels.shape)
-    return np.asarray(cv2.divide(brighter, white, scale=255, dtype=cv2.CV_8U), np.uint8).reshape(
+    level: Any = (white,) * 4  # a scalar for each band: OpenCV's type stubs accept arrays only
+    rest = cv2.add(cv2.subtract(brighter, pixels, dtype=cv2.CV_32F), level).reshape(pixels.shape)
+    return np.asarray(cv2.divide(brighter, rest, scale=white, dtype=cv2.CV_8U), np.uint8).reshape(
         pixels.shape
     )
 
@@ -84,11 +100,11 @@ def _basis(x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
     return np.stack([x, y, x * x, y * y, x * y, (x * x + y * y) ** 2], -1)
 
 
-def odds_table(gains: Float) -> NDArray[np.uint8]:
+def odds_table(gains: Float, white: float = WHITES[0]) -> NDArray[np.uint8]:
     """Lookup table (1, 256, bands) of gains in log odds."""
-    x = np.arange(256)[None, :, None] / 255.0
+    x = np.arange(256)[None, :, None] / white
     g = np.exp(gains.astype(np.float64))
-    return np.rint(255 * g * x / (1 + (g - 1) * x)).astype(np.uint8)
+    return np.minimum(np.rint(white * g * x / (1 + (g - 1) * x)), 255).astype(np.uint8)
 
 
 NEUTRAL = Exposure(gains={}, fields={})
@@ -113,7 +129,13 @@ class Balance:
     """
     gained: float = 0.1
     """Least share of the differences between photos that fields must explain to be applied."""
-    version: ClassVar[int] = 3
+    whites: tuple[float, ...] = WHITES
+    """Values at which the cameras' response may end; the survey's overlaps decide."""
+    version: ClassVar[int] = 4
+
+    def under(self, white: float) -> "Balance":
+        """The same for a response that is known."""
+        return replace(self, whites=(white,))
 
     def __call__(
         self,
@@ -129,7 +151,13 @@ class Balance:
         samples = self._samples(usable, thumbnails, surface, bounds)
         if not len(samples.point):
             return NEUTRAL
-        return self._solve(samples, usable)
+        best, apart = NEUTRAL, np.inf
+        for white in self.whites:
+            found = self._solve(samples.under(white), usable)
+            less = samples.apart(found, usable)
+            if less < (1 - STRAIGHTER) * apart:
+                best, apart = found, less
+        return best
 
     def _solve(self, s: "Samples", views: Sequence[View]) -> Exposure:
         """Condition: log odds + gain + radial + field is the same in all photos of a ground point,
@@ -160,6 +188,7 @@ class Balance:
         return Exposure(
             gains=dict(zip(photos, gains, strict=True)),
             fields=dict(zip(photos, fields.astype(np.float32), strict=True)),
+            white=s.white,
         )
 
     def _radial(self, s: "Samples", views: Sequence[View], pairs: Pairs) -> NDArray[np.float64]:
@@ -219,7 +248,7 @@ class Balance:
                 point=np.zeros(0, int),
                 row=np.zeros(0, int),
                 place=np.zeros((0, 2)),
-                log=np.zeros((0, 3)),
+                value=np.zeros((0, 3)),
             )
         levels = np.concatenate(value)
         good = ((levels > 8) & (levels < 247)).all(1)
@@ -227,7 +256,7 @@ class Balance:
             point=np.concatenate(point)[good],
             row=np.concatenate(row)[good],
             place=np.concatenate(place)[good],
-            log=np.log(levels[good] / (255 - levels[good])),
+            value=levels[good],
         )
 
 
@@ -241,8 +270,33 @@ class Samples:
     """(N,) view."""
     place: NDArray[np.float64]
     """(N, 2) x and y in the photo, see `image_place`."""
-    log: NDArray[np.float64]
-    """(N, bands) log odds of the brightness."""
+    value: NDArray[np.float64]
+    """(N, bands) brightness."""
+    white: float = WHITES[0]
+    """Value at which the response is taken to end."""
+
+    @cached_property
+    def log(self) -> NDArray[np.float64]:
+        """(N, bands) log odds of the brightness."""
+        return np.log(self.value / (self.white - self.value))
+
+    def under(self, white: float) -> "Samples":
+        """The same, of another response."""
+        return replace(self, white=white)
+
+    def apart(self, exposure: Exposure, views: Sequence[View]) -> float:
+        """Median difference from the mean of their point, in grey values, of corrected samples."""
+        photos = [v.photo for v in views]
+        gains = np.array([exposure.gains[i].mean() for i in photos])
+        fields = np.stack([exposure.fields[i] for i in photos])
+        basis = _basis(self.place[:, 0], self.place[:, 1])
+        odds = np.exp(gains[self.row] + (basis * fields[self.row]).sum(1))
+        level = exposure.brightened(self.value.mean(1), odds)
+        _, point = np.unique(self.point, return_inverse=True)
+        number = np.bincount(point)
+        mean = np.bincount(point, level) / number
+        several = number[point] > 1
+        return float(np.median(np.abs(level - mean[point])[several])) if several.any() else 0.0
 
 
 def _around(view: View, x: NDArray[Any], y: NDArray[Any]) -> tuple[slice, slice]:

@@ -51,6 +51,10 @@ class DriftMethod(Protocol):
 class BalanceMethod(Protocol):
     """Exposure of 8-bit photos from their overlaps."""
 
+    def under(self, white: float) -> "BalanceMethod":
+        """The same for a response of the cameras that is known, see `Exposure.white`."""
+        ...
+
     def __call__(
         self,
         views: Sequence[View],
@@ -100,7 +104,8 @@ def continued(
     for area in grows.areas:
         near = grows.near(ground.views, area)
         there = replace(ground, views=tuple(near), grid=part_of(ground.grid, area), growth=None)
-        fresh = balanced(unit, dtype, thumbnails, there, balance, drift, settings)
+        known = balance.under(exposure.white)
+        fresh = balanced(unit, dtype, thumbnails, there, known, drift, settings)
         exposure = with_new(exposure, fresh)
     return complete(exposure, ground.views)
 

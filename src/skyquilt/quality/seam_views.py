@@ -115,7 +115,7 @@ def _colours(
     value = cv2.remap(image, n.u, n.v, cv2.INTER_LINEAR).reshape(*n.u.shape, -1).astype(np.float32)
     if view.photo in exposure.gains:
         odds = exposure.odds(view.photo, *image_place(view, n.u, n.v))
-        value = 255 * odds * value / (255 + (odds - 1) * value)
+        value = exposure.brightened(value, odds)
     rgb = np.broadcast_to(value[..., :3], (*n.u.shape, 3)).mean(1)
     lab = cv2.cvtColor(np.asarray(rgb[None] / 255, np.float32), cv2.COLOR_RGB2LAB)[0]
     return np.where(seen[:, None], lab, np.nan).astype(np.float64)

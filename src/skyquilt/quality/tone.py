@@ -76,5 +76,5 @@ def _values(
     known = (value > CLIPPED[0]) & (value < CLIPPED[1])
     if view.photo in exposure.gains:
         odds = exposure.odds(view.photo, *image_place(view, u[None], v[None]))[0].mean(-1)
-        value = 255 * odds * value / (255 + (odds - 1) * value)
+        value = exposure.brightened(value, odds)
     return value, known

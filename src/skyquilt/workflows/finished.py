@@ -164,8 +164,11 @@ def _exposure(exposure: Exposure, where: Mapping[int, int]) -> Exposure:
     def moved(given: Mapping[int, Any]) -> dict[int, Any]:
         return {where[i]: v for i, v in given.items() if i in where}
 
-    return Exposure(
-        gains=moved(exposure.gains), fields=moved(exposure.fields), offsets=moved(exposure.offsets)
+    return replace(
+        exposure,
+        gains=moved(exposure.gains),
+        fields=moved(exposure.fields),
+        offsets=moved(exposure.offsets),
     )
 
 
