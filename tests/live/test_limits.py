@@ -34,6 +34,17 @@ from .conftest import served
 QUICK = LiveSettings(features=600)
 MAP = "/wms?VERSION=1.3.0&REQUEST=GetMap&CRS=EPSG:3857&FORMAT=image/png"
 
+SPEC = RasterSpec(
+    width=2000,
+    height=2000,
+    bands=3,
+    dtype="uint8",
+    transform=(0.1, 0, 400_000, 0, -0.1, 5_800_000),
+    crs="EPSG:32633",
+    mask=True,
+)
+WHOLE = np.ones((2000, 2000), bool)
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
@@ -48,16 +59,7 @@ def made_run(folder, photos):
     photos.mkdir(exist_ok=True)
     (photos / "a.jpg").write_bytes(jpeg())
     pixels = np.random.default_rng(0).integers(0, 255, (2000, 2000, 3), dtype=np.uint8)
-    spec = RasterSpec(
-        width=2000,
-        height=2000,
-        bands=3,
-        dtype="uint8",
-        transform=(0.1, 0, 400_000, 0, -0.1, 5_800_000),
-        crs="EPSG:32633",
-        mask=True,
-    )
-    write_array(out / "mosaic.tif", pixels, spec, np.ones((2000, 2000), bool))
+    write_array(out / "mosaic.tif", pixels, SPEC, WHOLE)
     from skyquilt.photos.headers import content_digest
 
     about = {
@@ -238,6 +240,8 @@ def test_a_final_map_that_is_being_replaced_is_not_shown_for_that_time(run, tmp_
         assert layers() == ["finished"]
         final.unlink()
         assert layers() == []
+        for lost in ("tiles/5/17/10?", "tiles.json?", "export?bbox=14,51,16,53&"):
+            assert httpx.get(f"{serving.url}{lost}layer=finished").status_code == 404
         shutil.copy(run / "mosaic.tif", final)
 
         # after it was found, before it is read
@@ -246,6 +250,32 @@ def test_a_final_map_that_is_being_replaced_is_not_shown_for_that_time(run, tmp_
 
         monkeypatch.setattr(FileSource, "bounds", gone)
         assert layers() == []
+    live.close()
+
+
+def test_tiles_of_a_final_map_that_was_made_again_are_the_new_ones(run, tmp_path):
+    live = LiveMap(tmp_path / "out", QUICK)
+    home = tmp_path / "out" / "finished"
+    home.mkdir()
+    shutil.copy(run / "mosaic.tif", home)
+    with ServerThread(
+        survey=open_survey(tmp_path / "out"), guard=Guard(), folder=tmp_path / "out"
+    ) as serving:
+        west, south, east, north = httpx.get(serving.url + "info").json()["layers"][0]["bounds"]
+        zoom = 2**16
+        x = int(((west + east) / 2 + 180) / 360 * zoom)
+        phi = np.radians((south + north) / 2)
+        y = int((1 - np.log(np.tan(phi) + 1 / np.cos(phi)) / np.pi) / 2 * zoom)
+
+        def tile():
+            answer = httpx.get(f"{serving.url}tiles/16/{x}/{y}?layer=finished")
+            assert answer.status_code == 200
+            return answer.content
+
+        before = tile()
+        write_array(home / "mosaic.tif", np.full((2000, 2000, 3), 9, np.uint8), SPEC, WHOLE)
+        live.ledger.tell("finish", {"state": "done"})
+        assert tile() != before
     live.close()
 
 

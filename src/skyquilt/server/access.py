@@ -22,6 +22,7 @@ from skyquilt.engine.error_log import log_error
 from skyquilt.errors import OutputError, UsageError
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.photo_intake import Intake
+from skyquilt.raster.map_source import MapSource
 from skyquilt.server.shown import Survey
 
 RESUMABLE = "/photos/uploads"
@@ -229,17 +230,19 @@ class Context:
     def __init__(self, survey: Survey, guard: Guard, writer: Writer | None) -> None:
         self.survey, self.guard, self.writer = survey, guard, writer
 
-    def layer(self, name: str | None) -> str:
-        """Checks the name of a layer; None gives the first layer."""
+    def layer(self, name: str | None) -> tuple[str, MapSource]:
+        """A layer by its name; None gives the first one. Its source is found in the same look: a
+        moment later a final map may be gone.
+        """
         known = self.survey.layers()
         if name is None and known:
-            return next(iter(known))
-        if name not in known:
+            return next(iter(known.items()))
+        if name is None or name not in known:
             raise HTTPException(
                 404,
                 f"there is no layer {str(name)[:60]!r}; there are {', '.join(known) or 'none yet'}",
             )
-        return str(name)
+        return name, known[name]
 
     def growing(self) -> Writer:
         """The growing map; an HTTP error if the survey is read-only."""

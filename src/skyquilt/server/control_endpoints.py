@@ -52,7 +52,7 @@ class ControlEndpoints:
         """Points and marks as stored, whether photos are there to mark them in, and the run."""
         survey = self._survey()
         names = set(self._names())
-        crs = survey.layers()["mosaic"].crs
+        crs = self.context.layer("mosaic")[1].crs
         found = stored(survey.folder, names) or {"crs": crs, "points": [], "marks": []}
         files = sum(p.path is not None for p in survey.photos())
         return {**found, "photos": files, "run": self.job.state() if self.job else {}}
@@ -153,7 +153,7 @@ class ControlEndpoints:
             raise HTTPException(422, "the photos are not where they were; view OUT --photos DIR")
         try:
             path = store(survey.folder, control)
-            if not self.job.start(survey.home, path.resolve(), survey.layers()["mosaic"].crs):
+            if not self.job.start(survey.home, path.resolve(), self.context.layer("mosaic")[1].crs):
                 raise HTTPException(409, "a run with control points is going on")
         except SkyquiltError as error:
             raise HTTPException(422, str(error)) from error

@@ -16,7 +16,7 @@ from skyquilt.raster.map_source import MERCATOR, Bounds, MapSource, between, mer
 from skyquilt.raster.picture_files import image_bytes
 from skyquilt.runs.layers import RunLayer, range_of, unit_of
 from skyquilt.server.shown import Survey
-from skyquilt.server.survey import LiveSurvey
+from skyquilt.server.survey import LiveSurvey, is_final
 
 KEPT = 3000
 """Number of tiles kept in memory."""
@@ -56,12 +56,11 @@ class Images:
                 self._kept.move_to_end(key)
             return self._kept.get(key)
 
-    def tile(self, layer: str, z: int, x: int, y: int) -> WebTile:
-        """A web tile, from the cache or drawn now."""
+    def tile(self, layer: str, source: MapSource, z: int, x: int, y: int) -> WebTile:
+        """A web tile of a layer, from the cache or drawn now."""
         if (found := self.kept(layer, z, x, y)) is not None:
             return found
         before = self._known
-        source = self.survey.layers()[layer]
         scale, palette = self.scale(layer, source), self.style(layer).palette
         rgba = picture(source, "EPSG:3857", mercator(z, x, y), TILE, TILE, scale, palette)
         made = WebTile(data=None if rgba is None else image_bytes(rgba, "image/webp"))
@@ -102,8 +101,17 @@ class Images:
             with self._lock:
                 for said in changed:
                     self._drop(said)
+                if any(kind == "finish" for _, kind, _ in told):
+                    self._drop_final()
                 self._known = told[-1][0]
         self._stamp = stamp
+
+    def _drop_final(self) -> None:
+        """Forgets the tiles of a final map: there is another one."""
+        for layer in [k for k in self._scales if is_final(k)]:
+            del self._scales[layer]
+        for key in [k for k in self._kept if is_final(k[0])]:
+            del self._kept[key]
 
     def _drop(self, said: Mapping[str, Any]) -> None:
         keys = [k for k in self._kept if k[0] == said["layer"]]

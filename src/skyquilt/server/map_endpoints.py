@@ -103,12 +103,14 @@ class MapEndpoints:
         """A web tile (EPSG:3857, 256 px, WebP); 204 if the map is empty there, 304 if the client
         has the current version.
         """
-        name = self.context.layer(layer)
+        name, source = self.context.layer(layer)
         if not (0 <= z <= 26 and 0 <= x < 2**z and 0 <= y < 2**z):
             raise HTTPException(404, f"there is no tile {z}/{x}/{y}")
         found = self.images.kept(name, z, x, y)
         if found is None:
-            found = await to_thread.run_sync(self.images.tile, name, z, x, y, limiter=self._drawing)
+            found = await to_thread.run_sync(
+                self.images.tile, name, source, z, x, y, limiter=self._drawing
+            )
         headers = {"Cache-Control": "no-cache", "ETag": found.tag}
         if found.tag in request.headers.get("if-none-match", ""):
             return Response(status_code=304, headers=headers)
@@ -118,8 +120,7 @@ class MapEndpoints:
 
     def tilejson(self, request: Request, layer: str | None = None) -> dict[str, Any]:
         """TileJSON 3.0."""
-        name = self.context.layer(layer)
-        source = self.context.survey.layers()[name]
+        name, source = self.context.layer(layer)
         bounds = source.bounds()
         box = (
             None
@@ -143,8 +144,7 @@ class MapEndpoints:
         return await to_thread.run_sync(self._exported, bbox, layer, limiter=self._writing)
 
     def _exported(self, bbox: str, layer: str | None) -> FileResponse:
-        name = self.context.layer(layer)
-        source = self.context.survey.layers()[name]
+        name, source = self.context.layer(layer)
         numbers = [real(v, -180, 180) for v in bbox.split(",", 4)]
         if len(numbers) != 4 or None in numbers:
             raise HTTPException(400, "bbox is west,south,east,north in degrees")

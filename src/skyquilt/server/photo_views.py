@@ -159,7 +159,7 @@ class PhotoViews:
     def on_ground(self, lon: float, lat: float) -> tuple[float, float, float]:
         """A place in the map's projection with the height of the surface."""
         layers = self.context.survey.layers()
-        source = next(iter(layers.values()))
+        _, source = self.context.layer(None)
         x, y = between("EPSG:4326", source.crs).transform(lon, lat)
         for name in HEIGHTS:
             if name in layers and (z := value_at(layers[name], x, y)) is not None:

@@ -49,6 +49,11 @@ def open_survey(
     )
 
 
+def is_final(layer: str) -> bool:
+    """Whether a layer of a live survey is one of its final map."""
+    return layer == FINISHED or layer.startswith(f"{FINISHED}-")
+
+
 class LiveSurvey:
     """A live survey, read from its folder while the mapping writes to it."""
 
@@ -100,7 +105,7 @@ class LiveSurvey:
     def _final(self) -> dict[str, RunLayer]:
         """Layers of the final map, if there is one."""
         return {
-            "finished" if name == "mosaic" else f"finished-{name}": layer
+            FINISHED if name == "mosaic" else f"{FINISHED}-{name}": layer
             for name, layer in layers_in(self.folder / FINISHED).items()
         }
 

@@ -28,6 +28,8 @@ const openFinal = async () => {
   if (!state.layers.has("finished")) return;
   $("layer").value = "finished";
   $("layer").onchange();
+  const everywhere = [L.latLngBounds([-90, -180], [90, 180])];
+  for (const layer of [first, second]) if (layer && layer.options.layer.startsWith("finished")) layer.refresh(everywhere);
   fit();
   await readFiles();
 };
