@@ -5,6 +5,7 @@ from skyquilt.model import camera, clip, features, poses, raster, surface
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.ortho import companions, exposure, labels
 from skyquilt.workflows.finished import Finished
+from skyquilt.workflows.links import PackedLinks
 from skyquilt.workflows.photo_features import PhotoFeatures
 
 REGISTRY = {
@@ -15,6 +16,7 @@ REGISTRY = {
         features.Features,
         features.Link,
         features.RejectedLink,
+        PackedLinks,
         features.Matches,
         camera.Camera,
         poses.Alignment,

@@ -1,8 +1,9 @@
 """Finds photos that show the same ground: candidate pairs, matches, verified links."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import groupby, pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.matching.candidates import Pair, sequence
 from skyquilt.matching.matchers import Guided
-from skyquilt.model.features import Features, Link, RejectedLink
+from skyquilt.model.features import Features, Link, RejectedLink, numbers
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import MapFrame, Prior
 from skyquilt.ortho.tie_surface import level
@@ -65,6 +66,59 @@ class Links:
     """Pairs that show the same ground."""
     rejected: tuple[RejectedLink, ...] = ()
     """Pairs that do not, with reasons."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PackedLinks:
+    """Pairs in their order, and what was found of each, as they are stored: a few long arrays are
+    read faster than two short ones of each link.
+    """
+
+    pairs: NDArray[np.int32]
+    """(n, 2) photos."""
+    ends: NDArray[np.int64]
+    """(n + 1,) where the matches of each pair begin in the lists of all."""
+    index_a: NDArray[np.integer[Any]]
+    """(M,) keypoints of the pairs' first photos."""
+    index_b: NDArray[np.integer[Any]]
+    """(M,) keypoints of their second ones."""
+    b_S_a: NDArray[np.complex128]
+    """(n,) scale and rotation, see `Link`."""
+    reasons: tuple[str | None, ...]
+    """Why a pair is none; None of links."""
+
+    @staticmethod
+    def of(found: Sequence[Link | RejectedLink]) -> "PackedLinks":
+        """What was found of some pairs."""
+        links = [k for k in found if isinstance(k, Link)]
+        return PackedLinks(
+            pairs=np.array([(k.a, k.b) for k in found], np.int32).reshape(-1, 2),
+            ends=np.cumsum([0, *(len(k) if isinstance(k, Link) else 0 for k in found)]),
+            index_a=_joined([k.index_a for k in links]),
+            index_b=_joined([k.index_b for k in links]),
+            b_S_a=np.array([k.b_S_a if isinstance(k, Link) else 0 for k in found], complex),
+            reasons=tuple(None if isinstance(k, Link) else k.reason for k in found),
+        )
+
+    def __iter__(self) -> Iterator[Link | RejectedLink]:
+        """The pairs; their arrays are parts of the long ones."""
+        ranges = pairwise(self.ends.tolist())
+        for k, ((a, b), (low, high)) in enumerate(zip(self.pairs.tolist(), ranges, strict=True)):
+            reason = self.reasons[k]
+            if reason is not None:
+                yield RejectedLink(a=a, b=b, reason=reason)
+                continue
+            yield Link(
+                a=a,
+                b=b,
+                index_a=self.index_a[low:high],
+                index_b=self.index_b[low:high],
+                b_S_a=complex(self.b_S_a[k]),
+            )
+
+
+def _joined(parts: Sequence[NDArray[np.integer[Any]]]) -> NDArray[np.integer[Any]]:
+    return numbers(np.concatenate([np.zeros(0, np.uint16), *parts]))
 
 
 def link_pair(
@@ -123,9 +177,18 @@ class _Linker:
         photos = self.found.photos
         names = [(photos[i].digest, photos[j].digest) for i, j in pairs]
         kept = self.store.get_or(
-            "links", digest(names, self._recipe), lambda: [self.one(pair) for pair in pairs]
+            "links",
+            digest(names, self._recipe),
+            lambda: PackedLinks.of([self.one(pair) for pair in pairs]),
         )
         return [replace(k, a=i, b=j) for k, (i, j) in zip(kept, pairs, strict=True)]
+
+    def key(self, priors: Sequence[Prior]) -> str:
+        """Key of all links of the survey."""
+        photos = [(p.digest, p.width, p.height) for p in self.found.photos]
+        methods = self.methods.nearest, self.methods.retrieval, link_photos
+        places = [p.map_C[:2].tolist() for p in priors]
+        return digest(photos, places, self._recipe, *methods)
 
 
 def link_photos(
@@ -136,9 +199,29 @@ def link_photos(
     store: Store,
     workers: Workers,
 ) -> Steps[Links]:
-    """Links neighbours first; their overlap gives the largest distance of further candidates."""
+    """Links neighbours first; their overlap gives the largest distance of further candidates. All
+    links are kept as one artefact too, so that a run that goes on has them at once.
+    """
+    linker = _Linker(found, frame, priors, methods, store)
+    key = linker.key(priors)
+    packed: PackedLinks | None = store.get("links", key)
+    if packed is None:
+        packed = PackedLinks.of((yield from _linked(linker, priors, workers)))
+        store.put("links", key, packed)
+    tried = list(packed)
+    yield len(tried), len(tried)
+    return Links(
+        links=tuple(k for k in tried if isinstance(k, Link)),
+        rejected=tuple(k for k in tried if isinstance(k, RejectedLink)),
+    )
+
+
+def _linked(
+    linker: _Linker, priors: Sequence[Prior], workers: Workers
+) -> Steps[list[Link | RejectedLink]]:
+    """Tries all pairs."""
+    found, methods, matched = linker.found, linker.methods, linker.batch
     n = len(found.photos)
-    matched = _Linker(found, frame, priors, methods, store).batch
     xy = np.array([p.map_C[:2] for p in priors]).reshape(-1, 2)
     lost = [i for i in range(n) if not np.isfinite(xy[i]).all()]
     # in order of capture, so that the features of a photo are read once for all its pairs
@@ -156,10 +239,7 @@ def link_photos(
     for batch in workers.each(matched, _batches(rest)):
         tried += batch
         yield len(tried), len(first) + len(rest)
-    return Links(
-        links=tuple(k for k in tried if isinstance(k, Link)),
-        rejected=tuple(k for k in tried if isinstance(k, RejectedLink)),
-    )
+    return tried
 
 
 def _closest(pairs: Sequence[Pair], count: int, each: int) -> list[Pair]:
