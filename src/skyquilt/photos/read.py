@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Protocol, TypeVar, cast
 
 import numpy as np
 
@@ -45,6 +45,16 @@ from skyquilt.photos.thermal import (
 
 T = TypeVar("T")
 _LARGEST_THERMAL = 1280
+
+
+class ReadPhoto(Protocol):
+    """Reads the metadata of a file, as `read_photo` does."""
+
+    def __call__(
+        self, path: Path, *, name: str | None, thermal_unit: str | None, most_mp: float
+    ) -> Photo | RejectedPhoto:
+        """The photo, or why it is none."""
+        ...
 
 
 def read_photo(

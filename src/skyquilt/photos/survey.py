@@ -18,7 +18,7 @@ from skyquilt.photos.implausible_positions import (
     without_outliers,
     without_stuck,
 )
-from skyquilt.photos.read import read_photo
+from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
 from skyquilt.video.read import CLIP_ENDINGS, side_files
@@ -126,27 +126,28 @@ def read_survey(
     thermal_unit: str | None = None,
     clips: bool = False,
     max_mp: float = MOST_MP,
+    read: ReadPhoto = read_photo,
 ) -> Survey:
     """All photos below a folder (or those given) in order of capture, without decoding their
     pixels.
 
     `geo` is a side file of positions (`geo.txt`, CSV, `.SRT`, `.MRK`); without one, a `geo.txt` at
     the top of the folder is used. `cameras` is a `cameras.json`, `thermal_unit` as in `read_photo`,
-    `max_mp` the largest area of a photo in megapixels.
+    `max_mp` the largest area of a photo in megapixels, `read` what reads a file.
     With `clips`, video clips are read too, and timed positions in `geo` (or a folder of such files)
     are those of the clips. A bad photo becomes a `RejectedPhoto`. Raises `UsageError` for a folder
     that does not exist, `NoPhotosError` where no photo can be read, `SideFileError` for a bad side
     file.
     """
     found = find_files(folder)
-    read = [
-        read_photo(path, name=name, thermal_unit=thermal_unit, most_mp=max_mp)
+    files = [
+        read(path, name=name, thermal_unit=thermal_unit, most_mp=max_mp)
         for name, path in found.photos
     ]
-    rejected = [p for p in read if isinstance(p, RejectedPhoto)]
+    rejected = [p for p in files if isinstance(p, RejectedPhoto)]
     films, more_rejected = read_clips(found.clips, geo) if clips else ((), ())
     rejected += more_rejected
-    photos, copies = _without_copies(p for p in read if isinstance(p, Photo))
+    photos, copies = _without_copies(p for p in files if isinstance(p, Photo))
     if not photos and not films:
         raise NoPhotosError(_nothing_sentence(folder, found, rejected, clips=clips))
     notes: tuple[str, ...] = ()

@@ -54,7 +54,7 @@ from skyquilt.workflows.flow import (
 )
 from skyquilt.workflows.methods import Methods, methods_for
 from skyquilt.workflows.run_report import finish_run
-from skyquilt.workflows.survey_input import Source, SurveyInput, check_input, read_input
+from skyquilt.workflows.survey_input import ReadFiles, Source, SurveyInput, check_input, read_input
 
 STAGES = (
     "read",
@@ -124,12 +124,14 @@ def iter_mosaic(
             malformed side file ...
     """
     settings, began = settings or MosaicSettings(), Clock.now()
-    given = read_input(folder, settings.input)
+    files = ReadFiles(Store(folder=Path(output) / STATE / "store", registry=REGISTRY))
+    given = read_input(folder, settings.input, files)
     made = yield from make_map(
         given,
         Path(output),
         settings,
         methods,
+        files,
         began=began,
         overwrite=overwrite,
         rerun_from=rerun_from,
@@ -162,6 +164,7 @@ def make_map(
     output: Path,
     settings: MosaicSettings,
     methods: Methods | None = None,
+    files: ReadFiles | None = None,
     *,
     began: tuple[float, float] | None = None,
     overwrite: bool = False,
@@ -169,7 +172,8 @@ def make_map(
     add: bool = False,
 ) -> Generator[Event, None, FinishedMap]:
     """Makes the map of a survey that was read; `began`: time at which reading began (`Clock.now`).
-    `add`: the map that `output` holds is continued where it can be.
+    `files` keeps what was read for a run that goes on. `add`: the map that `output` holds is
+    continued where it can be.
 
     Raises:
         SkyquiltError: any error that the user can correct.
@@ -189,6 +193,8 @@ def make_map(
         result = Result(output=run.path, metrics=former)
         return FinishedMap(result=result, given=given, methods=methods, settings=settings)
     run.mark("running")
+    if files is not None:
+        files.keep(store)
     survey = given.survey
     sees = [*(p.path for p in survey.photos), *(c.path for c in survey.clips)][:1]
     if settings.running.scheduler is None:
