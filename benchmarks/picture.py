@@ -17,7 +17,8 @@ Figures: SSIM (Wang et al. 2004; grey, windows of 7 x 7 px, range 255, after one
 the whole map) within 1.5 m of a height step of more than 1 m, and elsewhere; local displacement
 (phase correlation of windows of 64 px, after one shift of the whole map), median and 90th
 percentile in px; gradient energy on open ground over that of the truth; heights against the true
-surface, in GSD: NMAD on open ground and on objects 1 m inside their edges; share of the edges'
+surface, in GSD: NMAD on open ground and on objects 1 m inside their edges (all, and those that
+three photos or more show); share of the edges'
 length (where the surface crosses half of an object's height) that lie within 4 GSD of the true
 ones; share of the cells shown by two photos or more that had a height of their own before gaps
 were filled.
@@ -195,7 +196,7 @@ def product(flight: Path, truth: Truth, out: Path, words: list[str]) -> dict[str
     cpu, _, peak = run_process([sys.executable, "-c", COMMAND, str(kept), *told])
     figures = picture_figures(on_grid(out / "mosaic.tif", truth), truth)
     heights = out / "dsm.tif" if (out / "dsm.tif").is_file() else out / "surface.tif"
-    found = {**figures, **height_figures(heights, truth)}
+    found = {**figures, **height_figures(heights, out / "views.tif", truth)}
     if kept.is_file():
         found["measured"] = measured_share(kept, out / "views.tif")
     return {**found, "cpu_s": cpu, "peak_mb": peak}
@@ -342,13 +343,20 @@ def displacements(a: Floats, b: Floats, known: NDArray[np.bool_]) -> Floats:
     return np.array(out, np.float32).reshape(-1, 2)
 
 
-def height_figures(path: Path, truth: Truth) -> dict[str, float]:
-    """Errors of heights in GSD after one shift, on open ground and on objects."""
+def height_figures(path: Path, views: Path, truth: Truth) -> dict[str, float]:
+    """Errors of heights in GSD after one shift, on open ground and on objects; `views`: number of
+    photos per place.
+    """
     with (
         rasterio.open(path) as source,
         WarpedVRT(source, resampling=Resampling.bilinear, nodata=np.nan, **truth.profile) as vrt,
     ):
         z = vrt.read(1)
+    with (
+        rasterio.open(views) as source,
+        WarpedVRT(source, resampling=Resampling.nearest, **truth.profile) as vrt,
+    ):
+        number = vrt.read(1)
     known = np.isfinite(z - truth.height) & (z > -1e4)
     error = np.where(known, z - truth.height, np.nan)
     raised = cv2.dilate(truth.inner.astype(np.uint8), disc(4.0 / truth.gsd)) > 0
@@ -363,6 +371,7 @@ def height_figures(path: Path, truth: Truth) -> dict[str, float]:
     return {
         "z_open_gsd": nmad(open_),
         "z_inner_gsd": nmad(truth.inner),
+        "z_inner_3_gsd": nmad(truth.inner & (number >= 3)),
         "z_inner_bias_m": float(np.median(inner)) if inner.size else float("nan"),
         "edges": edges_found(truth.height + error, known, truth),
     }
