@@ -223,9 +223,17 @@ def test_the_button_makes_the_final_map_and_mapping_goes_on(flight, tmp_path):
         assert "finished" in [n["name"] for n in site.web.get("/info").json()["layers"]]
         site.send(flight.photos[4])
         site.until(lambda: list(site.states().values()) == ["refined"] * 5)
-        # asked again, the new photo takes part
+        # asked again, the new photo takes part; until then the former map is shown
         site.web.post("/finish")
-        site.until(lambda: site.web.get("/info").json()["finish"] == "done", 120)
+        shown = set()
+
+        def done():
+            info = site.web.get("/info").json()
+            shown.add("finished" in [n["name"] for n in info["layers"]])
+            return info["finish"] == "done"
+
+        site.until(done, 120)
+        assert shown == {True}
         assert (
             json.loads((tmp_path / "out" / "finished" / "metrics.json").read_text())["photos_used"]
             == 5

@@ -93,7 +93,8 @@ def open_run(
     """Opens a folder for a run: new, empty, the same run again (resumed), or overwritten.
 
     With `again`, another run's results may be replaced, but nothing is written among other files.
-    With `grows`, the run continues the one that is there, whose files stay until they are replaced.
+    With `grows`, the files of the run that is there stay until they are replaced: it is continued,
+    or shown meanwhile.
 
     Raises:
         OutputError: it holds something else, or cannot be written.

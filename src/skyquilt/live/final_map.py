@@ -47,8 +47,8 @@ def iter_finish(folder: Path, settings: LiveSettings) -> Iterator[Event]:
         max_view_angle=settings.max_view_angle,
     )
     # if the final map is requested again after more photos have arrived, it is made anew; results
-    # computed before are reused from the store
-    yield from iter_mosaic(paths, folder / FINISHED, wanted, overwrite=True)
+    # computed before are reused from the store, and the former map is shown until then
+    yield from iter_mosaic(paths, folder / FINISHED, wanted, overwrite=True, stays=True)
 
 
 def named(folder: Path, photos: list[tuple[int, str, str]]) -> list[Path]:

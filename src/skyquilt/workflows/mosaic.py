@@ -113,11 +113,13 @@ def iter_mosaic(
     overwrite: bool = False,
     rerun_from: str | None = None,
     add: bool = False,
+    stays: bool = False,
 ) -> Iterator[Event]:
     """Makes a mosaic and yields its progress; the last event is the `Result`.
 
     `methods` replace those selected by the settings, see `methods_for`. With `add`, photos that
-    joined the folder are added to the map that is in `output`: what they do not change stays.
+    joined the folder are added to the map that is in `output`: what they do not change stays. With
+    `stays`, the files of a map that is overwritten stay until those of the new one replace them.
 
     Raises:
         SkyquiltError: any error that the user can correct: no photos, an output folder in use, a
@@ -136,6 +138,7 @@ def iter_mosaic(
         overwrite=overwrite,
         rerun_from=rerun_from,
         add=add,
+        stays=stays,
     )
     yield made.result
 
@@ -170,10 +173,11 @@ def make_map(
     overwrite: bool = False,
     rerun_from: str | None = None,
     add: bool = False,
+    stays: bool = False,
 ) -> Generator[Event, None, FinishedMap]:
     """Makes the map of a survey that was read; `began`: time at which reading began (`Clock.now`).
     `files` keeps what was read for a run that goes on. `add`: the map that `output` holds is
-    continued where it can be.
+    continued where it can be. `stays`: see `iter_mosaic`.
 
     Raises:
         SkyquiltError: any error that the user can correct.
@@ -184,7 +188,7 @@ def make_map(
     key, recipe = run_key(given, settings, methods), recipe_of(given, settings, methods)
     earlier = _earlier(given, output, recipe) if add else None
     again = rerun_from is not None
-    run = open_run(output, key, overwrite=overwrite, again=again, grows=add)
+    run = open_run(output, key, overwrite=overwrite, again=again, grows=add or stays)
     store = Store(folder=run.store, registry=REGISTRY)
     store.tidy()
     _forget(run, store, rerun_from)
