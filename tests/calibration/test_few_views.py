@@ -90,7 +90,7 @@ def test_one_heated_sweep_is_a_calibration(heated, tmp_path):
     assert len(m["unknown"]) == 4 and "What so few views leave open" in page
     camera = next(iter(json.loads((tmp_path / "out" / "cameras.json").read_text()).values()))
     assert camera["width"] == 640
-    # weighted as printed the board is found too, with marks twice as far off and more
+    # weighted as printed the board is found too, its marks less exactly
     asked = replace(SETTINGS, weights="printed")
     printed = calibrate(heated, tmp_path / "printed", asked).metrics
     assert printed["views_used"] == 1
