@@ -46,6 +46,7 @@ def ours(method):
 
 METHODS = {
     "RANSAC-STE (A)": ours(RansacSte()),
+    "word for word": ours(RansacSte(literal=True)),
     "RANSAC-STE, t fixed": ours(RansacSte(threshold_px2=4.0)),
     "cv2 RANSAC": opencv(cv2.RANSAC),
     "cv2 MAGSAC": opencv(cv2.USAC_MAGSAC),

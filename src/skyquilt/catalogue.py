@@ -25,6 +25,7 @@ ESTIMATORS = {
     "lmeds": "skyquilt.papers.lmeds:Lmeds",
     "magsac": "skyquilt.papers.magsac:Magsac",
     "ste": "skyquilt.papers.ste:RansacSte",
+    "ste-printed": "skyquilt.papers.ste:literal",
     "ncc": "skyquilt.papers.direct:by_ncc",
     "phase": "skyquilt.papers.direct_refinement:by_phase",
     "ecc": "skyquilt.papers.direct_refinement:by_ecc",
@@ -41,6 +42,7 @@ REGISTRATIONS = {
     "surf-lobe": "skyquilt.papers.rfae:surf_by_lobe",
     "rfae": "skyquilt.papers.rfae:rfae",
     "rfae-sift": "skyquilt.papers.rfae:rfae_sift",
+    "rfae-printed": "skyquilt.papers.rfae:rfae_as_printed",
     "rfae-refined": "skyquilt.papers.rfae:rfae_refined",
     "surf+rfae": "skyquilt.papers.rfae:surf_and_rfae",
     "structure": "skyquilt.coregistration.methods:structure",
@@ -66,7 +68,7 @@ ALIGNMENTS: dict[str, tuple[str, dict[str, tuple[str, ...]]]] = {
         {
             "detector": _ANY,
             "matcher": ("mutual", "one-way"),
-            "estimator": ("ransac", "lmeds", "magsac", "ste", *DIRECT),
+            "estimator": ("ransac", "lmeds", "magsac", "ste", "ste-printed", *DIRECT),
             "transform": TRANSFORMS,
             "relief": (),
             "levelled": (),
@@ -79,7 +81,7 @@ ALIGNMENTS: dict[str, tuple[str, dict[str, tuple[str, ...]]]] = {
         {
             "detector": _ANY,
             "matcher": ("mutual",),
-            "estimator": ("ste", "ransac", "lmeds", "magsac"),
+            "estimator": ("ste", "ste-printed", "ransac", "lmeds", "magsac"),
             "transform": TRANSFORMS,
             "lines": ("heading", "distance"),
         },

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from skyquilt.calibration.assemble import Assemble, bimodality, cell_of, separation
+from skyquilt.calibration.assemble import WEIGHTS, Assemble, bimodality, cell_of, separation
 from skyquilt.calibration.calibrate import Calibrate
 from skyquilt.calibration.deviations import widened
 from skyquilt.calibration.find_board import FindBoard
@@ -12,7 +12,10 @@ from tests.calibration.boards import BOARD, CHESS, LENS, poses
 
 def test_bimodality_by_hand():
     """Two clusters at 1 +- 0.1 and 5 +- 0.1: (0.1 + 0.1) / 4^2."""
-    assert bimodality(np.array([0.9, 1.1, 4.9, 5.1])) == pytest.approx(0.2 / 16)
+    cell = np.array([0.9, 1.1, 4.9, 5.1])
+    assert bimodality(cell) == pytest.approx(0.2 / 16)
+    assert bimodality(cell, variance=True) == pytest.approx(0.02 / 16)
+    assert bimodality(100 * cell, variance=True) == pytest.approx(0.02 / 16)  # has no unit
 
 
 def test_bimodality_is_low_where_black_and_white_part():
@@ -46,29 +49,21 @@ def few(pose, rng, frames=24):
     return list(sweep(LENS, CHESS, pose, Lamp(frames=frames, cooling=0.35), Sensor(), rng))
 
 
-def by_variance(cell):
-    """phi of (5.1) with sigma as a variance, as the text of the thesis reads; it has no unit."""
-    below, above = cell[cell < cell.mean()], cell[cell > cell.mean()]
-    if not below.size or not above.size:
-        return np.inf
-    return (below.var() + above.var()) / (below.mean() - above.mean()) ** 2
-
-
 @pytest.mark.slow
-def test_the_printed_weight_does_no_harm_if_sigma_is_a_variance(monkeypatch):
+def test_the_printed_weight_does_no_harm_if_sigma_is_a_variance():
     """(5.3) weighs by phi itself: with deviations it prefers frames without contrast, with
     variances it hardly prefers any.
     """
     pose, rng = poses()[0], np.random.default_rng(4)
     frames = few(pose, rng)
     contrasts = []
-    for phi in (bimodality, by_variance):
-        monkeypatch.setattr("skyquilt.calibration.assemble.bimodality", phi)
-        found = FindBoard()("", Assemble(power=-1.0)(frames, BOARD), BOARD)
+    for made in (Assemble(power=-1.0), WEIGHTS["printed"]()):
+        found = FindBoard()("", made(frames, BOARD), BOARD)
         contrasts.append(found.contrast if found else 0.0)
     assert contrasts[1] > 2 * contrasts[0]
     flat = np.random.default_rng(5).normal(20, 0.3, 4000)
-    assert by_variance(flat) == pytest.approx(0.285, abs=0.01)  # of noise: (1 - 2 / pi) / (4 / pi)
+    of_noise = bimodality(flat, variance=True)
+    assert of_noise == pytest.approx(0.285, abs=0.01)  # (1 - 2 / pi) / (4 / pi)
 
 
 @pytest.mark.slow

@@ -90,6 +90,11 @@ def test_one_heated_sweep_is_a_calibration(heated, tmp_path):
     assert len(m["unknown"]) == 4 and "What so few views leave open" in page
     camera = next(iter(json.loads((tmp_path / "out" / "cameras.json").read_text()).values()))
     assert camera["width"] == 640
+    # weighted as printed the board is found too, its marks less exactly
+    asked = replace(SETTINGS, weights="printed")
+    printed = calibrate(heated, tmp_path / "printed", asked).metrics
+    assert printed["views_used"] == 1
+    assert printed["centres"]["rms_px"] > m["centres"]["rms_px"]
 
 
 def test_a_focal_length_needs_few_views():
@@ -97,6 +102,8 @@ def test_a_focal_length_needs_few_views():
         CalibrateSettings(columns=7, rows=6, square_m=0.1, focal_px=700)
     with pytest.raises(UsageError, match="--focal 1 lies outside"):
         replace(SETTINGS, focal_px=1.0)
+    with pytest.raises(UsageError, match="'phi' is not one of contrast, printed"):
+        replace(SETTINGS, weights="phi")
     with pytest.raises(ValueError, match="one size"):
         LOOSE([], BOARD)
     assert len(PARAMETERS) == 9

@@ -32,7 +32,10 @@ WAYS = (
     MosaicSettings(method="hybrid"),
     MosaicSettings(method="hybrid", optimiser="anneal"),
     MosaicSettings(method="flightline"),
-    *(MosaicSettings(method="image", estimator=e) for e in ("lmeds", "magsac", "ste")),
+    *(
+        MosaicSettings(method="image", estimator=e)
+        for e in ("lmeds", "magsac", "ste", "ste-printed")
+    ),
     *(MosaicSettings(method="image", estimator=e) for e in ("ncc", "phase", "ecc", "mi")),
     *(MosaicSettings(detector=d) for d in registry.names("detector")),
     *(MosaicSettings(matcher=m) for m in registry.names("matcher")),

@@ -12,7 +12,7 @@ from skyquilt.matching.estimate import needed, polished, samples
 from skyquilt.matching.ransac import Ransac
 from skyquilt.papers.lmeds import Lmeds
 from skyquilt.papers.magsac import Magsac
-from skyquilt.papers.ste import RansacSte, _distant
+from skyquilt.papers.ste import RansacSte, _distant, _Reference, needed_as_printed
 from tests.geometry.test_transforms import FRAME, drawn
 
 NOISE = 0.3
@@ -221,6 +221,40 @@ def test_ste_as_printed_breaks_where_the_extension_holds():
     assert error(RansacSte()(a, b), H) > 10
     mended = RansacSte(threshold_px2=4.0, max_iterations=300)(a, b)
     assert mended.method == "RANSAC-2-OPT" and error(mended, H) < 0.5
+
+
+def test_ten_word_for_word_draws_hardly_any_sample():
+    """log(0.01) / log(eps^S): by hand for half of six, and for nine tenths of 150."""
+    assert needed_as_printed(0.99, 0.5, 6, 1000) == 2  # 4.605 / (6 * 0.693) = 1.11
+    assert needed_as_printed(0.99, 0.9, 150, 1000) == 1
+    assert needed_as_printed(0.99, 0.02, 150, 1000) == 2  # 4.605 / (150 * 0.0202) = 1.52
+    assert needed_as_printed(0.99, 0.0, 150, 1000) == 1001
+    a, b, H, _ = matches("homography", 0, 0.25, 150)
+    found = [RansacSte(threshold_px2=4.0, literal=literal)(a, b) for literal in (False, True)]
+    assert error(found[0], H) < 0.5 and found[0].iterations > 40
+    assert not found[1] or found[1].iterations <= 12  # one or two of each of six runs
+    clean = matches("homography", 1, 0.0, 150)
+    assert error(RansacSte(literal=True)(*clean[:2]), clean[2]) < 0.3
+
+
+def test_the_rule_of_ten_times_word_for_word_lets_its_reference_grow(monkeypatch):
+    """Errors of 1, 8, 60 px^2, each with more inliers: 60 is no more than ten times 8, but more
+    than ten times the least.
+    """
+    a, b, H, _ = matches("homography", 0, 0.0, 150)
+    told = {}
+
+    def judged(self, H, a, b):
+        told[self.literal] = told.get(self.literal, 0) + 1
+        k = min(told[self.literal], 3)
+        inliers = np.arange(len(a)) < 40 * k
+        return _Reference(H=H, inliers=inliers, ste=(1.0, 8.0, 60.0)[k - 1], sigma=1.0)
+
+    monkeypatch.setattr(RansacSte, "_judged", judged)
+    monkeypatch.setattr(RansacSte, "_needed", lambda *_: 4)
+    for literal, ste in ((False, 8.0), (True, 60.0)):
+        rng = np.random.default_rng(0)
+        assert RansacSte(literal=literal)._ransac_1(rng, a, b).ste == ste
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -112,7 +112,7 @@ def test_rfae_registers_what_surf_cannot_and_patches_mend_what_it_gets_wrong():
     """
     if not REAL.is_file():
         pytest.skip(f"real pairs missing: {REAL}")
-    told = {"surf": [], "rfae": [], "rfae-refined": []}
+    told = {"surf": [], "rfae-printed": [], "rfae": [], "rfae-refined": []}
     for pair in read_pairs(REAL):
         if pair.source not in ("olinda2-olinda4", "vifb-manWalking", "vifb-manCar"):
             continue
@@ -123,7 +123,12 @@ def test_rfae_registers_what_surf_cannot_and_patches_mend_what_it_gets_wrong():
             found.append(off is not None and off < pair.tolerance_px)
             if method == "rfae-refined":
                 assert outcome.error is not None
-    assert told == {"surf": [False] * 3, "rfae": [True, False, False], "rfae-refined": [True] * 3}
+    assert told == {
+        "surf": [False] * 3,
+        "rfae-printed": [False] * 3,
+        "rfae": [True, False, False],
+        "rfae-refined": [True] * 3,
+    }
 
 
 @pytest.mark.real

@@ -63,9 +63,14 @@ def one_camera(photos: Sequence[Photo]) -> None:
 
 
 def look(
-    photos: Sequence[Photo], board: Board, find: FindBoard, series: str, workers: Workers
+    photos: Sequence[Photo],
+    board: Board,
+    find: FindBoard,
+    series: str,
+    workers: Workers,
+    assemble: Assemble,
 ) -> Steps[Seen]:
-    """Finds the board in every pose."""
+    """Finds the board in every pose, whose frames are assembled to one image."""
     yield 0, len(photos)
     poses, unreadable = grouped(photos, series)
     views: list[BoardView] = []
@@ -74,7 +79,7 @@ def look(
     done = 0
 
     def one(pose: Sequence[Photo]) -> tuple[BoardView | RejectedView, NDArray[Any] | None]:
-        return _view(pose, board, find)
+        return _view(pose, board, find, assemble)
 
     for pose, (found, picture) in zip(poses, workers.each(one, poses), strict=True):
         if isinstance(found, BoardView) and picture is not None:
@@ -124,13 +129,13 @@ def _folder(photo: Photo) -> str:
 
 
 def _view(
-    pose: Sequence[Photo], board: Board, find: FindBoard
+    pose: Sequence[Photo], board: Board, find: FindBoard, assemble: Assemble
 ) -> tuple[BoardView | RejectedView, NDArray[Any] | None]:
     """Finds the board in one pose: in the frame, or in the image assembled from its frames."""
     name = pose[0].name if len(pose) == 1 else f"{pose[0].name} and {len(pose) - 1} more"
     try:
         alone = len(pose) < _SWEEP
-        picture = grey_float(read_color(pose[0])) if alone else Assemble()(_read(pose), board)
+        picture = grey_float(read_color(pose[0])) if alone else assemble(_read(pose), board)
     except UnreadablePhotoError as error:
         return RejectedView(name=name, reason=str(error)), None
     return find(name, picture, board, frames=len(pose)), picture

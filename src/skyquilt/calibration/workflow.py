@@ -10,6 +10,7 @@ from pathlib import Path
 
 from skyquilt.calibration import figures as calibrate_judging
 from skyquilt.calibration import files as calibrate_files
+from skyquilt.calibration.assemble import WEIGHTS
 from skyquilt.calibration.board_views import SERIES, Seen, look, one_camera
 from skyquilt.calibration.calibrate import Calibrate, strangers
 from skyquilt.calibration.deviations import widened
@@ -46,6 +47,8 @@ class CalibrateSettings:
     """Side of a square in m."""
     series: str = "auto"
     """One of `SERIES`."""
+    weights: str = "contrast"
+    """One of `assemble.WEIGHTS`: how the frames of one pose are weighted."""
     few_views: bool = False
     """Make do with one or two views, as the thesis: see `few_views.FewViews`."""
     focal_px: float | None = None
@@ -56,6 +59,8 @@ class CalibrateSettings:
     def __post_init__(self) -> None:
         if self.series not in SERIES:
             raise UsageError(f"--series {self.series!r} is not one of {', '.join(SERIES)}")
+        if self.weights not in WEIGHTS:
+            raise UsageError(f"--weights {self.weights!r} is not one of {', '.join(WEIGHTS)}")
         if not (min(self.columns, self.rows) >= 3 and max(self.columns, self.rows) <= 100):
             raise UsageError(
                 f"--board {self.columns}x{self.rows}: 3 to 100 squares a side are expected"
@@ -100,7 +105,15 @@ def iter_calibrate(
     )
     board = settings.board
     seen = yield from clock.stage(
-        "boards", look(survey.photos, board, FindBoard(), settings.series, clock.workers)
+        "boards",
+        look(
+            survey.photos,
+            board,
+            FindBoard(),
+            settings.series,
+            clock.workers,
+            WEIGHTS[settings.weights](),
+        ),
     )
     unread = (RejectedView(name=r.name, reason=r.reason) for r in survey.rejected)
     seen = replace(seen, rejected=(*unread, *seen.rejected))

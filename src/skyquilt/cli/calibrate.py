@@ -29,6 +29,13 @@ def command(
             " (each folder is a pose), views (never)."
         ),
     ] = "auto",
+    weights: Annotated[
+        str,
+        typer.Option(
+            help="How the frames of one pose are weighted: contrast (those in which black and white"
+            " are well separated), printed (word for word as the thesis prints it)."
+        ),
+    ] = "contrast",
     few_views: Annotated[
         bool,
         typer.Option(
@@ -62,6 +69,7 @@ def command(
         rows=rows,
         square_m=square,
         series=series,
+        weights=weights,
         few_views=few_views,
         focal_px=focal,
         jobs=jobs,

@@ -73,8 +73,8 @@ def command(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help="What tells right matches from wrong: ransac, lmeds, magsac, ste; for image also"
-            " ncc, phase, ecc, mi.",
+            help="What tells right matches from wrong: ransac, lmeds, magsac, ste, ste-printed;"
+            " for image also ncc, phase, ecc, mi.",
             show_default="each method's own",
         ),
     ] = None,

@@ -138,8 +138,9 @@ def command(
         str | None,
         option(
             METHOD,
-            "What tells right matches from wrong: ransac, lmeds, magsac, ste (the article's); for"
-            " image also ncc, phase, ecc, mi, which compare pixels.",
+            "What tells right matches from wrong: ransac, lmeds, magsac, ste (the article's),"
+            " ste-printed (word for word); for image also ncc, phase, ecc, mi, which compare"
+            " pixels.",
             default="magsac for links, ransac for image, ste for flightline",
         ),
     ] = None,

@@ -22,8 +22,8 @@ def command(
         typer.Option(
             help="auto (structure, accepted only where independent patches agree); parts of it or"
             " beside it: structure, shapes (areas and objects); or a published method, which"
-            " accepts nine inliers: sift, sift-octave0, surf, surf-lobe, usurf, rfae, rfae-sift,"
-            " surf+rfae; rfae-refined: rfae, refined and confirmed by patches."
+            " accepts nine inliers: sift, sift-octave0, surf, surf-lobe, usurf, rfae, rfae-printed,"
+            " rfae-sift, surf+rfae; rfae-refined: rfae, refined and confirmed by patches."
         ),
     ] = "auto",
     metadata: Annotated[

@@ -193,7 +193,9 @@ def _estimator(settings: MosaicSettings, threshold_px: float, model: str) -> Est
     method.
     """
     name, asked = settings.matching.estimator or "ransac", settings.matching.transform or model
-    options: dict[str, Any] = {} if name in ("lmeds", "ste") else {"threshold_px": threshold_px}
+    options: dict[str, Any] = (
+        {} if name in ("lmeds", "ste", "ste-printed") else {"threshold_px": threshold_px}
+    )
     made: Estimator = registry.load("estimator", name)(
         model=asked, minimum=LEAST_INLIERS, seed=settings.running.seed, **options
     )

@@ -270,6 +270,11 @@ def rfae() -> Rfae:
     return Rfae(detect=_surf(), relate=_outliers())
 
 
+def rfae_as_printed() -> Rfae:
+    """The same with the single largest gradient and the three thresholds only [Y 5.2.2]."""
+    return Rfae(detect=_surf(), relate=_outliers(), largest=100.0, of_noise=False)
+
+
 def rfae_sift() -> Rfae:
     """SIFT along edges."""
     return Rfae(detect=_sift(), relate=_outliers())

@@ -4,13 +4,14 @@
 As printed, with five interpretations: (10) has (1 - eps)^s with s = 4 in the place of its exponent
 S; the errors are sums of squares, so 0.2, 0.5 and t are px^2; the four distant points are those of
 the two longest of random pairs; a model whose error exceeds ten times that of the best so far is
-skipped (taken literally, the reference error could only increase); RANSAC-2-OPT runs once and four
-times more. Photos must first be reduced to at most 1500 x 1000 px, since the thresholds are for
-this size.
+skipped; RANSAC-2-OPT runs once and four times more. Photos must first be reduced to at most
+1500 x 1000 px, since the thresholds are for this size. `RansacSte(literal=True)` takes (10) and the
+rule of ten times word for word.
 """
 
+import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -105,6 +106,10 @@ class RansacSte:
     """
     minimum: int = 8
     """Fewest inliers of an estimate."""
+    literal: bool = False
+    """Whether (10) has the number of matches S for its exponent, and the reference of the rule of
+    ten times is the last error that met it, both as printed.
+    """
     seed: int = 0
     """Seed of the samples; equal seeds give equal results."""
     accept_ste: ClassVar[float] = 0.2
@@ -190,11 +195,9 @@ class RansacSte:
             H = fit_many(self.model, a[None, index], b[None, index])[0]
             new = self._judged(refine(self.model, H, a, b), a, b) if np.isfinite(H).all() else None
             if new is not None and new.ste <= 10 * least:
-                least = min(least, new.ste)
+                least = new.ste if self.literal else min(least, new.ste)
                 best = new if best is None or new.beats(best) else best
-            wanted = (
-                cap + 1 if best is None else needed(self.confidence, best.count / len(a), size, cap)
-            )
+            wanted = self._needed(best, len(a), size, cap)
         return None if best is None else replace(best, iterations=done, capped=done < wanted)
 
     def _ransac_2(self, rng: np.random.Generator, a: Doubles, b: Doubles) -> _Reference | None:
@@ -209,14 +212,18 @@ class RansacSte:
                 done += 1
                 new = self._judged(H, a, b) if np.isfinite(H).all() else None
                 best = new if new is not None and (best is None or new.beats(best)) else best
-                wanted = (
-                    cap + 1
-                    if best is None
-                    else needed(self.confidence, best.count / len(a), size, cap)
-                )
+                wanted = self._needed(best, len(a), size, cap)
                 if done >= wanted:
                     break
         return None if best is None else replace(best, iterations=done, capped=done < wanted)
+
+    def _needed(self, best: _Reference | None, matches: int, size: int, cap: int) -> int:
+        """Number of samples by (10), at most cap + 1."""
+        if best is None:
+            return cap + 1
+        if self.literal:
+            return needed_as_printed(self.confidence, best.count / matches, matches, cap)
+        return needed(self.confidence, best.count / matches, size, cap)
 
     def _judged(self, H: Doubles, a: Doubles, b: Doubles) -> _Reference | None:
         """Steps iii and iv: errors, the threshold (9), the inliers with the sum and the scatter of
@@ -235,6 +242,20 @@ class RansacSte:
             ste=float(errors[inliers].sum()),
             sigma=float(errors[inliers].std()),
         )
+
+
+def needed_as_printed(confidence: float, share: float, matches: int, cap: int) -> int:
+    """(10) word for word, log(1 - p) / log(1 - (1 - eps^S)), at most cap + 1: 1 or 2
+    unless hardly any of the S matches are inliers.
+    """
+    if share >= 1 or share <= 0:
+        return 1 if share >= 1 else cap + 1
+    return min(cap + 1, math.ceil(math.log(1 - confidence) / (matches * math.log1p(-share))))
+
+
+def literal(**options: Any) -> RansacSte:
+    """The estimator as printed, word for word."""
+    return RansacSte(literal=True, **options)
 
 
 def _distant(rng: np.random.Generator, a: Doubles, size: int) -> NDArray[np.int64]:
