@@ -9,9 +9,10 @@ import pytest
 from skyquilt.engine.store import Store
 from skyquilt.model.photo import RejectedPhoto
 from skyquilt.photos import read
+from skyquilt.photos.read import ReadFiles
 from skyquilt.settings import InputSettings
 from skyquilt.workflows.artefacts import REGISTRY
-from skyquilt.workflows.survey_input import ReadFiles, read_input
+from skyquilt.workflows.survey_input import read_input
 
 
 @pytest.fixture

@@ -7,8 +7,6 @@ import io
 import json
 import math
 from collections.abc import Mapping
-from datetime import datetime
-from pathlib import Path, PurePath
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -17,7 +15,7 @@ Registry = Mapping[str, type]
 
 
 def encode(value: Any) -> bytes:
-    """Encodes dataclasses, containers, arrays, scalars, times and paths as bytes."""
+    """Encodes dataclasses, tuples, lists, dicts, sets, arrays and scalars as bytes."""
     buffer = io.BytesIO()
     write(buffer, value)
     return buffer.getvalue()
@@ -60,10 +58,6 @@ def _down(value: Any, arrays: dict[str, np.ndarray]) -> Any:
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else {"!": "float", "v": repr(value)}
-    if isinstance(value, datetime):
-        return {"!": "time", "v": value.isoformat()}
-    if isinstance(value, PurePath):
-        return {"!": "path", "v": str(value)}
     if isinstance(value, complex):
         return {"!": "complex", "v": [repr(value.real), repr(value.imag)]}
     if isinstance(value, np.generic):
@@ -91,10 +85,6 @@ def _up(tree: Any, arrays: Mapping[str, np.ndarray], registry: Registry) -> Any:
     kind, v = tree["!"], tree["v"]
     if kind == "float":
         return float(v)
-    if kind == "time":
-        return datetime.fromisoformat(v)
-    if kind == "path":
-        return Path(v)
     if kind == "complex":
         return complex(float(v[0]), float(v[1]))
     if kind == "array":

@@ -2,13 +2,15 @@
 
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from datetime import timedelta
+from dataclasses import dataclass, fields, replace
+from datetime import datetime, timedelta
+from importlib.resources import files
 from pathlib import Path
-from typing import Protocol, TypeVar, cast
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
 
+from skyquilt.engine.store import Store, digest
 from skyquilt.errors import UnreadablePhotoError
 from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Focal, Photo, RejectedPhoto, Stored
@@ -42,9 +44,14 @@ from skyquilt.photos.thermal import (
     thermal_frame_of_jpeg,
     thermal_frame_of_values,
 )
+from skyquilt.version import __version__
 
 T = TypeVar("T")
 _LARGEST_THERMAL = 1280
+TABLES = "sensors.csv", "shutters.csv"
+"""Tables with which metadata are read."""
+RECORDS = "records"
+"""Folder in the store of the metadata read."""
 
 
 class ReadPhoto(Protocol):
@@ -90,6 +97,52 @@ def rejected(name: str, error: Exception) -> RejectedPhoto:
     return RejectedPhoto(
         name=name, reason=words, trace="".join(traceback.format_exception(error))[-20_000:]
     )
+
+
+class ReadFiles:
+    """Reads the metadata of photos; of files that an earlier run in the same output folder read,
+    they are taken from its store: a run that goes on need not read thousands of files.
+
+    A file is the same if its name, its place on the disk, its size and the times of its last
+    changes, of content and of attributes, are the same.
+    """
+
+    def __init__(self, store: Store) -> None:
+        """What an earlier run read is taken from its store."""
+        tables = (files("skyquilt.photos").joinpath(name).read_text() for name in TABLES)
+        self._key = digest(read_photo, [f.name for f in fields(Photo)], *tables, __version__)
+        self._held: dict[str, dict[str, Any]] = dict(store.get(RECORDS, self._key) or {})
+        self._read: dict[str, dict[str, Any]] = {}
+
+    def __call__(
+        self, path: Path, *, name: str | None, thermal_unit: str | None, most_mp: float
+    ) -> Photo | RejectedPhoto:
+        """A file's metadata, see `read_photo`."""
+        try:
+            info = path.stat()
+        except OSError:
+            return read_photo(path, name=name, thermal_unit=thermal_unit, most_mp=most_mp)
+        stamp = f"{info.st_dev}:{info.st_ino}:{info.st_size}:{info.st_mtime_ns}:{info.st_ctime_ns}"
+        stamp = f"{stamp}:{thermal_unit}:{most_mp}:{name}"
+        held = self._held.get(stamp)
+        if held is not None:
+            self._read[stamp] = held
+            time = held["time"] and datetime.fromisoformat(held["time"])
+            return Photo(**{**held, "path": path, "time": time})
+        found = read_photo(path, name=name, thermal_unit=thermal_unit, most_mp=most_mp)
+        if isinstance(found, Photo):
+            told = {f.name: getattr(found, f.name) for f in fields(found) if f.name != "path"}
+            self._read[stamp] = told | {"time": found.time and found.time.isoformat()}
+        return found
+
+    def keep(self, store: Store) -> None:
+        """Stores what was read; where it is all there already, nothing is done.
+
+        Raises:
+            OutputError: the disk is full or the folder read-only.
+        """
+        if self._read.keys() != self._held.keys():
+            store.put(RECORDS, self._key, self._read)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

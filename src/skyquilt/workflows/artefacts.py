@@ -2,7 +2,7 @@
 
 from skyquilt.alignment import problem, start, tracks
 from skyquilt.model import camera, clip, features, poses, raster, surface
-from skyquilt.model.photo import Attitude, Focal, GeoPosition, Photo, RejectedPhoto, Shutter
+from skyquilt.model.photo import Attitude, Focal, GeoPosition, RejectedPhoto, Shutter
 from skyquilt.ortho import companions, exposure, labels
 from skyquilt.workflows.finished import Finished
 from skyquilt.workflows.links import PackedLinks
@@ -32,7 +32,6 @@ REGISTRY = {
         start.Start,
         tracks.Tracks,
         RejectedPhoto,
-        Photo,
         Focal,
         GeoPosition,
         Attitude,

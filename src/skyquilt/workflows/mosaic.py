@@ -30,6 +30,7 @@ from skyquilt.ortho.orthomosaic import SPOOL
 from skyquilt.ortho.radiometry import value_figures
 from skyquilt.outside import read_bounded
 from skyquilt.photos.headers import content_digest
+from skyquilt.photos.read import ReadFiles
 from skyquilt.quality.clip_figures import clip_figures
 from skyquilt.quality.placement import placement_quality
 from skyquilt.quality.run_metrics import figures
@@ -54,7 +55,7 @@ from skyquilt.workflows.flow import (
 )
 from skyquilt.workflows.methods import Methods, methods_for
 from skyquilt.workflows.run_report import finish_run
-from skyquilt.workflows.survey_input import ReadFiles, Source, SurveyInput, check_input, read_input
+from skyquilt.workflows.survey_input import Source, SurveyInput, check_input, read_input
 
 STAGES = (
     "read",

@@ -2,17 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from importlib.resources import files
 from pathlib import Path
 
 from skyquilt.alignment.priors import choose_frame
-from skyquilt.engine.store import Store, digest
 from skyquilt.errors import UsageError
 from skyquilt.model.clip import ChosenFrames
 from skyquilt.model.photo import (
     ControlPoint,
     KnownDistance,
-    Photo,
     PointObservation,
     RejectedPhoto,
     Survey,
@@ -25,12 +22,7 @@ from skyquilt.photos.sequence import sequence_of
 from skyquilt.photos.shutter import stated_shutter
 from skyquilt.photos.survey import read_survey
 from skyquilt.settings import InputSettings, MosaicSettings
-from skyquilt.version import __version__
 
-TABLES = "sensors.csv", "shutters.csv"
-"""Tables with which metadata are read."""
-RECORDS = "records"
-"""Folder in the store of the metadata read."""
 Source = Path | Sequence[Path]
 """A folder of photos and clips, or such files."""
 
@@ -81,50 +73,6 @@ class SurveyInput:
             distances=tuple(d for d in distances if d.observations_a and d.observations_b),
             rank={name: k for name, k in self.rank.items() if name not in names},
         )
-
-
-class ReadFiles:
-    """Reads the metadata of photos; of files that an earlier run in the same output folder read,
-    they are taken from its store: a run that goes on need not read thousands of files.
-
-    A file is the same if its name, its place on the disk, its size and the times of its last
-    changes, of content and of attributes, are the same.
-    """
-
-    def __init__(self, store: Store) -> None:
-        """What an earlier run read is taken from its store."""
-        tables = (files("skyquilt.photos").joinpath(name).read_text() for name in TABLES)
-        self._key = digest(read_photo, *tables, __version__)
-        self._held: dict[str, Photo] = dict(store.get(RECORDS, self._key) or {})
-        self._read: dict[str, Photo] = {}
-
-    def __call__(
-        self, path: Path, *, name: str | None, thermal_unit: str | None, most_mp: float
-    ) -> Photo | RejectedPhoto:
-        """A file's metadata, see `read_photo`."""
-        try:
-            info = path.stat()
-        except OSError:
-            return read_photo(path, name=name, thermal_unit=thermal_unit, most_mp=most_mp)
-        stamp = f"{info.st_dev}:{info.st_ino}:{info.st_size}:{info.st_mtime_ns}:{info.st_ctime_ns}"
-        stamp = f"{stamp}:{thermal_unit}:{most_mp}:{name}"
-        held = self._held.get(stamp)
-        if held is not None:
-            found: Photo | RejectedPhoto = replace(held, path=path)
-        else:
-            found = read_photo(path, name=name, thermal_unit=thermal_unit, most_mp=most_mp)
-        if isinstance(found, Photo):
-            self._read[stamp] = found
-        return found
-
-    def keep(self, store: Store) -> None:
-        """Stores what was read; where it is all there already, nothing is done.
-
-        Raises:
-            OutputError: the disk is full or the folder read-only.
-        """
-        if self._read.keys() != self._held.keys():
-            store.put(RECORDS, self._key, self._read)
 
 
 def read_input(
