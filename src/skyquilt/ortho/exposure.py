@@ -164,8 +164,7 @@ class Balance:
         so differences from the point's mean are zero.
         """
         photos, N = [v.photo for v in views], len(s.point)
-        _, point = np.unique(s.point, return_inverse=True)
-        pairs = Pairs.of(s.row, point, np.array([v.footprint.mean(0) for v in views]))
+        pairs = Pairs.of(s.row, s.point, np.array([v.footprint.mean(0) for v in views]))
         basis = _basis(s.place[:, 0], s.place[:, 1])
         radial = self._radial(s, views, pairs)
         grey = s.log.mean(1, keepdims=True) + (basis * radial[s.row]).sum(1)[:, None]
@@ -253,7 +252,7 @@ class Balance:
         levels = np.concatenate(value)
         good = ((levels > 8) & (levels < 247)).all(1)
         return Samples(
-            point=np.concatenate(point)[good],
+            point=np.unique(np.concatenate(point)[good], return_inverse=True)[1],
             row=np.concatenate(row)[good],
             place=np.concatenate(place)[good],
             value=levels[good],
@@ -265,7 +264,7 @@ class Samples:
     """Brightness of ground points in photos."""
 
     point: NDArray[np.int64]
-    """(N,) ground point."""
+    """(N,) ground point, numbered without gaps."""
     row: NDArray[np.int64]
     """(N,) view."""
     place: NDArray[np.float64]
@@ -291,12 +290,7 @@ class Samples:
         fields = np.stack([exposure.fields[i] for i in photos])
         basis = _basis(self.place[:, 0], self.place[:, 1])
         odds = np.exp(gains[self.row] + (basis * fields[self.row]).sum(1))
-        level = exposure.brightened(self.value.mean(1), odds)
-        _, point = np.unique(self.point, return_inverse=True)
-        number = np.bincount(point)
-        mean = np.bincount(point, level) / number
-        several = number[point] > 1
-        return float(np.median(np.abs(level - mean[point])[several])) if several.any() else 0.0
+        return _off_means(exposure.brightened(self.value.mean(1), odds), self.point)
 
 
 def _around(view: View, x: NDArray[Any], y: NDArray[Any]) -> tuple[slice, slice]:
@@ -343,6 +337,12 @@ def _apart(y: NDArray[Any], pairs: Pairs, sigma: float) -> float:
     """
     point, ridge, ones = pairs.point, np.array([1 / sigma**2]), np.ones((len(y), 1))
     level = y + robust_differences(ones, pairs, y[:, None], ridge)[pairs.row, 0, 0]
-    mean = np.bincount(point, level) / np.maximum(np.bincount(point), 1)
-    several = np.bincount(point)[point] > 1
+    return _off_means(level, point)
+
+
+def _off_means(level: NDArray[Any], point: NDArray[np.int64]) -> float:
+    """Median difference of samples (N,) from the mean of their point."""
+    number = np.bincount(point)
+    mean = np.bincount(point, level) / np.maximum(number, 1)
+    several = number[point] > 1
     return float(np.median(np.abs(level - mean[point])[several])) if several.any() else 0.0
