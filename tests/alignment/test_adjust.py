@@ -9,7 +9,8 @@ import pytest
 
 from skyquilt.alignment import equations
 from skyquilt.alignment.adjust import adjust, covariance, polish_points
-from skyquilt.alignment.equations import Equations, observation_equations
+from skyquilt.alignment.eliminated_points import observation_equations
+from skyquilt.alignment.equations import Equations
 from skyquilt.alignment.outcome import leave_one_out
 from skyquilt.alignment.problem import attitude_error, linearise, residuals_px
 from skyquilt.alignment.robust import prior_terms, robust_cost

@@ -157,7 +157,11 @@ class StoppedError(Exception):
     pass
 
 
-def test_an_interrupted_adjustment_of_many_photos_goes_on_at_its_iteration(plain):
+@pytest.mark.parametrize("factored", [600, 5])  # photos up to which each step has its factor
+def test_an_interrupted_adjustment_of_many_photos_goes_on_at_its_iteration(
+    plain, monkeypatch, factored
+):
+    monkeypatch.setattr("skyquilt.alignment.equations.FACTORED", factored)
     flown, _ = plain
     kept, made = {}, []
 

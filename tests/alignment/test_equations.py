@@ -5,7 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyquilt.alignment.equations import Equations, points_inverse
+from skyquilt.alignment import equations
+from skyquilt.alignment.adjust import adjust
+from skyquilt.alignment.eliminated_points import points_inverse
+from skyquilt.alignment.equations import Equations, NearFactor
+from skyquilt.engine.kept import Keep
 from tests.alignment.blocks import make_block
 
 
@@ -35,3 +39,72 @@ def test_what_is_not_kept_is_computed_again(monkeypatch):
     again = Equations(block.problem, block.truth).step(block.truth, 1e-4)
     assert all(np.array_equal(a, b) for a, b in zip(kept, again, strict=True))
     assert all(np.abs(a).max() > 0 for a in kept[::2])
+
+
+@pytest.fixture
+def factored(monkeypatch):
+    """Counts the factors that are made; a handful of photos counts as many."""
+    made, factor = [], equations.Factor
+
+    def counted(matrix):
+        made.append(matrix)
+        return factor(matrix)
+
+    monkeypatch.setattr(equations, "FACTORED", 3)
+    monkeypatch.setattr(equations, "Factor", counted)
+    return made
+
+
+def test_one_factor_serves_adjustments_of_many_photos(factored, monkeypatch):
+    """They end where those with a factor for each step end."""
+    block, near = make_block(3, lies=0.02), NearFactor()
+    problem = block.problem
+    wide = adjust(problem.with_loss(6.0), block.start, iterations=30, tolerance=1e-6, near=near)
+    first = len(factored)
+    found = adjust(problem, wide.state, iterations=60, tolerance=1e-9, damping=1e-6, near=near)
+    again = adjust(problem, found.state, iterations=60, tolerance=1e-12, near=near)
+    assert found.iterations + again.iterations > 8 and len(factored) <= first + 2
+    monkeypatch.setattr(equations, "FACTORED", 10**6)
+    exact = adjust(problem, wide.state, iterations=60, tolerance=1e-9, damping=1e-6)
+    assert len(factored) > first + 8
+    assert found.cost == pytest.approx(exact.cost, rel=1e-6)
+    assert np.abs(found.state.C - exact.state.C).max() < 1e-3
+
+
+def test_an_interrupted_adjustment_of_many_photos_goes_on_with_the_same_figures(factored):
+    block = make_block(4, lies=0.02)
+    kept = {}
+
+    def held(part, make):
+        if part not in kept:
+            kept[part] = make()
+        return kept[part]
+
+    def found():
+        near, keep = NearFactor(), Keep(held=held)
+        wide = adjust(block.problem.with_loss(6.0), block.start, keep=keep, near=near)
+        return adjust(block.problem, wide.state, keep=keep.within("then"), near=near).state
+
+    whole = found()
+    for left in range(1, len(kept)):
+        for part in list(kept)[left:]:
+            del kept[part]
+        again = found()
+        assert np.array_equal(again.C, whole.C) and np.array_equal(again.X, whole.X)
+
+
+def test_steps_that_cannot_be_factored_are_damped(factored, monkeypatch):
+    """As before, with one factor for each step."""
+    block = make_block(5)
+    good = adjust(block.problem, block.start, iterations=40, tolerance=1e-9)
+    factor, refused = equations.Factor, []
+
+    def refuses(matrix):
+        if len(refused) < 2:
+            refused.append(matrix)
+            raise np.linalg.LinAlgError
+        return factor(matrix)
+
+    monkeypatch.setattr(equations, "Factor", refuses)
+    found = adjust(block.problem, block.start, iterations=40, tolerance=1e-9)
+    assert len(refused) == 2 and found.cost == pytest.approx(good.cost, rel=1e-6)

@@ -8,7 +8,9 @@ from datetime import datetime, timedelta
 import numpy as np
 import pytest
 
+from skyquilt.alignment import stages
 from skyquilt.alignment.adjust import adjust, covariance
+from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.motion import velocities
 from skyquilt.alignment.problem import READOUT, Problem, State, residuals_px
 from skyquilt.alignment.triangulate import polish, triangulated
@@ -132,6 +134,51 @@ def test_turns_are_found_beside_readout():
     found = adjust(replace(problem, sigma_turn=spread), start, iterations=40, tolerance=1e-9).state
     missed = found.turn - truth.turn
     assert np.sqrt((missed**2).mean()) < 0.35 * np.sqrt((truth.turn**2).mean())
+
+
+def test_some_photos_of_a_problem_are_a_problem():
+    """Residuals of what is left are those of the whole."""
+    problem, truth, _ = block(turns=5.0)
+    some = np.array([3, 4, 5, 9, 10])
+    part, its = problem.among(some, truth)
+    mine = np.isin(problem.photo, some)
+    number = np.bincount(problem.point[mine], minlength=len(truth.X))
+    mine &= number[problem.point] >= 2
+    assert 50 < len(part.px) == mine.sum() and np.bincount(part.point).min() >= 2
+    assert np.array_equal(residuals_px(part, its), residuals_px(problem, truth)[mine])
+    assert np.array_equal(some[part.photo], problem.photo[mine])
+    for name in ("C0", "sigma_C", "R0", "sigma_R", "velocity"):
+        assert np.array_equal(getattr(part, name), getattr(problem, name)[some])
+    assert part.sigma_turn is None
+    spread = np.arange(len(truth.C)) * 1e-3
+    part, _ = replace(problem, sigma_turn=spread).among(some, truth)
+    assert np.array_equal(part.sigma_turn, spread[some])
+
+
+@pytest.mark.parametrize("stops", [False, True])
+def test_some_photos_of_a_large_survey_tell_whether_its_cameras_stood_still(monkeypatch, stops):
+    """Of a drone that flew on, the whole is not adjusted a second time; of one that stopped, with
+    velocities as if it had not, it is, and ends without readout.
+    """
+    problem, truth, _ = block(lens=replace(LENS, readout=0.0) if stops else LENS)
+    problem = replace(problem, sigma_turn=np.full(len(truth.C), 1e-3))
+    if stops:
+        problem = replace(problem, sigma_K=np.where(np.arange(10) == READOUT, 1e-4, 1.0))
+        problem.K0[:, READOUT] = LENS.readout  # what is usual for this model
+    moving = adjust(problem, replace(truth, K=problem.K0.copy()), iterations=40).state
+    asked = []
+
+    def counted(problem, *args, **options):
+        asked.append(len(problem.C0))
+        return adjust(problem, *args, **options)
+
+    monkeypatch.setattr(stages, "ASKED", 8)
+    monkeypatch.setattr(stages, "adjust", counted)
+    found, state = stages._standing(problem, moving, stages.MADE_NOW, NearFactor())
+    whole = len(truth.C)
+    assert [n < whole for n in asked] == ([True, True, False] if stops else [True, True])
+    assert bool(found.velocity.any()) is not stops
+    assert (state is moving) is not stops
 
 
 @pytest.mark.parametrize("turns", [0.0, 4.0])

@@ -143,3 +143,25 @@ def test_a_factor_for_which_the_disk_is_too_full_stays_in_memory(monkeypatch):
     factor = Factor(m)
     assert factor._parts._file is None and len(factor._parts._held) == len(m.pattern.fronts) > 4
     assert np.array_equal(factor.solve(rhs), held)
+
+
+@pytest.mark.parametrize("border", [0, 2])
+def test_the_product_is_that_of_the_dense_matrix(border):
+    m = matrix(*grid(9, 7, 2), border=border)
+    x = np.random.default_rng(3).normal(size=9 * 7 * 3 + border)
+    assert m.times()(x) == pytest.approx(dense_matrix(m) @ x, rel=1e-12)
+
+
+@pytest.mark.parametrize("heading", [0, 20, 37, 45, 70])
+def test_lines_of_any_heading_are_divided_as_well(heading):
+    """The work of factoring a survey does not depend on the direction of its flight lines."""
+    places, pairs = grid(40, 40, 2)
+    turn = np.radians(heading)
+    turned = np.array(places) @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+
+    def work(places):
+        a, b = np.array(pairs).T
+        fronts = pattern(np.asarray(places, float), 6, 10, a, b).fronts
+        return sum(f.eliminated * len(f.unknowns) ** 2 for f in fronts)
+
+    assert work(turned) < 1.25 * work(places)

@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.equations import Equations, add_diagonal, points_inverse, sums_by_point
+from skyquilt.alignment.eliminated_points import add_diagonal, points_inverse, sums_by_point
+from skyquilt.alignment.equations import Equations, NearFactor
 from skyquilt.alignment.problem import CAMERA, Problem, State, linearised_points
 from skyquilt.alignment.robust import observation_weights, point_terms, robust_cost
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.engine.workers import HERE
 from skyquilt.geometry.block_cholesky import Factor, Index, Matrix
-from skyquilt.geometry.levenberg_marquardt import levenberg_marquardt
+from skyquilt.geometry.levenberg_marquardt import Tried, levenberg_marquardt
 
 Array = NDArray[np.float64]
 ALONE = 60_000
@@ -116,6 +117,7 @@ def adjust(
     tolerance: float = 1e-5,
     damping: float = 1e-4,
     keep: Keep = MADE_NOW,
+    near: NearFactor | None = None,
 ) -> Adjusted:
     """Minimises the robust cost.
 
@@ -130,9 +132,12 @@ def adjust(
         tolerance: relative decrease of the cost below which the adjustment has converged.
         damping: first damping, relative to the diagonal of the normal equations.
         keep: keeps each iteration, from where an interrupted run goes on.
+        near: of earlier adjustments of nearly the same problem; it saves time if that is large.
     """
     shared = keep.workers.apart and len(problem.px) > ALONE
-    system = Equations(problem, state, keep.workers if shared else HERE)
+    workers = keep.workers if shared else HERE
+    near = near or NearFactor()
+    system = Equations(problem, state, workers, near=near)
     last: list[tuple[State, float]] = []
 
     def cost(state: State) -> float:
@@ -147,6 +152,23 @@ def adjust(
 
         return last[0][1] if known else cost(state), step
 
+    place = state
+
+    def kept(part: str, make: Callable[[], Tried[State]]) -> Tried[State]:
+        nonlocal place
+        now = False
+
+        def made() -> tuple[Tried[State], float | None]:
+            nonlocal now
+            now = True
+            return make(), near.renewed()
+
+        tried, renewed = keep(part, made)
+        if renewed is not None and not now:
+            near.know(problem, place, renewed, workers)
+        place = tried[3]
+        return tried
+
     found = levenberg_marquardt(
         state,
         equations,
@@ -154,7 +176,7 @@ def adjust(
         iterations=iterations,
         tolerance=tolerance,
         damping=damping,
-        keep=keep,
+        keep=kept,
     )
     return Adjusted(
         state=found.state, cost=found.cost, iterations=found.iterations, converged=found.converged

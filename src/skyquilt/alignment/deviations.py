@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import Covariance
-from skyquilt.alignment.equations import observation_equations
+from skyquilt.alignment.eliminated_points import observation_equations
 from skyquilt.alignment.least_squares_matching import LeastSquaresMatching
 from skyquilt.alignment.problem import CAMERA, Problem, State, residuals_px
 

@@ -6,171 +6,40 @@ one sparse matrix, and then forgotten. So memory holds the matrix, not the equat
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.problem import CAMERA, Problem, State, linearise
-from skyquilt.alignment.robust import observation_weights, point_terms, position_terms, prior_terms
+from skyquilt.alignment.eliminated_points import (
+    PointTies,
+    Reduced,
+    add_diagonal,
+    observation_equations,
+    points_step,
+    reduced_part,
+    ties_of,
+)
+from skyquilt.alignment.problem import CAMERA, Problem, State
+from skyquilt.alignment.robust import position_terms, prior_terms
 from skyquilt.engine.workers import HERE, Workers
 from skyquilt.geometry.block_cholesky import LEAF, Factor, Index, Matrix, pattern
+from skyquilt.geometry.conjugate_gradients import conjugate_gradients
 
 Array = NDArray[np.float64]
 KEPT = 600_000
 """Observations whose points are kept tied to photos and cameras (0.25 kB each) between the step of
 these and that of the points; those of larger problems are computed again.
 """
-ELIMINATED = 160
-"""Observations whose points are eliminated at once, about: few enough to be of few photos."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Normal:
-    """What a part's observations say, split for the Schur complement: photos and cameras (u),
-    points (v).
-
-    A photo has p = 6 unknowns, or 9 with its turn; a camera q = 10, or none where all are fixed.
-    """
-
-    seen: Index
-    """(s,) the photos of the part."""
-    row: Index
-    """(N,) place of each observation's photo among these."""
-    U: Array
-    """(s, p, p) photo blocks."""
-    Uc: Array
-    """(m, q, q) camera blocks."""
-    Upc: Array
-    """(s, p, q) photo-camera blocks."""
-    V: Array
-    """(P, 3, 3) point blocks, with the points' priors."""
-    Wp: Array
-    """(N, p, 3) photo-point block of each observation."""
-    Wc: Array
-    """(N, q, 3) camera-point block of each observation."""
-    gp: Array
-    """(s, p) gradient."""
-    gc: Array
-    """(m, q) gradient."""
-    gv: Array
-    """(P, 3) gradient, with the points' priors."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PointTies:
-    """What the step of a part's points needs of its equations, given that of photos and cameras.
-
-    In single precision: the points are polished after the step.
-    """
-
-    V: Array
-    """(P, 3, 3) point blocks."""
-    gv: Array
-    """(P, 3) gradient."""
-    Wp: NDArray[np.float32]
-    """(N, p, 3) photo-point blocks."""
-    Wc: NDArray[np.float32]
-    """(N, q, 3) camera-point blocks."""
-
-
-def _ties_of(normal: Normal) -> PointTies:
-    return PointTies(
-        V=normal.V, gv=normal.gv, Wp=normal.Wp.astype(np.float32), Wc=normal.Wc.astype(np.float32)
-    )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Reduced:
-    """What a part's observations say of photos and cameras, its points eliminated. The unknowns of
-    its s photos come first, then those of all m cameras.
-    """
-
-    seen: Index
-    """(s,) the photos."""
-    U: Array
-    """(s, p, p) photo blocks."""
-    Uc: Array
-    """(m, q, q) camera blocks."""
-    pair: Index
-    """(2, k) pairs of photos, each also with itself, by their places in `seen`, the first not after
-    the second: all that share a point, and some that do not.
-    """
-    tied: Array
-    """(k, p, p) what the points tie together of each pair, subtracted."""
-    beside: Array
-    """(s, p, q m) the same of photos with cameras, and what observations say of both."""
-    corner: Array
-    """(q m, q m) the same of cameras."""
-    gradient: Array
-    """(p s + q m,) gradient."""
-    ties: PointTies | None
-    """What the step of the points needs, if it is asked for."""
-
-
-def sums_by_point(problem: Problem, values: Array, count: int) -> Array:
-    """Sums of values (N, ...) of each point's observations: (count, ...). Observations are sorted
-    by point.
-    """
-    flat = values.reshape(len(values), -1)
-    starts = np.searchsorted(problem.point, np.arange(count))
-    total = np.add.reduceat(flat, np.minimum(starts, len(flat) - 1), axis=0)
-    total[np.diff(np.r_[starts, len(flat)]) == 0] = 0
-    return total.reshape(count, *values.shape[1:])
-
-
-def _by_photo(row: Index, count: int, rows: Array) -> Array:
-    """Products A^T A (count, k, k) of each photo's rows A; rows (N, 2, k)."""
-    order = np.argsort(row, kind="stable")
-    cuts = np.searchsorted(row[order], np.arange(count + 1))
-    sorted_rows = rows[order].reshape(-1, rows.shape[2])
-    out = np.empty((count, rows.shape[2], rows.shape[2]))
-    for i in range(count):
-        own = sorted_rows[2 * cuts[i] : 2 * cuts[i + 1]]
-        out[i] = own.T @ own
-    return out
-
-
-def add_diagonal(blocks: Array, values: Array) -> None:
-    """Adds values (n, k) to the diagonals of blocks (n, k, k)."""
-    k = np.arange(values.shape[1])
-    blocks[:, k, k] += values
-
-
-def observation_equations(problem: Problem, state: State) -> Normal:
-    """Normal equations of the reweighted observations at a state, with the priors on points."""
-    lin = linearise(problem, state)
-    weight, _ = observation_weights(problem, lin.residual)
-    root = np.sqrt(weight)[:, None, None]
-    e, J_point = lin.residual[..., None] * root, lin.J_point * root
-    rows = np.concatenate([lin.J_photo, lin.J_camera, lin.residual[..., None]], 2) * root
-    m, count, q = len(state.K), len(state.X), lin.J_camera.shape[2]
-    k = problem.photo_unknowns
-    seen, row = np.unique(problem.photo, return_inverse=True)
-    by_photo = _by_photo(row, len(seen), rows)
-    by_camera = np.zeros((m, q, q + 1))
-    np.add.at(by_camera, problem.camera[seen], by_photo[:, k : k + q, k:])
-    point_rows = np.concatenate([J_point, e], 2)
-    by_point = sums_by_point(problem, np.swapaxes(J_point, 1, 2) @ point_rows, count)
-    W = np.swapaxes(rows[:, :, :-1], 1, 2) @ J_point
-    precision, apart = point_terms(problem, state)
-    V = by_point[:, :, :3].copy()
-    add_diagonal(V, precision)
-    return Normal(
-        seen=seen,
-        row=row,
-        U=by_photo[:, :k, :k],
-        Uc=by_camera[:, :, :q],
-        Upc=by_photo[:, :k, k : k + q],
-        V=V,
-        Wp=W[:, :k],
-        Wc=W[:, k:],
-        gp=by_photo[:, :k, -1],
-        gc=by_camera[:, :, q],
-        gv=by_point[:, :, 3] + precision * apart,
-    )
+FACTORED = 600
+"""Photos up to which the equations of each step are factored. Beyond, factors take longer than
+equations: there one serves many steps, which are solved by conjugate gradients.
+"""
+STEP_ERROR = 0.01
+"""Error of a step found so, relative to its length in the norm of the equations: less than what the
+weights of a robust cost, which change with each step, make of it.
+"""
+STEPS = 12
+"""Steps of conjugate gradients that take less time than a factor."""
 
 
 def _together(problem: Problem) -> tuple[Index, Index]:
@@ -190,14 +59,55 @@ def _together(problem: Problem) -> tuple[Index, Index]:
         step += 1
 
 
+class NearFactor:
+    """The factor of one step's equations, for later steps, also of other adjustments.
+
+    An interrupted run makes it again from what is known of that step, so it gets the same figures.
+    """
+
+    def __init__(self) -> None:
+        self._made: Factor | None = None
+        self._of: tuple[Problem, State, float, Workers] | None = None
+        self._renewed: float | None = None
+
+    def take(self, factor: Factor, damping: float) -> None:
+        """Takes the factor of the present step."""
+        self._made, self._of, self._renewed = factor, None, damping
+
+    def renewed(self) -> float | None:
+        """Damping of the step whose factor was taken since this was asked, if one was."""
+        self._renewed, renewed = None, self._renewed
+        return renewed
+
+    def know(self, problem: Problem, state: State, damping: float, workers: Workers) -> None:
+        """Says of which step it is where an interrupted run took that step's factor."""
+        self._made, self._of = None, (problem, state, damping, workers)
+
+    def get(self) -> Factor | None:
+        """The factor; None if no step was made yet."""
+        if self._made is None and self._of is not None:
+            problem, state, damping, workers = self._of
+            equations = Equations(problem, state, workers, steps=False)
+            self._made = Factor(equations.reduced(state, damping)[0])
+        return self._made
+
+
 class Equations:
     """The equations of one problem, at any state: which photos are coupled is found once."""
 
     def __init__(
-        self, problem: Problem, state: State, workers: Workers = HERE, *, steps: bool = True
+        self,
+        problem: Problem,
+        state: State,
+        workers: Workers = HERE,
+        *,
+        near: NearFactor | None = None,
+        steps: bool = True,
     ) -> None:
-        """`workers` compute the equations of the parts. `steps`: steps will be computed, too."""
-        self.problem, self.workers = problem, workers
+        """`workers` compute the equations of the parts; `near`: a factor of nearly these equations.
+        `steps`: steps will be computed, too.
+        """
+        self.problem, self.workers, self.near = problem, workers, near
         self.kept = steps and len(problem.px) <= KEPT
         self.n, self.m = len(state.C), len(state.K)
         self.p = problem.photo_unknowns
@@ -212,7 +122,7 @@ class Equations:
             yield from self._ties
             return
         for part, own, _ in self.problem.parts(state):
-            yield part, _ties_of(observation_equations(part, own))
+            yield part, ties_of(observation_equations(part, own))
 
     def step(self, state: State, damping: float) -> tuple[Array, Array, Array]:
         """The Gauss-Newton step of photos (n, p), cameras (m, 10) and points (P, 3).
@@ -220,8 +130,7 @@ class Equations:
         Raises:
             LinAlgError: it goes nowhere.
         """
-        matrix, gradient = self.reduced(state, damping)
-        du = -Factor(matrix).solve(gradient)
+        du = -self._solved(state, damping)
         photos = self.p * self.n
         cameras = np.zeros((self.m, CAMERA))
         if self.q:
@@ -229,11 +138,26 @@ class Equations:
         placed = du[:photos].reshape(-1, self.p)
         points = np.concatenate(
             [
-                _points_step(part, ties, damping, placed, cameras)
+                points_step(part, ties, damping, placed, cameras)
                 for part, ties in self._point_ties(state)
             ]
         )
         return placed, cameras, points
+
+    def _solved(self, state: State, damping: float) -> Array:
+        """The inverse of the equations times the gradient."""
+        near = self.near if self.n > FACTORED else None
+        made = near and near.get()
+        matrix, gradient = self.reduced(state, damping)
+        if made:
+            times, nearly = matrix.times(), made.solve
+            found = conjugate_gradients(times, nearly, gradient, tolerance=STEP_ERROR, most=STEPS)
+            if found is not None:
+                return found
+        factor = Factor(matrix)
+        if near:
+            near.take(factor, damping)
+        return factor.solve(gradient)
 
     def reduced(self, state: State, damping: float) -> tuple[Matrix, Array]:
         """The Schur complement on photos and cameras, damped, and the gradient (photos, then
@@ -297,104 +221,3 @@ class Equations:
             out.beside[:, 3 + axis, at] = -precision[:, axis]
             total = float(precision[:, axis].sum())
             out.corner[at, at] = total if total > 0 else 1.0
-
-
-def points_inverse(blocks: Array, damping: float) -> Array:
-    """L^-1 (P, 3, 3) of the damped point blocks L L^T, written out: a library's loop over so many
-    small matrices takes ten times as long.
-
-    Raises:
-        LinAlgError: a block is not positive definite.
-    """
-    (a, b, c), (d, e, f) = (
-        (blocks[:, k, k] * (1 + damping) + 1e-12 for k in range(3)),
-        (blocks[:, 1, 0], blocks[:, 2, 0], blocks[:, 2, 1]),
-    )
-    out = np.zeros_like(blocks)
-    with np.errstate(all="ignore"):
-        l11 = np.sqrt(a)
-        l21, l31 = d / l11, e / l11
-        l22 = np.sqrt(b - l21 * l21)
-        l32 = (f - l31 * l21) / l22
-        l33 = np.sqrt(c - l31 * l31 - l32 * l32)
-        out[:, 0, 0], out[:, 1, 1], out[:, 2, 2] = 1 / l11, 1 / l22, 1 / l33
-        out[:, 1, 0] = -l21 * out[:, 0, 0] * out[:, 1, 1]
-        out[:, 2, 1] = -l32 * out[:, 1, 1] * out[:, 2, 2]
-        out[:, 2, 0] = -(l31 * out[:, 0, 0] + l32 * out[:, 1, 0]) * out[:, 2, 2]
-    if not np.isfinite(out).all():
-        raise np.linalg.LinAlgError("a point is not determined")
-    return out
-
-
-def _points_step(
-    part: Problem, ties: PointTies, damping: float, photos: Array, cameras: Array
-) -> Array:
-    """The step (P, 3) of a part's points with that of photos (n, p) and cameras (m, 10)."""
-    coupled = np.einsum("nij,ni->nj", ties.Wp, photos[part.photo])
-    if ties.Wc.shape[1]:
-        coupled += np.einsum("nij,ni->nj", ties.Wc, cameras[part.camera[part.photo]])
-    L_inv = points_inverse(ties.V, damping)
-    rhs = ties.gv + sums_by_point(part, coupled, len(ties.V))
-    half = np.einsum("pij,pj->pi", L_inv, rhs)
-    return np.asarray(-np.einsum("pji,pj->pi", L_inv, half))
-
-
-def reduced_part(given: tuple[Problem, State, float, bool]) -> Reduced:
-    """The equations of a part of the observations, its points eliminated: of (part, its state,
-    damping, whether the step of its points will be asked for).
-    """
-    part, state, damping, stepped = given
-    normal = observation_equations(part, state)
-    pair, tied, gradient = _eliminated(part, normal, damping)
-    (s, p), m = normal.gp.shape, len(normal.gc)
-    q = normal.gc.shape[1]
-    i, j = pair
-    return Reduced(
-        seen=normal.seen,
-        U=normal.U,
-        Uc=normal.Uc,
-        pair=pair,
-        tied=tied[: p * s, : p * s].reshape(s, p, s, p)[i, :, j],
-        beside=tied[: p * s, p * s :].reshape(s, p, q * m),
-        corner=tied[p * s :, p * s :],
-        gradient=gradient,
-        ties=_ties_of(normal) if stepped else None,
-    )
-
-
-def _eliminated(part: Problem, normal: Normal, damping: float) -> tuple[Index, Array, Array]:
-    """`pair` of a part, the matrix (p s + q m, p s + q m) of all its photos and cameras, and
-    `gradient`.
-    """
-    L_inv = points_inverse(normal.V, damping)
-    z = np.einsum("pij,pj->pi", L_inv, normal.gv)
-    (p, q), (s, m) = (normal.Wp.shape[1], normal.Wc.shape[1]), (len(normal.seen), len(normal.Uc))
-    tied = np.zeros((p * s + q * m,) * 2)
-    gradient = np.concatenate([normal.gp.ravel(), normal.gc.ravel()])
-    camera = part.camera[normal.seen]
-    together = np.zeros((s, s), np.bool_)
-    if q:
-        rows = np.arange(p * s).reshape(s, p, 1)
-        tied[rows, p * s + q * camera[:, None, None] + np.arange(q)] = normal.Upc
-    for lo, hi in pairwise(part.cuts(ELIMINATED)):
-        point, row = part.point[lo:hi], normal.row[lo:hi]
-        first, last = int(point[0]), int(point[-1]) + 1
-        some, local = np.unique(row, return_inverse=True)
-        cams, cam_of = np.unique(camera[some], return_inverse=True)
-        T = np.swapaxes(L_inv[point], 1, 2)
-        n, c = len(some), len(cams) if q else 0
-        rows = np.zeros((p * n + q * c, last - first, 3))
-        photos = rows[: p * n].reshape(n, p, last - first, 3)
-        photos[local, :, point - first] = normal.Wp[lo:hi] @ T
-        if q:
-            cameras = rows[p * n :].reshape(c, q, last - first, 3)
-            place: Any = (cam_of[local], slice(None), point - first)
-            np.add.at(cameras, place, normal.Wc[lo:hi] @ T)
-        flat = rows.reshape(len(rows), -1)
-        together[some[:, None], some] = True
-        own = (p * some[:, None] + np.arange(p)).ravel()
-        theirs = p * s + (q * cams[:c, None] + np.arange(q)).ravel()
-        at = np.concatenate([own, theirs])
-        tied[at[:, None], at] -= flat @ flat.T
-        gradient[at] -= flat @ z[first:last].ravel()
-    return np.stack(np.nonzero(np.triu(together))), tied, gradient

@@ -155,6 +155,30 @@ class Problem:
         )
         return thinner, points
 
+    def among(self, photos: Index, state: State) -> tuple["Problem", State]:
+        """The problem of some of its photos, renumbered, with the points that two of them show; and
+        its state.
+        """
+        number = np.full(len(self.camera), -1)
+        number[photos] = np.arange(len(photos))
+        inside = number[self.photo] >= 0
+        seen = np.bincount(self.point[inside], minlength=len(self.X0))
+        part, points = self.only(inside & (seen >= 2)[self.point])
+        turns = self.sigma_turn
+        problem = replace(
+            part,
+            photo=number[part.photo],
+            camera=self.camera[photos],
+            C0=self.C0[photos],
+            sigma_C=self.sigma_C[photos],
+            R0=self.R0[photos],
+            sigma_R=self.sigma_R[photos],
+            velocity=self.velocity[photos],
+            sigma_turn=None if turns is None else turns[photos],
+        )
+        R, C, turn = state.R[photos], state.C[photos], state.turn[photos]
+        return problem, State(R=R, C=C, K=state.K, X=state.X[points], turn=turn)
+
     def cuts(self, about: int) -> list[int]:
         """Borders of ranges of about so many observations, each of whole points."""
         if len(self.point) <= about:

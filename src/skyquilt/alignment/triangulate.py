@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.equations import sums_by_point
+from skyquilt.alignment.eliminated_points import sums_by_point
 from skyquilt.alignment.problem import READOUT, Problem, State, linearised_points
 from skyquilt.geometry.camera import undistort
 from skyquilt.model.camera import PARAMETERS, Camera

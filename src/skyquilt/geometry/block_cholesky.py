@@ -8,10 +8,10 @@ and n^2. Unknowns that are coupled with all others, the *border* (cameras), are 
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from io import BufferedRandom
 from tempfile import TemporaryFile
-from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,10 @@ LEAF = 40
 """Blocks that are eliminated together without another division."""
 WORTHWHILE = 0.35
 """A division is taken when its line holds at most this share of the blocks."""
+DIRECTIONS = [np.array([np.cos(a), np.sin(a)]) for a in np.arange(8) * np.pi / 8]
+"""Directions in which the blocks are divided. Photos lie in lines of any direction, and a division
+along or across them passes fewer photos than one aslant.
+"""
 STRIP = 256
 """Rows of a front that are added or taken at a time."""
 HELD = 128 * 2**20
@@ -91,6 +95,27 @@ class Matrix:
     corner: Array
     """(b, b) the border with itself."""
 
+    def times(self) -> Callable[[Array], Array]:
+        """The product of the matrix with a vector (total,)."""
+        from scipy.sparse import bsr_matrix
+
+        pat = self.pattern
+        n, p = pat.count, pat.size
+        starts = np.searchsorted(pat.first, np.arange(n + 1))
+        upper = bsr_matrix((self.blocks, pat.second, starts), shape=(n * p, n * p))
+        own = self.blocks[pat.find(np.arange(n), np.arange(n))]
+        beside = self.beside.reshape(n * p, pat.border)
+
+        def product(x: Array) -> Array:
+            blocks, border = x[: n * p], x[n * p :]
+            twice = (own @ blocks.reshape(n, p, 1)).ravel()
+            within = upper @ blocks + upper.T @ blocks - twice
+            return np.concatenate(
+                [within + beside @ border, beside.T @ blocks + self.corner @ border]
+            )
+
+        return product
+
 
 def pattern(place: Array, size: int, border: int, a: Index, b: Index) -> Pattern:
     """The order of elimination.
@@ -143,8 +168,8 @@ def _dissected(nodes: Index, a: Index, b: Index, place: Array) -> Iterator[tuple
 def _cut(nodes: Index, a: Index, b: Index, place: Array) -> NDArray[np.int8] | None:
     """The side of each block, 0 or 1, or 2 on the line between; None if no line is worth it."""
     best, least = None, int(WORTHWHILE * len(nodes))
-    for axis in (0, 1):
-        order = nodes[np.argsort(place[nodes, axis], kind="stable")]
+    for along in DIRECTIONS:
+        order = nodes[np.argsort(place[nodes] @ along, kind="stable")]
         side = np.zeros(len(place), np.int8)
         side[order[len(order) // 2 :]] = 1
         across = side[a] != side[b]
@@ -216,9 +241,11 @@ class _Parts:
         sizes = [8 * e * (e + c) for e, c in self._shapes]
         self._starts = np.cumsum([0, *sizes]).tolist()
         self._held = list[tuple[Array, Array]]()
-        self._file: IO[bytes] | None = None
+        self._file: BufferedRandom | None = None
+        self._read = np.empty(0)
         if self._starts[-1] > HELD:
             self._file = TemporaryFile(dir=_on_disk())  # noqa: SIM115 - closed with the factor
+            self._read = np.empty(max(sizes) // 8)
         self._added = 0
 
     def add(self, L: Array, M: Array) -> None:
@@ -227,17 +254,23 @@ class _Parts:
             try:
                 self._file.writelines(np.ascontiguousarray(part).data for part in (L.T, M))
             except OSError:  # a full disk
-                self._held, self._file = [self[k] for k in range(self._added)], None
+                self._held, self._file = [self._copied(k) for k in range(self._added)], None
         if self._file is None:
             self._held.append((L, M))
         self._added += 1
 
+    def _copied(self, k: int) -> tuple[Array, Array]:
+        L, M = self[k]
+        return L.copy(order="F"), M.copy()
+
     def __getitem__(self, k: int) -> tuple[Array, Array]:
+        """Those of one front, which hold until another one is asked for."""
         if self._file is None:
             return self._held[k]
         e, c = self._shapes[k]
         self._file.seek(self._starts[k])
-        both = np.frombuffer(self._file.read(8 * e * (e + c)))
+        both = self._read[: e * (e + c)]
+        self._file.readinto(both.data)
         return both[: e * e].reshape(e, e).T, both[e * e :].reshape(c, e)
 
 

@@ -34,6 +34,10 @@ WHITES = (255.0, 765.0)
 """Values at which a camera's response may end: gains act on the odds x / (white - x)."""
 STRAIGHTER = 0.05
 """A larger one is taken if it makes photos differ less by this share."""
+POINTS, SAMPLES = 60, 200
+"""Ground points a photo, at most, that are sampled of large surveys; samples where points lie
+in many photos.
+"""
 ROUNDS = 8
 """Rounds in which photos' gains and cameras' radial terms are solved for in turn, at most."""
 
@@ -131,7 +135,7 @@ class Balance:
     """Least share of the differences between photos that fields must explain to be applied."""
     whites: tuple[float, ...] = WHITES
     """Values at which the cameras' response may end; the survey's overlaps decide."""
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
 
     def under(self, white: float) -> "Balance":
         """The same for a response that is known."""
@@ -169,7 +173,7 @@ class Balance:
         radial = self._radial(s, views, pairs)
         grey = s.log.mean(1, keepdims=True) + (basis * radial[s.row]).sum(1)[:, None]
         terms = np.concatenate([np.ones((N, 1)), basis[:, :5]], 1)
-        ridge = 1 / np.array([self.sigma_gain] + 5 * [self.sigma_field]) ** 2
+        ridge = s.prior / np.array([self.sigma_gain] + 5 * [self.sigma_field]) ** 2
         x = robust_differences(terms, pairs, grey, ridge)[..., 0]
         fields = radial.copy()
         fields[:, :5] += x[:, 1:]
@@ -179,8 +183,8 @@ class Balance:
         ]
         fields *= (np.array(largest) > self.even)[:, None]
         even = s.log + (basis * fields[s.row]).sum(1)[:, None]
-        bare = _apart(s.log.mean(1), pairs, self.sigma_gain)
-        if _apart(even.mean(1), pairs, self.sigma_gain) > (1 - self.gained) * bare:
+        bare = _apart(s.log.mean(1), pairs, ridge[:1])
+        if _apart(even.mean(1), pairs, ridge[:1]) > (1 - self.gained) * bare:
             fields, even = np.zeros_like(fields), s.log
         gains = robust_differences(terms[:, :1], pairs, even, ridge[:1])[:, 0]
         gains = (gains - np.median(gains, axis=0)).astype(np.float32)
@@ -202,8 +206,8 @@ class Balance:
         columns = apart.reshape(len(r2), -1)
         grey = s.log.mean(1)
         found: NDArray[np.float64] = np.zeros(columns.shape[1])
-        ones, ridge = np.ones((len(r2), 1)), np.array([1 / self.sigma_gain**2])
-        pull = np.eye(len(found)) * SIGMA_LEVEL**2 * CORRELATED / self.sigma_radial**2
+        ones, ridge = np.ones((len(r2), 1)), np.array([s.prior / self.sigma_gain**2])
+        pull = np.eye(len(found)) * s.prior * SIGMA_LEVEL**2 * CORRELATED / self.sigma_radial**2
         for _ in range(ROUNDS):
             level = (grey + columns @ found)[:, None]
             gain = robust_differences(ones, pairs, level, ridge)[:, 0, 0]
@@ -224,7 +228,11 @@ class Balance:
         bounds: tuple[float, float, float, float],
     ) -> "Samples":
         west, south, east, north = bounds
-        step = np.sqrt((east - west) * (north - south) / max(self.points, 60 * len(views)))
+        area, each = (east - west) * (north - south), POINTS * len(views)
+        seen_by = sum(cv2.contourArea(v.footprint.astype(np.float32)) for v in views) / area
+        few = min(each, SAMPLES * len(views) / max(seen_by, 1e-9))
+        number = max(self.points, few)
+        step = np.sqrt(area / number)
         x, y = np.meshgrid(np.arange(west, east, step), np.arange(south, north, step))
         z = surface.at(x, y)
         point, row, place, value = [], [], [], []
@@ -256,6 +264,7 @@ class Balance:
             row=np.concatenate(row)[good],
             place=np.concatenate(place)[good],
             value=levels[good],
+            prior=min(1.0, number / each),
         )
 
 
@@ -273,6 +282,10 @@ class Samples:
     """(N, bands) brightness."""
     white: float = WHITES[0]
     """Value at which the response is taken to end."""
+    prior: float = 1.0
+    """Weight of the priors: less where points lie further apart than usual, since their errors are
+    less correlated then.
+    """
 
     @cached_property
     def log(self) -> NDArray[np.float64]:
@@ -331,11 +344,11 @@ def _sampled(
     return np.asarray(smooth[row, column].astype(np.float64))
 
 
-def _apart(y: NDArray[Any], pairs: Pairs, sigma: float) -> float:
+def _apart(y: NDArray[Any], pairs: Pairs, ridge: NDArray[Any]) -> float:
     """Median difference from the mean of their point, in log odds, of samples (N,) after one gain
     for each photo.
     """
-    point, ridge, ones = pairs.point, np.array([1 / sigma**2]), np.ones((len(y), 1))
+    point, ones = pairs.point, np.ones((len(y), 1))
     level = y + robust_differences(ones, pairs, y[:, None], ridge)[pairs.row, 0, 0]
     return _off_means(level, point)
 
