@@ -10,7 +10,6 @@ import pytest
 
 from skyquilt.alignment import stages
 from skyquilt.alignment.adjust import adjust, covariance
-from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.motion import velocities
 from skyquilt.alignment.problem import READOUT, Problem, State, residuals_px
 from skyquilt.alignment.triangulate import polish, triangulated
@@ -155,30 +154,37 @@ def test_some_photos_of_a_problem_are_a_problem():
     assert np.array_equal(part.sigma_turn, spread[some])
 
 
+class Sizes:
+    """What `weighed` needs of a setup."""
+
+    def __init__(self, photos):
+        self.members, self.size = np.arange(photos), np.tile([LENS.width, LENS.height], (photos, 1))
+
+
 @pytest.mark.parametrize("stops", [False, True])
 def test_some_photos_of_a_large_survey_tell_whether_its_cameras_stood_still(monkeypatch, stops):
-    """Of a drone that flew on, the whole is not adjusted a second time; of one that stopped, with
-    velocities as if it had not, it is, and ends without readout.
+    """The whole is adjusted once for each weight, under what they say, and ends as if all had been
+    asked.
     """
     problem, truth, _ = block(lens=replace(LENS, readout=0.0) if stops else LENS)
-    problem = replace(problem, sigma_turn=np.full(len(truth.C), 1e-3))
     if stops:
         problem = replace(problem, sigma_K=np.where(np.arange(10) == READOUT, 1e-4, 1.0))
         problem.K0[:, READOUT] = LENS.readout  # what is usual for this model
-    moving = adjust(problem, replace(truth, K=problem.K0.copy()), iterations=40).state
-    asked = []
+    whole, asked = len(truth.C), []
+    start = adjust(problem, replace(truth, K=problem.K0.copy()), iterations=40).state
+    sure, best = stages.weighed(problem, start, Sizes(whole))
 
     def counted(problem, *args, **options):
-        asked.append(len(problem.C0))
+        asked.append((len(problem.C0), bool(problem.velocity.any())))
         return adjust(problem, *args, **options)
 
     monkeypatch.setattr(stages, "ASKED", 8)
     monkeypatch.setattr(stages, "adjust", counted)
-    found, state = stages._standing(problem, moving, stages.MADE_NOW, NearFactor())
-    whole = len(truth.C)
-    assert [n < whole for n in asked] == ([True, True, False] if stops else [True, True])
-    assert bool(found.velocity.any()) is not stops
-    assert (state is moving) is not stops
+    found, state = stages.weighed(problem, start, Sizes(whole))
+    assert [moving for n, moving in asked if n < whole] == [True, True, True, False]
+    assert [moving for n, moving in asked if n == whole] == [not stops] * 3
+    assert bool(found.velocity.any()) is bool(sure.velocity.any()) is not stops
+    assert np.abs(state.C - best.C).max() < 0.1 * np.abs(best.C - truth.C).max()
 
 
 @pytest.mark.parametrize("turns", [0.0, 4.0])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.adjust import Adjusted, adjust
+from skyquilt.alignment.adjust import adjust
 from skyquilt.alignment.deviations import believed, observed_noise, robust_scale
 from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.problem import READOUT, Problem, State, residuals_px, swept
@@ -21,7 +21,7 @@ ROLLS_PX = 0.3
 TURN_RAD_S = np.radians(1.5)
 """Deviation of the rates at which they turn, in rad/s; it makes up for errors of velocities too."""
 ASKED = 160
-"""Photos that tell whether the cameras of a survey stood still while they exposed."""
+"""Photos that tell whether the cameras of a large survey stood still while they exposed."""
 DOUBTED = 2.5
 """Positions that a block misses by more than this many deviations are not what they claim."""
 
@@ -62,14 +62,35 @@ def weighed(
     problem: Problem, state: State, setup: Setup, keep: Keep = MADE_NOW
 ) -> tuple[Problem, State]:
     """The adjustment repeated with observations as sharp as their patches and their residuals show
-    them to be, and with the weight that those are worth; with turns of the cameras where rows were
-    exposed one after the other.
+    them to be, and with the weight that those are worth; where rows were exposed one after the
+    other, with turns of the cameras, or with cameras that stood still, whichever explains the
+    photos better. Of large surveys, some photos tell.
     """
     problem = replace(problem, sigma_px=problem.sigma_px * problem.relative, relative=1.0)
-    rolls, near = _rolls(problem, state), NearFactor()
+    sizes, near = setup.size[setup.members], NearFactor()
+    rolls, many = _rolls(problem, state), len(state.C) > 2 * ASKED
     if rolls:
         readout = np.abs(state.K[problem.camera, READOUT])
         problem = replace(problem, sigma_turn=np.maximum(TURN_RAD_S * readout, 1e-9))
+    if rolls and many:
+        chosen = _places_of(state)
+        some, its = problem.among(chosen, state)
+        some, its = _reweighed(some, its, sizes[chosen], MADE_NOW, NearFactor())
+        if _standing(some, its, MADE_NOW, NearFactor())[0] is not some:
+            problem, state = _still(problem, state)
+    problem, state = _reweighed(problem, state, sizes, keep, near)
+    if rolls and not many:
+        return _standing(problem, state, keep.within("still"), near)
+    return problem, state
+
+
+def _reweighed(
+    problem: Problem, state: State, sizes: Array, keep: Keep, near: NearFactor
+) -> tuple[Problem, State]:
+    """The adjustment with turns, if they are unknown, then twice with the weight that residuals
+    show observations to be worth; `sizes` (n, 2): of the photos in px.
+    """
+    if problem.sigma_turn is not None:
         part = keep.within("turns")
         found = adjust(
             problem, state, iterations=15, tolerance=1e-3, damping=1e-6, keep=part, near=near
@@ -78,22 +99,23 @@ def weighed(
     for again in range(2):
         scale = robust_scale(problem, state)
         problem = replace(problem, sigma_px=problem.sigma_px * scale)
-        noise = observed_noise(problem.with_loss(2.0), state, setup.size[setup.members])
+        noise = observed_noise(problem.with_loss(2.0), state, sizes)
         problem = believed(problem.with_loss(2.0), noise)
         part = keep.within(str(again))
         found = adjust(
             problem, state, iterations=15, tolerance=3e-4, damping=1e-6, keep=part, near=near
         )
         state = found.state
-    return _standing(problem, state, keep.within("still"), near) if rolls else (problem, state)
+    return problem, state
 
 
 def plain(problem: Problem, state: State, keep: Keep) -> tuple[Problem, State]:
     """In place of `weighed`, in a third of the time: observations keep their weights, and only
     drones that stop are told from those that fly on.
     """
-    still = _rolls(problem, state)
-    return _standing(problem, state, keep, NearFactor()) if still else (problem, state)
+    if not _rolls(problem, state):
+        return problem, state
+    return _standing(problem, state, keep, NearFactor())
 
 
 def _rolls(problem: Problem, state: State) -> bool:
@@ -107,29 +129,21 @@ def _standing(
 ) -> tuple[Problem, State]:
     """The adjustment as if cameras stood still while they expose, where that explains the photos
     better: drones that stop for each photo have positions and times as if they flew on.
-
-    Of large surveys some photos are asked first, since the whole adjustment takes a third of the
-    time of all.
     """
-    if len(state.C) > 2 * ASKED:
-        some, its = problem.among(_places_of(state), state)
-        moving = adjust(some, its, iterations=25, tolerance=1e-4, damping=1e-6)
-        if _stood(some, moving.state, MADE_NOW, NearFactor()).cost > moving.cost:
-            return problem, state
-    stood = _stood(problem, state, keep, near)
+    other, begin = _still(problem, state)
+    # as far as the other one was, or the two could not be compared
+    stood = adjust(other, begin, iterations=25, tolerance=1e-4, damping=1e-6, keep=keep, near=near)
     if stood.cost < robust_cost(problem, state):
-        return replace(problem, velocity=problem.velocity * 0.0), stood.state
+        return other, stood.state
     return problem, state
 
 
-def _stood(problem: Problem, state: State, keep: Keep, near: NearFactor) -> Adjusted:
-    """The adjustment as if cameras stood still while they expose."""
-    other = replace(problem, velocity=problem.velocity * 0.0)
+def _still(problem: Problem, state: State) -> tuple[Problem, State]:
+    """The same with cameras that stand still while they expose."""
     K = state.K.copy()
     K[:, READOUT] = problem.K0[:, READOUT]
-    begin = replace(state, K=K, turn=np.zeros_like(state.turn))
-    # as far as the other one was, or the two could not be compared
-    return adjust(other, begin, iterations=25, tolerance=1e-4, damping=1e-6, keep=keep, near=near)
+    still = replace(problem, velocity=problem.velocity * 0.0)
+    return still, replace(state, K=K, turn=np.zeros_like(state.turn))
 
 
 def _places_of(state: State) -> NDArray[np.int64]:

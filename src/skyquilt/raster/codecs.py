@@ -15,6 +15,8 @@ from skyquilt.raster.spec import RasterSpec
 MCU = 16
 """Side in px of the unit that 4:2:0 JPEG codes together: ringing stays within it."""
 
+KEPT_RIM, FADED_RIM = 8.0, 16.0
+"""px outside the mask that keep the colours of its border, and px over which these then fade."""
 DEFLATE_LEVEL = 6
 ZSTD_LEVEL = 3
 
@@ -109,34 +111,28 @@ def split_jpeg(stream: bytes) -> tuple[bytes, bytes]:
 
 
 def smooth_fill(pixels: NDArray[Any], valid: NDArray[np.bool_]) -> NDArray[Any]:
-    """Pixels (uint8) with the invalid ones of JPEG units that have valid ones set to the nearest
-    of these, so that its border keeps its colours; all others are black, for programs that ignore
-    masks.
+    """Pixels (uint8) with the invalid ones near to valid ones set to the nearest of these, ever
+    darker: the border keeps its colours in JPEG's units, and programs that ignore masks show a rim
+    that fades, without steps. All others are black.
     """
     if not valid.any():
         return np.zeros_like(pixels)
     mask = valid.view(np.uint8)
     out = np.zeros_like(pixels)
     cv2.copyTo(pixels, mask, out)
-    small = (valid.shape[1] // MCU, valid.shape[0] // MCU)
-    share = cv2.resize(mask * np.uint8(255), small, interpolation=cv2.INTER_AREA)
-    mixed = ((share > 0) & (share < 255)).repeat(MCU, 0).repeat(MCU, 1)
-    fill = np.flatnonzero(mixed & ~valid)
-    if len(fill):
-        # each valid pixel is a label; they are counted from 1 in the order of rows
-        _, place = cv2.distanceTransformWithLabels(
-            1 - mask, cv2.DIST_L2, cv2.DIST_MASK_3, labelType=cv2.DIST_LABEL_PIXEL
-        )
-        nearest = np.flatnonzero(valid)[place.ravel()[fill] - 1]
-        flat = out.reshape(-1, out.shape[2])
-        flat[fill] = flat[nearest]
+    if valid.all():
+        return out
+    # each valid pixel is a label; they are counted from 1 in the order of rows
+    apart, place = cv2.distanceTransformWithLabels(
+        1 - mask, cv2.DIST_L2, cv2.DIST_MASK_3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    apart = apart.ravel()
+    fill = np.flatnonzero((apart > 0) & (apart < KEPT_RIM + FADED_RIM))
+    nearest = np.flatnonzero(valid)[place.ravel()[fill] - 1]
+    light = 1 - np.maximum(apart[fill] - KEPT_RIM, 0) / FADED_RIM
+    flat = out.reshape(-1, out.shape[2])
+    flat[fill] = np.rint(flat[nearest] * light[:, None])
     return out
-
-
-def _units(array: NDArray[Any]) -> NDArray[Any]:
-    """A view (rows, columns, MCU, MCU, bands) of (h, w, bands)."""
-    h, w, bands = array.shape
-    return array.reshape(h // MCU, MCU, w // MCU, MCU, bands).swapaxes(1, 2)
 
 
 def pack_mask(valid: NDArray[np.bool_]) -> bytes:
