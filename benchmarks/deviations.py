@@ -207,6 +207,8 @@ def main() -> int:
     folder = Path(tempfile.gettempdir()) / "skyquilt-deviations"
     parser.add_argument("--work", type=Path, default=folder)
     args = parser.parse_args()
+    if unknown := set(args.kinds.split(",")) - set(KINDS):
+        parser.error(f"no kind {', '.join(sorted(unknown))}; there are {', '.join(KINDS)}")
     if args.pictures:
         pooled = defaultdict[str, list[float]](list)
         for number in range(args.pictures):

@@ -52,36 +52,45 @@ def leave_one_out(
 
 
 def ground_points(tracks: Tracks, setup: Setup, state: State) -> TiePoints:
-    """All tracks triangulated with the final poses; outliers and unstable points are removed."""
-    found = [_ground_part(part, state) for part in setup.problems(tracks)]
-    z = np.concatenate([whole.X[:, 2] for _, whole, _ in found] or [np.zeros(0)])
+    """All tracks triangulated with the final poses; outliers and unstable points are removed.
+
+    Of large surveys these are millions of observations, more than anything else in memory: what is
+    found of a part of them is small, and the parts are joined one field at a time.
+    """
+    found = [_ground_part(part, state, setup) for part in setup.problems(tracks)]
+    z = np.concatenate([ties.xyz[:, 2] for ties, _ in found] or [np.zeros(0)])
     height = abs(float(np.median(state.C[:, 2]) - np.median(z))) if len(z) else 0.0
     parts, first = [no_ties()], 0
-    for everything, whole, sigma_z in found:
-        keep = (sigma_z < 0.05 * height)[everything.point]
-        points, renumbered = np.unique(everything.point[keep], return_inverse=True)
-        photo = setup.members[everything.photo[keep]]
-        parts.append(
-            TiePoints(
-                xyz=whole.X[points],
-                point=first + renumbered.astype(np.int64),
-                photo=photo,
-                px=setup.file_px(photo, everything.px[keep]),
-                residual_px=residuals_px(everything, whole)[keep] * setup.file_sign(photo),
-            )
-        )
+    while found:
+        ties, sigma_z = found.pop(0)
+        keep = (sigma_z < 0.05 * height)[ties.point]
+        points, number = np.unique(ties.point[keep], return_inverse=True)
+        values = {n: getattr(ties, n)[keep] for n in ("photo", "px", "residual_px")}
+        point = (first + number).astype(ties.point.dtype)
+        parts.append(TiePoints(xyz=ties.xyz[points], point=point, **values))
         first += len(points)
-    names = [f.name for f in fields(TiePoints)]
-    return TiePoints(**{n: np.concatenate([getattr(p, n) for p in parts]) for n in names})
+    lists = {f.name: [getattr(p, f.name) for p in parts] for f in fields(TiePoints)}
+    del parts
+    return TiePoints(**{name: np.concatenate(lists.pop(name)) for name in list(lists)})
 
 
-def _ground_part(everything: Problem, state: State) -> tuple[Problem, State, Array]:
-    """The sound observations of some tracks, their points, and how well each height is known."""
+def _ground_part(everything: Problem, state: State, setup: Setup) -> tuple[TiePoints, Array]:
+    """The points of some tracks with their sound observations, and how well each height is
+    known.
+    """
     everything = replace(everything, loss_px=2.0)
     whole, _ = polish(everything, triangulated(everything, state), iterations=3)
     everything, whole = prune(everything, whole, 5.0)
     whole, sigma_z = polish(everything, whole, iterations=2)
-    return everything, whole, sigma_z
+    photo = setup.members[everything.photo]
+    ties = TiePoints(
+        xyz=whole.X,
+        point=everything.point.astype(np.int32),
+        photo=photo.astype(np.int32),
+        px=setup.file_px(photo, everything.px),
+        residual_px=residuals_px(everything, whole) * setup.file_sign(photo),
+    )
+    return ties, sigma_z
 
 
 def accuracy(setup: Setup, problem: Problem, state: State, covariance: Covariance) -> Accuracy:

@@ -65,10 +65,12 @@ class Setup:
     plane_t: NDArray[np.complex128]
     """(n,) translations of the start."""
 
-    def file_px(self, photo: NDArray[np.int64], px: Array) -> Array:
+    def file_px(self, photo: NDArray[np.integer[Any]], px: Array) -> Array:
         """Converts sensor pixels to file pixels, or back. For turned files the two differ by a
         rotation of 180 degrees.
         """
+        if not self.turned.any():
+            return px
         return np.where(self.turned[photo][:, None], self.size[photo] - 1 - px, px)
 
     def moving_as(self, photos: Sequence[Photo], C: Array) -> "Setup":
@@ -103,7 +105,7 @@ class Setup:
             X[points] = self._on_plane(tracks.part(some, points), row[some])
         problem = replace(
             self.base,
-            point=tracks.point,
+            point=tracks.point.astype(np.int64),
             photo=row,
             px=tracks.px,
             sigma_px=tracks.sigma_px,

@@ -93,9 +93,9 @@ def outwards(
 class Tracks:
     """Observations sorted by track."""
 
-    point: Index
+    point: NDArray[np.integer[Any]]
     """(N,) track of each observation, 0 .. count-1, ascending."""
-    photo: Index
+    photo: NDArray[np.integer[Any]]
     """(N,) photo."""
     px: NDArray[np.float64]
     """(N, 2) px."""
@@ -130,6 +130,8 @@ class Tracks:
 
     def only(self, observation: NDArray[np.bool_]) -> "Tracks":
         """The selected observations, without tracks left with one observation; renumbered."""
+        if observation.all():
+            return self
         point = self.point[observation]
         keep = np.flatnonzero(observation)[np.bincount(point, minlength=self.count)[point] >= 2]
         return Tracks(
@@ -159,7 +161,10 @@ class Thinning:
     """
 
     def chosen(
-        self, point: Index, photo: Index, px_of: Callable[[Index], NDArray[np.float64]]
+        self,
+        point: NDArray[np.integer[Any]],
+        photo: NDArray[np.integer[Any]],
+        px_of: Callable[[Index], NDArray[np.float64]],
     ) -> NDArray[np.bool_]:
         """(tracks,) which tracks are kept.
 
@@ -181,7 +186,7 @@ class Thinning:
         return chosen
 
     def _best(
-        self, photo: Index, length: Index, px: NDArray[np.float64], own: Index
+        self, photo: NDArray[np.integer[Any]], length: Index, px: NDArray[np.float64], own: Index
     ) -> NDArray[np.int64]:
         """Those of some photos' observations `own` that are the best ones of their cells."""
         cells = self.cells or max(1, math.isqrt(self.per_photo))
@@ -237,15 +242,12 @@ def build_tracks(
     px = np.empty((len(used), 2))
     px[by_photo] = px_of(by_photo)
     scales = np.array([f.scale for f in features])
-    return Tracks(
-        point=point.astype(np.int64),
-        photo=photo.astype(np.int64),
-        px=px,
-        sigma_px=np.maximum(sigma * scales[photo], 0.3),
-    )
+    return Tracks(point=point, photo=photo, px=px, sigma_px=np.maximum(sigma * scales[photo], 0.3))
 
 
-def _joined(features: Sequence[Features], links: Sequence[Link]) -> tuple[Index, ...]:
+def _joined(
+    features: Sequence[Features], links: Sequence[Link]
+) -> tuple[NDArray[np.integer[Any]], ...]:
     """Observations by track, as `build_tracks` describes: the feature of each in the list of all
     (N,), its photo (N,), its track (N,) ascending; and where each photo's features begin in that
     list (photos + 1,).
@@ -277,9 +279,9 @@ def _joined(features: Sequence[Features], links: Sequence[Link]) -> tuple[Index,
     return used[order], photo[order], point.astype(kind), offset
 
 
-def _renumbered(point: Index) -> Index:
+def _renumbered(point: NDArray[np.integer[Any]]) -> NDArray[np.integer[Any]]:
     """Numbers without gaps of ascending ones (n,)."""
-    return np.cumsum(np.r_[False, np.diff(point) != 0])[: len(point)]
+    return np.cumsum(np.r_[False, np.diff(point) != 0], dtype=point.dtype)[: len(point)]
 
 
 def _places(features: Sequence[Features]) -> tuple[Index, list[NDArray[np.int32]]]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,9 +119,9 @@ class TiePoints:
 
     xyz: Array
     """(P, 3) in m in the map frame."""
-    point: NDArray[np.int64]
+    point: NDArray[np.integer[Any]]
     """(N,) index into `xyz` of each observation, ascending."""
-    photo: NDArray[np.int64]
+    photo: NDArray[np.integer[Any]]
     """(N,) index of the photo of each observation."""
     px: Array
     """(N, 2) observed pixel."""
@@ -257,8 +258,8 @@ def no_ties() -> TiePoints:
     """Tie points of a method that has none."""
     return TiePoints(
         xyz=np.zeros((0, 3)),
-        point=np.zeros(0, np.int64),
-        photo=np.zeros(0, np.int64),
+        point=np.zeros(0, np.int32),
+        photo=np.zeros(0, np.int32),
         px=np.zeros((0, 2)),
         residual_px=np.zeros((0, 2)),
     )

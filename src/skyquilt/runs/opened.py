@@ -106,7 +106,7 @@ class Run:
         ties = alignment.ties
         return Observations(
             points=ties.xyz + np.array([*alignment.frame.origin, 0.0]),
-            point=ties.point,
+            point=ties.point.astype(np.int64),
             photo=np.array([names[i] for i in ties.photo.tolist()], dtype=str),
             px=ties.px,
             residual_px=ties.residual_px,
