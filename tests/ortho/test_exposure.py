@@ -13,6 +13,7 @@ from skyquilt.ortho import differences
 from skyquilt.ortho.earlier import complete, with_new
 from skyquilt.ortho.exposure import (
     NEUTRAL,
+    SAMPLES,
     WHITES,
     Balance,
     Exposure,
@@ -92,6 +93,26 @@ def test_gains_are_found_again(lit):
     assert np.median(mine, axis=0) == pytest.approx(0, abs=1e-6)
     assert np.abs(expected).max() > 0.2  # there was something to find
     assert not any(found.uneven(v.photo) for v in views)
+
+
+def test_photos_that_overlap_much_are_sampled_less_and_gains_are_found_again(lit):
+    """Samples per photo do not grow with the number of photos that show a point; with fewer of
+    them, priors weigh as much less.
+    """
+    views, pictures, true = lit
+    many = [replace(v, photo=1000 * k + v.photo) for k in range(12) for v in views]
+    shown = {v.photo: pictures[v.photo % 1000] for v in many}
+    balance = Balance(points=1)
+    few = balance._samples(views, pictures, FLAT, GRID.bounds)
+    more = balance._samples(many, shown, FLAT, GRID.bounds)
+    assert 1 > few.prior == pytest.approx(12 * more.prior)
+    assert np.bincount(more.row).mean() < 1.2 * SAMPLES
+    assert np.bincount(more.row).mean() == pytest.approx(SAMPLES, rel=0.4)
+    found = balance(many, shown, FLAT, GRID.bounds)
+    mine = np.array([found.gains[v.photo] for v in views])
+    expected = -np.array([true[v.photo] for v in views])
+    error = (mine - mine.mean(0)) - (expected - expected.mean(0))
+    assert np.abs(error).max() < 0.03
 
 
 def test_values_in_proportion_to_the_light_are_told_from_curved_ones(lit):
