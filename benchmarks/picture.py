@@ -67,13 +67,13 @@ import numpy as np
 from skyquilt.cli.main import run
 from skyquilt.ortho import stereo
 
-whole, kept = stereo._with_coarse, sys.argv.pop(1)
+whole, kept = stereo.with_coarse, sys.argv.pop(1)
 
 def noted(z, known, rough, cells, side):
     np.savez(kept, known=known)
     return whole(z, known, rough, cells, side)
 
-stereo._with_coarse = noted
+stereo.with_coarse = noted
 sys.argv[0] = "skyquilt"
 run()
 """

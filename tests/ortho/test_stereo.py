@@ -8,8 +8,8 @@ from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.engine.workers import Threads
 from skyquilt.model.camera import Camera
 from skyquilt.model.raster import Grid
-from skyquilt.ortho import fill, stereo
-from skyquilt.ortho.fill import filled, nearest_known, plateaus, settled
+from skyquilt.ortho import fill, fusion
+from skyquilt.ortho.fill import filled, lowered, nearest_known, plateaus, settled
 from skyquilt.ortho.pair_matching import pair_of
 from skyquilt.ortho.stereo import Stereo
 from skyquilt.ortho.tie_surface import level
@@ -196,10 +196,62 @@ def test_heights_joined_in_bands_are_those_joined_at_once(monkeypatch):
     cells = Grid(west=0.0, north=60.0, gsd=0.2, width=150, height=300)
     z = rng.normal(5, 1, (300, 150)).astype(np.float32)
     known = rng.random(z.shape) < np.linspace(0, 0.6, 300)[:, None]
-    rough = stereo.surface_of(np.full((60, 30), 2.0, np.float32), cells.coarser(5))
-    whole = stereo._with_coarse(z, known, rough, cells, 15)
-    monkeypatch.setattr(stereo, "BAND", 37)
-    bands = stereo._with_coarse(z, known, rough, cells, 15)
+    rough = fusion.surface_of(np.full((60, 30), 2.0, np.float32), cells.coarser(5))
+    whole = fusion.with_coarse(z, known, rough, cells, 15)
+    monkeypatch.setattr(fusion, "BAND", 37)
+    bands = fusion.with_coarse(z, known, rough, cells, 15)
     assert np.array_equal(whole, bands)
     share = (whole == 2.0).mean(1)
     assert share[:60].min() > 0.9 and share[240:].max() < 0.1
+
+
+def _crown():
+    """Heights of a crown of 8 m on ground that rises, and what is known of them: not a ring of
+    three to five cells around it, nor single cells anywhere.
+    """
+    y, x = np.mgrid[:120, :140].astype(np.float32)
+    away = np.hypot(x - 70, y - 60)
+    truth = (0.02 * x + np.where(away < 25, 8 - 0.05 * away, 0)).astype(np.float32)
+    lost = np.random.default_rng(2).random(truth.shape) < 0.1
+    lost |= (away >= 25) & (away < np.where(x > 70, 30, 28))
+    return truth, ~lost, away
+
+
+def test_hidden_ground_beside_a_crown_is_filled_from_the_ground():
+    """Every place of the ring becomes ground; the crown keeps its own heights, holes and all."""
+    truth, known, away = _crown()
+    z = np.where(known, truth, -99).astype(np.float32)
+    nearest = nearest_known(z.copy(), known)
+    out = lowered(nearest.copy(), known, 30, 1.0)
+    assert np.array_equal(out[known], truth[known])
+    ring = (away >= 25) & (away < 30)
+    wrong = np.abs(out - truth) > 0.5
+    assert (np.abs(nearest - truth) > 0.5)[ring].mean() > 0.3  # what it mends
+    assert wrong[ring].mean() < 0.01
+    assert wrong[away < 23].mean() == 0
+    short = lowered(nearest.copy(), known, 1, 1.0)
+    assert np.array_equal(short[ring & ~known], nearest[ring & ~known])
+
+
+def test_hidden_ground_is_filled_in_bands_as_at_once(monkeypatch):
+    truth, known, _ = _crown()
+    nearest = nearest_known(np.where(known, truth, -99).astype(np.float32), known)
+    whole = lowered(nearest.copy(), known, 12, 1.0)
+    monkeypatch.setattr(fill, "AT_ONCE", 140 * 17)
+    assert np.array_equal(lowered(nearest.copy(), known, 12, 1.0), whole)
+    turned = (np.ascontiguousarray(a[::-1, ::-1].T) for a in (nearest, known))
+    assert np.array_equal(lowered(*turned, 12, 1.0).T[::-1, ::-1], whole)
+
+
+def test_edges_are_sought_where_they_are_asked_for(flight):
+    """The walls of the box move closer to their place, and its roof and the ground stay."""
+    views, grey = flight
+    x, y = np.meshgrid(np.linspace(-9, 9, 361), np.linspace(-9, 9, 361))
+    outside = np.maximum(np.abs(x), np.abs(y)) - HALF
+    off = []
+    for asked in (0.0, 0.2):
+        z = Stereo(edges=asked)(level(0.0), views, GRID, grey, MADE_NOW).at(x, y)
+        assert np.median(np.abs(z[outside < -1] - BOX)) < 0.15
+        assert (np.abs(z[outside > 1]) < 0.5).mean() > 0.98
+        off.append(np.mean((z > BOX / 2) != (outside < 0)))
+    assert off[1] < 0.95 * off[0]

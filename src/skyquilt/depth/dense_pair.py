@@ -19,9 +19,9 @@ from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.fill import nearest_known
+from skyquilt.ortho.fusion import splatted, surface_of, without_specks
 from skyquilt.ortho.ground import GreyPicture
 from skyquilt.ortho.pair_matching import matched_points, pair_of
-from skyquilt.ortho.stereo import splatted, surface_of, without_specks
 
 LONGEST = 1000
 """Largest longer side in px of the pictures that are compared."""

@@ -16,6 +16,8 @@ WHOLE, BEYOND, COARSER = 2048, 512, 8
 """Rows of heights filled at a time, those looked at beyond them, and the step of the rows and
 columns that fill what is further away.
 """
+AT_ONCE = 1_000_000
+"""Cells whose surroundings are looked at at once, about."""
 STIFF = 0.002
 """Weight of a prior of zero for the slope of a plane."""
 
@@ -152,3 +154,64 @@ def plateaus(z: Float, side: int) -> Float:
     low, span = float(z.min()), max(float(np.ptp(z)), 1e-6)
     levels = np.rint((z - low) * (255 / span)).astype(np.uint8)
     return np.asarray(cv2.medianBlur(levels, side) * np.float32(span / 255) + low, np.float32)
+
+
+def lowered(z: Float, known: Mask, reach: int, step: float) -> Float:
+    """Heights (h, w) whose gaps were filled by the nearest known one, as `nearest_known` does, with
+    the gaps beside steps of more than `step` m filled from the lower side: what no two photos show
+    there is the ground behind something that stands. As in Hirschmueller (2008), the height is
+    the second lowest of the nearest known ones in eight directions, within `reach` cells. The
+    array itself is changed, and returned.
+    """
+    rows = max(reach, AT_ONCE // z.shape[1])
+    done = []  # bands are written when no later one looks at them any more
+    for row in range(0, len(z), rows):
+        first, last = max(0, row - reach), min(len(z), row + rows + reach)
+        inner = slice(row - first, min(row + rows, len(z)) - first)
+        gap = ~known[row : row + rows]
+        around = _around(z[first:last], known[first:last], reach, inner)[:, gap]
+        around.sort(axis=0)
+        number = np.isfinite(around).sum(0)
+        low = around[1]
+        high = np.take_along_axis(around, np.maximum(number - 2, 0)[None], 0)[0]
+        now = z[row : row + rows][gap]
+        behind = (number > 2) & (high - low > step) & (now > (high + low) / 2)
+        done.append((row, gap, np.where(behind, low, now)))
+    for row, gap, heights in done:
+        z[row : row + rows][gap] = heights
+    return z
+
+
+def _around(z: Float, known: Mask, reach: int, inner: slice) -> Float:
+    """(8, n, w) at each cell of the inner rows the nearest known height in each of eight
+    directions, NaN where there is none within `reach` cells.
+    """
+    found = [part[:, inner] for part in (_above(z, known, reach), _beside(z, known, reach))]
+    turned = (z[::-1, ::-1], known[::-1, ::-1])
+    for part in (_above(*turned, reach), _beside(*turned, reach)):
+        found.append(part[:, ::-1, ::-1][:, inner])
+    return np.concatenate(found)
+
+
+def _above(z: Float, known: Mask, reach: int) -> Float:
+    """(3, h, w) the nearest known heights straight above and along both diagonals."""
+    out = np.empty((3, *z.shape), np.float32)
+    last = np.full((3, z.shape[1]), np.nan, np.float32)
+    age = np.zeros(last.shape, np.int32)
+    for row, here in enumerate(known):
+        for carried, edge in ((last, np.float32(np.nan)), (age, 0)):
+            carried[1, 1:], carried[2, :-1] = carried[1, :-1].copy(), carried[2, 1:].copy()
+            carried[1, 0] = carried[2, -1] = edge
+        age += 1
+        out[:, row] = np.where(age <= reach, last, np.float32(np.nan))
+        last[:, here] = z[row, here]
+        age[:, here] = 0
+    return out
+
+
+def _beside(z: Float, known: Mask, reach: int) -> Float:
+    """(1, h, w) the nearest known heights to the left."""
+    column = np.arange(z.shape[1], dtype=np.int32)
+    last = np.maximum.accumulate(np.where(known, column, np.int32(-reach - 1)), axis=1)
+    value = np.take_along_axis(z, np.maximum(last, 0), 1)
+    return np.asarray(np.where(column - last <= reach, value, np.float32(np.nan)))[None]

@@ -20,24 +20,28 @@ from skyquilt.engine.workers import Workers
 from skyquilt.geometry.neighbours import pairs_within
 from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid, meet
-from skyquilt.model.surface import STRIP, Surface, least_cell
-from skyquilt.ortho.fill import nearest_known, plateaus, settled
+from skyquilt.model.surface import Surface, least_cell
+from skyquilt.ortho.fill import lowered, nearest_known, plateaus, settled
+from skyquilt.ortho.fusion import (
+    FIRM,
+    Cells,
+    agreed,
+    inside,
+    splatted,
+    surface_of,
+    with_coarse,
+    without_specks,
+)
 from skyquilt.ortho.pair_matching import Array, Float, Mask, Pair, matched_points, pair_of
 
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
-Cells = tuple[NDArray[np.int32], Float]
-"""Numbers (n,) of cells of a grid, row by row, and their heights (n,) in m."""
-BAND = 1024
-"""Rows of cells whose fine and coarse heights are joined at a time."""
 TILE = 512
 """Cells along a side of the pieces in which heights are fused."""
 NEW = 0.25
 """Share of the ground of a pair that must still lack pairs for it to be matched."""
 EDGES = 0.003
 """Share of a pair's ground that has edges where things stand on it."""
-FIRM = 0.25
-"""Share of the cells around with a fine height from which these are believed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,6 +90,12 @@ class Stereo:
     """Fine heights may leave the range of the coarse ones around them by this share of the flying
     height.
     """
+    edges: float = 0.0
+    """Edges are sought within this share of the flying height: fine heights may lie in the range of
+    the coarse ones as far around, since ground that shows between crowns lies far below these, and
+    gaps beside steps are filled from the lower side. 0 = fine heights keep to the coarse ones above
+    them, and gaps are filled by the nearest: real leaves need that where few photos see them.
+    """
     whole: float = 0.05
     """Size of crowns and of gaps between them, as a share of the flying height."""
     relief: float = 0.02
@@ -121,21 +131,23 @@ class Stereo:
         cells = grid.coarser(
             max(int(np.clip(round(2 * gsd / grid.gsd), *self.cell_px)), least_cell(grid))
         )
-        step = self.agree * height
+        step, far = self.agree * height, self.edges * height
         given = _Round(
             cells=cells,
-            low=_stretched(rough, 3 * gsd, cv2.MORPH_ERODE, -step),
-            high=_stretched(rough, 3 * gsd, cv2.MORPH_DILATE, step),
+            low=_stretched(rough, max(3 * gsd, far), cv2.MORPH_ERODE, -step),
+            high=_stretched(rough, max(3 * gsd, far / 2), cv2.MORPH_DILATE, step),
             grey=grey,
             agree=0.015 * height,
         )
         z = _fused(given, pairs, "fine", keep)
         known = without_specks(z, 0.01 * height, 6)
-        del given  # large surveys have rasters of 100 MB
         if known.any():
             z = nearest_known(z, known)
+        if known.any() and far > 0:
+            z = lowered(z, known, round(far / 2 / cells.gsd), given.agree)
+        del given  # large surveys have rasters of 100 MB
         side = 2 * round(self.whole * height / cells.gsd / 2) + 1
-        return surface_of(_with_coarse(z, known, rough, cells, side), cells)
+        return surface_of(with_coarse(z, known, rough, cells, side), cells)
 
     def _coarse(
         self,
@@ -281,15 +293,8 @@ def _tile(
     todo = [k for k in near if k not in held]
     for k, heights in zip(todo, workers.each(matched, [pairs[k] for k in todo]), strict=True):
         held[k] = heights
-    inside = (_inside(held[k], given.cells.width, *at) for k in near)
-    return _agreed([h for h in inside if len(h[0])], given.agree, at[2:])
-
-
-def _inside(heights: Cells, width: int, row: int, column: int, h: int, w: int) -> Cells:
-    """Those heights of a grid `width` cells wide that lie in a part of it, numbered there."""
-    r, c = heights[0] // width - row, heights[0] % width - column
-    mine = (r >= 0) & (r < h) & (c >= 0) & (c < w)
-    return r[mine] * np.int32(w) + c[mine], heights[1][mine]
+    parts = (inside(held[k], given.cells.width, *at) for k in near)
+    return agreed([h for h in parts if len(h[0])], given.agree, at[2:])
 
 
 def _over(a: View, b: View, known: Surface, gsd: float) -> Pair | None:
@@ -339,112 +344,11 @@ def _points(pair: Pair, level: Level, given: _Round) -> Float:
     return np.asarray(at[(z > given.low.at(x, y)) & (z < given.high.at(x, y))])
 
 
-def splatted(points: Float, origin: Array, part: Grid) -> Cells:
-    """Heights of the cells of a grid that points fall in: in each the mean of those near the
-    highest one.
-    """
-    column = np.floor((points[:, 0] + (origin[0] - part.west)) / part.gsd).astype(np.int32)
-    row = np.floor(((part.north - origin[1]) - points[:, 1]) / part.gsd).astype(np.int32)
-    mine = (column >= 0) & (column < part.width) & (row >= 0) & (row < part.height)
-    if not mine.any():
-        return np.zeros(0, np.int32), np.zeros(0, np.float32)
-    column, row, z = column[mine], row[mine], points[mine, 2]
-    # only the rectangle that this pair shows
-    west, wide = int(column.min()), int(np.ptp(column)) + 1
-    north, high = int(row.min()), int(np.ptp(row)) + 1
-    cell = (row - north) * wide + (column - west)
-    top = np.full(high * wide, -np.inf, np.float32)
-    np.maximum.at(top, cell, z)
-    close = z > top[cell] - 2 * part.gsd
-    cell, z = cell[close], z[close]
-    number = np.bincount(cell, minlength=len(top))
-    known = np.flatnonzero(number)
-    mean = np.bincount(cell, z, minlength=len(top))[known] / number[known]
-    at = (known // wide + north) * part.width + known % wide + west
-    return at.astype(np.int32), (mean + origin[2]).astype(np.float32)
-
-
-def _agreed(heights: Sequence[Cells], step: float, shape: tuple[int, int]) -> Float:
-    """Median (h, w) of the heights of each cell; of an even number the lower of the two in the
-    middle. NaN where there are none, or where of several none lies within `step` m of it.
-    """
-    number = np.zeros(shape[0] * shape[1], np.intp)
-    for cell, _ in heights:
-        number[cell] += 1
-    ordered = np.full((int(number.max(initial=0)), len(number)), np.nan, np.float32)
-    if not len(ordered):
-        return np.full(shape, np.nan, np.float32)
-    number[:] = 0
-    for cell, z in heights:
-        ordered[number[cell], cell] = z
-        number[cell] += 1
-    ordered.sort(axis=0)
-    z = np.take_along_axis(ordered, np.maximum(number - 1, 0)[None] // 2, 0)[0]
-    with np.errstate(invalid="ignore"):
-        close = (np.abs(ordered - z) < step).sum(0)
-    z = np.where((number > 1) & (close < 2), np.float32(np.nan), z)
-    return np.asarray(z.reshape(shape))
-
-
-def _with_coarse(z: Float, known: Mask, rough: Surface, cells: Grid, side: int) -> Float:
-    """Fine heights (h, w), smoothed, where enough of the window of `side` cells around has some of
-    its own; the coarse ones elsewhere. Cliffs of these stay as steep as the cells allow.
-    """
-    x, y = cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height))
-    out = np.empty((cells.height, cells.width), np.float32)[::-1]  # as `surface_of` turns it
-    halo = side // 2 + 1
-    for row in range(0, cells.height, BAND):
-        first = max(0, row - halo)
-        around = slice(first, row + BAND + halo)
-        inner = slice(row - first, min(row + BAND, cells.height) - first)
-        share = cv2.boxFilter(known[around].view(np.uint8), cv2.CV_32F, (side, side))
-        former = cv2.medianBlur(_stepwise(rough, x, y[around]), 3)
-        fine = cv2.medianBlur(z[around], 3)
-        out[row : row + BAND] = np.where(share > FIRM, fine, former)[inner]
-    return out
-
-
-def _stepwise(surface: Surface, x: NDArray[Any], y: NDArray[Any]) -> Float:
-    """Heights (h, w) of the nearest cells of a surface, at x (w,) and y (h,)."""
-    column = np.rint((x - surface.x0) / surface.cell).astype(np.int64)
-    row = np.rint((y - surface.y0) / surface.cell).astype(np.int64)
-    rows, columns = surface.z.shape
-    return surface.z[np.clip(row, 0, rows - 1)][:, np.clip(column, 0, columns - 1)]
-
-
-def without_specks(z: Float, step: float, least: int) -> Mask:
-    """Which heights (h, w) are kept: those of patches of at least `least` cells whose neighbours
-    differ by less than `step` m.
-    """
-    known = np.isfinite(z)
-    if not known.any():
-        return known
-    base = float(np.nanmin(z))
-    scale = min(100.0, 30000 / max(float(np.nanmax(z)) - base, 1e-6))
-    levels = np.full(z.shape, -1000, np.int16)
-    for row in range(0, len(z), STRIP):
-        part = slice(row, row + STRIP)
-        levels[part][known[part]] = (z[part][known[part]] - base) * scale + 1
-    cv2.filterSpeckles(levels, -1000, least, step * scale)
-    return levels >= 0
-
-
 def _stretched(surface: Surface, reach: float, kind: int, add: float) -> Surface:
     """The lowest or highest heights within `reach` m, moved by `add` m."""
     side = 2 * max(1, round(reach / surface.cell)) + 1
     z = cv2.morphologyEx(surface.z, kind, np.ones((side, side), np.uint8))
     return replace(surface, z=np.asarray(z + np.float32(add), np.float32))
-
-
-def surface_of(z: Float, cells: Grid) -> Surface:
-    """The surface of heights (rows, columns) in m of cells, row 0 in the north, without gaps."""
-    return Surface(
-        z=np.ascontiguousarray(z[::-1]),
-        x0=float(cells.x(np.array(0))),
-        y0=float(cells.y(np.array(cells.height - 1))),
-        cell=cells.gsd,
-        source="multi-view matching",
-    )
 
 
 Covered = tuple[slice, slice, Mask]

@@ -192,7 +192,9 @@ def heights_for(settings: MosaicSettings) -> SurfaceFromPictures | None:
     """The refinement of heights selected by the settings; None = tie points alone."""
     chosen: dict[str, SurfaceFromPictures] = {
         "auto": Stereo(),
-        "dense": Stereo(fine=Level(longest=1000, window=3, wanted=4), relief=0.0),
+        "dense": Stereo(
+            fine=Level(longest=1400, window=3, wanted=4), relief=0.0, edges=0.2, cell_px=(3, 8)
+        ),
         "sweep": Sweep(),
     }
     return chosen.get(settings.ground.surface)

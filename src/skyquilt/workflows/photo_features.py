@@ -27,8 +27,8 @@ from skyquilt.photos.read import rejected
 from skyquilt.workflows.methods import Detector
 
 PICTURE = 1000
-"""Longest side in px of the grey images kept for the refinement of observations and the search of
-heights.
+"""Longest side in px of the grey images kept of every photo for the refinement of observations and
+the search of heights.
 """
 KEPT_BYTES = 150_000_000
 """Bytes of grey images, and of features, kept in memory; the others are read from the store."""
@@ -160,8 +160,10 @@ class GreyPictures:
         self._longest = 0
 
     def __call__(self, photo: int, longest: int) -> NDArray[np.uint8]:
-        """Grey image of a photo (index), with at most `longest` px on its longest side."""
-        if longest >= PICTURE:
+        """Grey image of a photo (index), with at most `longest` px on its longest side. Those of
+        more than `PICTURE` px are made when they are asked for, and kept in the store too.
+        """
+        if longest == PICTURE:
             return self._cache(photo)
         if longest != self._longest:
             self._small.clear()
@@ -174,7 +176,14 @@ class GreyPictures:
         self._small.make_room()
 
     def _shrunken(self, photo: int) -> NDArray[np.uint8]:
-        return np.ascontiguousarray(shrink(self._cache(photo), self._longest)[0])
+        longest = self._longest
+        if longest > PICTURE:
+            return self._store.get_or(
+                "pictures",
+                digest(picture_key(self._photos[photo]), longest),
+                lambda: picture_of(self._pixels(photo), longest),
+            )
+        return np.ascontiguousarray(shrink(self._cache(photo), longest)[0])
 
     def _load(self, photo: int) -> NDArray[np.uint8]:
         return self._store.get_or(
@@ -222,12 +231,12 @@ def picture_recipe() -> tuple[Any, ...]:
     return PICTURE, halved, shrink, to_grey8
 
 
-def picture_of(pixels: NDArray[Any]) -> NDArray[np.uint8]:
-    """The grey image of a photo's pixels."""
-    rough = halved(pixels, PICTURE)
+def picture_of(pixels: NDArray[Any], longest: int = PICTURE) -> NDArray[np.uint8]:
+    """The grey image of a photo's pixels, with at most `longest` px on its longest side."""
+    rough = halved(pixels, longest)
     if rough.dtype == np.uint8:  # averaging one band takes a third of the time of three
-        return np.ascontiguousarray(shrink(to_grey8(rough), PICTURE)[0])
-    return np.ascontiguousarray(to_grey8(shrink(rough, PICTURE)[0]))
+        return np.ascontiguousarray(shrink(to_grey8(rough), longest)[0])
+    return np.ascontiguousarray(to_grey8(shrink(rough, longest)[0]))
 
 
 def thumbnail_of(pixels: NDArray[Any]) -> NDArray[Any]:

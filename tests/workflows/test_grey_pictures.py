@@ -1,0 +1,38 @@
+"""Grey images of every size come from a photo's pixels once, and then from the store."""
+
+import cv2
+import numpy as np
+
+from skyquilt.engine.store import Store
+from skyquilt.workflows.artefacts import REGISTRY
+from skyquilt.workflows.photo_features import PICTURE, GreyPictures
+from tests.alignment.surveys import photo
+from tests.texture import texture
+
+LONGEST = 1400
+
+
+def test_grey_images_larger_than_the_kept_ones_are_those_of_the_pixels(tmp_path):
+    """1400 of 2100 px are the means of 1.5 x 1.5 px; the photo is decoded once for each size, and
+    not at all for another run with the same store.
+    """
+    grey = np.clip(texture(1500, 2100, seed=3), 0, 255).astype(np.uint8)
+    read = []
+
+    def pixels(index):
+        read.append(index)
+        return np.repeat(grey[..., None], 3, 2)
+
+    def pictures():
+        return GreyPictures([photo("a.jpg")], pixels, Store(folder=tmp_path, registry=REGISTRY))
+
+    give = pictures()
+    large, kept = give(0, LONGEST), give(0, PICTURE)
+    assert large.shape == (1000, LONGEST) and kept.shape == (714, PICTURE)
+    mean = cv2.resize(grey, (LONGEST, 1000), interpolation=cv2.INTER_AREA)
+    assert np.abs(large.astype(int) - mean).max() <= 1
+    assert give(0, 500).shape == (357, 500)
+    assert np.array_equal(give(0, LONGEST), large)
+    assert len(read) == 2
+    assert np.array_equal(pictures()(0, LONGEST), large)
+    assert len(read) == 2
