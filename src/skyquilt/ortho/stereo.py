@@ -32,7 +32,7 @@ BAND = 1024
 """Rows of cells whose fine and coarse heights are joined at a time."""
 TILE = 512
 """Cells along a side of the pieces in which heights are fused."""
-NEW = (0.5, 0.25)
+NEW = (0.3, 0.25)
 """Share of the ground of a pair that must still lack pairs for it to be matched: first those with
 much new ground are taken, then others for what is left. Fewer pairs then see a place too often.
 """
