@@ -203,26 +203,3 @@ def test_heights_joined_in_bands_are_those_joined_at_once(monkeypatch):
     assert np.array_equal(whole, bands)
     share = (whole == 2.0).mean(1)
     assert share[:60].min() > 0.9 and share[240:].max() < 0.1
-
-
-def test_pairs_see_every_place_often_enough_and_not_much_more():
-    """170 photos of a block with 85 % overlap: nearly all places inside are seen by the three pairs
-    wanted, counted at points on the ground, and on average by less than three times as many.
-    """
-    shots = [view(k, 6.0 * (k % 17) - 48, 8.0 * (k // 17) - 36) for k in range(170)]
-    pairs = Stereo().pairs(shots, HEIGHT, 3)
-    x, y = np.meshgrid(np.linspace(-45, 45, 31), np.linspace(-35, 35, 31))
-    outline = {s.photo: s.footprint.astype(np.float32) for s in shots}
-    sees = {
-        k: np.array(
-            [
-                cv2.pointPolygonTest(o, p, measureDist=False) > 0
-                for p in np.column_stack([x.flat, y.flat])
-            ]
-        )
-        for k, o in outline.items()
-    }
-    number = sum((sees[a.photo] & sees[b.photo]).astype(int) for a, b in pairs)
-    assert (number >= 3).mean() > 0.95 and number.mean() < 9
-    ratio = [np.hypot(*(a.pose.map_C - b.pose.map_C)[:2]) / HEIGHT for a, b in pairs]
-    assert min(ratio) > 0.08 and max(ratio) < 0.65

@@ -32,10 +32,8 @@ BAND = 1024
 """Rows of cells whose fine and coarse heights are joined at a time."""
 TILE = 512
 """Cells along a side of the pieces in which heights are fused."""
-NEW = (0.3, 0.25)
-"""Share of the ground of a pair that must still lack pairs for it to be matched: first those with
-much new ground are taken, then others for what is left. Fewer pairs then see a place too often.
-"""
+NEW = 0.25
+"""Share of the ground of a pair that must still lack pairs for it to be matched."""
 EDGES = 0.003
 """Share of a pair's ground that has edges where things stand on it."""
 FIRM = 0.25
@@ -201,20 +199,15 @@ class Stereo:
         shape = tuple(np.ceil((far - corner) / side).astype(int)[::-1] + 1)
         counts = np.zeros(shape, np.int16)
         covers = [_covered(v.footprint, corner, side, counts.shape) for v in views]
-        chosen, rest = [], list(zip(i[order].tolist(), j[order].tolist(), strict=True))
-        for least in NEW:
-            left = []
-            for a, b in rest:
-                (rows, columns), (mask_a, mask_b) = _common(covers[a], covers[b])
-                both = mask_a & mask_b
-                part = counts[rows, columns]
-                new = both & (part < wanted)
-                if new.any() and new.sum() > least * both.sum():
-                    part += both
-                    chosen.append((views[a], views[b]))
-                else:
-                    left.append((a, b))
-            rest = left
+        chosen = []
+        for a, b in zip(i[order].tolist(), j[order].tolist(), strict=True):
+            (rows, columns), (mask_a, mask_b) = _common(covers[a], covers[b])
+            both = mask_a & mask_b
+            part = counts[rows, columns]
+            new = both & (part < wanted)
+            if new.any() and new.sum() > NEW * both.sum():
+                part += both
+                chosen.append((views[a], views[b]))
         return chosen
 
     def _matched(
