@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from skyquilt.engine.kept import Keep
+from skyquilt.imaging.nodes import densify
 from skyquilt.model.raster import Grid, Window
 from skyquilt.ortho.bare_ground import bare_ground
 from skyquilt.ortho.contours import contour_lines
 from skyquilt.ortho.exposure import NEUTRAL
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.occlusion import Shadow
-from skyquilt.ortho.seam_lines import SeamLines, flooded
+from skyquilt.ortho.seam_lines import SeamLines, _within, flooded
 from tests.ortho.scenes import FLAT, block, photograph, view
 
 GRID = Grid(west=-24.0, north=18.0, gsd=0.1, width=480, height=360)
@@ -168,3 +169,28 @@ def test_seams_go_on_at_their_tile(scene, monkeypatch):
     assert made[before:] == made[2:before]
     for labels in (first, again):
         assert (labels.photo == whole.photo).all() and (labels.hidden == whole.hidden).all()
+
+
+@pytest.mark.parametrize("size", [(64, 90), (57, 33)])
+def test_a_photo_is_compared_within_the_rectangle_that_it_shows(size):
+    """Interpolated there alone, nodes give what they give over the whole part; nothing that is seen
+    lies outside, nor the four cells beside it that the opening of shadows looks at.
+    """
+    h, w = size
+    rng = np.random.default_rng(3)
+    shape = (-(-h // 2) + 2, -(-w // 2) + 2)
+    values = rng.normal(size=shape).astype(np.float32)
+    whole = densify(values, h, w, 2)
+    for _ in range(20):
+        r0, c0 = (int(rng.integers(0, n - 3)) for n in shape)
+        seen = np.zeros(shape, np.bool_)
+        seen[r0 : r0 + int(rng.integers(1, 15)), c0 : c0 + int(rng.integers(1, 15))] = True
+        at, near = _within(seen, h, w)
+        part = densify(values[near], *whole[at].shape, 2)
+        assert np.array_equal(part, whole[at])
+        shown = densify(seen.astype(np.float32), h, w, 2) > 0.99
+        rows, columns = np.nonzero(shown)
+        if len(rows):
+            assert at[0].start <= max(rows.min() - 4, 0) and at[0].stop >= min(rows.max() + 5, h)
+            assert at[1].start <= max(columns.min() - 4, 0)
+            assert at[1].stop >= min(columns.max() + 5, w)

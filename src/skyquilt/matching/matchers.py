@@ -52,8 +52,8 @@ class Mutual:
         # 1 - s is d^2 / 2 for unit vectors, but proportional to the distance itself for bits
         ratio = self.ratio if a.binary else self.ratio**2
         clear = np.flatnonzero((1 - first) < ratio * (1 - second))
-        # the nearest in the other direction is needed only for matches that pass the ratio test
-        mutual = similarity[:, best[clear]].max(0) <= first[clear]
+        # the maxima of all columns take a sixth of the time of gathering those that are needed
+        mutual = similarity.max(0)[best[clear]] <= first[clear]
         kept = clear[mutual]
         return Matches(index_a=kept, index_b=best[kept])
 

@@ -63,15 +63,15 @@ class Exposure:
 
     def odds(self, photo: int, x: Float, y: Float) -> Float:
         """Factors (h, w, bands) on the odds at image positions x, y (h, w), see `image_place`."""
-        field = np.exp(_basis(x, y) @ self.fields[photo])
-        return (field[..., None] * np.exp(self.gains[photo])).astype(np.float32)
+        field = np.exp(_field(x, y, self.fields[photo]))
+        return np.asarray(field[..., None] * np.exp(self.gains[photo]), np.float32)
 
     def grey(self, view: View, value: NDArray[Any], u: NDArray[Any], v: NDArray[Any]) -> Float:
         """Corrected grey values (h, w) of a photo's pixels at columns u and rows v (h, w)."""
         photo = view.photo
         if photo not in self.gains:
             return np.asarray(value, np.float32)
-        field = _basis(*image_place(view, u, v)) @ self.fields[photo]
+        field = _field(*image_place(view, u, v), self.fields[photo])
         return np.asarray(
             self.brightened(value, np.exp(field + self.gains[photo].mean())), np.float32
         )
@@ -91,9 +91,12 @@ def with_odds(
     pixels: NDArray[np.uint8], odds: Float, white: float = WHITES[0]
 ) -> NDArray[np.uint8]:
     """Pixels (h, w, bands) with their odds multiplied by odds (h, w, bands)."""
-    brighter = cv2.multiply(pixels, odds, dtype=cv2.CV_32F).reshape(pixels.shape)
-    level: Any = (white,) * 4  # a scalar for each band: OpenCV's type stubs accept arrays only
-    rest = cv2.add(cv2.subtract(brighter, pixels, dtype=cv2.CV_32F), level).reshape(pixels.shape)
+    brighter = cv2.multiply(pixels, odds, dtype=cv2.CV_32F)
+    # white - pixels, without OpenCV's addition of scalars, which takes four times as long as all
+    # the rest
+    rest: Any = cv2.add(brighter, cv2.bitwise_not(pixels), dtype=cv2.CV_32F)
+    if white > WHITES[0]:
+        rest += np.float32(white - WHITES[0])
     return np.asarray(cv2.divide(brighter, rest, scale=white, dtype=cv2.CV_8U), np.uint8).reshape(
         pixels.shape
     )
@@ -102,6 +105,16 @@ def with_odds(
 def _basis(x: NDArray[Any], y: NDArray[Any]) -> NDArray[Any]:
     """(..., 6) terms of the field."""
     return np.stack([x, y, x * x, y * y, x * y, (x * x + y * y) ** 2], -1)
+
+
+def _field(x: NDArray[Any], y: NDArray[Any], terms: NDArray[Any]) -> NDArray[Any]:
+    """(...,) the field, `_basis(x, y) @ terms`, in single precision and without an array of all
+    terms.
+    """
+    a, b, c, d, e, f = terms.tolist()
+    x, y = np.asarray(x, np.float32), np.asarray(y, np.float32)
+    xx, yy = x * x, y * y
+    return np.asarray(a * x + b * y + c * xx + d * yy + e * (x * y) + f * (xx + yy) ** 2)
 
 
 def odds_table(gains: Float, white: float = WHITES[0]) -> NDArray[np.uint8]:

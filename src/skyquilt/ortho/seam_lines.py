@@ -298,35 +298,30 @@ class _Scene:
         if not some:
             return None
         views, nodes = [views[k] for k in some], [nodes[k] for k in some]
-        score = np.stack(
-            [
-                np.where(
-                    densify(n.seen.astype(np.float32), h, w, 2) > 0.99,
-                    densify(n.score, h, w, 2),
-                    np.float32(np.inf),
-                )
-                for n in nodes
-            ]
-        )
         part = (slice(row, row + h), slice(column, column + w))
-        slopes = self._slopes(*part)
-        for k, n in enumerate(nodes):  # what lies flat yields to sharper photos
-            smear = smeared(n, 2 * self.cells.gsd / STEP)
-            if smear.any():
-                score[k][densify(smear.astype(np.float32), h, w, 2) > 0.5] += SMEARED
+        slopes, over = self._slopes(*part), self.z[part]
         fx, fy = np.meshgrid(
             self.cells.x(np.arange(column, column + w)), self.cells.y(np.arange(row, row + h))
         )
-        for k, view in enumerate(views):
+        score = np.full((len(views), h, w), np.float32(np.inf))
+        for out, view, n in zip(score, views, nodes, strict=True):
+            at, near = _within(n.seen, h, w)
+            size = (at[0].stop - at[0].start, at[1].stop - at[1].start)
+            seen = densify(n.seen[near].astype(np.float32), *size, 2) > 0.99
+            own = np.where(seen, densify(n.score[near], *size, 2), np.float32(np.inf))
+            smear = smeared(n, 2 * self.cells.gsd / STEP)[near]
+            if smear.any():  # what lies flat yields to sharper photos
+                own[densify(smear.astype(np.float32), *size, 2) > 0.5] += SMEARED
             shadow = self._shadows(view.photo)
             if not shadow.empty:
-                lost = shadow.hides(fx, fy, self.z[part]) | self._grazing(
-                    view, slopes, self.z[part], fx, fy
-                )
+                x, y, z = fx[at], fy[at], over[at]
+                slope = (slopes[0][at], slopes[1][at])
+                lost = shadow.hides(x, y, z) | self._grazing(view, slope, z, x, y)
                 behind = cv2.morphologyEx(
                     lost.view(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)
                 )
-                score[k][behind > 0] += HIDDEN
+                own[behind > 0] += HIDDEN
+            out[at] = own
         return views, score, nodes
 
     def _slopes(self, rows: slice, columns: slice) -> tuple[Float, Float]:
@@ -360,11 +355,38 @@ class _Scene:
         out = np.zeros((h, w), np.float32)
         for k in np.unique(chosen[chosen >= 0]).tolist():
             view, n = views[k], nodes[k]
+            mine = chosen == k
+            at, near = _extent(mine)
+            size = (at[0].stop - at[0].start, at[1].stop - at[1].start)
             picture = self._grey(view.photo, self._longest)
             scale, half = np.float32(picture.shape[1] / view.camera.width), np.float32(0.5)
-            u, v = densify(n.u, h, w, 2), densify(n.v, h, w, 2)
+            u, v = (densify(p[near], *size, 2) for p in (n.u, n.v))
             value = cv2.remap(
                 picture, (u + half) * scale - half, (v + half) * scale - half, cv2.INTER_LINEAR
             )
-            np.copyto(out, self._exposure.grey(view, value, u, v), where=chosen == k)
+            np.copyto(out[at], self._exposure.grey(view, value, u, v), where=mine[at])
         return out
+
+
+Part = tuple[slice, slice]
+
+
+def _within(seen: Mask, h: int, w: int) -> tuple[Part, Part]:
+    """The rectangle of h x w cells in which a photo is seen at these nodes, two cells apart and one
+    ring around, and a margin that the opening of shadows looks at; as cells, and as their nodes.
+    """
+    wide = cv2.dilate(seen.view(np.uint8), np.ones((7, 7), np.uint8))[1:-1, 1:-1]
+    return _extent((wide > 0).repeat(2, 0).repeat(2, 1)[:h, :w])
+
+
+def _extent(cells: Mask) -> tuple[Part, Part]:
+    """The rectangle around the marked cells, which begins at an even row and column: as cells, and
+    as their nodes, two cells apart with one ring around.
+    """
+    inner, outer = [], []
+    for axis, size in ((1, cells.shape[0]), (0, cells.shape[1])):
+        at = np.flatnonzero(cells.any(axis))
+        first, last = (int(at[0]) // 2, int(at[-1]) // 2 + 1) if len(at) else (0, 1)
+        inner.append(slice(2 * first, min(2 * last, size)))
+        outer.append(slice(first, last + 2))
+    return (inner[0], inner[1]), (outer[0], outer[1])
