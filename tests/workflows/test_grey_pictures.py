@@ -1,5 +1,7 @@
 """Grey images of every size come from a photo's pixels once, and then from the store."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -24,7 +26,8 @@ def test_grey_images_larger_than_the_kept_ones_are_those_of_the_pixels(tmp_path)
         return np.repeat(grey[..., None], 3, 2)
 
     def pictures():
-        return GreyPictures([photo("a.jpg")], pixels, Store(folder=tmp_path, registry=REGISTRY))
+        own = replace(photo("a.jpg"), width=2100, height=1500)
+        return GreyPictures([own], pixels, Store(folder=tmp_path, registry=REGISTRY))
 
     give = pictures()
     large, kept = give(0, LONGEST), give(0, PICTURE)
@@ -36,3 +39,17 @@ def test_grey_images_larger_than_the_kept_ones_are_those_of_the_pixels(tmp_path)
     assert len(read) == 2
     assert np.array_equal(pictures()(0, LONGEST), large)
     assert len(read) == 2
+
+
+def test_a_photo_that_is_smaller_than_the_kept_ones_is_read_and_stored_once(tmp_path):
+    grey = np.clip(texture(600, 800, seed=4), 0, 255).astype(np.uint8)
+    read = []
+
+    def pixels(index):
+        read.append(index)
+        return np.repeat(grey[..., None], 3, 2)
+
+    own = replace(photo("a.jpg"), width=800, height=600)
+    give = GreyPictures([own], pixels, Store(folder=tmp_path, registry=REGISTRY))
+    assert np.array_equal(give(0, LONGEST), give(0, PICTURE))
+    assert give(0, LONGEST).shape == (600, 800) and len(read) == 1

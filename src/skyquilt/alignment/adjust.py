@@ -156,15 +156,8 @@ def adjust(
 
     def kept(part: str, make: Callable[[], Tried[State]]) -> Tried[State]:
         nonlocal place
-        now = False
-
-        def made() -> tuple[Tried[State], float | None]:
-            nonlocal now
-            now = True
-            return make(), near.renewed()
-
-        tried, renewed = keep(part, made)
-        if renewed is not None and not now:
+        tried, renewed = keep(part, lambda: (make(), near.renewed()))
+        if renewed is not None:
             near.know(problem, place, renewed, workers)
         place = tried[3]
         return tried

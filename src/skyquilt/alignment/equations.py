@@ -68,11 +68,13 @@ class NearFactor:
     def __init__(self) -> None:
         self._made: Factor | None = None
         self._of: tuple[Problem, State, float, Workers] | None = None
+        self._taken: State | None = None
         self._renewed: float | None = None
 
-    def take(self, factor: Factor, damping: float) -> None:
+    def take(self, factor: Factor, state: State, damping: float) -> None:
         """Takes the factor of the present step."""
-        self._made, self._of, self._renewed = factor, None, damping
+        self._made, self._of = factor, None
+        self._taken, self._renewed = state, damping
 
     def renewed(self) -> float | None:
         """Damping of the step whose factor was taken since this was asked, if one was."""
@@ -80,8 +82,9 @@ class NearFactor:
         return renewed
 
     def know(self, problem: Problem, state: State, damping: float, workers: Workers) -> None:
-        """Says of which step it is where an interrupted run took that step's factor."""
-        self._made, self._of = None, (problem, state, damping, workers)
+        """Says that a step renewed it, which an interrupted run may have taken."""
+        if state is not self._taken:
+            self._made, self._of = None, (problem, state, damping, workers)
 
     def get(self) -> Factor | None:
         """The factor; None if no step was made yet."""
@@ -156,7 +159,7 @@ class Equations:
                 return found
         factor = Factor(matrix)
         if near:
-            near.take(factor, damping)
+            near.take(factor, state, damping)
         return factor.solve(gradient)
 
     def reduced(self, state: State, damping: float) -> tuple[Matrix, Array]:

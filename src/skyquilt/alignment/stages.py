@@ -92,20 +92,18 @@ def _reweighed(
     """
     if problem.sigma_turn is not None:
         part = keep.within("turns")
-        found = adjust(
+        state = adjust(
             problem, state, iterations=15, tolerance=1e-3, damping=1e-6, keep=part, near=near
-        )
-        state = found.state
+        ).state
     for again in range(2):
         scale = robust_scale(problem, state)
         problem = replace(problem, sigma_px=problem.sigma_px * scale)
         noise = observed_noise(problem.with_loss(2.0), state, sizes)
         problem = believed(problem.with_loss(2.0), noise)
         part = keep.within(str(again))
-        found = adjust(
+        state = adjust(
             problem, state, iterations=15, tolerance=3e-4, damping=1e-6, keep=part, near=near
-        )
-        state = found.state
+        ).state
     return problem, state
 
 

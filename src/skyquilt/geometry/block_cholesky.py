@@ -103,13 +103,14 @@ class Matrix:
         n, p = pat.count, pat.size
         starts = np.searchsorted(pat.first, np.arange(n + 1))
         upper = bsr_matrix((self.blocks, pat.second, starts), shape=(n * p, n * p))
+        lower = upper.T  # once: it is copied
         own = self.blocks[pat.find(np.arange(n), np.arange(n))]
         beside = self.beside.reshape(n * p, pat.border)
 
         def product(x: Array) -> Array:
             blocks, border = x[: n * p], x[n * p :]
             twice = (own @ blocks.reshape(n, p, 1)).ravel()
-            within = upper @ blocks + upper.T @ blocks - twice
+            within = upper @ blocks + lower @ blocks - twice
             return np.concatenate(
                 [within + beside @ border, beside.T @ blocks + self.corner @ border]
             )

@@ -143,8 +143,8 @@ class Stereo:
         known = without_specks(z, 0.01 * height, 6)
         if known.any():
             z = nearest_known(z, known)
-        if known.any() and far > 0:
-            z = lowered(z, known, round(far / 2 / cells.gsd), given.agree)
+            if far > 0:
+                z = lowered(z, known, round(far / 2 / cells.gsd), given.agree)
         del given  # large surveys have rasters of 100 MB
         side = 2 * round(self.whole * height / cells.gsd / 2) + 1
         return surface_of(with_coarse(z, known, rough, cells, side), cells)

@@ -176,11 +176,11 @@ class GreyPictures:
         self._small.make_room()
 
     def _shrunken(self, photo: int) -> NDArray[np.uint8]:
-        longest = self._longest
-        if longest > PICTURE:
+        longest, own = self._longest, self._photos[photo]
+        if longest > PICTURE and max(own.width, own.height) > PICTURE:
             return self._store.get_or(
                 "pictures",
-                digest(picture_key(self._photos[photo]), longest),
+                digest(picture_key(own), longest),
                 lambda: picture_of(self._pixels(photo), longest),
             )
         return np.ascontiguousarray(shrink(self._cache(photo), longest)[0])
