@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from skyquilt.geometry.camera import project
-from skyquilt.imaging.nodes import STEP, inside
+from skyquilt.geometry.camera import project, undistort
+from skyquilt.imaging.nodes import STEP, inside, lifted, node_places, project_nodes
 from skyquilt.imaging.registration import shifts_between
 from skyquilt.live.tile_drawing import Newest
+from skyquilt.model.poses import Motion
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Average, Feather, First, Multiband
@@ -325,6 +326,99 @@ def test_relief_is_taken_out():
     x, y = GRID.x(columns[pick]), GRID.y(rows[pick])
     px = project(shot.camera, shot.pose.to_camera(np.c_[x, y, 0.2 * x]))
     assert np.abs(made.pixels[rows[pick], columns[pick]] - px).max() < 0.08
+
+
+ROOF = (-4.4, -3.6, 5.2, 6.0)
+"""West, south, east, north in m of a house of 6 m, its walls half-way between cells of 0.8 m."""
+WALL = 250
+
+
+def house():
+    """Heights of the house's cells."""
+    at = np.arange(-40, 40.1, 0.8)
+    x, y = np.meshgrid(at, at)
+    on = (x > ROOF[0]) & (x < ROOF[2]) & (y > ROOF[1]) & (y < ROOF[3])
+    return Surface(z=on * np.float32(6), x0=-40.0, y0=-40.0, cell=0.8, source="t")
+
+
+def of_the_house(x, y):
+    return (x > ROOF[0]) & (x < ROOF[2]) & (y > ROOF[1]) & (y < ROOF[3])
+
+
+def painted(x, y, roof):
+    """Grey values of ground and roof."""
+    return np.where(roof, 150 + 20 * np.sin(2 * x), 70 + 30 * np.sin(1.5 * x) * np.cos(1.3 * y))
+
+
+def photographed(shot):
+    """A picture of the house, from the rays of its pixels: walls are white."""
+    h, w = shot.camera.height, shot.camera.width
+    u, v = np.meshgrid(np.arange(w), np.arange(h))
+    d = np.c_[undistort(shot.camera, np.c_[u.ravel(), v.ravel()]), np.ones(h * w)]
+    d = d @ shot.pose.cam_R_map
+    C = shot.pose.map_C
+
+    def at(z):
+        return (C[:2] + d[:, :2] * ((z - C[2]) / d[:, 2])[:, None]).T
+
+    value = painted(*at(0.0), np.zeros(h * w, bool))
+    for z in np.arange(0, 6, 0.02):
+        value[of_the_house(*at(z))] = WALL
+    over = at(6.0)
+    value = np.where(of_the_house(*over), painted(*over, np.ones(h * w, bool)), value)
+    return value.reshape(h, w, 1).astype(np.float32)
+
+
+def test_a_house_has_no_walls_in_the_map():
+    """A photo that sees two walls: the map shows the roof up to its edges, the ground from there
+    on, and no strip of wall between.
+    """
+    surface = house()
+    shot = view(0, 9, 8, z=45, yaw=0, pitch=2, roll=-1, surface=surface)
+    pictures = {0: photographed(shot)}
+    compose = replace(
+        composer([shot], pictures, GRID, Feather(), surface=surface, dtype=np.float32),
+        detailed=True,
+    )
+    made = compose(WHOLE)
+    x, y = np.meshgrid(GRID.x(np.arange(GRID.width)), GRID.y(np.arange(GRID.height)))
+    roof = of_the_house(x, y)
+    hidden = np.zeros(x.shape, np.bool_)
+    for z in np.arange(0.02, 6, 0.02):
+        up = z / shot.pose.map_C[2]
+        hidden |= of_the_house(
+            *((1 - up) * p + up * c for p, c in zip((x, y), shot.pose.map_C[:2], strict=True))
+        )
+    aside = [
+        np.minimum(np.abs(p - low), np.abs(p - high))
+        for p, low, high in ((x, ROOF[0], ROOF[2]), (y, ROOF[1], ROOF[3]))
+    ]
+    # pixels across an edge hold both sides, and corners of the house are cut off by half a cell
+    edge = (np.minimum(*aside) < 0.06) | (np.hypot(*aside) < 0.4)
+    sees = (made.photo >= 0) & (roof | ~hidden) & ~edge
+    error = np.abs(made.pixels[..., 0] - painted(x, y, roof))[sees]
+    assert (sees & roof).sum() > 8000 and error.max() < 8
+    sloping = replace(compose, detailed=False)(WHOLE)
+    assert (made.pixels[..., 0] > 200)[sees].sum() == 0
+    assert (sloping.pixels[..., 0] > 200)[sees].sum() > 100
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_pixels_at_stepping_heights_lie_where_they_are_projected(moving):
+    rng = np.random.default_rng(5)
+    shot = view(0, 14, 9, z=45, yaw=30, pitch=12)
+    if moving:
+        motion = Motion(shift_m=np.array([0.3, -0.1, 0.0]), turn_rad=np.array([2e-3, 1e-3, 0]))
+        shot = replace(shot, pose=replace(shot.pose, motion=motion))
+    place = Window(row=32, column=64, height=256, width=200)
+    z = rng.uniform(-2, 12, (256, 200)).astype(np.float32)
+    x, y, level = node_places(GRID, FLAT, place)
+    nodes = project_nodes(shot, x, y, level)
+    found = lifted(nodes, x, y, z, -2.0, 12.0).pixels(256, 200, slice(0, 9), slice(0, 9))
+    at = np.meshgrid(GRID.x(place.column + np.arange(200)), GRID.y(place.row + np.arange(256)))
+    exact = project_nodes(shot, *at, z)
+    off = np.hypot(found[0] - exact.u, found[1] - exact.v)[exact.seen]
+    assert len(off) > 5000 and off.max() < 0.1
 
 
 def test_nothing_to_see():

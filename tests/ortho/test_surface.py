@@ -235,12 +235,62 @@ def test_one_photo_sweeps_nothing(scene):
 def test_heights_on_a_raster_are_those_at_its_places():
     rng = np.random.default_rng(3)
     surface = Surface(
-        z=rng.normal(0, 3, (40, 50)).astype(np.float32), x0=3.0, y0=-7.0, cell=0.7, source="plane"
+        z=rng.uniform(0, 1.39, (40, 50)).astype(np.float32), x0=3.0, y0=-7.0, cell=0.7, source="p"
     )
     x, y = np.arange(0, 45, 0.31), np.arange(-12, 30, 0.05)[::-1]
     assert len(y) > 3 * STRIP
     assert (surface.on(x, y) == surface.at(*np.meshgrid(x, y))).all()
+    assert surface.stepped(x, y) is None
     assert surface.on(x, y[:0]).shape == (0, len(x))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6))
+def test_at_steps_heights_are_those_of_one_side(seed):
+    """Rough ground: the ends of every cell's diagonal may be a step. A place lies between the
+    corners on its own side, and at a corner it has its height; no part depends on what is asked
+    beside it.
+    """
+    rng = np.random.default_rng(seed)
+    z = rng.choice(np.array([0, 0, 0, 7, 11], np.float32), (14, 17)) + rng.random(
+        (14, 17), np.float32
+    )
+    s = Surface(z=z, x0=-4.0, y0=9.0, cell=1.5, source="t")
+    x, y = -4 + 1.5 * np.arange(0.05, 16, 0.1), 9 + 1.5 * np.arange(0.05, 13, 0.1)[::-1]
+    found = s.on(x, y)
+    i, j = (np.floor((at - start) / 1.5).astype(int) for at, start in ((y, 9), (x, -4)))
+    corners = np.stack([z[i + a][:, j + b] for a in (0, 1) for b in (0, 1)])
+    low, high = corners.min(0), corners.max(0)
+    step = high - low > 3
+    side = (corners > (low + high) / 2) == (found > (low + high) / 2)
+    least, most = np.where(side, corners, 99).min(0), np.where(side, corners, -99).max(0)
+    assert ((found >= least - 1e-4) & (found <= most + 1e-4))[step].all()
+    assert (found == s.at(*np.meshgrid(x, y)))[~step].all()
+    assert np.abs(s.on(-4 + 1.5 * np.arange(17), 9 + 1.5 * np.arange(14)) - z).max() < 1e-5
+    some = (slice(int(rng.integers(0, 60)), 100), slice(int(rng.integers(0, 80)), 120))
+    assert s.on(x[some[1]], y[some[0]]) == pytest.approx(found[some], abs=1e-4)
+
+
+@pytest.mark.parametrize("turn_deg", [0, 7, 18, 30, 45, 77])
+def test_edges_run_straight_through_the_staircase_of_cells(turn_deg):
+    """A wall of 10 m in any direction: the map's edge stays within half a cell's side of it, where
+    the cells' own edges lie up to 0.7 away, and there is nothing between top and bottom.
+    """
+    a = np.radians(turn_deg)
+    c = np.arange(60) - 29.7
+    across = c * np.cos(a) + c[:, None] * np.sin(a)
+    s = Surface(z=np.float32(10) * (across > 0), x0=-29.7, y0=-29.7, cell=1.0, source="t")
+    x = y = np.linspace(-20, 20, 401)
+    found = s.on(x, y)
+    assert (np.minimum(np.abs(found), np.abs(found - 10)) < 1e-5).all()
+    away = x * np.cos(a) + y[:, None] * np.sin(a)
+    wrong = (found > 5) != (away > 0)
+    nearest = s.z[np.rint(y + 29.7).astype(int)][:, np.rint(x + 29.7).astype(int)] > 5
+    assert np.abs(away[wrong]).max() < 0.5 + 1e-6
+    if 0 < turn_deg < 45:
+        stairs = nearest != (away > 0)
+        off = [np.abs(away[w]).max() for w in (wrong, stairs)]
+        assert off[0] < 0.75 * off[1] and wrong.mean() < 0.7 * stairs.mean()
 
 
 @pytest.mark.parametrize("along", [0, 1])

@@ -1,7 +1,7 @@
 """What each photo sees of the map: coarse grids of the photo pixels of map points."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -26,6 +26,8 @@ resize, ten times as fast as a general warp, interpolates them exactly.
 """
 CORNERS = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 """Corners of a square about its centre."""
+STRAIGHT_PX = 0.05
+"""Photo pixels by which a pixel's way from the lowest to the highest level may bend unnoticed."""
 BORDER_PX = 2.0
 """Width in photo pixels of the border that is not used."""
 
@@ -80,6 +82,56 @@ class Nodes:
     """Median height of the camera above the window's ground in m."""
     step: int = STEP
     """Map pixels between neighbouring nodes."""
+    levels: NDArray[np.float32] | None = None
+    """(2, 3, r, c) photo columns and rows at the least, a middle and the greatest height of the map
+    pixels, where heights step between nodes.
+    """
+    rise: NDArray[np.float32] | None = None
+    """(h, w) how far each map pixel lies on its photo pixel's way from the least to the greatest
+    height, 0 to 1.
+    """
+
+    def reach(self) -> tuple[slice, slice]:
+        """The photo's columns and rows, at least one, between which all map pixels lie."""
+        u, v = (self.u, self.v) if self.levels is None else self.levels
+        return _reach(u, self.view.camera.width), _reach(v, self.view.camera.height)
+
+    def pixels(
+        self, height: int, width: int, x: slice, y: slice
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Photo columns and rows (height, width) of the map pixels, counted from the start of these
+        ranges.
+        """
+        start = np.float32(x.start), np.float32(y.start)
+        if self.levels is None or self.rise is None:
+            u, v = (
+                densify(p - s, height, width, self.step)
+                for p, s in zip((self.u, self.v), start, strict=True)
+            )
+            return u, v
+        u, v = (
+            _between(p, s, self.rise, self.step) for p, s in zip(self.levels, start, strict=True)
+        )
+        return u, v
+
+
+def _reach(places: NDArray[np.float32], size: int) -> slice:
+    """The range of pixels, of `size`, covered by a photo's node coordinates; at least one pixel."""
+    start = min(max(int(places.min()) - 2, 0), size - 1)
+    return slice(start, max(min(int(np.ceil(places.max())) + 3, size), start + 1))
+
+
+def _between(
+    p: NDArray[np.float32], start: np.float32, rise: NDArray[np.float32], step: int
+) -> NDArray[np.float32]:
+    """Photo columns or rows (h, w) from those of nodes at three levels, (3, r, c)."""
+    (low, middle, high), (h, w) = p, rise.shape
+    out = densify(high - low, h, w, step) * rise
+    out += densify(low - start, h, w, step)
+    bend = middle - (low + high) / 2
+    if np.abs(bend).max() > STRAIGHT_PX:
+        out += densify(4 * bend, h, w, step) * (rise * (1 - rise))
+    return out
 
 
 def project_nodes(view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> Nodes:
@@ -271,6 +323,34 @@ def least_scores(
     along = np.maximum(np.maximum(y[-1, 0] - north, north - y[0, 0]), 0.0)
     drop = np.maximum(np.maximum((up - z.min()) ** 2, (up - z.max()) ** 2), 1e-6)
     return np.asarray((aside**2 + along**2) / drop, np.float32)
+
+
+def lifted(
+    nodes: Nodes, x: NDArray[Any], y: NDArray[Any], z: NDArray[np.float32], low: float, high: float
+) -> Nodes:
+    """These nodes, at x, y (r, c) in m, for map pixels of heights z (h, w) between two levels, all
+    in m.
+
+    Along a vertical line a photo pixel moves, but for distortion, in proportion to the reciprocal
+    of its depth; for distortion there is a third level between.
+    """
+    view = nodes.view
+    centre = float(x.mean()), float(y.mean())
+    depth = [float(view.pose.planes_to_camera(*np.array([*centre, h]))[2]) for h in (low, high)]
+    ratio = depth[1] / depth[0]
+    middle = low + (high - low) / (1 + ratio)
+    three = project_nodes(view, x, y, np.array([low, middle, high])[:, None, None])
+    share = (z - np.float32(low)) * np.float32(1 / (high - low))
+    rise = share * np.float32(1 - 1 / ratio)
+    rise += np.float32(1 / ratio)
+    np.divide(share, rise, out=rise)
+    return replace(
+        nodes,
+        levels=np.stack([three.u, three.v]),
+        rise=rise,
+        seen=nodes.seen & three.seen.all(0),
+        real=nodes.real & three.real.all(0),
+    )
 
 
 def cut(nodes: Nodes, row: int, column: int, height: int, width: int) -> Nodes:

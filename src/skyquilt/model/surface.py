@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.model.height_steps import MARGIN, steep, with_steps
 from skyquilt.model.raster import Grid
 
 WIDEST = 32_000
@@ -38,10 +39,21 @@ class Surface:
         height.
         """
         shape = np.shape(x)
-        column = ((np.asarray(x) - self.x0) / self.cell).astype(np.float32)
-        row = ((np.asarray(y) - self.y0) / self.cell).astype(np.float32)
+        column, row = self._column(x), self._row(y)
         if column.ndim != 2:
             column, row = column.reshape(1, -1), row.reshape(1, -1)
+        return self._between(column, row).reshape(shape)
+
+    def _column(self, x: NDArray[Any]) -> NDArray[np.float32]:
+        return ((np.asarray(x) - self.x0) / self.cell).astype(np.float32)
+
+    def _row(self, y: NDArray[Any]) -> NDArray[np.float32]:
+        return ((np.asarray(y) - self.y0) / self.cell).astype(np.float32)
+
+    def _between(
+        self, column: NDArray[np.float32], row: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Bilinear heights at columns and rows (h, w) of the surface."""
         parts = []
         for k in range(0, column.shape[1], 30000):  # remap's maps must stay below 32768 columns
             parts.append(
@@ -53,16 +65,45 @@ class Surface:
                     borderMode=cv2.BORDER_REPLICATE,
                 )
             )
-        return np.concatenate(parts, 1, dtype=np.float32).reshape(shape)
+        if len(parts) == 1:
+            return np.asarray(parts[0], np.float32)
+        return np.concatenate(parts, 1, dtype=np.float32)
 
     def on(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float32]:
         """Heights (rows, columns) in m on a raster whose columns lie at x (columns,) and whose rows
-        lie at y (rows,); memory holds little more than the result.
+        lie at y (rows,): those of `at`, but at steps (`model.height_steps`) every place has the
+        height of the upper or of the lower side. Memory holds little more than the result.
         """
         out = np.empty((len(y), len(x)), np.float32)
         for low, high in pairwise([*range(0, len(y), STRIP), len(y)]):
-            out[low:high] = self.at(*np.meshgrid(x, y[low:high]))
+            part = self.stepped(x, y[low:high])
+            out[low:high] = self._sloping(x, y[low:high]) if part is None else part
         return out
+
+    def stepped(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float32] | None:
+        """The same for a part of a raster; None where heights do not step around it."""
+        z, row, column = self._around(x, y)
+        if min(z.shape) < 2 or not (squares := steep(z, self.cell)).any():
+            return None
+        out = self._sloping(x, y)
+        rows, columns = (y - self.y0) / self.cell - row, (x - self.x0) / self.cell - column
+        with_steps(out, z, squares, rows, columns)
+        return out
+
+    def _sloping(self, x: NDArray[Any], y: NDArray[Any]) -> NDArray[np.float32]:
+        """Bilinear heights (rows, columns) at x (columns,) and y (rows,)."""
+        return self._between(*np.meshgrid(self._column(x), self._row(y)))
+
+    def _around(self, x: NDArray[Any], y: NDArray[Any]) -> tuple[NDArray[np.float32], int, int]:
+        """The heights on which those in a rectangle depend, and the first row and column of
+        them.
+        """
+        first, last = [], []
+        for places, start, size in ((y, self.y0, self.z.shape[0]), (x, self.x0, self.z.shape[1])):
+            low, high = ((edge - start) / self.cell for edge in (places.min(), places.max()))
+            first.append(int(np.clip(np.floor(low) - MARGIN, 0, max(size - 2, 0))))
+            last.append(int(np.clip(np.floor(high) + 2 + MARGIN, 2, size)))
+        return self.z[first[0] : last[0], first[1] : last[1]], first[0], first[1]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -15,6 +15,7 @@ from skyquilt.imaging.nodes import (
     cut,
     densify,
     inside_everywhere,
+    lifted,
     node_places,
     project_nodes,
 )
@@ -53,6 +54,31 @@ class Composed:
     """(h, w) index of the leading photo of each pixel, -1 = none."""
     views: NDArray[np.uint16]
     """(r, c) number of planned photos that cover each STEP x STEP cell."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Stepped:
+    """Heights of the pixels of a piece in which they step."""
+
+    x: NDArray[np.float64]
+    """(r, c) eastings in m of the nodes of the piece."""
+    y: NDArray[np.float64]
+    """(r, c) northings in m."""
+    z: NDArray[np.float32]
+    """(h, w) heights in m of the pixels."""
+    low: float
+    """The least of them."""
+    high: float
+    """The greatest."""
+
+    def lifted(self, n: Nodes, row: int, column: int, h: int, w: int) -> Nodes:
+        """Nodes of a part of the piece, with the places of its pixels at their heights."""
+        if n.view.pose.cam_H_map is not None:  # photos in the plane, whatever the height
+            return n
+        r, c = row // STEP, column // STEP
+        nodes = (slice(r, r + n.u.shape[0]), slice(c, c + n.u.shape[1]))
+        part = (slice(row, row + h), slice(column, column + w))
+        return lifted(n, self.x[nodes], self.y[nodes], self.z[part], self.low, self.high)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -182,39 +208,40 @@ class Composer:
         if not chosen:
             return None
         alone = len(chosen) == 1
-        cuts = self._cuts(plan, [n for n, _ in chosen], row, column, h, w)
-        if alone and cuts[0].seen.all():  # nothing to blend, whatever the method
-            pixels, _ = self._warped(cuts[0], h, w, alone=True)
-            return pixels, np.full((h, w), cuts[0].view.photo, np.int32)
         place = Window(
             row=plan.window.row - plan.margin + row,
             column=plan.window.column - plan.margin + column,
             height=h,
             width=w,
         )
+        cuts = [cut(n, row, column, h, w) for n, _ in chosen]
+        stepped = self._stepped(place, max(float(n.score.max()) for n in cuts))
+        if stepped is None:
+            cuts = self._closer(plan, cuts, row, column, place)
+        if alone:
+            n = cuts[0] if stepped is None else stepped.lifted(cuts[0], 0, 0, h, w)
+            if n.seen.all():  # nothing to blend, whatever the method
+                pixels, _ = self._warped(n, h, w, ranked=False)
+                return pixels, np.full((h, w), n.view.photo, np.int32)
         layers = [
-            self._layer(n, here, place, alone=alone)
+            self._layer(n, here, place, stepped, alone=alone)
             for n, (_, here) in zip(cuts, chosen, strict=True)
         ]
         return self.blend.merge(layers, self.grid.gsd)
 
-    def _cuts(
-        self, plan: Plan, chosen: Sequence[Nodes], row: int, column: int, h: int, w: int
+    def _closer(
+        self, plan: Plan, cuts: list[Nodes], row: int, column: int, place: Window
     ) -> list[Nodes]:
-        """The nodes of photos over a piece (h, w); closer ones where heights bend between them."""
-        cuts = [cut(n, row, column, h, w) for n in chosen]
+        """The nodes of photos over a piece at its place in the map; closer ones where heights bend
+        between them.
+        """
         if not self.detailed or self.surface.cell >= STEP * self.grid.gsd:
             return cuts
-        place = Window(
-            row=plan.window.row - plan.margin + row,
-            column=plan.window.column - plan.margin + column,
-            height=h,
-            width=w,
-        )
         step = FINE[self.surface.cell >= FINE[1] * self.grid.gsd * 0.99]
         x, y, z = node_places(self.grid, self.surface, place, step)
         rows, columns = (
-            slice(at // STEP, at // STEP - (-n // STEP) + 2) for at, n in ((row, h), (column, w))
+            slice(at // STEP, at // STEP - (-n // STEP) + 2)
+            for at, n in ((row, place.height), (column, place.width))
         )
         straight = np.asarray(plan.z[rows, columns], np.float32)
         size = (step * (z.shape[0] - 2), step * (z.shape[1] - 2))
@@ -225,22 +252,53 @@ class Composer:
             return cuts
         return [replace(project_nodes(n.view, x, y, z), step=step) for n in cuts]
 
-    def _layer(self, n: Nodes, near: NDArray[np.bool_], place: Window, *, alone: bool) -> Layer:
+    def _stepped(self, place: Window, aside: float) -> _Stepped | None:
+        """The heights of the pixels of a piece; None where they do not step, or shift no photo
+        visibly; `aside`: the largest squared tangent of the angles that it is seen at.
+        """
+        if not self.detailed or self.surface.cell >= STEP * self.grid.gsd:
+            return None
+        rows, columns = (
+            np.arange(at, at + n)
+            for at, n in ((place.row, place.height), (place.column, place.width))
+        )
+        x, y = self.grid.x(columns), self.grid.y(rows)
+        z = self.surface.stepped(x, y)
+        if z is None:
+            return None
+        low, high = float(z.min()), float(z.max())
+        if (high - low) * np.sqrt(aside) <= BENT * self.grid.gsd:
+            return None
+        x, y, _ = node_places(self.grid, self.surface, place)
+        return _Stepped(x=x, y=y, z=z, low=low, high=high)
+
+    def _layer(
+        self,
+        n: Nodes,
+        near: NDArray[np.bool_],
+        place: Window,
+        stepped: _Stepped | None,
+        *,
+        alone: bool,
+    ) -> Layer:
         """One photo over a piece at its place in the map; filled only within the bounding box of
         the cells where it can be visible.
         """
         h, w = place.height, place.width
         rows, columns = _extent(np.asarray(near.any(1)), h), _extent(np.asarray(near.any(0)), w)
         size = rows.stop - rows.start, columns.stop - columns.start
-        pixels, score = self._warped(cut(n, rows.start, columns.start, *size), *size, alone=alone)
+        n = cut(n, rows.start, columns.start, *size)
+        if stepped is not None:
+            n = stepped.lifted(n, rows.start, columns.start, *size)
+        width = None if self.labels is None or alone else self.blend.seam_px
+        pixels, score = self._warped(n, *size, ranked=width is None and not alone)
         if size != (h, w):
             pixels = _embedded(pixels, 0, rows, columns, h, w)
             score = _embedded(score, np.inf, rows, columns, h, w)
         slope = None
-        if self.labels is not None and self.blend.seam_px is not None and not alone:
-            share = self.labels.share(n.view.photo, place, self.blend.seam_px)
-            score = np.where(np.isfinite(score), 1 - share, score)
-            slope = self.labels.slope(self.blend.seam_px)
+        if self.labels is not None and width is not None:
+            score += 1 - self.labels.share(n.view.photo, place, width)
+            slope = self.labels.slope(width)
         return Layer(
             photo=n.view.photo,
             pixels=pixels,
@@ -251,16 +309,17 @@ class Composer:
         )
 
     def _warped(
-        self, n: Nodes, h: int, w: int, *, alone: bool
+        self, n: Nodes, h: int, w: int, *, ranked: bool
     ) -> tuple[NDArray[Any], NDArray[np.float32]]:
-        """Pixels (h, w, bands) and scores (h, w) of a photo over the area of these nodes."""
+        """Pixels (h, w, bands) and scores (h, w) of a photo over the area of these nodes; scores
+        are zero if photos are not `ranked` by them.
+        """
         image = self.pixels(n.view.photo)
         # cv2.remap uses 16-bit coordinates: a cut-out keeps them small
-        x, y = _reach(n.u, image.shape[1]), _reach(n.v, image.shape[0])
-        u = densify(n.u - np.float32(x.start), h, w, n.step)
-        v = densify(n.v - np.float32(y.start), h, w, n.step)
+        x, y = n.reach()
+        u, v = n.pixels(h, w, x, y)
         warped = _remapped(image[y, x], u, v)
-        score = np.zeros((h, w), np.float32) if alone else densify(n.score, h, w, n.step)
+        score = densify(n.score, h, w, n.step) if ranked else np.zeros((h, w), np.float32)
         if not n.seen.all():
             within = inside_everywhere(n, u + np.float32(x.start), v + np.float32(y.start))
             np.copyto(score, np.float32(np.inf), where=~within)
@@ -300,16 +359,11 @@ def _extent(needed: NDArray[np.bool_], size: int) -> slice:
     return slice(int(at[0]) * STEP, min((int(at[-1]) + 1) * STEP, size))
 
 
-def _reach(places: NDArray[np.float32], size: int) -> slice:
-    """The range of pixels, of `size`, covered by a photo's node coordinates; at least one pixel."""
-    start = min(max(int(places.min()) - 2, 0), size - 1)
-    return slice(start, max(min(int(np.ceil(places.max())) + 3, size), start + 1))
-
-
 def _embedded(
     part: NDArray[Any], empty: float, rows: slice, columns: slice, h: int, w: int
 ) -> NDArray[Any]:
     """Inserts a part (rows, columns[, bands]) in an empty piece (h, w[, bands])."""
-    out = np.full((h, w, *part.shape[2:]), empty, part.dtype)
+    shape = (h, w, *part.shape[2:])
+    out = np.full(shape, empty, part.dtype) if empty else np.zeros(shape, part.dtype)
     out[rows, columns] = part
     return out

@@ -82,7 +82,7 @@ class SeamLines:
     """The same for a height of one metre or more above the surroundings, in grey values."""
     least: int = 24
     """Undisputed patches of fewer cells are contested too."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
 
     def __call__(
         self,
