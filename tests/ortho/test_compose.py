@@ -393,14 +393,15 @@ def test_a_house_has_no_walls_in_the_map():
         np.minimum(np.abs(p - low), np.abs(p - high))
         for p, low, high in ((x, ROOF[0], ROOF[2]), (y, ROOF[1], ROOF[3]))
     ]
-    # pixels across an edge hold both sides, and corners of the house are cut off by half a cell
-    edge = (np.minimum(*aside) < 0.06) | (np.hypot(*aside) < 0.4)
+    # a photo's pixels, 0.13 m wide, mix both sides of an edge; the house's corners are cut off
+    edge = (np.minimum(*aside) < 0.2) | (np.hypot(*aside) < 0.5)
+    hidden = cv2.dilate(hidden.view(np.uint8), np.ones((5, 5), np.uint8)) > 0
     sees = (made.photo >= 0) & (roof | ~hidden) & ~edge
     error = np.abs(made.pixels[..., 0] - painted(x, y, roof))[sees]
     assert (sees & roof).sum() > 8000 and error.max() < 8
     sloping = replace(compose, detailed=False)(WHOLE)
     assert (made.pixels[..., 0] > 200)[sees].sum() == 0
-    assert (sloping.pixels[..., 0] > 200)[sees].sum() > 100
+    assert (sloping.pixels[..., 0] > 200)[sees].sum() > 50
 
 
 @pytest.mark.parametrize("moving", [False, True])
