@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from skyquilt.geometry.camera import project, undistort
-from skyquilt.imaging.nodes import STEP, inside, lifted, node_places, project_nodes
+from skyquilt.imaging.nodes import STEP, inside, lifted, node_places, project_nodes, rises
 from skyquilt.imaging.registration import shifts_between
 from skyquilt.live.tile_drawing import Newest
 from skyquilt.model.poses import Motion
@@ -415,7 +415,7 @@ def test_pixels_at_stepping_heights_lie_where_they_are_projected(moving):
     z = rng.uniform(-2, 12, (256, 200)).astype(np.float32)
     x, y, level = node_places(GRID, FLAT, place)
     nodes = project_nodes(shot, x, y, level)
-    found = lifted(nodes, x, y, z, -2.0, 12.0).pixels(256, 200, slice(0, 9), slice(0, 9))
+    found = lifted(nodes, x, y, *rises(z, 45.0)).pixels(256, 200, slice(0, 9), slice(0, 9))
     at = np.meshgrid(GRID.x(place.column + np.arange(200)), GRID.y(place.row + np.arange(256)))
     exact = project_nodes(shot, *at, z)
     off = np.hypot(found[0] - exact.u, found[1] - exact.v)[exact.seen]

@@ -87,8 +87,8 @@ class Nodes:
     pixels, where heights step between nodes.
     """
     rise: NDArray[np.float32] | None = None
-    """(h, w) how far each map pixel lies on its photo pixel's way from the least to the greatest
-    height, 0 to 1.
+    """(2, h, w) how far each map pixel lies on its photo pixel's way from the least to the greatest
+    height, 0 to 1; and the share of the way's bend there, 1 in the middle.
     """
 
     def reach(self) -> tuple[slice, slice]:
@@ -125,13 +125,13 @@ def _between(
     p: NDArray[np.float32], start: np.float32, rise: NDArray[np.float32], step: int
 ) -> NDArray[np.float32]:
     """Photo columns or rows (h, w) from those of nodes at three levels, (3, r, c)."""
-    (low, middle, high), (h, w) = p, rise.shape
-    out = densify(high - low, h, w, step) * rise
+    (low, middle, high), (_, h, w) = p, rise.shape
+    out = densify(high - low, h, w, step) * rise[0]
     out += densify(low - start, h, w, step)
     bend = middle - (low + high) / 2
     if np.abs(bend).max() > STRAIGHT_PX:
-        out += densify(4 * bend, h, w, step) * (rise * (1 - rise))
-    return out
+        out += densify(bend, h, w, step) * rise[1]
+    return np.asarray(out)
 
 
 def project_nodes(view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]) -> Nodes:
@@ -139,10 +139,7 @@ def project_nodes(view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any])
     them.
     """
     camera, C = view.camera, view.pose.map_C
-    planes = view.pose.planes_to_camera(x, y, z)
-    if view.pose.motion is not None:
-        planes = _at_their_rows(planes, _swept(view.pose), camera.vector, camera.height)
-    u, v, real = _photo_pixels(planes, camera.vector, monotone_radius(camera))
+    u, v, real = _projected(view, x, y, z)
     real = np.broadcast_to(real, np.broadcast_shapes(x.shape, z.shape))
     drop = z - C[2]
     score = _scores(x - C[0], y - C[1], drop)
@@ -157,6 +154,17 @@ def project_nodes(view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any])
         score=score,
         height=float(np.median(-drop)),
     )
+
+
+def _projected(
+    view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Photo columns and rows of places in m, and which are real."""
+    camera = view.camera
+    planes = view.pose.planes_to_camera(x, y, z)
+    if view.pose.motion is not None:
+        planes = _at_their_rows(planes, _swept(view.pose), camera.vector, camera.height)
+    return _photo_pixels(planes, camera.vector, monotone_radius(camera))
 
 
 def project_all(
@@ -325,32 +333,45 @@ def least_scores(
     return np.asarray((aside**2 + along**2) / drop, np.float32)
 
 
-def lifted(
-    nodes: Nodes, x: NDArray[Any], y: NDArray[Any], z: NDArray[np.float32], low: float, high: float
-) -> Nodes:
-    """These nodes, at x, y (r, c) in m, for map pixels of heights z (h, w) between two levels, all
-    in m.
+def rises(
+    z: NDArray[np.float32], camera_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Three levels (3, 1, 1) of heights z (h, w) in m, the middle one half-way on a photo pixel's
+    way, and how far the heights lie on it: `Nodes.rise`. `camera_m`: height of the cameras.
 
-    Along a vertical line a photo pixel moves, but for distortion, in proportion to the reciprocal
-    of its depth; for distortion there is a third level between.
+    Along a vertical line a photo pixel moves about in proportion to the reciprocal of its depth.
     """
-    view = nodes.view
-    centre = float(x.mean()), float(y.mean())
-    depth = [float(view.pose.planes_to_camera(*np.array([*centre, h]))[2]) for h in (low, high)]
-    ratio = depth[1] / depth[0]
+    low, high = float(z.min()), float(z.max())
+    above = max(camera_m - high, 0.1 * (high - low))
+    ratio = above / (above + high - low)
     middle = low + (high - low) / (1 + ratio)
-    three = project_nodes(view, x, y, np.array([low, middle, high])[:, None, None])
     share = (z - np.float32(low)) * np.float32(1 / (high - low))
-    rise = share * np.float32(1 - 1 / ratio)
-    rise += np.float32(1 / ratio)
-    np.divide(share, rise, out=rise)
-    return replace(
-        nodes,
-        levels=np.stack([three.u, three.v]),
-        rise=rise,
-        seen=nodes.seen & three.seen.all(0),
-        real=nodes.real & three.real.all(0),
-    )
+    out = np.empty((2, *z.shape), np.float32)
+    np.multiply(share, np.float32(1 - 1 / ratio), out=out[1])
+    out[1] += np.float32(1 / ratio)
+    np.divide(share, out[1], out=out[0])
+    np.subtract(1, out[0], out=out[1])
+    out[1] *= out[0]
+    out[1] *= 4
+    return np.array([low, middle, high])[:, None, None], out
+
+
+def lifted(
+    nodes: Nodes,
+    x: NDArray[Any],
+    y: NDArray[Any],
+    levels: NDArray[np.float64],
+    rise: NDArray[np.float32],
+) -> Nodes:
+    """These nodes, at x, y (r, c) in m, for map pixels whose heights lie between `levels`, as from
+    `rises`. Unchanged where a level is not in front of the camera or its distortion folds back.
+    """
+    camera = nodes.view.camera
+    u, v, real = _projected(nodes.view, x, y, levels)
+    if not (real | ~nodes.real).all():
+        return nodes
+    seen = nodes.seen & inside(camera, u, v).all(0)
+    return replace(nodes, levels=np.stack([u, v]), rise=rise, seen=seen)
 
 
 def cut(nodes: Nodes, row: int, column: int, height: int, width: int) -> Nodes:

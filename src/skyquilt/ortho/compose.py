@@ -18,6 +18,7 @@ from skyquilt.imaging.nodes import (
     lifted,
     node_places,
     project_nodes,
+    rises,
 )
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
@@ -64,12 +65,10 @@ class _Stepped:
     """(r, c) eastings in m of the nodes of the piece."""
     y: NDArray[np.float64]
     """(r, c) northings in m."""
-    z: NDArray[np.float32]
-    """(h, w) heights in m of the pixels."""
-    low: float
-    """The least of them."""
-    high: float
-    """The greatest."""
+    levels: NDArray[np.float64]
+    """(3, 1, 1) heights in m between which those of the pixels lie."""
+    rise: NDArray[np.float32]
+    """(2, h, w) how far they lie between them, as in `Nodes`."""
 
     def lifted(self, n: Nodes, row: int, column: int, h: int, w: int) -> Nodes:
         """Nodes of a part of the piece, with the places of its pixels at their heights."""
@@ -77,8 +76,8 @@ class _Stepped:
             return n
         r, c = row // STEP, column // STEP
         nodes = (slice(r, r + n.u.shape[0]), slice(c, c + n.u.shape[1]))
-        part = (slice(row, row + h), slice(column, column + w))
-        return lifted(n, self.x[nodes], self.y[nodes], self.z[part], self.low, self.high)
+        rise = self.rise[:, row : row + h, column : column + w]
+        return lifted(n, self.x[nodes], self.y[nodes], self.levels, rise)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -215,7 +214,7 @@ class Composer:
             width=w,
         )
         cuts = [cut(n, row, column, h, w) for n, _ in chosen]
-        stepped = self._stepped(place, max(float(n.score.max()) for n in cuts))
+        stepped = self._stepped(place, cuts)
         if stepped is None:
             cuts = self._closer(plan, cuts, row, column, place)
         if alone:
@@ -252,9 +251,9 @@ class Composer:
             return cuts
         return [replace(project_nodes(n.view, x, y, z), step=step) for n in cuts]
 
-    def _stepped(self, place: Window, aside: float) -> _Stepped | None:
-        """The heights of the pixels of a piece; None where they do not step, or shift no photo
-        visibly; `aside`: the largest squared tangent of the angles that it is seen at.
+    def _stepped(self, place: Window, cuts: Sequence[Nodes]) -> _Stepped | None:
+        """The heights of the pixels of a piece that these photos show; None where they do not step,
+        or shift no photo visibly.
         """
         if not self.detailed or self.surface.cell >= STEP * self.grid.gsd:
             return None
@@ -266,11 +265,12 @@ class Composer:
         z = self.surface.stepped(x, y)
         if z is None:
             return None
-        low, high = float(z.min()), float(z.max())
-        if (high - low) * np.sqrt(aside) <= BENT * self.grid.gsd:
+        aside = max(float(n.score.max()) for n in cuts)
+        if float(np.ptp(z)) * np.sqrt(aside) <= BENT * self.grid.gsd:
             return None
         x, y, _ = node_places(self.grid, self.surface, place)
-        return _Stepped(x=x, y=y, z=z, low=low, high=high)
+        levels, rise = rises(z, float(np.median([n.view.pose.map_C[2] for n in cuts])))
+        return _Stepped(x=x, y=y, levels=levels, rise=rise)
 
     def _layer(
         self,
