@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from skyquilt.geometry.camera import project, undistort
-from skyquilt.imaging.nodes import STEP, inside, lifted, node_places, project_nodes, rises
+from skyquilt.imaging.nodes import STEP, inside, node_places, project_nodes
 from skyquilt.imaging.registration import shifts_between
 from skyquilt.live.tile_drawing import Newest
 from skyquilt.model.poses import Motion
@@ -18,6 +18,7 @@ from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Average, Feather, First, Multiband
 from skyquilt.ortho.compose import _remapped
 from skyquilt.ortho.plan import STILL
+from skyquilt.ortho.stepped import stepped_heights
 from tests.ortho.scenes import CAMERA, FLAT, GRID, block, composer, photograph, truth, view
 
 WHOLE = Window(row=0, column=0, height=GRID.height, width=GRID.width)
@@ -412,12 +413,15 @@ def test_pixels_at_stepping_heights_lie_where_they_are_projected(moving):
         motion = Motion(shift_m=np.array([0.3, -0.1, 0.0]), turn_rad=np.array([2e-3, 1e-3, 0]))
         shot = replace(shot, pose=replace(shot.pose, motion=motion))
     place = Window(row=32, column=64, height=256, width=200)
-    z = rng.uniform(-2, 12, (256, 200)).astype(np.float32)
-    x, y, level = node_places(GRID, FLAT, place)
-    nodes = project_nodes(shot, x, y, level)
-    found = lifted(nodes, x, y, *rises(z, 45.0)).pixels(256, 200, slice(0, 9), slice(0, 9))
-    at = np.meshgrid(GRID.x(place.column + np.arange(200)), GRID.y(place.row + np.arange(256)))
-    exact = project_nodes(shot, *at, z)
+    rough = Surface(
+        z=rng.uniform(-2, 12, (90, 90)).astype(np.float32), x0=-24.0, y0=-24.0, cell=0.5, source="t"
+    )
+    stepped = stepped_heights(GRID, rough, place, [shot])
+    assert stepped is not None
+    nodes = stepped.lifted(project_nodes(shot, *node_places(GRID, rough, place)), 0, 0, 256, 200)
+    found = nodes.pixels(256, 200, slice(0, 9), slice(0, 9))
+    x, y = GRID.x(place.column + np.arange(200)), GRID.y(place.row + np.arange(256))
+    exact = project_nodes(shot, *np.meshgrid(x, y), rough.on(x, y))
     off = np.hypot(found[0] - exact.u, found[1] - exact.v)[exact.seen]
     assert len(off) > 5000 and off.max() < 0.1
 

@@ -1,7 +1,7 @@
 """What each photo sees of the map: coarse grids of the photo pixels of map points."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -91,10 +91,12 @@ class Nodes:
     height, 0 to 1; and the share of the way's bend there, 1 in the middle.
     """
 
-    def reach(self) -> tuple[slice, slice]:
-        """The photo's columns and rows, at least one, between which all map pixels lie."""
+    def reach(self, height: int, width: int) -> tuple[slice, slice]:
+        """The columns and rows, at least one, of a photo of this size between which all map pixels
+        lie.
+        """
         u, v = (self.u, self.v) if self.levels is None else self.levels
-        return _reach(u, self.view.camera.width), _reach(v, self.view.camera.height)
+        return _reach(u, width), _reach(v, height)
 
     def pixels(
         self, height: int, width: int, x: slice, y: slice
@@ -139,7 +141,7 @@ def project_nodes(view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any])
     them.
     """
     camera, C = view.camera, view.pose.map_C
-    u, v, real = _projected(view, x, y, z)
+    u, v, real = projected(view, x, y, z)
     real = np.broadcast_to(real, np.broadcast_shapes(x.shape, z.shape))
     drop = z - C[2]
     score = _scores(x - C[0], y - C[1], drop)
@@ -156,7 +158,7 @@ def project_nodes(view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any])
     )
 
 
-def _projected(
+def projected(
     view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """Photo columns and rows of places in m, and which are real."""
@@ -331,47 +333,6 @@ def least_scores(
     along = np.maximum(np.maximum(y[-1, 0] - north, north - y[0, 0]), 0.0)
     drop = np.maximum(np.maximum((up - z.min()) ** 2, (up - z.max()) ** 2), 1e-6)
     return np.asarray((aside**2 + along**2) / drop, np.float32)
-
-
-def rises(
-    z: NDArray[np.float32], camera_m: float
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Three levels (3, 1, 1) of heights z (h, w) in m, the middle one half-way on a photo pixel's
-    way, and how far the heights lie on it: `Nodes.rise`. `camera_m`: height of the cameras.
-
-    Along a vertical line a photo pixel moves about in proportion to the reciprocal of its depth.
-    """
-    low, high = float(z.min()), float(z.max())
-    above = max(camera_m - high, 0.1 * (high - low))
-    ratio = above / (above + high - low)
-    middle = low + (high - low) / (1 + ratio)
-    share = (z - np.float32(low)) * np.float32(1 / (high - low))
-    out = np.empty((2, *z.shape), np.float32)
-    np.multiply(share, np.float32(1 - 1 / ratio), out=out[1])
-    out[1] += np.float32(1 / ratio)
-    np.divide(share, out[1], out=out[0])
-    np.subtract(1, out[0], out=out[1])
-    out[1] *= out[0]
-    out[1] *= 4
-    return np.array([low, middle, high])[:, None, None], out
-
-
-def lifted(
-    nodes: Nodes,
-    x: NDArray[Any],
-    y: NDArray[Any],
-    levels: NDArray[np.float64],
-    rise: NDArray[np.float32],
-) -> Nodes:
-    """These nodes, at x, y (r, c) in m, for map pixels whose heights lie between `levels`, as from
-    `rises`. Unchanged where a level is not in front of the camera or its distortion folds back.
-    """
-    camera = nodes.view.camera
-    u, v, real = _projected(nodes.view, x, y, levels)
-    if not (real | ~nodes.real).all():
-        return nodes
-    seen = nodes.seen & inside(camera, u, v).all(0)
-    return replace(nodes, levels=np.stack([u, v]), rise=rise, seen=seen)
 
 
 def cut(nodes: Nodes, row: int, column: int, height: int, width: int) -> Nodes:

@@ -15,10 +15,8 @@ from skyquilt.imaging.nodes import (
     cut,
     densify,
     inside_everywhere,
-    lifted,
     node_places,
     project_nodes,
-    rises,
 )
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
@@ -26,6 +24,7 @@ from skyquilt.ortho.blend import Blend, Layer
 from skyquilt.ortho.exposure import NEUTRAL, Exposure, image_place, with_odds
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.plan import Plan, planned, stale
+from skyquilt.ortho.stepped import Stepped, stepped_heights
 
 PhotoPixels = Callable[[int], NDArray[Any]]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""
@@ -55,29 +54,6 @@ class Composed:
     """(h, w) index of the leading photo of each pixel, -1 = none."""
     views: NDArray[np.uint16]
     """(r, c) number of planned photos that cover each STEP x STEP cell."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Stepped:
-    """Heights of the pixels of a piece in which they step."""
-
-    x: NDArray[np.float64]
-    """(r, c) eastings in m of the nodes of the piece."""
-    y: NDArray[np.float64]
-    """(r, c) northings in m."""
-    levels: NDArray[np.float64]
-    """(3, 1, 1) heights in m between which those of the pixels lie."""
-    rise: NDArray[np.float32]
-    """(2, h, w) how far they lie between them, as in `Nodes`."""
-
-    def lifted(self, n: Nodes, row: int, column: int, h: int, w: int) -> Nodes:
-        """Nodes of a part of the piece, with the places of its pixels at their heights."""
-        if n.view.pose.cam_H_map is not None:  # photos in the plane, whatever the height
-            return n
-        r, c = row // STEP, column // STEP
-        nodes = (slice(r, r + n.u.shape[0]), slice(c, c + n.u.shape[1]))
-        rise = self.rise[:, row : row + h, column : column + w]
-        return lifted(n, self.x[nodes], self.y[nodes], self.levels, rise)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -251,33 +227,24 @@ class Composer:
             return cuts
         return [replace(project_nodes(n.view, x, y, z), step=step) for n in cuts]
 
-    def _stepped(self, place: Window, cuts: Sequence[Nodes]) -> _Stepped | None:
+    def _stepped(self, place: Window, cuts: Sequence[Nodes]) -> Stepped | None:
         """The heights of the pixels of a piece that these photos show; None where they do not step,
         or shift no photo visibly.
         """
         if not self.detailed or self.surface.cell >= STEP * self.grid.gsd:
             return None
-        rows, columns = (
-            np.arange(at, at + n)
-            for at, n in ((place.row, place.height), (place.column, place.width))
-        )
-        x, y = self.grid.x(columns), self.grid.y(rows)
-        z = self.surface.stepped(x, y)
-        if z is None:
+        found = stepped_heights(self.grid, self.surface, place, [n.view for n in cuts])
+        if found is None:
             return None
         aside = max(float(n.score.max()) for n in cuts)
-        if float(np.ptp(z)) * np.sqrt(aside) <= BENT * self.grid.gsd:
-            return None
-        x, y, _ = node_places(self.grid, self.surface, place)
-        levels, rise = rises(z, float(np.median([n.view.pose.map_C[2] for n in cuts])))
-        return _Stepped(x=x, y=y, levels=levels, rise=rise)
+        return None if found.range_m * np.sqrt(aside) <= BENT * self.grid.gsd else found
 
     def _layer(
         self,
         n: Nodes,
         near: NDArray[np.bool_],
         place: Window,
-        stepped: _Stepped | None,
+        stepped: Stepped | None,
         *,
         alone: bool,
     ) -> Layer:
@@ -316,7 +283,7 @@ class Composer:
         """
         image = self.pixels(n.view.photo)
         # cv2.remap uses 16-bit coordinates: a cut-out keeps them small
-        x, y = n.reach()
+        x, y = n.reach(*image.shape[:2])
         u, v = n.pixels(h, w, x, y)
         warped = _remapped(image[y, x], u, v)
         score = densify(n.score, h, w, n.step) if ranked else np.zeros((h, w), np.float32)
