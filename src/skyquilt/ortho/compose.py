@@ -285,11 +285,18 @@ class Composer:
         # cv2.remap uses 16-bit coordinates: a cut-out keeps them small
         x, y = n.reach(*image.shape[:2])
         u, v = n.pixels(h, w, x, y)
-        warped = _remapped(image[y, x], u, v)
         score = densify(n.score, h, w, n.step) if ranked else np.zeros((h, w), np.float32)
         if not n.seen.all():
-            within = inside_everywhere(n, u + np.float32(x.start), v + np.float32(y.start))
+            start = np.float32(x.start), np.float32(y.start)
+            within = inside_everywhere(n, u + start[0], v + start[1])
+            if n.levels is not None:  # at the photo's rim it may show places only on slopes
+                sloping = replace(n, levels=None, rise=None)
+                su, sv = sloping.pixels(h, w, x, y)
+                more = inside_everywhere(sloping, su + start[0], sv + start[1]) & ~within
+                u[more], v[more] = su[more], sv[more]
+                within |= more
             np.copyto(score, np.float32(np.inf), where=~within)
+        warped = _remapped(image[y, x], u, v)
         return self._exposed(n, warped), score
 
     def _exposed(self, n: Nodes, warped: NDArray[Any]) -> NDArray[Any]:
