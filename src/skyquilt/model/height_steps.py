@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float32]
 Mask = NDArray[np.bool_]
-STEP = 2.0
+STEP = 5.0
 """Heights around a square of four that lie further apart than this number of cells are a step.
-Slopes of roofs stay slopes.
+Slopes of roofs and the sides of crowns stay slopes.
 """
 SOFT = 5
 """Side in cells of the window over which heights are softened to find where an edge runs."""
