@@ -182,11 +182,12 @@ def points_solved(
     return np.asarray(-np.einsum("pji,pj->pi", L_inv, half))
 
 
-def points_step(given: tuple[Problem, State, float, Array, Array]) -> Array:
-    """The step (P, 3) of a part's points that goes with that of photos and cameras: of (part, its
-    state, damping, step of all photos (n, p), step of the cameras (m, 10)).
+def points_step(
+    part: Problem, state: State, damping: float, photos: Array, cameras: Array
+) -> Array:
+    """The step (P, 3) of a part's points that goes with that of all photos (n, p) and of the
+    cameras (m, 10).
     """
-    part, state, damping, photos, cameras = given
     lin = linearise(part, state)
     weight, _ = observation_weights(part, lin.residual)
     moved = lin.residual + np.einsum("nij,nj->ni", lin.J_photo, photos[part.photo])

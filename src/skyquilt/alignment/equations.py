@@ -113,10 +113,13 @@ class Equations:
         if self.q:
             cameras = du[photos : photos + CAMERA * self.m].reshape(-1, CAMERA)
         placed = du[:photos].reshape(-1, self.p)
-        parts = (
-            (part, own, damping, placed, cameras) for part, own, _ in self.problem.parts(state)
+        # here: sharing them out would take as long
+        points = np.concatenate(
+            [
+                points_step(part, own, damping, placed, cameras)
+                for part, own, _ in self.problem.parts(state)
+            ]
         )
-        points = np.concatenate([*self.workers.each(points_step, parts)])
         return placed, cameras, points
 
     def _solved(self, state: State, damping: float) -> Array:
