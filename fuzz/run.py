@@ -4,7 +4,7 @@ python -m fuzz.run --seconds 10              every target for so long
 python -m fuzz.run --minutes 5               all targets together for so long
 python -m fuzz.run --seeds                   every seed once, without fuzzing
 python -m fuzz.run jpeg --seconds 60
-python -m fuzz.run --minutes 3 --seed 1      the same inputs every time, as far as the time goes
+python -m fuzz.run --minutes 2 --seed 1      the same inputs every time, as far as the time goes
 
 An input on which a target fails is kept in fuzz/found; once the reader is mended, it belongs into
 fuzz/seeds as a regression test.

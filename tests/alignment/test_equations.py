@@ -9,6 +9,8 @@ from skyquilt.alignment import equations
 from skyquilt.alignment.adjust import adjust
 from skyquilt.alignment.eliminated_points import points_inverse
 from skyquilt.alignment.equations import Equations, NearFactor
+from skyquilt.alignment.problem import linearise
+from skyquilt.alignment.robust import observation_weights, prior_terms
 from skyquilt.engine.kept import Keep
 from tests.alignment.blocks import make_block
 
@@ -31,14 +33,35 @@ def test_a_point_that_is_not_determined():
         points_inverse(-np.eye(3)[None], 0.0)
 
 
-def test_what_is_not_kept_is_computed_again(monkeypatch):
-    """The step of a problem too large to keep the ties of its points is the same."""
-    block = make_block(0)
-    kept = Equations(block.problem, block.truth).step(block.truth, 1e-4)
-    monkeypatch.setattr("skyquilt.alignment.equations.KEPT", 0)
-    again = Equations(block.problem, block.truth).step(block.truth, 1e-4)
-    assert all(np.array_equal(a, b) for a, b in zip(kept, again, strict=True))
-    assert all(np.abs(a).max() > 0 for a in kept[::2])
+@pytest.mark.parametrize("options", [{}, {"cameras": 2, "lies": 0.05}])
+def test_the_step_of_all_unknowns_solves_the_whole_equations(options):
+    """Those of photos, cameras and points, without elimination."""
+    block, damping = make_block(0, points=80, **options), 1e-3
+    problem, state = block.problem, block.start
+    photos, cameras, points = Equations(problem, state).step(state, damping)
+    lin = linearise(problem, state)
+    weight, _ = observation_weights(problem, lin.residual)
+    n, m, P = len(state.C), len(state.K), len(state.X)
+    J = np.zeros((len(problem.px), 2, 6 * n + 10 * m + 3 * P))
+    row = np.arange(len(J))
+    for k in range(6):
+        J[row, :, 6 * problem.photo + k] = lin.J_photo[:, :, k]
+    for k in range(10):
+        J[row, :, 6 * n + 10 * problem.camera[problem.photo] + k] = lin.J_camera[:, :, k]
+    for k in range(3):
+        J[row, :, 6 * n + 10 * m + 3 * problem.point + k] = lin.J_point[:, :, k]
+    J, w = J.reshape(2 * len(J), -1), np.repeat(weight, 2)
+    H, g = (J * w[:, None]).T @ J, J.T @ (w * lin.residual.ravel())
+    priors = prior_terms(problem, state)
+    fixed = np.where(problem.free, priors.camera, 1.0)
+    H[np.diag_indices(6 * n + 10 * m)] += np.r_[priors.photo[:, :6].ravel(), fixed.ravel()]
+    g[: 6 * n] += priors.photo_gradient[:, :6].ravel()
+    g[6 * n : 6 * n + 10 * m] += priors.camera_gradient.ravel()
+    H[np.diag_indices(len(H))] *= 1 + damping
+    found = np.concatenate([photos.ravel(), cameras.ravel(), points.ravel()])
+    assert np.abs(found).max() > 0.1
+    off = np.abs(H @ found + g) / np.sqrt(np.diag(H) * float(g @ np.linalg.solve(H, g)))
+    assert off.max() < 1e-5
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from skyquilt.engine.workers import Threads
 from skyquilt.model.camera import Camera
 from skyquilt.model.raster import Grid
 from skyquilt.ortho import fill, fusion
-from skyquilt.ortho.fill import filled, lowered, nearest_known, plateaus, settled
+from skyquilt.ortho.fill import crowns, filled, lowered, nearest_known, plateaus, settled
 from skyquilt.ortho.pair_matching import pair_of
 from skyquilt.ortho.stereo import Stereo
 from skyquilt.ortho.tie_surface import level
@@ -150,8 +150,8 @@ def test_beyond_the_support_lies_the_plane():
     support = x < 80
     z[90:94, 76:80] += 8
     noisy = np.where(support, z, 50.0).astype(np.float32)
-    out = settled(noisy, support, 0.0, 10.0)
-    assert out[:, :80] == pytest.approx(noisy[:, :80])
+    out = settled(noisy.copy(), support)
+    assert np.array_equal(out[:, :80], noisy[:, :80])
     far = out[20:180, 95:120]
     assert np.abs(far - (0.1 * x)[20:180, 95:120]).max() < 3.5
     assert np.abs(np.diff(out[20:180, 100:], axis=1)).max() < 0.3
@@ -188,7 +188,7 @@ def test_gaps_are_filled_from_their_sides():
     assert set(np.unique(steep)) == {0.0, 10.0}
     soft = filled(np.where(known, z, 0), known)
     assert soft.min() >= 0 and soft.max() <= 10 and 3 < soft[20, 19] < 7
-    assert plateaus(z, 7) == pytest.approx(z, abs=0.04)
+    assert plateaus(z, 7, 0.0, 10.0) == pytest.approx(z, abs=0.04)
 
 
 def test_heights_joined_in_bands_are_those_joined_at_once(monkeypatch):
@@ -198,11 +198,44 @@ def test_heights_joined_in_bands_are_those_joined_at_once(monkeypatch):
     known = rng.random(z.shape) < np.linspace(0, 0.6, 300)[:, None]
     rough = fusion.surface_of(np.full((60, 30), 2.0, np.float32), cells.coarser(5))
     whole = fusion.with_coarse(z, known, rough, cells, 15)
-    monkeypatch.setattr(fusion, "BAND", 37)
+    monkeypatch.setattr(fill, "BAND", 37)
     bands = fusion.with_coarse(z, known, rough, cells, 15)
     assert np.array_equal(whole, bands)
     share = (whole == 2.0).mean(1)
     assert share[:60].min() > 0.9 and share[240:].max() < 0.1
+
+
+def test_crowns_levelled_in_bands_are_those_levelled_at_once(monkeypatch):
+    """And leaves of which little is known become level, up to the cliff at their rim."""
+    rng = np.random.default_rng(4)
+    y, x = np.mgrid[:400, :160]
+    leaves = np.hypot(x - 80, y - 200) < 50
+    z = np.where(leaves, 12 + rng.normal(0, 1.5, x.shape), 0.02 * x).astype(np.float32)
+    known = rng.random(z.shape) < np.where(leaves, 0.1, 0.9)
+    z = nearest_known(np.where(known, z, -99).astype(np.float32), known)
+    whole = crowns(z.copy(), known, 11, 1.0)
+    monkeypatch.setattr(fill, "BAND", 37)
+    bands = crowns(z.copy(), known, 11, 1.0)
+    assert bands == pytest.approx(whole, abs=2e-3)
+    inner = np.hypot(x - 80, y - 200) < 35
+    assert np.std(z[inner]) > 1.2 and np.std(whole[inner]) < 0.7
+    beyond = np.hypot(x - 80, y - 200) > 60
+    assert whole[beyond] == pytest.approx((0.02 * x)[beyond], abs=0.1)
+
+
+def test_the_plane_beyond_is_the_one_fitted_to_all(monkeypatch):
+    """In strips as at once; means of cells are those of OpenCV's reduction by area."""
+    rng = np.random.default_rng(5)
+    z = rng.normal(20, 3, (301, 170)).astype(np.float32)
+    support = np.zeros(z.shape, bool)
+    support[40:220, 30:100] = True
+    shares = fill._shares(301, 64) @ z @ fill._shares(170, 36).T
+    assert shares == pytest.approx(cv2.resize(z, (36, 64), interpolation=cv2.INTER_AREA), abs=1e-3)
+    wide = fill._between(301, 64) @ shares @ fill._between(170, 36).T
+    assert wide == pytest.approx(cv2.resize(shares, (170, 301)), abs=1e-3)
+    whole = settled(z.copy(), support)
+    monkeypatch.setattr(fill, "STRIP", 7)
+    assert settled(z.copy(), support) == pytest.approx(whole, abs=1e-3)
 
 
 def _crown():

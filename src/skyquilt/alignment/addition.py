@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.bundle import Bundle
+from skyquilt.alignment.determined import weak_photos
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.local_adjustment import LocalAdjustment, NotAdjusted
 from skyquilt.alignment.near_new import Block, adjusted_near, ground_near, window_of
@@ -82,7 +83,8 @@ def added(inputs: AlignmentInputs, bundle: Bundle) -> Alignment | None:
             return None
         base = found
     if oblique:
-        base = hung(base, inputs.photos, priors, inputs.features, inputs.links, frozenset(oblique))
+        weak, away = weak_photos(base, priors), frozenset(oblique)
+        base = hung(base, weak, inputs.photos, priors, inputs.features, inputs.links, away)
     return base
 
 

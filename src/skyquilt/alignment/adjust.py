@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.eliminated_points import add_diagonal, points_inverse, sums_by_point
+from skyquilt.alignment.eliminated_points import points_solved
 from skyquilt.alignment.equations import Equations, NearFactor
 from skyquilt.alignment.problem import CAMERA, Problem, State, linearised_points
-from skyquilt.alignment.robust import observation_weights, point_terms, robust_cost
+from skyquilt.alignment.robust import observation_weights, robust_cost
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.engine.workers import HERE
 from skyquilt.geometry.block_cholesky import Factor, Index, Matrix
@@ -98,14 +98,8 @@ def polish_points(problem: Problem, state: State) -> State:
     for part, own, points in problem.parts(state):
         residual, J_point = linearised_points(part, own)
         weight, _ = observation_weights(part, residual)
-        rows = np.concatenate([J_point, residual[..., None]], 2) * np.sqrt(weight)[:, None, None]
-        sums = sums_by_point(part, np.swapaxes(rows[:, :, :3], 1, 2) @ rows, len(own.X))
-        precision, apart = point_terms(part, own)
-        H = sums[:, :, :3]
-        add_diagonal(H, precision + 1e-9)
-        g = sums[:, :, 3] + precision * apart
-        L_inv = points_inverse(H, 0.0)
-        X[points] -= np.einsum("pji,pj->pi", L_inv, np.einsum("pij,pj->pi", L_inv, g))
+        rows = np.concatenate([J_point, residual[..., None]], 2)
+        X[points] += points_solved(part, own, rows, weight, 0.0)
     return replace(state, X=X)
 
 
@@ -178,7 +172,7 @@ def adjust(
 
 def covariance(problem: Problem, state: State) -> Covariance | None:
     """Covariance of photos and cameras at a minimum; None if some unknowns are not determined."""
-    system = Equations(problem, state, steps=False)
+    system = Equations(problem, state)
     try:
         factor = Factor(system.reduced(state, 0.0)[0])
     except np.linalg.LinAlgError:

@@ -8,6 +8,7 @@ import numpy as np
 
 from skyquilt.alignment.adjust import covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
+from skyquilt.alignment.determined import weak_photos
 from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
@@ -54,7 +55,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 30
+    version: ClassVar[int] = 31
 
     def __call__(
         self,
@@ -89,10 +90,12 @@ class Bundle:
             found = block(aside)
         except AlignmentError:
             aside, found = frozenset(), block(frozenset())
-        if self.repair and (more := found_oblique(found, priors) - aside):
+        weak = weak_photos(found, priors)
+        if self.repair and (more := found_oblique(found, weak, priors) - aside):
             aside |= more
             found = block(aside)
-        return hung(found, photos, priors, features, links, aside)
+            weak = weak_photos(found, priors)
+        return hung(found, weak, photos, priors, features, links, aside)
 
     def _block(
         self,

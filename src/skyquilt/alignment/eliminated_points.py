@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from skyquilt.alignment.robust import observation_weights, point_terms
 from skyquilt.geometry.block_cholesky import Index
 
 Array = NDArray[np.float64]
-ELIMINATED = 160
+ELIMINATED = 320
 """Observations whose points are eliminated at once, about: few enough to be of few photos."""
 
 
@@ -49,30 +48,6 @@ class Normal:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class PointTies:
-    """What the step of a part's points needs of its equations, given that of photos and cameras.
-
-    In single precision: the points are polished after the step.
-    """
-
-    V: Array
-    """(P, 3, 3) point blocks."""
-    gv: Array
-    """(P, 3) gradient."""
-    Wp: NDArray[np.float32]
-    """(N, p, 3) photo-point blocks."""
-    Wc: NDArray[np.float32]
-    """(N, q, 3) camera-point blocks."""
-
-
-def ties_of(normal: Normal) -> PointTies:
-    """What the step of the points needs of these equations."""
-    return PointTies(
-        V=normal.V, gv=normal.gv, Wp=normal.Wp.astype(np.float32), Wc=normal.Wc.astype(np.float32)
-    )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
 class Reduced:
     """What a part's observations say of photos and cameras, its points eliminated. The unknowns of
     its s photos come first, then those of all m cameras.
@@ -96,8 +71,6 @@ class Reduced:
     """(q m, q m) the same of cameras."""
     gradient: Array
     """(p s + q m,) gradient."""
-    ties: PointTies | None
-    """What the step of the points needs, if it is asked for."""
 
 
 def sums_by_point(problem: Problem, values: Array, count: int) -> Array:
@@ -190,56 +163,54 @@ def points_inverse(blocks: Array, damping: float) -> Array:
     return out
 
 
-def points_step(
-    part: Problem, ties: PointTies, damping: float, photos: Array, cameras: Array
+def points_solved(
+    problem: Problem, state: State, rows: Array, weight: Array, damping: float
 ) -> Array:
-    """The step (P, 3) of a part's points with that of photos (n, p) and cameras (m, 10)."""
-    coupled = np.einsum("nij,ni->nj", ties.Wp, photos[part.photo])
-    if ties.Wc.shape[1]:
-        coupled += np.einsum("nij,ni->nj", ties.Wc, cameras[part.camera[part.photo]])
-    L_inv = points_inverse(ties.V, damping)
-    rhs = ties.gv + sums_by_point(part, coupled, len(ties.V))
-    half = np.einsum("pij,pj->pi", L_inv, rhs)
+    """The step (P, 3) of points that equations rows (N, 2, 4) ask for: derivatives by the point,
+    and residuals. `weight` (N,): of the observations; priors on points count, too.
+
+    Raises:
+        LinAlgError: a point is not determined.
+    """
+    rows = rows * np.sqrt(weight)[:, None, None]
+    sums = sums_by_point(problem, np.swapaxes(rows[:, :, :3], 1, 2) @ rows, len(state.X))
+    precision, apart = point_terms(problem, state)
+    V = sums[:, :, :3]
+    add_diagonal(V, precision + 1e-9)
+    L_inv = points_inverse(V, damping)
+    half = np.einsum("pij,pj->pi", L_inv, sums[:, :, 3] + precision * apart)
     return np.asarray(-np.einsum("pji,pj->pi", L_inv, half))
 
 
-def reduced_part(given: tuple[Problem, State, float, bool]) -> Reduced:
+def points_step(
+    part: Problem, state: State, damping: float, photos: Array, cameras: Array
+) -> Array:
+    """The step (P, 3) of a part's points that goes with that of all photos (n, p) and of the
+    cameras (m, 10).
+    """
+    lin = linearise(part, state)
+    weight, _ = observation_weights(part, lin.residual)
+    moved = lin.residual + np.einsum("nij,nj->ni", lin.J_photo, photos[part.photo])
+    if lin.J_camera.shape[2]:
+        moved += np.einsum("nij,nj->ni", lin.J_camera, cameras[part.camera[part.photo]])
+    rows = np.concatenate([lin.J_point, moved[..., None]], 2)
+    return points_solved(part, state, rows, weight, damping)
+
+
+def reduced_part(given: tuple[Problem, State, float]) -> Reduced:
     """The equations of a part of the observations, its points eliminated: of (part, its state,
-    damping, whether the step of its points will be asked for).
+    damping).
     """
-    part, state, damping, stepped = given
+    part, state, damping = given
     normal = observation_equations(part, state)
-    pair, tied, gradient = _eliminated(part, normal, damping)
-    (s, p), m = normal.gp.shape, len(normal.gc)
-    q = normal.gc.shape[1]
-    i, j = pair
-    return Reduced(
-        seen=normal.seen,
-        U=normal.U,
-        Uc=normal.Uc,
-        pair=pair,
-        tied=tied[: p * s, : p * s].reshape(s, p, s, p)[i, :, j],
-        beside=tied[: p * s, p * s :].reshape(s, p, q * m),
-        corner=tied[p * s :, p * s :],
-        gradient=gradient,
-        ties=ties_of(normal) if stepped else None,
-    )
-
-
-def _eliminated(part: Problem, normal: Normal, damping: float) -> tuple[Index, Array, Array]:
-    """`pair` of a part, the matrix (p s + q m, p s + q m) of all its photos and cameras, and
-    `gradient`.
-    """
     L_inv = points_inverse(normal.V, damping)
     z = np.einsum("pij,pj->pi", L_inv, normal.gv)
-    (p, q), (s, m) = (normal.Wp.shape[1], normal.Wc.shape[1]), (len(normal.seen), len(normal.Uc))
-    tied = np.zeros((p * s + q * m,) * 2)
-    gradient = np.concatenate([normal.gp.ravel(), normal.gc.ravel()])
+    (s, p), (m, q) = normal.gp.shape, normal.gc.shape
     camera = part.camera[normal.seen]
     together = np.zeros((s, s), np.bool_)
-    if q:
-        rows = np.arange(p * s).reshape(s, p, 1)
-        tied[rows, p * s + q * camera[:, None, None] + np.arange(q)] = normal.Upc
+    tied, beside, corner = np.zeros((s, s, p, p)), np.zeros((s, p, m, q)), np.zeros((m, q, m, q))
+    beside[np.arange(s), :, camera] = normal.Upc
+    gradient, of_cameras = normal.gp.copy(), normal.gc.copy()
     for lo, hi in pairwise(part.cuts(ELIMINATED)):
         point, row = part.point[lo:hi], normal.row[lo:hi]
         first, last = int(point[0]), int(point[-1]) + 1
@@ -252,13 +223,31 @@ def _eliminated(part: Problem, normal: Normal, damping: float) -> tuple[Index, A
         photos[local, :, point - first] = normal.Wp[lo:hi] @ T
         if q:
             cameras = rows[p * n :].reshape(c, q, last - first, 3)
-            place: Any = (cam_of[local], slice(None), point - first)
-            np.add.at(cameras, place, normal.Wc[lo:hi] @ T)
+            starts = np.flatnonzero(np.r_[True, np.diff(point) != 0])
+            coupled = normal.Wc[lo:hi] @ T
+            for k in range(c):
+                own = coupled if c == 1 else coupled * (cam_of[local] == k)[:, None, None]
+                sums = np.add.reduceat(own, starts)
+                cameras[k][:, point[starts] - first] = np.swapaxes(sums, 0, 1)
         flat = rows.reshape(len(rows), -1)
+        product, step = flat @ flat.T, flat @ z[first:last].ravel()
         together[some[:, None], some] = True
-        own = (p * some[:, None] + np.arange(p)).ravel()
-        theirs = p * s + (q * cams[:c, None] + np.arange(q)).ravel()
-        at = np.concatenate([own, theirs])
-        tied[at[:, None], at] -= flat @ flat.T
-        gradient[at] -= flat @ z[first:last].ravel()
-    return np.stack(np.nonzero(np.triu(together))), tied, gradient
+        blocks = product[: p * n, : p * n].reshape(n, p, n, p)
+        tied[some[:, None], some] -= np.swapaxes(blocks, 1, 2)
+        gradient[some] -= step[: p * n].reshape(n, p)
+        for k, cam in enumerate(cams[:c].tolist()):
+            at = slice(p * n + q * k, p * n + q * k + q)
+            beside[some, :, cam] -= product[: p * n, at].reshape(n, p, q)
+            of_cameras[cam] -= step[at]
+            corner[cam][:, cams] -= product[at, p * n :].reshape(q, c, q)
+    pair = np.stack(np.nonzero(np.triu(together)))
+    return Reduced(
+        seen=normal.seen,
+        U=normal.U,
+        Uc=normal.Uc,
+        pair=pair,
+        tied=tied[pair[0], pair[1]],
+        beside=beside.reshape(s, p, m * q),
+        corner=corner.reshape(m * q, m * q),
+        gradient=np.concatenate([gradient.ravel(), of_cameras.ravel()]),
+    )

@@ -4,21 +4,10 @@ Observations are taken in parts of whole points: what a part says of photos and 
 one sparse matrix, and then forgotten. So memory holds the matrix, not the equations.
 """
 
-from collections import deque
-from collections.abc import Iterator
-
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.eliminated_points import (
-    PointTies,
-    Reduced,
-    add_diagonal,
-    observation_equations,
-    points_step,
-    reduced_part,
-    ties_of,
-)
+from skyquilt.alignment.eliminated_points import Reduced, add_diagonal, points_step, reduced_part
 from skyquilt.alignment.problem import CAMERA, Problem, State
 from skyquilt.alignment.robust import position_terms, prior_terms
 from skyquilt.engine.workers import HERE, Workers
@@ -26,10 +15,6 @@ from skyquilt.geometry.block_cholesky import LEAF, Factor, Index, Matrix, patter
 from skyquilt.geometry.conjugate_gradients import conjugate_gradients
 
 Array = NDArray[np.float64]
-KEPT = 600_000
-"""Observations whose points are kept tied to photos and cameras (0.25 kB each) between the step of
-these and that of the points; those of larger problems are computed again.
-"""
 FACTORED = 600
 """Photos up to which the equations of each step are factored. Beyond, factors take longer than
 equations: there one serves many steps, which are solved by conjugate gradients.
@@ -90,7 +75,7 @@ class NearFactor:
         """The factor; None if no step was made yet."""
         if self._made is None and self._of is not None:
             problem, state, damping, workers = self._of
-            equations = Equations(problem, state, workers, steps=False)
+            equations = Equations(problem, state, workers)
             self._made = Factor(equations.reduced(state, damping)[0])
         return self._made
 
@@ -105,27 +90,16 @@ class Equations:
         workers: Workers = HERE,
         *,
         near: NearFactor | None = None,
-        steps: bool = True,
     ) -> None:
-        """`workers` compute the equations of the parts; `near`: a factor of nearly these equations.
-        `steps`: steps will be computed, too.
+        """`workers` compute the equations of the parts; `near`: a factor of nearly these
+        equations.
         """
         self.problem, self.workers, self.near = problem, workers, near
-        self.kept = steps and len(problem.px) <= KEPT
         self.n, self.m = len(state.C), len(state.K)
         self.p = problem.photo_unknowns
         self.q = CAMERA if problem.free.any() else 0
         border = self.q * self.m + (3 if problem.offset else 0)
         self.pattern = pattern(state.C[:, :2], self.p, border, *_together(problem))
-        self._ties: list[tuple[Problem, PointTies]] = []
-
-    def _point_ties(self, state: State) -> Iterator[tuple[Problem, PointTies]]:
-        """Those of the points of each part, kept since `reduced` unless the problem is large."""
-        if self.kept:
-            yield from self._ties
-            return
-        for part, own, _ in self.problem.parts(state):
-            yield part, ties_of(observation_equations(part, own))
 
     def step(self, state: State, damping: float) -> tuple[Array, Array, Array]:
         """The Gauss-Newton step of photos (n, p), cameras (m, 10) and points (P, 3).
@@ -139,10 +113,11 @@ class Equations:
         if self.q:
             cameras = du[photos : photos + CAMERA * self.m].reshape(-1, CAMERA)
         placed = du[:photos].reshape(-1, self.p)
+        # here: sharing them out would take as long
         points = np.concatenate(
             [
-                points_step(part, ties, damping, placed, cameras)
-                for part, ties in self._point_ties(state)
+                points_step(part, own, damping, placed, cameras)
+                for part, own, _ in self.problem.parts(state)
             ]
         )
         return placed, cameras, points
@@ -177,18 +152,8 @@ class Equations:
         )
         g, gc = priors.photo_gradient[:, :p].copy(), np.zeros(pat.border)
         gc[: q * m] = priors.camera_gradient[:, :q].ravel()
-        self._ties.clear()
-        asked: deque[Problem] = deque()
-
-        def parts() -> Iterator[tuple[Problem, State, float, bool]]:
-            for part, own, _ in self.problem.parts(state):
-                asked.append(part)
-                yield part, own, damping, self.kept
-
-        for found in self.workers.each(reduced_part, parts()):
-            part = asked.popleft()
-            if found.ties is not None:
-                self._ties.append((part, found.ties))
+        parts = ((part, own, damping) for part, own, _ in self.problem.parts(state))
+        for found in self.workers.each(reduced_part, parts):
             U[found.seen] += found.U
             Uc += found.Uc
             self._add(out, found)

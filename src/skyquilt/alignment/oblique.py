@@ -6,14 +6,14 @@ bend the block. They are placed by resection on its tie points instead: three po
 all others (Fischler and Bolles 1981), refined by least squares, the block held.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.determined import STATED_DEG, least_covered, weak_photos, why_weak, without
+from skyquilt.alignment.determined import STATED_DEG, least_covered, why_weak, without
 from skyquilt.alignment.pose import reported_camera
 from skyquilt.geometry.camera import project, undistort
 from skyquilt.geometry.frames import cam_R_map_from_angles
@@ -62,19 +62,22 @@ def tilts_reported(priors: Sequence[Prior]) -> bool:
     return any(p.sigma_tilt_deg <= STATED_DEG for p in priors)
 
 
-def found_oblique(alignment: Alignment, priors: Sequence[Prior]) -> frozenset[int]:
+def found_oblique(
+    alignment: Alignment, weak: Mapping[int, str], priors: Sequence[Prior]
+) -> frozenset[int]:
     """Photos without reported tilt that the adjustment turned far from the vertical, and those that
-    it could not hold; none if most are.
+    it could not hold; none if most are. `weak`: those that are not determined.
     """
     linked = [*alignment.held, *alignment.rejected]
     found = {i for i in alignment.held if tilt_deg(alignment.poses[i].cam_R_map) > OBLIQUE_DEG}
-    found |= alignment.rejected.keys() | weak_photos(alignment, priors).keys()
+    found |= alignment.rejected.keys() | weak.keys()
     guessed = {i for i in found if priors[i].sigma_tilt_deg > STATED_DEG}
     return frozenset(guessed if len(guessed) <= MOST_OBLIQUE * len(linked) else ())
 
 
 def hung(
     alignment: Alignment,
+    weak: Mapping[int, str],
     photos: Sequence[Photo],
     priors: Sequence[Prior],
     features: Sequence[Features],
@@ -82,9 +85,8 @@ def hung(
     aside: frozenset[int],
 ) -> Alignment:
     """The alignment with the photos kept aside placed by its tie points, the best linked first, and
-    without those that hang on it by too little.
+    without those that hang on it by too little (`weak`, with reasons: `determined.weak_photos`).
     """
-    weak = weak_photos(alignment, priors)
     alignment = _without(alignment, weak)
     left = set(aside)
     while left:
@@ -96,7 +98,7 @@ def hung(
     return alignment
 
 
-def _without(alignment: Alignment, gone: dict[int, str]) -> Alignment:
+def _without(alignment: Alignment, gone: Mapping[int, str]) -> Alignment:
     if not gone:
         return alignment
     return replace(
@@ -106,7 +108,7 @@ def _without(alignment: Alignment, gone: dict[int, str]) -> Alignment:
             b for old in alignment.blocks if (b := tuple(i for i in old if i not in gone))
         ),
         ties=without(alignment.ties, gone),
-        rejected=alignment.rejected | gone,
+        rejected={**alignment.rejected, **gone},
     )
 
 

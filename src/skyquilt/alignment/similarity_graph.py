@@ -104,7 +104,12 @@ def _solve_differences(
     B = sparse.csr_matrix((np.r_[w, -w], (np.r_[rows, rows], np.r_[j, i])), (len(i), count))
     normal = (B.T @ B + sparse.diags(wa**2)).tocsc()
     rhs = B.T @ (w * d) + wa**2 * anchor
-    return np.asarray(sparse_linalg.splu(normal.astype(complex)).solve(rhs))
+    # symmetric and positive definite: an order for such matrices, and no pivots
+    factor = sparse_linalg.splu(
+        normal, "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+    x = factor.solve(np.column_stack([rhs.real, rhs.imag]))
+    return np.asarray(x[:, 0] + 1j * x[:, 1])
 
 
 def _solve_small(

@@ -20,8 +20,10 @@ ROLLS_PX = 0.3
 """Cameras that move by more than this in px of the photo while a photo is read out turn, too."""
 TURN_RAD_S = np.radians(1.5)
 """Deviation of the rates at which they turn, in rad/s; it makes up for errors of velocities too."""
-ASKED = 160
-"""Photos that tell whether the cameras of a large survey stood still while they exposed."""
+ASKED, PLACES = 160, 4
+"""Photos of a large survey that tell its cameras' first intrinsics, and whether these stood still
+while they exposed; and the places where they were taken. Each camera has one place at least.
+"""
 DOUBTED = 2.5
 """Positions that a block misses by more than this many deviations are not what they claim."""
 
@@ -33,8 +35,16 @@ twenty photos is itself known to a fifth.
 
 def rough(problem: Problem, state: State, keep: Keep = MADE_NOW) -> tuple[Problem, State]:
     """First stage: intrinsics fixed under a wide loss, then all free under a narrower one; outliers
-    are removed in between.
+    are removed in between. The whole of a large survey begins with the intrinsics that some of its
+    photos show, and takes a third of the steps.
     """
+    if _is_large(problem):
+        its = _roughly(*problem.among(_places_of(problem, state), state), MADE_NOW)[1]
+        state = replace(state, K=its.K)
+    return _roughly(problem, state, keep)
+
+
+def _roughly(problem: Problem, state: State, keep: Keep) -> tuple[Problem, State]:
     fixed = replace(problem, free=np.zeros_like(problem.free), loss_px=20.0)
     part = keep.within("fixed")
     state = adjust(fixed, state, iterations=10, tolerance=3e-2, keep=part).state
@@ -68,12 +78,12 @@ def weighed(
     """
     problem = replace(problem, sigma_px=problem.sigma_px * problem.relative, relative=1.0)
     sizes, near = setup.size[setup.members], NearFactor()
-    rolls, many = _rolls(problem, state), len(state.C) > 2 * ASKED
+    rolls, many = _rolls(problem, state), _is_large(problem)
     if rolls:
         readout = np.abs(state.K[problem.camera, READOUT])
         problem = replace(problem, sigma_turn=np.maximum(TURN_RAD_S * readout, 1e-9))
     if rolls and many:
-        chosen = _places_of(state)
+        chosen = _places_of(problem, state)
         some, its = problem.among(chosen, state)
         some, its = _reweighed(some, its, sizes[chosen], MADE_NOW, NearFactor())
         if _standing(some, its, MADE_NOW, NearFactor())[0] is not some:
@@ -144,11 +154,23 @@ def _still(problem: Problem, state: State) -> tuple[Problem, State]:
     return still, replace(state, K=K, turn=np.zeros_like(state.turn))
 
 
-def _places_of(state: State) -> NDArray[np.int64]:
-    """ASKED photos, neighbours at four places that were flown over at four times."""
-    middles = (np.arange(4) * 2 + 1) * len(state.C) // 8
-    apart = np.linalg.norm(state.C[:, None, :2] - state.C[middles, :2], axis=2)
-    return np.unique(np.argsort(apart, axis=0, kind="stable")[: ASKED // 4])
+def _is_large(problem: Problem) -> bool:
+    """Whether some photos are asked first: they are few beside all."""
+    return len(problem.camera) > 2 * ASKED * max(1.0, len(problem.K0) / PLACES)
+
+
+def _places_of(problem: Problem, state: State) -> NDArray[np.int64]:
+    """Photos that stand for all: of each camera neighbours at places that were flown over at
+    different times.
+    """
+    chosen, places = [], max(1, PLACES // len(problem.K0))
+    for camera in range(len(problem.K0)):
+        own = np.flatnonzero(problem.camera == camera)
+        middles = own[(np.arange(places) * 2 + 1) * len(own) // (2 * places)]
+        apart = np.linalg.norm(state.C[own, None, :2] - state.C[middles, :2], axis=2)
+        near = np.argsort(apart, axis=0, kind="stable")[: ASKED // PLACES]
+        chosen.append(own[near].ravel())
+    return np.unique(np.concatenate(chosen))
 
 
 def heights_above(state: State) -> Array:

@@ -224,7 +224,8 @@ def build_tracks(
     `sigma`: standard deviation of a keypoint in px of the image it was found in. `thinning`: only
     some of the tracks are wanted.
     """
-    used, photo, point, offset = _joined(features, links)
+    offset, scales, place = _places(features)
+    used, photo, point = _joined(offset, place, links)
 
     def px_of(some: Index) -> NDArray[np.float64]:
         """Of observations sorted by photo."""
@@ -241,25 +242,23 @@ def build_tracks(
     by_photo = np.argsort(photo, kind="stable")
     px = np.empty((len(used), 2))
     px[by_photo] = px_of(by_photo)
-    scales = np.array([f.scale for f in features])
     return Tracks(point=point, photo=photo, px=px, sigma_px=np.maximum(sigma * scales[photo], 0.3))
 
 
 def _joined(
-    features: Sequence[Features], links: Sequence[Link]
+    offset: Index, place: list[NDArray[np.int32]], links: Sequence[Link]
 ) -> tuple[NDArray[np.integer[Any]], ...]:
     """Observations by track, as `build_tracks` describes: the feature of each in the list of all
-    (N,), its photo (N,), its track (N,) ascending; and where each photo's features begin in that
-    list (photos + 1,).
+    (N,), its photo (N,), and its track (N,) ascending. `offset`, `place` as `_places` gives them;
+    the latter is emptied.
     """
-    offset, place = _places(features)
     kind = _index_type(int(offset[-1]))
     ends = np.cumsum([0, *(len(k) for k in links)])
     a, b = np.empty(ends[-1], kind), np.empty(ends[-1], kind)
     for link, (lo, hi) in zip(links, pairwise(ends.tolist()), strict=True):
         a[lo:hi] = offset[link.a] + place[link.a][link.index_a]
         b[lo:hi] = offset[link.b] + place[link.b][link.index_b]
-    del place
+    place.clear()
     linked = np.zeros(offset[-1], bool)  # most features are in no link
     linked[a] = linked[b] = True
     used = np.flatnonzero(linked).astype(kind)
@@ -276,7 +275,7 @@ def _joined(
     good = ~wrong[track]
     used, photo, track = used[good], photo[good], track[good]
     order, point = _by_photos(track, photo)
-    return used[order], photo[order], point.astype(kind), offset
+    return used[order], photo[order], point.astype(kind)
 
 
 def _renumbered(point: NDArray[np.integer[Any]]) -> NDArray[np.integer[Any]]:
@@ -284,18 +283,21 @@ def _renumbered(point: NDArray[np.integer[Any]]) -> NDArray[np.integer[Any]]:
     return np.cumsum(np.r_[False, np.diff(point) != 0], dtype=point.dtype)[: len(point)]
 
 
-def _places(features: Sequence[Features]) -> tuple[Index, list[NDArray[np.int32]]]:
-    """Where each photo's features begin in the list of all (photos + 1,), and of each photo for
-    every feature the first one at the same place.
+def _places(
+    features: Sequence[Features],
+) -> tuple[Index, NDArray[np.float64], list[NDArray[np.int32]]]:
+    """Where each photo's features begin in the list of all (photos + 1,), their scale (photos,),
+    and of each photo for every feature the first one at the same place.
     """
-    parts, begin = list[NDArray[np.int32]](), [0]
+    parts, begin, scales = list[NDArray[np.int32]](), [0], list[float]()
     for photo in features:
         _, first, which = np.unique(
             photo.px[:, 0] + 1j * photo.px[:, 1], return_index=True, return_inverse=True
         )
         parts.append(first.astype(np.int32)[which])
         begin.append(begin[-1] + len(photo))
-    return np.array(begin, np.int64), parts
+        scales.append(photo.scale)
+    return np.array(begin, np.int64), np.array(scales), parts
 
 
 def _by_photos(track: Index, photo: Index) -> tuple[Index, Index]:

@@ -1,5 +1,6 @@
 """Heights where none were measured: gaps are filled, and the rim goes over to a plane."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import cv2
@@ -18,6 +19,12 @@ columns that fill what is further away.
 """
 AT_ONCE = 1_000_000
 """Cells whose surroundings are looked at at once, about."""
+BAND = 1024
+"""Rows of heights that are levelled at a time."""
+FIRM = 0.25
+"""Share of the cells around with a height of their own from which these are believed."""
+LEVEL = 5
+"""Side in cells of the window in which heights are smoothed."""
 STIFF = 0.002
 """Weight of a prior of zero for the slope of a plane."""
 
@@ -52,36 +59,40 @@ def _mean(total: Float, weight: Float) -> Float:
     return np.asarray(total / np.maximum(weight, 1e-6), np.float32)
 
 
-def settled(z: Float, support: Mask, reach: float, width: float) -> Float:
-    """Heights (h, w) that go over to the local plane beyond their support.
-
-    Up to `reach` cells from the support they are kept; over the next `width` cells they become the
-    plane fitted to the supported heights around, whose slope is drawn towards zero where few
-    determine it. So what a rim shows is a photo on a plane, not on heights continued from a few
-    points.
+def settled(z: Float, support: Mask) -> Float:
+    """Heights (h, w) that beyond their support are those of the local plane: fitted to the
+    supported heights around, its slope drawn towards zero where few determine it. So what a rim
+    shows is a photo on a plane, not on heights continued from a few points. The array itself is
+    changed, and returned.
     """
     if support.all() or not support.any():
         return z
-    away = cv2.distanceTransform((~support).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    share = np.clip((away - reach) / max(width, 1e-6), 0, 1)
-    share = share * share * (3 - 2 * share)
-    return np.asarray((1 - share) * z + share * _planes(z, support), np.float32)
+    plane = _planes(z, support)
+    columns = _between(z.shape[1], plane.shape[1])
+    for row in range(0, len(z), STRIP):
+        rows = slice(row, row + STRIP)
+        beyond = ~support[rows]
+        if beyond.any():
+            z[rows][beyond] = (_between(len(z), len(plane))[rows] @ plane @ columns.T)[beyond]
+    return z
 
 
 def _planes(z: Float, support: Mask) -> Float:
-    """(h, w) at each cell the height of a plane fitted to the supported heights around it, by
-    weighted least squares.
+    """Heights of planes fitted to the supported heights around each cell of a raster of at most
+    COARSE cells a side, by weighted least squares.
     """
     h, w = z.shape
     factor = max(1.0, max(h, w) / COARSE)
-    small: Any = (max(2, round(w / factor)), max(2, round(h / factor)))
-    weight = cv2.resize(support.astype(np.float32), small, interpolation=cv2.INTER_AREA)
-    mean = cv2.resize(
-        np.where(support, z, 0).astype(np.float32), small, interpolation=cv2.INTER_AREA
-    )
+    small = (max(2, round(h / factor)), max(2, round(w / factor)))
+    down, across = _shares(h, small[0]), _shares(w, small[1]).T
+    weight, mean = np.zeros(small, np.float32), np.zeros(small, np.float32)
+    for row in range(0, h, STRIP):
+        rows = slice(row, row + STRIP)
+        weight += down[:, rows] @ (support[rows].astype(np.float32) @ across)
+        mean += down[:, rows] @ (np.where(support[rows], z[rows], np.float32(0)) @ across)
     base = float(mean.sum() / weight.sum())
     total = mean - base * weight
-    y, x = np.mgrid[: small[1], : small[0]].astype(np.float32) / COARSE
+    y, x = np.mgrid[: small[0], : small[1]].astype(np.float32) / COARSE
 
     def spread(part: NDArray[Any]) -> NDArray[np.float64]:
         # a wide and a very wide surrounding: the second only counts where the first is empty
@@ -99,8 +110,21 @@ def _planes(z: Float, support: Mask) -> Float:
     mx, my = spread(total * x) / mass - cx * m, spread(total * y) / mass - cy * m
     det = vxx * vyy - vxy * vxy
     sx, sy = (vyy * mx - vxy * my) / det, (vxx * my - vxy * mx) / det
-    plane = base + m + sx * (x - cx) + sy * (y - cy)
-    return np.asarray(cv2.resize(plane.astype(np.float32), (w, h), interpolation=cv2.INTER_LINEAR))
+    return np.asarray(base + m + sx * (x - cx) + sy * (y - cy), np.float32)
+
+
+def _shares(n: int, small: int) -> Float:
+    """(small, n) weights of means over `small` equal ranges of n cells."""
+    ends = np.linspace(0, n, small + 1)
+    inside = np.minimum(ends[1:, None], np.arange(1, n + 1))
+    inside -= np.maximum(ends[:-1, None], np.arange(n))
+    return np.asarray(np.maximum(inside, 0) * (small / n), np.float32)
+
+
+def _between(n: int, small: int) -> Float:
+    """(n, small) weights of linear interpolation between `small` ranges of n cells."""
+    place = np.clip((np.arange(n) + 0.5) * (small / n) - 0.5, 0, small - 1)
+    return np.asarray(np.maximum(1 - np.abs(place[:, None] - np.arange(small)), 0), np.float32)
 
 
 def nearest_known(z: Float, known: Mask) -> Float:
@@ -147,12 +171,45 @@ def _nearest(z: Float, known: Mask) -> tuple[Float, Float]:
     return out, np.asarray(away, np.float32)
 
 
-def plateaus(z: Float, side: int) -> Float:
-    """Medians of heights (h, w) over windows of `side` cells, an odd number, to a 255th of their
-    range: crowns become level, and cliffs stay.
+def crowns(z: Float, known: Mask, side: int, step: float) -> Float:
+    """Heights (h, w) without gaps, measured where `known`: where this is a small share of the cells
+    around, as in leaves, they are those of whole crowns, closed and level over windows of `side`
+    cells (an odd number) except at cliffs of more than `step` m. The array itself is changed, and
+    returned.
     """
-    low, span = float(z.min()), max(float(np.ptp(z)), 1e-6)
-    levels = np.rint((z - low) * (255 / span)).astype(np.uint8)
+    closed = np.empty_like(z)
+    kernel = np.ones((side, side), np.uint8)
+    for rows, around, inner in bands(len(z), side):
+        closed[rows] = cv2.morphologyEx(z[around], cv2.MORPH_CLOSE, kernel)[inner]
+    low, span = float(closed.min()), max(float(np.ptp(closed)), 1e-6)
+    done: tuple[slice, Any] = (slice(0), z[:0])
+    for rows, around, inner in bands(len(z), side // 2 + LEVEL):
+        levels = plateaus(closed[around], side, low, span)
+        level = cv2.bilateralFilter(levels, LEVEL, step, 2.0)
+        share = cv2.boxFilter(known[around].view(np.uint8), cv2.CV_32F, (LEVEL, LEVEL))
+        clear = cv2.medianBlur(z[around], LEVEL)
+        z[done[0]] = done[1]  # the next band still looks at what this one was
+        done = rows, np.where(share > FIRM, clear, level)[inner]
+    z[done[0]] = done[1]
+    return z
+
+
+def bands(height: int, beyond: int) -> Iterator[tuple[slice, slice, slice]]:
+    """The rows of a raster in bands: which these are, these with `beyond` more on either side, and
+    the band's own among those.
+    """
+    for row in range(0, height, BAND):
+        rows = slice(row, min(row + BAND, height))
+        first = max(0, row - beyond)
+        around = slice(first, min(rows.stop + beyond, height))
+        yield rows, around, slice(row - first, rows.stop - first)
+
+
+def plateaus(z: Float, side: int, low: float, span: float) -> Float:
+    """Medians of heights (h, w) over windows of `side` cells, an odd number, to a 255th of their
+    range, which begins at `low` and is `span` m wide: crowns become level, and cliffs stay.
+    """
+    levels = np.rint((z - np.float32(low)) * np.float32(255 / span)).astype(np.uint8)
     return np.asarray(cv2.medianBlur(levels, side) * np.float32(span / 255) + low, np.float32)
 
 

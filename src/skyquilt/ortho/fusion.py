@@ -9,16 +9,13 @@ from numpy.typing import NDArray
 
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import STRIP, Surface
+from skyquilt.ortho.fill import FIRM, bands
 
 Array = NDArray[np.float64]
 Float = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Cells = tuple[NDArray[np.int32], Float]
 """Numbers (n,) of cells of a grid, row by row, and their heights (n,) in m."""
-BAND = 1024
-"""Rows of cells whose fine and coarse heights are joined at a time."""
-FIRM = 0.25
-"""Share of the cells around with a fine height from which these are believed."""
 
 
 def inside(heights: Cells, width: int, row: int, column: int, h: int, w: int) -> Cells:
@@ -81,15 +78,11 @@ def with_coarse(z: Float, known: Mask, rough: Surface, cells: Grid, side: int) -
     """
     x, y = cells.x(np.arange(cells.width)), cells.y(np.arange(cells.height))
     out = np.empty((cells.height, cells.width), np.float32)[::-1]  # as `surface_of` turns it
-    halo = side // 2 + 1
-    for row in range(0, cells.height, BAND):
-        first = max(0, row - halo)
-        around = slice(first, row + BAND + halo)
-        inner = slice(row - first, min(row + BAND, cells.height) - first)
+    for rows, around, inner in bands(cells.height, side // 2 + 1):
         share = cv2.boxFilter(known[around].view(np.uint8), cv2.CV_32F, (side, side))
         former = cv2.medianBlur(_stepwise(rough, x, y[around]), 3)
         fine = cv2.medianBlur(z[around], 3)
-        out[row : row + BAND] = np.where(share > FIRM, fine, former)[inner]
+        out[rows] = np.where(share > FIRM, fine, former)[inner]
     return out
 
 

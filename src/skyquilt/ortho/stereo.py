@@ -21,9 +21,8 @@ from skyquilt.geometry.neighbours import pairs_within
 from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid, meet
 from skyquilt.model.surface import Surface, least_cell
-from skyquilt.ortho.fill import lowered, nearest_known, plateaus, settled
+from skyquilt.ortho.fill import crowns, lowered, nearest_known, settled
 from skyquilt.ortho.fusion import (
-    FIRM,
     Cells,
     agreed,
     inside,
@@ -108,7 +107,7 @@ class Stereo:
     """The ratio that is preferred."""
     cell_px: tuple[int, int] = (4, 8)
     """Least and greatest side of a cell in map pixels."""
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
 
     def __call__(
         self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep
@@ -178,22 +177,16 @@ class Stereo:
         known = without_specks(z, 0.02 * height, 12)
         if not known.any():
             return surface, known
-        # where only some places agree, as in leaves, heights are those of whole crowns
-        firm = cv2.boxFilter(known.astype(np.float32), -1, (5, 5)) > FIRM
-        whole = nearest_known(z, known)
+        del given  # large surveys have rasters of 100 MB
         side = 2 * round(self.whole * height / cells.gsd) + 1
-        kernel = np.ones((side, side), np.uint8)
-        closed = np.asarray(cv2.morphologyEx(whole, cv2.MORPH_CLOSE, kernel), np.float32)
-        level = cv2.bilateralFilter(plateaus(closed, side), 5, 0.02 * height, 2.0)
-        whole = np.where(firm, cv2.medianBlur(whole, 5), level)
+        whole = crowns(nearest_known(z, known), known, side, 0.02 * height)
         around = cv2.morphologyEx(
             known.astype(np.uint8),
             cv2.MORPH_CLOSE,
             cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (15, 15)),
         )
         # at once: photos drawn on a slope between crowns and the plane would become streaks
-        whole = settled(np.asarray(whole, np.float32), around > 0, 0.0, 1.0)
-        return surface_of(whole, cells), known
+        return surface_of(settled(whole, around > 0), cells), known
 
     def pairs(self, views: Sequence[View], height: float, wanted: int) -> list[tuple[View, View]]:
         """The pairs that are matched, of photos `height` m above ground: those with good baselines
