@@ -210,7 +210,7 @@ class Composer:
         """The nodes of photos over a piece at its place in the map; closer ones where heights bend
         between them.
         """
-        if not self.detailed or self.surface.cell >= STEP * self.grid.gsd:
+        if not self._fine:
             return cuts
         step = FINE[self.surface.cell >= FINE[1] * self.grid.gsd * 0.99]
         x, y, z = node_places(self.grid, self.surface, place, step)
@@ -222,8 +222,7 @@ class Composer:
         size = (step * (z.shape[0] - 2), step * (z.shape[1] - 2))
         middle = slice(step // 2, None, step)
         bent = np.abs(z[1:-1, 1:-1] - densify(straight, *size)[middle, middle]).max()
-        aside = max(float(n.score.max()) for n in cuts)
-        if bent * np.sqrt(aside) <= BENT * self.grid.gsd:
+        if not self._shifts(float(bent), cuts):
             return cuts
         return [replace(project_nodes(n.view, x, y, z), step=step) for n in cuts]
 
@@ -231,13 +230,20 @@ class Composer:
         """The heights of the pixels of a piece that these photos show; None where they do not step,
         or shift no photo visibly.
         """
-        if not self.detailed or self.surface.cell >= STEP * self.grid.gsd:
+        if not self._fine:
             return None
         found = stepped_heights(self.grid, self.surface, place, [n.view for n in cuts])
-        if found is None:
-            return None
+        return found if found is not None and self._shifts(found.range_m, cuts) else None
+
+    @property
+    def _fine(self) -> bool:
+        """Whether photos are drawn on heights finer than the nodes."""
+        return self.detailed and self.surface.cell < STEP * self.grid.gsd
+
+    def _shifts(self, height_m: float, cuts: Sequence[Nodes]) -> bool:
+        """Whether such a difference in height shifts one of these photos visibly."""
         aside = max(float(n.score.max()) for n in cuts)
-        return None if found.range_m * np.sqrt(aside) <= BENT * self.grid.gsd else found
+        return bool(height_m * np.sqrt(aside) > BENT * self.grid.gsd)
 
     def _layer(
         self,

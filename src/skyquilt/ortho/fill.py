@@ -68,12 +68,12 @@ def settled(z: Float, support: Mask) -> Float:
     if support.all() or not support.any():
         return z
     plane = _planes(z, support)
-    columns = _between(z.shape[1], plane.shape[1])
+    down, across = (_between(n, small) for n, small in zip(z.shape, plane.shape, strict=True))
     for row in range(0, len(z), STRIP):
         rows = slice(row, row + STRIP)
         beyond = ~support[rows]
         if beyond.any():
-            z[rows][beyond] = (_between(len(z), len(plane))[rows] @ plane @ columns.T)[beyond]
+            z[rows][beyond] = (down[rows] @ plane @ across.T)[beyond]
     return z
 
 
