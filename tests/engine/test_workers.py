@@ -3,7 +3,7 @@ import time
 
 import pytest
 
-from skyquilt.engine.workers import Threads
+from skyquilt.engine.workers import Ahead, Threads
 from skyquilt.settings import RunningSettings
 
 
@@ -87,3 +87,34 @@ def test_a_run_takes_no_more_threads_than_its_memory_bears(monkeypatch):
     assert RunningSettings(jobs=32).threads == 32  # as asked
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     assert RunningSettings().threads == 2
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_results_taken_ahead_are_those_of_their_names(jobs):
+    """Whatever is asked for: the next ones, some left out, one again, one that was never told."""
+    made = []
+
+    def work(item):
+        made.append(item)
+        return -item
+
+    ahead = Ahead(Threads(jobs), work, [(f"n{i % 5}", i) for i in range(10)])
+    assert [ahead.take("n0", 0), ahead.take("n3", 3), ahead.take("n4", 4)] == [0, -3, -4]
+    assert ahead.take("n1", 6) == -6
+    assert ahead.take("other", 77) == -77
+    assert ahead.take("n4", 9) == -9
+    assert ahead.take("n0", 0) == 0
+    assert sorted(made) == sorted([*range(10), 77, 0])
+
+
+def test_work_ahead_goes_on_while_the_caller_is_busy():
+    begun = []
+
+    def work(item):
+        begun.append(item)
+        return item
+
+    ahead = Ahead(Threads(2), work, [(i, i) for i in range(50)])
+    assert ahead.take(0, 0) == 0
+    time.sleep(0.05)
+    assert 2 <= len(begun) <= 6

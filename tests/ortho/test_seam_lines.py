@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from skyquilt.engine.kept import Keep
+from skyquilt.engine.workers import Threads
 from skyquilt.imaging.nodes import densify
 from skyquilt.model.raster import Grid, Window
 from skyquilt.ortho.bare_ground import bare_ground
@@ -147,7 +148,10 @@ def test_nothing_known_gives_no_contours():
     assert list(contour_lines(z, 0.5)) == []
 
 
-def test_seams_go_on_at_their_tile(scene, monkeypatch):
+@pytest.mark.parametrize("tells", [True, False, None])
+@pytest.mark.parametrize("number", [1, 3])
+def test_seams_go_on_at_their_tile(scene, monkeypatch, tells, number):
+    """Also where what is kept is not known beforehand, or is said to be and cannot be read."""
     views, pictures = scene
     monkeypatch.setattr("skyquilt.ortho.seam_lines.TILE", 16)
     kept, made = {}, []
@@ -159,13 +163,15 @@ def test_seams_go_on_at_their_tile(scene, monkeypatch):
         return kept[part]
 
     grey = lambda photo, side: pictures[photo]  # noqa: E731
+    has = {True: kept.__contains__, False: lambda part: True, None: None}[tells]
+    keep = Keep(held=keep, has=has, workers=Threads(number))
     whole = SeamLines()(views, FLAT, GRID, grey, NEUTRAL)
-    first = SeamLines()(views, FLAT, GRID, grey, NEUTRAL, Keep(held=keep))
+    first = SeamLines()(views, FLAT, GRID, grey, NEUTRAL, keep)
     assert len(made) > 3
     for part in made[2:]:
         del kept[part]
     before = len(made)
-    again = SeamLines()(views, FLAT, GRID, grey, NEUTRAL, Keep(held=keep))
+    again = SeamLines()(views, FLAT, GRID, grey, NEUTRAL, keep)
     assert made[before:] == made[2:before]
     for labels in (first, again):
         assert (labels.photo == whole.photo).all() and (labels.hidden == whole.hidden).all()

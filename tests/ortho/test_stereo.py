@@ -1,5 +1,7 @@
 """A box of known height is found; beyond the photos the surface becomes a plane."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -111,9 +113,16 @@ def test_threads_and_parts_do_not_change_the_heights(flight, monkeypatch):
     def never(*_):
         raise AssertionError("matched again")
 
-    monkeypatch.setattr("skyquilt.ortho.stereo.matched_points", never)
-    assert np.array_equal(Stereo()(level(0.0), views, GRID, grey, keep).z, whole.z)
+    with monkeypatch.context() as patch:
+        patch.setattr("skyquilt.ortho.stereo.matched_points", never)
+        assert np.array_equal(Stereo()(level(0.0), views, GRID, grey, keep).z, whole.z)
     assert len(parts) == number
+    missing = list(parts)[1::3]
+    for has in (parts.__contains__, lambda name: True):  # the other: files that cannot be read
+        for name in missing:
+            del parts[name]
+        again = Stereo()(level(0.0), views, GRID, grey, replace(keep, has=has))
+        assert np.array_equal(again.z, whole.z)
 
 
 def test_level_ground_stays_level(flight):

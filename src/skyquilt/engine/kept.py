@@ -1,6 +1,6 @@
 """Parts of a long step: kept, so that an interrupted run need not repeat them, and shared out."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -17,6 +17,8 @@ class Keep:
 
     held: Held | None = None
     """Keeps them; None = nothing is kept."""
+    has: Callable[[str], bool] | None = None
+    """Whether a name is kept, as far as can be said without reading it; None = none is."""
     workers: Workers = HERE
     """Make parts that do not depend on one another."""
     prefix: str = ""
@@ -28,6 +30,10 @@ class Keep:
             return make()
         found: T = self.held(self.prefix + part, make)
         return found
+
+    def missing(self, parts: Iterable[str]) -> list[str]:
+        """Those of these parts that will be made, in their order."""
+        return [part for part in parts if self.has is None or not self.has(self.prefix + part)]
 
     def within(self, name: str) -> "Keep":
         """Gives the parts of a part."""

@@ -174,7 +174,10 @@ class Store:
         def held(part: str, make: Callable[[], T], /) -> T:
             return self.get_or(stage, digest(key, part), make)
 
-        return Keep(held=held, workers=workers)
+        def has(part: str) -> bool:
+            return (self.folder / stage / f"{digest(key, part)}.npz").exists()
+
+        return Keep(held=held, has=has, workers=workers)
 
     def tidy(self) -> None:
         """Removes what processes that were killed left of results."""

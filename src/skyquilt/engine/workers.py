@@ -1,12 +1,12 @@
 """Who computes what can be computed apart: threads of this process, or other processes."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Protocol, TypeVar
+from typing import ClassVar, Generic, Protocol, TypeVar
 
 from skyquilt.model.event import Note
 from skyquilt.settings import RunningSettings
@@ -80,6 +80,28 @@ class Threads:
 
 HERE = Threads()
 """One thread: that of the caller."""
+
+
+class Ahead(Generic[A, B]):
+    """Results of items in a known order, computed while the caller does something else with the
+    ones before.
+    """
+
+    def __init__(
+        self, workers: Workers, work: Callable[[A], B], items: Sequence[tuple[Hashable, A]]
+    ) -> None:
+        """`items`: by a name each, in the order in which `take` will ask for them."""
+        self._work = work
+        self._names = deque(name for name, _ in items)
+        self._results = workers.each(work, [item for _, item in items])
+
+    def take(self, name: Hashable, item: A) -> B:
+        """The result of the next item of this name; computed here if none is to come."""
+        if name not in self._names:  # the first one nearly always
+            return self._work(item)
+        while self._names.popleft() != name:
+            next(self._results)
+        return next(self._results)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ meet in the middle, at the most vertical view.
 Places that a photo does not see, because something stands before them, belong to one that does.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.engine.pixel_cache import PixelCache
-from skyquilt.engine.workers import Workers
+from skyquilt.engine.workers import Ahead
 from skyquilt.imaging.nodes import STEP, View, densify, overlapping, project_all
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface, least_cell
@@ -34,6 +34,8 @@ Float = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
+Box = tuple[int, int, int, int]
+"""Row, column, height and width in cells."""
 CELL = 8
 """Least number of map pixels along a side of a cell; it grows by powers of two."""
 LEAST_M = 0.2
@@ -112,46 +114,36 @@ class SeamLines:
             longest=self.longest,
         )
 
-        def compared(box: tuple[int, int, int, int]) -> _Part | None:
+        def compared(box: Box) -> _Part | None:
             return self._part(scene, *box)
 
         photo = np.full(z.shape, -1, np.int32)
         hidden = np.zeros(z.shape, np.bool_)
-        for row in range(0, cells.height, TILE):
-            for column in range(0, cells.width, TILE):
-                h, w = min(TILE, z.shape[0] - row), min(TILE, z.shape[1] - column)
-                at = (slice(row, row + h), slice(column, column + w))
-                photo[at], hidden[at] = keep(
-                    f"{row} {column}",
-                    lambda: self._tile(compared, photo, row, column, keep.workers),  # noqa: B023 - called at once
-                )
+        tiles = {f"{box[0]} {box[1]}": box for box in _boxes((0, 0, *z.shape), TILE)}
+        missing = keep.missing(tiles)
+        boxes = [(box, box) for tile in missing for box in _boxes(tiles[tile], PART)]
+        ahead = Ahead(keep.workers, compared, boxes)
+        for tile, (row, column, h, w) in tiles.items():
+            at = (slice(row, row + h), slice(column, column + w))
+            photo[at], hidden[at] = keep(tile, lambda: self._tile(ahead, photo, tiles[tile]))  # noqa: B023 - called at once
         return Labels(
             cells=cells, factor=factor, photo=photo, hidden=hidden, tall=over > STANDING_M
         )
 
     def _tile(
-        self,
-        compared: Callable[[tuple[int, int, int, int]], _Part | None],
-        photo: NDArray[np.int32],
-        row: int,
-        column: int,
-        workers: Workers,
+        self, compared: Ahead[Box, _Part | None], photo: NDArray[np.int32], tile: Box
     ) -> tuple[NDArray[np.int32], Mask]:
         """The labels (h, w) of a tile from its `compared` parts, and whether even that photo does
         not see the place; tiles above and to the left are finished.
         """
-        h, w = min(TILE, photo.shape[0] - row), min(TILE, photo.shape[1] - column)
+        row, column, h, w = tile
         top, left = min(row, 1), min(column, 1)
         ranked = np.full((3, h + top, w + left), -1, np.int32)
         sure = np.zeros(ranked.shape[1:], np.bool_)
         height = np.zeros(ranked.shape[1:], np.uint8)
         hidden = np.zeros((h, w), np.bool_)
-        boxes = [
-            (row + r, column + c, min(PART, h - r), min(PART, w - c))
-            for r in range(0, h, PART)
-            for c in range(0, w, PART)
-        ]
-        for box, part in zip(boxes, workers.each(compared, boxes), strict=True):
+        for box in _boxes(tile, PART):
+            part = compared.take(box, box)
             if part is None:
                 continue
             r, c, (rows, columns) = box[0] - row, box[1] - column, box[2:]
@@ -201,6 +193,14 @@ class SeamLines:
             height=np.clip(level, 0, 255).astype(np.uint8),
             hidden=(best[0] >= HIDDEN) & (order[0] >= 0),
         )
+
+
+def _boxes(whole: Box, side: int) -> Iterator[Box]:
+    """Boxes of at most so many cells along a side that fill a box, row by row."""
+    row, column, height, width = whole
+    for r in range(row, row + height, side):
+        for c in range(column, column + width, side):
+            yield r, c, min(side, row + height - r), min(side, column + width - c)
 
 
 def _covered(views: Sequence[View], cells: Grid) -> Mask:

@@ -7,7 +7,7 @@ with it. Where no pair gives a height, the coarser one stays; where none has any
 the plane through what is around.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.kept import Keep
-from skyquilt.engine.workers import Workers
+from skyquilt.engine.workers import Ahead
 from skyquilt.geometry.neighbours import pairs_within
 from skyquilt.imaging.nodes import View
 from skyquilt.model.raster import Grid, meet
@@ -245,49 +245,54 @@ def _fused(given: _Round, pairs: Sequence[tuple[Pair, Level]], name: str, keep: 
     """Heights (rows, columns) of the cells, row 0 in the north, NaN where no pair gives one."""
     cells = given.cells
     out = np.full((cells.height, cells.width), np.nan, np.float32)
-    held: dict[int, Cells] = {}
 
     def matched(which: tuple[Pair, Level]) -> Cells:
         return splatted(_points(*which, given), which[0].origin, cells)
 
-    for row in range(0, cells.height, TILE):
-        for column in range(0, cells.width, TILE):
-            part = replace(
-                cells,
-                west=cells.west + column * cells.gsd,
-                north=cells.north - row * cells.gsd,
-                width=min(TILE, cells.width - column),
-                height=min(TILE, cells.height - row),
-            )
-            near = [k for k, (p, _) in enumerate(pairs) if meet(p.bounds, part.bounds)]
-            inner = (slice(row, row + part.height), slice(column, column + part.width))
-            at = (row, column, part.height, part.width)
-            out[inner] = keep(
-                f"{name} {row} {column}",
-                lambda: _tile(pairs, near, held, given, at, matched, keep.workers),  # noqa: B023 - called at once
-            )
+    tiles = {f"{name} {at[0]} {at[1]}": at for at in _tiles(cells)}
+    near = {tile: _near(pairs, cells, at) for tile, at in tiles.items()}
+    order, before = list[int](), list[int]()
+    for tile in keep.missing(tiles):
+        order += [k for k in near[tile] if k not in before]
+        before = near[tile]
+    ahead = Ahead(keep.workers, matched, [(k, pairs[k]) for k in order])
+    held: dict[int, Cells] = {}
+
+    def fused(tile: str) -> Float:
+        """Heights (h, w) of a tile from the pairs that may see it."""
+        for k in [k for k in held if k not in near[tile]]:
+            del held[k]
+        for k in near[tile]:
+            if k not in held:
+                held[k] = ahead.take(k, pairs[k])
+        parts = (inside(held[k], cells.width, *tiles[tile]) for k in near[tile])
+        return agreed([h for h in parts if len(h[0])], given.agree, tiles[tile][2:])
+
+    for tile, (row, column, h, w) in tiles.items():
+        out[row : row + h, column : column + w] = keep(tile, lambda: fused(tile))  # noqa: B023 - called at once
     return out
 
 
-def _tile(
-    pairs: Sequence[tuple[Pair, Level]],
-    near: Sequence[int],
-    held: dict[int, Cells],
-    given: _Round,
-    at: tuple[int, int, int, int],
-    matched: Callable[[tuple[Pair, Level]], Cells],
-    workers: Workers,
-) -> Float:
-    """Heights (h, w) of the cells `at` (row, column, h, w) from the pairs that may see them.
-    `held`: heights of the pairs of the part before; `matched` gives those of a pair.
-    """
-    for k in [k for k in held if k not in near]:
-        del held[k]
-    todo = [k for k in near if k not in held]
-    for k, heights in zip(todo, workers.each(matched, [pairs[k] for k in todo]), strict=True):
-        held[k] = heights
-    parts = (inside(held[k], given.cells.width, *at) for k in near)
-    return agreed([h for h in parts if len(h[0])], given.agree, at[2:])
+def _tiles(cells: Grid) -> Iterator[tuple[int, int, int, int]]:
+    """Tiles of a grid: row, column, height and width in cells."""
+    for row in range(0, cells.height, TILE):
+        for column in range(0, cells.width, TILE):
+            yield row, column, min(TILE, cells.height - row), min(TILE, cells.width - column)
+
+
+def _near(
+    pairs: Sequence[tuple[Pair, Level]], cells: Grid, at: tuple[int, int, int, int]
+) -> list[int]:
+    """Which pairs may see a tile."""
+    row, column, h, w = at
+    part = replace(
+        cells,
+        west=cells.west + column * cells.gsd,
+        north=cells.north - row * cells.gsd,
+        width=w,
+        height=h,
+    )
+    return [k for k, (p, _) in enumerate(pairs) if meet(p.bounds, part.bounds)]
 
 
 def _over(a: View, b: View, known: Surface, gsd: float) -> Pair | None:
