@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment import equations
-from skyquilt.alignment.adjust import adjust, covariance, polish_points
-from skyquilt.alignment.eliminated_points import observation_equations
+from skyquilt.alignment.adjust import adjust, covariance
+from skyquilt.alignment.eliminated_points import observation_equations, points_step, polish_points
 from skyquilt.alignment.equations import Equations
 from skyquilt.alignment.outcome import leave_one_out
 from skyquilt.alignment.problem import attitude_error, linearise, residuals_px
@@ -103,7 +103,8 @@ def test_a_step_is_that_of_the_dense_normal_equations(small):
     )
     expected = np.zeros(len(g))
     expected[used] = -np.linalg.solve(H[np.ix_(used, used)], g[used])
-    photos, cameras, points = Equations(problem, state).step(state, 0.0)
+    photos, cameras = Equations(problem, state).step(state, 0.0)
+    points = points_step(problem, state, 0.0, photos, cameras)
     assert photos.ravel() == pytest.approx(expected[: 6 * n], abs=1e-6)
     assert cameras.ravel() == pytest.approx(expected[6 * n : 6 * n + 10 * m], abs=1e-6)
     assert points.ravel() == pytest.approx(expected[6 * n + 10 * m :], abs=1e-5)

@@ -7,11 +7,12 @@ from hypothesis import strategies as st
 
 from skyquilt.alignment import equations
 from skyquilt.alignment.adjust import adjust
-from skyquilt.alignment.eliminated_points import points_inverse
+from skyquilt.alignment.eliminated_points import points_inverse, points_step, polish_points
 from skyquilt.alignment.equations import Equations, NearFactor
 from skyquilt.alignment.problem import linearise
-from skyquilt.alignment.robust import observation_weights, prior_terms
+from skyquilt.alignment.robust import observation_weights, prior_terms, robust_cost
 from skyquilt.engine.kept import Keep
+from skyquilt.engine.workers import HERE, Threads
 from tests.alignment.blocks import make_block
 
 
@@ -38,7 +39,8 @@ def test_the_step_of_all_unknowns_solves_the_whole_equations(options):
     """Those of photos, cameras and points, without elimination."""
     block, damping = make_block(0, points=80, **options), 1e-3
     problem, state = block.problem, block.start
-    photos, cameras, points = Equations(problem, state).step(state, damping)
+    photos, cameras = Equations(problem, state).step(state, damping)
+    points = points_step(problem, state, damping, photos, cameras)
     lin = linearise(problem, state)
     weight, _ = observation_weights(problem, lin.residual)
     n, m, P = len(state.C), len(state.K), len(state.X)
@@ -131,3 +133,20 @@ def test_steps_that_cannot_be_factored_are_damped(factored, monkeypatch):
     monkeypatch.setattr(equations, "Factor", refuses)
     found = adjust(block.problem, block.start, iterations=40, tolerance=1e-9)
     assert len(refused) == 2 and found.cost == pytest.approx(good.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("workers", [HERE, Threads(3)], ids=["one", "three"])
+def test_a_state_is_moved_in_parts_as_at_once(monkeypatch, workers):
+    """Points follow the photos and are refined under them; the cost is that of the new state."""
+    block = make_block(6, lies=0.02)
+    problem, state = block.problem, block.start
+    photos, cameras = Equations(problem, state).step(state, 1e-3)
+    stepped = state.moved(photos, cameras, points_step(problem, state, 1e-3, photos, cameras))
+    expected = polish_points(problem, stepped)
+    monkeypatch.setattr("skyquilt.alignment.problem.PART", 150)
+    assert len(problem.pieces()) > 3
+    moved, cost = Equations(problem, state, workers).moved(state, 1e-3)
+    for name in ("R", "C", "K", "X", "turn"):
+        np.testing.assert_allclose(getattr(moved, name), getattr(expected, name), atol=1e-9)
+    assert np.abs(moved.X - stepped.X).max() > 1e-6
+    assert cost == pytest.approx(robust_cost(problem, expected), rel=1e-12)

@@ -8,15 +8,14 @@ that both can express.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.eliminated_points import points_solved
 from skyquilt.alignment.equations import Equations, NearFactor
-from skyquilt.alignment.problem import CAMERA, Problem, State, linearised_points
-from skyquilt.alignment.robust import observation_weights, robust_cost
+from skyquilt.alignment.problem import CAMERA, Problem, State
+from skyquilt.alignment.robust import robust_cost
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.engine.workers import HERE
 from skyquilt.geometry.block_cholesky import Factor, Index, Matrix
@@ -92,17 +91,6 @@ class Covariance:
         return np.block([[own, beside], [beside.T, self.inverse.corner]])
 
 
-def polish_points(problem: Problem, state: State) -> State:
-    """One Gauss-Newton step of the points alone."""
-    X = state.X.copy()
-    for part, own, points in problem.parts(state):
-        residual, J_point = linearised_points(part, own)
-        weight, _ = observation_weights(part, residual)
-        rows = np.concatenate([J_point, residual[..., None]], 2)
-        X[points] += points_solved(part, own, rows, weight, 0.0)
-    return replace(state, X=X)
-
-
 def adjust(
     problem: Problem,
     state: State,
@@ -135,16 +123,16 @@ def adjust(
     last: list[tuple[State, float]] = []
 
     def cost(state: State) -> float:
-        last[:] = [(state, robust_cost(problem, state))]
+        if not last or last[0][0] is not state:
+            last[:] = [(state, robust_cost(problem, state))]
         return last[0][1]
 
     def equations(state: State) -> tuple[float, Callable[[float], State]]:
-        known = bool(last) and last[0][0] is state
-
         def step(damping: float) -> State:
-            return polish_points(problem, state.moved(*system.step(state, damping)))
+            last[:] = [system.moved(state, damping)]
+            return last[0][0]
 
-        return last[0][1] if known else cost(state), step
+        return cost(state), step
 
     place = state
 

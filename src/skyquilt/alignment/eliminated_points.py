@@ -1,13 +1,13 @@
 """What a part of the observations says of photos and cameras, its points eliminated."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.problem import Problem, State, linearise
-from skyquilt.alignment.robust import observation_weights, point_terms
+from skyquilt.alignment.problem import Problem, State, linearise, linearised_points
+from skyquilt.alignment.robust import observation_weights, observed_cost, point_terms
 from skyquilt.geometry.block_cholesky import Index
 
 Array = NDArray[np.float64]
@@ -197,11 +197,27 @@ def points_step(
     return points_solved(part, state, rows, weight, damping)
 
 
-def reduced_part(given: tuple[Problem, State, float]) -> Reduced:
-    """The equations of a part of the observations, its points eliminated: of (part, its state,
-    damping).
+def polish_points(problem: Problem, state: State) -> State:
+    """One Gauss-Newton step of the points alone."""
+    residual, J_point = linearised_points(problem, state)
+    weight, _ = observation_weights(problem, residual)
+    rows = np.concatenate([J_point, residual[..., None]], 2)
+    return replace(state, X=state.X + points_solved(problem, state, rows, weight, 0.0))
+
+
+def moved_points(
+    part: Problem, state: State, damping: float, photos: Array, cameras: Array, there: State
+) -> tuple[Array, float]:
+    """The points (P, 3) of a part after a step, refined under the moved photos and cameras `there`,
+    and the robust cost of the part there.
     """
-    part, state, damping = given
+    X = state.X + points_step(part, state, damping, photos, cameras)
+    settled = polish_points(part, replace(there, X=X))
+    return settled.X, observed_cost(part, settled)
+
+
+def reduced_part(part: Problem, state: State, damping: float) -> Reduced:
+    """The equations of a part of the observations, its points eliminated."""
     normal = observation_equations(part, state)
     L_inv = points_inverse(normal.V, damping)
     z = np.einsum("pij,pj->pi", L_inv, normal.gv)

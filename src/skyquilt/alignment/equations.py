@@ -4,10 +4,15 @@ Observations are taken in parts of whole points: what a part says of photos and 
 one sparse matrix, and then forgotten. So memory holds the matrix, not the equations.
 """
 
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.eliminated_points import Reduced, add_diagonal, points_step, reduced_part
+from skyquilt.alignment.eliminated_points import Reduced, add_diagonal, moved_points, reduced_part
 from skyquilt.alignment.problem import CAMERA, Problem, State
 from skyquilt.alignment.robust import position_terms, prior_terms
 from skyquilt.engine.workers import HERE, Workers
@@ -80,6 +85,35 @@ class NearFactor:
         return self._made
 
 
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """Computes something of each part of a problem. Workers are told the problem once; then only
+    unknowns go there.
+    """
+
+    problem: Problem
+
+    def __call__(
+        self, given: tuple[tuple[int, int], State, Callable[[Problem, State], Any]]
+    ) -> Any:
+        piece, own, asked = given
+        return asked(self.problem.part(piece), own)
+
+    def each(
+        self, workers: Workers, state: State, asked: Callable[[Problem, State], T]
+    ) -> Iterator[tuple[slice, T]]:
+        """What is `asked` of each part and its state, and which points it has."""
+        points = [self.problem.points_of(piece) for piece in self.problem.pieces()]
+        given = [
+            (piece, replace(state, X=state.X[own]), asked)
+            for piece, own in zip(self.problem.pieces(), points, strict=True)
+        ]
+        return zip(points, workers.each(self, given), strict=True)
+
+
 class Equations:
     """The equations of one problem, at any state: which photos are coupled is found once."""
 
@@ -95,14 +129,15 @@ class Equations:
         equations.
         """
         self.problem, self.workers, self.near = problem, workers, near
+        self.parts = _Parts(problem)
         self.n, self.m = len(state.C), len(state.K)
         self.p = problem.photo_unknowns
         self.q = CAMERA if problem.free.any() else 0
         border = self.q * self.m + (3 if problem.offset else 0)
         self.pattern = pattern(state.C[:, :2], self.p, border, *_together(problem))
 
-    def step(self, state: State, damping: float) -> tuple[Array, Array, Array]:
-        """The Gauss-Newton step of photos (n, p), cameras (m, 10) and points (P, 3).
+    def step(self, state: State, damping: float) -> tuple[Array, Array]:
+        """The Gauss-Newton step of photos (n, p) and cameras (m, 10).
 
         Raises:
             LinAlgError: it goes nowhere.
@@ -112,15 +147,28 @@ class Equations:
         cameras = np.zeros((self.m, CAMERA))
         if self.q:
             cameras = du[photos : photos + CAMERA * self.m].reshape(-1, CAMERA)
-        placed = du[:photos].reshape(-1, self.p)
-        # here: sharing them out would take as long
-        points = np.concatenate(
-            [
-                points_step(part, own, damping, placed, cameras)
-                for part, own, _ in self.problem.parts(state)
-            ]
+        return du[:photos].reshape(-1, self.p), cameras
+
+    def moved(self, state: State, damping: float) -> tuple[State, float]:
+        """The state after a step, the points refined under the moved photos, and its robust cost.
+
+        Raises:
+            LinAlgError: it goes nowhere.
+        """
+        photos, cameras = self.step(state, damping)
+        there = state.moved(photos, cameras, np.zeros(3))
+        asked = partial(
+            moved_points,
+            damping=damping,
+            photos=photos,
+            cameras=cameras,
+            there=replace(there, X=there.X[:0]),
         )
-        return placed, cameras, points
+        X, cost = there.X, prior_terms(self.problem, there).cost
+        for points, (own, observed) in self.parts.each(self.workers, state, asked):
+            X[points] = own
+            cost += observed
+        return there, cost
 
     def _solved(self, state: State, damping: float) -> Array:
         """The inverse of the equations times the gradient."""
@@ -152,8 +200,8 @@ class Equations:
         )
         g, gc = priors.photo_gradient[:, :p].copy(), np.zeros(pat.border)
         gc[: q * m] = priors.camera_gradient[:, :q].ravel()
-        parts = ((part, own, damping) for part, own, _ in self.problem.parts(state))
-        for found in self.workers.each(reduced_part, parts):
+        asked = partial(reduced_part, damping=damping)
+        for _, found in self.parts.each(self.workers, state, asked):
             U[found.seen] += found.U
             Uc += found.Uc
             self._add(out, found)

@@ -188,23 +188,28 @@ class Problem:
         inner = np.unique(starts[np.searchsorted(starts, wanted, "right") - 1])
         return [0, *inner[inner > 0].tolist(), len(self.point)]
 
+    def pieces(self) -> list[tuple[int, int]]:
+        """First observation, and that after the last, of each part."""
+        return [(lo, hi) for lo, hi in pairwise(self.cuts(PART)) if lo < hi]
+
+    def points_of(self, piece: tuple[int, int]) -> slice:
+        """The points of a part."""
+        return slice(int(self.point[piece[0]]), int(self.point[piece[1] - 1]) + 1)
+
+    def part(self, piece: tuple[int, int]) -> "Problem":
+        """A part of the problem, its points renumbered."""
+        points, some = self.points_of(piece), self.at(slice(*piece))
+        return replace(
+            some, point=some.point - points.start, X0=self.X0[points], sigma_X=self.sigma_X[points]
+        )
+
     def parts(self, state: "State") -> Iterator[tuple["Problem", "State", slice]]:
         """The problem in parts of whole points, with the state of those points and which they
         are.
         """
-        for lo, hi in pairwise(self.cuts(PART)):
-            if lo == hi:
-                continue
-            first, last = int(self.point[lo]), int(self.point[hi - 1]) + 1
-            part = self.at(slice(lo, hi))
-            points = slice(first, last)
-            yield (
-                replace(
-                    part, point=part.point - first, X0=self.X0[points], sigma_X=self.sigma_X[points]
-                ),
-                replace(state, X=state.X[points]),
-                points,
-            )
+        for piece in self.pieces():
+            points = self.points_of(piece)
+            yield self.part(piece), replace(state, X=state.X[points]), points
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

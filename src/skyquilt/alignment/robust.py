@@ -92,9 +92,14 @@ def position_terms(problem: Problem, state: State) -> tuple[Array, Array, Array]
     return np.where(precision > 0, apart - shift, 0.0), pc, cost
 
 
-def robust_cost(problem: Problem, state: State) -> float:
-    """Robust cost of a state."""
+def observed_cost(problem: Problem, state: State) -> float:
+    """Robust cost of the observations and of what is known of points."""
     error = np.nan_to_num(residuals_px(problem, state)) / problem.sigma_px[:, None]
     precision, apart = point_terms(problem, state)
-    observed = observation_weights(problem, error)[1]
-    return observed + prior_terms(problem, state).cost + float((precision * apart**2).sum())
+    return observation_weights(problem, error)[1] + float((precision * apart**2).sum())
+
+
+def robust_cost(problem: Problem, state: State) -> float:
+    """Robust cost of a state."""
+    observed = sum(observed_cost(part, own) for part, own, _ in problem.parts(state))
+    return observed + prior_terms(problem, state).cost

@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from io import BytesIO
 from itertools import islice
 from pathlib import Path, PurePath
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from skyquilt.engine.folder import refusal
 from skyquilt.engine.free_memory import return_large_blocks
@@ -134,6 +134,16 @@ def _address_in(file: Path) -> str:
     return address
 
 
+class _Step(NamedTuple):
+    """What workers are doing."""
+
+    work: Any
+    file: Path
+    """Where they read it."""
+    spent_s: deque[float]
+    """Seconds that its last items took."""
+
+
 class Cluster:
     """Workers of a Dask scheduler, as `engine.workers.Workers`."""
 
@@ -146,7 +156,7 @@ class Cluster:
         self._workers: set[str] = set()
         self._threads = 1
         self._since = time.monotonic()
-        self._step: tuple[Any, Path] | None = None
+        self._step: _Step | None = None
         self.handed = 0
         """Number of tasks so far."""
 
@@ -182,11 +192,11 @@ class Cluster:
         """
         waiting: deque[Any] = deque()
         name = f"{getattr(work, '__name__', type(work).__name__)}-{uuid.uuid4().hex[:8]}"
-        rest, number, spent_s = iter(items), 0, deque[float](maxlen=LOOKED)
+        rest, number, spent_s = iter(items), 0, self._spent_s(work)
         share = len(items) // (AHEAD * self._threads) if isinstance(items, Sized) else MOST_ITEMS
         try:
             while some := list(islice(rest, max(1, min(_size(spent_s), share)))):
-                path, number = self._file_of(work), number + 1
+                path, number = self._file_of(work, spent_s), number + 1
                 waiting.append(
                     self._client.submit(_do, str(path), some, key=f"{name}-{number}", pure=False)
                 )
@@ -216,16 +226,22 @@ class Cluster:
         with suppress(OSError):
             self._folder.rmdir()
 
-    def _file_of(self, work: Any) -> Path:
+    def _spent_s(self, work: Any) -> deque[float]:
+        """Seconds that the last items of this work took, for its next tasks to be added to."""
+        if self._step is not None and self._step.work is work:
+            return self._step.spent_s
+        return deque(maxlen=LOOKED)
+
+    def _file_of(self, work: Any, spent_s: deque[float]) -> Path:
         """The file of a step; what was written for the same work before, since workers know it."""
-        if self._step is None or self._step[0] is not work:
+        if self._step is None or self._step.work is not work:
             self._forget()
-            self._step = work, self._written(work)
-        return self._step[1]
+            self._step = _Step(work, self._written(work), spent_s)
+        return self._step.file
 
     def _forget(self) -> None:
         if self._step is not None:
-            self._step[1].unlink(missing_ok=True)
+            self._step.file.unlink(missing_ok=True)
             self._step = None
 
     def _written(self, work: Any) -> Path:
