@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -129,7 +130,7 @@ def test_values_in_proportion_to_the_light_are_told_from_curved_ones(lit):
     }
     assert Balance()(views, curved, FLAT, GRID.bounds).white == WHITES[0]
     found = Balance()(views, straight, FLAT, GRID.bounds)
-    assert found.white == WHITES[1]
+    assert found.white == WHITES[-1]
     old = Balance().under(WHITES[0])(views, straight, FLAT, GRID.bounds)
     assert old.white == WHITES[0]
 
@@ -259,3 +260,62 @@ def test_blocks_give_what_full_matrices_give(k, bands, leaf, monkeypatch):
     pairs = differences.Pairs.of(row, point, rng.uniform(0, 9, (7, 2)))
     found = differences.robust_differences(terms, pairs, y, ridge)
     assert np.abs(found - stated_plainly(terms, row, point, y, ridge, 7)).max() < 1e-9
+
+
+@pytest.mark.parametrize("leaning", [0.0, 0.25])
+def test_things_that_lean_do_not_move_the_gains(leaning):
+    """A third of each photo's samples is darker, as where crowns lean over a lawn, and more so in
+    some photos: weights of their own scatter leave the gains where they are; scattered samples of
+    usual surveys keep the wide ones.
+    """
+    rng = np.random.default_rng(4)
+    n, points = 12, 900
+    point = np.repeat(np.arange(points), 4)
+    row = np.concatenate([rng.choice(n, 4, replace=False) for _ in range(points)])
+    true, share = rng.uniform(-0.3, 0.3, n), rng.uniform(0.1, 0.5, n)
+    light = rng.uniform(-1, 1, points)[point] + rng.normal(0, 0.01, len(point))
+    light -= leaning * (rng.random(len(point)) < share[row])
+    pairs = differences.Pairs.of(row, point, rng.uniform(0, 1, (n, 2)))
+    ones, ridge = np.ones((len(row), 1)), np.array([4.0])
+
+    def off(closely):
+        y = (light - true[row])[:, None]
+        found = differences.robust_differences(ones, pairs, y, ridge, closely=closely)[:, 0, 0]
+        return float((found - true - (found - true).mean()).std())
+
+    assert off(closely=True) < 0.006
+    assert (off(closely=False) > 0.015) == (leaning > 0)
+
+
+def test_close_weights_are_taken_only_where_photos_then_agree_better(lit):
+    """Not where light differs over each photo: there the middle of all samples counts."""
+    views, pictures, _ = lit
+    clean = Balance()(views, pictures, FLAT, GRID.bounds)
+    rng = np.random.default_rng(2)
+    spotted, uneven = {}, {}
+    for v in views:
+        one = pictures[v.photo].astype(float)
+        h, w = one.shape[:2]
+        leaning = np.zeros((h, w, 1))
+        for _ in range(int(rng.integers(4, 40))):
+            r, c = rng.integers(0, h - 8), rng.integers(0, w - 8)
+            leaning[r : r + 12, c : c + 12] = 1
+        spotted[v.photo] = np.rint(one * (1 - 0.35 * leaning)).astype(np.uint8)
+        waves = rng.normal(0, 0.25, (6, 8)).astype(np.float32)
+        field = cv2.resize(waves, (w, h), interpolation=cv2.INTER_CUBIC)[..., None]
+        uneven[v.photo] = np.rint(odds_scaled(np.clip(one, 12, 240), field)).astype(np.uint8)
+
+    def gains(photos, white=WHITES[0]):
+        found = Balance().under(white)(views, photos, FLAT, GRID.bounds)
+        mine = np.array([found.gains[v.photo].mean() for v in views])
+        return mine - mine.mean()
+
+    expected = np.array([clean.gains[v.photo].mean() for v in views])
+    assert np.abs(gains(spotted) - (expected - expected.mean())).max() < 0.03
+    wide = Balance().under(WHITES[0])
+    samples = wide._samples(views, uneven, FLAT, GRID.bounds)
+    where = np.array([v.footprint.mean(0) for v in views])
+    pairs = differences.Pairs.of(samples.row, samples.point, where)
+    kept, _ = wide._best(samples, views, pairs, closely=False)
+    same = wide(views, uneven, FLAT, GRID.bounds)
+    assert all((same.gains[v.photo] == kept.gains[v.photo]).all() for v in views)

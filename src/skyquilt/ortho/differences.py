@@ -14,6 +14,12 @@ SIGMA_LEVEL = 0.15
 """Standard deviation in log odds of the difference in brightness of one ground point between two
 photos with the same exposure.
 """
+WIDE = 0.25
+"""Residual in log odds at which a sample counts half."""
+CLOSE, LEAST = 2.0, 0.01
+"""The same where samples weigh by their own scatter: in medians of the residuals, and at least."""
+STEPS, CLOSE_STEPS = 6, 14
+"""Steps of reweighting, at most."""
 CORRELATED = 30.0
 """Errors of neighbouring samples are correlated: this number of samples counts as one independent
 sample.
@@ -78,17 +84,24 @@ class Pairs:
 
 
 def robust_differences(
-    terms: NDArray[Any], pairs: Pairs, y: NDArray[Any], ridge: NDArray[Any]
+    terms: NDArray[Any],
+    pairs: Pairs,
+    y: NDArray[Any],
+    ridge: NDArray[Any],
+    *,
+    closely: bool = False,
 ) -> NDArray[np.float64]:
     """x (n, k, bands) that makes y + terms . x[row] equal within each point, y (N, bands) and
     terms (N, k), with robust weights common to all bands, against moving objects and shadows.
-    `ridge` (k,): weight of the prior of zero for x.
+    `ridge` (k,): weight of the prior of zero for x; `closely`: samples weigh by their own scatter,
+    see `Balance`.
     """
     row, point, count = pairs.row, pairs.point, len(pairs.where)
     w = np.ones(len(y))
     x: NDArray[np.float64] = np.zeros((count, terms.shape[1], y.shape[1]))
     pull = np.tile(ridge * SIGMA_LEVEL**2 * CORRELATED, count)
-    for _ in range(6):
+    several = np.bincount(point)[point] > 1
+    for step in range(CLOSE_STEPS if closely else STEPS):
         mass = np.maximum(np.bincount(point, w), 1e-9)
         weighted = w[:, None] * terms
         blocks = pairs.products(weighted / np.sqrt(mass[point])[:, None])
@@ -106,24 +119,38 @@ def robust_differences(
             break
         level = y + np.einsum("nk,nkb->nb", terms, x[row])
         residual = level - (_sums(point, w[:, None] * level, len(mass)) / mass[:, None])[point]
-        w = 1 / (1 + (residual**2).mean(1) / 0.25**2)
+        off = np.sqrt((residual**2).mean(1))
+        w = 1 / (1 + (off / _scale(off[several], closely and step > 0, WIDE)) ** 2)
     return x
 
 
+def _scale(off: NDArray[Any], closely: bool, widest: float) -> float:
+    """Residual at which a sample counts half, of residuals (N,)."""
+    return float(np.clip(CLOSE * np.median(off), LEAST, widest)) if closely and len(off) else widest
+
+
 def within_points(
-    terms: NDArray[Any], y: NDArray[Any], point: NDArray[Any], pull: NDArray[Any]
+    terms: NDArray[Any],
+    y: NDArray[Any],
+    point: NDArray[Any],
+    pull: NDArray[Any],
+    *,
+    closely: bool = False,
 ) -> NDArray[np.float64]:
     """x (k,) that makes y + terms . x equal within each point, y (N,) and terms (N, k), with robust
-    weights; `pull` (k, k): weight of the prior of zero.
+    weights; `pull` (k, k): weight of the prior of zero; `closely`: as for `robust_differences`.
     """
     w, x = np.ones(len(y)), np.zeros(terms.shape[1])
     count = int(point.max()) + 1
-    for _ in range(5):
+    several = np.bincount(point)[point] > 1
+    for step in range(CLOSE_STEPS if closely else STEPS - 1):
         mass = np.maximum(np.bincount(point, w, count), 1e-9)
         apart = terms - (_sums(point, w[:, None] * terms, count) / mass[:, None])[point]
         off = y - (np.bincount(point, w * y, count) / mass)[point]
         x = -np.linalg.solve(apart.T @ (w[:, None] * apart) + pull, apart.T @ (w * off))
-        w = 1 / (1 + ((off + apart @ x) / SIGMA_LEVEL) ** 2)
+        rest = off + apart @ x
+        scale = _scale(np.abs(rest[several]), closely and step > 0, SIGMA_LEVEL)
+        w = 1 / (1 + (rest / scale) ** 2)
     return np.asarray(x)
 
 

@@ -30,10 +30,12 @@ from skyquilt.ortho.differences import (
 
 Float = NDArray[np.float32]
 
-WHITES = (255.0, 765.0)
+WHITES = (255.0, 765.0, 2550.0)
 """Values at which a camera's response may end: gains act on the odds x / (white - x)."""
-STRAIGHTER = 0.05
-"""A larger one is taken if it makes photos differ less by this share."""
+BETTER, CLOSELY_BETTER = 0.05, 0.02
+"""A larger one, or closer weights, are taken if they make photos differ less by this share; a
+larger one under closer weights by the other.
+"""
 POINTS, SAMPLES = 60, 200
 """Ground points a photo, at most, that are sampled of large surveys; samples where points lie
 in many photos.
@@ -148,7 +150,7 @@ class Balance:
     """Least share of the differences between photos that fields must explain to be applied."""
     whites: tuple[float, ...] = WHITES
     """Values at which the cameras' response may end; the survey's overlaps decide."""
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
 
     def under(self, white: float) -> "Balance":
         """The same for a response that is known."""
@@ -168,26 +170,53 @@ class Balance:
         samples = self._samples(usable, thumbnails, surface, bounds)
         if not len(samples.point):
             return NEUTRAL
-        best, apart = NEUTRAL, np.inf
-        for white in self.whites:
-            found = self._solve(samples.under(white), usable)
-            less = samples.apart(found, usable)
-            if less < (1 - STRAIGHTER) * apart:
-                best, apart = found, less
-        return best
+        where = np.array([v.footprint.mean(0) for v in usable])
+        pairs = Pairs.of(samples.row, samples.point, where)
+        wide, apart = self._best(samples, usable, pairs, closely=False)
+        fields = np.stack([wide.fields[v.photo] for v in usable])
+        s = samples.under(wide.white)
+        tried = self._with_gains(s, usable, pairs, fields, closely=True)
+        if samples.apart(tried, usable) > (1 - BETTER / 2) * apart:  # saves the rest of the work
+            return wide
+        close, less = self._best(samples, usable, pairs, closely=True, least=wide.white)
+        return close if less < (1 - BETTER) * apart else wide
 
-    def _solve(self, s: "Samples", views: Sequence[View]) -> Exposure:
+    def _best(
+        self,
+        samples: "Samples",
+        views: Sequence[View],
+        pairs: Pairs,
+        *,
+        closely: bool,
+        least: float = 0.0,
+    ) -> tuple[Exposure, float]:
+        """The exposure under the response that fits, of those that end at `least` or beyond, and
+        how far corrected samples differ.
+        """
+        best, apart, better = NEUTRAL, np.inf, CLOSELY_BETTER if closely else BETTER
+        for white in self.whites:
+            if white < least:
+                continue
+            found = self._solve(samples.under(white), views, pairs, closely=closely)
+            less = samples.apart(found, views)
+            if less >= (1 - better) * apart:
+                break
+            best, apart = found, less
+        return best, apart
+
+    def _solve(
+        self, s: "Samples", views: Sequence[View], pairs: Pairs, *, closely: bool
+    ) -> Exposure:
         """Condition: log odds + gain + radial + field is the same in all photos of a ground point,
         so differences from the point's mean are zero.
         """
-        photos, N = [v.photo for v in views], len(s.point)
-        pairs = Pairs.of(s.row, s.point, np.array([v.footprint.mean(0) for v in views]))
+        N = len(s.point)
         basis = _basis(s.place[:, 0], s.place[:, 1])
-        radial = self._radial(s, views, pairs)
+        radial = self._radial(s, views, pairs, closely=closely)
         grey = s.log.mean(1, keepdims=True) + (basis * radial[s.row]).sum(1)[:, None]
         terms = np.concatenate([np.ones((N, 1)), basis[:, :5]], 1)
         ridge = s.prior / np.array([self.sigma_gain] + 5 * [self.sigma_field]) ** 2
-        x = robust_differences(terms, pairs, grey, ridge)[..., 0]
+        x = robust_differences(terms, pairs, grey, ridge, closely=closely)[..., 0]
         fields = radial.copy()
         fields[:, :5] += x[:, 1:]
         largest = [
@@ -195,19 +224,36 @@ class Balance:
             for v, field in zip(views, fields, strict=True)
         ]
         fields *= (np.array(largest) > self.even)[:, None]
-        even = s.log + (basis * fields[s.row]).sum(1)[:, None]
-        bare = _apart(s.log.mean(1), pairs, ridge[:1])
-        if _apart(even.mean(1), pairs, ridge[:1]) > (1 - self.gained) * bare:
-            fields, even = np.zeros_like(fields), s.log
-        gains = robust_differences(terms[:, :1], pairs, even, ridge[:1])[:, 0]
+        even = s.log.mean(1) + (basis * fields[s.row]).sum(1)
+        bare = _apart(s.log.mean(1), pairs, ridge[:1], closely=closely)
+        if _apart(even, pairs, ridge[:1], closely=closely) > (1 - self.gained) * bare:
+            fields = np.zeros_like(fields)
+        return self._with_gains(s, views, pairs, fields, closely=closely)
+
+    def _with_gains(
+        self,
+        s: "Samples",
+        views: Sequence[View],
+        pairs: Pairs,
+        fields: NDArray[Any],
+        *,
+        closely: bool,
+    ) -> Exposure:
+        """The gains of photos with these fields (n, 6)."""
+        even = s.log + (_basis(s.place[:, 0], s.place[:, 1]) * fields[s.row]).sum(1)[:, None]
+        ridge, ones = np.array([s.prior / self.sigma_gain**2]), np.ones((len(s.point), 1))
+        gains = robust_differences(ones, pairs, even, ridge, closely=closely)[:, 0]
         gains = (gains - np.median(gains, axis=0)).astype(np.float32)
+        photos = [v.photo for v in views]
         return Exposure(
             gains=dict(zip(photos, gains, strict=True)),
             fields=dict(zip(photos, fields.astype(np.float32), strict=True)),
             white=s.white,
         )
 
-    def _radial(self, s: "Samples", views: Sequence[View], pairs: Pairs) -> NDArray[np.float64]:
+    def _radial(
+        self, s: "Samples", views: Sequence[View], pairs: Pairs, *, closely: bool
+    ) -> NDArray[np.float64]:
         """(n, 6) the radial fall of light of each view's camera, as a field; photos' gains and
         cameras' terms are solved for in turn.
         """
@@ -223,8 +269,11 @@ class Balance:
         pull = np.eye(len(found)) * s.prior * SIGMA_LEVEL**2 * CORRELATED / self.sigma_radial**2
         for _ in range(ROUNDS):
             level = (grey + columns @ found)[:, None]
-            gain = robust_differences(ones, pairs, level, ridge)[:, 0, 0]
-            before, found = found, within_points(columns, grey + gain[s.row], pairs.point, pull)
+            gain = robust_differences(ones, pairs, level, ridge, closely=closely)[:, 0, 0]
+            before, found = (
+                found,
+                within_points(columns, grey + gain[s.row], pairs.point, pull, closely=closely),
+            )
             if np.abs(found - before).max() < SETTLED:
                 break
         fields = np.zeros((len(views), 6))
@@ -357,12 +406,13 @@ def _sampled(
     return np.asarray(smooth[row, column].astype(np.float64))
 
 
-def _apart(y: NDArray[Any], pairs: Pairs, ridge: NDArray[Any]) -> float:
+def _apart(y: NDArray[Any], pairs: Pairs, ridge: NDArray[Any], *, closely: bool) -> float:
     """Median difference from the mean of their point, in log odds, of samples (N,) after one gain
     for each photo.
     """
     point, ones = pairs.point, np.ones((len(y), 1))
-    level = y + robust_differences(ones, pairs, y[:, None], ridge)[pairs.row, 0, 0]
+    found = robust_differences(ones, pairs, y[:, None], ridge, closely=closely)
+    level = y + found[pairs.row, 0, 0]
     return _off_means(level, point)
 
 
