@@ -28,7 +28,7 @@ from tests.alignment.blocks import LENS  # noqa: E402
 from tests.alignment.test_bundle import FRAME, Flown  # noqa: E402
 
 from skyquilt.alignment.bundle import Bundle  # noqa: E402
-from skyquilt.alignment.control import Control  # noqa: E402
+from skyquilt.alignment.control import MARKED_PX, Control  # noqa: E402
 from skyquilt.engine.clock import Clock, result_of  # noqa: E402
 from skyquilt.engine.store import Store  # noqa: E402
 from skyquilt.model.camera import PARAMETERS, Camera  # noqa: E402
@@ -79,8 +79,6 @@ class Drawn(Flown):
 def points_of(flown: Flown, rng: np.random.Generator, check: bool, count: int) -> list[Control]:
     """Surveyed points, marked in photos with the deviations that the adjustment assumes."""
     from tests.alignment.blocks import HEIGHT, WIDTH, ground, seen_by
-
-    from skyquilt.alignment.control import MARKED_PX
 
     C = flown.truth.C
     low, high = C[:, :2].min(0), C[:, :2].max(0)
@@ -140,7 +138,7 @@ def pictured(number: int, work: Path) -> dict[str, list[float]]:
     route, reporting, with_control = FLIGHTS[number % len(FLIGHTS)]
     wrong = float(np.random.default_rng([number, 77]).normal(0, 0.01))
     reporting = replace(reporting, dewarp=(SMALL.p1, SMALL.p2), focal_error=wrong)
-    control = SurveyedPoints(points=4, checks=4)
+    control = SurveyedPoints(points=4, checks=4, pixel_noise=MARKED_PX)
     settings = FlightSettings(
         seed=500 + number, lens=SMALL, route=route, reporting=reporting, control=control
     )

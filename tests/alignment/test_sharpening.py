@@ -109,6 +109,19 @@ def test_what_does_not_look_alike_stays(scene):
     assert (found == px).all(1).mean() > 0.99 and (sigma == 0.5).mean() > 0.99
 
 
+def test_places_that_no_patch_confirms_count_least(scene):
+    """In one of the photos there is nothing but noise."""
+    views, pictures, xyz, tracks = scene
+    px, _ = disturbed(scene)
+    spoilt = min(pictures)
+    noise = np.random.default_rng(7).integers(0, 255, pictures[spoilt].shape, np.uint8)
+    found = matched((views, pictures | {spoilt: noise}, xyz, tracks), px)
+    stays = (tracks.photo == spoilt) & (found.sigma_px == 0.5)
+    assert stays.sum() > 50
+    assert (found.relative[stays] == LeastSquaresMatching().bluntest).all()
+    assert np.median(found.relative[tracks.photo != spoilt]) < 1.5
+
+
 def test_parts_do_not_change_the_result(scene, monkeypatch):
     px, _ = disturbed(scene)
     whole = sharpened(scene, px)

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from skyquilt.imaging.align_patches import translate
 
 
-def pairs(noise: float, blur: float, seed: int, count: int = 200):
+def pairs(noise: float, blur: float, seed: int, count: int = 200, grain: float = 0.0):
     """Patches (n, 15, 15) and (n, 21, 21) of a random texture with a fraction of a px between them,
-    each with its own noise, and these shifts (n, 2).
+    each with its own noise, blurred by `grain` px, and these shifts (n, 2).
     """
     rng = np.random.default_rng(seed)
     waves = rng.normal(0, 1 / blur, (60, 2)) / np.sqrt(2)  # the spectrum of blurred white noise
@@ -19,9 +20,18 @@ def pairs(noise: float, blur: float, seed: int, count: int = 200):
     )
     reference, moving = reference.reshape(-1, 15, 15), moving.reshape(-1, 21, 21)
     one, other = (
-        (p + rng.normal(0, noise, p.shape)).astype(np.float32) for p in (reference, moving)
+        (p + noise * _grains(rng, p.shape, grain)).astype(np.float32) for p in (reference, moving)
     )
     return one, other, shift
+
+
+def _grains(rng: np.random.Generator, shape: tuple[int, ...], grain: float) -> np.ndarray:
+    """Noise of deviation 1 that is alike within so many px."""
+    white = rng.normal(0, 1, shape)
+    if grain == 0:
+        return white
+    found = gaussian_filter(white, (0, grain, grain), mode="wrap")
+    return np.asarray(found / found.std())
 
 
 def _places(reach: int) -> np.ndarray:
@@ -36,6 +46,17 @@ def test_the_stated_deviation_is_that_of_the_errors(noise, blur):
     errors are a third larger.
     """
     reference, moving, truth = pairs(noise, blur, seed=7)
+    shift, score, told = translate(reference, moving)
+    known = np.isfinite(score)
+    assert known.mean() > 0.95
+    ratio = ((shift - truth)[known] / told[known, None]).ravel()
+    assert 0.9 < 1.48 * np.median(np.abs(ratio)) < 1.6
+
+
+@pytest.mark.parametrize(("noise", "grain"), [(2.0, 0.7), (4.0, 0.7), (2.0, 1.0), (4.0, 1.0)])
+def test_misfits_of_neighbouring_pixels_that_are_alike_tell_less(noise, grain):
+    """As of leaves, of which each photo sees others."""
+    reference, moving, truth = pairs(noise, 2.0, seed=9, grain=grain)
     shift, score, told = translate(reference, moving)
     known = np.isfinite(score)
     assert known.mean() > 0.95

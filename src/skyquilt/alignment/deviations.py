@@ -26,7 +26,7 @@ CELLS = 8
 REACH = 2
 """Parts of a photo along each side over which a correlation is taken to reach."""
 
-HIDDEN = 0.004
+HIDDEN = 0.003
 """Deviation of the error that all observations of a part of a photo have in common and that its
 pose takes up, in px of an image of `MATCHED` px, or of the photo if that is smaller.
 """

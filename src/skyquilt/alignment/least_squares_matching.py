@@ -51,16 +51,14 @@ class LeastSquaresMatching:
     longest: int = 1000
     """Longest side of the images in px."""
     agree: float = 0.75
-    """Least correlation of two patches. Observations below it keep their place and standard
-    deviation.
-    """
+    """Least correlation of two patches. Observations below it keep their place."""
     sigma: float = 0.12
     """Standard deviation of a usual refined observation in px of the image."""
     sharpest: float = 0.5
     """Least standard deviation of a refined observation, in usual ones."""
-    bluntest: float = 4.0
-    """Largest, likewise."""
-    version: ClassVar[int] = 2
+    bluntest: float = 8.0
+    """Largest, likewise; also that of observations that keep their place."""
+    version: ClassVar[int] = 3
 
     def __call__(
         self,
@@ -86,9 +84,14 @@ class LeastSquaresMatching:
         parts = list(tracks.parts(PART))
         for (some, _), found in zip(parts, keep.workers.each(part, parts), strict=True):
             px[some], sigma[some], told[some] = found
-        usual = float(np.nanmedian(told)) if np.isfinite(told).any() else 1.0
-        relative = np.nan_to_num((told / usual).clip(self.sharpest, self.bluntest), nan=1.0)
-        return replace(tracks, px=px, sigma_px=sigma, relative=relative)
+        return replace(tracks, px=px, sigma_px=sigma, relative=self._relative(told))
+
+    def _relative(self, told: Array) -> Array:
+        """Deviations (N,) over the usual one. Places that no patch confirmed are the worst."""
+        if not np.isfinite(told).any():
+            return np.ones(len(told))
+        over = (told / np.nanmedian(told)).clip(self.sharpest, self.bluntest)
+        return np.asarray(np.nan_to_num(over, nan=self.bluntest))
 
     def _sharper(
         self,

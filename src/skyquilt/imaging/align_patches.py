@@ -1,11 +1,15 @@
 """Sub-pixel translation of many small patches at once, by Gauss-Newton on brightness."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.float32]
 MOST_NOISE = 0.75
 """Largest share of the weakest gradients that counts as noise."""
+ALIKE = 3
+"""Side in px of the squares within which misfits of two patches may be correlated."""
 
 
 def translate(
@@ -32,41 +36,62 @@ def translate(
         return np.zeros((0, 2)), np.zeros(0), np.zeros(0)
     ref = _normalised(reference.reshape(n, -1))
     gy, gx = (np.asarray(g) for g in np.gradient(ref.reshape(n, s, s), axis=(1, 2)))
-    J = np.stack([gx.reshape(n, -1), gy.reshape(n, -1)], 1)
-    H = J @ np.swapaxes(J, 1, 2) + 1e-6 * np.eye(2, dtype=np.float32)
+    slope = np.stack([gx.reshape(n, -1), gy.reshape(n, -1)], 1)
+    H = slope @ np.swapaxes(slope, 1, 2) + 1e-6 * np.eye(2, dtype=np.float32)
     # what offset and gain do not take up
-    taken = np.stack([J.mean(2) * s, np.einsum("nki,ni->nk", J, ref)], 2)
+    taken = np.stack([slope.mean(2) * s, np.einsum("nki,ni->nk", slope, ref)], 2)
     held = H.astype(np.float64) - taken @ np.swapaxes(taken, 1, 2)
-    J = np.linalg.solve(H, J)
+    J = np.linalg.solve(H, slope)
     shift = np.zeros((n, 2))
     for _ in range(iterations):
         current = _normalised(_sampled(moving, shift, margin, s))
         shift -= np.einsum("nki,ni->nk", J, current - ref)
         shift = np.clip(np.nan_to_num(shift), -margin, margin)
-    score = np.einsum("ni,ni->n", _normalised(_sampled(moving, shift, margin, s)), ref)
+    current = _normalised(_sampled(moving, shift, margin, s))
+    score = np.einsum("ni,ni->n", current, ref)
     lost = (np.abs(shift) >= margin - 1e-6).any(1) | ~np.isfinite(score)
     shift[lost], score[lost] = np.nan, np.nan
-    # both have unit length, so what is left between them is 2 (1 - score); offset, gain and shift
-    # are estimated
-    left = np.maximum(2 * (1 - score), 0) / (s * s - 4)
-    return shift, score, _deviation(held, np.nan_to_num(left), s * s)
+    misfit = np.nan_to_num(current - score[:, None].astype(np.float32) * ref)
+    pull = (slope * misfit[:, None]).reshape(n, 2, s, s)
+    return shift, score, _deviation(held, pull, (misfit**2).sum(1))
 
 
 def _deviation(
-    H: NDArray[np.float64], left: NDArray[np.float64], count: int
+    H: NDArray[np.float64], pull: Float, squares: NDArray[np.floating[Any]]
 ) -> NDArray[np.float64]:
-    """Standard deviations (n,) of an axis, from normal matrices (n, 2, 2) and the variance (n,) of
-    the misfit of each of so many pixels.
+    """Standard deviations (n,) in px of an axis, from normal matrices (n, 2, 2), from slope times
+    misfit of each pixel (n, 2, s, s), and from the sum of squares (n,) of the misfit.
 
-    Half of the misfit is noise of the reference. Its gradients are in the normal matrix, but do not
-    hold a shift: what holds it is G = H - noise, and the covariance is left G^-1 H G^-1.
+    The covariance is G^-1 S G^-1. Half of the misfit is noise of the reference. Its gradients are
+    in the normal matrix, but do not hold a shift: what holds it is G = H - noise. S is the
+    covariance of what the misfits pull at the shift. Leaves and relief within a patch make those of
+    neighbouring pixels alike, so their products within small squares are added to it (Newey and
+    West 1987): as if they were independent, crowns would seem half as inaccurate as they are.
     """
+    s = pull.shape[2]
     trace, det = H[:, 0, 0] + H[:, 1, 1], H[:, 0, 0] * H[:, 1, 1] - H[:, 0, 1] ** 2
     weakest = trace / 2 - np.sqrt(np.maximum(trace**2 / 4 - det, 0))
+    # offset, gain and shift are estimated
+    spare = s * s / (s * s - 4)
     # central differences of white noise have half of its variance
-    noise = np.minimum(left * count / 4, MOST_NOISE * weakest)
+    noise = np.minimum(squares * spare / 4, MOST_NOISE * weakest)
     G_inv = np.linalg.inv(H - noise[:, None, None] * np.eye(2))
-    return np.asarray(np.sqrt(left * np.einsum("nij,njk,nki->n", G_inv, H, G_inv) / 2))
+    S = _of_squares(pull).astype(np.float64) * spare
+    return np.asarray(np.sqrt(np.maximum(np.einsum("nij,njk,nki->n", G_inv, S, G_inv) / 2, 0)))
+
+
+def _of_squares(pull: Float) -> Float:
+    """Covariances (n, 2, 2) of sums over patches (n, 2, s, s), in which pixels of the same square
+    of `ALIKE` px may be correlated, averaged over all places of these squares.
+    """
+    s, k = pull.shape[2], min(ALIKE, pull.shape[2])
+    inside = s - k + 1
+    columns = sum((pull[:, :, i : i + inside] for i in range(1, k)), pull[:, :, :inside])
+    squares = sum(
+        (columns[..., i : i + inside] for i in range(1, k)), columns[..., :inside]
+    ).reshape(len(pull), 2, -1)
+    share = s * s / (inside * k) ** 2
+    return np.asarray(squares @ np.swapaxes(squares, 1, 2) * np.float32(share))
 
 
 def _normalised(flat: Float) -> Float:
