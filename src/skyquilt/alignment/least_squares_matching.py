@@ -87,8 +87,10 @@ class LeastSquaresMatching:
         for (some, _), found in zip(parts, keep.workers.each(part, parts), strict=True):
             px[some], sigma[some], told[some] = found
         usual = float(np.nanmedian(told)) if np.isfinite(told).any() else 1.0
-        relative = np.nan_to_num((told / usual).clip(self.sharpest, self.bluntest), nan=1.0)
-        return replace(tracks, px=px, sigma_px=sigma, relative=relative)
+        told /= usual
+        np.clip(told, self.sharpest, self.bluntest, out=told)
+        np.nan_to_num(told, copy=False, nan=1.0)
+        return replace(tracks, px=px, sigma_px=sigma, relative=told)
 
     def _sharper(
         self,

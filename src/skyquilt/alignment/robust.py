@@ -1,11 +1,11 @@
 """The robust cost of an adjustment: Cauchy's loss on observations, pseudo-Huber on priors."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.alignment.problem import Problem, State, attitude_error, residuals_px
+from skyquilt.alignment.problem import Problem, State, attitude_error, squared_residuals
 
 Array = NDArray[np.float64]
 
@@ -13,7 +13,16 @@ Array = NDArray[np.float64]
 def _cauchy(squared: Array, scale: float) -> tuple[Array, Array]:
     """Weights and costs of squared whitened residuals under Cauchy's loss."""
     u = squared / scale**2
-    return 1 / (1 + u), scale**2 * np.log1p(u)
+    return 1 / (1 + u), _cauchy_cost(u, scale)
+
+
+def _cauchy_cost(u: Array, scale: float) -> Array:
+    """Costs of squared residuals in units of the scale. The array itself is changed, and returned:
+    of large surveys it is one of the largest.
+    """
+    np.log1p(u, out=u)
+    u *= scale**2
+    return u
 
 
 def _pseudo_huber(squared: Array, scale: float) -> tuple[Array, Array]:
@@ -94,7 +103,12 @@ def position_terms(problem: Problem, state: State) -> tuple[Array, Array, Array]
 
 def robust_cost(problem: Problem, state: State) -> float:
     """Robust cost of a state."""
-    error = np.nan_to_num(residuals_px(problem, state)) / problem.sigma_px[:, None]
-    precision, apart = point_terms(problem, state)
-    observed = observation_weights(problem, error)[1]
-    return observed + prior_terms(problem, state).cost + float((precision * apart**2).sum())
+    u = np.nan_to_num(squared_residuals(problem, state), copy=False)
+    u /= problem.loss_px**2
+    cost = _cauchy_cost(u, problem.loss_px)
+    cost *= problem.trust
+    pinned = np.flatnonzero(np.isfinite(problem.X0).any(1))
+    some = replace(problem, X0=problem.X0[pinned], sigma_X=problem.sigma_X[pinned])
+    precision, apart = point_terms(some, replace(state, X=state.X[pinned]))
+    points = float((precision * apart**2).sum())
+    return float(cost.sum()) + prior_terms(problem, state).cost + points

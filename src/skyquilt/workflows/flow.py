@@ -41,6 +41,7 @@ from skyquilt.workflows.photo_features import (
     PixelsInUse,
     features_recipe,
     find_features,
+    make_room,
     of_one_kind,
     picture_recipe,
     pixels_of,
@@ -187,6 +188,7 @@ def align_photos(
         control=given.control,
         order=_order(found.photos, given.rank),
         grey=grey,
+        make_room=lambda: make_room(found, grey),
         former=None if earlier is None else earlier.alignment_of(found.photos),
     )
     if links.links and earlier is None:
@@ -285,9 +287,7 @@ def draw_map(
     labels, labelled = yield from clock.stage(
         "seams", _at_once(lambda: _labels(aligned, on, exposure, methods, clock))
     )
-    aligned.found.looks.make_room()
-    aligned.grey.make_room()
-    give_back()
+    make_room(aligned.found, aligned.grey)
     compose = orthomosaic.composer(
         first.channels, first.dtype, on, exposure, labels, methods.blend, aligned.pixels
     )
