@@ -121,7 +121,7 @@ def make_block(
         sigma_C=sigma_C,
         R0=R0,
         sigma_R=sigma_R,
-        share=px[:, 1] / (HEIGHT - 1) - 0.5,
+        last_row=np.full(n, HEIGHT - 1.0),
         velocity=np.zeros((n, 3)),
         X0=np.full(X.shape, np.nan),
         sigma_X=np.ones(X.shape),

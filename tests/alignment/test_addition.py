@@ -100,7 +100,7 @@ def test_tie_points_name_their_photos(flown, grown):
     """Each observation is one of the photo's own keypoints."""
     for i in (0, 40, *NEW):
         mine = grown.ties.px[grown.ties.photo == i]
-        there = {tuple(p) for p in flown.features[i].px.tolist()}
+        there = {tuple(p) for p in flown.features[i].px.astype(mine.dtype).tolist()}
         assert len(mine) > 20 and all(tuple(p) in there for p in mine.tolist())
     assert (np.bincount(grown.ties.point, minlength=len(grown.ties.xyz)) >= 2).all()
 

@@ -198,7 +198,7 @@ def test_tie_points_project_where_they_were_seen(plain):
     for i in (0, 7, 17):
         mine = t.photo == i
         px = project(found.camera(i), found.poses[i].to_camera(t.xyz[t.point[mine]]))
-        assert px - t.px[mine] == pytest.approx(t.residual_px[mine], abs=1e-6)
+        assert px - t.px[mine] == pytest.approx(t.residual_px[mine], abs=1e-4)
     assert (np.diff(t.point) >= 0).all() and np.bincount(t.point).min() >= 2
 
 
@@ -223,7 +223,7 @@ def test_files_turned_by_half_a_turn(plain):
         t = found.ties
         mine = t.photo == i
         px = project(found.camera(i), found.poses[i].to_camera(t.xyz[t.point[mine]]))
-        assert px - t.px[mine] == pytest.approx(t.residual_px[mine], abs=1e-6)
+        assert px - t.px[mine] == pytest.approx(t.residual_px[mine], abs=1e-4)
 
 
 def test_a_mirrored_camera_is_the_turned_file_s():

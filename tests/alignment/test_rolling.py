@@ -75,7 +75,7 @@ def block(seed=0, *, noise=0.1, lens=LENS, **options):
         sigma_R=np.full(C.shape, np.radians(1.0)),
         X0=np.full((len(used), 3), np.nan),
         sigma_X=np.ones((len(used), 3)),
-        share=px[:, 1] / (lens.height - 1) - 0.5,
+        last_row=np.full(n, lens.height - 1.0),
         velocity=np.array([s.velocity for s in flown]),
         loss_px=1e6,
         loss_C=1e6,

@@ -1,9 +1,15 @@
-"""The first stage of the adjustment of large surveys."""
+"""The stages of the adjustment of large surveys: what they hold, and how the first one begins."""
+
+import tracemalloc
+import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from skyquilt.alignment import stages
+from skyquilt.alignment import equations, stages
+from skyquilt.alignment.deviations import observed_noise, robust_scale
+from skyquilt.alignment.robust import robust_cost
 from skyquilt.engine.kept import Keep
 from tests.alignment.blocks import make_block
 
@@ -50,3 +56,80 @@ def test_photos_that_stand_for_all_are_of_each_camera(monkeypatch):
         apart = np.linalg.norm(block.start.C[chosen, None, :2] - block.start.C[chosen, :2], axis=2)
         near = np.sort(apart + np.eye(len(apart)) * 1e9, axis=1)[:, 0]
         assert near.max() < 40 and apart.max() > 60
+
+
+def test_short_numbers_change_nothing():
+    """Points and photos in 32 bits, as large surveys hold them, and in 64."""
+    block = make_block(3, lies=0.02)
+    one = stages.fine(*stages.rough(block.problem, block.start))
+    short = {k: getattr(block.problem, k).astype(np.int32) for k in ("point", "photo")}
+    other = stages.fine(*stages.rough(replace(block.problem, **short), block.start))
+    for name in ("R", "C", "K", "X"):
+        assert np.array_equal(getattr(one[1], name), getattr(other[1], name))
+    assert np.array_equal(one[0].point, other[0].point)
+    assert other[0].point.dtype == other[0].photo.dtype == np.int32
+
+
+def test_photos_of_large_surveys_are_paired_by_long_numbers():
+    """The number of a pair of photos, one's number times how many there are, exceeds 32 bits."""
+    block = make_block(0, lines=2, per_line=3, points=60)
+    photos = 70_000
+    far = replace(
+        block.problem,
+        point=block.problem.point.astype(np.int32),
+        photo=(photos - 6 + block.problem.photo).astype(np.int32),
+        camera=np.zeros(photos, np.int64),
+    )
+    a, b = equations._together(far)
+    seen = block.problem.point[:, None] == np.arange(block.problem.point[-1] + 1)
+    shown = np.array([seen[block.problem.photo == k].any(0) for k in range(6)])
+    wanted = {(i, j) for i in range(6) for j in range(i + 1, 6) if (shown[i] & shown[j]).any()}
+    assert {(int(i) - photos + 6, int(j) - photos + 6) for i, j in zip(a, b, strict=True)} == wanted
+
+
+def test_what_was_removed_is_not_held(monkeypatch):
+    """Who takes the steps of a stage holds one problem at a time."""
+    block = make_block(1, lies=0.05)
+    problem, state = replace(block.problem, px=block.problem.px.copy()), block.start
+    first, alive = weakref.ref(problem.px), list[bool]()
+    given, adjust = len(problem.px), stages.adjust
+
+    def watched(*words, **named):
+        alive.append(first() is not None)
+        return adjust(*words, **named)
+
+    monkeypatch.setattr(stages, "adjust", watched)
+    for step in stages.rough_steps():
+        problem, state = step(problem, state)
+    assert len(problem.px) < given
+    assert alive == [True, False]
+
+
+def test_what_millions_of_observations_tell_takes_little_memory():
+    """Bytes for each observation of a problem of 0.4 million, beside the problem itself."""
+    block = make_block(2, lines=4, per_line=8, points=1500)
+    own, times = block.problem, 400_000 // len(block.problem.px)
+    P, again = len(own.X0), np.repeat(np.arange(times), len(own.px))
+    many = replace(
+        own,
+        point=(np.tile(own.point, times) + P * again).astype(np.int32),
+        photo=np.tile(own.photo, times).astype(np.int32),
+        px=np.tile(own.px, (times, 1)),
+        sigma_px=np.tile(own.sigma_px, times),
+        X0=np.broadcast_to(np.nan, (P * times, 3)),
+        sigma_X=np.broadcast_to(1.0, (P * times, 3)),
+    )
+    state = replace(block.truth, X=np.tile(block.truth.X, (times, 1)))
+    size = np.full((len(own.camera), 2), [800.0, 600.0])
+    cases = {
+        "cost": (lambda: robust_cost(many, state), 20),
+        "scale": (lambda: robust_scale(many, state), 60),
+        "noise": (lambda: observed_noise(many, state, size), 70),
+        "prune": (lambda: stages.prune(many, state, 1e9), 90),
+    }
+    for name, (work, most) in cases.items():
+        tracemalloc.start()
+        work()
+        taken = tracemalloc.get_traced_memory()[1] / len(many.px)
+        tracemalloc.stop()
+        assert taken < most, (name, taken)

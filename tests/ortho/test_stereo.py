@@ -214,6 +214,22 @@ def test_heights_joined_in_bands_are_those_joined_at_once(monkeypatch):
     assert share[:60].min() > 0.9 and share[240:].max() < 0.1
 
 
+def test_specks_found_in_bands_are_those_found_at_once(monkeypatch):
+    """Patches of all sizes about the least one, across the borders of bands."""
+    rng = np.random.default_rng(12)
+    z = np.round(rng.normal(0, 0.6, (200, 90))).astype(np.float32)
+    z[rng.random(z.shape) < 0.35] = np.nan
+    for least in (3, 6, 12):
+        monkeypatch.setattr(fill, "BAND", 1000)
+        whole = fusion.without_specks(z, 0.5, least)
+        monkeypatch.setattr(fill, "BAND", 7)
+        assert np.array_equal(fusion.without_specks(z, 0.5, least), whole)
+        number, label = cv2.connectedComponents((z == 0).astype(np.uint8), connectivity=4)
+        size = np.bincount(label.ravel())
+        assert {s for s in size if least - 2 < s < least + 3}  # some just large enough, some not
+        assert np.array_equal(whole[z == 0], (size > least)[label[z == 0]])
+
+
 def test_crowns_levelled_in_bands_are_those_levelled_at_once(monkeypatch):
     """And leaves of which little is known become level, up to the cliff at their rim."""
     rng = np.random.default_rng(4)

@@ -53,6 +53,7 @@ class ByLinks:
             control,
             inputs.grey,
             inputs.keep,
+            inputs.make_room,
         )
         return replace(with_loose_photos(found, inputs.photos, inputs.priors), why=REQUESTED)
 

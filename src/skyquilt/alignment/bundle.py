@@ -1,6 +1,6 @@
 """`bundle`: similarity graph -> adjustment with self-calibration and priors -> ground points."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -15,10 +15,11 @@ from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, ti
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, undetermined
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
-from skyquilt.alignment.stages import believe_positions, fine, plain, rough, weighed
+from skyquilt.alignment.stages import believe_positions, fine_steps, plain, rough_steps, weighed
 from skyquilt.alignment.start import Start, find_start, ground_of
 from skyquilt.alignment.tracks import Thinning, Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
+from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.errors import AlignmentError
 from skyquilt.model.features import Features, Link
@@ -55,7 +56,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 32
+    version: ClassVar[int] = 33
 
     def __call__(
         self,
@@ -67,10 +68,12 @@ class Bundle:
         control: Sequence[Control] = (),
         grey: GreyPicture | None = None,
         keep: Keep = MADE_NOW,
+        make_room: Callable[[], None] = give_back,
     ) -> Alignment:
         """Aligns the photos that are connected by links; `grey` gives images for the refinement of
         observations. `keep`: parts of the adjustment of more than `many` photos are kept, so that
-        an interrupted run goes on. Its workers refine the observations.
+        an interrupted run goes on. Its workers refine the observations. `make_room` is called when
+        features, and when grey images are not needed any more, and after other large parts.
 
         Raises:
             AlignmentError: no two photos are linked.
@@ -84,7 +87,9 @@ class Bundle:
                 if len(photos) > self.many
                 else Keep(workers=keep.workers)
             )
-            return self._block(photos, frame, priors, features, upright, control, grey, part)
+            return self._block(
+                photos, frame, priors, features, upright, control, grey, part, make_room
+            )
 
         try:
             found = block(aside)
@@ -107,6 +112,7 @@ class Bundle:
         control: Sequence[Control],
         grey: GreyPicture | None,
         keep: Keep,
+        make_room: Callable[[], None],
     ) -> Alignment:
         """Adjusts the photos that these links connect."""
         start = _kept_start(photos, priors, features, links, ground_of(frame), keep)
@@ -123,18 +129,25 @@ class Bundle:
             begin, each, least = ROUGHLY, self.per_photo // 3, ROUGHLY
         used = setup.sensor_tracks(tracks)
         del tracks
+        make_room()
         problem, state = setup.problem(thin(used, sizes, per_photo=begin, least=least))
-        problem, state = rough(problem, state, keep.within("rough"))
+        for step in rough_steps(keep.within("rough")):
+            problem, state = step(problem, state)
+        del step  # some hold a factor
         setup = setup.moving_as(photos, state.C)
         problem = replace(problem, velocity=setup.base.velocity)
         method = self.match_observations
         if sharp := grey is not None and method is not None:
             part = keep.within("sharp")
             used = sharpened(used, photos, setup, problem, state, method, grey, part)
+            make_room()
         if sharp or begin != each:
             problem, _ = setup.problem(thin(used, sizes, per_photo=each, least=least))
             state = triangulated(problem, state)
-        problem, state = fine(problem, state, keep.within("fine"))
+        for step in fine_steps(keep.within("fine")):
+            problem, state = step(problem, state)
+        del step
+        make_room()
         setup = setup.moving_as(photos, state.C)
         problem = replace(problem, velocity=setup.base.velocity)
         if self.thorough:
@@ -146,8 +159,10 @@ class Bundle:
             part = keep.within("positions")
             problem, state = believe_positions(problem, state, setup, part)
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
+        make_room()
         ties = ground_points(used, setup, state)
         del used
+        make_room()
         done = _outcome(
             photos, frame, setup, start, ties, problem, state, reports, predicted=self.thorough
         )

@@ -110,7 +110,6 @@ def _alone(
         px=px,
         sigma_px=np.ones(len(px)),
         relative=1.0,
-        share=setup.share(row, px),
         X0=empty,
         sigma_X=np.ones_like(empty),
     )
@@ -215,7 +214,6 @@ def with_points(
         relative=np.concatenate(
             [np.broadcast_to(problem.relative, len(problem.px)), np.ones(len(px))]
         ),
-        share=np.concatenate([problem.share, setup.share(row, px)]),
         # what was marked in photos by hand errs independently of the tie points
         trust=np.concatenate([np.broadcast_to(problem.trust, len(problem.px)), np.ones(len(px))]),
         X0=np.concatenate([problem.X0, surveyed]),

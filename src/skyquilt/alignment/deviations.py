@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from skyquilt.alignment.adjust import Covariance
 from skyquilt.alignment.eliminated_points import observation_equations
 from skyquilt.alignment.least_squares_matching import LeastSquaresMatching
-from skyquilt.alignment.problem import CAMERA, Problem, State, residuals_px
+from skyquilt.alignment.problem import CAMERA, PART, Problem, State, residuals_px
 
 Array = NDArray[np.float64]
 CELLS = 8
@@ -50,24 +50,29 @@ def robust_scale(problem: Problem, state: State) -> float:
     Residuals of a few observations per point are smaller than the errors; the share of the
     equations that is left after the unknowns accounts for that.
     """
-    e = residuals_px(problem, state) / problem.sigma_px[:, None]
+    e = residuals_px(problem, state)
+    e /= problem.sigma_px[:, None]
     left = max(1 - _unknowns(problem, state) / (2 * len(e)), 0.05)
     if not np.isfinite(e).any():  # photos of one place: no ray has a point on it
         return float("nan")
-    return float(1.48 * np.nanmedian(np.abs(e)) / np.sqrt(left))
+    return float(1.48 * np.nanmedian(np.abs(e, out=e)) / np.sqrt(left))
 
 
 def observed_noise(problem: Problem, state: State, size: Array) -> Noise:
     """The noise of the observations at a minimum; `size` (n, 2): each photo's in px."""
-    e = np.nan_to_num(residuals_px(problem, state)) / problem.sigma_px[:, None]
-    u = (e**2).sum(1) / problem.loss_px**2
-    w = 1 / (1 + u)
-    psi = e * w[:, None]
-    spare = max(2 * len(e) - _unknowns(problem, state), 1)
+    psi = np.nan_to_num(residuals_px(problem, state), copy=False)  # of millions of observations
+    psi /= problem.sigma_px[:, None]
+    w = 1 / (1 + (psi**2).sum(1) / problem.loss_px**2)
+    psi *= w[:, None]
+    spare = max(2 * len(psi) - _unknowns(problem, state), 1)
     # the weights enter the normal equations; their variance and slope tell what these are worth
     variance = float((psi**2).sum()) / spare * float(w.mean()) / float((w**2).mean()) ** 2
-    hidden = HIDDEN * np.maximum(size.max(1) / MATCHED, 1)[problem.photo] / problem.sigma_px
-    near = max(_alike(problem, psi, size), 0.0) + float((hidden**2).mean()) / variance
+    del w
+    near = max(_alike(problem, psi, size), 0.0)
+    del psi
+    hidden = (HIDDEN * np.maximum(size.max(1) / MATCHED, 1))[problem.photo]
+    hidden /= problem.sigma_px
+    near += float((hidden**2).mean()) / variance
     part = _part(problem, size, REACH)
     crowd = np.bincount(part).astype(float)
     together = float((crowd**2).sum() / crowd.sum())  # in the part of an observation, on average
@@ -81,8 +86,14 @@ def _unknowns(problem: Problem, state: State) -> int:
 
 def _part(problem: Problem, size: Array, parts: int) -> NDArray[np.int64]:
     """Number (N,) of the cell of its photo in which each observation lies."""
-    cell = np.clip((problem.px + 0.5) / size[problem.photo] * parts, 0, parts - 1).astype(int)
-    return np.asarray((problem.photo * parts + cell[:, 1]) * parts + cell[:, 0])
+    out = np.empty(len(problem.px), np.int64)
+    for lo in range(0, len(out), PART):
+        some = slice(lo, lo + PART)
+        photo = problem.photo[some].astype(np.int64)
+        cell = (problem.px[some] + 0.5) / size[photo] * parts
+        column, row = np.clip(cell, 0, parts - 1).astype(int).T
+        out[some] = (photo * parts + row) * parts + column
+    return out
 
 
 def _alike(problem: Problem, psi: Array, size: Array) -> float:

@@ -45,7 +45,7 @@ def _together(problem: Problem) -> tuple[Index, Index]:
         if not len(alive):
             return keys // n, keys % n
         ends = np.sort([problem.photo[alive], problem.photo[alive + step]], axis=0)
-        keys = np.union1d(keys, ends[0] * n + ends[1])
+        keys = np.union1d(keys, ends[0].astype(np.int64) * n + ends[1])
         step += 1
 
 

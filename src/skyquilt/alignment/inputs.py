@@ -7,6 +7,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import ControlPoint, Photo
@@ -38,6 +39,8 @@ class AlignmentInputs:
     """Gives grey images."""
     keep: Keep = MADE_NOW
     """Keeps parts of large adjustments, and shares them out."""
+    make_room: Callable[[], None] = give_back
+    """Gives memory back: what was read of features, or of grey images, is not needed any more."""
     former: Alignment | None = None
     """An alignment of some of these photos that the others are added to; None = all are aligned
     anew. Methods that cannot add photos align all anew.

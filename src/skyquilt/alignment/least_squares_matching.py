@@ -87,11 +87,14 @@ class LeastSquaresMatching:
         return replace(tracks, px=px, sigma_px=sigma, relative=self._relative(told))
 
     def _relative(self, told: Array) -> Array:
-        """Deviations (N,) over the usual one. Places that no patch confirmed are the worst."""
+        """Deviations (N,) over the usual one, in place of `told`. Places that no patch confirmed
+        are the worst.
+        """
         if not np.isfinite(told).any():
             return np.ones(len(told))
-        over = (told / np.nanmedian(told)).clip(self.sharpest, self.bluntest)
-        return np.asarray(np.nan_to_num(over, nan=self.bluntest))
+        told /= np.nanmedian(told)
+        np.clip(told, self.sharpest, self.bluntest, out=told)
+        return np.asarray(np.nan_to_num(told, copy=False, nan=self.bluntest))
 
     def _sharper(
         self,

@@ -87,8 +87,8 @@ def _ground_part(everything: Problem, state: State, setup: Setup) -> tuple[TiePo
         xyz=whole.X,
         point=everything.point.astype(np.int32),
         photo=photo.astype(np.int32),
-        px=setup.file_px(photo, everything.px),
-        residual_px=residuals_px(everything, whole) * setup.file_sign(photo),
+        px=setup.file_px(photo, everything.px).astype(np.float32),
+        residual_px=(residuals_px(everything, whole) * setup.file_sign(photo)).astype(np.float32),
     )
     return ties, sigma_z
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from skyquilt.geometry.frames import rotation_from_vector
 from skyquilt.model.camera import PARAMETERS
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+Index = NDArray[Any]
 READOUT = len(PARAMETERS)
 """Column of a camera's readout time in s, after the intrinsics."""
 CAMERA = READOUT + 1
@@ -21,6 +22,14 @@ PART = 8192
 """Observations that are computed at once, about: what a computation holds then stays small, however
 large the survey.
 """
+
+
+def _of_points(values: Array, some: Index | slice) -> Array:
+    """What belongs to some points (P, 3); what is the same for all stays one row."""
+    if len(values) and values.strides[0] == 0:
+        number = len(range(len(values))[some]) if isinstance(some, slice) else len(some)
+        return np.broadcast_to(values[0], (number, values.shape[1]))
+    return values[some]
 
 
 def of_some(values: Array | float, some: NDArray[np.bool_] | Index | slice) -> Array | float:
@@ -61,7 +70,9 @@ class State:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Problem:
-    """Observations and priors. Observations are sorted by point."""
+    """Observations and priors. Observations are sorted by point. Of large surveys they fill the
+    memory: their numbers are of 32 bits, and those of `parts` of 64.
+    """
 
     point: Index
     """(N,) point of each observation, ascending."""
@@ -113,12 +124,19 @@ class Problem:
     """Whether all measured centres share an unknown shift (height datum, base station), as where
     control points tie the block to the ground. It is estimated along with the other unknowns.
     """
-    share: Array
-    """(N,) place of each observation's row in the photo, -0.5 at the first and 0.5 at the last."""
+    last_row: Array
+    """(n,) number of the last row of each photo."""
     velocity: Array
     """(n, 3) velocity of each camera in m/s in the map frame; zero where unknown."""
     sigma_turn: Array | None = None
     """(n,) deviations of `State.turn` from zero in rad; None = turns are not estimated."""
+
+    @property
+    def share(self) -> Array:
+        """(N,) place of each observation's row in the photo, -0.5 at the first and 0.5 at the
+        last.
+        """
+        return np.asarray(self.px[:, 1] / self.last_row[self.photo] - 0.5)
 
     @property
     def photo_unknowns(self) -> int:
@@ -137,7 +155,6 @@ class Problem:
             photo=self.photo[observations],
             px=self.px[observations],
             sigma_px=self.sigma_px[observations],
-            share=self.share[observations],
             trust=of_some(self.trust, observations),
             relative=of_some(self.relative, observations),
         )
@@ -146,12 +163,14 @@ class Problem:
         """The problem with some of its observations and with the points that these show,
         renumbered; and the numbers these points had.
         """
-        points, number = np.unique(self.point[observations], return_inverse=True)
+        thinner = self.at(observations)
+        first = np.r_[True, thinner.point[1:] != thinner.point[:-1]][: len(thinner.point)]
+        points = thinner.point[first]
         thinner = replace(
-            self.at(observations),
-            point=number.astype(np.int64),
-            X0=self.X0[points],
-            sigma_X=self.sigma_X[points],
+            thinner,
+            point=np.cumsum(first, dtype=thinner.point.dtype) - 1,
+            X0=_of_points(self.X0, points),
+            sigma_X=_of_points(self.sigma_X, points),
         )
         return thinner, points
 
@@ -159,7 +178,7 @@ class Problem:
         """The problem of some of its photos, renumbered, with the points that two of them show; and
         its state.
         """
-        number = np.full(len(self.camera), -1)
+        number = np.full(len(self.camera), -1, self.photo.dtype)
         number[photos] = np.arange(len(photos))
         inside = number[self.photo] >= 0
         seen = np.bincount(self.point[inside], minlength=len(self.X0))
@@ -169,6 +188,7 @@ class Problem:
             part,
             photo=number[part.photo],
             camera=self.camera[photos],
+            last_row=self.last_row[photos],
             C0=self.C0[photos],
             sigma_C=self.sigma_C[photos],
             R0=self.R0[photos],
@@ -183,9 +203,8 @@ class Problem:
         """Borders of ranges of about so many observations, each of whole points."""
         if len(self.point) <= about:
             return [0, len(self.point)]
-        starts = np.flatnonzero(np.r_[True, np.diff(self.point) != 0])
-        wanted = np.arange(about, len(self.point), about)
-        inner = np.unique(starts[np.searchsorted(starts, wanted, "right") - 1])
+        wanted = self.point[about::about]
+        inner = np.unique(np.searchsorted(self.point, wanted))
         return [0, *inner[inner > 0].tolist(), len(self.point)]
 
     def pieces(self) -> list[tuple[int, int]]:
@@ -200,7 +219,11 @@ class Problem:
         """A part of the problem, its points renumbered."""
         points, some = self.points_of(piece), self.at(slice(*piece))
         return replace(
-            some, point=some.point - points.start, X0=self.X0[points], sigma_X=self.sigma_X[points]
+            some,
+            point=some.point.astype(np.int64) - points.start,
+            photo=some.photo.astype(np.int64),
+            X0=_of_points(self.X0, points),
+            sigma_X=_of_points(self.sigma_X, points),
         )
 
     def parts(self, state: "State") -> Iterator[tuple["Problem", "State", slice]]:
@@ -298,13 +321,30 @@ def residuals_px(problem: Problem, state: State) -> Array:
     """Image residuals (N, 2) in px, projected minus observed; NaN for points behind their
     camera.
     """
-    out = np.empty(problem.px.shape)
-    for lo in range(0, len(out), PART):
-        part = problem.at(slice(lo, lo + PART))
+    out = np.empty((len(problem.px), 2))
+    for some, residual in _residuals(problem, state):
+        out[some] = residual
+    return out
+
+
+def squared_residuals(problem: Problem, state: State) -> Array:
+    """Squared lengths (N,) of the residuals in units of the deviation of their observations; NaN
+    for points behind their camera.
+    """
+    out = np.empty(len(problem.px))
+    for some, residual in _residuals(problem, state):
+        out[some] = ((residual / problem.sigma_px[some, None]) ** 2).sum(1)
+    return out
+
+
+def _residuals(problem: Problem, state: State) -> Iterator[tuple[slice, Array]]:
+    """`residuals_px` of parts of the observations, and which they are."""
+    for lo in range(0, len(problem.px), PART):
+        some = slice(lo, lo + PART)
+        part = problem.at(some)
         local, _, behind = _local(part, state)
         px = pixels(local[:, :2] / local[:, 2:], state.K[part.camera[part.photo], :READOUT])
-        out[lo : lo + PART] = np.where(behind[:, None], np.nan, px - part.px)
-    return out
+        yield some, np.where(behind[:, None], np.nan, px - part.px)
 
 
 def attitude_error(R: Array, R0: Array) -> Array:

@@ -78,13 +78,6 @@ class Setup:
         members = [photos[m] for m in self.members.tolist()]
         return replace(self, base=replace(self.base, velocity=velocities(members, C)))
 
-    def share(self, row: NDArray[np.int64], px: Array) -> Array:
-        """Place (N,) of sensor pixels (N, 2) in the photos of these rows, along the readout: -0.5
-        at the first row, 0.5 at the last.
-        """
-        last = self.size[self.members[row], 1] - 1
-        return np.asarray(px[:, 1] / last - 0.5)
-
     def file_sign(self, photo: NDArray[np.int64]) -> Array:
         """(N, 1) factor that takes residuals from the sensor to the file."""
         return np.where(self.turned[photo][:, None], -1.0, 1.0)
@@ -105,12 +98,11 @@ class Setup:
             X[points] = self._on_plane(tracks.part(some, points), row[some])
         problem = replace(
             self.base,
-            point=tracks.point.astype(np.int64),
-            photo=row,
+            point=tracks.point,
+            photo=row.astype(tracks.photo.dtype),
             px=tracks.px,
             sigma_px=tracks.sigma_px,
             relative=tracks.relative,
-            share=self.share(row, tracks.px),
             X0=np.broadcast_to(np.nan, X.shape),
             sigma_X=np.broadcast_to(1.0, X.shape),
             trust=min(1.0, INDEPENDENT * len(self.members) / max(len(row), 1)),
@@ -179,7 +171,7 @@ def set_up(
         sigma_R=sigma_R,
         X0=np.zeros((0, 3)),
         sigma_X=np.zeros((0, 3)),
-        share=np.zeros(0),
+        last_row=np.array([photos[m].height - 1.0 for m in members.tolist()]),
         velocity=velocities([photos[m] for m in members.tolist()], start_C),
         loss_px=2.0,
         loss_C=3.0 if repair else 1e6,

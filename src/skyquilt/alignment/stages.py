@@ -2,7 +2,9 @@
 positions believed as far as they show to be right.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 from skyquilt.alignment.adjust import adjust
 from skyquilt.alignment.deviations import believed, observed_noise, robust_scale
 from skyquilt.alignment.equations import NearFactor
-from skyquilt.alignment.problem import READOUT, Problem, State, residuals_px, swept
+from skyquilt.alignment.problem import READOUT, Problem, State, squared_residuals, swept
 from skyquilt.alignment.robust import robust_cost
 from skyquilt.alignment.setup import Setup
 from skyquilt.engine.kept import MADE_NOW, Keep
@@ -33,39 +35,84 @@ twenty photos is itself known to a fifth.
 """
 
 
+Step = Callable[[Problem, State], tuple[Problem, State]]
+"""A step of a stage. Who takes one after the other holds one problem at a time: an earlier one with
+all that was removed since would take as much memory again.
+"""
+
+
 def rough(problem: Problem, state: State, keep: Keep = MADE_NOW) -> tuple[Problem, State]:
+    """All `rough_steps`."""
+    for step in rough_steps(keep):
+        problem, state = step(problem, state)
+    return problem, state
+
+
+def rough_steps(keep: Keep = MADE_NOW) -> tuple[Step, ...]:
     """First stage: intrinsics fixed under a wide loss, then all free under a narrower one; outliers
     are removed in between. The whole of a large survey begins with the intrinsics that some of its
     photos show, and takes a third of the steps.
     """
+    return _with_lens_of_some, *_roughly(keep)
+
+
+def _with_lens_of_some(problem: Problem, state: State) -> tuple[Problem, State]:
     if _is_large(problem):
-        its = _roughly(*problem.among(_places_of(problem, state), state), MADE_NOW)[1]
+        some, its = problem.among(_places_of(problem, state), state)
+        for step in _roughly(MADE_NOW):
+            some, its = step(some, its)
         state = replace(state, K=its.K)
-    return _roughly(problem, state, keep)
+    return problem, state
 
 
-def _roughly(problem: Problem, state: State, keep: Keep) -> tuple[Problem, State]:
-    fixed = replace(problem, free=np.zeros_like(problem.free), loss_px=20.0)
-    part = keep.within("fixed")
-    state = adjust(fixed, state, iterations=10, tolerance=3e-2, keep=part).state
-    problem, state = prune(problem, state, 40.0)
-    narrow, part = problem.with_loss(6.0), keep.within("free")
-    state = adjust(narrow, state, iterations=20, tolerance=3e-3, damping=1e-5, keep=part).state
-    return prune(problem, state, 12.0)
+def _roughly(keep: Keep) -> tuple[Step, ...]:
+    def fixed(problem: Problem, state: State) -> tuple[Problem, State]:
+        still = replace(problem, free=np.zeros_like(problem.free), loss_px=20.0)
+        part = keep.within("fixed")
+        return problem, adjust(still, state, iterations=10, tolerance=3e-2, keep=part).state
+
+    def free(problem: Problem, state: State) -> tuple[Problem, State]:
+        narrow, part = problem.with_loss(6.0), keep.within("free")
+        found = adjust(narrow, state, iterations=20, tolerance=3e-3, damping=1e-5, keep=part)
+        return problem, found.state
+
+    return fixed, _pruning(40.0), free, _pruning(12.0)
 
 
 def fine(problem: Problem, state: State, keep: Keep = MADE_NOW) -> tuple[Problem, State]:
+    """All `fine_steps`."""
+    for step in fine_steps(keep):
+        problem, state = step(problem, state)
+    return problem, state
+
+
+def fine_steps(keep: Keep = MADE_NOW) -> tuple[Step, ...]:
     """Second stage: all unknowns free under ever narrower losses; outliers are removed in
     between.
     """
-    problem, state = prune(problem, state, 20.0)
     near = NearFactor()
-    narrow, part = problem.with_loss(2.5), keep.within("2.5")
-    found = adjust(narrow, state, iterations=20, tolerance=2e-3, damping=1e-6, keep=part, near=near)
-    problem, state = prune(problem, found.state, 5.0)
-    narrow, part = problem.with_loss(2.0), keep.within("2.0")
-    found = adjust(narrow, state, iterations=15, tolerance=3e-4, damping=1e-6, keep=part, near=near)
-    return problem, found.state
+
+    def under(loss_px: float, iterations: int, tolerance: float) -> Step:
+        def step(problem: Problem, state: State) -> tuple[Problem, State]:
+            part = keep.within(str(loss_px))
+            found = adjust(
+                problem.with_loss(loss_px),
+                state,
+                iterations=iterations,
+                tolerance=tolerance,
+                damping=1e-6,
+                keep=part,
+                near=near,
+            )
+            return problem, found.state
+
+        return step
+
+    return _pruning(20.0), under(2.5, 20, 2e-3), _pruning(5.0), under(2.0, 15, 3e-4)
+
+
+def _pruning(limit: float) -> Step:
+    return partial(prune, limit=limit)
 
 
 def weighed(
@@ -182,9 +229,8 @@ def prune(problem: Problem, state: State, limit: float) -> tuple[Problem, State]
     """Removes observations with residuals above `limit` deviations and points left with one
     observation; control points are kept.
     """
-    error = np.linalg.norm(residuals_px(problem, state), axis=1) / problem.sigma_px
     pinned = np.asarray(np.isfinite(problem.X0).any(1))
-    good = (error < limit) | pinned[problem.point]
+    good = (squared_residuals(problem, state) < limit**2) | pinned[problem.point]
     enough = np.bincount(problem.point[good], minlength=len(state.X)) >= 2
     good &= enough[problem.point] | pinned[problem.point]
     thinner, points = problem.only(good)

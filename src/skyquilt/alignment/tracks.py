@@ -18,7 +18,7 @@ TOGETHER = 1_000_000
 """Edges or observations that are looked at at once."""
 
 
-def connected(count: int, a: NDArray[Any], b: NDArray[Any]) -> Index:
+def connected(count: int, a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.integer[Any]]:
     """Component (count,) of each node of a graph with edges a-b, numbered in order of their first
     nodes.
 
@@ -41,8 +41,11 @@ def connected(count: int, a: NDArray[Any], b: NDArray[Any]) -> Index:
                 moved = True
         while (label[label] != label).any():
             label = label[label]
-    first = label == np.arange(count, dtype=label.dtype)
-    return np.asarray(np.cumsum(first)[label] - 1, np.int64)
+    number: NDArray[Any] = np.cumsum(
+        label == np.arange(count, dtype=label.dtype), dtype=label.dtype
+    )
+    number -= 1
+    return np.asarray(number[label])
 
 
 def _index_type(count: int) -> type[np.int32 | np.int64]:
@@ -264,7 +267,7 @@ def _joined(
     used = np.flatnonzero(linked).astype(kind)
     number: NDArray[Any] = np.cumsum(linked, dtype=kind)
     number -= 1
-    label = connected(len(used), number[a], number[b]).astype(kind)
+    label = connected(len(used), number[a], number[b])
     del a, b, linked, number
     photo = (np.searchsorted(offset, used, "right") - 1).astype(kind)
     order = np.argsort(label, kind="stable")  # within a track they are in order of photos

@@ -309,6 +309,7 @@ class Factor:
                 rest = M @ M.T
                 np.subtract(whole[e:, e:], rest, out=rest)
                 left.setdefault(front.parent, []).append((front.unknowns[e:], rest))
+            del whole, L, M  # before the next front is assembled: large ones take 300 MB
 
     def solve(self, rhs: Array) -> Array:
         """The matrix's inverse times rhs (total,) or (total, k)."""

@@ -123,9 +123,9 @@ class TiePoints:
     """(N,) index into `xyz` of each observation, ascending."""
     photo: NDArray[np.integer[Any]]
     """(N,) index of the photo of each observation."""
-    px: Array
-    """(N, 2) observed pixel."""
-    residual_px: Array
+    px: NDArray[np.floating[Any]]
+    """(N, 2) observed pixel, to some 0.0001 px: there are millions of large surveys."""
+    residual_px: NDArray[np.floating[Any]]
     """(N, 2) projected minus observed."""
 
     def of_photos(self, photos: Sequence[int]) -> dict[int, NDArray[np.int64]]:
@@ -260,6 +260,6 @@ def no_ties() -> TiePoints:
         xyz=np.zeros((0, 3)),
         point=np.zeros(0, np.int32),
         photo=np.zeros(0, np.int32),
-        px=np.zeros((0, 2)),
-        residual_px=np.zeros((0, 2)),
+        px=np.zeros((0, 2), np.float32),
+        residual_px=np.zeros((0, 2), np.float32),
     )

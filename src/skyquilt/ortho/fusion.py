@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.model.raster import Grid
-from skyquilt.model.surface import STRIP, Surface
+from skyquilt.model.surface import Surface
 from skyquilt.ortho.fill import FIRM, bands
 
 Array = NDArray[np.float64]
@@ -103,12 +103,13 @@ def without_specks(z: Float, step: float, least: int) -> Mask:
         return known
     base = float(np.nanmin(z))
     scale = min(100.0, 30000 / max(float(np.nanmax(z)) - base, 1e-6))
-    levels = np.full(z.shape, -1000, np.int16)
-    for row in range(0, len(z), STRIP):
-        part = slice(row, row + STRIP)
-        levels[part][known[part]] = (z[part][known[part]] - base) * scale + 1
-    cv2.filterSpeckles(levels, -1000, least, step * scale)
-    return levels >= 0
+    kept = np.empty_like(known)
+    for rows, around, inner in bands(len(z), least):  # a patch that reaches beyond is large enough
+        own, levels = known[around], np.full(known[around].shape, -1000, np.int16)
+        levels[own] = (z[around][own] - base) * scale + 1
+        cv2.filterSpeckles(levels, -1000, least, step * scale)
+        kept[rows] = levels[inner] >= 0
+    return kept
 
 
 def surface_of(z: Float, cells: Grid) -> Surface:

@@ -138,13 +138,13 @@ class Stereo:
             grey=grey,
             agree=0.015 * height,
         )
-        z = _fused(given, pairs, "fine", keep)
+        z, agree = _fused(given, pairs, "fine", keep), given.agree
+        del given, pairs  # large surveys have rasters of 100 MB
         known = without_specks(z, 0.01 * height, 6)
         if known.any():
             z = nearest_known(z, known)
             if far > 0:
-                z = lowered(z, known, round(far / 2 / cells.gsd), given.agree)
-        del given  # large surveys have rasters of 100 MB
+                z = lowered(z, known, round(far / 2 / cells.gsd), agree)
         side = 2 * round(self.whole * height / cells.gsd / 2) + 1
         return surface_of(with_coarse(z, known, rough, cells, side), cells)
 

@@ -108,8 +108,8 @@ class Run:
             points=ties.xyz + np.array([*alignment.frame.origin, 0.0]),
             point=ties.point.astype(np.int64),
             photo=np.array([names[i] for i in ties.photo.tolist()], dtype=str),
-            px=ties.px,
-            residual_px=ties.residual_px,
+            px=ties.px.astype(np.float64),
+            residual_px=ties.residual_px.astype(np.float64),
         )
 
     def _alignment(self) -> tuple[Alignment, dict[int, str]]:

@@ -41,6 +41,7 @@ from skyquilt.workflows.photo_features import (
     PixelsInUse,
     features_recipe,
     find_features,
+    make_room,
     of_one_kind,
     picture_recipe,
     pixels_of,
@@ -49,7 +50,7 @@ from skyquilt.workflows.second_look import connect
 from skyquilt.workflows.survey_input import SurveyInput
 
 T = TypeVar("T")
-ADJUSTED_GB, ADJUSTED_PHOTO_GB = 0.8, 0.00022
+ADJUSTED_GB, ADJUSTED_PHOTO_GB = 0.5, 0.0001
 """Memory in GB of an adjustment, and how much more for each photo (measured: docs/scale.md)."""
 ADJUSTING = "adjusting"
 """Folder in the store with the parts of an adjustment that is not finished."""
@@ -187,6 +188,7 @@ def align_photos(
         control=given.control,
         order=_order(found.photos, given.rank),
         grey=grey,
+        make_room=lambda: make_room(found, grey),
         former=None if earlier is None else earlier.alignment_of(found.photos),
     )
     if links.links and earlier is None:
@@ -285,9 +287,7 @@ def draw_map(
     labels, labelled = yield from clock.stage(
         "seams", _at_once(lambda: _labels(aligned, on, exposure, methods, clock))
     )
-    aligned.found.looks.make_room()
-    aligned.grey.make_room()
-    give_back()
+    make_room(aligned.found, aligned.grey)
     compose = orthomosaic.composer(
         first.channels, first.dtype, on, exposure, labels, methods.blend, aligned.pixels
     )
