@@ -203,7 +203,7 @@ def _nowhere(start: Start) -> dict[int, str]:
     lost = [b for b in others if not start.georeferenced.intersection(b)]
     return {
         i: f"it is linked with {len(block) - 1} other photos, but not with the {len(first)} of the"
-        " largest block, and without a position its place is not known"
+        " largest block, and without a usable position its place is not known"
         for block in lost
         for i in block
     }
