@@ -463,3 +463,20 @@ def test_too_few_positions_to_leave_one_out():
     problem = replace(block.problem, C0=C0)
     assert leave_one_out(problem, block.truth, covariance(problem, block.truth)) is None
     assert leave_one_out(block.problem, block.truth, None) is None
+
+
+@pytest.mark.parametrize("lone", [0, 4])
+def test_a_photo_of_which_others_tell_nothing_is_not_left_out_by_a_million_metres(lone):
+    """Its position is known as well as it was measured, to rounding: nothing is left to divide
+    by.
+    """
+    block = make_block(41, lines=2, per_line=3, points=120)
+    found = adjust(block.problem, block.start, iterations=40).state
+    full = covariance(block.problem, found)
+    C0, photos = block.problem.C0.copy(), full.photos.copy()
+    photos[lone, 3:6, 3:6] = np.diag(block.problem.sigma_C[lone] ** 2) * (1 - 1e-12)
+    alone = replace(block.problem, C0=C0.copy())
+    alone.C0[lone] = found.C[lone] - 1e-3 * block.problem.sigma_C[lone]
+    C0[lone] = np.nan
+    others = leave_one_out(replace(block.problem, C0=C0), found, full)
+    assert leave_one_out(alone, found, replace(full, photos=photos)) == pytest.approx(others)

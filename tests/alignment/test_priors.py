@@ -41,6 +41,16 @@ def test_utm_zones(latitude, longitude, code):
     assert utm_epsg(latitude, longitude) == f"EPSG:{code}"
 
 
+@pytest.mark.parametrize("east", [179.9995, 179.9999, -179.9999])
+def test_a_flight_over_the_meridian_of_180_degrees_has_its_frame_there(east):
+    flown = [(east + 0.0001 * i + 180) % 360 - 180 for i in range(-4, 4)]
+    frame = choose_frame([at(-17.0, longitude) for longitude in flown], None)
+    assert frame.crs in ("EPSG:32760", "EPSG:32701")
+    to_map = Transformer.from_crs(4326, frame.crs, always_xy=True)
+    x, y = to_map.transform(flown, [-17.0] * len(flown))
+    assert np.hypot(np.array(x) - frame.origin[0], np.array(y) - frame.origin[1]).max() < 200
+
+
 @settings(max_examples=60, deadline=None)
 @given(*places)
 def test_the_zone_holds_its_place(latitude, longitude):

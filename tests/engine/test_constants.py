@@ -46,7 +46,11 @@ IN_NO_KEY = {
     "SIGMA_HEIGHT": "the same",
     "YAW_DEG": "conflicts are told in the report and shape nothing",
     "CERTAIN": "conflicts are told in the report and shape nothing",
-    "CONTRADICTED_PX": "conflicts are told in the report and shape nothing",
+    **dict.fromkeys(
+        ("CONTRADICTED_PX", "FEWEST_POSITIONS", "CONTRADICTED_DEVIATIONS", "CONTRADICTED_SHARE")
+        + ("MIRRORED",),
+        "conflicts are told in the report and shape nothing",
+    ),
     **dict.fromkeys(
         ("_WIDTH", "_HEIGHT", "_BITS", "_CODEC", "_SAMPLES", "_STRIPS", "_TILES", "_XMP_TAG")
         + ("_CODECS",),

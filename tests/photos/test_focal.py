@@ -182,6 +182,15 @@ def test_digital_zoom_lengthens_the_lens(make_jpeg):
     assert any("digital zoom of 2" in n for n in photo.notes)
 
 
+def test_photos_with_and_without_digital_zoom_have_intrinsics_of_their_own(make_jpeg):
+    wide, near, nearer, said = (
+        read_photo(make_jpeg(exif=exif_of("FC300S", FocalLength=(361, 100), **zoom)))
+        for zoom in ({}, *({"DigitalZoomRatio": (z, 10)} for z in (16, 20, 10)))
+    )
+    assert len({wide.camera_key, near.camera_key, nearer.camera_key}) == 3
+    assert said.camera_key == wide.camera_key
+
+
 def test_contradicting_focal_lengths_are_named_with_both_values(make_jpeg):
     exif = exif_of("FC300S", FocalLength=(361, 100), FocalLengthIn35mmFilm=35)
     notes = read_photo(make_jpeg(exif=exif, image=pixels(120, 90))).notes

@@ -307,6 +307,7 @@ KEYS = (
     "tie_points",
     "seam_disparity_px",
     "metadata_conflicts",
+    "warnings",
     "seconds",
     "cpu_seconds",
     "peak_memory_mb",

@@ -176,15 +176,13 @@ def with_loose_photos(
             reason = "it could not be linked to the other photos, and it has"
             rejected[i] = rejected.get(i, f"{reason} {lacking} to place it by")
             continue
-        rejected.pop(i, None)
+        weak = rejected.pop(i, "it could not be linked to any other photo")
         R = cam_R_map_from_angles(priors[i].yaw_deg, priors[i].pitch_deg, priors[i].roll_deg)
         poses[i] = Pose(cam_R_map=R, map_C=C)
         cameras.setdefault(photo.camera_key, reported_camera(photo))
         camera_of[i] = photo.camera_key
         blocks.append((i,))
-        notes.append(
-            f"{photo.name} could not be linked to any other photo; it is placed by its metadata."
-        )
+        notes.append(f"{photo.name} is placed by its metadata: {weak}.")
     return replace(
         alignment,
         poses=poses,

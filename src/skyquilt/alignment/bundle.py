@@ -56,7 +56,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 33
+    version: ClassVar[int] = 34
 
     def __call__(
         self,
@@ -218,7 +218,7 @@ def _nowhere(start: Start) -> dict[int, str]:
     lost = [b for b in others if not start.georeferenced.intersection(b)]
     return {
         i: f"it is linked with {len(block) - 1} other photos, but not with the {len(first)} of the"
-        " largest block, and without a position its place is not known"
+        " largest block, and without a usable position its place is not known"
         for block in lost
         for i in block
     }

@@ -64,6 +64,8 @@ def _yaw(photo: Photo, prior: Prior, alignment: Alignment, i: int) -> list[Metad
     )
     if abs(abs(off) - 180) < 20 and photo.editor:
         why = "another program has turned the file upside down, not its metadata"
+    elif abs(abs(off) - 90) < 20 and photo.height > photo.width:
+        why = "the file was turned upright, by a quarter, and its metadata were not"
     return [
         MetadataConflict(
             photo=photo.name,

@@ -17,6 +17,8 @@ from skyquilt.model.poses import Accuracy, TiePoints, no_ties
 Array = NDArray[np.float64]
 SAMPLED = 400
 """Ground points whose accuracy is predicted, about."""
+LEAST_TOLD = 1e-3
+"""Share of what is known of a photo's position that all others must tell, to predict it."""
 UNDETERMINED = 0.4
 """A focal length whose deviation stays above this share of its prior's is not determined: what the
 metadata say of it counts for a sixth or more.
@@ -27,7 +29,7 @@ def leave_one_out(
     problem: Problem, state: State, covariance: Covariance | None
 ) -> tuple[float, float, float] | None:
     """RMS per axis in m of the difference between each measured position and its prediction from
-    all other observations.
+    all other observations; photos of which the others tell nothing are left out.
 
     Computed from the covariance of the full solution (the usual identity of linear least squares)
     instead of n adjustments.
@@ -44,10 +46,15 @@ def leave_one_out(
             1 + (white @ white) / problem.loss_C**2
         )
         own = covariance.photos[i, 3:6, 3:6][np.ix_(axes, axes)]
+        told = np.eye(len(e)) - own @ precision  # by the others
+        if np.linalg.eigvals(told).real.min() < LEAST_TOLD:
+            continue
         full = np.full(3, np.nan)
-        full[axes] = np.linalg.solve(np.eye(len(e)) - own @ precision, e)
+        full[axes] = np.linalg.solve(told, e)
         out.append(full)
-    rms = np.sqrt(np.nanmean(np.array(out) ** 2, axis=0)) if out else np.full(3, np.nan)
+    if not out:
+        return None
+    rms = np.sqrt(np.nanmean(np.array(out) ** 2, axis=0))
     return float(rms[0]), float(rms[1]), float(rms[2])
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from pyproj import CRS, Proj, Transformer
 from pyproj.exceptions import CRSError
 
@@ -50,7 +51,7 @@ def choose_frame(
                 " them with --geo"
             )
         return MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="unknown", metric=metric)
-    latitude, longitude = np.median(np.array(places), axis=0)
+    latitude, longitude = _middle(np.array(places))
     name = name or utm_epsg(latitude, longitude)
     x, y = Transformer.from_crs(4326, name, always_xy=True).transform(longitude, latitude)
     origin = (float(np.round(x, -2)), float(np.round(y, -2)))
@@ -64,6 +65,17 @@ def choose_frame(
         control_datum=control_datum(control, vertical_datum, datum),
         convergence_deg=float(convergence),
     )
+
+
+def _middle(places: NDArray[np.float64]) -> tuple[float, float]:
+    """Median latitude and longitude of places (n, 2); the meridian of 180 degrees may lie between
+    them.
+    """
+    latitude, longitude = places.T
+    if np.ptp(longitude) <= 180:
+        return float(np.median(latitude)), float(np.median(longitude))
+    east = float(np.median(longitude % 360))
+    return float(np.median(latitude)), east if east < 180 else east - 360
 
 
 def _checked_crs(crs: str) -> str:

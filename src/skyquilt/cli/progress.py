@@ -192,6 +192,7 @@ def mosaic_summary(result: Result) -> str:
     lines += [
         f"left out: {name}: {reason}" for name, reason in list(m["photos_rejected"].items())[:10]
     ]
+    lines += [f"warning: {told}" for told in m.get("warnings", [])]
     if m["metadata_conflicts"]:
         lines.append(
             f"{len(m['metadata_conflicts'])} contradictions between metadata and images: see the"

@@ -132,7 +132,7 @@ class Photo:
     stored: Stored = ""
     """What a value of a thermal TIFF means as stored in the file; empty for other files."""
     camera_key: str
-    """Photos with equal keys share their intrinsics: make, model, serial, lens, size."""
+    """Photos with equal keys share their intrinsics: make, model, serial, lens, size, zoom."""
     calibration: Camera | None = None
     """Intrinsics that metadata or a side file give, distortion included."""
     unusable_calibration: str = ""

@@ -1,5 +1,5 @@
-"""Detects implausible positions: one far from all others, all in one place, a whole flight at
-height zero.
+"""Detects implausible positions: far from the others, all in one place, a whole flight at height
+zero.
 """
 
 from collections.abc import Sequence
@@ -9,33 +9,50 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.model.photo import Datum, Photo
+from skyquilt.photos.position_groups import FAR_M, distances_to_median, groups, on_sphere, spread_m
+from skyquilt.photos.side_rows import sentence_of
 
-_FAR_M = 5_000.0
-_FAR_SPREADS = 20.0
-_METRES_PER_DEGREE = 111_320.0
 _GROUND_M = 2.0
 _STUCK_M = 0.05
 _STUCK_PHOTOS = 4
+_SITE_PHOTOS = 3
 
 
 def without_outliers(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """The photos, without the positions that are implausibly far from the others, and a note for
-    each.
+    """The photos, without the positions that a wide gap separates from most others, and a note for
+    each, or for each group of them that is a site of its own.
 
-    Implausible is more than 5 km from the median and more than 20 times the median distance to it;
-    it takes at least three positions to decide which one is wrong. The photo stays, and its note
-    keeps the value.
+    It takes at least three positions to decide which one is wrong. The photo stays, and its note
+    keeps the value: where pictures overlap, they place it.
     """
-    placed = [p for p in photos if p.position]
-    if len(placed) < 3:
-        return tuple(photos), _far_pair(placed)
-    distance = dict(zip((p.name for p in placed), distances_to_median(placed), strict=True))
-    limit = max(_FAR_M, _FAR_SPREADS * float(np.median(list(distance.values()))))
-    far = {name: d for name, d in distance.items() if d > limit}
-    notes = tuple(
-        f"{name} reports a position {d / 1000:.0f} km from the others." for name, d in far.items()
-    )
-    return tuple(_unplaced(p, far[p.name]) if p.name in far else p for p in photos), notes
+    if sum(p.position is not None for p in photos) < 3:
+        return tuple(photos), _far_pair([p for p in photos if p.position])
+    main, *others = groups(photos)
+    middle = np.median(on_sphere([photos[i] for i in main]), axis=0)
+    kept, notes = list(photos), list[str]()
+    for group in others:
+        members = [photos[i] for i in group]
+        far = np.linalg.norm(on_sphere(members) - middle, axis=1)
+        for i, distance in zip(group, far.tolist(), strict=True):
+            kept[i] = _unplaced(photos[i], distance)
+        notes += _told(members, far, len(main))
+    return tuple(kept), tuple(notes)
+
+
+def _told(members: Sequence[Photo], far: NDArray[np.float64], main: int) -> list[str]:
+    """What is said of positions far from `main` others. Three or more that differ are no error of
+    a receiver, which repeats an old position.
+    """
+    if len(members) < _SITE_PHOTOS or spread_m(members) < _STUCK_M:
+        return [
+            f"{photo.name} reports a position {distance / 1000:.0f} km from the others."
+            for photo, distance in zip(members, far.tolist(), strict=True)
+        ]
+    return [
+        f"{len(members)} photos ({sentence_of([p.name for p in members])}) lie"
+        f" {np.median(far) / 1000:.0f} km from the {main} others; these positions were not used. If"
+        " they show another site, make a map of them by themselves, from a folder of their own."
+    ]
 
 
 def without_ground_heights(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
@@ -60,7 +77,7 @@ def without_stuck(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str
     Such positions would shrink the map to a point.
     """
     placed = [p for p in photos if p.position]
-    if len(placed) < _STUCK_PHOTOS or distances_to_median(placed).max() > _STUCK_M:
+    if len(placed) < _STUCK_PHOTOS or spread_m(placed) > _STUCK_M:
         return tuple(photos), ()
     place = placed[0].position
     note = (
@@ -87,20 +104,9 @@ def _unraised(photo: Photo) -> Photo:
 def _far_pair(placed: Sequence[Photo]) -> tuple[str, ...]:
     """With two positions far apart, one of them is wrong, but it cannot be decided which."""
     apart = 2 * float(distances_to_median(placed)[0]) if len(placed) == 2 else 0.0
-    if apart <= _FAR_M:
+    if apart <= FAR_M:
         return ()
     return (f"{placed[0].name} and {placed[1].name} report positions {apart / 1000:.0f} km apart.",)
-
-
-def distances_to_median(photos: Sequence[Photo]) -> NDArray[np.float64]:
-    """Horizontal distances (n,) in m of placed photos to the median of their positions."""
-    places = [(p.position.latitude_deg, p.position.longitude_deg) for p in photos if p.position]
-    degrees = np.array(places, dtype=np.float64)
-    middle = np.median(degrees, axis=0)
-    away = degrees - middle
-    away[:, 1] = (away[:, 1] + 180) % 360 - 180
-    away[:, 1] *= np.cos(np.radians(middle[0]))
-    return np.asarray(np.hypot(*away.T) * _METRES_PER_DEGREE)
 
 
 def _unplaced(photo: Photo, distance_m: float) -> Photo:

@@ -21,6 +21,11 @@ _FAR_NORTH_DEG = 85.0
 """Latitude beyond which a position is implausible: no UTM zone reaches there."""
 _SIGMA = (0.001, 1000.0)
 """Plausible standard deviations of positions in m."""
+NO_HEMISPHERE = (
+    "It does not say whether its latitude is north or south, or its longitude east or west; north"
+    " and east are assumed."
+)
+"""A note of a photo whose GPS position lacks a reference."""
 _YEARS = (1980, 2100)
 _RTK_FLOAT, _RTK_FIXED = 34, 50
 _DRONE_SIGMA = (1.5, 3.0)
@@ -37,6 +42,8 @@ def read_position(exif: Exif, xmp: Xmp) -> tuple[GeoPosition | None, tuple[str, 
     source = "xmp"
     if found is None:
         found, source = _place(_exif_degrees(exif), "EXIF", notes), "exif"
+        if found is not None and not _hemispheres_told(exif):
+            notes.append(NO_HEMISPHERE)
     if found is None:
         return None, tuple(notes or ["It has no GPS position."])
     takeoff, sea, ellipsoid = _heights(exif, xmp, notes)
@@ -98,6 +105,12 @@ def _exif_degrees(exif: Exif) -> tuple[float | None, float | None] | None:
     latitude = _sexagesimal(exif.gps.get(tag.GPS_LAT), as_text(exif.gps.get(tag.GPS_LAT_REF)))
     longitude = _sexagesimal(exif.gps.get(tag.GPS_LON), as_text(exif.gps.get(tag.GPS_LON_REF)))
     return latitude, longitude
+
+
+def _hemispheres_told(exif: Exif) -> bool:
+    """Whether EXIF says on which side of the equator and of Greenwich its position lies."""
+    north, east = (as_text(exif.gps.get(t)).upper()[:1] for t in (tag.GPS_LAT_REF, tag.GPS_LON_REF))
+    return north in ("N", "S") and east in ("E", "W")
 
 
 def _sexagesimal(value: object, reference: str) -> float | None:

@@ -20,6 +20,7 @@ from skyquilt.photos.flir import MOST_THERMAL_MP
 from skyquilt.photos.headers import Header, content_digest, read_header
 from skyquilt.photos.lens import (
     Sensor,
+    digital_zoom,
     find_focal,
     find_sensor,
     focal_notes,
@@ -295,7 +296,7 @@ def _is_lwir(header: Header) -> bool:
 
 def _camera_key(header: Header, width: int, height: int) -> str:
     exif, xmp = header.exif, header.xmp
-    mm = exif.number(tag.FOCAL_MM)
+    mm, zoom = exif.number(tag.FOCAL_MM), digital_zoom(exif)
     make, model = exif.text(tag.MAKE) or "unknown", exif.text(tag.MODEL) or "camera"
     parts = (
         "" if model.lower().startswith(make.lower()) else make,
@@ -305,6 +306,7 @@ def _camera_key(header: Header, width: int, height: int) -> str:
         xmp.text("Camera:BandName"),
         f"{width}x{height}",
         f"{mm:.1f}mm" if mm else "",
+        f"zoom {zoom:g}" if zoom > 1 else "",
     )
     return " ".join(" ".join(p.lower().split()) for p in parts if p)
 

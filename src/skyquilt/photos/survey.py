@@ -13,11 +13,13 @@ from skyquilt.model.photo import Photo, RejectedPhoto, Survey
 from skyquilt.outside import MOST_MP, plain, walk
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
 from skyquilt.photos.clips import is_timed, read_clips
+from skyquilt.photos.coarse_positions import with_coarse_deviations
 from skyquilt.photos.implausible_positions import (
     without_ground_heights,
     without_outliers,
     without_stuck,
 )
+from skyquilt.photos.metadata import NO_HEMISPHERE
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
@@ -170,11 +172,14 @@ def read_survey(
 
 
 def placed_plausibly(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """Photos in order of capture, without positions that cannot be right, and notes on these."""
+    """Photos in order of capture, without positions that cannot be right, those that say little
+    with larger deviations, and notes on these.
+    """
     ordered, grounded = without_ground_heights(sorted(photos, key=capture_order))
     ordered, stuck = without_stuck(ordered)
     ordered, far = without_outliers(ordered)
-    return ordered, (*grounded, *stuck, *far)
+    ordered, coarse = with_coarse_deviations(ordered)
+    return ordered, (*grounded, *stuck, *far, *coarse)
 
 
 def capture_order(photo: Photo) -> tuple[bool, datetime, str]:
@@ -273,6 +278,13 @@ def _gaps(photos: Sequence[Photo]) -> Iterator[str]:
         )
         yield f"{which} a usable GPS position" + (
             f": {sentence_of(void)}." if len(void) < len(photos) else "."
+        )
+    assumed = [p.name for p in photos if NO_HEMISPHERE in p.notes]
+    if assumed:
+        yield (
+            f"{len(assumed)} photos do not say whether their position lies north or south, east or"
+            f" west: {sentence_of(assumed)}. North and east are assumed; where that is wrong, give"
+            " positions in a geo.txt."
         )
     if photos and all(p.attitude is None for p in photos):
         yield "No photo has camera angles."

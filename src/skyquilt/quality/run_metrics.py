@@ -162,6 +162,7 @@ def figures(
     seams: Mapping[str, Any],
     looks: Mapping[str, Any],
     conflicts: Sequence[MetadataConflict],
+    warnings: Sequence[str],
     notes: Sequence[str],
 ) -> dict[str, Any]:
     """The figures of a run, without times."""
@@ -188,6 +189,7 @@ def figures(
         "seam_disparity_px": seams,
         **looks,
         "metadata_conflicts": [asdict(c) for c in conflicts],
+        "warnings": list(warnings),
         "cameras": camera_figures(photos, alignment),
         "shutter": shutter_figures(photos, alignment),
         "accuracy": accuracy_figures(alignment.accuracy),

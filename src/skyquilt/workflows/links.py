@@ -1,7 +1,7 @@
 """Finds photos that show the same ground: candidate pairs, matches, verified links."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby, pairwise
 from typing import Any
 
@@ -15,8 +15,9 @@ from skyquilt.engine.workers import Workers
 from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.matching.candidates import Pair, sequence
+from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
 from skyquilt.matching.matchers import Guided
-from skyquilt.model.features import Features, Link, RejectedLink, numbers
+from skyquilt.model.features import Features, Link, Matches, RejectedLink, numbers
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import MapFrame, Prior
 from skyquilt.ortho.tie_surface import level
@@ -66,6 +67,8 @@ class Links:
     """Pairs that show the same ground."""
     rejected: tuple[RejectedLink, ...] = ()
     """Pairs that do not, with reasons."""
+    marks: FixedMarks = field(default_factory=FixedMarks)
+    """What pictures show at the same place each, and does not connect them."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -128,17 +131,22 @@ def link_pair(
     photo: Photo,
     methods: Methods,
     expected: NDArray[np.float64] | None = None,
+    marked: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None,
 ) -> Link | RejectedLink:
     """The link of photos a and b (numbers), or the reason why there is none. `photo` is a.
 
     `expected` (len(features of a), 2): positions in px of a's keypoints in b predicted from
-    metadata, NaN where unknown; needed by a guided matcher only.
+    metadata, NaN where unknown; needed by a guided matcher only. `marked`: which keypoints of each
+    lie on fixed marks; their matches are not used.
     """
     if isinstance(methods.matcher, Guided):
         assert expected is not None, "a guided matcher needs predicted positions"
         matches = methods.matcher.for_width(photo.width)(*features, expected)
     else:
         matches = methods.matcher(*features)
+    if marked is not None:
+        ground = ~(marked[0][matches.index_a] | marked[1][matches.index_b])
+        matches = Matches(index_a=matches.index_a[ground], index_b=matches.index_b[ground])
     return methods.verify(a, b, *features, matches, photo.width)
 
 
@@ -155,20 +163,22 @@ class _Linker:
     ) -> None:
         self.found, self.methods, self.store = found, methods, store
         self.features = found.features
+        self.marks = marks_of(found.photos, found.features)
         self.expected: ExpectedPlaces | None = None
         if isinstance(methods.matcher, Guided):
             height = methods.matcher.height_m
             self.expected = ExpectedPlaces(found.photos, frame, priors, height)
         by = None if self.expected is None else self.expected.key
         self._recipe = digest(
-            features_recipe(methods.detector), methods.matcher, methods.verify, by
+            features_recipe(methods.detector), methods.matcher, methods.verify, by, self.marks
         )
 
     def one(self, pair: Pair) -> Link | RejectedLink:
         a, b = pair
         two = self.features[a], self.features[b]
         places = None if self.expected is None else self.expected(a, b, two[0].px)
-        return link_pair(a, b, two, self.found.photos[a], self.methods, places)
+        marked = marked_in(self.marks, self.found.photos, pair, two)
+        return link_pair(a, b, two, self.found.photos[a], self.methods, places, marked)
 
     def batch(self, pairs: Sequence[Pair]) -> list[Link | RejectedLink]:
         """Links of a batch. They are stored by content: photos that join the survey later change
@@ -213,7 +223,25 @@ def link_photos(
     return Links(
         links=tuple(k for k in tried if isinstance(k, Link)),
         rejected=tuple(k for k in tried if isinstance(k, RejectedLink)),
+        marks=linker.marks,
     )
+
+
+def marks_of(photos: Sequence[Photo], features: Sequence[Features]) -> FixedMarks:
+    """What the pictures of each camera show at the same place each."""
+    cameras, sizes = [p.camera_key for p in photos], [(p.width, p.height) for p in photos]
+    return FindFixedMarks()(features, cameras, sizes)
+
+
+def marked_in(
+    marks: FixedMarks, photos: Sequence[Photo], pair: Pair, two: tuple[Features, Features]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
+    """Which keypoints of a pair lie on marks; None where neither camera has any."""
+    cameras = [photos[i].camera_key for i in pair]
+    if not any(c in marks.masks for c in cameras):
+        return None
+    a, b = (marks.on_mark(c, f.px) for c, f in zip(cameras, two, strict=True))
+    return a, b
 
 
 def _linked(

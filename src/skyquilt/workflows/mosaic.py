@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from skyquilt.alignment.conflicts import conflicts
+from skyquilt.alignment.contradicted_positions import position_warnings
 from skyquilt.alignment.heights import height_figures
 from skyquilt.engine.clock import Clock, Steps, result_of
 from skyquilt.engine.error_log import log_error
@@ -386,6 +387,7 @@ def _metrics(
             seams=seams.figures,
             looks={**seams.looks, "tone_residual": _tone(aligned, ground, map_)},
             conflicts=conflicts(aligned.photos, aligned.priors, alignment),
+            warnings=[*aligned.links.marks.notes, *position_warnings(aligned.priors, alignment)],
             notes=[*survey.notes, *alignment.notes],
         )
         | {

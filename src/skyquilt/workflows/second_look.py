@@ -6,7 +6,7 @@ for so many in all photos would be a waste.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +17,12 @@ from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
 from skyquilt.imaging.grey import shrink
 from skyquilt.matching.candidates import Pair
+from skyquilt.matching.fixed_marks import FixedMarks
 from skyquilt.matching.matchers import Guided
 from skyquilt.model.features import Features, Link, RejectedLink, numbers
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Prior
-from skyquilt.workflows.links import Links, link_pair
+from skyquilt.workflows.links import Links, link_pair, marked_in
 from skyquilt.workflows.methods import Countable, Methods
 from skyquilt.workflows.photo_features import PICTURE, FeaturedPhotos, GreyPictures, features_recipe
 
@@ -45,6 +46,8 @@ class CloserLook:
     """Finds, matches and verifies features."""
     store: Store
     """Keeps the features."""
+    marks: FixedMarks = field(default_factory=FixedMarks)
+    """What the pictures show at the same place each."""
 
     def __call__(self, photo: int) -> Features:
         """Features of a photo (index)."""
@@ -65,10 +68,13 @@ class CloserLook:
         """The link of two photos, or the reason why there is none."""
         a, b = pair
         names = (self.photos[a].digest, self.photos[b].digest)
-        recipe = (features_recipe(self.methods.detector), self.methods.matcher, self.methods.verify)
+        methods = self.methods
+        recipe = (features_recipe(methods.detector), methods.matcher, methods.verify, self.marks)
 
         def compared() -> Link | RejectedLink:
-            return link_pair(a, b, (self(a), self(b)), self.photos[a], self.methods)
+            two = self(a), self(b)
+            marked = marked_in(self.marks, self.photos, pair, two)
+            return link_pair(a, b, two, self.photos[a], methods, marked=marked)
 
         found = self.store.get_or("links", digest(names, "closer", recipe), compared)
         return replace(found, a=a, b=b)
@@ -91,7 +97,7 @@ def connect(
     if not pairs or isinstance(methods.matcher, Guided) or not isinstance(detector, Countable):
         return found, links
     more = replace(methods, detector=detector.counted(MORE * detector.count))
-    look = CloserLook(photos=found.photos, grey=grey, methods=more, store=store)
+    look = CloserLook(photos=found.photos, grey=grey, methods=more, store=store, marks=links.marks)
     photos = sorted({i for pair in pairs for i in pair})
     total, better = len(photos) + len(pairs), list[Link]()
     for done, _ in enumerate(workers.each(look.prepare, photos)):
@@ -112,7 +118,8 @@ def connect(
     }
     whole = sorted([*links.links, *joined.values()], key=lambda k: (k.a, k.b))
     rest = tuple(k for k in links.rejected if (k.a, k.b) not in joined)
-    return replace(found, closer=look, again=again), Links(links=tuple(whole), rejected=rest)
+    linked = replace(links, links=tuple(whole), rejected=rest)
+    return replace(found, closer=look, again=again), linked
 
 
 def unconnected(count: int, links: Links, priors: Sequence[Prior]) -> list[Pair]:

@@ -1,0 +1,134 @@
+"""Marks that lie at the same place of every picture: a burnt-in text, a logo, dirt on the lens.
+
+They match perfectly, as if the camera had not moved, and where the ground has few features they
+outvote it. So matches on them are not used.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.model.features import Features
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FixedMarks:
+    """Where the pictures of each camera show marks."""
+
+    masks: dict[str, Mask] = field(default_factory=dict)
+    """By camera, only of cameras with marks: cells of the picture, True on marks."""
+    cell_px: dict[str, float] = field(default_factory=dict)
+    """By camera: side of a cell in px of the photo."""
+
+    def on_mark(self, camera: str, px: NDArray[np.float64]) -> Mask:
+        """(n,) whether places (n, 2) in px of a photo lie on marks."""
+        mask = self.masks.get(camera)
+        if mask is None:
+            return np.zeros(len(px), bool)
+        column, row = np.floor(px / self.cell_px[camera]).astype(int).T
+        rows, columns = mask.shape
+        return np.asarray(mask[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)])
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """A sentence for each camera with marks."""
+        return tuple(
+            f"Photos of {camera} show the same marks at the same place in every picture, on"
+            f" {100 * mask.mean():.1f} % of it: a text or logo written into them, a frame, or dirt"
+            " on the lens. They are not used to connect photos, but they are on the map."
+            for camera, mask in self.masks.items()
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FindFixedMarks:
+    """Looks for marks in some photos of each camera."""
+
+    looked_at: int = 8
+    """Photos of a camera in which marks are looked for, spread evenly over the survey."""
+    fewest: int = 6
+    """Fewest photos of a camera that can tell marks from ground."""
+    agreeing: int = 3
+    """So many of the other photos looked at must show a mark."""
+    alike: float = 0.85
+    """Least similarity of two descriptors of one mark."""
+    standing: float = 0.4
+    """With a larger share than this of a photo's keypoints at the same place in others, the camera
+    stood still.
+    """
+    least: int = 3
+    """Fewest keypoints on marks in one photo."""
+    cell_px: int = 4
+    """Side of a cell of a mask, in px of the image that was searched for features."""
+
+    def __call__(
+        self, features: Sequence[Features], cameras: Sequence[str], sizes: Sequence[tuple[int, int]]
+    ) -> FixedMarks:
+        """The marks of each camera (its name for each photo); `sizes`: width and height of the
+        photos in px.
+        """
+        masks, cells = dict[str, Mask](), dict[str, float]()
+        for camera in dict.fromkeys(cameras):
+            own = [i for i, c in enumerate(cameras) if c == camera]
+            if len(own) < self.fewest:
+                continue
+            spread = np.unique(np.linspace(0, len(own) - 1, self.looked_at).round().astype(int))
+            some = [features[own[k]] for k in spread.tolist()]
+            side = self.cell_px * some[0].scale
+            width, height = sizes[own[0]]
+            mask = np.zeros((int(height / side) + 1, int(width / side) + 1), bool)
+            for one, fixed in zip(some, self._fixed(some), strict=True):
+                column, row = np.floor(one.px[fixed] / side).astype(int).T
+                inside = np.clip(row, 0, mask.shape[0] - 1), np.clip(column, 0, mask.shape[1] - 1)
+                mask[inside] = True
+            if mask.any():
+                masks[camera], cells[camera] = _widened(mask), float(side)
+        return FixedMarks(masks=masks, cell_px=cells)
+
+    def _fixed(self, photos: Sequence[Features]) -> list[Mask]:
+        """Which keypoints of each photo others show at the same place."""
+        rasters, described = [_raster(f) for f in photos], [f.unit for f in photos]
+        found = []
+        for a, one in enumerate(photos):
+            seen, place = np.zeros(len(one), int), _cells(one)
+            for b, raster in enumerate(rasters):
+                if a == b:
+                    continue
+                inside = (place < raster.shape[::-1]).all(1)
+                other = np.full(len(one), -1)
+                other[inside] = raster[place[inside, 1], place[inside, 0]]
+                near = np.flatnonzero(other >= 0)
+                likeness = (described[a][near] * described[b][other[near]]).sum(1)
+                seen[near[likeness > self.alike]] += 1
+            fixed = seen >= self.agreeing
+            marks = self.least <= fixed.sum() <= self.standing * len(one)
+            found.append(fixed if marks else np.zeros_like(fixed))
+        return found
+
+
+def _cells(features: Features) -> NDArray[np.int64]:
+    """(n, 2) px of the image that was searched in which the keypoints lie."""
+    return np.maximum(np.round(features.px / features.scale).astype(np.int64), 0)
+
+
+def _raster(features: Features) -> NDArray[np.int32]:
+    """The number of the keypoint at or beside each px of the image that was searched; -1 = none."""
+    place = _cells(features)
+    size = place.max(0) + 2 if len(place) else np.array([1, 1])
+    raster = np.full((size[1], size[0]), -1, np.int32)
+    beside = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)]
+    for x, y in sorted(beside, key=lambda b: -abs(b[0]) - abs(b[1])):  # its own px last
+        raster[np.maximum(place[:, 1] + y, 0), np.maximum(place[:, 0] + x, 0)] = range(len(place))
+    return raster
+
+
+def _widened(mask: Mask) -> Mask:
+    """The mask with the cells around each of its cells."""
+    wide = np.pad(mask, 1)
+    rows, columns = mask.shape
+    shifted = [wide[y : y + rows, x : x + columns] for y in range(3) for x in range(3)]
+    return np.asarray(np.any(shifted, axis=0))

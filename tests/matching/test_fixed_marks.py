@@ -1,0 +1,103 @@
+"""Marks at the same place of every picture are found, and ground is not taken for them."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
+from skyquilt.matching.sift import Sift
+from skyquilt.matching.verify import Verify
+from skyquilt.model.features import Link
+from skyquilt.settings import MosaicSettings
+from skyquilt.workflows.links import link_pair, marked_in
+from skyquilt.workflows.methods import methods_for
+from tests.alignment.surveys import photo
+from tests.texture import texture
+
+WIDE, HIGH = 480, 360
+STAMP = (20, 320, 440, 350)
+"""Left, top, right and bottom of the text in px."""
+FIND = Sift(count=600)
+
+
+def stamped(picture, text="SKYCAM 4K  46.59N 14.29E"):
+    out = np.clip(picture, 0, 255).astype(np.uint8)
+    cv2.putText(out, text, (STAMP[0], STAMP[3] - 6), 0, 0.9, 255, 2, cv2.LINE_AA)
+    return out
+
+
+def flight(count, step=90, seed=0):
+    """Photos along a line over one texture."""
+    ground = texture(HIGH, WIDE + step * count, seed)
+    cuts = [ground[:, step * i : step * i + WIDE] for i in range(count)]
+    return [np.clip(cut, 0, 255).astype(np.uint8) for cut in cuts]
+
+
+def marks_in(pictures, cameras=None):
+    features = [FIND(p) for p in pictures]
+    cameras = cameras or ["cam"] * len(pictures)
+    return features, FindFixedMarks()(features, cameras, [(WIDE, HIGH)] * len(pictures))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_text_is_found_and_nothing_beside_it(seed):
+    features, marks = marks_in([stamped(p) for p in flight(10, seed=seed)])
+    left, top, right, bottom = STAMP
+    for one in features:
+        x, y = one.px.T
+        inside = (x > left) & (x < right) & (y > top) & (y < bottom)
+        far = (x < left - 20) | (x > right + 20) | (y < top - 20)
+        found = marks.on_mark("cam", one.px)
+        assert found[inside].mean() > 0.6
+        assert not found[far].any()
+    assert len(marks.notes) == 1
+
+
+def test_texts_that_change_in_part_are_found_where_they_do_not():
+    _, marks = marks_in([stamped(p, f"CAM 10:3{i}") for i, p in enumerate(flight(8))])
+    assert marks.on_mark("cam", np.array([[40.0, 335.0]])).all()
+
+
+@pytest.mark.parametrize("step", [20, 90, 400])
+def test_ground_is_no_mark(step):
+    _, marks = marks_in(flight(10, step))
+    assert not marks.masks and not marks.notes
+
+
+def test_a_camera_that_stands_still_shows_no_marks():
+    rng = np.random.default_rng(1)
+    (still,) = flight(1)
+    noisy = [
+        np.clip(still + rng.normal(0, 2, still.shape), 0, 255).astype(np.uint8) for _ in range(8)
+    ]
+    assert not marks_in(noisy)[1].masks
+
+
+def test_every_camera_has_its_own_marks():
+    plain, marked = flight(8), [stamped(p) for p in flight(8, seed=5)]
+    _, marks = marks_in([*plain, *marked], ["plain"] * 8 + ["marked"] * 8)
+    assert list(marks.masks) == ["marked"]
+
+
+def test_few_photos_tell_nothing():
+    assert not marks_in([stamped(p) for p in flight(5)])[1].masks
+
+
+def test_photos_of_different_ground_are_linked_by_their_text_unless_it_is_known():
+    pictures = [stamped(p) for p in flight(8, step=500)]
+    features, marks = marks_in(pictures)
+    photos = [photo(f"{i}.jpg") for i in range(8)]
+    methods = replace(methods_for(MosaicSettings()), verify=Verify(minimum=8))
+
+    def linked(known):
+        found = []
+        for pair in ((0, 1), (2, 5), (3, 7)):
+            two = features[pair[0]], features[pair[1]]
+            marked = marked_in(known, photos, pair, two)
+            found.append(link_pair(*pair, two, photos[0], methods, marked=marked))
+        return sum(isinstance(k, Link) for k in found)
+
+    assert linked(FixedMarks()) >= 2
+    assert linked(marks) == 0

@@ -1,0 +1,105 @@
+"""Positions that are wrong, of two sites, rounded, or repeated."""
+
+import numpy as np
+import piexif
+import pytest
+from pyproj import Geod
+
+from skyquilt.photos.read import read_photo
+from skyquilt.photos.survey import read_survey
+
+from .conftest import dji_exif, dji_xmp, gps_exif
+
+STATED_M = 5.0
+"""Deviation of a position in EXIF that states none."""
+
+
+def photo_at(make_jpeg, number, latitude, longitude, drone=False):
+    """A photo with its position in XMP (as a drone states it) or in EXIF, five seconds after the
+    one before.
+    """
+    taken = f"2020:06:01 10:{number // 12:02d}:{number * 5 % 60:02d}"
+    exif = dji_exif(Exif={piexif.ExifIFD.DateTimeOriginal: taken})
+    exif["GPS"] = gps_exif(latitude, longitude)
+    xmp = dji_xmp(GpsLatitude=f"{latitude:.9f}", GpsLongitude=f"{longitude:.9f}") if drone else None
+    return make_jpeg(f"{number:03d}.jpg", exif=exif, xmp=xmp, seed=number).parent
+
+
+def placed(survey):
+    return [p.name for p in survey.photos if p.position]
+
+
+@pytest.mark.parametrize(("first", "second"), [(6, 4), (4, 6), (5, 5)])
+def test_the_larger_of_two_sites_is_mapped_and_the_other_is_named_once(make_jpeg, first, second):
+    for i in range(first + second):
+        latitude = 46.6 + 0.27 * (i >= first) + i * 0.000123
+        folder = photo_at(make_jpeg, i, latitude, 14.3)
+    survey = read_survey(folder)
+    mapped = range(first) if first >= second else range(first, first + second)
+    assert placed(survey) == [f"{i:03d}.jpg" for i in mapped]
+    (note,) = [n for n in survey.notes if "another site" in n]
+    away = Geod(ellps="sphere").inv(14.3, 46.6, 14.3, 46.87)[2] / 1000
+    assert f"lie {away:.0f} km from the {max(first, second)} others" in note
+    assert note.startswith(f"{min(first, second)} photos")
+
+
+def test_an_old_position_that_is_repeated_is_no_site(make_jpeg):
+    for i in range(9):
+        folder = photo_at(make_jpeg, i, 47.9 if i < 3 else 46.6 + i * 0.000123, 14.3)
+    survey = read_survey(folder)
+    assert placed(survey) == [f"{i:03d}.jpg" for i in range(3, 9)]
+    assert sum("from the others" in n for n in survey.notes) == 3
+
+
+def test_a_flight_over_the_meridian_of_180_degrees_is_one_site(make_jpeg):
+    for i in range(8):
+        longitude = 179.9993 + i * 0.000213
+        longitude -= 360 * (longitude > 180)
+        folder = photo_at(make_jpeg, i, -17.0, longitude)
+    assert len(placed(read_survey(folder))) == 8
+
+
+@pytest.mark.parametrize("step", [1e-3, 1e-4, 1 / 3600])
+def test_rounded_positions_are_as_uncertain_as_rounding_makes_them(make_jpeg, step):
+    rng = np.random.default_rng(3)
+    true = np.array([46.6, 14.3]) + rng.uniform(0, 0.02, (6, 2))
+    for i, (latitude, longitude) in enumerate(np.round(true / step) * step):
+        folder = photo_at(make_jpeg, i, latitude, longitude)
+    survey = read_survey(folder)
+    many = rng.uniform(0, 1, 100_000)
+    sigma = max(float(np.std(np.round(many / step) * step - many)) * 111_320, STATED_M)
+    assert [p.position.sigma_xy_m for p in survey.photos] == pytest.approx([sigma] * 6, rel=0.01)
+    assert any("rounded" in n for n in survey.notes) == (sigma > STATED_M)
+
+
+def test_positions_of_a_receiver_are_not_taken_for_rounded_ones(make_jpeg):
+    for i, north in enumerate(np.random.default_rng(5).uniform(0, 0.001, 6)):
+        folder = photo_at(make_jpeg, i, 46.6 + round(north, 6), 14.3)
+    survey = read_survey(folder)
+    assert {p.position.sigma_xy_m for p in survey.photos} == {STATED_M}
+    assert not any("rounded" in n for n in survey.notes)
+
+
+def test_a_repeated_position_is_as_uncertain_as_the_way_to_the_next(make_jpeg):
+    """Four photos in a line, each place stated three times; the last ones have no next."""
+    places = [46.6 + 0.000213 * (i // 3) * (1 + i // 6) for i in range(12)]
+    for i, latitude in enumerate(places):
+        folder = photo_at(make_jpeg, i, latitude, 14.3, drone=True)
+    survey = read_survey(folder)
+    found = [p.position.sigma_xy_m for p in survey.photos]
+    stated = found[0]
+    steps = np.diff(np.unique(places)) * 111_320
+    for run, way in enumerate([*steps, steps[-1]]):
+        assert found[3 * run] == stated
+        assert found[3 * run + 1 : 3 * run + 3] == pytest.approx([way] * 2, rel=1e-3)
+    assert any("8 photos" in n and "repeat" in n for n in survey.notes)
+
+
+def test_a_missing_reference_of_a_position_is_told(make_jpeg):
+    exif = dji_exif()
+    told = read_photo(make_jpeg("told.jpg", exif=exif))
+    del exif["GPS"][piexif.GPSIFD.GPSLongitudeRef]
+    path = make_jpeg("untold.jpg", exif=exif, seed=2)
+    assert not any("north and east are assumed" in n for n in told.notes)
+    assert any("north and east are assumed" in n for n in read_photo(path).notes)
+    assert any("1 photos do not say" in n for n in read_survey(path.parent).notes)
