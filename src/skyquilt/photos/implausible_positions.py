@@ -1,5 +1,8 @@
-"""Detects implausible positions: far from the others, all in one place, a whole flight at height
-zero.
+"""Positions that are wrong or say less than they seem: far from the others, all in one place, a
+whole flight at height zero, rounded, or repeated.
+
+Wrong ones are not used. Rounded and repeated ones get deviations as large as they are, so that they
+do not shrink or turn a map.
 """
 
 from collections.abc import Sequence
@@ -9,13 +12,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.model.photo import Datum, Photo
-from skyquilt.photos.position_groups import FAR_M, distances_to_median, groups, on_sphere, spread_m
 from skyquilt.photos.side_rows import sentence_of
 
+Array = NDArray[np.float64]
+_METRES_PER_DEGREE = 111_320.0
+FAR_M = 5_000.0
+FAR_STEPS = 20.0
+"""A gap is longer than FAR_M and longer than so many times the way from a photo to the nearest."""
+_EARTH_M = _METRES_PER_DEGREE * 180 / np.pi
 _GROUND_M = 2.0
 _STUCK_M = 0.05
 _STUCK_PHOTOS = 4
 _SITE_PHOTOS = 3
+_STEPS_DEG = (0.1, 1 / 60, 1e-2, 1e-3, 1 / 3600, 1e-4)
+"""What degrees are rounded to, coarse to fine: finer steps are below a receiver's own error."""
+_EXACT_DEG = 1e-8
+"""Difference from a multiple of a step, or from another position, that counts as none."""
+_ROUNDED_PHOTOS = 4
+"""So many photos of a camera must agree before their positions are called rounded."""
 
 
 def without_outliers(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
@@ -118,3 +132,122 @@ def _unplaced(photo: Photo, distance_m: float) -> Photo:
         " not used."
     )
     return replace(photo, position=None, notes=(*photo.notes, note))
+
+
+def with_coarse_deviations(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    """The photos (in order of capture) with larger deviations where their positions are rounded or
+    repeat the one before, and notes on these.
+    """
+    kept, notes = list(photos), list[str]()
+    for key in dict.fromkeys(p.camera_key for p in photos if p.position):
+        own = [i for i, p in enumerate(photos) if p.position and p.camera_key == key]
+        for coarse in (_rounded, _repeated):
+            given = [kept[i] for i in own]
+            found, note = coarse(given)
+            for i, photo in zip(own, found, strict=True):
+                kept[i] = photo
+            changed = [new.name for old, new in zip(given, found, strict=True) if new is not old]
+            if changed:
+                notes.append(f"{len(changed)} photos ({sentence_of(changed)}) {note}")
+    return tuple(kept), tuple(notes)
+
+
+def _rounded(photos: Sequence[Photo]) -> tuple[list[Photo], str]:
+    """Photos of a camera whose positions all are multiples of a step of degrees."""
+    degrees = _degrees(photos)
+    for step in _STEPS_DEG if len(photos) >= _ROUNDED_PHOTOS else ():
+        if (np.abs(degrees - step * np.round(degrees / step)) < _EXACT_DEG).all():
+            metres = step * _METRES_PER_DEGREE
+            sigma = metres / np.sqrt(12)  # of a uniform distribution
+            note = (
+                f"have positions that are rounded to {metres:.0f} m; they count as uncertain by"
+                f" {sigma:.1f} m."
+            )
+            return [_widened(p, float(sigma)) for p in photos], note
+    return list(photos), ""
+
+
+def _repeated(photos: Sequence[Photo]) -> tuple[list[Photo], str]:
+    """Photos of a camera that repeat the position of the photo before: the camera is somewhere on
+    the way to the next position that differs.
+    """
+    degrees, xyz = _degrees(photos), on_sphere(photos)
+    new = np.ones(len(photos), bool)
+    new[1:] = (np.abs(np.diff(degrees, axis=0)) > _EXACT_DEG).any(1)
+    starts = np.flatnonzero(new)
+    if len(starts) < 2 or new.all():
+        return list(photos), ""
+    run = np.cumsum(new) - 1
+    to_next = np.linalg.norm(np.diff(xyz[starts], axis=0), axis=1)
+    away = np.append(to_next, to_next[-1])[run]
+    found = [
+        p if first else _widened(p, float(m)) for p, first, m in zip(photos, new, away, strict=True)
+    ]
+    note = (
+        "repeat the position of the photo before: a receiver that was slow or stuck; they count as"
+        f" uncertain by up to {away[~new].max():.0f} m."
+    )
+    return found, note
+
+
+def _degrees(photos: Sequence[Photo]) -> Array:
+    places = [(p.position.latitude_deg, p.position.longitude_deg) for p in photos if p.position]
+    return np.array(places, np.float64).reshape(-1, 2)
+
+
+def _widened(photo: Photo, sigma_xy_m: float) -> Photo:
+    """The photo whose position has at least that deviation."""
+    if photo.position is None or sigma_xy_m <= photo.position.sigma_xy_m:
+        return photo
+    return replace(photo, position=replace(photo.position, sigma_xy_m=sigma_xy_m))
+
+
+def groups(photos: Sequence[Photo]) -> list[list[int]]:
+    """Indices of the photos with positions, in groups with a gap around each; the largest first,
+    of equal ones the one that began first.
+    """
+    placed = [i for i, p in enumerate(photos) if p.position]
+    if not placed:
+        return []
+    xyz = on_sphere(photos)
+    limit = max(FAR_M, FAR_STEPS * _usual_step(xyz))
+    rest, found = np.arange(len(placed)), list[list[int]]()
+    while len(rest):
+        reached, rest, done = [int(rest[0])], rest[1:], 0
+        while done < len(reached) and len(rest):
+            near = np.linalg.norm(xyz[rest] - xyz[reached[done]], axis=1) <= limit
+            reached += rest[near].tolist()
+            rest, done = rest[~near], done + 1
+        found.append(sorted(placed[k] for k in reached))
+    return sorted(found, key=lambda g: (-len(g), g[0]))
+
+
+def on_sphere(photos: Sequence[Photo]) -> Array:
+    """Positions (n, 3) in m on a sphere, of those photos that have one: distances between them
+    do not depend on the pole or on the meridian of 180 degrees.
+    """
+    places = [(p.position.latitude_deg, p.position.longitude_deg) for p in photos if p.position]
+    north, east = np.radians(np.array(places, np.float64).reshape(-1, 2)).T
+    flat = np.cos(north)
+    return _EARTH_M * np.stack([flat * np.cos(east), flat * np.sin(east), np.sin(north)], 1)
+
+
+def _usual_step(xyz: Array) -> float:
+    """Median distance in m from a position to the nearest of some neighbours in capture order."""
+    reach = range(1, min(len(xyz), 4))
+    steps = np.full((len(xyz), 2 * len(reach)), np.inf)
+    for k in reach:
+        apart = np.linalg.norm(xyz[k:] - xyz[:-k], axis=1)
+        steps[k:, 2 * k - 2], steps[:-k, 2 * k - 1] = apart, apart
+    return float(np.median(steps.min(1))) if len(xyz) > 1 else 0.0
+
+
+def spread_m(photos: Sequence[Photo]) -> float:
+    """Largest distance in m of positions to their middle."""
+    return float(distances_to_median(photos).max())
+
+
+def distances_to_median(photos: Sequence[Photo]) -> Array:
+    """Distances (n,) in m of placed photos to the median of their positions."""
+    xyz = on_sphere(photos)
+    return np.asarray(np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1))

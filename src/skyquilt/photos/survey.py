@@ -13,8 +13,8 @@ from skyquilt.model.photo import Photo, RejectedPhoto, Survey
 from skyquilt.outside import MOST_MP, plain, walk
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
 from skyquilt.photos.clips import is_timed, read_clips
-from skyquilt.photos.coarse_positions import with_coarse_deviations
 from skyquilt.photos.implausible_positions import (
+    with_coarse_deviations,
     without_ground_heights,
     without_outliers,
     without_stuck,
