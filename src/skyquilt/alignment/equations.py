@@ -106,10 +106,11 @@ class _Parts:
         self, workers: Workers, state: State, asked: Callable[[Problem, State], T]
     ) -> Iterator[tuple[slice, T]]:
         """What is `asked` of each part and its state, and which points it has."""
-        points = [self.problem.points_of(piece) for piece in self.problem.pieces()]
+        pieces = self.problem.pieces()
+        points = [self.problem.points_of(piece) for piece in pieces]
         given = [
             (piece, replace(state, X=state.X[own]), asked)
-            for piece, own in zip(self.problem.pieces(), points, strict=True)
+            for piece, own in zip(pieces, points, strict=True)
         ]
         return zip(points, workers.each(self, given), strict=True)
 

@@ -7,6 +7,7 @@ outvote it. So matches on them are not used.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -86,7 +87,9 @@ class FindFixedMarks:
                 inside = np.clip(row, 0, mask.shape[0] - 1), np.clip(column, 0, mask.shape[1] - 1)
                 mask[inside] = True
             if mask.any():
-                masks[camera], cells[camera] = _widened(mask), float(side)
+                # with the cells around each
+                wide = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
+                masks[camera], cells[camera] = wide > 0, float(side)
         return FixedMarks(masks=masks, cell_px=cells)
 
     def _fixed(self, photos: Sequence[Features]) -> list[Mask]:
@@ -124,11 +127,3 @@ def _raster(features: Features) -> NDArray[np.int32]:
     for x, y in sorted(beside, key=lambda b: -abs(b[0]) - abs(b[1])):  # its own px last
         raster[np.maximum(place[:, 1] + y, 0), np.maximum(place[:, 0] + x, 0)] = range(len(place))
     return raster
-
-
-def _widened(mask: Mask) -> Mask:
-    """The mask with the cells around each of its cells."""
-    wide = np.pad(mask, 1)
-    rows, columns = mask.shape
-    shifted = [wide[y : y + rows, x : x + columns] for y in range(3) for x in range(3)]
-    return np.asarray(np.any(shifted, axis=0))

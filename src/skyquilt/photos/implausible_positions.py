@@ -191,6 +191,7 @@ def _repeated(photos: Sequence[Photo]) -> tuple[list[Photo], str]:
 
 
 def _degrees(photos: Sequence[Photo]) -> Array:
+    """Latitudes and longitudes (n, 2) of those photos that have a position."""
     places = [(p.position.latitude_deg, p.position.longitude_deg) for p in photos if p.position]
     return np.array(places, np.float64).reshape(-1, 2)
 
@@ -226,8 +227,7 @@ def on_sphere(photos: Sequence[Photo]) -> Array:
     """Positions (n, 3) in m on a sphere, of those photos that have one: distances between them
     do not depend on the pole or on the meridian of 180 degrees.
     """
-    places = [(p.position.latitude_deg, p.position.longitude_deg) for p in photos if p.position]
-    north, east = np.radians(np.array(places, np.float64).reshape(-1, 2)).T
+    north, east = np.radians(_degrees(photos)).T
     flat = np.cos(north)
     return _EARTH_M * np.stack([flat * np.cos(east), flat * np.sin(east), np.sin(north)], 1)
 
