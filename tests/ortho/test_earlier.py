@@ -1,5 +1,7 @@
 """A map that photos are added to: areas, grids, and what is laid into what."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,10 +9,12 @@ from hypothesis import strategies as st
 
 from skyquilt.model.raster import Grid, Window, meet
 from skyquilt.model.surface import Surface
-from skyquilt.ortho import earlier
+from skyquilt.ortho import companions, earlier
 from skyquilt.ortho.earlier import ALIGNED, EarlierMap, Growth, with_new
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.labels import Labels
+from skyquilt.ortho.orthomosaic import Drawing
+from skyquilt.raster import Block
 
 GRID = Grid(west=-40.0, north=60.0, gsd=0.05, width=4000, height=3000)
 AREA = (100.0, -60.0, 190.0, 30.0)
@@ -161,3 +165,13 @@ def test_new_photos_get_the_level_of_those_that_stay():
         Exposure(gains={}, fields={}, offsets={0: 1.5, 1: -0.5, 2: 0.75}),
     )
     assert frames.offsets == {0: 1.0, 1: -1.0, 2: 0.25}
+
+
+def test_a_map_too_large_for_its_provenance_is_drawn_anew(monkeypatch):
+    grows = growth()
+    grid = grows.grown(wanted(-70.0, -80.0, 185.0, 90.0))
+    drawing = SimpleNamespace(growth=grows, compose=SimpleNamespace(grid=grid))
+    block = Block(row0=1536, col0=1536, height=2048, width=1024, tile=512)
+    assert list(Drawing._staying(drawing, [block])) == [block]
+    monkeypatch.setattr(companions, "MOST_NUMBERS", GRID.width * GRID.height / 16)
+    assert Drawing._staying(drawing, [block]) == {}

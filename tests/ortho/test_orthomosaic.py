@@ -3,20 +3,55 @@
 import numpy as np
 import pytest
 
+from skyquilt.imaging.nodes import STEP
 from skyquilt.model.raster import Grid
-from skyquilt.ortho.companions import PROVENANCE, _thinned, preview_factor, reduced
+from skyquilt.ortho import companions
+from skyquilt.ortho.companions import (
+    MOST_NUMBERS,
+    PROVENANCE,
+    _thinned,
+    preview_factor,
+    provenance_step,
+    reduced,
+)
+from skyquilt.ortho.compose import Composed
 from skyquilt.ortho.ground import round_gsd
 
 
 def test_provenance_is_taken_from_the_middle_of_its_cell():
     numbers = np.arange(64).reshape(8, 8)
-    assert _thinned(numbers).tolist() == [[18, 22], [50, 54]] and PROVENANCE == 4
+    assert _thinned(numbers, PROVENANCE).tolist() == [[18, 22], [50, 54]] and PROVENANCE == 4
 
 
 @pytest.mark.parametrize(("height", "width"), [(8, 9), (9, 8), (5, 6), (2, 2), (1, 7), (4, 3)])
 def test_cells_cut_off_by_the_rim_still_count(height, width):
-    thin = _thinned(np.full((height, width), 7))
+    thin = _thinned(np.full((height, width), 7), PROVENANCE)
     assert thin.shape == (-(-height // PROVENANCE), -(-width // PROVENANCE)) and (thin == 7).all()
+
+
+@pytest.mark.parametrize(("side", "step"), [(1000, 4), (30_000, 4), (56_067, 8), (300_000, 64)])
+def test_the_provenance_of_large_maps_is_coarser(side, step):
+    grid = Grid(west=0, north=0, gsd=0.05, width=side, height=side)
+    cells = grid.coarser(provenance_step(grid))
+    assert provenance_step(grid) == step and cells.width * cells.height <= 1.01 * MOST_NUMBERS
+
+
+def test_blocks_of_a_coarser_provenance_fit_together(monkeypatch):
+    grid = Grid(west=0, north=0, gsd=1, width=4 * STEP, height=3 * STEP)
+    numbers = np.arange(grid.height * grid.width).reshape(grid.height, grid.width) % 5 + 1
+    monkeypatch.setattr(companions, "MOST_NUMBERS", numbers.size / 64)
+    whole = companions.Companions(grid, 1, np.dtype(np.uint8), 5)
+    table, valid = np.arange(1, 7, dtype=np.uint32), np.ones((STEP, 2 * STEP), bool)
+    for row in range(0, grid.height, STEP):
+        for column in range(0, grid.width, 2 * STEP):
+            composed = Composed(
+                pixels=np.zeros((*valid.shape, 1), np.uint8),
+                photo=numbers[row : row + STEP, column : column + 2 * STEP].astype(np.int32) - 1,
+                views=np.ones((1, 2), np.uint16),
+            )
+            whole.add(row, column, companions.extras_of(composed, valid, table, grid))
+    assert np.array_equal(whole.provenance, numbers[4::8, 4::8])
+    assert whole.fine.gsd == 8 and (whole.views == 1).all()
 
 
 def test_previews_average_what_is_valid():

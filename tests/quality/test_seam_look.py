@@ -7,6 +7,7 @@ from skyquilt.model.raster import Grid
 from skyquilt.ortho.exposure import NEUTRAL, Exposure
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.tie_surface import level
+from skyquilt.quality import seam_look
 from skyquilt.quality.seam_look import cut_objects, seam_colours
 from skyquilt.quality.seam_points import SeamPoint
 from skyquilt.quality.seam_views import Look, views_at
@@ -87,3 +88,19 @@ def test_the_share_of_seams_over_things_that_stand():
     assert cut_objects(shown, cells, labels) == 0.0
     assert cut_objects(np.ones((4, 4), int), cells, labels) is None
     assert cut_objects(np.where(shown == 2, 0, 1), cells, labels) is None  # a rim is no seam
+
+
+def test_strips_of_a_map_have_the_same_share(monkeypatch):
+    rng = np.random.default_rng(7)
+    shown = rng.integers(0, 4, (23, 17))
+    cells = Grid(west=0, north=0, gsd=1, width=17, height=23)
+    labels = Labels(
+        cells=cells,
+        factor=1,
+        photo=shown.astype(np.int32),
+        hidden=np.zeros(shown.shape, bool),
+        tall=rng.random(shown.shape) < 0.3,
+    )
+    at_once = cut_objects(shown, cells, labels)
+    monkeypatch.setattr(seam_look, "STRIP", 4)
+    assert cut_objects(shown, cells, labels) == at_once

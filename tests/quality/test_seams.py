@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skyquilt.quality import seam_points as seam_points_module
 from skyquilt.quality.seam_points import SeamPoint, seam_points
 from skyquilt.quality.seams import PatchPairs, seam_disparity
 from tests.texture import seen, texture
@@ -65,6 +66,13 @@ def test_the_limit_is_kept_and_shared_by_length():
         assert 0 < len(points) <= limit
         assert limit < len(pairs) or {(p.a, p.b) for p in points} == pairs
     assert seam_points(labels, limit=0) == []
+
+
+def test_strips_of_a_raster_have_the_same_points(monkeypatch):
+    labels = np.kron(np.random.default_rng(3).integers(0, 5, (6, 5)), np.ones((7, 9), int))
+    at_once = seam_points(labels, spacing_px=4)
+    monkeypatch.setattr(seam_points_module, "STRIP", 5)
+    assert len(at_once) > 20 and seam_points(labels, spacing_px=4) == at_once
 
 
 @pytest.mark.parametrize(

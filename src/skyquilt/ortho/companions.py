@@ -16,7 +16,9 @@ from skyquilt.model.raster import Grid
 from skyquilt.ortho.compose import Composed, Composer
 
 PROVENANCE = 4
-"""Map pixels per provenance pixel."""
+"""Map pixels per provenance pixel, along a side; more for large maps, see `provenance_step`."""
+MOST_NUMBERS = 6e7
+"""Most pixels of a provenance raster: it is in memory as a whole."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -24,7 +26,7 @@ class BlockExtras:
     """Data of a map block for the additional rasters."""
 
     provenance: NDArray[np.uint32]
-    """Shot numbers from 1, 0 = none, every PROVENANCE-th pixel."""
+    """Shot numbers from 1, 0 = none, every `provenance_step`-th pixel."""
     views: NDArray[np.uint16]
     """Number of photos that cover each STEP-pixel cell."""
     preview: NDArray[Any]
@@ -63,22 +65,32 @@ def shot_numbers(compose: Composer) -> NDArray[np.uint32]:
     return table
 
 
-def extras_of(
-    composed: Composed, valid: NDArray[np.bool_], table: NDArray[np.uint32], factor: int
-) -> BlockExtras:
-    """The additional data of a composed block; `table`: shot numbers by photo, `factor`: reduction
-    of the preview.
+def provenance_step(grid: Grid) -> int:
+    """Map pixels per provenance pixel, along a side: `PROVENANCE`, doubled until no more than
+    `MOST_NUMBERS` pixels are left.
     """
-    preview, shown = reduced(composed.pixels, valid, factor)
-    numbers = table[np.where(_thinned(valid), _thinned(composed.photo), -1)]
+    step = PROVENANCE
+    while grid.width * grid.height / step**2 > MOST_NUMBERS:
+        step *= 2
+    return step
+
+
+def extras_of(
+    composed: Composed, valid: NDArray[np.bool_], table: NDArray[np.uint32], grid: Grid
+) -> BlockExtras:
+    """The additional data of a composed block of a map on a grid; `table`: shot numbers by
+    photo.
+    """
+    step = provenance_step(grid)
+    preview, shown = reduced(composed.pixels, valid, preview_factor(grid))
+    numbers = table[np.where(_thinned(valid, step), _thinned(composed.photo, step), -1)]
     return BlockExtras(provenance=numbers, views=composed.views, preview=preview, shown=shown)
 
 
-def _thinned(numbers: NDArray[Any]) -> NDArray[Any]:
-    """Every PROVENANCE-th pixel in both directions, taken at the middle of its cell."""
+def _thinned(numbers: NDArray[Any], step: int) -> NDArray[Any]:
+    """Every `step`-th pixel in both directions, taken at the middle of its cell."""
     rows, columns = (
-        np.minimum(np.arange(PROVENANCE // 2, size + PROVENANCE // 2, PROVENANCE), size - 1)
-        for size in numbers.shape
+        np.minimum(np.arange(step // 2, size + step // 2, step), size - 1) for size in numbers.shape
     )
     return np.asarray(numbers[rows][:, columns])
 
@@ -134,8 +146,9 @@ class Companions:
 
     def __init__(self, grid: Grid, bands: int, dtype: np.dtype, photos: int) -> None:
         self.grid, self.factor = grid, preview_factor(grid)
+        self._step = provenance_step(grid)
         self.fine, self.coarse, small = (
-            grid.coarser(PROVENANCE),
+            grid.coarser(self._step),
             grid.coarser(STEP),
             grid.coarser(self.factor),
         )
@@ -148,7 +161,7 @@ class Companions:
     def add(self, row: int, column: int, extras: BlockExtras) -> None:
         """Inserts the data of a block whose first pixel is at (row, column) of the map."""
         for target, part, step in (
-            (self.provenance, extras.provenance, PROVENANCE),
+            (self.provenance, extras.provenance, self._step),
             (self.views, extras.views, STEP),
             (self.preview, extras.preview, self.factor),
             (self.shown, extras.shown, self.factor),

@@ -20,6 +20,8 @@ CLOSE, LEAST = 2.0, 0.01
 """The same where samples weigh by their own scatter: in medians of the residuals, and at least."""
 STEPS, CLOSE_STEPS = 6, 14
 """Steps of reweighting, at most."""
+AT_ONCE = 65_536
+"""Samples whose products are summed at once, in double precision."""
 CORRELATED = 30.0
 """Errors of neighbouring samples are correlated: this number of samples counts as one independent
 sample.
@@ -30,9 +32,9 @@ sample.
 class Pairs:
     """All pairs of samples of one point, a sample with itself included, sorted by their photos."""
 
-    row: NDArray[np.int64]
+    row: NDArray[np.integer[Any]]
     """(N,) photo of each sample."""
-    point: NDArray[np.int64]
+    point: NDArray[np.integer[Any]]
     """(N,) point of each sample."""
     where: NDArray[np.float64]
     """(n, 2) where the photos lie."""
@@ -59,10 +61,14 @@ class Pairs:
             a.append(order[same])
             b.append(order[same + lag])
         first, second = np.concatenate(a), np.concatenate(b)
-        sort = np.lexsort((row[second], row[first]))
-        first, second = first[sort], second[sort]
-        new = np.flatnonzero((np.diff(row[first]) != 0) | (np.diff(row[second]) != 0)) + 1
-        cuts = np.r_[0, new, len(first)]
+        del a, b, order
+        photos = row[first].astype(np.int64)
+        photos *= len(where)
+        photos += row[second]
+        sort = np.argsort(photos, kind="stable")
+        first, second, photos = first[sort], second[sort], photos[sort]
+        del sort
+        cuts = np.r_[0, np.flatnonzero(np.diff(photos)) + 1, len(first)]
         return cls(
             row=row,
             point=point,
@@ -70,15 +76,16 @@ class Pairs:
             a=first,
             b=second,
             cuts=cuts,
-            row_a=row[first[cuts[:-1]]],
-            row_b=row[second[cuts[:-1]]],
+            row_a=row[first[cuts[:-1]]].astype(np.int64),
+            row_b=row[second[cuts[:-1]]].astype(np.int64),
         )
 
     def products(self, terms: NDArray[Any]) -> NDArray[np.float64]:
         """(G, k, k) sums of the outer products of terms (N, k) over the pairs of two photos."""
         if terms.shape[1] == 1:
-            both = terms[self.a, 0] * terms[self.b, 0]
-            return np.asarray(np.add.reduceat(both, self.cuts[:-1])[:, None, None])
+            both = terms[self.a, 0]
+            both *= terms[self.b, 0]
+            return np.asarray(np.add.reduceat(both, self.cuts[:-1], dtype=float)[:, None, None])
         ends = zip(self.cuts[:-1].tolist(), self.cuts[1:].tolist(), strict=True)
         return np.stack([terms[self.a[i:j]].T @ terms[self.b[i:j]] for i, j in ends])
 
@@ -97,16 +104,16 @@ def robust_differences(
     see `Balance`.
     """
     row, point, count = pairs.row, pairs.point, len(pairs.where)
-    w = np.ones(len(y))
+    w = np.ones(len(y), terms.dtype)
     x: NDArray[np.float64] = np.zeros((count, terms.shape[1], y.shape[1]))
     pull = np.tile(ridge * SIGMA_LEVEL**2 * CORRELATED, count)
     several = np.bincount(point)[point] > 1
     for step in range(CLOSE_STEPS if closely else STEPS):
         mass = np.maximum(np.bincount(point, w), 1e-9)
         weighted = w[:, None] * terms
-        blocks = pairs.products(weighted / np.sqrt(mass[point])[:, None])
-        mean_y = _sums(point, w[:, None] * y, len(mass)) / mass[:, None]
-        rhs = -_sums(row, weighted[:, :, None] * (y - mean_y[point])[:, None], count)
+        blocks = pairs.products(weighted / np.sqrt(mass).astype(w.dtype)[point][:, None])
+        off = y - _means(point, w, y, mass)[point]
+        rhs = -np.stack([_sums(row, column[:, None] * off, count) for column in weighted.T], 1)
         own = np.empty((count, terms.shape[1], terms.shape[1]))
         for i in range(terms.shape[1]):
             for j in range(i + 1):
@@ -117,11 +124,21 @@ def robust_differences(
         )
         if np.abs(x - before).max() < SETTLED:
             break
-        level = y + np.einsum("nk,nkb->nb", terms, x[row])
-        residual = level - (_sums(point, w[:, None] * level, len(mass)) / mass[:, None])[point]
-        off = np.sqrt((residual**2).mean(1))
-        w = 1 / (1 + (off / _scale(off[several], closely and step > 0, WIDE)) ** 2)
+        level = y.copy()
+        for k, column in enumerate(terms.T):
+            level += column[:, None] * x[:, k].astype(y.dtype)[row]
+        level -= _means(point, w, level, mass)[point]
+        away = np.sqrt((level**2).mean(1))
+        w = 1 / (1 + (away / _scale(away[several], closely and step > 0, WIDE)) ** 2)
     return x
+
+
+def _means(
+    point: NDArray[Any], w: NDArray[Any], values: NDArray[Any], mass: NDArray[np.float64]
+) -> NDArray[Any]:
+    """(points, bands) weighted means of values (N, bands) by point, of sums of weights `mass`."""
+    total = _sums(point, w[:, None] * values, len(mass)) / mass[:, None]
+    return np.asarray(total.astype(values.dtype))
 
 
 def _scale(off: NDArray[Any], closely: bool, widest: float) -> float:
@@ -140,15 +157,20 @@ def within_points(
     """x (k,) that makes y + terms . x equal within each point, y (N,) and terms (N, k), with robust
     weights; `pull` (k, k): weight of the prior of zero; `closely`: as for `robust_differences`.
     """
-    w, x = np.ones(len(y)), np.zeros(terms.shape[1])
+    w, x = np.ones(len(y), terms.dtype), np.zeros(terms.shape[1])
     count = int(point.max()) + 1
     several = np.bincount(point)[point] > 1
     for step in range(CLOSE_STEPS if closely else STEPS - 1):
         mass = np.maximum(np.bincount(point, w, count), 1e-9)
-        apart = terms - (_sums(point, w[:, None] * terms, count) / mass[:, None])[point]
-        off = y - (np.bincount(point, w * y, count) / mass)[point]
-        x = -np.linalg.solve(apart.T @ (w[:, None] * apart) + pull, apart.T @ (w * off))
-        rest = off + apart @ x
+        apart = terms - _means(point, w, terms, mass)[point]
+        off = y - _means(point, w, y[:, None], mass)[point, 0]
+        normal, right = pull.copy(), np.zeros(len(x))
+        for some in (slice(k, k + AT_ONCE) for k in range(0, len(y), AT_ONCE)):
+            own = apart[some].astype(np.float64)
+            normal += own.T @ (w[some, None] * own)
+            right += own.T @ (w[some] * off[some])
+        x = -np.linalg.solve(normal, right)
+        rest = off + apart @ x.astype(off.dtype)
         scale = _scale(np.abs(rest[several]), closely and step > 0, SIGMA_LEVEL)
         w = 1 / (1 + (rest / scale) ** 2)
     return np.asarray(x)

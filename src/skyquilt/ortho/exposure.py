@@ -150,7 +150,7 @@ class Balance:
     """Least share of the differences between photos that fields must explain to be applied."""
     whites: tuple[float, ...] = WHITES
     """Values at which the cameras' response may end; the survey's overlaps decide."""
-    version: ClassVar[int] = 6
+    version: ClassVar[int] = 7
 
     def under(self, white: float) -> "Balance":
         """The same for a response that is known."""
@@ -211,12 +211,14 @@ class Balance:
         so differences from the point's mean are zero.
         """
         N = len(s.point)
-        basis = _basis(s.place[:, 0], s.place[:, 1])
         radial = self._radial(s, views, pairs, closely=closely)
-        grey = s.log.mean(1, keepdims=True) + (basis * radial[s.row]).sum(1)[:, None]
-        terms = np.concatenate([np.ones((N, 1)), basis[:, :5]], 1)
+        grey = s.log.mean(1) + s.field(radial)
+        terms = np.concatenate(
+            [np.ones((N, 1), np.float32), _basis(s.place[:, 0], s.place[:, 1])[:, :5]], 1
+        )
         ridge = s.prior / np.array([self.sigma_gain] + 5 * [self.sigma_field]) ** 2
-        x = robust_differences(terms, pairs, grey, ridge, closely=closely)[..., 0]
+        x = robust_differences(terms, pairs, grey[:, None], ridge, closely=closely)[..., 0]
+        del terms
         fields = radial.copy()
         fields[:, :5] += x[:, 1:]
         largest = [
@@ -224,7 +226,7 @@ class Balance:
             for v, field in zip(views, fields, strict=True)
         ]
         fields *= (np.array(largest) > self.even)[:, None]
-        even = s.log.mean(1) + (basis * fields[s.row]).sum(1)
+        even = s.log.mean(1) + s.field(fields)
         bare = _apart(s.log.mean(1), pairs, ridge[:1], closely=closely)
         if _apart(even, pairs, ridge[:1], closely=closely) > (1 - self.gained) * bare:
             fields = np.zeros_like(fields)
@@ -240,8 +242,9 @@ class Balance:
         closely: bool,
     ) -> Exposure:
         """The gains of photos with these fields (n, 6)."""
-        even = s.log + (_basis(s.place[:, 0], s.place[:, 1]) * fields[s.row]).sum(1)[:, None]
-        ridge, ones = np.array([s.prior / self.sigma_gain**2]), np.ones((len(s.point), 1))
+        even = s.log + s.field(fields)[:, None]
+        ridge = np.array([s.prior / self.sigma_gain**2])
+        ones = np.ones((len(s.point), 1), np.float32)
         gains = robust_differences(ones, pairs, even, ridge, closely=closely)[:, 0]
         gains = (gains - np.median(gains, axis=0)).astype(np.float32)
         photos = [v.photo for v in views]
@@ -260,19 +263,26 @@ class Balance:
         names = {c: k for k, c in enumerate(dict.fromkeys(v.camera for v in views))}
         camera = np.array([names[v.camera] for v in views])[s.row]
         r2 = (s.place**2).sum(1)
-        apart = np.zeros((len(r2), len(names), 2))
+        apart = np.zeros((len(r2), len(names), 2), np.float32)
         apart[np.arange(len(r2)), camera] = np.stack([r2, r2 * r2], 1)
         columns = apart.reshape(len(r2), -1)
         grey = s.log.mean(1)
         found: NDArray[np.float64] = np.zeros(columns.shape[1])
-        ones, ridge = np.ones((len(r2), 1)), np.array([s.prior / self.sigma_gain**2])
+        ones = np.ones((len(r2), 1), np.float32)
+        ridge = np.array([s.prior / self.sigma_gain**2])
         pull = np.eye(len(found)) * s.prior * SIGMA_LEVEL**2 * CORRELATED / self.sigma_radial**2
         for _ in range(ROUNDS):
-            level = (grey + columns @ found)[:, None]
+            level = (grey + columns @ found.astype(np.float32))[:, None]
             gain = robust_differences(ones, pairs, level, ridge, closely=closely)[:, 0, 0]
             before, found = (
                 found,
-                within_points(columns, grey + gain[s.row], pairs.point, pull, closely=closely),
+                within_points(
+                    columns,
+                    grey + gain.astype(np.float32)[s.row],
+                    pairs.point,
+                    pull,
+                    closely=closely,
+                ),
             )
             if np.abs(found - before).max() < SETTLED:
                 break
@@ -306,9 +316,9 @@ class Balance:
                 continue
             u, v, seen = nodes.u[r, c], nodes.v[r, c], (r + part[0].start) * x.shape[1]
             seen += c + part[1].start
-            point.append(seen)
-            row.append(np.full(len(seen), index))
-            place.append(np.stack(image_place(view, u, v), -1))
+            point.append(seen.astype(np.int32))
+            row.append(np.full(len(seen), index, np.int32))
+            place.append(np.stack(image_place(view, u, v), -1).astype(np.float32))
             value.append(
                 _sampled(thumbnails[view.photo], u, v, view.camera.width, view.camera.height)
             )
@@ -316,13 +326,14 @@ class Balance:
             return Samples(
                 point=np.zeros(0, int),
                 row=np.zeros(0, int),
-                place=np.zeros((0, 2)),
-                value=np.zeros((0, 3)),
+                place=np.zeros((0, 2), np.float32),
+                value=np.zeros((0, 3), np.float32),
             )
         levels = np.concatenate(value)
         good = ((levels > 8) & (levels < 247)).all(1)
+        shown = np.unique(np.concatenate(point)[good], return_inverse=True)[1]
         return Samples(
-            point=np.unique(np.concatenate(point)[good], return_inverse=True)[1],
+            point=shown.astype(np.int32),
             row=np.concatenate(row)[good],
             place=np.concatenate(place)[good],
             value=levels[good],
@@ -332,15 +343,17 @@ class Balance:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Samples:
-    """Brightness of ground points in photos."""
+    """Brightness of ground points in photos. Of large surveys they fill the memory: they are in
+    single precision, sums of them in double.
+    """
 
-    point: NDArray[np.int64]
+    point: NDArray[np.int32]
     """(N,) ground point, numbered without gaps."""
-    row: NDArray[np.int64]
+    row: NDArray[np.int32]
     """(N,) view."""
-    place: NDArray[np.float64]
+    place: Float
     """(N, 2) x and y in the photo, see `image_place`."""
-    value: NDArray[np.float64]
+    value: Float
     """(N, bands) brightness."""
     white: float = WHITES[0]
     """Value at which the response is taken to end."""
@@ -350,21 +363,28 @@ class Samples:
     """
 
     @cached_property
-    def log(self) -> NDArray[np.float64]:
+    def log(self) -> Float:
         """(N, bands) log odds of the brightness."""
-        return np.log(self.value / (self.white - self.value))
+        odds = self.value / (np.float32(self.white) - self.value)
+        return np.asarray(np.log(odds, out=odds))
 
     def under(self, white: float) -> "Samples":
         """The same, of another response."""
         return replace(self, white=white)
 
+    def field(self, terms: NDArray[Any]) -> Float:
+        """(N,) the field of each sample's photo at its place, from terms (n, 6) of the photos."""
+        out = np.zeros(len(self.row), np.float32)
+        for k, basis in enumerate(_basis(self.place[:, 0], self.place[:, 1]).T):
+            out += basis * terms[:, k].astype(np.float32)[self.row]
+        return out
+
     def apart(self, exposure: Exposure, views: Sequence[View]) -> float:
         """Median difference from the mean of their point, in grey values, of corrected samples."""
         photos = [v.photo for v in views]
-        gains = np.array([exposure.gains[i].mean() for i in photos])
+        gains = np.array([exposure.gains[i].mean() for i in photos], np.float32)
         fields = np.stack([exposure.fields[i] for i in photos])
-        basis = _basis(self.place[:, 0], self.place[:, 1])
-        odds = np.exp(gains[self.row] + (basis * fields[self.row]).sum(1))
+        odds = np.exp(gains[self.row] + self.field(fields))
         return _off_means(exposure.brightened(self.value.mean(1), odds), self.point)
 
 
@@ -397,26 +417,26 @@ def _corners(view: View) -> tuple[NDArray[Any], NDArray[Any]]:
 
 def _sampled(
     thumbnail: NDArray[np.uint8], u: NDArray[Any], v: NDArray[Any], width: int, height: int
-) -> NDArray[np.float64]:
+) -> Float:
     """Smoothed thumbnail values (n, bands) at photo pixels."""
     h, w = thumbnail.shape[:2]
     smooth = cv2.GaussianBlur(thumbnail.astype(np.float32), (0, 0), 1.5).reshape(h, w, -1)
     column = np.clip(np.rint((u + 0.5) * w / width - 0.5), 0, w - 1).astype(int)
     row = np.clip(np.rint((v + 0.5) * h / height - 0.5), 0, h - 1).astype(int)
-    return np.asarray(smooth[row, column].astype(np.float64))
+    return np.asarray(smooth[row, column])
 
 
 def _apart(y: NDArray[Any], pairs: Pairs, ridge: NDArray[Any], *, closely: bool) -> float:
     """Median difference from the mean of their point, in log odds, of samples (N,) after one gain
     for each photo.
     """
-    point, ones = pairs.point, np.ones((len(y), 1))
+    point, ones = pairs.point, np.ones((len(y), 1), np.float32)
     found = robust_differences(ones, pairs, y[:, None], ridge, closely=closely)
-    level = y + found[pairs.row, 0, 0]
+    level = y + found[:, 0, 0].astype(y.dtype)[pairs.row]
     return _off_means(level, point)
 
 
-def _off_means(level: NDArray[Any], point: NDArray[np.int64]) -> float:
+def _off_means(level: NDArray[Any], point: NDArray[np.integer[Any]]) -> float:
     """Median difference of samples (N,) from the mean of their point."""
     number = np.bincount(point)
     mean = np.bincount(point, level) / np.maximum(number, 1)

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.imaging.nodes import STEP
-from skyquilt.model.raster import Window
-from skyquilt.ortho.companions import PROVENANCE, BlockExtras, reduced
+from skyquilt.model.raster import Grid, Window
+from skyquilt.ortho.companions import BlockExtras, preview_factor, provenance_step, reduced
 from skyquilt.raster import Block, RasterSpec
 from skyquilt.raster.cog import Encoded
 from skyquilt.raster.former import FormerRaster
@@ -62,10 +62,10 @@ class FormerFiles:
         self._opened.close()
 
     def block(
-        self, block: Block, old: Window, spec: RasterSpec, names: NDArray[np.uint32], factor: int
+        self, block: Block, old: Window, spec: RasterSpec, names: NDArray[np.uint32], grid: Grid
     ) -> FormerBlock:
         """A block that lies at a window of the earlier map, at a multiple of a tile. `names`: the
-        shot number now of each former one; `factor`: reduction of the preview.
+        shot number now of each former one; `grid`: that of the map now.
         """
         pixels, valid = self._map.pixels(old.row, old.column, old.height, old.width)
         down, right = (old.row - block.row0) // spec.tile, (old.column - block.col0) // spec.tile
@@ -73,10 +73,10 @@ class FormerFiles:
         for row, column, _, _ in block.tiles():
             if (found := self._map.tile(row + down, column + right, spec)) is not None:
                 tiles[row, column] = found
-        preview, shown = reduced(pixels, valid, factor)
+        preview, shown = reduced(pixels, valid, preview_factor(grid))
         fine, coarse = (
             tuple(slice(at // step, -(-(at + size) // step)) for at, size in _sides(old))
-            for step in (PROVENANCE, STEP)
+            for step in (provenance_step(grid), STEP)
         )
         return FormerBlock(
             pixels=pixels,

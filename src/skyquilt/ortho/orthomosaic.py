@@ -28,7 +28,7 @@ from skyquilt.ortho.companions import (
     coloured,
     extras_of,
     geotransform,
-    preview_factor,
+    provenance_step,
     shot_numbers,
 )
 from skyquilt.ortho.compose import Composer, PhotoPixels
@@ -171,6 +171,8 @@ class Drawing:
         if self.growth is None:
             return {}
         grid, grows = self.compose.grid, self.growth
+        if provenance_step(grid) != provenance_step(grows.earlier.grid):
+            return {}  # its provenance is too fine for the grown map
         found = ((b, grows.stays(_window(b), grid)) for b in todo)
         return {b: old for b, old in found if old is not None}
 
@@ -178,11 +180,11 @@ class Drawing:
         """These blocks, from the files of the earlier map."""
         if self.growth is None or not stay:
             return
-        table, factor = shot_numbers(self.compose), preview_factor(self.compose.grid)
+        table = shot_numbers(self.compose)
         names = np.array([0, *(table[i] for i in self.growth.earlier.shown)], np.uint32)
         with FormerFiles(self.output) as files:
             for block, old in stay.items():
-                yield files.block(block, old, spec, names, factor)
+                yield files.block(block, old, spec, names, self.compose.grid)
 
     def companions(self) -> Drawn:
         """Writes provenance.tif and views.tif, and returns them."""
@@ -216,7 +218,7 @@ class Drawing:
         """Draws a block: pixels (h, w, bands), where they show a photo (h, w), and what lies
         beside.
         """
-        compose, factor = self.compose, preview_factor(self.compose.grid)
+        compose = self.compose
         keep, table = _keeper(compose, self.alignment, self.boundary), shot_numbers(compose)
 
         def drawn(block: Block) -> tuple[NDArray[Any], NDArray[np.bool_], BlockExtras]:
@@ -225,7 +227,7 @@ class Drawing:
             if keep is not None:
                 valid &= keep(block)
             pixels = _blanked(composed.pixels, valid)
-            return pixels, valid, extras_of(composed, valid, table, factor)
+            return pixels, valid, extras_of(composed, valid, table, compose.grid)
 
         return drawn
 

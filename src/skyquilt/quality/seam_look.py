@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.model.raster import Grid
+from skyquilt.model.surface import STRIP
 from skyquilt.ortho.labels import Labels
 
 
@@ -51,12 +52,14 @@ def cut_objects(provenance: NDArray[Any], grid: Grid, labels: Labels) -> float |
     """
     total = over = 0
     row, column = labels.cells.nearest(grid)
-    tall = labels.tall[row][:, column]
-    for a, b, ta, tb in (
-        (provenance[1:], provenance[:-1], tall[1:], tall[:-1]),
-        (provenance[:, 1:], provenance[:, :-1], tall[:, 1:], tall[:, :-1]),
-    ):
-        edge = (a != b) & (a != 0) & (b != 0)
-        total += int(edge.sum())
-        over += int((edge & (ta | tb)).sum())
+    for first in range(0, len(provenance), STRIP):  # masks of large maps would fill the memory
+        here, rows = provenance[first : first + STRIP + 1], row[first : first + STRIP + 1]
+        tall = labels.tall[rows][:, column]
+        for a, b, ta, tb in (
+            (here[1:], here[:-1], tall[1:], tall[:-1]),
+            (here[:STRIP, 1:], here[:STRIP, :-1], tall[:STRIP, 1:], tall[:STRIP, :-1]),
+        ):
+            edge = (a != b) & (a != 0) & (b != 0)
+            total += int(edge.sum())
+            over += int((edge & (ta | tb)).sum())
     return over / total if total else None

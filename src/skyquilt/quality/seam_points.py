@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.model.surface import STRIP
+
 
 @dataclass(frozen=True, kw_only=True)
 class SeamPoint:
@@ -64,10 +66,12 @@ def _edges(labels: NDArray[Any]) -> _Edges:
         (labels[:, 1:], labels[:, :-1], (0.0, 0.5)),
     )
     for there, here, middle in (below, right):
-        pixels = np.argwhere((there != here) & (there != 0) & (here != 0))
-        a, b = here[tuple(pixels.T)].astype(np.int64), there[tuple(pixels.T)].astype(np.int64)
-        places.append(pixels + np.array(middle))
-        pairs.append(np.stack([np.minimum(a, b), np.maximum(a, b)], 1))
+        for row in range(0, max(len(here), 1), STRIP):  # masks of large maps would fill the memory
+            one, other = here[row : row + STRIP], there[row : row + STRIP]
+            pixels = np.argwhere((other != one) & (other != 0) & (one != 0))
+            a, b = one[tuple(pixels.T)].astype(np.int64), other[tuple(pixels.T)].astype(np.int64)
+            places.append(pixels + np.array([row + middle[0], middle[1]]))
+            pairs.append(np.stack([np.minimum(a, b), np.maximum(a, b)], 1))
     place, pair = np.concatenate(places), np.concatenate(pairs)
     order = np.lexsort((pair[:, 1], pair[:, 0]))
     place, pair = place[order], pair[order]

@@ -15,7 +15,7 @@ from skyquilt.geometry.frames import angles_from_cam_R_map
 from skyquilt.imaging.nodes import STEP
 from skyquilt.model.event import Note
 from skyquilt.model.raster import Window
-from skyquilt.ortho.companions import PROVENANCE, Drawn
+from skyquilt.ortho.companions import Drawn, provenance_step
 from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.height_files import write_heights
@@ -154,10 +154,10 @@ def _seam_marks(seams: MeasuredSeams, drawn: Drawn) -> list[SeamMark]:
 
 def _crops(compose: Composer, seams: MeasuredSeams, drawn: Drawn) -> list[NDArray[np.uint8]]:
     """The map around the worst places of the seams."""
-    crops = []
+    crops, step = [], provenance_step(compose.grid)
     for point in seams.worst:
         row, column = (
-            int(np.clip(at * PROVENANCE - CROP // 2, 0, max(size - CROP, 0))) // STEP * STEP
+            int(np.clip(at * step - CROP // 2, 0, max(size - CROP, 0))) // STEP * STEP
             for at, size in ((point.row, compose.grid.height), (point.column, compose.grid.width))
         )
         pixels = compose(Window(row=row, column=column, height=CROP, width=CROP)).pixels
