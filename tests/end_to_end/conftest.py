@@ -116,8 +116,8 @@ def skyquilt(*words: str | Path) -> tuple[int, str, str]:
 
 @pytest.fixture(scope="package", autouse=True)
 def pictures_seen_before() -> Iterator[None]:
-    """What SIFT finds on the same picture again, in another test, is remembered in this process: the
-    tests here are about all that follows, and it is half of a run's time.
+    """What SIFT finds on the same picture again, in another test, is remembered in this process:
+    the tests here are about all that follows, and it is half of a run's time.
     """
     honest, found = Sift.of_shrunken, {}
 

@@ -18,7 +18,7 @@ METHODS = ("position", "pose", "image", "hybrid", "flightline")
 @pytest.fixture(scope="session")
 def lines(tmp_path_factory):
     """Twelve photos in three lines of four, with their truth."""
-    route = Route(site=(70.0, 90.0), overlap=0.7, sidelap=0.5, height=60.0)
+    route = Route(site=(45.0, 60.0), overlap=0.7, sidelap=0.5, height=60.0)
     settings = FlightSettings(
         seed=5, lens=Lens().scaled(WIDE, HIGH), route=route, control=Control(points=4, checks=0)
     )
