@@ -6,6 +6,10 @@ USE := .venv/installed
 DEVELOP := .venv/installed-for-tests
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --quiet --constraint constraints.txt
 
+# Compiled files of the tests are kept, whatever the shell says: rewriting all their assertions takes
+# each of the test processes ten seconds.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: install demo test test-all check format docs fuzz fuzz-quick wheels sbom locked clean
 
 # The program with its live map and viewer: .venv/bin/skyquilt

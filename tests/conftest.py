@@ -9,10 +9,11 @@ import pytest
 
 from skyquilt.model.event import Event, Result
 from skyquilt.settings import MosaicSettings
-from skyquilt.simulate import FlightSettings, simulate
+from skyquilt.simulate import FlightSettings
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
 from skyquilt.workflows.mosaic import iter_mosaic
+from tests.once import flown_once
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,16 +34,13 @@ class Finished:
 @pytest.fixture(scope="session")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nine photos of 800 x 600 px, `gcp_list.txt` beside their folder `photos`, and `truth`."""
-    folder = tmp_path_factory.mktemp("flight")
     settings = FlightSettings(
         seed=3,
         lens=Lens().scaled(800, 600),
         route=Route(photos=9),
         control=Control(points=5, checks=3),
     )
-    for _ in simulate(settings, folder, overwrite=True):
-        pass
-    return folder
+    return flown_once(tmp_path_factory, "large", settings)
 
 
 @pytest.fixture(scope="session")

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from skyquilt.alignment.aligners import shown_already
 from skyquilt.alignment.determined import deviation_px, weak_photos
 from skyquilt.alignment.dominant_plane import dominant_normal, levelled
 from skyquilt.alignment.oblique import reported_oblique, resected, tilt_deg
@@ -164,3 +165,12 @@ def test_the_dominant_plane_levels_the_map_whatever_stands_on_it():
         before = project(CAMERA, tilted.poses[i].to_camera(tilted.ties.xyz[:50]))
         after = project(CAMERA, where.to_camera(again.ties.xyz[:50]))
         np.testing.assert_allclose(after, before, atol=1e-6)
+
+
+def test_a_photo_without_links_is_not_drawn_over_what_others_show():
+    """A lens cap in the middle of a survey adds black; at its rim it might be woods or water."""
+    done = block(LAWN, hills(3000))
+    assert shown_already(pose(0, 0), CAMERA, done)
+    assert shown_already(pose(70, 0, z=-1.0), CAMERA, done)  # taken on the ground
+    assert not shown_already(pose(75, 0), CAMERA, done)
+    assert not shown_already(pose(0, 0, z=200.0), CAMERA, done)

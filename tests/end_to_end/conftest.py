@@ -1,6 +1,8 @@
 """A small flight of known truth, the command line in this process, and ways to spoil photos."""
 
 import contextlib
+import copy
+import hashlib
 import io
 import json
 import os
@@ -8,7 +10,7 @@ import re
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,9 +23,12 @@ from PIL import Image
 
 from skyquilt.cli.main import run
 from skyquilt.engine.folder import CONTRACT
-from skyquilt.simulate import FlightSettings, simulate
+from skyquilt.matching.sift import Sift
+from skyquilt.model.features import Features
+from skyquilt.simulate import FlightSettings
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
+from tests.once import flown_once
 from tests.photos.conftest import gps_exif, with_segment
 
 QUICK = ("--features", "300", "--surface", "ties", "--gsd", "30", "--jobs", "2")
@@ -109,6 +114,24 @@ def skyquilt(*words: str | Path) -> tuple[int, str, str]:
     return code, out.getvalue(), err.getvalue()
 
 
+@pytest.fixture(scope="package", autouse=True)
+def pictures_seen_before() -> Iterator[None]:
+    """What SIFT finds on the same picture again, in another test, is remembered in this process:
+    the tests here are about all that follows, and it is half of a run's time.
+    """
+    honest, found = Sift.of_shrunken, {}
+
+    def remembered(sift: Sift, small: np.ndarray, full: tuple[int, int]) -> Features:
+        picture = hashlib.sha256(np.ascontiguousarray(small)).digest()
+        key = (sift, picture, small.shape, small.dtype.str, full)
+        if key not in found:
+            found[key] = honest(sift, small, full)
+        return copy.deepcopy(found[key])
+
+    with mock.patch.object(Sift, "of_shrunken", remembered):
+        yield
+
+
 Mosaic = Callable[..., Told]
 
 
@@ -130,16 +153,13 @@ def mosaic(tmp_path: Path) -> Mosaic:
 @pytest.fixture(scope="session")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nine photos of WIDE x HIGH px with `gcp_list.txt` beside their folder `photos`."""
-    folder = tmp_path_factory.mktemp("flight")
     settings = FlightSettings(
         seed=3,
         lens=Lens().scaled(WIDE, HIGH),
         route=Route(photos=9),
         control=Control(points=5, checks=1),
     )
-    for _ in simulate(settings, folder, overwrite=True):
-        pass
-    return folder
+    return flown_once(tmp_path_factory, "end_to_end", settings)
 
 
 @pytest.fixture

@@ -6,10 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from skyquilt.simulate import FlightSettings, simulate
+from skyquilt.simulate import FlightSettings
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
 from tests.end_to_end.conftest import HIGH, WIDE, named, relabel, skyquilt
+from tests.once import flown_once
 
 METHODS = ("position", "pose", "image", "hybrid", "flightline")
 
@@ -17,14 +18,11 @@ METHODS = ("position", "pose", "image", "hybrid", "flightline")
 @pytest.fixture(scope="session")
 def lines(tmp_path_factory):
     """Twelve photos in three lines of four, with their truth."""
-    folder = tmp_path_factory.mktemp("lines")
-    route = Route(site=(70.0, 90.0), overlap=0.7, sidelap=0.5, height=60.0)
+    route = Route(site=(45.0, 60.0), overlap=0.7, sidelap=0.5, height=60.0)
     settings = FlightSettings(
         seed=5, lens=Lens().scaled(WIDE, HIGH), route=route, control=Control(points=4, checks=0)
     )
-    for _ in simulate(settings, folder, overwrite=True):
-        pass
-    return folder
+    return flown_once(tmp_path_factory, "lines", settings)
 
 
 def places(folder):

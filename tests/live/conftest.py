@@ -20,9 +20,10 @@ from skyquilt.live.workflow import iter_live
 from skyquilt.server.access import Guard
 from skyquilt.server.server_thread import ServerThread
 from skyquilt.server.survey import LiveSurvey
-from skyquilt.simulate import FlightSettings, simulate
+from skyquilt.simulate import FlightSettings
 from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Reporting, Route, Thermal
+from tests.once import flown_once
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,12 +45,10 @@ class Flight:
         return np.array(next(p["cam_R_map"] for p in self.truth["photos"] if p["name"] == name))
 
 
-def made(folder: Path, **settings: Any) -> Flight:
+def made(temporary: pytest.TempPathFactory, name: str, **settings: Any) -> Flight:
     """A flight of 480 x 360 px."""
-    for _ in simulate(
-        FlightSettings(lens=Lens().scaled(480, 360), **settings), folder, overwrite=True
-    ):
-        pass
+    flown = FlightSettings(lens=Lens().scaled(480, 360), **settings)
+    folder = flown_once(temporary, name, flown)
     return Flight(folder=folder, truth=json.loads((folder / "truth" / "truth.json").read_text()))
 
 
@@ -57,7 +56,8 @@ def made(folder: Path, **settings: Any) -> Flight:
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     """Six photos in two lines."""
     return made(
-        tmp_path_factory.mktemp("small"),
+        tmp_path_factory,
+        "small",
         seed=3,
         route=Route(photos=6),
         control=Control(points=0, checks=0),
@@ -70,7 +70,8 @@ def drones(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     degrees off.
     """
     return made(
-        tmp_path_factory.mktemp("drones"),
+        tmp_path_factory,
+        "drones",
         seed=5,
         route=Route(photos=18, drones=2),
         control=Control(points=0, checks=0),
@@ -85,7 +86,8 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Flight:
         lens=Lens(width=320, height=256, focal=386.0, k1=-0.2, k2=0.05, p1=0.0, p2=0.0)
     )
     return made(
-        tmp_path_factory.mktemp("thermal"),
+        tmp_path_factory,
+        "both",
         seed=3,
         route=Route(photos=6),
         control=Control(points=0, checks=0),

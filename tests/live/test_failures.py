@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from skyquilt.errors import OutputError
+from skyquilt.live import folder_watch
 from skyquilt.live.folder_watch import Watch
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import Ledger
@@ -25,15 +26,25 @@ from tests.attacks import SHARED, jpeg, needs_attacks
 QUICK = LiveSettings(features=600)
 
 
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch):
+    """Whoever waits for a file that is not whole waits for half a second, not for four."""
+    monkeypatch.setattr(folder_watch, "PATIENCE_S", 0.5)
+
+
 def taken(out, inbox, photos, seconds=60):
-    """Runs live on a folder until so many photos are accepted and drawn; the map stays open."""
+    """Runs live on a folder until so many photos are placed or refused and nothing is left to draw;
+    the map stays open.
+    """
     live = LiveMap(out, QUICK)
     stop = threading.Event()
     timer = threading.Timer(seconds, stop.set)
     timer.start()
     for _ in iter_live([inbox], live, stop=stop):
-        done = live.ledger.counts()
-        if sum(done.get(k, 0) for k in ("refined", "waiting", "refused")) >= photos:
+        done, redraw = live.ledger.counts(), live.redraw
+        left = redraw.urgent or redraw.pending or redraw.dirty or redraw.later
+        settled = sum(done.get(k, 0) for k in ("placed", "refined", "waiting", "refused"))
+        if settled >= photos and not left:
             stop.set()
     timer.cancel()
     return live
@@ -146,21 +157,27 @@ class Box:
         self.intake = Intake(self.ledger, inbox, settings)
         self.watch = Watch(folder=self.folder, intake=self.intake)
 
-    def look(self, seconds=1.0):
-        found = []
-        for _ in range(int(seconds / 0.05)):
+    def look(self, seconds=1.0, photos=None):
+        """What is taken or refused within some seconds; soon after so many `photos` no more is
+        waited for, but for what would be one too many.
+        """
+        found, rounds = [], int(seconds / 0.05)
+        while rounds > 0:
             found += self.watch.look()
             threading.Event().wait(0.05)
+            rounds = (
+                min(rounds - 1, 5) if photos is not None and len(found) >= photos else rounds - 1
+            )
         return found
 
 
 def test_names_that_are_no_text_are_taken(tmp_path):
     box = Box(tmp_path)
     Path(os.fsdecode(os.fsencode(box.folder) + b"/a\xff\x1b.jpg")).write_bytes(jpeg())
-    found = box.look()
+    found = box.look(photos=1)
     assert len(found) == 1 and not isinstance(found[0], Refused)
     assert found[0].name.isprintable()
-    assert Box(tmp_path).look() == []  # it is known after a restart
+    assert Box(tmp_path).look(0.3) == []  # it is known after a restart
 
 
 def test_a_file_that_is_gone_again_is_forgotten(tmp_path, monkeypatch):
@@ -180,7 +197,7 @@ def test_a_file_that_is_too_large_is_refused_and_the_next_is_taken(tmp_path):
     box = Box(tmp_path, most_bytes=10_000)
     (box.folder / "a.jpg").write_bytes(jpeg() + bytes(20_000))
     (box.folder / "b.jpg").write_bytes(jpeg())
-    found = {f.name: f for f in box.look(5)}
+    found = {f.name: f for f in box.look(5, photos=2)}
     assert isinstance(found["a.jpg"], Refused) and "--max-mb" in found["a.jpg"].reason
     assert not isinstance(found["b.jpg"], Refused)
 
@@ -193,7 +210,7 @@ def test_pipes_sockets_and_devices_are_refused_and_the_next_is_taken(tmp_path, m
         one.bind("in/b.jpg")
     (box.folder / "c.jpg").symlink_to(os.devnull)
     (box.folder / "d.jpg").write_bytes(jpeg())
-    found = {f.name: f for f in box.look(6)}
+    found = {f.name: f for f in box.look(6, photos=4)}
     assert not isinstance(found.pop("d.jpg"), Refused)
     assert {name: bool(f) for name, f in found.items()} == {
         "a.jpg": False,
@@ -210,35 +227,33 @@ def test_links_that_loop_are_not_followed(tmp_path):
     box = Box(tmp_path)
     assert len(box.watch._closed._folders) == 2
     (inner / "a.jpg").write_bytes(jpeg())
-    assert len(box.look()) == 1
+    assert len(box.look(photos=1)) == 1
 
 
 def test_an_inbox_that_goes_away_and_comes_back(tmp_path):
     box = Box(tmp_path)
     (box.folder / "a.jpg").write_bytes(jpeg())
-    assert len(box.look(0.5)) == 1
+    assert len(box.look(photos=1)) == 1
     box.folder.rename(tmp_path / "away")
     assert box.look(0.3) == []
     (tmp_path / "away").rename(box.folder)
     (box.folder / "b.jpg").write_bytes(jpeg(96, 80))
-    assert len(box.look(2.5)) == 1
+    assert len(box.look(2.5, photos=1)) == 1
 
 
 def test_what_was_reported_while_the_inbox_is_away_is_taken_when_it_is_back(tmp_path, monkeypatch):
     """Without waiting for the next scan of the whole folder."""
-    from skyquilt.live import folder_watch
-
     box = Box(tmp_path)
     monkeypatch.setattr(folder_watch, "SCAN_TOLD_S", 1000.0)
     monkeypatch.setattr(folder_watch, "SCAN_S", 1000.0)
     (box.folder / "a.jpg").write_bytes(jpeg())
-    assert len(box.look(1.0)) == 1
+    assert len(box.look(1.0, photos=1)) == 1
     for number in range(3):
         (box.folder / f"b{number}.jpg").write_bytes(jpeg(96, 80 + number))
     box.folder.rename(tmp_path / "away")
     assert box.look(0.3) == []  # the reports are read now
     (tmp_path / "away").rename(box.folder)
-    assert len(box.look(2.0)) == 3
+    assert len(box.look(2.0, photos=3)) == 3
 
 
 def test_two_live_maps_on_one_folder_are_refused(tmp_path):

@@ -3,7 +3,6 @@
 import shutil
 import struct
 import time
-import zlib
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from skyquilt.photos.side_files import read_geo_txt, read_mrk, read_positions_cs
 from skyquilt.photos.srt import read_srt
 from skyquilt.photos.tags import parse_xmp
 from skyquilt.raster.boundary import read_boundary
-from tests.attacks import SHARED, jpeg, needs_attacks, resident_mb, xmp
+from tests.attacks import SHARED, deflated_zeros, jpeg, needs_attacks, resident_mb, xmp
 
 REASONS = {
     "thin-20000x32.jpg": "one side",
@@ -112,7 +111,7 @@ def test_strips_that_unpack_to_more_than_they_hold(tmp_path):
     """A strip of 1 MB that inflates to 1 GB."""
     path = tmp_path / "a.tif"
     tifffile.imwrite(path, np.zeros((64, 64, 3), np.uint8), photometric="rgb", compression=8)
-    bomb = zlib.compress(bytes(2**30), 9)
+    bomb = deflated_zeros(2**30)
     data = bytearray(path.read_bytes())
     with tifffile.TiffFile(path) as tiff:
         for tag, value in ((273, len(data)), (279, len(bomb))):

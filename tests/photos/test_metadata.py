@@ -3,10 +3,10 @@ from datetime import UTC, datetime, timedelta, timezone
 import piexif
 import pytest
 
-from skyquilt.model.photo import Photo
+from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.photos.read import read_photo
 
-from .conftest import dji_exif, dji_xmp, gps_exif
+from .conftest import dji_exif, dji_xmp, gps_exif, jpeg_bytes, pixels
 
 
 def test_exif_alone(make_jpeg):
@@ -177,3 +177,16 @@ def test_an_xml_bomb_is_not_expanded(make_jpeg):
     entities = '<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]>'
     bomb = entities + '<x:xmpmeta xmlns:x="adobe:ns:meta/">&b;</x:xmpmeta>'
     assert isinstance(read_photo(make_jpeg(xmp=bomb)), Photo)
+
+
+def test_panoramas_are_left_out(tmp_path):
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF'
+        ' xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description'
+        ' xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"'
+        ' GPano:ProjectionType="equirectangular"/></rdf:RDF></x:xmpmeta>'
+    )
+    (tmp_path / "around.jpg").write_bytes(jpeg_bytes(pixels(), xmp=xmp))
+    found = read_photo(tmp_path / "around.jpg")
+    assert isinstance(found, RejectedPhoto)
+    assert "panorama (equirectangular)" in found.reason

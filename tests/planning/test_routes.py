@@ -23,7 +23,7 @@ from skyquilt.planning.view import find_view
 
 VIEW = find_view("FC6310")
 ZONE = "EPSG:32633"
-QUICK = PlanSettings(height_m=60, seconds=1.0)
+QUICK = PlanSettings(height_m=60, seconds=0.4)
 
 
 def grid(columns, rows, step=30.0):
@@ -225,7 +225,7 @@ def test_a_turn_that_does_not_fit_between_keep_outs_is_told():
     walls = box(-300, -50, 570, 400).difference(box(-15, -50, 285, 105))
     site = make_site(box(0, 0, 270, 90), (KeepOut(shape=walls),), ZONE)
     drones = fleet(1, turn_radius_m=200.0, photo_s=0.0, start=(135.0, -300.0))
-    routes = plan_routes(site, grid(10, 3), drones, QUICK, FLAT, 60.0)
+    routes = plan_routes(site, grid(4, 2), drones, QUICK, FLAT, 60.0)
     assert "d0 turns within 200 m and cannot keep its distance" in " ".join(routes.warnings)
 
 

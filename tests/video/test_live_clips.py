@@ -8,6 +8,7 @@ import pytest
 
 from skyquilt.engine.clock import result_of
 from skyquilt.engine.store import Store
+from skyquilt.live import clip_intake, folder_watch
 from skyquilt.live.folder_watch import Watch
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import Ledger
@@ -73,18 +74,20 @@ def test_a_watched_folder_takes_the_frames_of_a_finished_clip(film, tmp_path):
     assert len(rows) == len(done)
 
 
-def test_photos_are_taken_while_a_clip_is_looked_through(film, tmp_path):
+def test_photos_are_taken_while_a_clip_is_looked_through(film, tmp_path, monkeypatch):
     """However long a clip is, a look at the folder takes a short time only."""
+    monkeypatch.setattr(folder_watch, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(clip_intake, "SLICE_S", 0.02)
     folder, out = tmp_path / "in", tmp_path / "out"
     folder.mkdir()
     out.mkdir()
-    places = np.stack([np.full(400, 500.0), 1800 - 2.5 * np.arange(400)], axis=1)
-    write_clip(folder / "LONG.MP4", flown(places, size=(960, 720)), fps=5.0)
+    places = np.stack([np.full(200, 500.0), 1800 - 2.5 * np.arange(200)], axis=1)
+    write_clip(folder / "LONG.MP4", flown(places, size=(480, 360)), fps=5.0)
     ledger = Ledger(out, write=True)
     watch = Watch(
         folder=folder, intake=Intake(ledger, Inbox(ledger, out / "photos"), LiveSettings())
     )
-    time.sleep(4.1)  # the patience with its positions is over
+    time.sleep(0.2)  # the patience with its positions is over
     assert list(watch.look()) == []
     frame = result_of(
         with_frames(
@@ -103,8 +106,6 @@ def test_photos_are_taken_while_a_clip_is_looked_through(film, tmp_path):
 
 
 def test_a_clip_that_fails_in_an_unforeseen_way_is_refused_alone(film, tmp_path, monkeypatch):
-    import skyquilt.live.clip_intake as module
-
     def broken(*_):
         raise ZeroDivisionError("unforeseen")
 
@@ -112,8 +113,8 @@ def test_a_clip_that_fails_in_an_unforeseen_way_is_refused_alone(film, tmp_path,
     out.mkdir()
     ledger = Ledger(out, write=True)
     intake = Intake(ledger, Inbox(ledger, out / "photos"), LiveSettings())
-    monkeypatch.setattr(module, "with_frames", broken)
-    done = [d for d in module.take_clip(intake, film, "here") if d is not None]
+    monkeypatch.setattr(clip_intake, "with_frames", broken)
+    done = [d for d in clip_intake.take_clip(intake, film, "here") if d is not None]
     assert [d.name for d in done] == ["A.MP4"]
     assert "ZeroDivisionError" in done[0].reason
     assert "unforeseen" in (out / "errors.log").read_text()

@@ -10,16 +10,25 @@ from numpy.typing import NDArray
 from skyquilt.alignment.addition import added, median_offset
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import control_in_frame
+from skyquilt.alignment.determined import ground_places
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.oblique import tilted
 from skyquilt.alignment.pose import ByMetadata, ByPose, reported_camera
 from skyquilt.alignment.repair import Repaired, repair
 from skyquilt.alignment.start import ground_of
 from skyquilt.errors import AlignmentError
+from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.model.camera import Camera
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Pose, Prior
 
+SHOWN_ALREADY = 0.8
+"""Photos without links are left out where connected photos show more than this share of what they
+would show.
+"""
+NEIGHBOURS = 40
+"""So many of the nearest connected photos are asked."""
 REQUESTED = "asked for"
 """The reason recorded for a method that the user requested."""
 
@@ -32,7 +41,7 @@ class ByLinks:
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
-    version: ClassVar[int] = 1
+    version: ClassVar[int] = 2
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -178,6 +187,11 @@ def with_loose_photos(
             continue
         weak = rejected.pop(i, "it could not be linked to any other photo")
         R = cam_R_map_from_angles(priors[i].yaw_deg, priors[i].pitch_deg, priors[i].roll_deg)
+        if shown_already(Pose(cam_R_map=R, map_C=C), reported_camera(photo), alignment):
+            rejected[i] = (
+                f"{weak}, and what it would show by its metadata is shown by photos that are"
+            )
+            continue
         poses[i] = Pose(cam_R_map=R, map_C=C)
         cameras.setdefault(photo.camera_key, reported_camera(photo))
         camera_of[i] = photo.camera_key
@@ -192,6 +206,29 @@ def with_loose_photos(
         blocks=tuple(blocks),
         notes=tuple(notes),
     )
+
+
+def shown_already(pose: Pose, camera: Camera, alignment: Alignment) -> bool:
+    """Whether connected photos show what a photo without links would show. It does not look like
+    them, then: a lens cap, a hand, a landing, a panorama; or it adds nothing to them.
+    """
+    if not len(alignment.ties.xyz):
+        return False
+    ground = float(np.median(alignment.ties.xyz[:, 2]))
+    if pose.map_C[2] <= ground:
+        return True
+    places = ground_places(pose, camera, ground)
+    if not len(places):
+        return False
+    held = np.array(alignment.held)
+    away = [float(np.hypot(*(alignment.poses[i].map_C - pose.map_C)[:2])) for i in held.tolist()]
+    shown = np.zeros(len(places), np.bool_)
+    for i in held[np.argsort(away)[:NEIGHBOURS]].tolist():
+        own, local = alignment.camera(i), alignment.poses[i].to_camera(places)
+        ahead = local[:, 2] > 0
+        px = project(own, np.where(ahead[:, None], local, [0.0, 0.0, 1.0]))
+        shown |= ahead & ((px > 0) & (px < [own.width - 1, own.height - 1])).all(1)
+    return bool(shown.mean() > SHOWN_ALREADY)
 
 
 def _lacking(C: NDArray[np.float64], prior: Prior) -> str:

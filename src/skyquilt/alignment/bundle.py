@@ -12,6 +12,7 @@ from skyquilt.alignment.determined import weak_photos
 from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
+from skyquilt.alignment.oblique_start import reported_start, slanting, untold
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, undetermined
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
@@ -56,7 +57,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 34
+    version: ClassVar[int] = 35
 
     def __call__(
         self,
@@ -78,7 +79,9 @@ class Bundle:
         Raises:
             AlignmentError: no two photos are linked.
         """
-        aside = reported_oblique(priors) if self.repair else frozenset[int]()
+        aside = frozenset[int]()
+        if self.repair:
+            aside = untold(priors) if slanting(priors) else reported_oblique(priors)
 
         def block(aside: frozenset[int]) -> Alignment:
             upright = [k for k in links if k.a not in aside and k.b not in aside]
@@ -102,6 +105,10 @@ class Bundle:
             weak = weak_photos(found, priors)
         return hung(found, weak, photos, priors, features, links, aside)
 
+    def _in_space(self, priors: Sequence[Prior]) -> bool:
+        """Whether the start takes what photos report for their poses."""
+        return self.repair and slanting(priors)
+
     def _block(
         self,
         photos: Sequence[Photo],
@@ -115,7 +122,9 @@ class Bundle:
         make_room: Callable[[], None],
     ) -> Alignment:
         """Adjusts the photos that these links connect."""
-        start = _kept_start(photos, priors, features, links, ground_of(frame), keep)
+        start = reported_start(photos, priors, features, links) if self._in_space(priors) else None
+        if start is None:
+            start = _kept_start(photos, priors, features, links, ground_of(frame), keep)
         if not start.blocks:
             raise AlignmentError(f"none of {len(photos)} photos could be linked to another one")
         sizes = [(p.width, p.height) for p in photos]

@@ -185,7 +185,7 @@ def deviation_px(
     normal = weight * (flat.T @ flat)
     if prior is not None:
         normal += _known(prior)
-    places = _ground_places(pose, camera, float(np.median(xyz[:, 2])))
+    places = ground_places(pose, camera, float(np.median(xyz[:, 2])))
     if not len(places):
         return 0.0
     scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-12))  # metres and radians
@@ -217,7 +217,7 @@ def _known(prior: Prior) -> Array:
     return np.diag(out)
 
 
-def _ground_places(pose: Pose, camera: Camera, z: float) -> Array:
+def ground_places(pose: Pose, camera: Camera, z: float) -> Array:
     """(k, 3) places at height z that the picture shows, those seen too flatly left out."""
     px = GRID * [camera.width - 1, camera.height - 1]
     ray = rays(camera, px) @ pose.cam_R_map

@@ -11,12 +11,17 @@ from skyquilt.alignment.motion import velocities
 from skyquilt.alignment.problem import PART, READOUT, Problem, State
 from skyquilt.alignment.start import Start
 from skyquilt.alignment.tracks import Tracks
+from skyquilt.alignment.triangulate import intersect
 from skyquilt.geometry.frames import angle_difference_deg, cam_R_map_from_angles
 from skyquilt.model.camera import PARAMETERS, Camera, order_named
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Motion, Pose, Prior
 
 Array = NDArray[np.float64]
+LEAST_FALL = np.sin(np.radians(10.0))
+"""Rays flatter than this are taken for as steep as this, where they meet the ground plane."""
+TOLD_APART = np.sin(np.radians(3.0))
+"""Rays that differ by less than about this angle do not tell where they meet."""
 HALF_TURN = np.diag([-1.0, -1.0, 1.0])
 INDEPENDENT = 40
 """Independent observations that tell as much as a photo's many correlated ones."""
@@ -64,6 +69,8 @@ class Setup:
     """(n,) similarity factors of the start; they give the first points on the ground plane."""
     plane_t: NDArray[np.complex128]
     """(n,) translations of the start."""
+    in_space: bool = False
+    """The first points are where rays meet near the ground plane, not on it."""
 
     def file_px(self, photo: NDArray[np.integer[Any]], px: Array) -> Array:
         """Converts sensor pixels to file pixels, or back. For turned files the two differ by a
@@ -94,8 +101,9 @@ class Setup:
         """
         row = np.searchsorted(self.members, tracks.photo)
         X = np.empty((tracks.count, 3))
+        first_points = self._meeting if self.in_space else self._on_plane
         for some, points in tracks.parts(PART):
-            X[points] = self._on_plane(tracks.part(some, points), row[some])
+            X[points] = first_points(tracks.part(some, points), row[some])
         problem = replace(
             self.base,
             point=tracks.point,
@@ -120,8 +128,7 @@ class Setup:
 
     def _on_plane(self, tracks: Tracks, row: NDArray[np.int64]) -> Array:
         """Points (P, 3) of tracks on the plane of the start, `row` (N,) being their photos'."""
-        K = self.base.K0[self.camera[row]]
-        p = ((tracks.px[:, 0] - K[:, 1]) - 1j * (tracks.px[:, 1] - K[:, 2])) / K[:, 0]
+        p = self._plain(tracks, row)
         p = np.where(self.turned[tracks.photo], -p, p)
         ground = self.plane_a[row] * p + self.plane_t[row]
         X = np.full((tracks.count, 3), self.z_ground)
@@ -129,6 +136,27 @@ class Setup:
         X[:, 0] = np.bincount(tracks.point, ground.real, tracks.count) / number
         X[:, 1] = np.bincount(tracks.point, ground.imag, tracks.count) / number
         return X
+
+    def _meeting(self, tracks: Tracks, row: NDArray[np.int64]) -> Array:
+        """Points (P, 3) where the rays of tracks meet, drawn towards the ground plane as far as
+        these are too parallel to tell.
+        """
+        p = self._plain(tracks, row)
+        local = np.column_stack([p.real, -p.imag, np.ones(len(p))])
+        ray = np.einsum("nji,nj->ni", self.start_R[row], local)
+        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+        C, count = self.start_C[row], tracks.count
+        down = np.maximum(-ray[:, 2], LEAST_FALL)
+        there = C + ray * ((C[:, 2] - self.z_ground) / down)[:, None]
+        number = np.bincount(tracks.point, minlength=count)
+        near = [np.bincount(tracks.point, axis, count) / number for axis in there.T]
+        return intersect(tracks.point, C, ray, count, np.column_stack(near), TOLD_APART**2 * number)
+
+    def _plain(self, tracks: Tracks, row: NDArray[np.int64]) -> NDArray[np.complex128]:
+        """(N,) places in the picture over the focal length, y up, distortion neglected."""
+        K = self.base.K0[self.camera[row]]
+        p = ((tracks.px[:, 0] - K[:, 1]) - 1j * (tracks.px[:, 1] - K[:, 2])) / K[:, 0]
+        return np.asarray(p)
 
 
 def set_up(
@@ -155,6 +183,9 @@ def set_up(
             for m, y in zip(members.tolist(), yaw, strict=True)
         ]
     )
+    if start.in_space:
+        start_C = np.array([priors[m].map_C for m in members])
+        start_R = R0.copy()
     K0, sigma_K, free = intrinsic_priors([photos[m] for m in first], distortion)
     base = Problem(
         point=np.zeros(0, np.int64),
@@ -192,6 +223,7 @@ def set_up(
         start_C=start_C,
         plane_a=a,
         plane_t=t,
+        in_space=start.in_space,
     )
 
 

@@ -45,6 +45,8 @@ class Start:
     """Photos of blocks that positions placed."""
     metric: bool
     """False if the scale had to be assumed."""
+    in_space: bool = False
+    """Photos begin with the poses that they report; otherwise they look straight down."""
 
 
 def plane_link(link: Link, photos: Sequence[Photo], features: Sequence[Features]) -> PlaneLink:

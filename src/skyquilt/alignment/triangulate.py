@@ -1,6 +1,7 @@
 """Points from observations with known poses."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +14,25 @@ from skyquilt.model.camera import PARAMETERS, Camera
 Array = NDArray[np.float64]
 
 
-def intersect(point: NDArray[np.int64], origin: Array, direction: Array, count: int) -> Array:
+def intersect(
+    point: NDArray[np.integer[Any]],
+    origin: Array,
+    direction: Array,
+    count: int,
+    near: Array | None = None,
+    weight: Array | float = 1e-9,
+) -> Array:
     """Least-squares intersections (count, 3) of rays: origins (N, 3), directions (N, 3), by point
-    (N,).
+    (N,). They are drawn to the places `near` (count, 3), or the origin, with a `weight` each.
     """
     d = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     M = np.eye(3) - d[:, :, None] * d[:, None, :]
     A, b = np.zeros((count, 3, 3)), np.zeros((count, 3))
     np.add.at(A, point, M)
     np.add.at(b, point, np.einsum("nij,nj->ni", M, origin))
-    A += np.eye(3) * 1e-9
+    A += np.eye(3) * np.broadcast_to(weight, count)[:, None, None]
+    if near is not None:
+        b += near * np.broadcast_to(weight, count)[:, None]
     return np.asarray(np.linalg.solve(A, b[..., None])[..., 0])
 
 
@@ -53,6 +63,19 @@ def _intersected(problem: Problem, state: State) -> Array:
     return intersect(problem.point, origin, direction, len(problem.X0))
 
 
+def regular(H: Array) -> Array:
+    """Normal equations (P, 3, 3), those of points beside a camera's own plane, which tell one
+    direction only, made ones that can be solved.
+    """
+    size = np.abs(H).max((1, 2))
+    flat = ~(np.abs(np.linalg.det(H)) > 1e-30 * size**3)
+    if flat.any():
+        H = H.copy()
+        added = np.maximum(1e-9 * size[flat], 1.0)
+        H[flat] = np.nan_to_num(H[flat]) + np.eye(3) * added[:, None, None]
+    return H
+
+
 def polish(problem: Problem, state: State, *, iterations: int = 5) -> tuple[State, Array]:
     """Gauss-Newton on the points alone; returns the state and the standard deviation (P,) of each
     point's height in m.
@@ -65,7 +88,7 @@ def polish(problem: Problem, state: State, *, iterations: int = 5) -> tuple[Stat
             rows = np.concatenate([J, residual[..., None]], 2)
             products = np.swapaxes(J, 1, 2) @ rows * w[:, None, None]
             sums = sums_by_point(part, products, len(own.X))
-            H = sums[:, :, :3] + np.eye(3) * 1e-9
+            H = regular(sums[:, :, :3] + np.eye(3) * 1e-9)
             own = replace(own, X=own.X - np.linalg.solve(H, sums[:, :, 3:])[..., 0])
             sigma_z[points] = np.sqrt(np.abs(np.linalg.inv(H)[:, 2, 2]))
         X[points] = own.X

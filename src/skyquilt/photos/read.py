@@ -100,6 +100,10 @@ def rejected(name: str, error: Exception) -> RejectedPhoto:
     )
 
 
+PANORAMAS = ("equirectangular", "cylindrical")
+"""Projections of panoramas; no camera takes such a picture at once."""
+
+
 class ReadFiles:
     """Reads the metadata of photos; of files that an earlier run in the same output folder read,
     they are taken from its store: a run that goes on need not read thousands of files.
@@ -158,6 +162,9 @@ class _Lens:
 
 
 def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> Photo:
+    joined = header.xmp.text("GPano:ProjectionType", "panorama:ProjectionType").lower()
+    if joined in PANORAMAS:
+        raise UnreadablePhotoError(f"it is a panorama ({joined}), joined from several photos")
     frame = _thermal_frame(path, header, thermal_unit)
     height, width = frame.values.shape if frame else (header.height, header.width)
     strange: list[str] = []

@@ -107,8 +107,13 @@ class Lens:
         return ideal_x, ideal_y
 
     def project(self, points: Doubles, rotation: Doubles, centre: Doubles) -> Doubles:
-        """Pixels (n, 2) of map points (n, 3); NaN behind the camera."""
-        camera = (np.asarray(points, dtype=np.float64) - centre) @ rotation.T
+        """Pixels (n, 2) of map points (n, 3); NaN behind the camera.
+
+        One rotation (3, 3) and centre (3,) for all points, or one for each: (n, 3, 3) and (n, 3).
+        """
+        away = np.asarray(points, dtype=np.float64) - centre
+        each = rotation.ndim == 3
+        camera = np.einsum("nij,nj->ni", rotation, away) if each else away @ rotation.T
         depth = np.where(camera[:, 2] > 1e-6, camera[:, 2], np.nan)
         x, y = self.distort(camera[:, 0] / depth, camera[:, 1] / depth)
         return np.stack([self.focal * x + self.cx, self.focal * self.aspect * y + self.cy], axis=1)

@@ -62,7 +62,8 @@ def lay_out(
     anywhere = nadirs[rng.integers(len(nadirs), size=_CANDIDATES)] + rng.uniform(
         -reach, reach, (_CANDIDATES, 2)
     )
-    clear = np.array([_open(country.layout, place) for place in anywhere])
+    covered = _covered(country.layout)
+    clear = np.array([_open(country.layout, covered, place) for place in anywhere])
     views = _views(lens, shots, anywhere)
     places = anywhere[:wanted]
     for least in (1, 2, 3, 4):  # the largest number of views that enough places have
@@ -94,12 +95,18 @@ def _views(lens: Lens, shots: Sequence[Shot], places: Doubles) -> NDArray[np.int
     return count
 
 
-def _open(layout: Layout, place: Doubles) -> bool:
+def _covered(layout: Layout) -> Doubles:
+    """Circles (n, 3) that trees, houses and cars cover with some space around: x, y and radius."""
+    circles = [(t.x, t.y, t.radius + 2.5) for t in layout.trees]
+    circles += [(h.x, h.y, h.length / 2 + 6.0) for h in layout.houses]
+    circles += [(c.x, c.y, 4.5) for c in layout.cars]
+    return np.array(circles).reshape(-1, 3)
+
+
+def _open(layout: Layout, covered: Doubles, place: Doubles) -> bool:
     """Whether no object covers a place or is close to it."""
     x, y = place
-    clear = all(np.hypot(t.x - x, t.y - y) > t.radius + 2.5 for t in layout.trees)
-    clear = clear and all(np.hypot(h.x - x, h.y - y) > h.length / 2 + 6.0 for h in layout.houses)
-    clear = clear and all(np.hypot(c.x - x, c.y - y) > 4.5 for c in layout.cars)
+    clear = bool((np.hypot(covered[:, 0] - x, covered[:, 1] - y) > covered[:, 2]).all())
     spot = (float(x), float(y))
     closed = [p.outline for p in layout.parcels if p.kind in ("maize", "wood")] + list(layout.ponds)
     return clear and all(

@@ -88,12 +88,7 @@ class Shot:
         for _ in range(4):  # each round is a hundred times as close as the one before
             share = np.clip(pixels[:, 1] / (lens.height - 1) - 0.5, -2, 2)
             rotation, centre = self.exposed(lens, np.nan_to_num(share))
-            pixels = np.array(
-                [
-                    lens.project(points[i : i + 1], rotation[i], centre[i])[0]
-                    for i in range(len(points))
-                ]
-            ).reshape(-1, 2)
+            pixels = lens.project(points, rotation, centre)
         return pixels
 
     @property

@@ -1,0 +1,112 @@
+"""The start of an oblique survey (orbits, facades, a tilted grid): photos as their metadata say.
+
+Links of oblique photos are no similarities of the ground plane, so a start by them bends into a
+dome. Where most photos report their tilt and their place, these are near enough to the truth for
+an adjustment in space to begin with.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.alignment.determined import STATED_DEG
+from skyquilt.alignment.oblique import MOST_OBLIQUE, tilted
+from skyquilt.alignment.similarity_graph import components
+from skyquilt.alignment.start import Start, plane_link
+from skyquilt.alignment.triangulate import intersect
+from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.model.features import Features, Link
+from skyquilt.model.photo import Photo
+from skyquilt.model.poses import Prior
+
+Array = NDArray[np.float64]
+APART = np.sin(np.radians(5.0))
+"""Sine of the least angle between two rays that tell where they meet, positions erring by metres.
+"""
+FEWEST_MET = 50
+"""Fewest such pairs of rays that tell the height of the ground."""
+
+
+def slanting(priors: Sequence[Prior]) -> bool:
+    """Whether the survey itself is oblique by what its photos report."""
+    return sum(tilted(p) for p in priors) > MOST_OBLIQUE * len(priors)
+
+
+def told(prior: Prior) -> bool:
+    """Whether metadata tell a photo's whole pose."""
+    return bool(
+        np.isfinite([*prior.map_C, prior.yaw_deg]).all() and prior.sigma_tilt_deg <= STATED_DEG
+    )
+
+
+def untold(priors: Sequence[Prior]) -> frozenset[int]:
+    """The photos whose metadata do not tell their whole pose."""
+    return frozenset(i for i, p in enumerate(priors) if not told(p))
+
+
+def reported_start(
+    photos: Sequence[Photo],
+    priors: Sequence[Prior],
+    features: Sequence[Features],
+    links: Sequence[Link],
+) -> Start | None:
+    """The start with linked photos where their metadata put them, photos that do not tell their
+    pose left out; None if the rays of these do not tell the height of the ground.
+    """
+    links = tuple(k for k in links if told(priors[k.a]) and told(priors[k.b]))
+    plane = [plane_link(k, photos, features) for k in links]
+    groups = [g.tolist() for g in components(len(photos), plane) if len(g) > 1]
+    members = sorted(i for g in groups for i in g)
+    meetings = _meetings(photos, priors, features, links)
+    if not members or len(meetings) < FEWEST_MET:
+        return None
+    lowest = min(priors[i].map_C[2] for i in members)
+    ground = min(float(np.median(meetings)), lowest - 1.0)
+    placed = {}
+    for i in members:
+        x, y, z = priors[i].map_C.tolist()
+        turn = np.exp(-1j * np.radians(priors[i].yaw_deg))
+        placed[i] = complex((z - ground) * turn), complex(x, y)
+    return Start(
+        placed=placed,
+        blocks=tuple(map(tuple, groups)),
+        links=links,
+        sigma_xy={},
+        georeferenced=frozenset(members),
+        metric=True,
+        in_space=True,
+    )
+
+
+def _meetings(
+    photos: Sequence[Photo],
+    priors: Sequence[Prior],
+    features: Sequence[Features],
+    links: Sequence[Link],
+) -> Array:
+    """Heights in m where the rays of matched keypoints meet, if they do in front of both photos."""
+    found = [np.zeros(0)]
+    for k in links:
+        rays = [
+            _rays(photos[i], priors[i], features[i].px[index])
+            for i, index in ((k.a, k.index_a), (k.b, k.index_b))
+        ]
+        count = len(k)
+        point = np.tile(np.arange(count), 2)
+        C = np.repeat([priors[k.a].map_C, priors[k.b].map_C], count, axis=0)
+        X = intersect(point, C, np.concatenate(rays), count)
+        ahead = np.ones(count, np.bool_)
+        for i, ray in zip((k.a, k.b), rays, strict=True):
+            ahead &= ((X - priors[i].map_C) * ray).sum(1) > 0
+        sine = np.linalg.norm(np.cross(rays[0], rays[1]), axis=1)
+        found.append(X[ahead & (sine > APART), 2])
+    return np.concatenate(found)
+
+
+def _rays(photo: Photo, prior: Prior, px: NDArray[np.floating]) -> Array:
+    """(n, 3) unit vectors in the map frame, the lens's distortion neglected."""
+    middle = np.array([photo.width - 1, photo.height - 1]) / 2
+    local = np.column_stack([(px - middle) / photo.focal.px, np.ones(len(px))])
+    local /= np.linalg.norm(local, axis=1, keepdims=True)
+    return local @ cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)

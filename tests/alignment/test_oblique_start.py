@@ -1,0 +1,121 @@
+"""Surveys that are oblique as a whole, from photos, links and what the photos report."""
+
+import numpy as np
+import pytest
+
+from skyquilt.alignment.bundle import Bundle
+from skyquilt.alignment.oblique_start import reported_start, slanting
+from skyquilt.alignment.triangulate import regular
+from skyquilt.geometry.camera import project
+from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.matching.verify import Verify
+from skyquilt.model.camera import Camera
+from skyquilt.model.features import Features, Link, Matches
+from skyquilt.model.poses import MapFrame, Pose
+from tests.alignment.surveys import FOCAL, HEIGHT, WIDTH, photo, prior
+
+FRAME = MapFrame(crs="EPSG:32630", origin=(500000.0, 5600000.0), vertical_datum="takeoff")
+CAMERA = Camera.ideal(width=WIDTH, height=HEIGHT, focal=FOCAL)
+
+
+class Slanting:
+    """Photos with known poses over rough ground, reported with errors of receivers."""
+
+    def __init__(self, places, *, gps=1.5, seed=0):
+        """`places`: x, y, z in m, yaw and pitch in degrees of each photo."""
+        rng = np.random.default_rng(seed)
+        xyz = np.column_stack([rng.uniform(-110, 110, (5000, 2)), rng.gamma(0.7, 1.5, 5000)])
+        self.truth, self.photos, self.priors, self.features, seen = [], [], [], [], []
+        for i, (x, y, z, yaw, pitch) in enumerate(places):
+            R = cam_R_map_from_angles(yaw, pitch, 0.5)
+            where = Pose(cam_R_map=R, map_C=np.array([x, y, z]))
+            local = where.to_camera(xyz)
+            px = project(CAMERA, np.where(local[:, 2:] > 1, local, [0, 0, -1]))
+            inside = np.flatnonzero(((px > 5) & (px < [WIDTH - 6, HEIGHT - 6])).all(1))
+            inside = inside[local[inside, 2] < 160]
+            px = px[inside] + rng.normal(0, 0.3, (len(inside), 2))
+            seen.append({int(p): k for k, p in enumerate(inside)})
+            self.truth.append(where)
+            self.photos.append(photo(f"{i:02d}.jpg"))
+            error = rng.normal(0, gps, 3)
+            self.priors.append(
+                prior(where.map_C + error, yaw=yaw + rng.normal(), pitch=pitch + rng.normal(0, 0.5))
+            )
+            words = np.zeros((len(px), 4), np.uint8)
+            size = np.ones(len(px), np.float32)
+            self.features.append(Features(px=px, size=size, descriptors=words, scale=1.0))
+        self.links = []
+        for i in range(len(places)):
+            for j in range(i + 1, len(places)):
+                both = sorted(seen[i].keys() & seen[j].keys())
+                m = Matches(
+                    index_a=np.array([seen[i][p] for p in both], int),
+                    index_b=np.array([seen[j][p] for p in both], int),
+                )
+                turn = abs((places[j][3] - places[i][3] + 180) % 360 - 180)
+                if len(both) < 20 or turn > 45:  # no descriptor is alike from further apart
+                    continue
+                link = Verify()(i, j, self.features[i], self.features[j], m, WIDTH)
+                if isinstance(link, Link):
+                    self.links.append(link)
+
+    def aligned(self):
+        return Bundle()(self.photos, FRAME, self.priors, self.features, self.links)
+
+    def errors(self, found):
+        """Distances (n,) of centres in m from the truth, a shift of all removed, and angles (n,) of
+        rotations in degrees.
+        """
+        apart = np.array([p.map_C - self.truth[i].map_C for i, p in found.poses.items()])
+        turns = [
+            np.degrees(np.arccos(np.clip((np.trace(p.cam_R_map @ R.T) - 1) / 2, -1, 1)))
+            for i, p in found.poses.items()
+            for R in [self.truth[i].cam_R_map]
+        ]
+        return np.linalg.norm(apart - np.median(apart, 0), axis=1), np.array(turns)
+
+
+def orbit(count, tilt, height=40.0, pitch=None):
+    reach = height * np.tan(np.radians(tilt))
+    return [
+        (reach * np.sin(b), reach * np.cos(b), height, np.degrees(b) - 180, pitch or tilt)
+        for b in np.radians(np.arange(count) * 360 / count)
+    ]
+
+
+def grid(pitch):
+    return [(x, y, 45.0, 0.0, pitch) for y in (-40, -22, -4) for x in (-36, -18, 0, 18, 36)]
+
+
+SURVEYS = {"orbit": orbit(20, 50), "horizon": orbit(20, 45, pitch=66), "grid": grid(45)}
+
+
+@pytest.mark.parametrize("name", SURVEYS)
+def test_an_oblique_survey_is_placed(name):
+    flown = Slanting(SURVEYS[name])
+    found = flown.aligned()
+    assert len(found.poses) == len(flown.photos)
+    away, turned = flown.errors(found)
+    assert np.median(away) < 0.8
+    assert np.median(turned) < 1.0
+
+
+def test_photos_that_do_not_tell_their_pose_hang_on_the_others():
+    flown = Slanting(orbit(20, 50), seed=2)
+    flown.priors[7] = prior((np.nan,) * 3, pitch=50)
+    found = flown.aligned()
+    assert np.linalg.norm(found.poses[7].map_C - flown.truth[7].map_C) < 2
+
+
+def test_points_in_a_camera_s_own_plane_can_be_solved():
+    H = np.array([np.eye(3), np.diag([1e20, 0, 0]), np.full((3, 3), 1e25)])
+    assert np.isfinite(np.linalg.solve(regular(H), np.ones((3, 3, 1)))).all()
+    assert (regular(H)[0] == H[0]).all()
+
+
+def test_what_is_an_oblique_survey():
+    level, tilted = prior((0, 0, 60.0)), prior((0, 0, 60.0), pitch=45)
+    assert slanting([level] * 3 + [tilted] * 8)
+    assert not slanting([level] * 8 + [tilted] * 3)
+    flown = Slanting(orbit(12, 50))
+    assert reported_start(flown.photos, flown.priors, flown.features, ()) is None
