@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from skyquilt.alignment.aligners import choose_method
+from skyquilt.alignment.aligners import blank_notes, choose_method
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import Control, control_in_frame, fit_similarity_3d
 from skyquilt.alignment.setup import HALF_TURN
@@ -497,3 +497,18 @@ def test_control_points_in_another_crs():
 )
 def test_what_places_the_map_is_said(positions, control, says):
     assert choose_method(9, 30, positions, control) == ("bundle", says)
+
+
+@pytest.mark.parametrize(("blank", "told"), [(0, False), (2, False), (3, True), (4, True)])
+def test_photos_that_show_nothing_are_told(blank, told):
+    def found(count):
+        return Features(
+            px=np.zeros((count, 2)),
+            size=np.zeros(count, np.float32),
+            descriptors=np.zeros((count, 128), np.uint8),
+            scale=1.0,
+        )
+
+    notes = blank_notes([found(0)] * blank + [found(300)] * (4 - blank))
+    assert bool(notes) == told
+    assert not told or notes[0].startswith(f"{blank} of 4 photos show next to nothing")

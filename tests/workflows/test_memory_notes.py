@@ -9,13 +9,13 @@ from skyquilt.workflows.flow import memory_notes
 
 
 def test_surveys_that_fit_are_not_told_anything():
-    assert memory_notes(6900, None) == []
+    assert memory_notes(4900, None) == []
     assert memory_notes(10_000, 4.0) == []
 
 
 def test_large_ones_are_told_what_would_do():
     (note,) = memory_notes(10_000, None)
-    assert "10,000 photos takes about 1.5 GB, more than --memory 1.2" in note.text
+    assert "10,000 photos takes about 1.9 GB, more than --memory 1.2" in note.text
 
 
 @pytest.mark.parametrize("side_m", [100.0, 1000.0, 10_000.0])

@@ -20,6 +20,7 @@ from skyquilt.errors import AlignmentError
 from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.model.camera import Camera
+from skyquilt.model.features import Features
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Pose, Prior
 
@@ -29,6 +30,8 @@ would show.
 """
 NEIGHBOURS = 40
 """So many of the nearest connected photos are asked."""
+KEYPOINTS = 8
+"""A photo with fewer shows next to nothing: a lens cap, a white sky."""
 REQUESTED = "asked for"
 """The reason recorded for a method that the user requested."""
 
@@ -113,9 +116,26 @@ class Auto:
         """
         positions = sum(bool(np.isfinite(p.map_C[:2]).all()) for p in inputs.priors)
         control = sum(not point.check for point in inputs.control)
-        method, why = choose_method(len(inputs.photos), len(inputs.links), positions, control)
-        chosen = self.bundle if method == "bundle" else self.pose
-        return replace(chosen(inputs), why=why)
+        blank = () if inputs.links else blank_notes(inputs.features)
+        try:
+            method, why = choose_method(len(inputs.photos), len(inputs.links), positions, control)
+            found = (self.bundle if method == "bundle" else self.pose)(inputs)
+        except AlignmentError as error:
+            if blank:
+                raise AlignmentError(f"{error}. {blank[0]}") from error
+            raise
+        return replace(found, why=why, notes=(*found.notes, *blank))
+
+
+def blank_notes(features: Sequence[Features]) -> tuple[str, ...]:
+    """What is said where most photos have next to no keypoints."""
+    blank = sum(len(found.px) < KEYPOINTS for found in features)
+    if 2 * blank <= len(features):
+        return ()
+    return (
+        f"{blank} of {len(features)} photos show next to nothing that can be recognised: are they"
+        " black, overexposed, or out of focus?",
+    )
 
 
 def choose_method(photos: int, links: int, positions: int, control: int) -> tuple[str, str]:

@@ -62,7 +62,8 @@ class Pairs:
             b.append(order[same + lag])
         first, second = np.concatenate(a), np.concatenate(b)
         del a, b, order
-        photos = row[first].astype(np.int64)
+        narrow = np.int32 if len(where) ** 2 < 2**31 else np.int64
+        photos: NDArray[Any] = row[first].astype(narrow)
         photos *= len(where)
         photos += row[second]
         sort = np.argsort(photos, kind="stable")

@@ -50,7 +50,7 @@ from skyquilt.workflows.second_look import connect
 from skyquilt.workflows.survey_input import SurveyInput
 
 T = TypeVar("T")
-ADJUSTED_GB, ADJUSTED_PHOTO_GB = 0.5, 0.0001
+ADJUSTED_GB, ADJUSTED_PHOTO_GB = 0.5, 0.00014
 """Memory in GB of an adjustment, and how much more for each photo (measured: docs/scale.md)."""
 ADJUSTING = "adjusting"
 """Folder in the store with the parts of an adjustment that is not finished."""
