@@ -1,10 +1,12 @@
 """Surveys that are oblique as a whole, from photos, links and what the photos report."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from skyquilt.alignment.bundle import Bundle
-from skyquilt.alignment.oblique_start import reported_start, slanting
+from skyquilt.alignment.oblique_start import reported_start, slanting, tilt_warnings, turned_priors
 from skyquilt.alignment.triangulate import regular
 from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import cam_R_map_from_angles
@@ -119,3 +121,53 @@ def test_what_is_an_oblique_survey():
     assert not slanting([level] * 8 + [tilted] * 3)
     flown = Slanting(orbit(12, 50))
     assert reported_start(flown.photos, flown.priors, flown.features, ()) is None
+
+
+def untold_tilts(flown):
+    return [replace(p, pitch_deg=0.0, roll_deg=0.0, sigma_tilt_deg=6.0) for p in flown.priors]
+
+
+def test_photos_that_an_adjustment_turned_are_taken_to_report_that():
+    flown = Slanting(orbit(20, 50))
+    found, level = flown.aligned(), untold_tilts(flown)
+    assert turned_priors(found, flown.priors) is None
+    assert tilt_warnings(flown.priors, found) == []
+    turned = turned_priors(found, level)
+    assert slanting(turned)
+    for i, p in enumerate(turned):
+        R = cam_R_map_from_angles(p.yaw_deg, p.pitch_deg, p.roll_deg)
+        assert found.poses[i].cam_R_map == pytest.approx(R, abs=1e-9)
+    (says,) = tilt_warnings(level, found)
+    assert "none reports its camera angles" in says
+    nowhere = [replace(p, map_C=np.full(3, np.nan)) for p in level]
+    assert turned_priors(found, nowhere) is None
+
+
+def test_an_orbit_begun_as_if_it_looked_down_is_begun_again(monkeypatch):
+    """The first adjustment ends with the whole block tilted by ten degrees."""
+    flown = Slanting(orbit(20, 50), seed=1)
+    whole, untouched = flown.aligned(), Bundle._block
+    flown.priors = untold_tilts(flown)
+    aside = np.radians(10.0)
+    lean = np.array(
+        [[1, 0, 0], [0, np.cos(aside), -np.sin(aside)], [0, np.sin(aside), np.cos(aside)]]
+    )
+    middle = np.mean([p.map_C for p in whole.poses.values()], 0) * [1, 1, 0]
+    leaning = {
+        i: Pose(cam_R_map=p.cam_R_map @ lean.T, map_C=lean @ (p.map_C - middle) + middle)
+        for i, p in whole.poses.items()
+    }
+    begun = []
+
+    def block(self, photos, frame, priors, *rest):
+        begun.append(priors)
+        if len(begun) == 1:
+            return replace(whole, poses=leaning)
+        return untouched(self, photos, frame, priors, *rest)
+
+    monkeypatch.setattr(Bundle, "_block", block)
+    begun_with = np.median(flown.errors(replace(whole, poses=leaning))[0])
+    away, turned = flown.errors(flown.aligned())
+    assert 3 <= len(begun) <= 6
+    assert np.median(away) < 2 < 5 < begun_with  # receivers err by 1.5 m
+    assert np.median(turned) < 2.5

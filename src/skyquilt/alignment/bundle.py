@@ -12,7 +12,13 @@ from skyquilt.alignment.determined import weak_photos
 from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
-from skyquilt.alignment.oblique_start import reported_start, slanting, untold
+from skyquilt.alignment.oblique_start import (
+    off_positions,
+    reported_start,
+    slanting,
+    turned_priors,
+    untold,
+)
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, undetermined
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
@@ -29,6 +35,10 @@ from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
 
 ROUGHLY = 64
 """Observations per photo of the first stage, which only removes outliers and sets out."""
+BEGUN_AGAIN, NEARER = 5, 0.95
+"""An oblique survey without camera angles is adjusted again as it was found, so often at most, as
+long as photos come nearer to their positions by this factor.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +67,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 35
+    version: ClassVar[int] = 36
 
     def __call__(
         self,
@@ -83,10 +93,12 @@ class Bundle:
         if self.repair:
             aside = untold(priors) if slanting(priors) else reported_oblique(priors)
 
-        def block(aside: frozenset[int]) -> Alignment:
+        def block(
+            aside: frozenset[int], priors: Sequence[Prior] = priors, name: str = ""
+        ) -> Alignment:
             upright = [k for k in links if k.a not in aside and k.b not in aside]
             part = (
-                keep.within(f"{sorted(aside)}")
+                keep.within(f"{name}{sorted(aside)}")
                 if len(photos) > self.many
                 else Keep(workers=keep.workers)
             )
@@ -98,6 +110,13 @@ class Bundle:
             found = block(aside)
         except AlignmentError:
             aside, found = frozenset(), block(frozenset())
+        for again in range(BEGUN_AGAIN) if self.repair else ():
+            if (turned := turned_priors(found, priors)) is None:
+                break
+            other = block(untold(turned), turned, f"turned {again} ")
+            if not off_positions(other, priors) < NEARER * off_positions(found, priors):
+                break
+            found, aside = other, untold(turned)
         weak = weak_photos(found, priors)
         if self.repair and (more := found_oblique(found, weak, priors) - aside):
             aside |= more

@@ -6,19 +6,20 @@ an adjustment in space to begin with.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.determined import STATED_DEG
-from skyquilt.alignment.oblique import MOST_OBLIQUE, tilted
+from skyquilt.alignment.oblique import MOST_OBLIQUE, OBLIQUE_DEG, tilt_deg, tilted, tilts_reported
 from skyquilt.alignment.similarity_graph import components
 from skyquilt.alignment.start import Start, plane_link
 from skyquilt.alignment.triangulate import intersect
-from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Prior
+from skyquilt.model.poses import Alignment, Prior
 
 Array = NDArray[np.float64]
 APART = np.sin(np.radians(5.0))
@@ -43,6 +44,50 @@ def told(prior: Prior) -> bool:
 def untold(priors: Sequence[Prior]) -> frozenset[int]:
     """The photos whose metadata do not tell their whole pose."""
     return frozenset(i for i, p in enumerate(priors) if not told(p))
+
+
+def turned_far(found: Alignment, priors: Sequence[Prior]) -> bool:
+    """Whether an adjustment turned most photos far from the vertical, and none reports its tilt."""
+    far = sum(tilt_deg(found.poses[i].cam_R_map) > OBLIQUE_DEG for i in found.held)
+    return not tilts_reported(priors) and far > MOST_OBLIQUE * len(found.held)
+
+
+def tilt_warnings(priors: Sequence[Prior], found: Alignment) -> list[str]:
+    """A sentence where an oblique survey was placed without its camera angles."""
+    if not turned_far(found, priors):
+        return []
+    return [
+        "Most photos look far from straight down, and none reports its camera angles: heights,"
+        " scale and tilt of the map rest on positions alone. Compare it with known distances, or"
+        " give camera angles or control points."
+    ]
+
+
+def turned_priors(found: Alignment, priors: Sequence[Prior]) -> list[Prior] | None:
+    """What photos without reported tilt are taken to report, where an adjustment turned most
+    of them far from the vertical: it was begun, and held, as if all looked down. None otherwise.
+    """
+    if not turned_far(found, priors) or not np.isfinite(off_positions(found, priors)):
+        return None
+    turned = list(priors)
+    for i in found.held:
+        yaw, pitch, roll = angles_from_cam_R_map(found.poses[i].cam_R_map)
+        turned[i] = replace(
+            priors[i],
+            yaw_deg=yaw,
+            pitch_deg=pitch,
+            roll_deg=roll,
+            sigma_yaw_deg=STATED_DEG,
+            sigma_tilt_deg=STATED_DEG,
+        )
+    return turned
+
+
+def off_positions(found: Alignment, priors: Sequence[Prior]) -> float:
+    """Median distance in m of the held photos from where they report to be; NaN if none does."""
+    away = np.array([np.linalg.norm(found.poses[i].map_C - priors[i].map_C) for i in found.held])
+    known = away[np.isfinite(away)]
+    return float(np.median(known)) if len(known) else np.nan
 
 
 def reported_start(

@@ -17,6 +17,7 @@ from typing import Any
 from skyquilt.alignment.conflicts import conflicts
 from skyquilt.alignment.contradicted_positions import position_warnings
 from skyquilt.alignment.heights import height_figures
+from skyquilt.alignment.oblique_start import tilt_warnings
 from skyquilt.engine.clock import Clock, Steps, result_of
 from skyquilt.engine.error_log import log_error
 from skyquilt.engine.folder import STATE, RunFolder, open_run
@@ -387,7 +388,11 @@ def _metrics(
             seams=seams.figures,
             looks={**seams.looks, "tone_residual": _tone(aligned, ground, map_)},
             conflicts=conflicts(aligned.photos, aligned.priors, alignment),
-            warnings=[*aligned.links.marks.notes, *position_warnings(aligned.priors, alignment)],
+            warnings=[
+                *aligned.links.marks.notes,
+                *position_warnings(aligned.priors, alignment),
+                *tilt_warnings(aligned.priors, alignment),
+            ],
             notes=[*survey.notes, *alignment.notes],
         )
         | {
