@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from skyquilt.alignment.equations import Equations, NearFactor
 from skyquilt.alignment.problem import CAMERA, Problem, State
 from skyquilt.alignment.robust import robust_cost
+from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.engine.workers import HERE
 from skyquilt.geometry.block_cholesky import Factor, Index, Matrix
@@ -161,6 +162,7 @@ def adjust(
 def covariance(problem: Problem, state: State) -> Covariance | None:
     """Covariance of photos and cameras at a minimum; None if some unknowns are not determined."""
     system = Equations(problem, state)
+    give_back()
     try:
         factor = Factor(system.reduced(state, 0.0)[0])
     except np.linalg.LinAlgError:

@@ -29,6 +29,7 @@ from skyquilt.alignment.triangulate import triangulated
 from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.errors import AlignmentError
+from skyquilt.geometry.set_aside import SetAside
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
@@ -159,19 +160,26 @@ class Bundle:
         del tracks
         make_room()
         problem, state = setup.problem(thin(used, sizes, per_photo=begin, least=least))
+        aside = SetAside(used, large=large)
+        del used
         for step in rough_steps(keep.within("rough")):
             problem, state = step(problem, state)
         del step  # some hold a factor
         setup = setup.moving_as(photos, state.C)
         problem = replace(problem, velocity=setup.base.velocity)
         method = self.match_observations
+        make_room()
         if sharp := grey is not None and method is not None:
             part = keep.within("sharp")
-            used = sharpened(used, photos, setup, problem, state, method, grey, part)
+            used = sharpened(aside.get(), photos, setup, problem, state, method, grey, part)
+            aside = SetAside(used, large=large)
             make_room()
         if sharp or begin != each:
+            used = aside.get()
             problem, _ = setup.problem(thin(used, sizes, per_photo=each, least=least))
+            del used
             state = triangulated(problem, state)
+            make_room()
         for step in fine_steps(keep.within("fine")):
             problem, state = step(problem, state)
         del step
@@ -188,8 +196,7 @@ class Bundle:
             problem, state = believe_positions(problem, state, setup, part)
         problem, state, frame, reports = hold_to_control(problem, state, frame, setup, control)
         make_room()
-        ties = ground_points(used, setup, state)
-        del used
+        ties = ground_points(aside.get(), setup, state)
         make_room()
         done = _outcome(
             photos, frame, setup, start, ties, problem, state, reports, predicted=self.thorough

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from skyquilt.alignment.eliminated_points import Reduced, add_diagonal, moved_points, reduced_part
 from skyquilt.alignment.problem import CAMERA, Problem, State
 from skyquilt.alignment.robust import position_terms, prior_terms
+from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.workers import HERE, Workers
 from skyquilt.geometry.block_cholesky import LEAF, Factor, Index, Matrix, pattern
 from skyquilt.geometry.conjugate_gradients import conjugate_gradients
@@ -177,10 +178,13 @@ class Equations:
         made = near and near.get()
         matrix, gradient = self.reduced(state, damping)
         if made:
-            times, nearly = matrix.times(), made.solve
-            found = conjugate_gradients(times, nearly, gradient, tolerance=STEP_ERROR, most=STEPS)
+            found = conjugate_gradients(
+                matrix.times(), made.solve, gradient, tolerance=STEP_ERROR, most=STEPS
+            )
             if found is not None:
                 return found
+        if near:
+            give_back()  # a factor takes more memory than all before it
         factor = Factor(matrix)
         if near:
             near.take(factor, state, damping)

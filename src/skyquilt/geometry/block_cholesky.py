@@ -7,7 +7,6 @@ matrices. For a survey of n photos the cost grows as n^1.5 and the memory as n l
 and n^2. Unknowns that are coupled with all others, the *border* (cameras), are eliminated last.
 """
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from io import BufferedRandom
@@ -15,6 +14,8 @@ from tempfile import TemporaryFile
 
 import numpy as np
 from numpy.typing import NDArray
+
+from skyquilt.geometry.set_aside import SetAside, folder_on_disk
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -30,6 +31,8 @@ STRIP = 256
 """Rows of a front that are added or taken at a time."""
 HELD = 128 * 2**20
 """Bytes of a factor that are held in memory; larger ones lie in a temporary file."""
+WAITING = 4 * 2**20
+"""Bytes of what a front leaves that wait in memory; more lies in a temporary file too."""
 SMALL = 500
 """Largest system that NumPy solves. SciPy's triangular solver takes less time, but loading it takes
 longer than it saves on small systems.
@@ -245,7 +248,7 @@ class _Parts:
         self._file: BufferedRandom | None = None
         self._read = np.empty(0)
         if self._starts[-1] > HELD:
-            self._file = TemporaryFile(dir=_on_disk())  # noqa: SIM115 - closed with the factor
+            self._file = TemporaryFile(dir=folder_on_disk())  # noqa: SIM115 - closed with the factor
             self._read = np.empty(max(sizes) // 8)
         self._added = 0
 
@@ -275,11 +278,6 @@ class _Parts:
         return both[: e * e].reshape(e, e).T, both[e * e :].reshape(c, e)
 
 
-def _on_disk() -> str | None:
-    """A folder for temporary files that is not memory itself, as `/tmp` is on some systems."""
-    return "/var/tmp" if os.access("/var/tmp", os.W_OK) else None
-
-
 class Factor:
     """The Cholesky factor of a matrix.
 
@@ -292,24 +290,33 @@ class Factor:
         self.total = matrix.pattern.count * matrix.pattern.size + matrix.pattern.border
         self._plain = self.total <= SMALL
         self._parts = _Parts(self.pattern.fronts)
-        left = dict[int, list[tuple[Index, Array]]]()
+        left = dict[int, list[tuple[Index, SetAside[Array]]]]()
         for k, front in enumerate(self.pattern.fronts):
-            whole = _assembled(matrix, front)
-            waiting = left.pop(k, [])
-            while waiting:
-                unknowns, rest = waiting.pop(0)
-                at = _places(front.unknowns, unknowns, self.total)
-                for some in _strips(len(at)):
-                    whole[at[some, None], at] += rest[some]
-            e = front.eliminated
-            L = self._cholesky(whole[:e, :e])
-            M = self._forward(L, whole[:e, e:]).T if e < len(whole) else np.zeros((0, e))
-            self._parts.add(L, M)
+            rest = self._eliminated(matrix, front, left.pop(k, []))
             if front.parent >= 0:
-                rest = M @ M.T
-                np.subtract(whole[e:, e:], rest, out=rest)
-                left.setdefault(front.parent, []).append((front.unknowns[e:], rest))
-            del whole, L, M  # before the next front is assembled: large ones take 300 MB
+                left.setdefault(front.parent, []).append((front.unknowns[front.eliminated :], rest))
+
+    def _eliminated(
+        self, matrix: Matrix, front: Front, waiting: list[tuple[Index, SetAside[Array]]]
+    ) -> SetAside[Array]:
+        """Adds the next front's part of the factor, and gives what it leaves to its parent.
+        `waiting`: what others left to it.
+        """
+        whole = _assembled(matrix, front)
+        while waiting:
+            unknowns, aside = waiting.pop(0)
+            at, rest = _places(front.unknowns, unknowns, self.total), aside.get()
+            for some in _strips(len(at)):
+                whole[at[some, None], at] += rest[some]
+            del aside, rest
+        e = front.eliminated
+        L = self._cholesky(whole[:e, :e])
+        M = self._forward(L, whole[:e, e:]).T if e < len(whole) else np.zeros((0, e))
+        self._parts.add(L, M)
+        del L
+        left = M @ M.T
+        np.subtract(whole[e:, e:], left, out=left)
+        return _aside(left)
 
     def solve(self, rhs: Array) -> Array:
         """The matrix's inverse times rhs (total,) or (total, k)."""
@@ -332,33 +339,40 @@ class Factor:
         blocks = np.empty((len(pattern.first), p, p))
         beside = np.empty((pattern.count, p, pattern.border))
         corner = np.zeros((pattern.border, pattern.border))
-        waiting = np.array([f.parent for f in pattern.fronts])
-        known = dict[int, Array]()
+        above = np.array([f.parent for f in pattern.fronts])
+        known = dict[int, SetAside[Array]]()
         for k in range(len(pattern.fronts) - 1, -1, -1):
-            front, (L, M) = pattern.fronts[k], self._parts[k]
-            e = front.eliminated
-            inverse_L = self._forward(L, np.eye(e))
-            Z = np.empty((len(front.unknowns),) * 2)
-            if front.parent < 0:
-                Z[:, :] = inverse_L.T @ inverse_L
-                corner = Z[e - pattern.border :, e - pattern.border :].copy()
-            else:
-                at = _places(pattern.fronts[front.parent].unknowns, front.unknowns[e:], self.total)
-                beyond = Z[e:, e:]
-                for some in _strips(len(at)):
-                    beyond[some] = known[front.parent][at[some, None], at]
-                down = M @ inverse_L
-                Z[e:, :e] = -beyond @ down
-                Z[:e, e:] = Z[e:, :e].T
-                Z[:e, :e] = inverse_L.T @ inverse_L - down.T @ Z[e:, :e]
-            blocks[front.pairs] = Z[front.rows[:, :, None], front.columns[:, None, :]]
+            front = pattern.fronts[k]
+            Z = self._inverse_of(k, known.pop(k, None))
             own = len(front.own) * p
-            beside[front.own] = Z[:own, len(Z) - pattern.border :].reshape(
-                len(front.own), p, pattern.border
-            )
-            known[k] = Z
-            known = {j: z for j, z in known.items() if (waiting[:k] == j).any()}
+            border = slice(len(Z) - pattern.border, len(Z))
+            blocks[front.pairs] = Z[front.rows[:, :, None], front.columns[:, None, :]]
+            beside[front.own] = Z[:own, border].reshape(len(front.own), p, pattern.border)
+            if front.parent < 0:
+                corner = Z[border, border].copy()
+            for below in np.flatnonzero(above[:k] == k).tolist():
+                of = pattern.fronts[below]
+                at = _places(front.unknowns, of.unknowns[of.eliminated :], self.total)
+                known[below] = _aside(Z[at[:, None], at])
+            del Z
         return Matrix(pattern=pattern, blocks=blocks, beside=beside, corner=corner)
+
+    def _inverse_of(self, k: int, beyond: SetAside[Array] | None) -> Array:
+        """The inverse of the whole matrix at the unknowns of a front; `beyond`: the same at those
+        that are eliminated later.
+        """
+        (L, M), size = self._parts[k], len(self.pattern.fronts[k].unknowns)
+        e = len(L)
+        inverse_L = self._forward(L, np.eye(e))
+        if beyond is None:
+            return np.asarray(inverse_L.T @ inverse_L)
+        Z = np.empty((size, size))
+        Z[e:, e:] = beyond.get()
+        down = M @ inverse_L
+        Z[e:, :e] = -Z[e:, e:] @ down
+        Z[:e, e:] = Z[e:, :e].T
+        Z[:e, :e] = inverse_L.T @ inverse_L - down.T @ Z[e:, :e]
+        return Z
 
     def _cholesky(self, A: Array) -> Array:
         if self._plain:
@@ -400,6 +414,11 @@ def _assembled(matrix: Matrix, front: Front) -> Array:
     if front.parent < 0:
         whole[size - b :, size - b :] = matrix.corner
     return whole
+
+
+def _aside(values: Array) -> SetAside[Array]:
+    """In memory, or beside it where they are large."""
+    return SetAside(values, large=values.nbytes > WAITING)
 
 
 def _strips(count: int) -> Iterator[slice]:
