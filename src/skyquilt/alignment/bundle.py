@@ -129,6 +129,32 @@ class Bundle:
         """Whether the start takes what photos report for their poses."""
         return self.repair and slanting(priors)
 
+    def _begun(
+        self,
+        photos: Sequence[Photo],
+        frame: MapFrame,
+        priors: Sequence[Prior],
+        features: Sequence[Features],
+        links: Sequence[Link],
+        keep: Keep,
+    ) -> tuple[Start, Tracks]:
+        """Where the photos that these links connect lie about, and their tracks.
+
+        Raises:
+            AlignmentError: no two photos are linked.
+        """
+        features = [f.places for f in features]  # read once, though used many times
+        start = reported_start(photos, priors, features, links) if self._in_space(priors) else None
+        if start is None:
+            start = _kept_start(photos, priors, features, links, ground_of(frame), keep)
+        if not start.blocks:
+            raise AlignmentError(f"none of {len(photos)} photos could be linked to another one")
+        some = None
+        if len(start.placed) > self.many:
+            sizes = [(p.width, p.height) for p in photos]
+            some = Thinning(sizes=sizes, per_photo=self.ties, least=self.ties // 2)
+        return start, keep("tracks", lambda: build_tracks(features, start.links, thinning=some))
+
     def _block(
         self,
         photos: Sequence[Photo],
@@ -142,15 +168,9 @@ class Bundle:
         make_room: Callable[[], None],
     ) -> Alignment:
         """Adjusts the photos that these links connect."""
-        start = reported_start(photos, priors, features, links) if self._in_space(priors) else None
-        if start is None:
-            start = _kept_start(photos, priors, features, links, ground_of(frame), keep)
-        if not start.blocks:
-            raise AlignmentError(f"none of {len(photos)} photos could be linked to another one")
+        start, tracks = self._begun(photos, frame, priors, features, links, keep)
         sizes = [(p.width, p.height) for p in photos]
         large = len(start.placed) > self.many
-        some = Thinning(sizes=sizes, per_photo=self.ties, least=self.ties // 2) if large else None
-        tracks = keep("tracks", lambda: build_tracks(features, start.links, thinning=some))
         setup = set_up(photos, priors, start, distortion=self.distortion, repair=self.repair)
         begin = each = self.per_photo
         least = 0

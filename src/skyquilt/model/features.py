@@ -33,6 +33,11 @@ class Features:
     def __len__(self) -> int:
         return len(self.px)
 
+    @property
+    def places(self) -> "Features":
+        """The same without descriptors, which take most of the memory."""
+        return replace(self, descriptors=np.zeros((len(self), 0), self.descriptors.dtype))
+
     def followed_by(self, more: "Features") -> "Features":
         """These, then others of the same kind in the same photo."""
         return replace(
