@@ -14,9 +14,10 @@ from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
 from skyquilt.live.failures import concerning
 from skyquilt.live.ledger import DAMAGED
+from skyquilt.live.marks import LiveMarks
 from skyquilt.live.members import Member, Members
 from skyquilt.model.features import Features, Link, numbers
-from skyquilt.workflows.links import link_pair
+from skyquilt.workflows.links import link_pair, marked_in
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import photo_features
 
@@ -36,6 +37,7 @@ class LiveLinks:
     ) -> None:
         self.members, self.methods, self.store, self.pixels = members, methods, store, pixels
         self._features: OrderedDict[int, Features] = OrderedDict()
+        self.marks = LiveMarks(members, self.features)
 
     def has_features(self, number: int) -> bool:
         """Whether a photo's features are in memory."""
@@ -58,15 +60,38 @@ class LiveLinks:
         """Links to other photos, compared one after the other until there are enough links; None
         where a pair does not match.
         """
-        own = self.features(member.id)
+        if self.marks.look(member.photo.camera_key):
+            self._compare_again(member.photo.camera_key)
         found: dict[tuple[int, int], Link | None] = {}
         for i in others:
             if sum(link is not None for link in found.values()) >= ENOUGH:
                 break
-            two, photo = (self.features(i), own), self.members.by_id[i].photo
-            link = link_pair(i, member.id, two, photo, self.methods)
-            found[i, member.id] = link if isinstance(link, Link) else None
+            found[i, member.id] = self._compared(i, member.id)
         return found
+
+    def _compared(self, a: int, b: int) -> Link | None:
+        """The link of two photos; None where they do not match."""
+        photos = [self.members.by_id[i].photo for i in (a, b)]
+        two = self.features(a), self.features(b)
+        marked = marked_in(self.marks.known, photos, (0, 1), two)
+        link = link_pair(a, b, two, photos[0], self.methods, marked=marked)
+        return link if isinstance(link, Link) else None
+
+    def _compare_again(self, camera: str) -> None:
+        """Links of a camera's photos anew, after marks were found on its pictures: they may rest on
+        nothing else.
+        """
+        ids = {i for i, m in self.members.by_id.items() if m.photo.camera_key == camera}
+        pairs = [(k.a, k.b) for k in self.links_among(self.members.by_id, ids)]
+        links = [(a, b, self._compared(a, b)) for a, b in pairs]
+        with self.members.ledger.change():
+            self.members.ledger.put_links(
+                [(a, b, None if k is None else link_bytes(k)) for a, b, k in links]
+            )
+            self.marks.keep(camera)
+        for a, b, link in links:
+            if link is None:
+                self.members.parted(a, b)
 
     def links_among(
         self, ids: Iterable[int], touching: Collection[int] | None = None

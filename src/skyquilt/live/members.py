@@ -173,6 +173,22 @@ class Members:
         for i in self.blocks.pop(other):
             self.block_of[i] = one
 
+    def parted(self, a: int, b: int) -> None:
+        """Forgets a link, and divides the block that it alone held together."""
+        self.by_id[a].links.discard(b)
+        self.by_id[b].links.discard(a)
+        left = self.blocks.pop(self.block_of[a])
+        while left:
+            block, rim = set[int](), {min(left)}
+            while rim:
+                block |= rim
+                rim = {j for i in rim for j in self.by_id[i].links} - block
+            left -= block
+            name = min(block)
+            self.blocks[name] = block
+            for i in block:
+                self.block_of[i] = name
+
     def block(self, photo: int) -> set[int]:
         """All photos that are connected with this one by links."""
         return self.blocks[self.block_of[photo]]

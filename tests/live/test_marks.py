@@ -1,0 +1,124 @@
+"""Texts burnt into pictures do not connect photos of the live map."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from skyquilt.live.live_map import LiveMap
+from skyquilt.live.marks import LOOKED
+from skyquilt.live.settings import LiveSettings
+from skyquilt.simulate.settings import Control, Route
+from tests.live.conftest import made, offsets
+
+pytestmark = pytest.mark.slow
+LINES = ((8, 350), (8, 58), (8, 86))
+"""Where the text stands in px: it covers a tenth of the picture."""
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """14 photos of 480 x 360 px in lines."""
+    control = Control(points=0, checks=0)
+    return made(tmp_path_factory, "marks", seed=2, route=Route(photos=14), control=control)
+
+
+@pytest.fixture(scope="module")
+def stamped(plain, tmp_path_factory):
+    """The same photos with a text."""
+    folder = tmp_path_factory.mktemp("stamped")
+    for path in plain.photos:
+        image = Image.open(path)
+        pixels = np.array(image.convert("RGB"))
+        for at in LINES:
+            text = "SKYCAM 4K  46.59N 14.29E ALT 120"
+            cv2.putText(pixels, text, at, 0, 0.75, (255, 255, 255), 2, cv2.LINE_AA)
+        kept = {"exif": image.info["exif"], "xmp": image.info["xmp"], "quality": 92}
+        Image.fromarray(pixels).save(folder / path.name, **kept)
+    return sorted(folder.iterdir())
+
+
+def opened(folder, **settings):
+    return LiveMap(folder, LiveSettings(**settings))
+
+
+def mapped(live, paths):
+    for path in paths:
+        live.add(path)
+    live.blocks.last_arrival = -1e9  # as if it had been quiet for long
+    for _ in live.drain_all():
+        pass
+    return live
+
+
+def rms(live, flight):
+    return np.sqrt((offsets(live, flight)[:, :2] ** 2).mean(0)).max()
+
+
+def test_a_text_in_every_picture_moves_nothing(plain, stamped, tmp_path):
+    """Without marks it moves photos by 16 m. Positions scatter by 2 m."""
+    one = mapped(opened(tmp_path / "plain"), plain.photos)
+    live = mapped(opened(tmp_path / "stamped"), stamped)
+    try:
+        assert [m.state for m in live.members.by_id.values()] == ["refined"] * 14
+        assert rms(live, plain) < 1.2 * rms(one, plain) < 1.5
+        assert not one.live_links.marks.known.masks and len(live.live_links.marks.known.masks) == 1
+        said = [body["text"] for _, (kind, body) in _events(live) if kind == "note"]
+        assert sum("same marks at the same place" in text for text in said) == 1
+    finally:
+        one.close()
+        live.close()
+
+
+def test_a_restart_goes_on_with_the_same_marks(stamped, tmp_path):
+    through = mapped(opened(tmp_path / "through", deterministic=True), stamped[:9])
+    begun = mapped(opened(tmp_path / "again", deterministic=True), stamped[:7])
+    looked = begun.ledger.meta(LOOKED)
+    begun.close()
+    again = mapped(opened(tmp_path / "again", deterministic=True), stamped[7:9])
+    try:
+        assert list(looked.values()) == [6]
+        for a, b in zip(through.members.on_map(), again.members.on_map(), strict=True):
+            assert a.links == b.links
+            assert np.array_equal(a.pose.map_C, b.pose.map_C)
+        masks = [next(iter(m.live_links.marks.known.masks.values())) for m in (through, again)]
+        assert np.array_equal(*masks)
+    finally:
+        through.close()
+        again.close()
+
+
+@pytest.mark.parametrize("said", ["text", [1], {"camera": "many"}, {"camera": -3}])
+def test_a_damaged_list_of_looks_counts_as_none(stamped, tmp_path, said):
+    live = mapped(opened(tmp_path / "out"), stamped[:2])
+    try:
+        live.ledger.put_meta(LOOKED, said)
+        assert live.live_links.marks._told("camera") == 0
+    finally:
+        live.close()
+
+
+def _events(live):
+    rows = live.ledger.rows("select seq, kind, body from event order by seq")
+    return [(seq, (kind, json.loads(body))) for seq, kind, body in rows]
+
+
+def test_blocks_are_divided_where_a_link_alone_held_them_together(plain, tmp_path):
+    live = mapped(opened(tmp_path / "out"), plain.photos[:5])
+    members = live.members
+    try:
+        for i in range(1, 6):
+            for j in sorted(members.by_id[i].links):
+                members.parted(i, j)
+        assert members.blocks == {i: {i} for i in range(1, 6)}
+        for a, b in (1, 2), (2, 3), (4, 5), (3, 4), (1, 3):
+            members.joined(a, b)
+        members.parted(1, 2)  # 1 - 3 - 2 still holds
+        assert members.blocks == {1: {1, 2, 3, 4, 5}}
+        members.parted(3, 4)
+        assert members.blocks == {1: {1, 2, 3}, 4: {4, 5}}
+        assert members.block_of == {1: 1, 2: 1, 3: 1, 4: 4, 5: 4}
+    finally:
+        live.close()
