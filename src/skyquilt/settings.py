@@ -235,7 +235,7 @@ class PictureSettings:
             one_of("--vertical-datum", self.vertical_datum, VERTICAL_DATUMS)
         within("--gsd", self.gsd_cm, 0.05, 10000)
         within("--feather", self.feather_px, 0, 10000)
-        within("--max-view-angle", self.max_view_angle, 0, 90)
+        within("--max-view-angle", self.max_view_angle, 1, 90)
         b = self.bounds
         if b and not (all(isfinite(v) for v in b) and b[0] < b[2] and b[1] < b[3]):
             raise UsageError(

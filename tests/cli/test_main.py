@@ -134,6 +134,33 @@ def test_mistakes_get_a_sentence_and_a_code(monkeypatch, capsys, tmp_path, words
     assert sentence in told
 
 
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        *((["inspect", "{photos}", "--max-mp", v], "--max-mp") for v in ("nan", "inf", "0", "-1")),
+        *(
+            (["depth", "{photos}", "-o", "{out}", "--relief", v], "--relief")
+            for v in ("nan", "inf", "-1", "1e308")
+        ),
+        *(
+            (["live", "{photos}", "-o", "{out}", option, v], option)
+            for option in ("--max-mb", "--max-clip-mb", "--viewer-memory", "--max-mp")
+            for v in ("nan", "inf", "1e308")
+        ),
+        (["export", "{photos}", "--what", "png", "--max-memory", "inf"], "--max-memory"),
+        (["simulate", "{out}", "--photos", "9" * 23], "photos must be 1 to 100,000"),
+    ],
+)
+def test_numbers_that_cannot_be_meant(monkeypatch, capsys, tmp_path, words, option):
+    (tmp_path / "photos").mkdir()
+    places = {"photos": tmp_path / "photos", "out": tmp_path / "out"}
+    assert run(monkeypatch, *(word.format(**places) for word in words)) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(("skyquilt: ", "Usage: "))
+    assert option in told
+    assert not (tmp_path / "out").exists()
+
+
 INTERRUPTED = """
 import sys
 from skyquilt.cli import app, main

@@ -29,9 +29,10 @@ pytestmark = pytest.mark.filterwarnings(
         (("--image-search", "all"), ("--image-search 'all'", "chain, loop, overview")),
         (("--optimiser", "luck"), ("--optimiser 'luck'", "anneal, surfaces")),
         (("--lines", "eye"), ("--lines 'eye'", "heading, distance")),
-        (("--max-view-angle", "91"), ("--max-view-angle 91", "outside 0 to 90")),
-        (("--max-view-angle", "-1"), ("--max-view-angle -1", "outside 0 to 90")),
-        (("--max-view-angle", "nan"), ("--max-view-angle nan", "outside 0 to 90")),
+        (("--max-view-angle", "91"), ("--max-view-angle 91", "outside 1 to 90")),
+        (("--max-view-angle", "0"), ("--max-view-angle 0", "outside 1 to 90")),
+        (("--max-view-angle", "-1"), ("--max-view-angle -1", "outside 1 to 90")),
+        (("--max-view-angle", "nan"), ("--max-view-angle nan", "outside 1 to 90")),
         (("--shutter", "slow"), ("--shutter 'slow'", "global, rolling")),
         (("--shutter-readout", "0"), ("--shutter-readout 0", "at most 1000 ms")),
         (("--shutter-readout", "-30"), ("--shutter-readout -30", "more than 0")),
@@ -70,6 +71,10 @@ pytestmark = pytest.mark.filterwarnings(
         (("--gsd", "nan"), ("--gsd",)),
         (("--memory", "0.1"), ("--memory", "outside")),
         (("--memory", "nan"), ("--memory",)),
+        *(
+            (("--max-memory", value), ("--max-memory", "outside 0.1 to"))
+            for value in ("nan", "inf", "-inf", "1e308", "0", "-1")
+        ),
         (("--jobs", "-1"), ("--jobs", "outside")),
         (("--quality", "0"), ("--quality", "outside")),
         (("--features", "1"), ("--features", "outside")),

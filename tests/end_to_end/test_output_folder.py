@@ -559,6 +559,22 @@ def test_what_is_spoiled_between_runs_is_made_again_or_named(mosaic, flight, fin
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("stage", ["links", "mosaic", "measure", "report"])
+def test_an_output_that_disappears_while_a_map_is_made(mosaic, photos, finished, tmp_path, stage):
+    """All of it is made, or the run says what is missing and the same command makes it."""
+    output, gone = tmp_path / "out", ""
+    settings = MosaicSettings(features=300, surface="ties", gsd_cm=30.0, jobs=2)
+    try:
+        for event in iter_mosaic(photos, output, settings):
+            if isinstance(event, StageStarted) and event.stage == stage:
+                shutil.rmtree(output)
+    except OutputError as error:
+        gone = str(error)
+    assert ("mosaic.tif" in gone) == (stage in ("measure", "report"))
+    same_result(mosaic(photos, output=output).made().output, finished)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stage", "spoil"),
     [

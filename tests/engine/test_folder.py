@@ -1,10 +1,15 @@
 import errno
 import json
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+from skyquilt.engine import lock
 from skyquilt.engine.folder import CONTRACT, STATE, open_run
+from skyquilt.engine.lock import NO_LOCKS
 from skyquilt.errors import OutputError
 
 
@@ -49,6 +54,57 @@ def test_another_run_is_refused_replaced_or_made_again(tmp_path):
     assert (tmp_path / "mosaic.tif").exists()
     open_run(tmp_path, "other", overwrite=False, again=True)
     assert not (tmp_path / "mosaic.tif").exists()
+
+
+def test_one_process_writes_to_a_folder_at_a_time(tmp_path):
+    """What the first has made stays, whatever the second asks for; a killed one holds nothing."""
+    code = (
+        "import sys; from pathlib import Path; from skyquilt.engine.folder import open_run;"
+        "run = open_run(Path(sys.argv[1]), 'k', overwrite=False);"
+        "(run.path / 'mosaic.tif').write_text('half');"
+        "print('held', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as other:
+        assert other.stdout.readline() == "held\n"
+        for key, overwrite in (("k", False), ("k", True), ("other", True)):
+            with pytest.raises(OutputError, match=rf"another run works.*process {other.pid}"):
+                open_run(tmp_path, key, overwrite=overwrite)
+        assert (tmp_path / "mosaic.tif").read_text() == "half"
+        assert json.loads((tmp_path / STATE / "run.json").read_text())["key"] == "k"
+        other.kill()
+        other.wait()
+    open_run(tmp_path, "k", overwrite=False)
+
+
+@pytest.mark.parametrize("number", NO_LOCKS)
+def test_disks_without_locks_are_written_to(tmp_path, monkeypatch, number):
+    def refused(*asked):
+        raise OSError(number, "no locks here")
+
+    monkeypatch.setattr(lock.fcntl, "lockf", refused)
+    finish(tmp_path)
+    assert open_run(tmp_path, "k", overwrite=False).done
+
+
+def test_a_run_whose_results_disappeared_is_not_finished(tmp_path):
+    """The folder was emptied while the run worked: the same command goes on afterwards."""
+    run = open_run(tmp_path, "k", overwrite=False)
+    for name in CONTRACT:
+        (tmp_path / name).write_text("result")
+    (tmp_path / "mosaic.tif").unlink()
+    shutil.rmtree(tmp_path / STATE)
+    with pytest.raises(OutputError, match=r"mosaic\.tif in .* disappeared.*same command again"):
+        run.finish()
+    again = open_run(tmp_path, "k", overwrite=False)
+    assert not again.done
+    (tmp_path / "mosaic.tif").write_text("result")
+    again.finish()
+    assert open_run(tmp_path, "k", overwrite=False).done
 
 
 def test_other_files_are_refused_and_survive_overwriting(tmp_path):

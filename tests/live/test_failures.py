@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from skyquilt.engine.lock import FolderLock
 from skyquilt.errors import OutputError
 from skyquilt.live import folder_watch
 from skyquilt.live.folder_watch import Watch
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import Ledger
 from skyquilt.live.live_map import LiveMap
-from skyquilt.live.lock import FolderLock
 from skyquilt.live.photo_intake import Intake, Refused
 from skyquilt.live.settings import LiveSettings
 from skyquilt.live.workflow import iter_live
@@ -258,8 +258,8 @@ def test_what_was_reported_while_the_inbox_is_away_is_taken_when_it_is_back(tmp_
 
 def test_two_live_maps_on_one_folder_are_refused(tmp_path):
     code = (
-        "import sys; from pathlib import Path; from skyquilt.live.lock import FolderLock;"
-        "lock = FolderLock(Path(sys.argv[1])); lock.tell('http://here/');"
+        "import sys; from pathlib import Path; from skyquilt.engine.lock import FolderLock;"
+        "lock = FolderLock(Path(sys.argv[1]), 'live.lock', 'live map'); lock.tell('http://here/');"
         "print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(
@@ -270,10 +270,10 @@ def test_two_live_maps_on_one_folder_are_refused(tmp_path):
     ) as other:
         assert other.stdout.readline() == "held\n"
         with pytest.raises(OutputError, match=rf"process {other.pid}, http://here/"):
-            FolderLock(tmp_path)
+            FolderLock(tmp_path, "live.lock", "live map")
         other.kill()
         other.wait()
-        FolderLock(tmp_path).close()  # whoever was killed holds nothing
+        FolderLock(tmp_path, "live.lock", "live map").close()  # whoever was killed holds nothing
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as another user")

@@ -173,7 +173,9 @@ def command(
     """Report the metadata of photos and videos, and what is missing or contradictory."""
     from skyquilt.photos.contradictions import contradictions
     from skyquilt.photos.survey import read_survey
+    from skyquilt.settings import within
 
+    within("--max-mp", max_mp, 0.01, 10_000)
     survey = read_survey(photos, geo=geo, cameras=cameras, max_mp=max_mp, clips=True)
     findings = contradictions(survey.photos)
     if json:

@@ -129,7 +129,7 @@ def command(
     """
     with ends_at_once():
         from skyquilt.cli.progress import show_live
-        from skyquilt.engine.memory_watch import ends_run, limit_bytes
+        from skyquilt.engine.memory_watch import MEMORY_GB, ends_run, limit_bytes
         from skyquilt.errors import UsageError
         from skyquilt.live.fill import known_plan
         from skyquilt.live.folder_watch import create_inbox
@@ -139,6 +139,10 @@ def command(
         from skyquilt.server.access import Guard
         from skyquilt.server.layer_files import layer_of_file
         from skyquilt.server.server_process import ServerConfig, ServerProcess
+        from skyquilt.settings import within
+    within("--max-mb", max_mb, 0.01, 1e5)
+    within("--max-clip-mb", max_clip_mb, 0.01, 1e6)
+    within("--viewer-memory", viewer_memory, *MEMORY_GB)
     settings = LiveSettings(
         gsd_cm=gsd,
         crs=crs,

@@ -43,7 +43,7 @@ from skyquilt.errors import RefusedError, UsageError
 from skyquilt.model.event import Event, Note, Result
 from skyquilt.model.surface import Surface
 from skyquilt.raster.atomic import write_text
-from skyquilt.settings import MosaicSettings
+from skyquilt.settings import MosaicSettings, within
 from skyquilt.version import __version__
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.flow import Scene, align_photos, find_ground, frames_added, scene_of
@@ -97,6 +97,7 @@ def iter_depth(
     settings, output, began = settings or MosaicSettings(), Path(output), Clock.now()
     if route not in ROUTES:
         raise UsageError(f"--route {route!r} is not one of {', '.join(ROUTES)}")
+    within("--relief", relief_m, 0, 10_000)
     given = read_input(photos, settings.input)
     if not given.survey.clips:
         _enough(given)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from skyquilt.engine import error_log
+from skyquilt.engine.lock import FolderLock
 from skyquilt.errors import OutputError
 from skyquilt.outside import read_bounded
 
@@ -25,7 +26,7 @@ CONTRACT = (
     "run.toml",
 )
 """Files of a finished run."""
-STATE, EXPORTS = ".skyquilt", "export"
+STATE, EXPORTS, LOCK = ".skyquilt", "export", "run.lock"
 FILES = {
     "mosaic.tif": "map",
     "thermal.tif": "thermal map",
@@ -54,6 +55,8 @@ class RunFolder:
     """The folder."""
     key: str
     """Identifies what the run is made from: inputs and settings."""
+    lock: FolderLock
+    """Held until the run is finished, or its process ends."""
 
     @property
     def store(self) -> Path:
@@ -65,11 +68,27 @@ class RunFolder:
         target = self.path / STATE / "run.json"
         partial = target.with_suffix(".partial")
         try:
+            target.parent.mkdir(parents=True, exist_ok=True)  # removed by somebody while it ran
             partial.write_text(json.dumps({"key": self.key, "state": state}))
             partial.replace(target)
         except OSError as error:
             partial.unlink(missing_ok=True)
             raise refusal(self.path, error) from error
+
+    def finish(self) -> None:
+        """Records that the run is done, and lets others write to the folder.
+
+        Raises:
+            OutputError: files that it had written are gone.
+        """
+        gone = [name for name in CONTRACT if not (self.path / name).is_file()]
+        self.mark("running" if gone else "done")
+        self.lock.close()
+        if gone:
+            raise OutputError(
+                f"{', '.join(gone)} in {self.path} disappeared while the run worked; let nothing"
+                " else change that folder, and run the same command again to make what is missing"
+            )
 
     @property
     def done(self) -> bool:
@@ -97,7 +116,7 @@ def open_run(
     or shown meanwhile.
 
     Raises:
-        OutputError: it holds something else, or cannot be written.
+        OutputError: it holds something else, another run works in it, or it cannot be written.
     """
     if path.exists() and not path.is_dir():
         raise OutputError(f"{path} is a file; the output is a folder")
@@ -112,18 +131,19 @@ def open_run(
                 f"{path} already holds {what}; add --overwrite to replace its results,"
                 " or choose another folder"
             )
+        (path / STATE).mkdir(parents=True, exist_ok=True)
+        lock = FolderLock(path, f"{STATE}/{LOCK}", "run")
         if taken and not grows:
             for name in (*CONTRACT, error_log.NAME):
                 (path / name).unlink(missing_ok=True)
         if taken:
             shutil.rmtree(path / EXPORTS, ignore_errors=True)  # of the map that is replaced
-        (path / STATE).mkdir(parents=True, exist_ok=True)
         probe = path / STATE / "probe"
         probe.write_bytes(b"x")
         probe.unlink()
     except OSError as error:
         raise refusal(path, error) from error
-    folder = RunFolder(path=path, key=key)
+    folder = RunFolder(path=path, key=key, lock=lock)
     if state != "done" or known != key:
         folder.mark("running")
     return folder

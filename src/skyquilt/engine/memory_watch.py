@@ -12,11 +12,15 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from skyquilt.settings import within
+
 CHECK_S = 0.25
 """Time in s between checks."""
 SHARE = 0.9
 """Share of the machine's memory, or of that of its container, that a run may take by default."""
 EXIT_CODE = 1
+MEMORY_GB = (0.1, 1e6)
+"""Least and largest limit that can be asked for, in GB."""
 _CGROUPS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
 
@@ -42,7 +46,12 @@ def machine_bytes() -> int:
 
 
 def limit_bytes(asked_gb: float | None) -> int:
-    """The limit in bytes: as asked, or a share of the machine's memory; 0 = none."""
+    """The limit in bytes: as asked, or a share of the machine's memory; 0 = none.
+
+    Raises:
+        UsageError: no machine has what is asked, or no run can do with it.
+    """
+    within("--max-memory", asked_gb, *MEMORY_GB)
     return int(asked_gb * 1e9) if asked_gb is not None else int(SHARE * machine_bytes())
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from skyquilt.engine.error_log import NAME as ERRORS
 from skyquilt.engine.error_log import log_error
 from skyquilt.engine.free_memory import give_back
+from skyquilt.engine.lock import FolderLock
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store
 from skyquilt.errors import OutputError, UnreadablePhotoError, UsageError
@@ -33,7 +34,6 @@ from skyquilt.live.initial_pose import InitialPose
 from skyquilt.live.ledger import DAMAGED, Ledger
 from skyquilt.live.links import LiveLinks
 from skyquilt.live.local_pose import LocalPose
-from skyquilt.live.lock import FolderLock
 from skyquilt.live.members import Members, Queues
 from skyquilt.live.neighbours import Neighbours
 from skyquilt.live.photo_intake import Intake, Refused
@@ -52,6 +52,8 @@ from skyquilt.workflows.photo_features import PhotoFeatures
 
 PHOTOS, TILES, FINISHED = "photos", "tiles.db", "finished"
 """Names of the accepted photos, the map's tiles and the final map in the survey's folder."""
+LOCK = "live.lock"
+"""Name of the file that one live map holds."""
 STORE = Path(FINISHED) / ".skyquilt" / "store"
 FULL_BYTES = 120_000_000
 """Bytes of full-size photos kept in memory."""
@@ -83,7 +85,7 @@ class LiveMap:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"cannot write to {folder}: {error.strerror or error}") from error
-        self.lock = FolderLock(self.folder)
+        self.lock = FolderLock(self.folder, LOCK, "live map")
         self.ledger = Ledger(self.folder, write=True)
         self._same_settings()
         self.inbox = Inbox(self.ledger, self.folder / PHOTOS, most_bytes=self.settings.most_bytes)

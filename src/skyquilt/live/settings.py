@@ -77,7 +77,7 @@ class LiveSettings:
         for name, value, low, high in (
             ("--gsd", self.gsd_cm, 0.05, 10000),
             ("--features", self.features, 100, 50000),
-            ("--max-view-angle", self.max_view_angle, 0, 90),
+            ("--max-view-angle", self.max_view_angle, 1, 90),
             ("--max-photos", self.most_photos, 1, 10**7),
             ("--max-mb", self.most_bytes / 1e6, 0.01, 1e5),
             ("--max-clip-mb", self.most_clip_bytes / 1e6, 0.01, 1e6),

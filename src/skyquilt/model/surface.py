@@ -65,6 +65,8 @@ class Surface:
                     borderMode=cv2.BORDER_REPLICATE,
                 )
             )
+        if not parts:
+            return np.zeros(column.shape, np.float32)
         if len(parts) == 1:
             return np.asarray(parts[0], np.float32)
         return np.concatenate(parts, 1, dtype=np.float32)

@@ -265,7 +265,7 @@ def _route_rules(settings: FlightSettings) -> _Rules:
     low = f"height {route.height:g} m is too low over a relief of {relief:g} m"
     lost = f"cannot lose {route.lost} of {route.photos} photos, at most every second one"
     return [
-        (route.photos >= 1, f"photos must be at least 1, not {route.photos}"),
+        (1 <= route.photos <= 100_000, f"photos must be 1 to 100,000, not {route.photos}"),
         (0 <= route.overlap < 0.98, f"overlap must be 0 to 97 %, not {100 * route.overlap:.0f} %"),
         (0 <= route.sidelap < 0.98, f"sidelap must be 0 to 97 %, not {100 * route.sidelap:.0f} %"),
         (

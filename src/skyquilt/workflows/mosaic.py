@@ -216,7 +216,7 @@ def make_map(
         _log(run.path, given.survey.rejected)
         make = _Making(run.path, key, recipe, settings, methods, clock, earlier)
         metrics, given = yield from _without_bad(given, make)
-    run.mark("done")
+    run.finish()
     result = Result(output=run.path, metrics=metrics)
     return FinishedMap(result=result, given=given, methods=methods, settings=settings)
 

@@ -1,5 +1,6 @@
-"""One live map writes to a survey's folder at a time."""
+"""One run, or one live map, writes to a folder at a time."""
 
+import errno
 import json
 import os
 from contextlib import suppress
@@ -13,22 +14,22 @@ try:
 except ImportError:  # Windows: there is no lock there
     fcntl = None  # type: ignore[assignment]
 
-NAME = "live.lock"
-"""Name of the file in the survey's folder. The system releases the lock when its process ends,
-however it ends.
-"""
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+"""What file systems without locks answer; work goes on there as if nobody else worked."""
 
 
 class FolderLock:
-    """Holds a survey's folder against other processes, and tells them who holds it."""
+    """Holds a folder against other processes, and tells them who holds it. The system releases the
+    lock when its process ends, however it ends.
+    """
 
-    def __init__(self, folder: Path) -> None:
-        """Takes the lock.
+    def __init__(self, folder: Path, name: str, what: str) -> None:
+        """Takes the lock: `name`, the path of its file in the folder; `what` holds it.
 
         Raises:
-            OutputError: the folder cannot be written, or another live map works there.
+            OutputError: the folder cannot be written, or another process holds the lock.
         """
-        self.path = folder / NAME
+        self.path = folder / name
         try:
             self._handle = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         except OSError as error:
@@ -36,13 +37,12 @@ class FolderLock:
                 f"cannot write to {folder}: {error.strerror or error}; choose another output folder"
             ) from error
         try:
-            if fcntl is not None:
-                fcntl.lockf(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._lock()
             self.tell("")
         except (BlockingIOError, PermissionError) as error:
             self.close()
             raise OutputError(
-                f"another live map works in {folder}{self._other()}; end that one, or choose"
+                f"another {what} works in {folder}{self._other()}; end that one, or choose"
                 " another folder"
             ) from error
         except OSError as error:
@@ -50,6 +50,15 @@ class FolderLock:
             raise OutputError(
                 f"cannot write to {folder}: {error.strerror or error}; choose another output folder"
             ) from error
+
+    def _lock(self) -> None:
+        if fcntl is None:
+            return
+        try:
+            fcntl.lockf(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise
 
     def tell(self, url: str) -> None:
         """Writes the process and the URL of its viewer into the file."""
