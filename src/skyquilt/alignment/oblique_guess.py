@@ -32,10 +32,10 @@ FAR = 4.0
 """Photos this many deviations of their positions apart tell where they look."""
 CLEARER = 0.5
 """A guess is taken whose rays miss by less than this share of what they missed by before."""
-TILTS_DEG = range(40, 76, 5)
+TILTS_DEG = (40, 45, 50, 55, 60, 65, 70, 75)
 """Tilts that are tried where none is reported, all oblique ones: the adjustment finds the rest."""
-TURNS_DEG = range(15, 360, 15)
-"""Angles by which headings are turned."""
+TURN_DEG = 15
+"""Headings are turned by multiples of this angle."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,7 +94,7 @@ def _guesses(priors: Sequence[Prior]) -> Iterator[list[Prior]]:
             yield [_looking(p, yaw, float(tilt)) for p, yaw in zip(priors, inwards, strict=True)]
         return
     yield [replace(p, yaw_deg=yaw) for p, yaw in zip(priors, inwards, strict=True)]
-    for turn in TURNS_DEG:
+    for turn in range(TURN_DEG, 360, TURN_DEG):
         yield [replace(p, yaw_deg=p.yaw_deg + turn) for p in priors]
 
 
