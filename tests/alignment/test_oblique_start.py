@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment.bundle import Bundle
+from skyquilt.alignment.oblique_guess import guessed_priors
 from skyquilt.alignment.oblique_start import reported_start, slanting, tilt_warnings, turned_priors
 from skyquilt.alignment.triangulate import regular
 from skyquilt.geometry.camera import project
@@ -171,3 +172,35 @@ def test_an_orbit_begun_as_if_it_looked_down_is_begun_again(monkeypatch):
     assert 3 <= len(begun) <= 6
     assert np.median(away) < 2 < 5 < begun_with  # receivers err by 1.5 m
     assert np.median(turned) < 2.5
+
+
+@pytest.mark.parametrize("turn", [90, 180])
+def test_headings_that_are_all_false_by_one_angle_are_corrected(turn):
+    flown = Slanting(orbit(20, 50), seed=turn)
+    flown.priors = [replace(p, yaw_deg=p.yaw_deg + turn) for p in flown.priors]
+    found = flown.aligned()
+    assert len(found.held) == len(flown.photos)
+    away, turned = flown.errors(found)
+    assert np.median(away) < 0.8
+    assert np.median(turned) < 1.0
+
+
+def test_photos_without_angles_are_guessed_to_look_at_the_middle():
+    flown = Slanting(orbit(24, 40), seed=3)
+    level = [replace(p, yaw_deg=np.nan) for p in untold_tilts(flown)]
+    guess = guessed_priors(flown.photos, level, flown.features, flown.links)
+    for own, where in zip(guess, flown.truth, strict=True):
+        R = cam_R_map_from_angles(own.yaw_deg, own.pitch_deg, own.roll_deg)
+        assert np.degrees(np.arccos((np.trace(R @ where.cam_R_map.T) - 1) / 2)) < 15
+    flown.priors = level
+    found = flown.aligned()
+    assert len(found.held) == len(flown.photos)
+    assert np.median(flown.errors(found)[0]) < 2.0
+
+
+def test_what_photos_report_is_kept_where_no_guess_is_clearly_better():
+    for places in SURVEYS.values():
+        flown = Slanting(places)
+        assert guessed_priors(flown.photos, flown.priors, flown.features, flown.links) is None
+    nowhere = [prior((np.nan,) * 3, pitch=50) for _ in flown.priors]
+    assert guessed_priors(flown.photos, nowhere, flown.features, flown.links) is None

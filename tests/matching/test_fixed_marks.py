@@ -75,6 +75,36 @@ def test_a_camera_that_stands_still_shows_no_marks():
     assert not marks_in(noisy)[1].masks
 
 
+def hovering(flown, still, seed):
+    """A flight with photos from one place in it: the picture drifts by up to two px and changes in
+    part, as leaves do.
+    """
+    rng, at, shots = np.random.default_rng(seed), len(flown) // 2, []
+    (other,) = flight(1, seed=seed + 50)
+    leaves = cv2.resize(rng.random((18, 24)).astype(np.float32), (WIDE, HIGH)) < 0.5
+    for _ in range(still):
+        noisy = np.where(leaves, rng.permutation(other.ravel()).reshape(HIGH, WIDE), flown[at])
+        moved = np.roll(noisy + rng.normal(0, 3, noisy.shape), rng.integers(-2, 3, 2), (0, 1))
+        shots.append(np.clip(moved, 0, 255).astype(np.uint8))
+    return [*flown[:at], *shots, *flown[at:]]
+
+
+@pytest.mark.parametrize(("still", "seed"), [(10, 0), (20, 1)])
+def test_a_hover_within_a_flight_shows_no_marks(still, seed):
+    assert not marks_in(hovering(flight(10, seed=seed), still, seed))[1].masks
+
+
+def test_a_text_is_found_though_the_drone_hovered():
+    pictures = [stamped(p) for p in hovering(flight(12), 8, 0)]
+    features, marks = marks_in(pictures)
+    x, y = features[0].px.T
+    left, top, right, bottom = STAMP
+    inside = (x > left) & (x < right) & (y > top) & (y < bottom)
+    found = marks.on_mark("cam", features[0].px)
+    assert found[inside].mean() > 0.6
+    assert not found[y < top - 20].any()
+
+
 def test_every_camera_has_its_own_marks():
     plain, marked = flight(8), [stamped(p) for p in flight(8, seed=5)]
     _, marks = marks_in([*plain, *marked], ["plain"] * 8 + ["marked"] * 8)

@@ -12,13 +12,8 @@ from skyquilt.alignment.determined import weak_photos
 from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
-from skyquilt.alignment.oblique_start import (
-    off_positions,
-    reported_start,
-    slanting,
-    turned_priors,
-    untold,
-)
+from skyquilt.alignment.oblique_guess import guessed_priors, misled
+from skyquilt.alignment.oblique_start import nearer, reported_start, slanting, turned_priors, untold
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, undetermined
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
@@ -36,9 +31,9 @@ from skyquilt.model.poses import Alignment, MapFrame, Prior, TiePoints
 
 ROUGHLY = 64
 """Observations per photo of the first stage, which only removes outliers and sets out."""
-BEGUN_AGAIN, NEARER = 5, 0.95
+BEGUN_AGAIN = 5
 """An oblique survey without camera angles is adjusted again as it was found, so often at most, as
-long as photos come nearer to their positions by this factor.
+long as photos come nearer to their positions.
 """
 
 
@@ -68,7 +63,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 36
+    version: ClassVar[int] = 38
 
     def __call__(
         self,
@@ -111,11 +106,18 @@ class Bundle:
             found = block(aside)
         except AlignmentError:
             aside, found = frozenset(), block(frozenset())
+        linked = len({i for k in links for i in (k.a, k.b)})
+        if self.repair and misled(found, priors, linked):
+            guess = guessed_priors(photos, priors, features, links)
+            if guess is not None:
+                other = block(untold(guess), guess, "guessed ")
+                if nearer(other, found, priors):
+                    found, aside = other, untold(guess)
         for again in range(BEGUN_AGAIN) if self.repair else ():
             if (turned := turned_priors(found, priors)) is None:
                 break
             other = block(untold(turned), turned, f"turned {again} ")
-            if not off_positions(other, priors) < NEARER * off_positions(found, priors):
+            if not nearer(other, found, priors):
                 break
             found, aside = other, untold(turned)
         weak = weak_photos(found, priors)

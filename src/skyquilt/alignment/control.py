@@ -109,6 +109,7 @@ def _alone(
         photo=row,
         px=px,
         sigma_px=np.ones(len(px)),
+        shared=1.0,
         relative=1.0,
         X0=empty,
         sigma_X=np.ones_like(empty),
@@ -214,6 +215,7 @@ def with_points(
         relative=np.concatenate(
             [np.broadcast_to(problem.relative, len(problem.px)), np.ones(len(px))]
         ),
+        shared=np.concatenate([np.broadcast_to(problem.shared, len(problem.px)), np.ones(len(px))]),
         # what was marked in photos by hand errs independently of the tie points
         trust=np.concatenate([np.broadcast_to(problem.trust, len(problem.px)), np.ones(len(px))]),
         X0=np.concatenate([problem.X0, surveyed]),

@@ -114,12 +114,13 @@ def point_deviations(
     """Standard deviations (k, 3) in m of points of a problem.
 
     Args:
-        problem: their observations; each point's own are taken to be independent of one another.
+        problem: their observations; each point's own are taken to be independent of one another,
+            but for those of photos of the same place.
         state: the minimum.
         covariance: of photos and cameras, as from `adjust.covariance`.
         points: (k,) which points.
     """
-    own, _ = replace(problem, trust=1.0).only(np.isin(problem.point, points))
+    own, _ = replace(problem, trust=problem.shared).only(np.isin(problem.point, points))
     normal = observation_equations(own, replace(state, X=state.X[np.sort(points)]))
     p, q = normal.Wp.shape[1], normal.Wc.shape[1]
     first = np.searchsorted(own.point, np.arange(len(points) + 1))
@@ -142,4 +143,4 @@ def point_deviations(
 def believed(problem: Problem, noise: Noise) -> Problem:
     """The problem whose observations weigh what the noise says that they tell."""
     effect = noise.design_effect
-    return replace(problem, design_effect=effect, trust=1 / (effect * noise.variance))
+    return replace(problem, design_effect=effect, trust=problem.shared / (effect * noise.variance))

@@ -25,6 +25,10 @@ Array = NDArray[np.float64]
 APART = np.sin(np.radians(5.0))
 """Sine of the least angle between two rays that tell where they meet, positions erring by metres.
 """
+NEARER = 0.95
+"""Photos come nearer to their positions where their distance falls by this factor."""
+LOST = 0.8
+"""An adjustment that holds less than this share of another's photos lost them."""
 FEWEST_MET = 50
 """Fewest such pairs of rays that tell the height of the ground."""
 
@@ -88,6 +92,15 @@ def off_positions(found: Alignment, priors: Sequence[Prior]) -> float:
     away = np.array([np.linalg.norm(found.poses[i].map_C - priors[i].map_C) for i in found.held])
     known = away[np.isfinite(away)]
     return float(np.median(known)) if len(known) else np.nan
+
+
+def nearer(other: Alignment, found: Alignment, priors: Sequence[Prior]) -> bool:
+    """Whether another adjustment's photos lie clearly nearer to their positions, and no fewer of
+    them are held; or whether it holds far more.
+    """
+    more, less = len(other.held), len(found.held)
+    close = off_positions(other, priors) < NEARER * off_positions(found, priors)
+    return (close and more >= less) or LOST * more > less
 
 
 def reported_start(

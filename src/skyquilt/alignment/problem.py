@@ -116,6 +116,10 @@ class Problem:
     """Factor on the cost of observations, of all or of each (N,): the reciprocal of their design
     effect and of their variance over the assumed one (`alignment.deviations`).
     """
+    shared: Array | float = 1.0
+    """What observations count for, of all or of each (N,), beside those of the same point by other
+    photos of the same place (`alignment.same_place`).
+    """
     relative: Array | float = 1.0
     """Deviation of all observations or of each (N,) over that of a usual one. What is too far off
     is judged by `sigma_px` alone; `alignment.stages.weighed` multiplies it in.
@@ -156,6 +160,7 @@ class Problem:
             px=self.px[observations],
             sigma_px=self.sigma_px[observations],
             trust=of_some(self.trust, observations),
+            shared=of_some(self.shared, observations),
             relative=of_some(self.relative, observations),
         )
 

@@ -14,6 +14,7 @@ from skyquilt.alignment.deviations import believed, observed_noise, robust_scale
 from skyquilt.alignment.equations import NearFactor
 from skyquilt.alignment.problem import READOUT, Problem, State, squared_residuals, swept
 from skyquilt.alignment.robust import robust_cost
+from skyquilt.alignment.same_place import shares
 from skyquilt.alignment.setup import Setup
 from skyquilt.engine.kept import MADE_NOW, Keep
 
@@ -145,13 +146,16 @@ def _reweighed(
     problem: Problem, state: State, sizes: Array, keep: Keep, near: NearFactor
 ) -> tuple[Problem, State]:
     """The adjustment with turns, if they are unknown, then twice with the weight that residuals
-    show observations to be worth; `sizes` (n, 2): of the photos in px.
+    show observations to be worth, those of photos of one place as one; `sizes` (n, 2): of the
+    photos in px.
     """
     if problem.sigma_turn is not None:
         part = keep.within("turns")
         state = adjust(
             problem, state, iterations=15, tolerance=1e-3, damping=1e-6, keep=part, near=near
         ).state
+    shared = shares(problem, state, float(np.median(heights_above(state))))
+    problem = replace(problem, shared=shared)
     for again in range(2):
         scale = robust_scale(problem, state)
         problem = replace(problem, sigma_px=problem.sigma_px * scale)

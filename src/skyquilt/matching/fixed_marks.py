@@ -61,6 +61,12 @@ class FindFixedMarks:
     """With a larger share than this of a photo's keypoints at the same place in others, the camera
     stood still.
     """
+    spread: float = 0.2
+    """It also did between two photos that share keypoints at the same place in more than this share
+    of the parts of the picture inside its rim: marks lie together, or along the rim.
+    """
+    parts: int = 10
+    """Parts along a side."""
     least: int = 3
     """Fewest keypoints on marks in one photo."""
     cell_px: int = 4
@@ -82,7 +88,7 @@ class FindFixedMarks:
             side = self.cell_px * some[0].scale
             width, height = sizes[own[0]]
             mask = np.zeros((int(height / side) + 1, int(width / side) + 1), bool)
-            for one, fixed in zip(some, self._fixed(some), strict=True):
+            for one, fixed in zip(some, self._fixed(some, sizes[own[0]]), strict=True):
                 column, row = np.floor(one.px[fixed] / side).astype(int).T
                 inside = np.clip(row, 0, mask.shape[0] - 1), np.clip(column, 0, mask.shape[1] - 1)
                 mask[inside] = True
@@ -92,12 +98,29 @@ class FindFixedMarks:
                 masks[camera], cells[camera] = wide > 0, float(side)
         return FixedMarks(masks=masks, cell_px=cells)
 
-    def _fixed(self, photos: Sequence[Features]) -> list[Mask]:
-        """Which keypoints of each photo others show at the same place."""
+    def _fixed(self, photos: Sequence[Features], size: tuple[int, int]) -> list[Mask]:
+        """Which keypoints of each photo others show at the same place. Of photos between which the
+        camera stood still, one tells. `size`: width and height in px.
+        """
+        alike = self._alike(photos)
+        apart = list[int]()
+        for a, one in enumerate(photos):
+            if not any(self._stood_still(one, alike[a][b], size) for b in apart):
+                apart.append(a)
+        found = [np.zeros(len(one), bool) for one in photos]
+        for a in apart:
+            seen = np.sum([alike[a][b] for b in apart], axis=0)
+            fixed = seen >= self.agreeing
+            if self.least <= fixed.sum() <= self.standing * len(photos[a]):
+                found[a] = fixed
+        return found
+
+    def _alike(self, photos: Sequence[Features]) -> list[list[Mask]]:
+        """Which keypoints of each photo each of the others shows at the same place."""
         rasters, described = [_raster(f) for f in photos], [f.unit for f in photos]
         found = []
         for a, one in enumerate(photos):
-            seen, place = np.zeros(len(one), int), _cells(one)
+            place, own = _cells(one), [np.zeros(len(one), bool) for _ in photos]
             for b, raster in enumerate(rasters):
                 if a == b:
                     continue
@@ -106,11 +129,18 @@ class FindFixedMarks:
                 other[inside] = raster[place[inside, 1], place[inside, 0]]
                 near = np.flatnonzero(other >= 0)
                 likeness = (described[a][near] * described[b][other[near]]).sum(1)
-                seen[near[likeness > self.alike]] += 1
-            fixed = seen >= self.agreeing
-            marks = self.least <= fixed.sum() <= self.standing * len(one)
-            found.append(fixed if marks else np.zeros_like(fixed))
+                own[b][near[likeness > self.alike]] = True
+            found.append(own)
         return found
+
+    def _stood_still(self, one: Features, shared: Mask, size: tuple[int, int]) -> bool:
+        """Whether a photo shares keypoints (n,) with another all over the picture."""
+        column, row = (one.px / size * self.parts).astype(int).clip(0, self.parts - 1).T
+        cells = np.zeros((2, self.parts, self.parts), bool)
+        cells[0, row, column] = True
+        cells[1, row[shared], column[shared]] = True
+        shown, common = cells[:, 1:-1, 1:-1].sum((1, 2))
+        return bool(common > self.spread * shown)
 
 
 def _cells(features: Features) -> NDArray[np.int64]:

@@ -184,8 +184,9 @@ def _repeated(photos: Sequence[Photo]) -> tuple[list[Photo], str]:
         p if first else _widened(p, float(m)) for p, first, m in zip(photos, new, away, strict=True)
     ]
     note = (
-        "repeat the position of the photo before: a receiver that was slow or stuck; they count as"
-        f" uncertain by up to {away[~new].max():.0f} m."
+        "repeat the position of the photo before: they were taken at the same place, or the"
+        " receiver was slow or stuck; they count as uncertain by up to"
+        f" {away[~new].max():.0f} m."
     )
     return found, note
 
