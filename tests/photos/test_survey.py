@@ -46,6 +46,18 @@ def test_photos_without_a_time_come_last_by_name(make_jpeg):
     assert any("Without a capture time" in n and "a.jpg" in n for n in survey.notes)
 
 
+def test_pictures_of_formats_that_are_not_read_are_told(make_jpeg):
+    folder = flight(make_jpeg, 3)
+    for name in ("b.webp", "sub/c.HEIC", "p1.dng", "notes.txt", "Thumbs.db"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_bytes(b"x")
+    (told,) = (n for n in read_survey(folder).notes if "format" in n)
+    assert told.startswith("2 pictures are not in the map") and "(b.webp, sub/c.HEIC)" in told
+    (folder / "b.webp").unlink()
+    (folder / "sub/c.HEIC").unlink()  # a raw picture beside its JPEG is no loss
+    assert not any("format" in n for n in read_survey(folder).notes)
+
+
 def test_a_bad_file_never_stops_a_survey(make_jpeg):
     folder = flight(make_jpeg, 3)
     (folder / "cut.jpg").write_bytes((folder / "p1.JPG").read_bytes()[:1500])

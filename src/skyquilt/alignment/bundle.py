@@ -10,10 +10,18 @@ from skyquilt.alignment.adjust import covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
 from skyquilt.alignment.determined import weak_photos
 from skyquilt.alignment.dominant_plane import levelled
+from skyquilt.alignment.late_positions import moved_note, unshifted
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
 from skyquilt.alignment.oblique_guess import guessed_priors, misled
-from skyquilt.alignment.oblique_start import nearer, reported_start, slanting, turned_priors, untold
+from skyquilt.alignment.oblique_start import (
+    nearer,
+    off_positions,
+    reported_start,
+    slanting,
+    turned_priors,
+    untold,
+)
 from skyquilt.alignment.outcome import accuracy, ground_points, leave_one_out, undetermined
 from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.setup import Setup, camera_records, pose_records, set_up
@@ -63,7 +71,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 38
+    version: ClassVar[int] = 39
 
     def __call__(
         self,
@@ -106,6 +114,13 @@ class Bundle:
             found = block(aside)
         except AlignmentError:
             aside, found = frozenset(), block(frozenset())
+        said, name = list[str](), ""
+        moved = unshifted(found, priors, photos) if self.repair else priors
+        if moved is not priors:
+            other = block(aside, moved, "moved ")
+            if off_positions(other, moved) < off_positions(found, priors):
+                said.append(moved_note(priors, moved))
+                found, priors, name = other, moved, "moved "
         linked = len({i for k in links for i in (k.a, k.b)})
         if self.repair and misled(found, priors, linked):
             guess = guessed_priors(photos, priors, features, links)
@@ -123,9 +138,10 @@ class Bundle:
         weak = weak_photos(found, priors)
         if self.repair and (more := found_oblique(found, weak, priors) - aside):
             aside |= more
-            found = block(aside)
+            found = block(aside, priors, name)
             weak = weak_photos(found, priors)
-        return hung(found, weak, photos, priors, features, links, aside)
+        done = hung(found, weak, photos, priors, features, links, aside)
+        return replace(done, notes=(*done.notes, *said)) if said else done
 
     def _in_space(self, priors: Sequence[Prior]) -> bool:
         """Whether the start takes what photos report for their poses."""

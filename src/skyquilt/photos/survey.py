@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from skyquilt.errors import NoPhotosError, UsageError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
@@ -26,6 +26,14 @@ from skyquilt.photos.side_rows import sentence_of
 from skyquilt.video.read import CLIP_ENDINGS, side_files
 
 _PHOTO_ENDINGS = frozenset({".jpg", ".jpeg", ".tif", ".tiff", ".png"})
+_OTHER_PICTURES = frozenset(
+    f".{ending}"
+    for ending in (
+        *("avif", "bmp", "gif", "heic", "heif", "jp2", "jxl", "webp"),
+        *("arw", "cr2", "cr3", "dng", "nef", "orf", "pef", "r3d", "raf", "raw", "rw2", "srw"),
+    )
+)
+"""Endings of pictures in formats that are not read."""
 _RUN_MARK = "run.toml"
 _RUN_STATE = ".skyquilt"
 _SIDE_NAMES = frozenset({"geo.txt", "gcp_list.txt"})
@@ -167,7 +175,13 @@ def read_survey(
         if clips
         else tuple(sorted((*found.ignored, *(n for n, _ in found.clips)))),
         clips=films,
-        notes=(*notes, *_run_notes(found), *implausible, *survey_notes(photos, len(copies))),
+        notes=(
+            *notes,
+            *_run_notes(found),
+            *_unread_notes(found),
+            *implausible,
+            *survey_notes(photos, len(copies)),
+        ),
     )
 
 
@@ -202,6 +216,26 @@ def _without_copies(photos: Iterable[Photo]) -> tuple[tuple[Photo, ...], tuple[R
 
 def _run_notes(found: FoundFiles) -> tuple[str, ...]:
     return tuple(f"The folder {run} contains an earlier run and was skipped." for run in found.runs)
+
+
+def _unread_notes(found: FoundFiles) -> tuple[str, ...]:
+    """A sentence on pictures in formats that are not read, but for those beside a photo of the same
+    name, as cameras write them.
+    """
+    read = {PurePosixPath(name).with_suffix("") for name, _ in found.photos}
+    missed = [
+        name
+        for name in found.ignored
+        if PurePosixPath(name).suffix.lower() in _OTHER_PICTURES
+        and PurePosixPath(name).with_suffix("") not in read
+    ]
+    if not missed:
+        return ()
+    number = f"{len(missed)} pictures are" if len(missed) > 1 else "1 picture is"
+    return (
+        f"{number} not in the map: their format is not read ({sentence_of(missed)}). Save them as"
+        " JPEG, TIFF or PNG with their metadata.",
+    )
 
 
 def _nothing_sentence(

@@ -14,6 +14,7 @@ from typing import TypeVar
 
 from skyquilt.alignment.addition import added
 from skyquilt.alignment.inputs import AlignmentInputs
+from skyquilt.alignment.late_positions import unshifted
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.free_memory import give_back
@@ -200,7 +201,7 @@ def align_photos(
         given=given,
         found=found,
         frame=frame,
-        priors=tuple(reported),
+        priors=tuple(unshifted(alignment, reported, found.photos)),
         links=links,
         order=tuple(known.order),
         alignment=alignment,
