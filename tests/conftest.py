@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import settings as hypothesis_settings
 
 from skyquilt.model.event import Event, Result
 from skyquilt.settings import MosaicSettings
@@ -14,6 +15,10 @@ from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
 from skyquilt.workflows.mosaic import iter_mosaic
 from tests.once import flown_once
+
+# on a busy machine a time limit per example judges the machine
+hypothesis_settings.register_profile("skyquilt", deadline=None)
+hypothesis_settings.load_profile("skyquilt")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -126,3 +126,16 @@ def test_a_survey_that_does_not_fit_is_dropped_as_a_whole():
     kept.make_room()
     assert all(kept.peek(i) is None for i in range(4))
     assert kept(3)[0] == 3
+
+
+def test_what_is_asked_for_once_is_not_kept_where_not_all_fit():
+    fits = cache(300)
+    assert [fits.once(i)[0] for i in (0, 1, 2)] == [0, 1, 2]
+    assert fits.decoded == 3 and fits.once(1) is fits.peek(1)
+    full = cache(300)
+    for i in range(4):
+        full(i)
+    assert full.once(9)[0] == 9 and full.peek(9) is None
+    assert full.once(3) is full.peek(3)
+    full.make_room()
+    assert full.once(3)[0] == 3 and full.peek(3) is None

@@ -75,6 +75,15 @@ class PixelCache(Generic[Kept]):
             self.put(photo, pixels)
             return pixels
 
+    def once(self, photo: int) -> Kept:
+        """Pixels of a photo that is not asked for again soon: they are not kept where not all photos
+        fitted so far.
+        """
+        if not self.dropped:
+            return self(photo)
+        held = self.peek(photo)
+        return self.read(photo) if held is None else held
+
     def put(self, photo: int, pixels: Kept) -> None:
         """Keeps pixels that the caller decoded, if they fit."""
         with self._lock:

@@ -120,7 +120,7 @@ class _ThumbnailsOf(Mapping[int, NDArray[Any]]):
     def __getitem__(self, photo: int) -> NDArray[Any]:
         if photo not in self._photos:
             raise KeyError(photo)
-        return self._found.looks(self._found.number[photo]).thumbnail
+        return self._found.looks.once(self._found.number[photo]).thumbnail
 
 
 class PixelsInUse:
