@@ -76,8 +76,8 @@ class PixelCache(Generic[Kept]):
             return pixels
 
     def once(self, photo: int) -> Kept:
-        """Pixels of a photo that is not asked for again soon: they are not kept where not all photos
-        fitted so far.
+        """Pixels of a photo that is not asked for again soon: they are not kept where not all of
+        them fitted so far.
         """
         if not self.dropped:
             return self(photo)
