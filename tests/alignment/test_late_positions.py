@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment.late_positions import unshifted
-from tests.alignment.surveys import alignment, photo, prior
+from tests.alignment.surveys import alignment, prior
 from tests.alignment.test_oblique_start import Slanting
 
 LINES = np.array(
@@ -44,8 +44,7 @@ def told_at(places, sigma, seed):
 @pytest.mark.parametrize("seed", range(4))
 def test_late_positions_are_moved(late, seed):
     true = told_at(LINES, 1.5, seed)
-    photos = [photo(f"{i:02d}.jpg") for i in range(len(LINES))]
-    moved = unshifted(block(LINES), late_by(true, late), photos)
+    moved = unshifted(block(LINES), late_by(true, late), ["A"] * len(LINES))
     inside = slice(None, -1) if late > 0 else slice(1, None)
     for a, b in zip(moved[inside], true[inside], strict=True):
         assert np.array_equal(a.map_C, b.map_C)
@@ -55,43 +54,39 @@ def test_late_positions_are_moved(late, seed):
 @pytest.mark.parametrize("sigma", [0.02, 1.5, 5.0, 15.0])
 @pytest.mark.parametrize("seed", range(4))
 def test_positions_that_are_right_stay(sigma, seed):
-    photos = [photo(f"{i:02d}.jpg") for i in range(len(LINES))]
     priors = told_at(LINES, sigma, seed)
-    assert unshifted(block(LINES), priors, photos) is priors
+    assert unshifted(block(LINES), priors, ["A"] * len(LINES)) is priors
     some = [replace(p, map_C=np.full(3, np.nan)) if i % 3 else p for i, p in enumerate(priors)]
-    assert unshifted(block(LINES), some, photos) is some
+    assert unshifted(block(LINES), some, ["A"] * len(LINES)) is some
     far = [
         replace(p, map_C=p.map_C + (40, 0, 0)) if i % 3 == 0 else p for i, p in enumerate(priors)
     ]
-    assert unshifted(block(LINES), far, photos) is far
+    assert unshifted(block(LINES), far, ["A"] * len(LINES)) is far
 
 
 @pytest.mark.parametrize("seed", range(40))
 def test_noise_that_is_not_told_and_positions_in_any_order_move_nothing(seed):
-    photos = [photo(f"{i:02d}.jpg") for i in range(len(LINES))]
     rng = np.random.default_rng(seed)
     for noise in (3.0, 8.0, 15.0):
         priors = [prior(C, sigma=1.0) for C in LINES + rng.normal(0, noise, LINES.shape)]
-        assert unshifted(block(LINES), priors, photos) is priors
+        assert unshifted(block(LINES), priors, ["A"] * len(LINES)) is priors
     mixed = [prior(LINES[i], sigma=1.0) for i in rng.permutation(len(LINES))]
-    assert unshifted(block(LINES), mixed, photos) is mixed
+    assert unshifted(block(LINES), mixed, ["A"] * len(LINES)) is mixed
 
 
 def test_a_straight_line_tells_nothing():
     line = np.array([(20.0 * k, 0, 60.0) for k in range(12)])
-    photos = [photo(f"{i:02d}.jpg") for i in range(12)]
     priors = late_by(told_at(line, 1.0, 1), 1)
-    assert unshifted(block(line), priors, photos) is priors
+    assert unshifted(block(line), priors, ["A"] * len(line)) is priors
 
 
 def test_each_camera_has_its_own_order():
     """Two cameras expose together, so the photo before is that of the other one."""
     both = np.repeat(LINES, 2, axis=0)
-    photos = [photo(f"{i:02d}.jpg", key="AB"[i % 2]) for i in range(len(both))]
     true = told_at(both, 1.5, 3)
     told = list(true)
     told[::2] = late_by(true[::2], 1)
-    moved = unshifted(block(both), told, photos)
+    moved = unshifted(block(both), told, ["A", "B"] * len(LINES))
     assert all(np.array_equal(moved[i].map_C, true[i].map_C) for i in range(len(both) - 2))
     assert moved[1::2] == told[1::2]
 

@@ -55,6 +55,21 @@ def test_a_text_is_found_and_nothing_beside_it(seed):
     assert len(marks.notes) == 1
 
 
+@pytest.mark.parametrize("rows", [(30, 58, 86, 350), (30, 58, 86, 270, 300, 330, 350)])
+def test_many_lines_of_text_are_no_camera_that_stands_still(rows):
+    def lines(picture):
+        for y in rows:
+            cv2.putText(
+                picture, "SKYCAM 4K  46.59N 14.29E ALT", (8, y), 0, 0.75, 255, 2, cv2.LINE_AA
+            )
+        return picture
+
+    _, marks = marks_in([lines(p) for p in flight(8, seed=4)])
+    y = np.array(rows) - 8.0
+    assert marks.on_mark("cam", np.column_stack([np.full(len(y), 60.0), y])).mean() > 0.5
+    assert not marks.on_mark("cam", np.array([[240.0, 180.0], [100.0, 200.0]])).any()
+
+
 def test_texts_that_change_in_part_are_found_where_they_do_not():
     _, marks = marks_in([stamped(p, f"CAM 10:3{i}") for i, p in enumerate(flight(8))])
     assert marks.on_mark("cam", np.array([[40.0, 335.0]])).all()

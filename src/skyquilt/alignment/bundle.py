@@ -115,7 +115,8 @@ class Bundle:
         except AlignmentError:
             aside, found = frozenset(), block(frozenset())
         said, name = list[str](), ""
-        moved = unshifted(found, priors, photos) if self.repair else priors
+        cameras = [p.camera_key for p in photos]
+        moved = unshifted(found, priors, cameras) if self.repair else priors
         if moved is not priors:
             other = block(aside, moved, "moved ")
             if off_positions(other, moved) < off_positions(found, priors):

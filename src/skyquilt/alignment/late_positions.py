@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.similarity_graph import fit_similarity
-from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Prior
 
 FEWEST = 10
@@ -23,16 +22,14 @@ OFF = 1.5
 """... which is more than this times their deviations."""
 
 
-def unshifted(
-    found: Alignment, priors: Sequence[Prior], photos: Sequence[Photo]
-) -> Sequence[Prior]:
+def unshifted(found: Alignment, priors: Sequence[Prior], cameras: Sequence[str]) -> Sequence[Prior]:
     """The priors with positions of each camera's photos moved to the photo before or after, in
     order of capture, where they then fit the pictures far better; photos for which none is left
-    have none. The very same priors where none is moved.
+    have none. `cameras`: that of each photo. The very same priors where none is moved.
     """
     out = list(priors)
-    for camera in dict.fromkeys(p.camera_key for p in photos):
-        own = [i for i, p in enumerate(photos) if p.camera_key == camera]
+    for camera in dict.fromkeys(cameras):
+        own = [i for i, c in enumerate(cameras) if c == camera]
         now = _misfit(found, priors, own, 0)
         sigma = [priors[i].sigma_C[0] for i in own if np.isfinite(priors[i].map_C[0])]
         if now is None or not now > OFF * float(np.median(sigma)):

@@ -63,7 +63,8 @@ class FindFixedMarks:
     """
     spread: float = 0.2
     """It also did between two photos that share keypoints at the same place in more than this share
-    of the parts of the picture inside its rim: marks lie together, or along the rim.
+    of the parts of the picture inside its rim, and in more than half of this share in each quarter
+    and in the middle: marks lie together, or along the rim.
     """
     parts: int = 10
     """Parts along a side."""
@@ -139,8 +140,20 @@ class FindFixedMarks:
         cells = np.zeros((2, self.parts, self.parts), bool)
         cells[0, row, column] = True
         cells[1, row[shared], column[shared]] = True
-        shown, common = cells[:, 1:-1, 1:-1].sum((1, 2))
-        return bool(common > self.spread * shown)
+        rim, half = slice(1, -1), self.parts // 2
+        low, high, middle = slice(1, half), slice(half, -1), slice(half // 2 + 1, -half // 2)
+        places = [(a, b) for a in (low, high) for b in (low, high)]
+        return _shares(cells[:, rim, rim], self.spread) and all(
+            _shares(cells[:, a, b], self.spread / 2) for a, b in (*places, (middle, middle))
+        )
+
+
+def _shares(cells: Mask, share: float) -> bool:
+    """Whether of some parts of a picture that show keypoints (first) more than a share have some in
+    common with another (second); cells (2, rows, columns).
+    """
+    shown, common = cells.sum((1, 2))
+    return bool(common > share * shown)
 
 
 def _cells(features: Features) -> NDArray[np.int64]:

@@ -201,7 +201,7 @@ def align_photos(
         given=given,
         found=found,
         frame=frame,
-        priors=tuple(unshifted(alignment, reported, found.photos)),
+        priors=tuple(unshifted(alignment, reported, [p.camera_key for p in found.photos])),
         links=links,
         order=tuple(known.order),
         alignment=alignment,
