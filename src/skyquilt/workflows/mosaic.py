@@ -293,8 +293,8 @@ def _made(given: SurveyInput, make: _Making) -> Generator[Event, None, dict[str,
         writing = write_frames(output, aligned.photos, aligned.pixels)
         yield from clock.stage("write frames", writing, keeps=False)
     measuring = _measured(aligned, ground, drawn, settings, clock.workers)
-    seams, quality = yield from clock.stage("measure", measuring, keeps=False)
-    metrics = _metrics(aligned, ground, drawn, seams, settings) | {"quality": quality}
+    seams, quality, tone = yield from clock.stage("measure", measuring, keeps=False)
+    metrics = _metrics(aligned, ground, drawn, seams, tone, settings) | {"quality": quality}
     metrics |= added
     aligned.found.looks.make_room()
     give_back()
@@ -347,8 +347,10 @@ def _measured(
     map_: DrawnMap,
     settings: MosaicSettings,
     workers: Workers,
-) -> Steps[tuple[MeasuredSeams, dict[str, Any]]]:
-    """Measures the seams and the agreement of the placed photos."""
+) -> Steps[tuple[MeasuredSeams, dict[str, Any], dict[str, Any] | None]]:
+    """Measures the seams, the agreement of the placed photos, and how evenly they show the same
+    ground.
+    """
     seams = yield from measure_seams(map_.compose, map_.drawn, ground, workers)
     aligned.pixels.make_room()
     quality = yield from placement_quality(
@@ -363,7 +365,11 @@ def _measured(
         workers,
     )
     aligned.grey.make_room()
-    return seams, quality
+    thumbnails = aligned.found.thumbnails([v.photo for v in ground.views])
+    tone = tone_residual(
+        ground.views, thumbnails, ground.surface, ground.grid.bounds, map_.exposure
+    )
+    return seams, quality, tone
 
 
 def _metrics(
@@ -371,6 +377,7 @@ def _metrics(
     ground: Ground,
     map_: DrawnMap,
     seams: MeasuredSeams,
+    tone: dict[str, Any] | None,
     settings: MosaicSettings,
 ) -> dict[str, Any]:
     survey, alignment = aligned.given.survey, aligned.alignment
@@ -386,7 +393,7 @@ def _metrics(
             ground=ground,
             drawn=map_.drawn,
             seams=seams.figures,
-            looks={**seams.looks, "tone_residual": _tone(aligned, ground, map_)},
+            looks={**seams.looks, "tone_residual": tone},
             conflicts=conflicts(aligned.photos, aligned.priors, alignment),
             warnings=[
                 *aligned.links.marks.notes,
@@ -402,14 +409,6 @@ def _metrics(
         }
         | clip_figures(aligned.given.clips)
         | value_figures(aligned.photos, map_.exposure, settings.picture)
-    )
-
-
-def _tone(aligned: AlignedPhotos, ground: Ground, map_: DrawnMap) -> dict[str, Any] | None:
-    """How evenly the balanced photos show the same ground."""
-    thumbnails = aligned.found.thumbnails([v.photo for v in ground.views])
-    return tone_residual(
-        ground.views, thumbnails, ground.surface, ground.grid.bounds, map_.exposure
     )
 
 

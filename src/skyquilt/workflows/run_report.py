@@ -34,6 +34,8 @@ DEPTHS, DEPTH_WIDTH = 4, 420
 """Depth maps shown, and their width in px."""
 CROP = 320
 """Side in map px of the crops of the worst places of the seams."""
+MOST_CELLS = 2000
+"""Cells along a side, about, of what the report shows of views and heights."""
 LATER = ("metrics.json",)
 """Files that are written after the report."""
 LEAST_DISPARITIES = 12
@@ -110,8 +112,11 @@ def report_input(
 ) -> ReportInput:
     """The data shown in the report."""
     frame, views = aligned.alignment.frame, drawn.views_grid
-    z = ground.surface.on(views.x(np.arange(views.width)), views.y(np.arange(views.height)))
-    heights = np.where(drawn.views > 0, z, np.float32(np.nan))
+    every = 1 + max(drawn.views.shape) // MOST_CELLS
+    number = drawn.views[::every, ::every]
+    columns, rows = (np.arange(0, n, every) for n in (views.width, views.height))
+    z = ground.surface.on(views.x(columns), views.y(rows))
+    heights = np.where(number > 0, z, np.float32(np.nan))
     return ReportInput(
         metrics=metrics,
         preview=drawn.preview,
@@ -119,7 +124,7 @@ def report_input(
         origin=frame.origin,
         crs=frame.crs,
         metric=frame.metric,
-        views=drawn.views,
+        views=number,
         views_bounds=views.bounds,
         surface=heights,
         surface_bounds=views.bounds,
