@@ -195,10 +195,7 @@ def _geo_txt_row(line: str, place: str, to_degrees: "Transformer", datum: Datum)
 def _split(line: str) -> tuple[str, list[float]]:
     """The name (which may contain spaces) and the numbers after it."""
     words = line.split()
-    if with_decimal_commas(words):
-        words = with_points(words)
-    else:
-        words = line.replace(",", " ").split()
+    words = with_points(words) if with_decimal_commas(words) else line.replace(",", " ").split()
     numbers: list[float] = []
     while len(numbers) < _MOST_NUMBERS and words and (value := number(words[-1])) is not None:
         numbers.append(value)
