@@ -209,7 +209,7 @@ def test_the_map_agrees_with_the_bounds():
     )
 
 
-@pytest.mark.parametrize("tolerance", [0.0, -3.0, float("nan")])
+@pytest.mark.parametrize("tolerance", [0.0, -3.0, float("nan"), 1e308])
 def test_a_tolerance_is_a_number_of_pixels(tolerance):
     with pytest.raises(UsageError, match="tolerance"):
         RegisterSettings(tolerance_px=tolerance)

@@ -329,3 +329,46 @@ def test_cameras_of_another_shape_do_not_fit(tmp_path, photo):
     )
     with pytest.raises(SideFileError, match="dji fc300s"):
         apply_cameras([photo], read_cameras_json(path), file=path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.csv", "name;lat;lon;alt\nDJI_0001;46,25;9,5;210,5\n"),
+        ("a.csv", "name\tlat\tlon\talt\nDJI_0001\t46,25\t9,5\t210,5\n"),
+        ("a.csv", "sep=;\nname;lat;lon;alt\nDJI_0001;46.25;9.5;210.5\n"),
+        ("geo.txt", "EPSG:4326\nDJI_0001 9,5 46,25 210,5\n"),
+        ("geo.txt", "EPSG:4326\nDJI_0001,9.5,46.25,210.5\n"),
+    ],
+)
+def test_decimal_commas_and_separators_of_spreadsheets_give_the_same_position(tmp_path, name, text):
+    read = read_geo_txt if name == "geo.txt" else read_positions_csv
+    (row,) = read(written(tmp_path, text, name))
+    assert (row.name, row.latitude_deg, row.longitude_deg) == (
+        "DJI_0001",
+        pytest.approx(46.25, abs=1e-9),
+        pytest.approx(9.5, abs=1e-9),
+    )
+    assert (row.altitude_m, row.angles_deg) == (210.5, None)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("name,lat,lon,alt [ft]\nDJI_0001,46,9,700\n", r"'alt \[ft\]' is in ft"),
+        ("name,lat (rad),lon\nDJI_0001,0.8,0.1\n", "is in rad"),
+        ("name,lat,lon\n", "a header only"),
+        ("name;lat;lon;alt\nDJI_0001;46.25;9.5;1,210\n", "found '1,210'"),
+    ],
+)
+def test_other_units_and_tables_without_rows_are_refused(tmp_path, text, words):
+    with pytest.raises(SideFileError, match=words):
+        read_positions_csv(written(tmp_path, text, "a.csv"))
+
+
+def test_two_rows_of_one_photo_that_differ_are_refused(tmp_path, photo):
+    head, row = "EPSG:4326\n", "DJI_0001.JPG 9 46 100\n"
+    with pytest.raises(SideFileError, match=r"two rows for DJI_0001.JPG that differ"):
+        apply_positions([photo], written(tmp_path, head + row + "dji_0001 9.1 46 100\n"))
+    ((after,), _) = apply_positions([photo], written(tmp_path, head + row + row))
+    assert after.position.longitude_deg == pytest.approx(9)

@@ -42,7 +42,7 @@ def choose_frame(
         to_wgs = Transformer.from_crs(control[0].crs, 4326, always_xy=True)
         lon, lat = to_wgs.transform([c.x for c in control], [c.y for c in control])
         places = list(zip(lat, lon, strict=True))
-    name = _checked_crs(crs) if crs else ""
+    name = checked_crs(crs) if crs else ""
     if not places:
         metric = any(p.position and p.position.takeoff_m for p in photos)
         if vertical_datum is not None:
@@ -78,7 +78,12 @@ def _middle(places: NDArray[np.float64]) -> tuple[float, float]:
     return float(np.median(latitude)), east if east < 180 else east - 360
 
 
-def _checked_crs(crs: str) -> str:
+def checked_crs(crs: str) -> str:
+    """The coordinate system, where a map can be made in it.
+
+    Raises:
+        UsageError: it is unknown, or suits no map.
+    """
     try:
         parsed = CRS.from_user_input(crs)
     except CRSError as error:

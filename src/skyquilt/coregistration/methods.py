@@ -38,8 +38,10 @@ class RegisterSettings:
         one_of("--method", self.method, registry.names("registration"))
         if self.tolerance_px is None:
             return
-        if not 0 < self.tolerance_px < float("inf"):
-            raise UsageError(f"--tolerance is {self.tolerance_px:g}; give a number of px above 0")
+        if not 0 < self.tolerance_px <= 1e6:  # beyond any picture; nan is refused too
+            raise UsageError(
+                f"--tolerance is {self.tolerance_px:g}; give a number of px above 0, at most 1e6"
+            )
         if self.method not in STATING:
             raise UsageError(
                 f"--tolerance: method {self.method} does not state its error;"

@@ -72,6 +72,10 @@ class LiveSettings:
         if self.thermal_unit is not None:
             one_of("--thermal-unit", self.thermal_unit, THERMAL_UNITS)
         check_shutter(self.shutter, self.shutter_readout_ms)
+        if self.crs is not None:
+            from skyquilt.alignment.priors import checked_crs
+
+            checked_crs(self.crs)
         if self.vertical_datum is not None:
             one_of("--vertical-datum", self.vertical_datum, VERTICAL_DATUMS)
         for name, value, low, high in (

@@ -6,18 +6,27 @@ at integers. A check point, which is not used in the adjustment, has a name that
 or the word `check` in the eighth column: OpenDroneMap ignores both extensions.
 """
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import TYPE_CHECKING
 
 from skyquilt.errors import SideFileError
-from skyquilt.model.photo import ControlPoint, Datum, PointObservation
+from skyquilt.model.photo import ControlPoint, Datum, Photo, PointObservation
 from skyquilt.outside import plain
 from skyquilt.photos.side_rows import PhotoNames, finite, number, read_crs, read_lines, sentence_of
 
 if TYPE_CHECKING:
     from pyproj import CRS
+
+
+FAR_KM = 50.0
+"""Distance of control points from all photos that no flight explains: another coordinate system, or
+x and y swapped.
+"""
+_KM_PER_DEGREE = 111.32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,3 +149,60 @@ def _point(
         observations=tuple(PointObservation(photo=n, x=s.column, y=s.row) for n, s in seen if n),
         check=any(s.check for s in group),
     )
+
+
+def check_control(path: Path, control: Sequence[ControlPoint], photos: Sequence[Photo]) -> None:
+    """Refuses control points that cannot be right, whatever the flight.
+
+    Raises:
+        SideFileError: a point is observed outside its photo or at two places of it, or the points
+            are far from where the photos were taken.
+    """
+    sizes = {p.name: (p.width, p.height) for p in photos}
+    for point in control:
+        seen: dict[str, PointObservation] = {}
+        for at in point.observations:
+            width, height = sizes[at.photo]
+            where = f"{path.name}: {plain(point.name, 80)} is observed"
+            if not (-1 <= at.x <= width and -1 <= at.y <= height):
+                raise SideFileError(
+                    f"{where} at ({at.x:g}, {at.y:g}), outside {plain(at.photo, 80)} of {width} x"
+                    f" {height} px. Correct that row: it takes pixels of the photo as stored."
+                )
+            first = seen.setdefault(at.photo, at)
+            if math.hypot(first.x - at.x, first.y - at.y) > 1:
+                raise SideFileError(
+                    f"{where} at two places of {plain(at.photo, 80)}. Remove one of the rows."
+                )
+    _check_places(path, control, photos)
+
+
+def _check_places(path: Path, control: Sequence[ControlPoint], photos: Sequence[Photo]) -> None:
+    flown = [(p.position.latitude_deg, p.position.longitude_deg) for p in photos if p.position]
+    if not control or not flown:
+        return
+    from pyproj import Transformer
+
+    to_degrees = Transformer.from_crs(control[0].crs, "EPSG:4326", always_xy=True)
+    away = []
+    for point in control:
+        longitude, latitude = to_degrees.transform(point.x, point.y)
+        if not (math.isfinite(longitude) and abs(latitude) <= 90):
+            raise SideFileError(
+                f"{path.name}: {plain(point.name, 80)} at ({point.x:g}, {point.y:g}) is no place in"
+                f" {plain(control[0].crs, 60)}. Correct the point or the coordinate system."
+            )
+        away.append(min(_apart_km(latitude, longitude, *there) for there in flown))
+    if median(away) > FAR_KM:
+        raise SideFileError(
+            f"{path.name}: its points are {median(away):.0f} km from the photos. Correct the"
+            " coordinate system in its first line, or the order of x (east) and y (north); where"
+            " the photos' positions are wrong, give others with --geo."
+        )
+
+
+def _apart_km(latitude: float, longitude: float, other_lat: float, other_lon: float) -> float:
+    """About the distance of two places given in degrees."""
+    turn = (longitude - other_lon + 180) % 360 - 180
+    shrink = math.cos(math.radians((latitude + other_lat) / 2))
+    return _KM_PER_DEGREE * math.hypot(latitude - other_lat, turn * shrink)

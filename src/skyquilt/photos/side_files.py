@@ -18,6 +18,8 @@ from skyquilt.photos.side_rows import (
     read_crs,
     read_lines,
     read_table,
+    with_decimal_commas,
+    with_points,
 )
 from skyquilt.photos.srt import read_srt
 
@@ -60,6 +62,9 @@ _COLUMNS = {
     ),
     "sigma_z": ("verticalaccuracy", "vacc", "accuracyvert", "sigmazm", "zaccuracy"),
 }
+_SEPARATOR = re.compile(r"\"?sep=.?\"?", re.IGNORECASE)
+_OTHER_UNIT = re.compile(r"[\[(]\s*(u\.?s\.? ?ft|ft|feet|foot|rad|radians?|gon|km|cm|mm)\b")
+"""Units in a header that are not those which are read."""
 _DATUMS: tuple[Datum, ...] = ("ellipsoid", "takeoff", "sea_level")
 
 
@@ -69,14 +74,20 @@ def read_positions_csv(path: Path) -> tuple[SideRow, ...]:
     Columns (case, blanks and underscores do not matter): name or filename; lat, lon in degrees; alt
     (above sea level), rel_alt (above take-off) or ellipsoid in m; yaw, pitch, roll in degrees
     (pitch 0 = nadir; below -45 it is read as a gimbal's); accuracy, vertical_accuracy in m. Only
-    the name is required.
+    the name is required. Decimal commas are read where semicolons or tabs separate the columns.
     """
     lines = [line for _, line in read_lines(path)]
+    if lines and _SEPARATOR.fullmatch(lines[0]):  # written by spreadsheets for themselves
+        del lines[0]
     if not lines:
         raise SideFileError(f"{path.name} is empty; expected a header and one line per photo.")
     delimiter = max(",;\t", key=lines[0].count)
     table = read_table(lines, file=path.name, delimiter=delimiter)
     columns = _columns(table[0], path)
+    if len(table) < 2:
+        raise SideFileError(f"{path.name} has a header only; expected one line per photo below it.")
+    if delimiter != "," and with_decimal_commas(cell for row in table for cell in row):
+        table = [with_points(row) for row in table]
     return tuple(
         _csv_row(cells, columns, f"{path.name}, row {i}") for i, cells in enumerate(table[1:], 1)
     )
@@ -94,6 +105,12 @@ def _columns(header: list[str], path: Path) -> dict[str, int]:
             f"{path.name}: its header is '{plain(', '.join(header), 200)}'; expected at least"
             " 'name' with 'lat' and 'lon', or 'name' with 'yaw'. Add a header line."
         )
+    for column in found.values():
+        if unit := _OTHER_UNIT.search(header[column].lower()):
+            raise SideFileError(
+                f"{path.name}: the column '{plain(header[column], 60)}' is in {unit[1]}; expected"
+                " degrees, and heights and accuracies in m. Convert that column."
+            )
     return found
 
 
@@ -177,7 +194,8 @@ def _geo_txt_row(line: str, place: str, to_degrees: "Transformer", datum: Datum)
 
 def _split(line: str) -> tuple[str, list[float]]:
     """The name (which may contain spaces) and the numbers after it."""
-    words = line.replace(",", " ").split()
+    words = line.split()
+    words = with_points(words) if with_decimal_commas(words) else line.replace(",", " ").split()
     numbers: list[float] = []
     while len(numbers) < _MOST_NUMBERS and words and (value := number(words[-1])) is not None:
         numbers.append(value)

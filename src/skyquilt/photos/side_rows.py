@@ -22,6 +22,7 @@ _ALTITUDE = (-12_000.0, 100_000.0)
 """Heights in m that are taken."""
 _MOST_ANGLE = 100_000.0
 _MOST_CRS = 20_000
+_DECIMAL_COMMA = re.compile(r"[-+]?[0-9]{1,15},[0-9]{1,20}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +84,14 @@ def apply_rows(
     invalid.
     """
     names = PhotoNames(p.name for p in photos)
-    found = {names.find(row.name): row for row in rows}
+    found: dict[str | None, SideRow] = {}
+    for row in rows:
+        photo = names.find(row.name)
+        former = found.setdefault(photo, row)
+        if photo is not None and replace(former, name=row.name) != row:
+            raise SideFileError(
+                f"{file.name} has two rows for {plain(photo, 80)} that differ. Remove one of them."
+            )
     strangers = [row.name for row in rows if names.find(row.name) is None]
     if rows and len(strangers) == len(rows):
         raise SideFileError(
@@ -215,6 +223,18 @@ def read_table(lines: Sequence[str], *, file: str, delimiter: str = ",") -> list
     if len(table) != len(lines):
         raise SideFileError(f"{file}: a quote is opened and not closed in its line. Correct it.")
     return table
+
+
+def with_points(cells: Sequence[str]) -> list[str]:
+    """Cells with decimal points in place of decimal commas, where these separate no columns."""
+    return [c.replace(",", ".") if _DECIMAL_COMMA.fullmatch(c.strip()) else c for c in cells]
+
+
+def with_decimal_commas(cells: Iterable[str]) -> bool:
+    """Whether numbers are written with decimal commas: two or more are, and none with a point."""
+    words = [c.strip() for c in cells]
+    commas = sum(_DECIMAL_COMMA.fullmatch(w) is not None for w in words)
+    return commas > 1 and not any("." in w and real(w) is not None for w in words)
 
 
 def number(text: str) -> float | None:

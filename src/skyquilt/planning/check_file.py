@@ -12,6 +12,7 @@ from skyquilt.planning.plan_file import read_plan
 from skyquilt.planning.site import in_zone, read_site
 from skyquilt.planning.terrain import FLAT, read_terrain
 from skyquilt.planning.view import find_view
+from skyquilt.settings import within
 
 AROUND_M = 300.0
 """Terrain is read so far around a mission."""
@@ -33,6 +34,9 @@ def check_file(
         SideFileError, UsageError, RefusedError: a file cannot be used.
     """
     path = Path(path)
+    within("--views", views, 1, 200)
+    within("--width", width_m, 0.1, 100_000)
+    within("--clearance", clearance, 0, 1000)
     if path.suffix.lower() == ".json":
         plan = read_plan(path)
         if terrain is None and plan.terrain:

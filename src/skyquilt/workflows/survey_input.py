@@ -15,7 +15,7 @@ from skyquilt.model.photo import (
     Survey,
 )
 from skyquilt.photos.distances import read_distances
-from skyquilt.photos.gcp import read_gcp_list
+from skyquilt.photos.gcp import check_control, read_gcp_list
 from skyquilt.photos.lever_arm import with_lever_arm
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.sequence import sequence_of
@@ -138,6 +138,7 @@ def completed(given: SurveyInput, settings: InputSettings) -> SurveyInput:
     control: tuple[ControlPoint, ...] = ()
     if gcp is not None:
         control, notes = read_gcp_list(gcp, names)
+        check_control(gcp, control, survey.photos)
         survey = replace(survey, notes=(*survey.notes, *notes))
     known = settings.distances
     return replace(
