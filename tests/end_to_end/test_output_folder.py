@@ -241,7 +241,7 @@ def test_another_run_is_replaced_only_when_asked_for(mosaic, flight):
     assert {n: (output / n).read_bytes() for n in CONTRACT} == before
     told = mosaic(flight / "photos", "--blend", "first", "--overwrite", "--json").made()
     reused = {e["stage"]: e["reused"] for e in told.events if e["event"] == "StageFinished"}
-    kept = ("features", "links", "align", "surface")
+    kept = ("features", "links", "align", "surface", "balance")
     assert reused == {s: s in kept for s in STAGES[1:] if s != "frames"}
 
 
@@ -279,7 +279,7 @@ def test_rerun_from_each_stage(mosaic, flight, finished, stage):
     output = mosaic(flight / "photos").made().output
     told = mosaic(flight / "photos", "--rerun-from", stage, "--json").made()
     reused = {e["stage"]: e["reused"] for e in told.events if e["event"] == "StageFinished"}
-    stored = {"features", "links", "align", "surface", "seams", "mosaic"}
+    stored = {"features", "links", "align", "surface", "balance", "seams", "mosaic"}
     first = STAGES.index(stage)
     assert reused == {
         s: s in stored and k + 1 < first for k, s in enumerate(STAGES[1:]) if s != "frames"

@@ -1,4 +1,6 @@
+import io
 import math
+import zipfile
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from typing import Any
@@ -110,6 +112,14 @@ def test_changed_bytes_are_a_value_error_or_a_value(leaf, data):
         changed[data.draw(st.integers(0, len(changed) - 1))] = data.draw(st.integers(0, 255))
     with suppress(ValueError):
         decode(bytes(changed), REGISTRY)
+
+
+def test_thousands_of_small_arrays_take_one_place_in_the_file():
+    many = {k: np.full(3, k, np.float32) for k in range(5000)} | {-1: np.arange(400.0)}
+    data = encode(many)
+    with zipfile.ZipFile(io.BytesIO(data)) as file:
+        assert len(file.namelist()) == 3
+    assert same(many, decode(data, {}))
 
 
 @given(st.binary(max_size=200))

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.geometry import block_cholesky
 from skyquilt.model.raster import Window
 from skyquilt.ortho import differences
@@ -302,8 +303,35 @@ def test_close_weights_are_not_taken_where_light_differs_over_each_photo(lit):
     samples = balance._samples(views, uneven, FLAT, GRID.bounds)
     where = np.array([v.footprint.mean(0) for v in views])
     pairs = differences.Pairs.of(samples.row, samples.point, where)
-    wide, _ = balance._best(samples, views, pairs, closely=False)
-    close, _ = balance._best(samples, views, pairs, closely=True)
+    wide, _ = balance._best(samples, views, pairs, MADE_NOW, closely=False)
+    close, _ = balance._best(samples, views, pairs, MADE_NOW, closely=True)
     found = balance(views, uneven, FLAT, GRID.bounds)
     assert all((found.gains[v.photo] == wide.gains[v.photo]).all() for v in views)
     assert any((close.gains[v.photo] != wide.gains[v.photo]).any() for v in views)
+
+
+def test_an_interrupted_balance_goes_on_with_what_it_had(lit):
+    """Solutions are kept by name; none is computed twice, and the result is the same."""
+    views, pictures, _ = lit
+    kept: dict[str, Exposure] = {}
+    solved = []
+
+    class Counting(Balance):
+        def _solve(self, *args, **options):
+            solved.append(options)
+            return super()._solve(*args, **options)
+
+    def held(name, make):
+        if name not in kept:
+            kept[name] = make()
+        return kept[name]
+
+    whole = Counting()(views, pictures, FLAT, GRID.bounds, Keep(held=held))
+    first = len(solved)
+    again = Counting()(views, pictures, FLAT, GRID.bounds, Keep(held=held))
+    assert first > 1 and len(solved) == first
+    alone = Balance()(views, pictures, FLAT, GRID.bounds)
+    for other in (again, alone):
+        assert other.white == whole.white
+        assert all((other.gains[v.photo] == whole.gains[v.photo]).all() for v in views)
+        assert all((other.fields[v.photo] == whole.fields[v.photo]).all() for v in views)

@@ -14,7 +14,7 @@ from skyquilt.model.poses import MapFrame
 from skyquilt.settings import MosaicSettings
 from skyquilt.thermal import workflow as thermal
 from skyquilt.workflows import survey_input
-from skyquilt.workflows.flow import alignment_key
+from skyquilt.workflows.keys import alignment_key
 from skyquilt.workflows.methods import methods_for
 from skyquilt.workflows.mosaic import make_map
 from skyquilt.workflows.survey_input import read_input

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.differences import (
@@ -162,6 +163,7 @@ class Balance:
         thumbnails: Mapping[int, NDArray[np.uint8]],
         surface: Surface,
         bounds: tuple[float, float, float, float],
+        keep: Keep = MADE_NOW,
     ) -> Exposure:
         """Estimates the exposure from thumbnails (h, w[, bands]) of the photos."""
         usable = [v for v in views if v.photo in thumbnails]
@@ -172,13 +174,13 @@ class Balance:
             return NEUTRAL
         where = np.array([v.footprint.mean(0) for v in usable])
         pairs = Pairs.of(samples.row, samples.point, where)
-        wide, apart = self._best(samples, usable, pairs, closely=False)
+        wide, apart = self._best(samples, usable, pairs, keep, closely=False)
         fields = np.stack([wide.fields[v.photo] for v in usable])
         s = samples.under(wide.white)
-        tried = self._with_gains(s, usable, pairs, fields, closely=True)
+        tried = keep("tried", lambda: self._with_gains(s, usable, pairs, fields, closely=True))
         if samples.apart(tried, usable) > (1 - BETTER / 2) * apart:  # saves the rest of the work
             return wide
-        close, less = self._best(samples, usable, pairs, closely=True, least=wide.white)
+        close, less = self._best(samples, usable, pairs, keep, closely=True, least=wide.white)
         return close if less < (1 - BETTER) * apart else wide
 
     def _best(
@@ -186,6 +188,7 @@ class Balance:
         samples: "Samples",
         views: Sequence[View],
         pairs: Pairs,
+        keep: Keep,
         *,
         closely: bool,
         least: float = 0.0,
@@ -197,12 +200,18 @@ class Balance:
         for white in self.whites:
             if white < least:
                 continue
-            found = self._solve(samples.under(white), views, pairs, closely=closely)
+            found = self._kept(samples.under(white), views, pairs, keep, closely=closely)
             less = samples.apart(found, views)
             if less >= (1 - better) * apart:
                 break
             best, apart = found, less
         return best, apart
+
+    def _kept(
+        self, s: "Samples", views: Sequence[View], pairs: Pairs, keep: Keep, *, closely: bool
+    ) -> Exposure:
+        name = f"{s.white:g}{' closely' if closely else ''}"
+        return keep(name, lambda: self._solve(s, views, pairs, closely=closely))
 
     def _solve(
         self, s: "Samples", views: Sequence[View], pairs: Pairs, *, closely: bool

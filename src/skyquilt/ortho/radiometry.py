@@ -3,12 +3,13 @@ reported.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.imaging.nodes import View
 from skyquilt.model.photo import Photo
 from skyquilt.model.surface import Surface
@@ -61,53 +62,57 @@ class BalanceMethod(Protocol):
         thumbnails: Mapping[int, NDArray[Any]],
         surface: Surface,
         bounds: tuple[float, float, float, float],
+        keep: Keep = MADE_NOW,
     ) -> Exposure:
-        """The corrections that bring photos to a common brightness."""
+        """The corrections that bring photos to a common brightness; `keep` keeps parts of them."""
         ...
 
 
-def balanced(
-    unit: str,
-    dtype: str,
-    thumbnails: Mapping[int, NDArray[Any]],
-    ground: Ground,
-    balance: BalanceMethod,
-    drift: DriftMethod,
-    settings: PictureSettings,
-) -> Exposure:
-    """Exposure of placed photos of one kind, or the drift of measured values; neutral where neither
-    is wanted. `unit` and `dtype` are those of the pixels, `thumbnails` are by photo (index).
-    """
-    bounds = ground.grid.bounds
-    if unit:
-        return drift_of(ground.views, thumbnails, ground.surface, bounds, unit, drift, settings)
-    if not settings.balance or dtype != "uint8":
-        return NEUTRAL
-    return balance(ground.views, thumbnails, ground.surface, bounds)
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Levelling:
+    """How placed photos of one kind are brought to a common level."""
 
+    unit: str
+    """Unit of the pixels; empty for pictures."""
+    dtype: str
+    """Type of the pixels."""
+    thumbnails: Mapping[int, NDArray[Any]]
+    """Small pictures by photo (index)."""
+    balance: BalanceMethod
+    """Finds the exposure of pictures."""
+    drift: DriftMethod
+    """Finds the offsets of measured values."""
+    settings: PictureSettings
+    """What is wanted."""
+    keep: Keep = MADE_NOW
+    """Keeps what takes long of large surveys."""
 
-def continued(
-    unit: str,
-    dtype: str,
-    thumbnails: Mapping[int, NDArray[Any]],
-    ground: Ground,
-    balance: BalanceMethod,
-    drift: DriftMethod,
-    settings: PictureSettings,
-) -> Exposure:
-    """The same for a map that continues an earlier one: photos that were there keep their
-    corrections, new ones are brought to their level.
-    """
-    if (grows := ground.growth) is None:
-        return balanced(unit, dtype, thumbnails, ground, balance, drift, settings)
-    exposure = grows.earlier.exposure
-    for area in grows.areas:
-        near = grows.near(ground.views, area)
-        there = replace(ground, views=tuple(near), grid=part_of(ground.grid, area), growth=None)
-        known = balance.under(exposure.white)
-        fresh = balanced(unit, dtype, thumbnails, there, known, drift, settings)
-        exposure = with_new(exposure, fresh)
-    return complete(exposure, ground.views)
+    def __call__(self, ground: Ground) -> Exposure:
+        """The photos' exposure, or the drift of measured values; neutral where neither is wanted.
+
+        In a map that continues an earlier one, photos that were there keep their corrections, and
+        new ones are brought to their level.
+        """
+        if (grows := ground.growth) is None:
+            return self._alone(ground)
+        exposure = grows.earlier.exposure
+        for area in grows.areas:
+            near = grows.near(ground.views, area)
+            there = replace(ground, views=tuple(near), grid=part_of(ground.grid, area), growth=None)
+            known = self.balance.under(exposure.white)
+            part = replace(self, balance=known, keep=self.keep.within(f"{area}"))
+            exposure = with_new(exposure, part._alone(there))
+        return complete(exposure, ground.views)
+
+    def _alone(self, ground: Ground) -> Exposure:
+        views, surface, bounds = ground.views, ground.surface, ground.grid.bounds
+        if self.unit:
+            return drift_of(
+                views, self.thumbnails, surface, bounds, self.unit, self.drift, self.settings
+            )
+        if not self.settings.balance or self.dtype != "uint8":
+            return NEUTRAL
+        return self.balance(views, self.thumbnails, surface, bounds, self.keep)
 
 
 def drift_of(

@@ -109,12 +109,14 @@ def camera_figures(photos: Sequence[Photo], alignment: Alignment) -> dict[str, A
 def shutter_figures(photos: Sequence[Photo], alignment: Alignment) -> dict[str, Any]:
     """How the rows of each camera's photos were exposed, and by how much that shifts them."""
     out: dict[str, Any] = {}
+    heights = alignment.ties.xyz[:, 2]
+    ground = float(np.median(heights)) if len(heights) else None
     for i in sorted(alignment.poses):
         key, pose, camera = photos[i].camera_key, alignment.poses[i], alignment.camera(i)
         moved = pose.motion
         px = 0.0
-        if moved is not None and len(alignment.ties.xyz):
-            above = max(float(pose.map_C[2] - np.median(alignment.ties.xyz[:, 2])), 1.0)
+        if moved is not None and ground is not None:
+            above = max(float(pose.map_C[2]) - ground, 1.0)
             px = camera.focal * float(np.linalg.norm(moved.shift_m)) / above
         entry = out.setdefault(
             key,

@@ -44,7 +44,7 @@ class Shot:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraResiduals:
-    """Observations of tie points in all photos of one camera."""
+    """Observations of tie points in all photos of one camera, or an even sample of them."""
 
     camera: str
     """Name of its calibration."""
@@ -56,6 +56,8 @@ class CameraResiduals:
     """(N, 2) observed pixels."""
     residual_px: NDArray[Any]
     """(N, 2) projected minus observed."""
+    every: int = 1
+    """One of so many observations is given."""
 
 
 @dataclass(frozen=True, kw_only=True)

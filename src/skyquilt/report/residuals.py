@@ -1,5 +1,6 @@
 """Section: residuals of the tie points."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,7 @@ def residuals_section(data: ReportInput) -> Section:
         why = "This method uses no tie points, so there are no residuals to show."
         return Section(id="residuals", title="Reprojection residuals", blocks=(Missing(why=why),))
     every = np.concatenate([r.residual_px for r in cameras])
+    apart = max(r.every for r in cameras)
     blocks: list[Block] = [
         _density(every),
         _lengths(every),
@@ -53,7 +55,8 @@ def residuals_section(data: ReportInput) -> Section:
     return Section(
         id="residuals",
         title="Reprojection residuals",
-        lead="Computed minus observed image position of every tie point in every photo of it.",
+        lead="Computed minus observed image position of every tie point in every photo of it."
+        + (f" One of {apart} observations is taken." if apart > 1 else ""),
         blocks=tuple(blocks),
     )
 
@@ -61,9 +64,7 @@ def residuals_section(data: ReportInput) -> Section:
 def _finite(r: CameraResiduals) -> CameraResiduals:
     px, residual = np.reshape(r.px, (-1, 2)), np.reshape(r.residual_px, (-1, 2))
     keep = np.isfinite(px).all(1) & np.isfinite(residual).all(1)
-    return CameraResiduals(
-        camera=r.camera, width=r.width, height=r.height, px=px[keep], residual_px=residual[keep]
-    )
+    return replace(r, px=px[keep], residual_px=residual[keep])
 
 
 def _density(residual: NDArray[Any]) -> Figure:

@@ -44,3 +44,15 @@ REGISTRY = {
     )
 }
 """Records that the store may hold."""
+ARTEFACTS = {
+    "frames": "looks",
+    "features": "features",
+    "read": "pictures",
+    "links": "links",
+    "align": "alignment",
+    "surface": "surface",
+    "balance": "balance",
+    "seams": "seams",
+    "mosaic": "blocks",
+}
+"""Stage -> folder in the store."""

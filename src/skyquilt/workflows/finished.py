@@ -16,6 +16,7 @@ from skyquilt.ortho.earlier import EarlierMap
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.former_files import FILES
 from skyquilt.ortho.labels import Labels
+from skyquilt.workflows.keys import photo_key
 
 STAGE, NAME = "finished", "map"
 """Where the record is in the store."""
@@ -102,13 +103,6 @@ class Earlier:
         now = {photo_key(p): i for i, p in enumerate(photos)}
         found = ((i, now.get(key)) for i, key in enumerate(self.finished.photos))
         return {i: n for i, n in found if n is not None}
-
-
-def photo_key(photo: Photo) -> str:
-    """Content and metadata of a photo."""
-    return digest(
-        photo.name, photo.digest, photo.position, photo.attitude, photo.focal, photo.calibration
-    )
 
 
 def stamps(output: Path) -> tuple[tuple[int, ...], ...]:

@@ -9,8 +9,9 @@ from skyquilt.ortho.earlier import same_pose
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.orthomosaic import used_photos
 from skyquilt.report.tables import added_sentence
-from skyquilt.workflows.finished import Finished, photo_key, stamps
+from skyquilt.workflows.finished import Finished, stamps
 from skyquilt.workflows.flow import AlignedPhotos, DrawnMap
+from skyquilt.workflows.keys import photo_key
 
 
 def finished(

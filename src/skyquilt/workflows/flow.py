@@ -12,14 +12,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
-from skyquilt.alignment.addition import added
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.late_positions import unshifted
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.pixel_cache import PixelCache, pixel_budget, resident_budget
-from skyquilt.engine.store import Store, digest
+from skyquilt.engine.store import Store
 from skyquilt.engine.workers import Workers
 from skyquilt.model.event import Event, Note
 from skyquilt.model.photo import Photo, RejectedPhoto
@@ -30,17 +29,17 @@ from skyquilt.ortho.compose import Composer
 from skyquilt.ortho.exposure import Exposure
 from skyquilt.ortho.ground import Ground
 from skyquilt.ortho.labels import Labels
-from skyquilt.ortho.radiometry import continued
-from skyquilt.settings import USUAL_GB, MosaicSettings
+from skyquilt.ortho.radiometry import Levelling
+from skyquilt.settings import USUAL_GB, MosaicSettings, PictureSettings
 from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.finished import Earlier
+from skyquilt.workflows.keys import alignment_key, exposure_key, labels_key
 from skyquilt.workflows.links import Links, link_photos
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import (
     FeaturedPhotos,
     GreyPictures,
     PixelsInUse,
-    features_recipe,
     find_features,
     make_room,
     of_one_kind,
@@ -194,7 +193,7 @@ def align_photos(
     )
     if links.links and earlier is None:
         yield from memory_notes(len(found.photos), settings.running.memory_gb)
-    key = alignment_key(known, methods) if earlier is None else _key_with(earlier, known, methods)
+    key = alignment_key(known, methods, earlier.key if earlier else "")
     alignment = yield from clock.stage("align", _align(known, key, methods, clock))
     yield from (Note(text=n, warning=True) for n in alignment.notes)
     return AlignedPhotos(
@@ -269,21 +268,8 @@ def draw_map(
         OutputError: the disk is full or read-only.
     """
     alignment, first = aligned.alignment, aligned.photos[0]  # all are of one kind
-    thumbnails = aligned.found.thumbnails([v.photo for v in on.views])
     exposure = yield from clock.stage(
-        "balance",
-        _at_once(
-            lambda: continued(
-                first.unit,
-                first.dtype,
-                thumbnails,
-                on,
-                methods.balance,
-                methods.drift,
-                settings.picture,
-            )
-        ),
-        keeps=False,
+        "balance", _at_once(lambda: _exposure(aligned, on, methods, settings.picture, clock.store))
     )
     labels, labelled = yield from clock.stage(
         "seams", _at_once(lambda: _labels(aligned, on, exposure, methods, clock))
@@ -317,6 +303,24 @@ def _drawn(
     return drawing.companions()
 
 
+def _exposure(
+    aligned: AlignedPhotos, on: Ground, methods: Methods, picture: PictureSettings, store: Store
+) -> Exposure:
+    """The photos' exposure, from their thumbnails."""
+    first = aligned.photos[0]
+    key = exposure_key(aligned.alignment, aligned.photos, on, methods, picture)
+    levelled = Levelling(
+        unit=first.unit,
+        dtype=first.dtype,
+        thumbnails=aligned.found.thumbnails([v.photo for v in on.views]),
+        balance=methods.balance,
+        drift=methods.drift,
+        settings=picture,
+        keep=store.parts("balance", key),
+    )
+    return store.get_or("balance", key, lambda: levelled(on))
+
+
 def _labels(
     aligned: AlignedPhotos, on: Ground, exposure: Exposure, methods: Methods, clock: Clock
 ) -> tuple[Labels | None, str]:
@@ -325,17 +329,7 @@ def _labels(
     """
     if methods.blend.seam_px is None:
         return None, ""
-    key = digest(
-        ground.poses_digest(aligned.alignment),
-        on.surface.z,
-        on.grid,
-        dict(exposure.gains),
-        dict(exposure.fields),
-        methods.seams,
-        picture_recipe(),
-        [p.digest for p in aligned.photos],
-        *(() if on.growth is None else on.growth.key),
-    )
+    key = labels_key(aligned.alignment, aligned.photos, on, exposure, methods)
     keep = clock.store.parts("seams", key, clock.workers)
     grows = on.growth
 
@@ -381,32 +375,6 @@ def _links(
         return found, Links()
     links = yield from link_photos(found, frame, reported, methods, store, workers)
     return (yield from connect(found, links, reported, grey, methods, store, workers))
-
-
-def alignment_key(known: AlignmentInputs, methods: Methods) -> str:
-    """Key of an alignment: all that enters it."""
-    photos = [
-        (p.digest, p.name, p.camera_key, p.focal, p.calibration, p.editor) for p in known.photos
-    ]
-    moving = [(p.shutter, p.velocity_ned, p.time and p.time.isoformat()) for p in known.photos]
-    held = [(k.a, k.b, k.index_a, k.index_b) for k in known.links]
-    return digest(
-        photos,
-        moving,
-        known.frame,
-        list(known.priors),
-        held,
-        list(known.control),
-        features_recipe(methods.detector),
-        connect,
-        list(known.order),
-        methods.align,
-    )
-
-
-def _key_with(earlier: Earlier, known: AlignmentInputs, methods: Methods) -> str:
-    """Key of an alignment that continues an earlier one."""
-    return digest(alignment_key(known, methods), earlier.key, added)
 
 
 def _align(known: AlignmentInputs, key: str, methods: Methods, clock: Clock) -> Steps[Alignment]:

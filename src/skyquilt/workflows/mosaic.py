@@ -40,9 +40,9 @@ from skyquilt.quality.seam_measurement import MeasuredSeams, measure_seams
 from skyquilt.quality.tone import tone_residual
 from skyquilt.settings import MosaicSettings
 from skyquilt.version import __version__
-from skyquilt.workflows.artefacts import REGISTRY
+from skyquilt.workflows.artefacts import ARTEFACTS, REGISTRY
 from skyquilt.workflows.clip_frames import frame_methods, write_frames
-from skyquilt.workflows.finished import NAME, STAGE, Earlier, earlier_map, photo_key
+from skyquilt.workflows.finished import NAME, STAGE, Earlier, earlier_map
 from skyquilt.workflows.finishing import added_figures, added_note, finished
 from skyquilt.workflows.flow import (
     ADJUSTING,
@@ -55,6 +55,7 @@ from skyquilt.workflows.flow import (
     frames_added,
     scene_of,
 )
+from skyquilt.workflows.keys import photo_key
 from skyquilt.workflows.methods import Methods, methods_for
 from skyquilt.workflows.run_report import finish_run
 from skyquilt.workflows.survey_input import Source, SurveyInput, check_input, read_input
@@ -73,17 +74,6 @@ STAGES = (
     "report",
 )
 """Stages in order."""
-ARTEFACTS = {
-    "frames": "looks",
-    "features": "features",
-    "read": "pictures",
-    "links": "links",
-    "align": "alignment",
-    "surface": "surface",
-    "seams": "seams",
-    "mosaic": "blocks",
-}
-"""Stage -> folder in the store."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -36,6 +36,8 @@ CROP = 320
 """Side in map px of the crops of the worst places of the seams."""
 MOST_CELLS = 2000
 """Cells along a side, about, of what the report shows of views and heights."""
+MOST_RESIDUALS = 1_000_000
+"""Observations of tie points, about, whose residuals the report shows."""
 LATER = ("metrics.json",)
 """Files that are written after the report."""
 LEAST_DISPARITIES = 12
@@ -236,17 +238,20 @@ def _shot_figures(
 
 def _residuals(aligned: AlignedPhotos) -> list[CameraResiduals]:
     alignment, ties = aligned.alignment, aligned.alignment.ties
-    keys = sorted({alignment.camera_of[i] for i in np.unique(ties.photo).tolist()})
+    every = 1 + len(ties.photo) // MOST_RESIDUALS
+    photo, px, residual = ties.photo[::every], ties.px[::every], ties.residual_px[::every]
+    keys = sorted({alignment.camera_of[i] for i in np.unique(photo).tolist()})
     number = {key: k for k, key in enumerate(keys)}
     of_photo = [number.get(alignment.camera_of.get(i, ""), -1) for i in range(len(aligned.photos))]
-    camera = np.array(of_photo)[ties.photo]
+    camera = np.array(of_photo)[photo]
     return [
         CameraResiduals(
             camera=key,
             width=alignment.cameras[key].width,
             height=alignment.cameras[key].height,
-            px=ties.px[camera == k],
-            residual_px=ties.residual_px[camera == k],
+            px=px[camera == k],
+            residual_px=residual[camera == k],
+            every=every,
         )
         for key, k in number.items()
     ]
