@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from skyquilt.engine.memory_watch import resident_bytes
 from skyquilt.geometry import set_aside
-from skyquilt.geometry.set_aside import SetAside
+from skyquilt.geometry.set_aside import InFile, SetAside
 
 
 @pytest.mark.parametrize("large", [True, False])
@@ -43,3 +44,34 @@ def test_without_a_disk_for_it_a_value_stays_in_memory(monkeypatch, missing):
 
     monkeypatch.setattr(set_aside, "TemporaryFile", temporary)
     assert SetAside([1, 2, 3]).get() == [1, 2, 3]
+
+
+@pytest.mark.parametrize("large", [True, False])
+@pytest.mark.parametrize("shape", [(0,), (5,), (3, 2), (100_000, 2)])
+def test_an_array_in_a_file_is_the_same_before_and_after_its_memory_is_given_back(shape, large):
+    values = np.random.default_rng(2).integers(0, 60_000, shape).astype(np.uint16)
+    held = InFile(values, large=large)
+    for _ in range(2):
+        assert held.values.dtype == values.dtype and np.array_equal(held.values, values)
+        held.release()
+    assert (held.values is values) == (not large or not values.size)
+
+
+def test_an_array_in_a_file_takes_memory_only_while_it_is_used():
+    held = InFile(np.ones(16_000_000))
+    before = resident_bytes()
+    assert held.values.sum() == 16_000_000
+    assert resident_bytes() > before + 100e6
+    held.release()
+    assert resident_bytes() < before + 10e6
+
+
+def test_without_a_disk_for_it_an_array_stays_in_memory(monkeypatch):
+    def none(dir):
+        raise FileNotFoundError(2, "no folder for temporary files")
+
+    monkeypatch.setattr(set_aside, "TemporaryFile", none)
+    values = np.arange(9)
+    held = InFile(values)
+    held.release()
+    assert held.values is values

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from skyquilt.engine.codec import decode, encode
 from skyquilt.model.features import Link, RejectedLink, numbers
 from skyquilt.settings import MosaicSettings
+from skyquilt.workflows import links
 from skyquilt.workflows.artefacts import REGISTRY
 from skyquilt.workflows.links import PackedLinks, _Linker
 from skyquilt.workflows.mosaic import iter_mosaic, mosaic
@@ -68,3 +69,21 @@ def test_a_run_that_goes_on_takes_all_links_at_once(flight, tmp_path, monkeypatc
     names = sorted((flight / "photos").iterdir())[:-1]
     mosaic(names, tmp_path / "fewer", quick)
     assert asked
+
+
+def test_matches_in_files_give_the_same_map(flight, tmp_path, monkeypatch):
+    quick = MosaicSettings(surface="ties", gsd_cm=30.0, jobs=1, features=1500)
+    mosaic(flight / "photos", tmp_path / "memory", quick)
+    monkeypatch.setattr(links, "LONG", 0)
+    held = []
+    in_files = PackedLinks.in_files
+
+    def watched(self):
+        held.extend(in_files(self))
+        return tuple(held)
+
+    monkeypatch.setattr(PackedLinks, "in_files", watched)
+    mosaic(flight / "photos", tmp_path / "files", quick)
+    assert len(held) == 2 and all(not part.values.flags.writeable for part in held)
+    one, two = ((tmp_path / name / "mosaic.tif").read_bytes() for name in ("memory", "files"))
+    assert one == two

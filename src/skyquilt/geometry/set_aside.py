@@ -1,9 +1,13 @@
 """Large values that are not needed for a while: in a temporary file instead of the memory."""
 
+import mmap
 import os
 import pickle
 from tempfile import TemporaryFile
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 T = TypeVar("T")
 
@@ -38,3 +42,30 @@ class SetAside(Generic[T]):
         self._file.seek(0)
         value: T = pickle.load(self._file)
         return value
+
+
+class InFile:
+    """An array in a temporary file: only the parts that are used are in memory, until they are
+    released. Where there is no disk for it, it stays in memory.
+    """
+
+    def __init__(self, values: NDArray[Any], *, large: bool = True) -> None:
+        """Writes it to a file if it is `large`."""
+        self.values: NDArray[Any] = values
+        """The array, read-only where it lies in a file."""
+        self._map: mmap.mmap | None = None
+        if not large or not values.size:
+            return
+        try:
+            with TemporaryFile(dir=folder_on_disk()) as file:
+                file.write(np.ascontiguousarray(values).data)
+                file.flush()
+                self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        except OSError:
+            return
+        self.values = np.frombuffer(self._map, values.dtype).reshape(values.shape)
+
+    def release(self) -> None:
+        """Gives the memory of what was used back; what is used again is read again."""
+        if self._map is not None and hasattr(mmap, "MADV_DONTNEED"):
+            self._map.madvise(mmap.MADV_DONTNEED)

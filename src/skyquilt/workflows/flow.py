@@ -34,14 +34,13 @@ from skyquilt.settings import USUAL_GB, MosaicSettings, PictureSettings
 from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.finished import Earlier
 from skyquilt.workflows.keys import alignment_key, exposure_key, labels_key
-from skyquilt.workflows.links import Links, link_photos
+from skyquilt.workflows.links import Links, link_photos, make_room
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import (
     FeaturedPhotos,
     GreyPictures,
     PixelsInUse,
     find_features,
-    make_room,
     of_one_kind,
     picture_recipe,
     pixels_of,
@@ -188,13 +187,14 @@ def align_photos(
         control=given.control,
         order=_order(found.photos, given.rank),
         grey=grey,
-        make_room=lambda: make_room(found, grey),
+        make_room=lambda: make_room(found, grey, links),
         former=None if earlier is None else earlier.alignment_of(found.photos),
     )
     if links.links and earlier is None:
         yield from memory_notes(len(found.photos), settings.running.memory_gb)
     key = alignment_key(known, methods, earlier.key if earlier else "")
     alignment = yield from clock.stage("align", _align(known, key, methods, clock))
+    links.make_room()
     yield from (Note(text=n, warning=True) for n in alignment.notes)
     return AlignedPhotos(
         given=given,
@@ -274,7 +274,7 @@ def draw_map(
     labels, labelled = yield from clock.stage(
         "seams", _at_once(lambda: _labels(aligned, on, exposure, methods, clock))
     )
-    make_room(aligned.found, aligned.grey)
+    make_room(aligned.found, aligned.grey, aligned.links)
     compose = orthomosaic.composer(
         first.channels, first.dtype, on, exposure, labels, methods.blend, aligned.pixels
     )

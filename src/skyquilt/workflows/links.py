@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.pose import ByPose
 from skyquilt.engine.clock import Steps
+from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
+from skyquilt.geometry.set_aside import InFile
 from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.matching.candidates import Pair, sequence
@@ -22,7 +24,7 @@ from skyquilt.model.photo import Photo
 from skyquilt.model.poses import MapFrame, Prior
 from skyquilt.ortho.tie_surface import level
 from skyquilt.workflows.methods import Methods
-from skyquilt.workflows.photo_features import FeaturedPhotos, features_recipe
+from skyquilt.workflows.photo_features import FeaturedPhotos, GreyPictures, features_recipe
 
 
 class ExpectedPlaces:
@@ -59,6 +61,10 @@ BATCH = 24
 """Most pairs of a stored artefact: those of one photo with later ones, which one worker matches."""
 
 
+LONG = 1_000_000
+"""Matches of a survey beyond which they lie in files: they are needed now and then only."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Links:
     """Verified links and refused pairs."""
@@ -69,6 +75,13 @@ class Links:
     """Pairs that do not, with reasons."""
     marks: FixedMarks = field(default_factory=FixedMarks)
     """What pictures show at the same place each, and does not connect them."""
+    matches: tuple[InFile, ...] = ()
+    """Where the keypoints of all links lie."""
+
+    def make_room(self) -> None:
+        """Gives back the memory of matches that were used."""
+        for part in self.matches:
+            part.release()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,6 +115,11 @@ class PackedLinks:
             b_S_a=np.array([k.b_S_a if isinstance(k, Link) else 0 for k in found], complex),
             reasons=tuple(None if isinstance(k, Link) else k.reason for k in found),
         )
+
+    def in_files(self) -> tuple[InFile, InFile]:
+        """The two lists of keypoints, in files if they are long."""
+        long = len(self.index_a) > LONG
+        return InFile(self.index_a, large=long), InFile(self.index_b, large=long)
 
     def __iter__(self) -> Iterator[Link | RejectedLink]:
         """The pairs; their arrays are parts of the long ones."""
@@ -218,12 +236,15 @@ def link_photos(
     if packed is None:
         packed = PackedLinks.of((yield from _linked(linker, priors, workers)))
         store.put("links", key, packed)
-    tried = list(packed)
+    matches = packed.in_files()
+    tried = list(replace(packed, index_a=matches[0].values, index_b=matches[1].values))
+    del packed
     yield len(tried), len(tried)
     return Links(
         links=tuple(k for k in tried if isinstance(k, Link)),
         rejected=tuple(k for k in tried if isinstance(k, RejectedLink)),
         marks=linker.marks,
+        matches=matches,
     )
 
 
@@ -311,3 +332,11 @@ def _batches(pairs: Sequence[Pair]) -> list[Sequence[Pair]]:
     """Sorted pairs, those of each first photo by themselves."""
     of_photo = [list(own) for _, own in groupby(pairs, key=lambda pair: pair[0])]
     return [own[k : k + BATCH] for own in of_photo for k in range(0, len(own), BATCH)]
+
+
+def make_room(found: FeaturedPhotos, grey: GreyPictures, links: Links) -> None:
+    """Drops features, grey images and matches kept in memory where not all fit."""
+    found.looks.make_room()
+    grey.make_room()
+    links.make_room()
+    give_back()

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.engine.clock import Steps
-from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.pixel_cache import PixelCache
 from skyquilt.engine.store import Store, digest
 from skyquilt.engine.workers import Workers
@@ -190,13 +189,6 @@ class GreyPictures:
         return self._store.get_or(
             "pictures", picture_key(self._photos[photo]), lambda: picture_of(self._pixels(photo))
         )
-
-
-def make_room(found: FeaturedPhotos, grey: GreyPictures) -> None:
-    """Drops features and grey images kept in memory where not all fit."""
-    found.looks.make_room()
-    grey.make_room()
-    give_back()
 
 
 def pixels_of(photo: Photo, store: Store) -> NDArray[Any]:
