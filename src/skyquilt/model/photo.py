@@ -164,7 +164,11 @@ class Photo:
     velocity_ned: tuple[float, float, float] | None = None
     """Velocity of the aircraft as reported, north, east and down in m/s."""
     editor: str | None = None
-    """Software that rewrote the file after the camera, where the metadata name one."""
+    """Software that rewrote the file after the camera, where the metadata name one, or where files
+    are coded otherwise than the others of their camera.
+    """
+    coding: str = ""
+    """How a JPEG is coded (`photos.headers.JpegHeader.coding`); empty for other files."""
     frame_s: float | None = None
     """Time in s of the frame in the clip that `path` is; None where `path` is a photo."""
     notes: tuple[str, ...] = ()

@@ -11,7 +11,7 @@ from skyquilt.outside import MOST_MP, check_picture, open_regular
 from skyquilt.photos.tags import Exif, Xmp, parse_exif, parse_xmp
 
 SOI, EOI, SOS = 0xD8, 0xD9, 0xDA
-APP1, APP3 = 0xE1, 0xE3
+APP0, APP1, APP3 = 0xE0, 0xE1, 0xE3
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _BARE = frozenset({0x01, *range(0xD0, 0xD8)})  # markers without a length
 _FLIR = b"FLIR\x00"
@@ -39,6 +39,8 @@ class JpegHeader:
     """Marker and payload of every APP segment, in the order of the file."""
     scan_offset: int
     """Byte at which the first scan begins."""
+    sampling: tuple[int, ...] = ()
+    """Sampling factors of each component: 16 times the horizontal one plus the vertical one."""
     several_scans: bool = False
     """Whether the pixels come in several scans (progressive, or a band at a time), so that decoding
     keeps all coefficients in memory.
@@ -48,6 +50,15 @@ class JpegHeader:
     def radiometric(self) -> bool:
         """Whether segments of the kind that FLIR and DJI keep raw thermal data in are there."""
         return any(m == APP3 or (m == APP1 and p.startswith(_FLIR)) for m, p in self.segments)
+
+    @property
+    def coding(self) -> str:
+        """What tells the program that wrote the file from others, whatever the quality: sampling
+        factors, as `2x1 1x1 1x1`, and whether there is a JFIF segment.
+        """
+        factors = [f"{factor >> 4}x{factor & 15}" for factor in self.sampling]
+        jfif = any(m == APP0 and p.startswith(b"JFIF") for m, p in self.segments)
+        return " ".join((*factors, "JFIF")) if jfif else " ".join(factors)
 
     @property
     def exif(self) -> bytes:
@@ -102,6 +113,7 @@ def read_jpeg_header(file: BinaryIO) -> JpegHeader:
     file.seek(2)
     segments: list[tuple[int, bytes]] = []
     frame: tuple[int, int, int] | None = None
+    sampling: tuple[int, ...] = ()
     several = False
     for _ in range(MOST_SEGMENTS):
         marker = _next_marker(file)
@@ -115,6 +127,7 @@ def read_jpeg_header(file: BinaryIO) -> JpegHeader:
         if marker in _FRAMES and len(payload) >= 6:
             height, width = (int.from_bytes(payload[k : k + 2], "big") for k in (1, 3))
             frame, several = (width, height, payload[5]), marker in _SEVERAL_SCANS
+            sampling = tuple(payload[7 : 6 + 3 * payload[5] : 3])
         elif 0xE0 <= marker <= 0xEF:
             segments.append((marker, payload))
         if file.tell() > MOST_HEADER_BYTES:
@@ -136,6 +149,7 @@ def read_jpeg_header(file: BinaryIO) -> JpegHeader:
         channels=frame[2],
         segments=tuple(segments),
         scan_offset=offset,
+        sampling=sampling,
         several_scans=several or (bool(bands) and bands[0] < frame[2]),
     )
 

@@ -212,6 +212,7 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         shutter=find_shutter(header.exif.text(tag.MODEL), lens.captured_mp, rolling),
         velocity_ned=read_velocity(header.xmp),
         editor=find_editor(header.exif, header.xmp),
+        coding="" if header.jpeg is None else header.jpeg.coding,
         notes=tuple(n for n in (*_broken_notes(header), *strange, *seen, *more) if n),
     )
 

@@ -21,6 +21,7 @@ from skyquilt.photos.implausible_positions import (
 )
 from skyquilt.photos.metadata import NO_HEMISPHERE
 from skyquilt.photos.read import ReadPhoto, read_photo
+from skyquilt.photos.recoded import with_editors
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
 from skyquilt.video.read import CLIP_ENDINGS, side_files
@@ -167,7 +168,7 @@ def read_survey(
     if cameras:
         photos, more = apply_cameras(photos, read_cameras_json(cameras), file=cameras)
         notes = (*notes, *more)
-    photos, implausible = placed_plausibly(photos)
+    photos, implausible = placed_plausibly(with_editors(photos))
     return Survey(
         photos=photos,
         rejected=tuple(sorted((*rejected, *copies), key=lambda r: r.name)),
