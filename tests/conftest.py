@@ -1,6 +1,7 @@
 """A small simulated flight and its mosaic, made once."""
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from skyquilt.simulate.camera import Lens
 from skyquilt.simulate.settings import Control, Route
 from skyquilt.workflows.mosaic import iter_mosaic
 from tests.once import flown_once
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
 
 # on a busy machine a time limit per example judges the machine
 hypothesis_settings.register_profile("skyquilt", deadline=None)
@@ -62,3 +65,15 @@ def finished(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """The longest test begins first, so that it does not run alone after all others."""
     items.sort(key=lambda item: "test_large_survey" not in item.nodeid)
+
+
+@pytest.fixture
+def survey_data() -> Callable[[str], Path]:
+    """A real survey beside the checkout; the test is skipped where it is missing."""
+
+    def find(name: str) -> Path:
+        if not (DATA / name).is_dir():
+            pytest.skip(f"real survey missing: {DATA / name}")
+        return DATA / name
+
+    return find

@@ -11,7 +11,6 @@ import pytest
 from PIL import Image
 
 MakeJpeg = Callable[..., Path]
-DATA = Path(__file__).parents[2].parent / "shared" / "data"
 
 
 def pixels(width: int = 96, height: int = 64, seed: int = 0) -> np.ndarray:
@@ -108,15 +107,3 @@ def make_jpeg(tmp_path: Path) -> MakeJpeg:
         return path
 
     return make
-
-
-@pytest.fixture
-def survey_data() -> Callable[[str], Path]:
-    """A real survey beside the checkout; the test is skipped where it is missing."""
-
-    def find(name: str) -> Path:
-        if not (DATA / name).is_dir():
-            pytest.skip(f"real survey missing: {DATA / name}")
-        return DATA / name
-
-    return find
