@@ -7,9 +7,8 @@ import pytest
 from PIL import Image
 
 from skyquilt.photos.headers import read_jpeg_header
-from skyquilt.photos.recoded import UNNAMED, with_editors
+from skyquilt.photos.recoded import UNNAMED, recoded
 from skyquilt.photos.survey import read_survey
-from tests.alignment.surveys import photo
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)
 
@@ -41,30 +40,21 @@ def test_coding(data, coding):
     assert read_jpeg_header(io.BytesIO(data)).coding == coding
 
 
-def coded(*codings, **more):
-    return [photo(f"{i}.jpg", coding=c, **more) for i, c in enumerate(codings)]
-
-
-def editors(photos):
-    return [p.editor for p in with_editors(photos)]
+def odd(codings, cameras=None):
+    return [i for i, other in enumerate(recoded(cameras or "x" * len(codings), codings)) if other]
 
 
 def test_the_few_that_are_coded_otherwise_were_rewritten():
-    assert editors(coded("a", "a", "b", "a")) == [None, None, UNNAMED, None]
+    assert odd("aaba") == [2]
 
 
-def test_nothing_is_told_by_few_photos_or_halves():
-    assert editors(coded("a", "b", "a")) == [None] * 3
-    assert editors(coded("a", "b") * 3) == [None] * 6
+def test_nothing_is_told_by_few_files_or_halves():
+    assert odd("aba") == odd("ababab") == odd("") == []
 
 
 def test_each_camera_codes_its_own_way():
-    assert editors(coded("a", "a", "a", key="x") + coded("b", key="y")) == [None] * 4
-
-
-def test_a_program_that_is_named_stays():
-    photos = coded("a", "a", "a", "b", editor="Some Viewer")
-    assert editors(photos) == ["Some Viewer"] * 4
+    assert odd("aaabbbb", "xxxyyyy") == []
+    assert odd("aaabbbba", "xxxyyyyy") == [7]
 
 
 def test_a_survey_names_them(tmp_path):

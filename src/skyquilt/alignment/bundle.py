@@ -29,7 +29,7 @@ from skyquilt.alignment.stages import believe_positions, fine_steps, plain, roug
 from skyquilt.alignment.start import Start, find_start, ground_of
 from skyquilt.alignment.tracks import Thinning, Tracks, build_tracks, thin
 from skyquilt.alignment.triangulate import triangulated
-from skyquilt.alignment.upside_down import turned_notes, upside_down
+from skyquilt.alignment.upside_down import turned_note, upside_down
 from skyquilt.engine.free_memory import give_back
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.errors import AlignmentError
@@ -224,9 +224,11 @@ class Bundle:
             problem, state = step(problem, state)
         del step
         make_room()
+        said = tuple[str, ...]()
         if self.repair:
-            found = upside_down(problem, state, setup, photos, priors, keep.within("turned"))
+            found = upside_down(problem, state, setup, keep.within("turned"))
             if found.rows.any():
+                said = (turned_note([photos[i].name for i in setup.members[found.rows]]),)
                 problem, state, setup = found.problem, found.state, found.setup
                 aside = SetAside(found.turned_tracks(aside.get()), large=large)
         setup = setup.moving_as(photos, state.C)
@@ -246,7 +248,7 @@ class Bundle:
         done = _outcome(
             photos, frame, setup, start, ties, problem, state, reports, predicted=self.thorough
         )
-        done = replace(done, notes=(*done.notes, *turned_notes(setup, photos, priors)))
+        done = replace(done, notes=(*done.notes, *said))
         held = setup.georeferenced or any(not c.check for c in reports)
         return done if held or tilts_reported(priors) else levelled(done)
 

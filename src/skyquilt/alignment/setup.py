@@ -69,6 +69,10 @@ class Setup:
     """(n,) similarity factors of the start; they give the first points on the ground plane."""
     plane_t: NDArray[np.complex128]
     """(n,) translations of the start."""
+    rewritten: tuple[str, ...]
+    """(n,) the program that rewrote the file of each row; empty where none did, and where a heading
+    tells how the file lies.
+    """
     in_space: bool = False
     """The first points are where rays meet near the ground plane, not on it."""
 
@@ -223,6 +227,10 @@ def set_up(
         start_C=start_C,
         plane_a=a,
         plane_t=t,
+        rewritten=tuple(
+            "" if np.isfinite(priors[m].yaw_deg) else photos[m].editor or ""
+            for m in members.tolist()
+        ),
         in_space=start.in_space,
     )
 

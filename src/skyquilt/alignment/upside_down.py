@@ -17,8 +17,6 @@ from skyquilt.alignment.problem import Problem, State
 from skyquilt.alignment.setup import HALF_TURN, Setup
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.engine.kept import MADE_NOW, Keep
-from skyquilt.model.photo import Photo
-from skyquilt.model.poses import Prior
 from skyquilt.photos.side_rows import sentence_of
 
 Mask = NDArray[np.bool_]
@@ -50,19 +48,12 @@ class Unturned:
         return replace(tracks, px=_turned_px(tracks.px, mine, self.setup.size[tracks.photo]))
 
 
-def upside_down(
-    problem: Problem,
-    state: State,
-    setup: Setup,
-    photos: Sequence[Photo],
-    priors: Sequence[Prior],
-    keep: Keep = MADE_NOW,
-) -> Unturned:
+def upside_down(problem: Problem, state: State, setup: Setup, keep: Keep = MADE_NOW) -> Unturned:
     """Finds the files that were turned, among those that report no heading: all that one program
     rewrote of a camera's photos, or none of them; the clearest first, since it hides others.
     """
     rows = np.zeros(len(setup.members), bool)
-    groups = list(_rewritten(setup, photos, priors))
+    groups = list(_rewritten(setup))
     while groups:
         part = keep.within(str(len(groups)))
         gains = [
@@ -78,33 +69,25 @@ def upside_down(
     return Unturned(problem=problem, state=state, setup=setup, rows=rows)
 
 
-def turned_notes(setup: Setup, photos: Sequence[Photo], priors: Sequence[Prior]) -> tuple[str, ...]:
+def turned_note(names: Sequence[str]) -> str:
     """A sentence on the files that only the lens shows to be turned."""
-    names = [
-        photos[i].name
-        for i in setup.members.tolist()
-        if setup.turned[i] and not np.isfinite(priors[i].yaw_deg)
-    ]
-    if not names:
-        return ()
     files = "1 file was" if len(names) == 1 else f"{len(names)} files were"
     return (
         f"{files} turned upside down by another program, as the lens shows: {sentence_of(names)}."
-        " They are used as the camera took them.",
+        " They are used as the camera took them."
     )
 
 
-def _rewritten(setup: Setup, photos: Sequence[Photo], priors: Sequence[Prior]) -> Iterator[Rows]:
+def _rewritten(setup: Setup) -> Iterator[Rows]:
     """Rows of the photos without a heading that another program rewrote, by camera and program;
     without the camera's other photos, nothing tells how its lens lies.
     """
     groups: dict[tuple[int, str], list[int]] = {}
-    for row, (i, camera) in enumerate(
-        zip(setup.members.tolist(), setup.camera.tolist(), strict=True)
+    for row, (camera, program) in enumerate(
+        zip(setup.camera.tolist(), setup.rewritten, strict=True)
     ):
-        editor = photos[i].editor
-        if editor is not None and not np.isfinite(priors[i].yaw_deg):
-            groups.setdefault((camera, editor), []).append(row)
+        if program:
+            groups.setdefault((camera, program), []).append(row)
     number = np.bincount(setup.camera)
     for (camera, _), rows in groups.items():
         if len(rows) < number[camera]:

@@ -2,30 +2,25 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
-
-from skyquilt.model.photo import Photo
 
 UNNAMED = "a program that its metadata do not name"
+"""The editor of such files."""
 LEAST = 3
-"""Photos of a camera that must be coded alike to tell how it codes."""
+"""Files of a camera that must be coded alike to tell how it codes."""
 
 
-def with_editors(photos: Sequence[Photo]) -> tuple[Photo, ...]:
-    """The photos; those coded otherwise than most of their camera have an unnamed editor, unless
-    they name one. A camera codes all its photos alike, but for their quality.
+def recoded(cameras: Sequence[str], codings: Sequence[str]) -> list[bool]:
+    """Which files, of these cameras, are coded otherwise than most files of their camera: a camera
+    codes all alike, but for their quality.
     """
     groups: dict[str, Counter[str]] = {}
-    for photo in photos:
-        groups.setdefault(photo.camera_key, Counter())[photo.coding] += 1
+    for camera, coding in zip(cameras, codings, strict=True):
+        groups.setdefault(camera, Counter())[coding] += 1
     usual = {}
-    for key, codings in groups.items():
-        coding, number = codings.most_common(1)[0]
-        if number >= LEAST and 2 * number > codings.total():
-            usual[key] = coding
-    return tuple(
-        replace(p, editor=UNNAMED)
-        if p.editor is None and p.coding != usual.get(p.camera_key, p.coding)
-        else p
-        for p in photos
-    )
+    for camera, group in groups.items():
+        coding, number = group.most_common(1)[0]
+        if number >= LEAST and 2 * number > group.total():
+            usual[camera] = coding
+    return [
+        coding != usual.get(camera, coding) for camera, coding in zip(cameras, codings, strict=True)
+    ]

@@ -3,7 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -21,7 +21,7 @@ from skyquilt.photos.implausible_positions import (
 )
 from skyquilt.photos.metadata import NO_HEMISPHERE
 from skyquilt.photos.read import ReadPhoto, read_photo
-from skyquilt.photos.recoded import with_editors
+from skyquilt.photos.recoded import UNNAMED, recoded
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
 from skyquilt.video.read import CLIP_ENDINGS, side_files
@@ -168,7 +168,7 @@ def read_survey(
     if cameras:
         photos, more = apply_cameras(photos, read_cameras_json(cameras), file=cameras)
         notes = (*notes, *more)
-    photos, implausible = placed_plausibly(with_editors(photos))
+    photos, implausible = placed_plausibly(_with_editors(photos))
     return Survey(
         photos=photos,
         rejected=tuple(sorted((*rejected, *copies), key=lambda r: r.name)),
@@ -195,6 +195,15 @@ def placed_plausibly(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[
     ordered, far = without_outliers(ordered)
     ordered, coarse = with_coarse_deviations(ordered)
     return ordered, (*grounded, *stuck, *far, *coarse)
+
+
+def _with_editors(photos: Sequence[Photo]) -> tuple[Photo, ...]:
+    """The photos; those that only their coding shows to be rewritten have an unnamed editor."""
+    other = recoded([p.camera_key for p in photos], [p.coding for p in photos])
+    return tuple(
+        replace(p, editor=UNNAMED) if changed and p.editor is None else p
+        for p, changed in zip(photos, other, strict=True)
+    )
 
 
 def capture_order(photo: Photo) -> tuple[bool, datetime, str]:
