@@ -1,4 +1,6 @@
+import csv
 import math
+from importlib.resources import files
 
 import piexif
 import pytest
@@ -53,9 +55,18 @@ def test_otherwise_it_is_native_or_guessed(make_jpeg, exif):
     else:
         assert (found.source, found.px, found.sigma_px) == (
             "guess",
-            pytest.approx(102),
-            pytest.approx(25.5),
+            pytest.approx(0.75 * 120),
+            pytest.approx(0.75 * 120 * 0.25),
         )
+
+
+def test_a_guess_is_that_of_usual_cameras():
+    """In the middle of the table, and every visible camera within two and a half deviations."""
+    with files("skyquilt.photos").joinpath("sensors.csv").open() as table:
+        rows = [r for r in csv.DictReader(table) if r["band"] == "visible" and r["focal_mm"]]
+    known = [float(r["focal_mm"]) / float(r["sensor_width_mm"]) for r in rows]
+    assert 0.45 < sum(k < 0.75 for k in known) / len(known) < 0.75
+    assert all(abs(k - 0.75) < 2.5 * 0.25 * 0.75 for k in known)
 
 
 def test_an_absurd_focal_length_is_passed_over(make_jpeg):
