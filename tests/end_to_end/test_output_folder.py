@@ -25,7 +25,7 @@ from skyquilt.settings import MosaicSettings
 from skyquilt.workflows import flow
 from skyquilt.workflows.mosaic import STAGES, iter_mosaic
 from tests.end_to_end.conftest import leftovers, named
-from tests.interrupts import hears_interrupts
+from tests.interrupts import hears_interrupts, worked
 
 pytestmark = pytest.mark.filterwarnings(
     "error::RuntimeWarning", "error::scipy.linalg.LinAlgWarning"
@@ -445,7 +445,7 @@ def test_ctrl_c_ends_soon_and_the_same_command_resumes(
 @pytest.mark.parametrize("delay", [0.3, *map(late, (0.2, 0.5, 0.8))])
 def test_ctrl_c_while_the_program_is_still_loading(flight, tmp_path, delay):
     running = Running(flight / "photos", tmp_path / "out", *SLOWER)
-    time.sleep(delay)
+    worked(running.process.pid, delay)
     code, seconds, err = running.signalled(signal.SIGINT)
     assert code == 130, err
     assert seconds < 3
