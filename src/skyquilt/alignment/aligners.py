@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from skyquilt.alignment.addition import added, median_offset
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import control_in_frame
+from skyquilt.alignment.crowded_positions import without_crowded
 from skyquilt.alignment.determined import ground_places
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.oblique import tilted
@@ -44,7 +45,7 @@ class ByLinks:
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -53,6 +54,7 @@ class ByLinks:
         Raises:
             AlignmentError: no two photos are linked.
         """
+        inputs, said = without_crowded(inputs)
         if inputs.former is not None and (grown := added(inputs, self.bundle)) is not None:
             return with_loose_photos(grown, inputs.photos, inputs.priors)
         control = control_in_frame(inputs.control, inputs.photos, inputs.frame)
@@ -67,6 +69,7 @@ class ByLinks:
             inputs.keep,
             inputs.make_room,
         )
+        found = replace(found, notes=(*found.notes, *said))
         return replace(with_loose_photos(found, inputs.photos, inputs.priors), why=REQUESTED)
 
 
@@ -105,7 +108,7 @@ class Auto:
     """For linked photos."""
     pose: ByReport
     """For photos that only have positions."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -114,6 +117,7 @@ class Auto:
         Raises:
             AlignmentError: photos without links and without positions.
         """
+        inputs, said = without_crowded(inputs)
         positions = sum(bool(np.isfinite(p.map_C[:2]).all()) for p in inputs.priors)
         control = sum(not point.check for point in inputs.control)
         blank = () if inputs.links else blank_notes(inputs.features)
@@ -124,7 +128,7 @@ class Auto:
             if blank:
                 raise AlignmentError(f"{error}. {blank[0]}") from error
             raise
-        return replace(found, why=why, notes=(*found.notes, *blank))
+        return replace(found, why=why, notes=(*found.notes, *blank, *said))
 
 
 def blank_notes(features: Sequence[Features]) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.late_positions import moved_note, unshifted
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
-from skyquilt.alignment.oblique_guess import guessed_priors, misled
+from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered, misled
 from skyquilt.alignment.oblique_start import (
     nearer,
     off_positions,
@@ -71,7 +71,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 39
+    version: ClassVar[int] = 40
 
     def __call__(
         self,
@@ -136,6 +136,8 @@ class Bundle:
             if not nearer(other, found, priors):
                 break
             found, aside = other, untold(turned)
+        if lowered(found, priors) is not priors:
+            said.append(LOWERED)
         weak = weak_photos(found, priors)
         if self.repair and (more := found_oblique(found, weak, priors) - aside):
             aside |= more

@@ -12,8 +12,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
+from skyquilt.alignment.crowded_positions import believed
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.late_positions import unshifted
+from skyquilt.alignment.oblique_guess import lowered
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.free_memory import give_back
@@ -196,11 +198,12 @@ def align_photos(
     alignment = yield from clock.stage("align", _align(known, key, methods, clock))
     links.make_room()
     yield from (Note(text=n, warning=True) for n in alignment.notes)
+    trusted = lowered(alignment, believed(alignment, frame, reported))
     return AlignedPhotos(
         given=given,
         found=found,
         frame=frame,
-        priors=tuple(unshifted(alignment, reported, [p.camera_key for p in found.photos])),
+        priors=tuple(unshifted(alignment, trusted, [p.camera_key for p in found.photos])),
         links=links,
         order=tuple(known.order),
         alignment=alignment,
