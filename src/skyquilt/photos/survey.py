@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 from skyquilt.errors import NoPhotosError, UsageError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
 from skyquilt.outside import MOST_MP, plain, walk
+from skyquilt.photos.bands import band_note
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
 from skyquilt.photos.clips import is_timed, read_clips
 from skyquilt.photos.implausible_positions import (
@@ -269,6 +270,7 @@ def survey_notes(photos: Sequence[Photo], copies: int = 0) -> tuple[str, ...]:
     """
     return (
         *_cameras(photos),
+        *band_note(photos),
         *_thermal_units(photos),
         *_gaps(photos),
         *_clocks(photos),
