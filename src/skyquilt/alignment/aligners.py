@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from skyquilt.alignment.addition import added, median_offset
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import control_in_frame
+from skyquilt.alignment.copied_views import without_copied_views
 from skyquilt.alignment.crowded_positions import without_crowded
 from skyquilt.alignment.determined import ground_places
 from skyquilt.alignment.inputs import AlignmentInputs
@@ -69,6 +70,7 @@ class ByLinks:
             inputs.keep,
             inputs.make_room,
         )
+        found = without_copied_views(found, inputs.photos)
         found = replace(found, notes=(*found.notes, *said))
         return replace(with_loose_photos(found, inputs.photos, inputs.priors), why=REQUESTED)
 
