@@ -23,7 +23,6 @@ from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features
-from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Pose, Prior
 
 SHOWN_ALREADY = 0.8
@@ -34,6 +33,10 @@ NEIGHBOURS = 40
 """So many of the nearest connected photos are asked."""
 KEYPOINTS = 8
 """A photo with fewer shows next to nothing: a lens cap, a white sky."""
+TONE_PX, BLACK, WHITE = 64, 12, 243
+"""Longest side in px of a picture that is asked whether it is black or white all over, and the
+levels of 255 below and above which it is.
+"""
 REQUESTED = "asked for"
 """The reason recorded for a method that the user requested."""
 
@@ -57,7 +60,7 @@ class ByLinks:
         """
         inputs, said = without_crowded(inputs)
         if inputs.former is not None and (grown := added(inputs, self.bundle)) is not None:
-            return with_loose_photos(grown, inputs.photos, inputs.priors)
+            return with_loose_photos(grown, inputs)
         control = control_in_frame(inputs.control, inputs.photos, inputs.frame)
         found = self.bundle(
             inputs.photos,
@@ -72,7 +75,7 @@ class ByLinks:
         )
         found = without_copied_views(found, inputs.photos)
         found = replace(found, notes=(*found.notes, *said))
-        return replace(with_loose_photos(found, inputs.photos, inputs.priors), why=REQUESTED)
+        return replace(with_loose_photos(found, inputs), why=REQUESTED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,12 +193,11 @@ def placed_by_metadata(
     return replace(placed, notes=(*placed.notes, *repaired.notes))
 
 
-def with_loose_photos(
-    alignment: Alignment, photos: Sequence[Photo], priors: Sequence[Prior]
-) -> Alignment:
+def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignment:
     """Adds photos without links, placed by their own metadata relative to the adjusted ones, with a
-    note each; photos that lack metadata are rejected.
+    note each; photos that lack metadata, or are black or white, are rejected.
     """
+    photos, priors = inputs.photos, inputs.priors
     poses, cameras = dict(alignment.poses), dict(alignment.cameras)
     camera_of, rejected = dict(alignment.camera_of), dict(alignment.rejected)
     blocks, notes = list(alignment.blocks), list(alignment.notes)
@@ -210,6 +212,9 @@ def with_loose_photos(
             lacking = _lacking(C, priors[i]) or "no heading"
             reason = "it could not be linked to the other photos, and it has"
             rejected[i] = rejected.get(i, f"{reason} {lacking} to place it by")
+            continue
+        if one_tone(inputs, i):
+            rejected[i] = "it is black or white all over"
             continue
         weak = rejected.pop(i, "it could not be linked to any other photo")
         R = cam_R_map_from_angles(priors[i].yaw_deg, priors[i].pitch_deg, priors[i].roll_deg)
@@ -232,6 +237,17 @@ def with_loose_photos(
         blocks=tuple(blocks),
         notes=tuple(notes),
     )
+
+
+def one_tone(inputs: AlignmentInputs, i: int) -> bool:
+    """Whether a photo is black or white all over: a lens cap, a failed exposure. It would be drawn
+    as a hole in the map. Measured values are none.
+    """
+    photo = inputs.photos[i]
+    if photo.dtype != "uint8" or photo.unit or len(inputs.features[i].px) >= KEYPOINTS:
+        return False
+    dark, light = np.percentile(inputs.grey(i, TONE_PX), [1, 99])
+    return bool(light < BLACK or dark > WHITE)
 
 
 def shown_already(pose: Pose, camera: Camera, alignment: Alignment) -> bool:

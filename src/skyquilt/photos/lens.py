@@ -184,9 +184,8 @@ def _on_plane(exif: Exif, width: int, height: int) -> Focal | None:
 
 
 def _believed_plane(exif: Exif, width: int, height: int) -> Focal | None:
-    """By focal-plane resolution, in the unit with which it agrees with the 35 mm equivalent: cameras
-    confuse inches and centimetres. Where it agrees with none, one of the two is wrong, and either
-    may be.
+    """By focal-plane resolution, in the unit with which it agrees with the 35 mm equivalent, since
+    cameras confuse inches and centimetres. Where it agrees in none, either of the two may be wrong.
     """
     found, rounded = _on_plane(exif, width, height), _from_35mm(exif, width, height)
     if found is None or rounded is None or _agree(found.px, rounded.px):
