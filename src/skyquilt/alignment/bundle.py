@@ -9,6 +9,7 @@ import numpy as np
 from skyquilt.alignment.adjust import covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
 from skyquilt.alignment.determined import weak_photos
+from skyquilt.alignment.displaced_parts import brought_together
 from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.late_positions import moved_note, unshifted
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
@@ -122,6 +123,12 @@ class Bundle:
             if off_positions(other, moved) < off_positions(found, priors):
                 said.append(moved_note(priors, moved))
                 found, priors, name = other, moved, "moved "
+        together = brought_together(found, photos, priors) if self.repair else None
+        if together is not None:
+            other = block(aside, together.priors, "together ")
+            if off_positions(other, together.priors) < off_positions(found, priors):
+                said.append(together.note)
+                found, priors, name = other, together.priors, "together "
         linked = len({i for k in links for i in (k.a, k.b)})
         if self.repair and misled(found, priors, linked):
             guess = guessed_priors(photos, priors, features, links)
