@@ -106,6 +106,8 @@ class InputSettings:
     """One of `THERMAL_UNITS`: what values of single-band TIFFs mean; None = found from the file, as
     is whether they are thermal.
     """
+    band: str | None = None
+    """Band that the map shows, of cameras that write a file for each; None = the usual one."""
     lever_arm: tuple[float, float, float] | None = None
     """From the antenna, to which reported positions refer, to the camera: right, forward, up in m
     in the aircraft's body; None = positions are those of the camera.

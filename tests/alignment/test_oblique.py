@@ -5,15 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment.aligners import shown_already
+from skyquilt.alignment.aligners import shown_already, with_loose_photos
 from skyquilt.alignment.determined import deviation_px, weak_photos
 from skyquilt.alignment.dominant_plane import dominant_normal, levelled
+from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.oblique import reported_oblique, resected, tilt_deg
 from skyquilt.geometry.camera import project, rays
 from skyquilt.geometry.frames import cam_R_map_from_angles, rotation_from_vector
 from skyquilt.model.camera import Camera
+from skyquilt.model.features import Features
 from skyquilt.model.poses import Alignment, MapFrame, Pose, TiePoints
-from tests.alignment.surveys import prior
+from tests.alignment.surveys import photo, prior
 
 CAMERA = Camera(width=1000, height=750, focal=830.0, cx=505.0, cy=371.0, k1=-0.08, k2=0.03)
 LOCAL = MapFrame(crs=None, origin=(0.0, 0.0), vertical_datum="unknown")
@@ -174,3 +176,26 @@ def test_a_photo_without_links_is_not_drawn_over_what_others_show():
     assert shown_already(pose(70, 0, z=-1.0), CAMERA, done)  # taken on the ground
     assert not shown_already(pose(75, 0), CAMERA, done)
     assert not shown_already(pose(0, 0, z=200.0), CAMERA, done)
+
+
+@pytest.mark.parametrize(("level", "placed"), [(0, False), (255, False), (11, False), (90, True)])
+def test_a_black_or_white_photo_is_not_placed_by_its_metadata(level, placed):
+    where = [pose(20.0 * x, 20.0 * y) for x in range(3) for y in range(3)]
+    done = replace(block(where, hills(600)), frame=replace(LOCAL, crs="EPSG:32630"))
+    photos = [photo(f"{i}.jpg", key="A") for i in range(10)]
+    blank = Features(
+        px=np.zeros((0, 2)), size=np.zeros(0), descriptors=np.zeros((0, 4), np.uint8), scale=1.0
+    )
+    inputs = AlignmentInputs(
+        photos=photos,
+        features=[blank] * 10,
+        frame=done.frame,
+        priors=[*(prior(p.map_C) for p in where), prior((110.0, 20.0, 60.0))],
+        links=(),
+        control=(),
+        order=range(10),
+        grey=lambda i, longest: np.full((48, longest), level, np.uint8),
+    )
+    found = with_loose_photos(done, inputs)
+    assert (9 in found.poses) == placed
+    assert placed or "black or white" in found.rejected[9]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skyquilt.alignment.bundle import Bundle
-from skyquilt.alignment.oblique_guess import guessed_priors
+from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered
 from skyquilt.alignment.oblique_start import reported_start, slanting, tilt_warnings, turned_priors
 from skyquilt.alignment.triangulate import regular
 from skyquilt.geometry.camera import project
@@ -183,6 +183,26 @@ def test_headings_that_are_all_false_by_one_angle_are_corrected(turn):
     away, turned = flown.errors(found)
     assert np.median(away) < 0.8
     assert np.median(turned) < 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_pitch_counted_from_straight_down_is_found_by_the_pictures(seed):
+    flown = Slanting(grid(2), seed=seed)
+    ahead = [replace(p, yaw_deg=p.yaw_deg, pitch_deg=p.pitch_deg + 90) for p in flown.priors]
+    flown.priors = ahead
+    found = flown.aligned()
+    assert len(found.held) == len(flown.photos)
+    assert np.median(flown.errors(found)[0]) < 2.0
+    assert LOWERED in found.notes
+    for own, where in zip(lowered(found, ahead), flown.truth, strict=True):
+        R = cam_R_map_from_angles(own.yaw_deg, own.pitch_deg, own.roll_deg)
+        assert np.degrees(np.arccos((np.trace(R @ where.cam_R_map.T) - 1) / 2)) < 5
+
+
+def test_what_looks_at_the_horizon_is_not_lowered():
+    flown = Slanting(orbit(24, 40, pitch=72), seed=1)
+    found = replace(flown.aligned(), poses=dict(enumerate(flown.truth)))
+    assert lowered(found, flown.priors) is flown.priors
 
 
 def test_photos_without_angles_are_guessed_to_look_at_the_middle():

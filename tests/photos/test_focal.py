@@ -206,3 +206,25 @@ def test_contradicting_focal_lengths_are_named_with_both_values(make_jpeg):
     exif = exif_of("FC300S", FocalLength=(361, 100), FocalLengthIn35mmFilm=35)
     notes = read_photo(make_jpeg(exif=exif, image=pixels(120, 90))).notes
     assert any("corresponds to 69 px, its 35 mm equivalent to 121 px" in n for n in notes)
+
+
+@pytest.mark.parametrize(
+    ("unit", "per_unit", "px", "sigma"),
+    [
+        (3, 250, 100.0, 3.0),  # centimetres, as stated: 4 mm at 25 px a mm
+        (2, 250, 100.0, 3.0),  # said to be inches: 39 px
+        (3, 500, 200.0, 100.0),  # a unit that is none: either may be right
+    ],
+)
+def test_a_focal_plane_in_another_unit_than_stated(make_jpeg, unit, per_unit, px, sigma):
+    exif = exif_of(
+        "Unknown",
+        FocalLength=(4, 1),
+        FocalPlaneXResolution=(per_unit, 1),
+        FocalPlaneResolutionUnit=unit,
+        FocalLengthIn35mmFilm=29,  # 100.5 px
+    )
+    found = focal(make_jpeg, exif)
+    assert found.source == "focal-plane"
+    assert found.px == pytest.approx(px, rel=0.01)
+    assert found.sigma_px == pytest.approx(sigma, rel=0.02)

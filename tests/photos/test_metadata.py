@@ -166,6 +166,22 @@ def test_pix4d_angles_count_from_nadir(make_jpeg):
     assert attitude.source == "xmp-camera"
 
 
+@pytest.mark.parametrize(("pitch", "down"), [("-90", 0), ("+90", 0), ("+88", 2), ("-88", 2)])
+def test_a_gimbal_that_looks_to_the_zenith_has_the_other_sign(make_jpeg, pitch, down):
+    xmp = dji_xmp(GimbalYawDegree="20", GimbalPitchDegree=pitch, GimbalRollDegree="0")
+    photo = read_photo(make_jpeg(xmp=xmp))
+    assert photo.attitude.yaw_deg == pytest.approx(20)
+    assert (photo.attitude.pitch_deg, photo.attitude.roll_deg) == pytest.approx((down, 0))
+    assert any("taken for" in note for note in photo.notes) == pitch.startswith("+")
+
+
+def test_gimbal_angles_that_are_all_zero_were_not_measured(make_jpeg):
+    xmp = dji_xmp(GimbalYawDegree="0.00", GimbalPitchDegree="0.00", GimbalRollDegree="+0.00")
+    photo = read_photo(make_jpeg(xmp=xmp))
+    assert photo.attitude is None
+    assert any("all zero" in note for note in photo.notes)
+
+
 def test_broken_xmp_is_searched_as_text(make_jpeg):
     xmp = dji_xmp(RelativeAltitude="+39.80").replace("/>", ">")
     photo = read_photo(make_jpeg(exif=dji_exif(), xmp=xmp))

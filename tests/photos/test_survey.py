@@ -7,7 +7,9 @@ import pytest
 from PIL import Image
 
 from skyquilt.errors import NoPhotosError, SideFileError, UsageError
+from skyquilt.model.photo import RejectedPhoto
 from skyquilt.photos.contradictions import contradictions
+from skyquilt.photos.read import read_photo
 from skyquilt.photos.survey import read_survey
 
 from .conftest import dji_exif, dji_xmp, gps_exif, pixels
@@ -230,3 +232,22 @@ def test_a_flight_at_height_zero_counts_from_sea_level_instead(make_jpeg):
         (p.position.altitude_m, p.position.datum, p.position.takeoff_m) for p in survey.photos
     } == {(198.3, "sea_level", None)}
     assert any("were not used" in n for n in survey.notes)
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        (b"\0\0\0\x18ftypheic\0\0\0\0mif1heic", "a HEIC picture"),
+        (b"\0\0\0\x1cftypavif", "an AVIF picture"),
+        (b"RIFF\x10\0\0\0WEBPVP8 ", "a WebP picture"),
+        (b"<html><body>403 forbidden", "a web page"),
+        (b"version https://git-lfs.github.com/spec/v1", "Git LFS"),
+        (bytes(5000), "interrupted copy"),
+        (b"something else", "neither JPEG, TIFF nor PNG"),
+    ],
+)
+def test_other_content_under_the_name_of_a_photo_is_named(tmp_path, content, what):
+    path = tmp_path / "DJI_0001.JPG"
+    path.write_bytes(content)
+    found = read_photo(path)
+    assert isinstance(found, RejectedPhoto) and what in found.reason

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from skyquilt.alignment.addition import added, median_offset
 from skyquilt.alignment.bundle import Bundle
 from skyquilt.alignment.control import control_in_frame
+from skyquilt.alignment.copied_views import without_copied_views
+from skyquilt.alignment.crowded_positions import without_crowded
 from skyquilt.alignment.determined import ground_places
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.oblique import tilted
@@ -21,7 +23,6 @@ from skyquilt.geometry.camera import project
 from skyquilt.geometry.frames import cam_R_map_from_angles
 from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features
-from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Pose, Prior
 
 SHOWN_ALREADY = 0.8
@@ -32,6 +33,10 @@ NEIGHBOURS = 40
 """So many of the nearest connected photos are asked."""
 KEYPOINTS = 8
 """A photo with fewer shows next to nothing: a lens cap, a white sky."""
+TONE_PX, BLACK, WHITE = 64, 12, 243
+"""Longest side in px of a picture that is asked whether it is black or white all over, and the
+levels of 255 below and above which it is.
+"""
 REQUESTED = "asked for"
 """The reason recorded for a method that the user requested."""
 
@@ -44,7 +49,7 @@ class ByLinks:
 
     bundle: Bundle = field(default_factory=Bundle)
     """The adjustment."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -53,8 +58,9 @@ class ByLinks:
         Raises:
             AlignmentError: no two photos are linked.
         """
+        inputs, said = without_crowded(inputs)
         if inputs.former is not None and (grown := added(inputs, self.bundle)) is not None:
-            return with_loose_photos(grown, inputs.photos, inputs.priors)
+            return with_loose_photos(grown, inputs)
         control = control_in_frame(inputs.control, inputs.photos, inputs.frame)
         found = self.bundle(
             inputs.photos,
@@ -67,7 +73,9 @@ class ByLinks:
             inputs.keep,
             inputs.make_room,
         )
-        return replace(with_loose_photos(found, inputs.photos, inputs.priors), why=REQUESTED)
+        found = without_copied_views(found, inputs.photos)
+        found = replace(found, notes=(*found.notes, *said))
+        return replace(with_loose_photos(found, inputs), why=REQUESTED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +113,7 @@ class Auto:
     """For linked photos."""
     pose: ByReport
     """For photos that only have positions."""
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
     needs_links: ClassVar[bool] = True
 
     def __call__(self, inputs: AlignmentInputs) -> Alignment:
@@ -114,6 +122,7 @@ class Auto:
         Raises:
             AlignmentError: photos without links and without positions.
         """
+        inputs, said = without_crowded(inputs)
         positions = sum(bool(np.isfinite(p.map_C[:2]).all()) for p in inputs.priors)
         control = sum(not point.check for point in inputs.control)
         blank = () if inputs.links else blank_notes(inputs.features)
@@ -124,7 +133,7 @@ class Auto:
             if blank:
                 raise AlignmentError(f"{error}. {blank[0]}") from error
             raise
-        return replace(found, why=why, notes=(*found.notes, *blank))
+        return replace(found, why=why, notes=(*found.notes, *blank, *said))
 
 
 def blank_notes(features: Sequence[Features]) -> tuple[str, ...]:
@@ -184,12 +193,11 @@ def placed_by_metadata(
     return replace(placed, notes=(*placed.notes, *repaired.notes))
 
 
-def with_loose_photos(
-    alignment: Alignment, photos: Sequence[Photo], priors: Sequence[Prior]
-) -> Alignment:
+def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignment:
     """Adds photos without links, placed by their own metadata relative to the adjusted ones, with a
-    note each; photos that lack metadata are rejected.
+    note each; photos that lack metadata, or are black or white, are rejected.
     """
+    photos, priors = inputs.photos, inputs.priors
     poses, cameras = dict(alignment.poses), dict(alignment.cameras)
     camera_of, rejected = dict(alignment.camera_of), dict(alignment.rejected)
     blocks, notes = list(alignment.blocks), list(alignment.notes)
@@ -204,6 +212,9 @@ def with_loose_photos(
             lacking = _lacking(C, priors[i]) or "no heading"
             reason = "it could not be linked to the other photos, and it has"
             rejected[i] = rejected.get(i, f"{reason} {lacking} to place it by")
+            continue
+        if one_tone(inputs, i):
+            rejected[i] = "it is black or white all over"
             continue
         weak = rejected.pop(i, "it could not be linked to any other photo")
         R = cam_R_map_from_angles(priors[i].yaw_deg, priors[i].pitch_deg, priors[i].roll_deg)
@@ -226,6 +237,17 @@ def with_loose_photos(
         blocks=tuple(blocks),
         notes=tuple(notes),
     )
+
+
+def one_tone(inputs: AlignmentInputs, i: int) -> bool:
+    """Whether a photo is black or white all over: a lens cap, a failed exposure. It would be drawn
+    as a hole in the map. Measured values are none.
+    """
+    photo = inputs.photos[i]
+    if photo.dtype != "uint8" or photo.unit or len(inputs.features[i].px) >= KEYPOINTS:
+        return False
+    dark, light = np.percentile(inputs.grey(i, TONE_PX), [1, 99])
+    return bool(light < BLACK or dark > WHITE)
 
 
 def shown_already(pose: Pose, camera: Camera, alignment: Alignment) -> bool:

@@ -9,11 +9,12 @@ import numpy as np
 from skyquilt.alignment.adjust import covariance
 from skyquilt.alignment.control import Control, hold_to_control, residuals_of_control
 from skyquilt.alignment.determined import weak_photos
+from skyquilt.alignment.displaced_parts import brought_together
 from skyquilt.alignment.dominant_plane import levelled
 from skyquilt.alignment.late_positions import moved_note, unshifted
 from skyquilt.alignment.least_squares_matching import GreyPicture, LeastSquaresMatching
 from skyquilt.alignment.oblique import found_oblique, hung, reported_oblique, tilts_reported
-from skyquilt.alignment.oblique_guess import guessed_priors, misled
+from skyquilt.alignment.oblique_guess import LOWERED, guessed_priors, lowered, misled
 from skyquilt.alignment.oblique_start import (
     nearer,
     off_positions,
@@ -72,7 +73,7 @@ class Bundle:
     """Whether observations are weighed by what their residuals show, and the accuracy is predicted.
     False takes a third of the time, for blocks that are soon adjusted again.
     """
-    version: ClassVar[int] = 40
+    version: ClassVar[int] = 41
 
     def __call__(
         self,
@@ -123,6 +124,12 @@ class Bundle:
             if off_positions(other, moved) < off_positions(found, priors):
                 said.append(moved_note(priors, moved))
                 found, priors, name = other, moved, "moved "
+        together = brought_together(found, photos, priors) if self.repair else None
+        if together is not None:
+            other = block(aside, together.priors, "together ")
+            if off_positions(other, together.priors) < off_positions(found, priors):
+                said.append(together.note)
+                found, priors, name = other, together.priors, "together "
         linked = len({i for k in links for i in (k.a, k.b)})
         if self.repair and misled(found, priors, linked):
             guess = guessed_priors(photos, priors, features, links)
@@ -137,6 +144,8 @@ class Bundle:
             if not nearer(other, found, priors):
                 break
             found, aside = other, untold(turned)
+        if lowered(found, priors) is not priors:
+            said.append(LOWERED)
         weak = weak_photos(found, priors)
         if self.repair and (more := found_oblique(found, weak, priors) - aside):
             aside |= more

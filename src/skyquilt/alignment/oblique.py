@@ -87,7 +87,7 @@ def hung(
     """The alignment with the photos kept aside placed by its tie points, the best linked first, and
     without those that hang on it by too little (`weak`, with reasons: `determined.weak_photos`).
     """
-    alignment = _without(alignment, weak)
+    alignment = without_photos(alignment, weak)
     left = set(aside)
     while left:
         counted = {i: _points_of(i, alignment, features, links) for i in sorted(left)}
@@ -98,7 +98,8 @@ def hung(
     return alignment
 
 
-def _without(alignment: Alignment, gone: Mapping[int, str]) -> Alignment:
+def without_photos(alignment: Alignment, gone: Mapping[int, str]) -> Alignment:
+    """The alignment without some photos and their observations; `gone`: why each is left out."""
     if not gone:
         return alignment
     return replace(

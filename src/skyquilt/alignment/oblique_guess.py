@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyquilt.alignment.determined import STATED_DEG
-from skyquilt.alignment.oblique import tilts_reported
+from skyquilt.alignment.oblique import OBLIQUE_DEG, tilt_deg, tilts_reported
 from skyquilt.alignment.oblique_start import off_positions, slanting, turned_far
-from skyquilt.geometry.frames import cam_R_map_from_angles
+from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Prior
@@ -34,8 +34,13 @@ CLEARER = 0.5
 """A guess is taken whose rays miss by less than this share of what they missed by before."""
 TILTS_DEG = (40, 45, 50, 55, 60, 65, 70, 75)
 """Tilts that are tried where none is reported, all oblique ones: the adjustment finds the rest."""
+LEVEL_DEG, NEARLY_ALL = 70.0, 0.9
+"""A photo that reports a larger tilt looks at the horizon; and the share of photos that must."""
 TURN_DEG = 15
 """Headings are turned by multiples of this angle."""
+
+_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+"""Turns a camera that looks ahead downwards, about its axis to the right."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -84,8 +89,33 @@ def guessed_priors(
     return best
 
 
+def lowered(found: Alignment, priors: Sequence[Prior]) -> Sequence[Prior]:
+    """The priors with pitch counted from straight down, where nearly all photos report that they
+    look at the horizon and the pictures show that they look down; otherwise the very same priors.
+    """
+    level = sum(_tilt_deg(priors[i]) > LEVEL_DEG for i in found.held)
+    down = sum(tilt_deg(found.poses[i].cam_R_map) < OBLIQUE_DEG for i in found.held)
+    most = max(1.0, NEARLY_ALL * len(found.held))
+    if not tilts_reported(priors) or level < most or down < most:
+        return priors
+    return [_lowered(p) if _tilt_deg(p) > LEVEL_DEG else p for p in priors]
+
+
+LOWERED = (
+    "The photos report that they look at the horizon, and the pictures show that they look down:"
+    " their pitch was counted from straight down."
+)
+"""What is said of priors that were lowered."""
+
+
+def _tilt_deg(prior: Prior) -> float:
+    return tilt_deg(cam_R_map_from_angles(0.0, prior.pitch_deg, prior.roll_deg))
+
+
 def _guesses(priors: Sequence[Prior]) -> Iterator[list[Prior]]:
-    """Photos that look at the middle of their positions, and headings turned by one angle."""
+    """Photos that look at the middle of their positions, headings turned by one angle, and pitch
+    counted from straight down.
+    """
     xy = np.array([p.map_C[:2] for p in priors])
     east, north = (np.nanmedian(xy, axis=0) - xy).T
     inwards = np.degrees(np.arctan2(east, north)).tolist()
@@ -93,9 +123,19 @@ def _guesses(priors: Sequence[Prior]) -> Iterator[list[Prior]]:
         for tilt in TILTS_DEG:
             yield [_looking(p, yaw, float(tilt)) for p, yaw in zip(priors, inwards, strict=True)]
         return
+    yield [_lowered(p) for p in priors]
     yield [replace(p, yaw_deg=yaw) for p, yaw in zip(priors, inwards, strict=True)]
     for turn in range(TURN_DEG, 360, TURN_DEG):
         yield [replace(p, yaw_deg=p.yaw_deg + turn) for p in priors]
+
+
+def _lowered(prior: Prior) -> Prior:
+    """The prior of a photo that looks a right angle below where it is taken to look: some programs
+    count a gimbal's pitch from straight down.
+    """
+    R = cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)
+    yaw, pitch, roll = angles_from_cam_R_map(_DOWN @ R)
+    return replace(prior, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
 
 
 def _looking(prior: Prior, yaw_deg: float, tilt_deg: float) -> Prior:

@@ -98,6 +98,14 @@ def command(
             " of names.",
         ),
     ] = "time",
+    band: Annotated[
+        str | None,
+        option(
+            INPUT,
+            "Band that the map shows, of cameras that write a file for each, e.g. nir.",
+            default="that of most photos",
+        ),
+    ] = None,
     lever_arm: Annotated[
         str | None,
         option(
@@ -346,6 +354,7 @@ def command(
         cameras=cameras,
         distances=distances,
         sequence=sequence,
+        band=band,
         lever_arm=parse_lever_arm(lever_arm),
         repair=repair,
         detector=detector,

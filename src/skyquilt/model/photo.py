@@ -135,6 +135,8 @@ class Photo:
     """Photos with equal keys share their intrinsics: make, model, serial, lens, size, zoom."""
     calibration: Camera | None = None
     """Intrinsics that metadata or a side file give, distortion included."""
+    band_name: str = ""
+    """Band that a file of a multispectral camera shows, in lower case; empty for others."""
     unusable_calibration: str = ""
     """A phrase on what its metadata give as a calibration and no lens can have; it is ignored."""
     focal: Focal

@@ -102,7 +102,9 @@ def find_ground(
     if not rough:
         raise UsageError(
             "no photo shows ground that is seen at less than"
-            f" {picture.max_view_angle:g} degrees from the vertical (--max-view-angle)"
+            f" {picture.max_view_angle:g} degrees from the vertical (--max-view-angle): as placed,"
+            f" half of the photos look {_usual_tilt_deg(alignment):.0f} degrees or more away from"
+            " straight down; check their gimbal angles with `skyquilt inspect`"
         )
     native = native_gsd(rough, flat)
     gsd = picture.gsd_cm / 100 if picture.gsd_cm else round_gsd(native)
@@ -226,6 +228,12 @@ def poses_digest(alignment: Alignment) -> str:
     order = sorted(alignment.poses)
     placed = [(alignment.poses[i], alignment.camera(i).vector) for i in order]
     return digest(order, placed, alignment.frame)
+
+
+def _usual_tilt_deg(alignment: Alignment) -> float:
+    """Median angle of the photos' axes from straight down, in degrees."""
+    down = [-pose.cam_R_map[2, 2] for pose in alignment.poses.values()]
+    return float(np.degrees(np.arccos(np.clip(np.median(down), -1, 1))))
 
 
 def round_gsd(gsd: float) -> float:

@@ -264,6 +264,34 @@ def content_digest(path: Path) -> str:
     return digest.hexdigest()
 
 
+_OTHERS = {
+    b"RIFF": "a WebP picture",
+    b"GIF8": "a GIF picture",
+    b"BM": "a BMP picture",
+    b"%PDF": "a PDF document",
+    b"PK\x03\x04": "a ZIP archive",
+    b"\xff\x0a": "a JPEG XL picture",
+    b"\0\0\0\x0cJXL ": "a JPEG XL picture",
+    b"\0\0\0\x0cjP  ": "a JPEG 2000 picture",
+    b"<": "a web page or other text",
+    b"version ": "a pointer of Git LFS to a file that is not here",
+    b"\0\x05\x16\x07": "macOS's notes on another file",
+    b"\0" * 8: "empty (zeros), as of an interrupted copy",
+}
+"""How files of other formats begin that are found under the name of a photo."""
+_BOXES = {
+    b"hei": "a HEIC picture",
+    b"hev": "a HEIC picture",
+    b"mif": "a HEIC picture",
+    b"avi": "an AVIF picture",
+    b"crx": "a raw picture (CR3)",
+    b"mp4": "a video",
+    b"iso": "a video",
+    b"qt ": "a video",
+}
+"""The same of files of the ISO base media format, by their brand."""
+
+
 def _kind(file: BinaryIO) -> Kind:
     head = file.read(8)
     if not head:
@@ -274,6 +302,12 @@ def _kind(file: BinaryIO) -> Kind:
         return "tiff"
     if head == b"\x89PNG\r\n\x1a\n":
         return "png"
+    known = next((name for magic, name in _OTHERS.items() if head.startswith(magic)), "")
+    if head[4:8] == b"ftyp":
+        known = _BOXES.get(file.read(4)[:3], "a video or HEIF picture")
+    if known:
+        saved = "; save it as JPEG, TIFF or PNG with its metadata" if "picture" in known else ""
+        raise UnreadablePhotoError(f"its content is {known}, whatever its name{saved}")
     raise UnreadablePhotoError("its content is neither JPEG, TIFF nor PNG, whatever its name")
 
 

@@ -125,7 +125,7 @@ def find_focal(
     candidates = (
         _calibrated(calibration),
         _on_sensor(exif, sensor, width, height),
-        _on_plane(exif, width, height),
+        _believed_plane(exif, width, height),
         _from_35mm(exif, width, height),
     )
     long = max(width, height)
@@ -153,7 +153,7 @@ def focal_notes(exif: Exif, sensor: Sensor | None, width: int, height: int) -> t
     )
     direct = _on_sensor(exif, sensor, width, height) or _on_plane(exif, width, height)
     rounded = _from_35mm(exif, width, height)
-    if direct and rounded and not 1 / _APART < direct.px / rounded.px < _APART:
+    if direct and rounded and not _agree(direct.px, rounded.px):
         return zoomed, (
             f"Its focal length in mm corresponds to {direct.px:.0f} px, its 35 mm equivalent to"
             f" {rounded.px:.0f} px; "
@@ -187,6 +187,26 @@ def _on_plane(exif: Exif, width: int, height: int) -> Focal | None:
         return None
     px = mm * resolution / unit * native_scale(exif, width, height)[0] * digital_zoom(exif)
     return Focal(px=px, sigma_px=0.03 * px, source="focal-plane")
+
+
+def _believed_plane(exif: Exif, width: int, height: int) -> Focal | None:
+    """By focal-plane resolution, in the unit with which it agrees with the 35 mm equivalent, since
+    cameras confuse inches and centimetres. Where it agrees in none, either of the two may be wrong.
+    """
+    found, rounded = _on_plane(exif, width, height), _from_35mm(exif, width, height)
+    if found is None or rounded is None or _agree(found.px, rounded.px):
+        return found
+    stated = _MM_PER_UNIT[int(exif.number(tag.PLANE_UNIT) or 2)]
+    for mm in _MM_PER_UNIT.values():
+        px = found.px * stated / mm
+        if _agree(px, rounded.px):
+            return Focal(px=px, sigma_px=0.03 * px, source="focal-plane")
+    apart = abs(found.px - rounded.px)
+    return Focal(px=found.px, sigma_px=max(found.sigma_px, apart), source="focal-plane")
+
+
+def _agree(px: float, other: float) -> bool:
+    return 1 / _APART < px / other < _APART
 
 
 def _from_35mm(exif: Exif, width: int, height: int) -> Focal | None:

@@ -202,6 +202,8 @@ _GIMBAL = (
 )
 _LOOKS_DOWN_AT_MINUS_90 = -45.0
 _MOST_DEG = 720.0
+_LOOKS_UP_DEG = 80.0
+"""No survey camera looks to the zenith: such a pitch has the other sign than the usual one."""
 
 
 def read_attitude(xmp: Xmp) -> tuple[Attitude | None, tuple[str, ...]]:
@@ -210,10 +212,13 @@ def read_attitude(xmp: Xmp) -> tuple[Attitude | None, tuple[str, ...]]:
     `Gimbal*Degree` (DJI, Autel) and `drone-parrot:Camera*Degree` are gimbal angles (pitch -90 =
     nadir). Pix4D's `Camera:Yaw/Pitch/Roll` (senseFly, Parrot Sequoia, MicaSense) are belly angles:
     pitch 0 = nadir. Some files contain -90 there for nadir and are read as gimbal angles, because
-    no survey camera looks backwards to the horizon.
+    no survey camera looks backwards to the horizon. Gimbal angles that are all zero were not
+    measured; a pitch of +90 is taken for -90.
     """
     for names in _GIMBAL:
         yaw, pitch, roll = (xmp.number(name) for name in names)
+        if yaw == pitch == roll == 0:
+            return None, ("Its camera angles are all zero: they were not measured.",)
         if yaw is not None:
             return _impossible(yaw, pitch, roll) or _from_gimbal(yaw, pitch, roll, "xmp-gimbal")
     yaw, pitch, roll = (xmp.number(f"Camera:{a}") for a in ("Yaw", "Pitch", "Roll"))
@@ -275,11 +280,12 @@ def read_flight_tilt(xmp: Xmp) -> tuple[float, float]:
 def _from_gimbal(
     yaw: float, pitch: float | None, roll: float | None, source: str
 ) -> tuple[Attitude, tuple[str, ...]]:
-    notes = (
-        ()
-        if pitch is not None
-        else ("It has a gimbal yaw but no pitch; straight down is assumed.",)
-    )
+    notes: tuple[str, ...] = ()
+    if pitch is None:
+        notes = ("It has a gimbal yaw but no pitch; straight down is assumed.",)
+    elif pitch > _LOOKS_UP_DEG:
+        notes = (f"Its gimbal pitch of {pitch:+g} degrees is taken for {-pitch:+g}, downwards.",)
+        pitch = -pitch
     belly = belly_from_gimbal(yaw, -90.0 if pitch is None else pitch, roll or 0.0)
     attitude = Attitude(yaw_deg=belly[0], pitch_deg=belly[1], roll_deg=belly[2], source=source)
     return attitude, notes

@@ -200,6 +200,7 @@ def _photo(path: Path, name: str, header: Header, thermal_unit: str | None) -> P
         stored=frame.stored if frame else "",
         camera_key=_camera_key(header, width, height),
         calibration=lens.calibration,
+        band_name=_band_name(header),
         unusable_calibration=" and ".join(lens.nonsense),
         focal=lens.focal,
         position=position,
@@ -300,6 +301,10 @@ def _stated(header: Header) -> Stored:
 
 def _is_lwir(header: Header) -> bool:
     return "lwir" in header.xmp.text("Camera:BandName").lower()
+
+
+def _band_name(header: Header) -> str:
+    return plain(" ".join(header.xmp.text("Camera:BandName", "BandName").lower().split()), 40)
 
 
 def _camera_key(header: Header, width: int, height: int) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path, PurePosixPath
 from skyquilt.errors import NoPhotosError, UsageError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
 from skyquilt.outside import MOST_MP, plain, walk
+from skyquilt.photos.bands import band_note
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
 from skyquilt.photos.clips import is_timed, read_clips
 from skyquilt.photos.implausible_positions import (
@@ -22,6 +23,7 @@ from skyquilt.photos.implausible_positions import (
 from skyquilt.photos.metadata import NO_HEMISPHERE
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.recoded import UNNAMED, recoded
+from skyquilt.photos.reduced_copies import without_reduced
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
 from skyquilt.video.read import CLIP_ENDINGS, side_files
@@ -159,6 +161,7 @@ def read_survey(
     films, more_rejected = read_clips(found.clips, geo) if clips else ((), ())
     rejected += more_rejected
     photos, copies = _without_copies(p for p in files if isinstance(p, Photo))
+    photos, reduced = without_reduced(photos)
     if not photos and not films:
         raise NoPhotosError(_nothing_sentence(folder, found, rejected, clips=clips))
     notes: tuple[str, ...] = ()
@@ -171,7 +174,7 @@ def read_survey(
     photos, implausible = placed_plausibly(_with_editors(photos))
     return Survey(
         photos=photos,
-        rejected=tuple(sorted((*rejected, *copies), key=lambda r: r.name)),
+        rejected=tuple(sorted((*rejected, *copies, *reduced), key=lambda r: r.name)),
         ignored=found.ignored
         if clips
         else tuple(sorted((*found.ignored, *(n for n, _ in found.clips)))),
@@ -181,7 +184,7 @@ def read_survey(
             *_run_notes(found),
             *_unread_notes(found),
             *implausible,
-            *survey_notes(photos, len(copies)),
+            *survey_notes(photos, len(copies) + len(reduced)),
         ),
     )
 
@@ -279,6 +282,7 @@ def survey_notes(photos: Sequence[Photo], copies: int = 0) -> tuple[str, ...]:
     """
     return (
         *_cameras(photos),
+        *band_note(photos),
         *_thermal_units(photos),
         *_gaps(photos),
         *_clocks(photos),

@@ -12,8 +12,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
+from skyquilt.alignment.crowded_positions import believed
+from skyquilt.alignment.displaced_parts import brought_together
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.late_positions import unshifted
+from skyquilt.alignment.oblique_guess import lowered
 from skyquilt.alignment.priors import choose_frame, priors
 from skyquilt.engine.clock import Clock, Steps
 from skyquilt.engine.free_memory import give_back
@@ -196,11 +199,12 @@ def align_photos(
     alignment = yield from clock.stage("align", _align(known, key, methods, clock))
     links.make_room()
     yield from (Note(text=n, warning=True) for n in alignment.notes)
+    trusted = _trusted(alignment, frame, found.photos, reported)
     return AlignedPhotos(
         given=given,
         found=found,
         frame=frame,
-        priors=tuple(unshifted(alignment, reported, [p.camera_key for p in found.photos])),
+        priors=trusted,
         links=links,
         order=tuple(known.order),
         alignment=alignment,
@@ -209,6 +213,16 @@ def align_photos(
         key=key,
         earlier=earlier,
     )
+
+
+def _trusted(
+    alignment: Alignment, frame: MapFrame, photos: Sequence[Photo], reported: Sequence[Prior]
+) -> tuple[Prior, ...]:
+    """The reported priors as the alignment took them."""
+    priors = lowered(alignment, believed(alignment, frame, reported))
+    priors = unshifted(alignment, priors, [p.camera_key for p in photos])
+    together = brought_together(alignment, photos, priors)
+    return tuple(priors) if together is None else together.priors
 
 
 def memory_notes(photos: int, memory_gb: float | None) -> list[Note]:

@@ -328,7 +328,10 @@ def of_one_kind(found: FeaturedPhotos) -> FeaturedPhotos:
     odd = tuple(
         RejectedPhoto(
             name=p.name,
-            reason=f"its pixels ({p.channels} x {p.dtype}, {p.band}) differ from the survey's"
+            reason=f"it is a {p.band} photo, and the map shows the {common[2]} ones; give thermal"
+            " photos in a folder of their own, with --thermal"
+            if p.band != common[2]
+            else f"its pixels ({p.channels} x {p.dtype}, {p.band}) differ from the survey's"
             f" ({common[0]} x {common[1]}, {common[2]})",
         )
         for p, k in zip(found.photos, kinds, strict=True)

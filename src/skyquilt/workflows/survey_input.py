@@ -14,6 +14,7 @@ from skyquilt.model.photo import (
     RejectedPhoto,
     Survey,
 )
+from skyquilt.photos.bands import of_one_band
 from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import check_control, read_gcp_list
 from skyquilt.photos.lever_arm import with_lever_arm
@@ -95,6 +96,7 @@ def read_input(
         clips=True,
         read=read,
     )
+    survey = of_one_band(survey, settings.band)
     shutter = stated_shutter(settings.shutter, settings.shutter_readout_ms)
     if shutter is not None:
         survey = replace(

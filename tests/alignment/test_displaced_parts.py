@@ -1,0 +1,78 @@
+"""Positions of flights with different errors are brought together, and others are left alone."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skyquilt.alignment.displaced_parts import brought_together
+from tests.alignment.surveys import alignment, photo, prior
+
+
+def lines(count, per_line=6):
+    column, row = np.divmod(np.arange(count), per_line)
+    row = np.where(column % 2, per_line - 1 - row, row)
+    return np.column_stack([25.0 * column, 18.0 * row, np.full(count, 60.0)])
+
+
+def survey(true, told, sigma):
+    """An alignment turned and shrunk a little against what the photos report, and their priors."""
+    c, s = 0.97 * np.cos(0.05), 0.97 * np.sin(0.05)
+    placed = true @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    found = alignment(len(true))
+    poses = {i: replace(found.poses[i % 8], map_C=C) for i, C in enumerate(placed)}
+    sigmas = np.broadcast_to(sigma, len(true))
+    priors = [prior(C, sigma=float(e)) for C, e in zip(told, sigmas, strict=True)]
+    found = replace(found, poses=poses, blocks=(tuple(range(len(true))),))
+    return found, [photo(f"{i:03d}.jpg") for i in range(len(true))], priors
+
+
+@pytest.mark.parametrize("count", [16, 24, 150])
+@pytest.mark.parametrize("seed", range(4))
+def test_a_second_flight_is_brought_to_the_first(count, seed):
+    rng = np.random.default_rng(seed)
+    true, begins = lines(count), count // 2 + int(rng.integers(-count // 12, count // 12 + 1))
+    told = true + rng.normal(0, 0.4, true.shape)
+    told[begins:, :2] += jump if np.hypot(*(jump := rng.normal(0, 5, 2))) > 4 else (4.0, 3.0)
+    moved = brought_together(*survey(true, told, 1.5))
+    assert f"{begins:03d}.jpg" in moved.note
+    off = np.array([p.map_C[:2] for p in moved.priors]) - true[:, :2]
+    assert np.abs(off[begins:].mean(0) - off[:begins].mean(0)).max() < 0.8
+    middle = off.mean(0) - (told - true)[:, :2].mean(0)
+    assert np.abs(middle).max() < 1e-9  # of all, it stays
+    assert all(np.array_equal(p.map_C[2:], t[2:]) for p, t in zip(moved.priors, told, strict=True))
+
+
+def test_three_flights_one_of_which_knows_better():
+    true = lines(36)
+    told = true + np.random.default_rng(3).normal(0, 0.3, true.shape)
+    told[12:24, :2] += (5, -3)
+    told[24:, :2] += (-4, -4)
+    sigma = np.where(np.arange(36) // 12 == 1, 0.02, 2.0)
+    moved = brought_together(*survey(true, told, sigma))
+    assert "012.jpg and from 024.jpg" in moved.note
+    shift = np.array([p.map_C[:2] for p in moved.priors]) - told[:, :2]
+    assert np.abs(shift[12:24]).max() < 0.01
+
+
+@pytest.mark.parametrize("count", [8, 12, 24, 150])
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_and_gross_errors_are_no_parts(count, seed):
+    rng = np.random.default_rng(seed)
+    true = lines(count)
+    told = true + rng.normal(0, 1.5, true.shape)
+    told[rng.choice(count, count // 10, replace=False), :2] += rng.normal(0, 50, 2)
+    assert brought_together(*survey(true, told, 1.5)) is None
+
+
+def test_what_is_small_beside_the_deviations_is_left_alone():
+    true = lines(24)
+    told = true + np.random.default_rng(1).normal(0, 0.01, true.shape)
+    told[12:, :2] += 0.3
+    assert brought_together(*survey(true, told, 1.5)) is None
+    assert brought_together(*survey(true, told, 0.02)) is not None
+
+
+def test_photos_in_one_place_tell_nothing():
+    true = np.zeros((14, 3)) + (3.0, 4.0, 60.0)
+    assert brought_together(*survey(true, true.copy(), 1.5)) is None

@@ -1,0 +1,61 @@
+"""Cameras that write a file for each band give a map of one band."""
+
+from dataclasses import replace
+
+import pytest
+
+from skyquilt.errors import UsageError
+from skyquilt.model.photo import Survey
+from skyquilt.photos.bands import band_note, of_one_band
+from skyquilt.photos.read import read_photo
+from tests.alignment.surveys import photo
+
+
+def band(name, shot, channels=1):
+    return replace(photo(f"{shot}_{name}.tif"), band_name=name, channels=channels, dtype="uint16")
+
+
+def survey(*photos):
+    return Survey(photos=tuple(photos), rejected=(), ignored=(), notes=())
+
+
+FIVE = survey(*(band(n, k) for k in range(3) for n in ("blue", "green", "red", "nir", "red edge")))
+
+
+@pytest.mark.parametrize(("wanted", "shown"), [(None, "green"), ("NIR", "nir"), ("red", "red")])
+def test_one_band_is_kept_and_the_others_are_named(wanted, shown):
+    kept = of_one_band(FIVE, wanted)
+    assert {p.band_name for p in kept.photos} == {shown} and len(kept.photos) == 3
+    assert len(kept.rejected) == 12
+    assert all(f"the map shows {shown}" in r.reason for r in kept.rejected)
+    (note,) = band_note(FIVE.photos)
+    assert "red edge (3)" in note
+
+
+def test_the_band_of_most_photos_is_shown():
+    lost = survey(*(p for p in FIVE.photos if not (p.band_name == "green" and p.name[0] == "1")))
+    assert {p.band_name for p in of_one_band(lost, None).photos} == {"red"}
+
+
+def test_files_without_a_band_stay():
+    colour = [band("", k, channels=3) for k in range(3)]
+    kept = of_one_band(survey(*FIVE.photos, *colour), None)
+    assert [p.band_name for p in kept.photos] == ["green"] * 3 + [""] * 3
+    plain = survey(*colour)
+    assert of_one_band(plain, None) is plain and band_note(colour) == ()
+
+
+@pytest.mark.parametrize(("given", "words"), [(FIVE, "blue, green"), (survey(photo()), "none")])
+def test_a_band_that_no_photo_shows_is_refused(given, words):
+    with pytest.raises(UsageError, match=words):
+        of_one_band(given, "thermal")
+
+
+def test_the_name_is_read_from_xmp(make_jpeg):
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF'
+        ' xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description'
+        ' xmlns:Camera="http://pix4d.com/camera/1.0/"><Camera:BandName>Red  Edge</Camera:BandName>'
+        "</rdf:Description></rdf:RDF></x:xmpmeta>"
+    )
+    assert read_photo(make_jpeg(xmp=xmp)).band_name == "red edge"

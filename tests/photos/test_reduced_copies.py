@@ -1,0 +1,61 @@
+"""Smaller copies of photos are left out, and nothing else is."""
+
+from dataclasses import replace
+from datetime import datetime
+
+import pytest
+
+from skyquilt.model.photo import GeoPosition
+from skyquilt.photos.reduced_copies import without_reduced
+from tests.alignment.surveys import photo
+
+
+def taken(name, k, *, width=4000, focal=3000.0, height=None, **more):
+    place = GeoPosition(
+        latitude_deg=50.8 + 1e-4 * k, longitude_deg=-0.14, altitude_m=60.0, datum="takeoff"
+    )
+    told = {"position": place, "time": datetime(2024, 5, 1, 12, 0, k), **more}
+    made = photo(name, focal=focal)
+    return replace(made, width=width, height=height or width * 3 // 4, **told)
+
+
+FULL = [taken(f"DJI_{k:04d}.JPG", k) for k in range(4)]
+
+
+def left_out(*more):
+    kept, out = without_reduced([*FULL, *more])
+    assert len(kept) + len(out) == len(FULL) + len(more)
+    return {r.name for r in out}
+
+
+@pytest.mark.parametrize("name", ["thumbs/DJI_0001.jpg", "small one.jpg"])
+def test_a_smaller_copy_with_its_metadata(name):
+    assert left_out(taken(name, 1, width=1000, focal=750.0)) == {name}
+
+
+def test_a_thumbnail_without_metadata_or_with_a_focal_length_in_other_pixels():
+    bare = taken("thumbs/DJI_0001.jpg", 1, width=240, time=None, position=None)
+    assert left_out(bare) == {bare.name}
+    assert left_out(taken("thumbs/DJI_0002.jpg", 2, width=240)) == {"thumbs/DJI_0002.jpg"}
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        taken("zoom.jpg", 1, width=2000, focal=6000.0),  # another lens of the same drone
+        taken("wide.jpg", 1, width=2000, height=2000),
+        taken("thermal/DJI_0001.jpg", 1, width=640, band="thermal"),
+        taken("101MEDIA/DJI_0001.JPG", 9, width=2000, focal=1500.0),  # another flight
+        taken("edited/DJI_0001.JPG", 1),  # as large
+        taken("chat.jpg", 1, width=1600, time=None, position=None),
+    ],
+    ids=lambda p: p.name,
+)
+def test_other_photos_stay(other):
+    assert left_out(other) == set()
+
+
+def test_without_metadata_anywhere_equal_names_tell_nothing():
+    bare = [replace(p, time=None, position=None) for p in FULL]
+    small = replace(bare[0], name="second/DJI_0000.JPG", width=2000, height=1500)
+    assert without_reduced([*bare, small])[1] == ()
