@@ -8,15 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.nodes import (
-    STEP,
-    Nodes,
-    View,
-    cut,
-    densify,
-    inside_everywhere,
-    node_places,
-)
+from skyquilt.imaging.nodes import STEP, Nodes, View, cut, densify, inside_everywhere, node_places
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Blend, Layer

@@ -1,5 +1,5 @@
-"""Photo pixels of the map's pixels where heights step, so that nodes cannot be interpolated, or bend
-between nodes, so that these must lie closer.
+"""Photo pixels of the map's pixels where heights step, so that nodes cannot be interpolated, or
+bend between nodes, so that these must lie closer.
 
 Photos are projected at the nodes of three levels. Along a vertical line a photo pixel moves, but
 for distortion, in proportion to the reciprocal of its depth, so that the pixels at any height
@@ -12,15 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.nodes import (
-    STEP,
-    Nodes,
-    View,
-    inside,
-    node_places,
-    project_nodes,
-    projected,
-)
+from skyquilt.imaging.nodes import STEP, Nodes, View, inside, node_places, project_nodes, projected
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 

@@ -107,7 +107,7 @@ class Stereo:
     """The ratio that is preferred."""
     cell_px: tuple[int, int] = (4, 8)
     """Least and greatest side of a cell in map pixels."""
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
 
     def __call__(
         self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep
@@ -304,9 +304,10 @@ def _over(a: View, b: View, known: Surface, gsd: float) -> Pair | None:
 
 
 def _sampled(pair: Pair, surface: Surface) -> Float:
-    """Heights (n, n) of a surface over the part that a pair shows."""
+    """Heights (n, n) in m of a surface above the plane of a pair, over the part that it shows."""
     places = pair.places(*np.meshgrid(*(np.linspace(0, n, 48) for n in pair.size), indexing="ij"))
-    return surface.at(places[..., 0], places[..., 1])
+    x, y, plane = np.moveaxis(places, -1, 0)
+    return np.asarray(surface.at(x, y) - plane, np.float32)
 
 
 def _relief(pair: Pair, surface: Surface) -> float:
@@ -330,10 +331,7 @@ def _steps(pair: Pair, surface: Surface, least: float) -> bool:
 def _points(pair: Pair, level: Level, given: _Round) -> Float:
     """Points (n, 3) in m, relative to the pair's origin, of a round."""
     side = level.longest
-    over = float(pair.origin[2])
-    tilt = abs(float(pair.along[2])) * pair.gsd * max(pair.size)
-    low = float(_sampled(pair, given.low).min()) - over - tilt
-    high = float(_sampled(pair, given.high).max()) - over + tilt
+    low, high = float(_sampled(pair, given.low).min()), float(_sampled(pair, given.high).max())
     pictures = (given.grey(pair.a.photo, side), given.grey(pair.b.photo, side))
     at = matched_points(pair, *pictures, low, high, level.window)
     if not len(at):
