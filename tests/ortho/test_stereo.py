@@ -10,7 +10,7 @@ from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.engine.workers import Threads
 from skyquilt.model.camera import Camera
 from skyquilt.model.raster import Grid
-from skyquilt.ortho import fill, fusion
+from skyquilt.ortho import fill, fusion, stereo
 from skyquilt.ortho.fill import crowns, filled, lowered, nearest_known, plateaus, settled
 from skyquilt.ortho.pair_matching import pair_of
 from skyquilt.ortho.stereo import Stereo
@@ -313,3 +313,17 @@ def test_edges_are_sought_where_they_are_asked_for(flight):
         assert (np.abs(z[outside > 1]) < 0.5).mean() > 0.98
         off.append(np.mean((z > BOX / 2) != (outside < 0)))
     assert off[1] < 0.95 * off[0]
+
+
+@pytest.mark.parametrize("room", [0, 30, 1_000])
+def test_heights_of_pairs_wait_for_later_tiles_as_far_as_there_is_room(room, monkeypatch):
+    monkeypatch.setattr(stereo, "HELD_BYTES", room)
+    near = [[0, 1], [1, 2], [2, 3], [0, 1, 3], [], [1, 2]]
+    stays = stereo._staying(near, [10, 20, 10, 40])
+    matched, before = [0] * 4, list[int]()
+    for pairs, stay in zip(near, stays, strict=True):
+        for k in set(pairs) - set(before):
+            matched[k] += 1
+        assert set(stay) <= {*pairs, *before}
+        before = stay
+    assert matched == {0: [2, 3, 2, 1], 30: [1, 2, 2, 1], 1_000: [1, 1, 1, 1]}[room]

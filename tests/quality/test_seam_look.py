@@ -1,5 +1,6 @@
 """Colours on both sides of a seam, and objects that seams cut, against known pictures."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -10,7 +11,7 @@ from skyquilt.ortho.tie_surface import level
 from skyquilt.quality import seam_look
 from skyquilt.quality.seam_look import cut_objects, seam_colours
 from skyquilt.quality.seam_points import SeamPoint
-from skyquilt.quality.seam_views import Look, views_at
+from skyquilt.quality.seam_views import Look, lab_of, views_at
 from tests.ortho.scenes import view
 
 GSD = 0.05
@@ -104,3 +105,11 @@ def test_strips_of_a_map_have_the_same_share(monkeypatch):
     at_once = cut_objects(shown, cells, labels)
     monkeypatch.setattr(seam_look, "STRIP", 4)
     assert cut_objects(shown, cells, labels) == at_once
+
+
+def test_colours_are_those_of_the_standard_and_of_opencv():
+    rgb = np.random.default_rng(1).random((500, 3)) ** 3
+    rgb[0], rgb[1] = 0, 1
+    known = cv2.cvtColor(rgb[None].astype(np.float32), cv2.COLOR_RGB2LAB)[0]
+    np.testing.assert_allclose(lab_of(rgb), [lab(255 * c) for c in rgb], atol=0.01)
+    np.testing.assert_allclose(lab_of(rgb), known, atol=0.6)  # it interpolates in a table

@@ -8,23 +8,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.nodes import (
-    STEP,
-    Nodes,
-    View,
-    cut,
-    densify,
-    inside_everywhere,
-    node_places,
-    project_nodes,
-)
+from skyquilt.imaging.nodes import STEP, Nodes, View, cut, densify, inside_everywhere, node_places
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
 from skyquilt.ortho.blend import Blend, Layer
 from skyquilt.ortho.exposure import NEUTRAL, Exposure, image_place, with_odds
 from skyquilt.ortho.labels import Labels
 from skyquilt.ortho.plan import Plan, planned, stale
-from skyquilt.ortho.stepped import Stepped, stepped_heights
+from skyquilt.ortho.stepped import Closer, Stepped, stepped_heights
 
 PhotoPixels = Callable[[int], NDArray[Any]]
 """Gives the full-size pixels (H, W[, bands]) of a photo by its index."""
@@ -106,11 +97,11 @@ class Composer:
     def drawn(self, plan: Plan) -> Composed:
         """Composes a planned window piece by piece."""
         window, margin = plan.window, plan.margin
-        out = np.full(
-            (window.height, window.width, self.bands),
-            np.nan if self.dtype.kind == "f" else 0,
-            self.dtype,
-        )
+        shape = (window.height, window.width, self.bands)
+        # memory of zeros is not touched where no photo is drawn
+        out = np.zeros(shape, self.dtype)
+        if self.dtype.kind == "f":
+            out.fill(np.nan)
         photo = np.full((window.height, window.width), -1, np.int32)
         for row in range(0, window.height, PIECE):
             for column in range(0, window.width, PIECE):
@@ -190,28 +181,26 @@ class Composer:
             width=w,
         )
         cuts = [cut(n, row, column, h, w) for n, _ in chosen]
-        stepped = self._stepped(place, cuts)
-        if stepped is None:
-            cuts = self._closer(plan, cuts, row, column, place)
+        finer = self._stepped(place, cuts) or self._closer(plan, cuts, row, column, place)
         if alone:
-            n = cuts[0] if stepped is None else stepped.lifted(cuts[0], 0, 0, h, w)
+            n = cuts[0] if finer is None else finer.lifted(cuts[0], 0, 0, h, w)
             if n.seen.all():  # nothing to blend, whatever the method
                 pixels, _ = self._warped(n, h, w, ranked=False)
                 return pixels, np.full((h, w), n.view.photo, np.int32)
         layers = [
-            self._layer(n, here, place, stepped, alone=alone)
+            self._layer(n, here, place, finer, alone=alone)
             for n, (_, here) in zip(cuts, chosen, strict=True)
         ]
         return self.blend.merge(layers, self.grid.gsd)
 
     def _closer(
-        self, plan: Plan, cuts: list[Nodes], row: int, column: int, place: Window
-    ) -> list[Nodes]:
-        """The nodes of photos over a piece at its place in the map; closer ones where heights bend
-        between them.
+        self, plan: Plan, cuts: Sequence[Nodes], row: int, column: int, place: Window
+    ) -> Closer | None:
+        """Closer nodes over a piece at its place in the map; None where heights do not bend between
+        those of the plan.
         """
         if not self._fine:
-            return cuts
+            return None
         step = FINE[self.surface.cell >= FINE[1] * self.grid.gsd * 0.99]
         x, y, z = node_places(self.grid, self.surface, place, step)
         rows, columns = (
@@ -222,9 +211,7 @@ class Composer:
         size = (step * (z.shape[0] - 2), step * (z.shape[1] - 2))
         middle = slice(step // 2, None, step)
         bent = np.abs(z[1:-1, 1:-1] - densify(straight, *size)[middle, middle]).max()
-        if not self._shifts(float(bent), cuts):
-            return cuts
-        return [replace(project_nodes(n.view, x, y, z), step=step) for n in cuts]
+        return Closer(x=x, y=y, z=z, step=step) if self._shifts(float(bent), cuts) else None
 
     def _stepped(self, place: Window, cuts: Sequence[Nodes]) -> Stepped | None:
         """The heights of the pixels of a piece that these photos show; None where they do not step,
@@ -250,7 +237,7 @@ class Composer:
         n: Nodes,
         near: NDArray[np.bool_],
         place: Window,
-        stepped: Stepped | None,
+        finer: Stepped | Closer | None,
         *,
         alone: bool,
     ) -> Layer:
@@ -261,8 +248,8 @@ class Composer:
         rows, columns = _extent(np.asarray(near.any(1)), h), _extent(np.asarray(near.any(0)), w)
         size = rows.stop - rows.start, columns.stop - columns.start
         n = cut(n, rows.start, columns.start, *size)
-        if stepped is not None:
-            n = stepped.lifted(n, rows.start, columns.start, *size)
+        if finer is not None:
+            n = finer.lifted(n, rows.start, columns.start, *size)
         width = None if self.labels is None or alone else self.blend.seam_px
         pixels, score = self._warped(n, *size, ranked=width is None and not alone)
         if size != (h, w):

@@ -86,8 +86,16 @@ class Exposure:
 
     def table(self, photo: int) -> NDArray[np.uint8] | None:
         """Lookup table (1, 256, bands) of a photo with gains only; None if nothing changes."""
-        gains = self.gains[photo]
-        return odds_table(gains, self.white) if float(np.abs(gains).max()) >= 0.005 else None
+        if photo not in self._tables:
+            gains = self.gains[photo]
+            none = float(np.abs(gains).max()) < 0.005
+            self._tables[photo] = None if none else odds_table(gains, self.white)
+        return self._tables[photo]
+
+    @cached_property
+    def _tables(self) -> dict[int, NDArray[np.uint8] | None]:
+        """Tables made so far."""
+        return {}
 
 
 def with_odds(

@@ -125,14 +125,15 @@ def matched_points(
     """
     left, right = stretched(left, right)
     d, good = _disparities(pair, left, right, low, min(high, TALLEST * pair.height), window)
-    rows, columns = np.nonzero(good)
-    along = pair.gsd * d[rows, columns]
+    along = pair.gsd * d[good]
     share = (along / (np.float32(pair.base) + along)).astype(np.float32)  # of the way to a
-    at = (
-        rows[:, None] * (pair.gsd * pair.down) + columns[:, None] * (pair.gsd * pair.along)
-    ).astype(np.float32)
+    rows, columns = (np.arange(n)[:, None] for n in d.shape)
+    beside, below = columns * (pair.gsd * pair.along), rows * (pair.gsd * pair.down)
     centre = (pair.a.pose.map_C - pair.origin).astype(np.float32)
-    at += (centre - at) * share[:, None]
+    at = np.empty((len(share), 3), np.float32)
+    for k in range(3):  # one axis at a time: several times as fast as rows of three
+        own = np.add.outer(below[:, k], beside[:, k]).astype(np.float32)[good]
+        at[:, k] = own + (centre[k] - own) * share
     return at
 
 

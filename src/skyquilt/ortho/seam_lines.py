@@ -276,9 +276,12 @@ class _Scene:
     ) -> None:
         self.views, self.cells, self.z, self.over = views, cells, z, over
         self._grey, self._exposure, self._longest = grey, exposure, longest
-        self._tall = over > STANDING_M
-        self._view = {view.photo: view for view in views}
-        self._shadows = PixelCache(read=self._shadow, budget_bytes=SHADOWS_BYTES)
+        tall = over > STANDING_M
+        view_of = {view.photo: view for view in views}
+        # not a method of this scene: as one it would keep all of it in memory until the end
+        self._shadows = PixelCache(
+            read=lambda photo: Shadow(view_of[photo], cells, z, tall), budget_bytes=SHADOWS_BYTES
+        )
 
     def scores(
         self, row: int, column: int, h: int, w: int
@@ -344,9 +347,6 @@ class _Scene:
         down, right = slopes
         toward = (x - cx) * right - (y - cy) * down
         return np.asarray(1 + toward / np.maximum(cz - z, 0.1) < GRAZING)
-
-    def _shadow(self, photo: int) -> Shadow:
-        return Shadow(self._view[photo], self.cells, self.z, self._tall)
 
     def greys(
         self, views: Sequence[View], nodes: Sequence[Any], chosen: NDArray[Any], h: int, w: int

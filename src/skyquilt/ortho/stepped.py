@@ -1,4 +1,5 @@
-"""Photo pixels of the map's pixels where heights step, so that nodes cannot be interpolated.
+"""Photo pixels of the map's pixels where heights step, so that nodes cannot be interpolated, or
+bend between nodes, so that these must lie closer.
 
 Photos are projected at the nodes of three levels. Along a vertical line a photo pixel moves, but
 for distortion, in proportion to the reciprocal of its depth, so that the pixels at any height
@@ -11,9 +12,33 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.imaging.nodes import STEP, Nodes, View, inside, node_places, projected
+from skyquilt.imaging.nodes import STEP, Nodes, View, inside, node_places, project_nodes, projected
 from skyquilt.model.raster import Grid, Window
 from skyquilt.model.surface import Surface
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Closer:
+    """Nodes of a piece of the map that lie closer than those of a plan."""
+
+    x: NDArray[np.float64]
+    """(r, c) eastings in m."""
+    y: NDArray[np.float64]
+    """(r, c) northings in m."""
+    z: NDArray[np.float32]
+    """(r, c) heights in m."""
+    step: int
+    """Map pixels between them."""
+
+    def lifted(self, n: Nodes, row: int, column: int, h: int, w: int) -> Nodes:
+        """Nodes of a part (h, w) of the piece, which begins at a multiple of STEP px, replaced by
+        the closer ones.
+        """
+        at = tuple(
+            slice(k // self.step, k // self.step - (-size // self.step) + 2)
+            for k, size in ((row, h), (column, w))
+        )
+        return replace(project_nodes(n.view, self.x[at], self.y[at], self.z[at]), step=self.step)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -7,6 +7,7 @@ with it. Where no pair gives a height, the coarser one stays; where none has any
 the plane through what is around.
 """
 
+from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -37,6 +38,8 @@ GreyPicture = Callable[[int, int], NDArray[np.uint8]]
 """Gives the grey image (h, w) of a photo (index), reduced to the given px on its longest side."""
 TILE = 512
 """Cells along a side of the pieces in which heights are fused."""
+HELD_BYTES = 6.4e7
+"""Bytes of heights of pairs, about, that wait in memory for later tiles."""
 NEW = 0.25
 """Share of the ground of a pair that must still lack pairs for it to be matched."""
 EDGES = 0.003
@@ -107,7 +110,7 @@ class Stereo:
     """The ratio that is preferred."""
     cell_px: tuple[int, int] = (4, 8)
     """Least and greatest side of a cell in map pixels."""
-    version: ClassVar[int] = 4
+    version: ClassVar[int] = 5
 
     def __call__(
         self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep
@@ -251,25 +254,55 @@ def _fused(given: _Round, pairs: Sequence[tuple[Pair, Level]], name: str, keep: 
 
     tiles = {f"{name} {at[0]} {at[1]}": at for at in _tiles(cells)}
     near = {tile: _near(pairs, cells, at) for tile, at in tiles.items()}
+    missing = keep.missing(tiles)
+    sizes = [8 * p.size[0] * p.size[1] * min(1.0, p.gsd / cells.gsd) ** 2 for p, _ in pairs]
+    stays = dict(zip(missing, _staying([near[tile] for tile in missing], sizes), strict=True))
     order, before = list[int](), list[int]()
-    for tile in keep.missing(tiles):
+    for tile in missing:
         order += [k for k in near[tile] if k not in before]
-        before = near[tile]
+        before = stays[tile]
     ahead = Ahead(keep.workers, matched, [(k, pairs[k]) for k in order])
     held: dict[int, Cells] = {}
 
     def fused(tile: str) -> Float:
         """Heights (h, w) of a tile from the pairs that may see it."""
-        for k in [k for k in held if k not in near[tile]]:
-            del held[k]
         for k in near[tile]:
             if k not in held:
                 held[k] = ahead.take(k, pairs[k])
         parts = (inside(held[k], cells.width, *tiles[tile]) for k in near[tile])
-        return agreed([h for h in parts if len(h[0])], given.agree, tiles[tile][2:])
+        found = agreed([h for h in parts if len(h[0])], given.agree, tiles[tile][2:])
+        for k in held.keys() - set(stays.get(tile, ())):
+            del held[k]
+        return found
 
     for tile, (row, column, h, w) in tiles.items():
         out[row : row + h, column : column + w] = keep(tile, lambda: fused(tile))  # noqa: B023 - called at once
+    return out
+
+
+def _staying(near: Sequence[Sequence[int]], sizes: Sequence[float]) -> list[list[int]]:
+    """The pairs whose heights stay in memory after each tile, from the pairs near each: those near
+    the next one, and those that later tiles need, the next needed first, as many as `HELD_BYTES`
+    bear. `sizes`: bytes of the heights of each pair, about.
+    """
+    needed: dict[int, list[int]] = {}
+    for number, pairs in enumerate(near):
+        for k in pairs:
+            needed.setdefault(k, []).append(number)
+    out = list[list[int]]()
+    for number, pairs in enumerate(near):
+        known = {*pairs, *(out[-1] if out else ())}
+        later = [
+            (after[at], k)
+            for k in known
+            if (at := bisect_right(after := needed[k], number)) < len(after)
+        ]
+        stay, room = list[int](), HELD_BYTES
+        for when, k in sorted(later):
+            room -= sizes[k]
+            if when == number + 1 or room >= 0:
+                stay.append(k)
+        out.append(stay)
     return out
 
 
@@ -304,9 +337,10 @@ def _over(a: View, b: View, known: Surface, gsd: float) -> Pair | None:
 
 
 def _sampled(pair: Pair, surface: Surface) -> Float:
-    """Heights (n, n) of a surface over the part that a pair shows."""
+    """Heights (n, n) in m of a surface above the plane of a pair, over the part that it shows."""
     places = pair.places(*np.meshgrid(*(np.linspace(0, n, 48) for n in pair.size), indexing="ij"))
-    return surface.at(places[..., 0], places[..., 1])
+    x, y, plane = np.moveaxis(places, -1, 0)
+    return np.asarray(surface.at(x, y) - plane, np.float32)
 
 
 def _relief(pair: Pair, surface: Surface) -> float:
@@ -330,10 +364,7 @@ def _steps(pair: Pair, surface: Surface, least: float) -> bool:
 def _points(pair: Pair, level: Level, given: _Round) -> Float:
     """Points (n, 3) in m, relative to the pair's origin, of a round."""
     side = level.longest
-    over = float(pair.origin[2])
-    tilt = abs(float(pair.along[2])) * pair.gsd * max(pair.size)
-    low = float(_sampled(pair, given.low).min()) - over - tilt
-    high = float(_sampled(pair, given.high).max()) - over + tilt
+    low, high = float(_sampled(pair, given.low).min()), float(_sampled(pair, given.high).max())
     pictures = (given.grey(pair.a.photo, side), given.grey(pair.b.photo, side))
     at = matched_points(pair, *pictures, low, high, level.window)
     if not len(at):

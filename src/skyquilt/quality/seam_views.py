@@ -24,6 +24,10 @@ BESIDE = 30
 """Distance in map px of the places beside the seam."""
 PLACES = np.array([(0, 0), (BESIDE, 0), (-BESIDE, 0), (0, BESIDE), (0, -BESIDE)])
 """(5, 2) places east and north of a point in map px whose colours are compared."""
+XYZ = np.array(
+    [(0.412453, 0.357580, 0.180423), (0.212671, 0.715160, 0.072169), (0.019334, 0.119193, 0.950227)]
+)
+"""(3, 3) X, Y and Z of linear sRGB values; white has the sums of its rows."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,5 +121,15 @@ def _colours(
         odds = exposure.odds(view.photo, *image_place(view, n.u, n.v))
         value = exposure.brightened(value, odds)
     rgb = np.broadcast_to(value[..., :3], (*n.u.shape, 3)).mean(1)
-    lab = cv2.cvtColor(np.asarray(rgb[None] / 255, np.float32), cv2.COLOR_RGB2LAB)[0]
-    return np.where(seen[:, None], lab, np.nan).astype(np.float64)
+    return np.where(seen[:, None], lab_of(rgb / 255), np.nan)
+
+
+def lab_of(rgb: NDArray[Any]) -> NDArray[np.float64]:
+    """CIE L*a*b* (n, 3), D65, of sRGB values (n, 3) from 0 to 1. OpenCV first fills tables, which
+    takes longer than all else that is measured of a small map.
+    """
+    rgb = np.asarray(rgb, np.float64)
+    linear = np.where(rgb > 0.04045, ((rgb + 0.055) / 1.055) ** 2.4, rgb / 12.92)
+    share = linear @ (XYZ / XYZ.sum(1, keepdims=True)).T
+    fx, fy, fz = np.where(share > 0.008856, np.cbrt(share), 7.787 * share + 16 / 116).T
+    return np.stack([116 * fy - 16, 500 * (fx - fy), 200 * (fy - fz)], 1)
