@@ -215,6 +215,7 @@ def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignmen
             continue
         if one_tone(inputs, i):
             rejected[i] = "it is black or white all over"
+            notes.append(f"{photo.name} is left out: {rejected[i]}.")
             continue
         weak = rejected.pop(i, "it could not be linked to any other photo")
         R = cam_R_map_from_angles(priors[i].yaw_deg, priors[i].pitch_deg, priors[i].roll_deg)

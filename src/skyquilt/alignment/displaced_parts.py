@@ -31,6 +31,9 @@ TOLD_APART = 0.5
 TRUSTED = 0.8
 """Share of the positions that are compared, those that fit best: others may be gross errors."""
 
+DONE = "They were brought together;"
+"""Words of the note by which an alignment tells that it did so."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Displaced:
@@ -67,10 +70,19 @@ def brought_together(
     first = [photos[own[k]].name for k in np.flatnonzero(np.diff(part)) + 1]
     note = (
         f"Positions from {' and from '.join(first)} on are displaced against those before by up to"
-        f" {apart:.1f} m: another flight, or a correction that was lost. They were brought"
-        " together; the map's place is as uncertain as that."
+        f" {apart:.1f} m: another flight, or a correction that was lost. {DONE} the map's place is"
+        " as uncertain as that."
     )
     return Displaced(priors=tuple(moved), note=note)
+
+
+def as_taken(
+    found: Alignment, photos: Sequence[Photo], priors: Sequence[Prior]
+) -> tuple[Prior, ...]:
+    """The priors as an alignment took them: brought together where it says so."""
+    told = any(DONE in note for note in found.notes)
+    together = brought_together(found, photos, priors) if told else None
+    return tuple(priors) if together is None else together.priors
 
 
 def _parts(placed: Complex, told: Complex) -> Parts:
