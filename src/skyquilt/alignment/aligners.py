@@ -73,7 +73,13 @@ class ByLinks:
             inputs.keep,
             inputs.make_room,
         )
-        found = without_copied_views(found, inputs.photos)
+        told = {i for i, p in enumerate(inputs.photos) if p.position is not None}
+        bare = {
+            i
+            for i, p in enumerate(inputs.photos)
+            if p.position is None and p.attitude is None and p.focal.source == "guess"
+        }
+        found = without_copied_views(found, [p.name for p in inputs.photos], told, bare)
         found = replace(found, notes=(*found.notes, *said))
         return replace(with_loose_photos(found, inputs), why=REQUESTED)
 

@@ -139,7 +139,7 @@ class Bundle:
                 break
             found, aside, guessed = other, untold(turned), True
         level = self.repair and not guessed and not slanting(priors)
-        together = brought_together(found, photos, priors) if level else None
+        together = brought_together(found, [p.name for p in photos], priors) if level else None
         if together is not None:
             other = block(aside, together.priors, "together ")
             if off_positions(other, together.priors) < off_positions(found, priors):

@@ -221,7 +221,7 @@ def _trusted(
     """The reported priors as the alignment took them."""
     priors = lowered(alignment, believed(alignment, frame, reported))
     priors = unshifted(alignment, priors, [p.camera_key for p in photos])
-    return as_taken(alignment, photos, priors)
+    return as_taken(alignment, [p.name for p in photos], priors)
 
 
 def memory_notes(photos: int, memory_gb: float | None) -> list[Note]:
