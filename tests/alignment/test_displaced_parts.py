@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skyquilt.alignment.displaced_parts import brought_together
-from tests.alignment.surveys import alignment, photo, prior
+from skyquilt.alignment.displaced_parts import as_taken, brought_together
+from tests.alignment.surveys import alignment, prior
 
 
 def lines(count, per_line=6):
@@ -24,7 +24,7 @@ def survey(true, told, sigma):
     sigmas = np.broadcast_to(sigma, len(true))
     priors = [prior(C, sigma=float(e)) for C, e in zip(told, sigmas, strict=True)]
     found = replace(found, poses=poses, blocks=(tuple(range(len(true))),))
-    return found, [photo(f"{i:03d}.jpg") for i in range(len(true))], priors
+    return found, [f"{i:03d}.jpg" for i in range(len(true))], priors
 
 
 @pytest.mark.parametrize("count", [16, 24, 150])
@@ -36,6 +36,10 @@ def test_a_second_flight_is_brought_to_the_first(count, seed):
     told[begins:, :2] += jump if np.hypot(*(jump := rng.normal(0, 5, 2))) > 4 else (4.0, 3.0)
     moved = brought_together(*survey(true, told, 1.5))
     assert f"{begins:03d}.jpg" in moved.note
+    found, names, priors = survey(true, told, 1.5)
+    assert as_taken(found, names, priors) == tuple(priors)  # not what that one was made with
+    taken = as_taken(replace(found, notes=(moved.note,)), names, priors)
+    assert all(np.array_equal(a.map_C, b.map_C) for a, b in zip(taken, moved.priors, strict=True))
     off = np.array([p.map_C[:2] for p in moved.priors]) - true[:, :2]
     assert np.abs(off[begins:].mean(0) - off[:begins].mean(0)).max() < 0.8
     middle = off.mean(0) - (told - true)[:, :2].mean(0)

@@ -122,6 +122,7 @@ def run(monkeypatch, *words):
         (["--bounds", "5,0,1,9"], 2, "west < east"),
         (["--rerun-from", "lunch"], 2, "features, links, align"),
         (["--quiet", "--json"], 2, "exclude one another"),
+        (["--thermal-route", "lunch"], 2, "needs --thermal"),
         ([], 3, ""),
     ],
 )

@@ -213,7 +213,7 @@ def test_sizes_of_one_pixel_are_refused_not_met_with_a_crash(mosaic, photos):
 
 @pytest.mark.slow
 def test_a_black_photo(mosaic, photos):
-    """It has no features: it lies where its metadata say, and is named."""
+    """It shows nothing: it is left out, not drawn where its metadata say, and is named."""
     path = named(photos)[4]
     block, xmp, _ = taken_apart(path.read_bytes())
     data = jpeg_bytes(np.zeros((HIGH, WIDE, 3), np.uint8))
@@ -222,6 +222,7 @@ def test_a_black_photo(mosaic, photos):
     told = mosaic(photos).made()
     assert told.metrics["photos_total"] == 9
     assert path.name in told.notes
+    assert "black" in told.metrics["photos_rejected"][path.name]
     assert max(told.metrics["blocks"]) == 8
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from skyquilt.errors import UsageError
 from skyquilt.model.photo import Survey
-from skyquilt.photos.bands import band_note, of_one_band
+from skyquilt.photos.left_out import band_note, of_one_band
 from skyquilt.photos.read import read_photo
 from tests.alignment.surveys import photo
 

@@ -6,7 +6,7 @@ from datetime import datetime
 import pytest
 
 from skyquilt.model.photo import GeoPosition
-from skyquilt.photos.reduced_copies import without_reduced
+from skyquilt.photos.left_out import without_reduced
 from tests.alignment.surveys import photo
 
 

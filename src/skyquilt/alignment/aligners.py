@@ -73,7 +73,13 @@ class ByLinks:
             inputs.keep,
             inputs.make_room,
         )
-        found = without_copied_views(found, inputs.photos)
+        told = {i for i, p in enumerate(inputs.photos) if p.position is not None}
+        bare = {
+            i
+            for i, p in enumerate(inputs.photos)
+            if p.position is None and p.attitude is None and p.focal.source == "guess"
+        }
+        found = without_copied_views(found, [p.name for p in inputs.photos], told, bare)
         found = replace(found, notes=(*found.notes, *said))
         return replace(with_loose_photos(found, inputs), why=REQUESTED)
 
@@ -215,6 +221,7 @@ def with_loose_photos(alignment: Alignment, inputs: AlignmentInputs) -> Alignmen
             continue
         if one_tone(inputs, i):
             rejected[i] = "it is black or white all over"
+            notes.append(f"{photo.name} is left out: {rejected[i]}.")
             continue
         weak = rejected.pop(i, "it could not be linked to any other photo")
         R = cam_R_map_from_angles(priors[i].yaw_deg, priors[i].pitch_deg, priors[i].roll_deg)

@@ -124,26 +124,28 @@ class Bundle:
             if off_positions(other, moved) < off_positions(found, priors):
                 said.append(moved_note(priors, moved))
                 found, priors, name = other, moved, "moved "
-        together = brought_together(found, photos, priors) if self.repair else None
-        if together is not None:
-            other = block(aside, together.priors, "together ")
-            if off_positions(other, together.priors) < off_positions(found, priors):
-                said.append(together.note)
-                found, priors, name = other, together.priors, "together "
         linked = len({i for k in links for i in (k.a, k.b)})
+        guessed = False
         if self.repair and misled(found, priors, linked):
             guess = guessed_priors(photos, priors, features, links)
             if guess is not None:
                 other = block(untold(guess), guess, "guessed ")
                 if nearer(other, found, priors):
-                    found, aside = other, untold(guess)
+                    found, aside, guessed = other, untold(guess), True
         for again in range(BEGUN_AGAIN) if self.repair else ():
             if (turned := turned_priors(found, priors)) is None:
                 break
             other = block(untold(turned), turned, f"turned {again} ")
             if not nearer(other, found, priors):
                 break
-            found, aside = other, untold(turned)
+            found, aside, guessed = other, untold(turned), True
+        level = self.repair and not guessed and not slanting(priors)
+        together = brought_together(found, [p.name for p in photos], priors) if level else None
+        if together is not None:
+            other = block(aside, together.priors, "together ")
+            if off_positions(other, together.priors) < off_positions(found, priors):
+                said.append(together.note)
+                found, priors, name = other, together.priors, "together "
         if lowered(found, priors) is not priors:
             said.append(LOWERED)
         weak = weak_photos(found, priors)

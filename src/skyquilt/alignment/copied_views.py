@@ -4,7 +4,7 @@ screenshots, photographs of a screen.
 They link as well as the photo does, and what is around the photo in them would be drawn, too.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.oblique import without_photos
 from skyquilt.geometry.camera import project
-from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment
 
 SAME_PLACE = 0.03
@@ -27,17 +26,21 @@ none of the points that photos show there.
 """
 
 
-def without_copied_views(found: Alignment, photos: Sequence[Photo]) -> Alignment:
-    """The alignment without pictures of that kind, each with its reason."""
-    told = [i for i in found.held if photos[i].position is not None]
-    bare = [i for i in found.held if _without_metadata(photos[i])]
+def without_copied_views(
+    found: Alignment, names: Sequence[str], told: Collection[int], bare: Collection[int]
+) -> Alignment:
+    """The alignment without pictures of that kind, each with its reason. `told`: photos that report
+    their position; `bare`: pictures without any metadata.
+    """
+    told = [i for i in found.held if i in told]
+    bare = [i for i in found.held if i in bare]
     if not told or not bare or not len(found.ties.xyz):
         return found
-    reasons = {i: _copied(found, i, told, photos) or _else(found, i) for i in bare}
+    reasons = {i: _copied(found, i, told, names) or _else(found, i) for i in bare}
     return without_photos(found, {i: why for i, why in reasons.items() if why})
 
 
-def _copied(found: Alignment, i: int, told: Sequence[int], photos: Sequence[Photo]) -> str:
+def _copied(found: Alignment, i: int, told: Sequence[int], names: Sequence[str]) -> str:
     """Why a picture is a copy of one of the photos `told`; empty if it is none."""
     places = np.array([found.poses[j].map_C for j in told])
     height = float(np.median(places[:, 2]) - np.median(found.ties.xyz[:, 2]))
@@ -46,7 +49,7 @@ def _copied(found: Alignment, i: int, told: Sequence[int], photos: Sequence[Phot
     if not away[nearest] < SAME_PLACE * height:
         return ""
     return (
-        f"it has no metadata and shows the view of {photos[told[nearest]].name}: it is a copy, or a"
+        f"it has no metadata and shows the view of {names[told[nearest]]}: it is a copy, or a"
         " picture of a screen"
     )
 
@@ -74,7 +77,3 @@ def _cells(px: NDArray[np.floating[Any]], size: NDArray[np.int64]) -> NDArray[np
     """Numbers (n,) of the cells in which pixels (n, 2) lie."""
     column, row = np.clip(px * CELLS // size, 0, CELLS - 1).astype(np.int64).T
     return np.asarray(row * CELLS + column)
-
-
-def _without_metadata(photo: Photo) -> bool:
-    return photo.position is None and photo.attitude is None and photo.focal.source == "guess"

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Prior
 
 Complex = NDArray[np.complex128]
@@ -31,6 +30,9 @@ TOLD_APART = 0.5
 TRUSTED = 0.8
 """Share of the positions that are compared, those that fit best: others may be gross errors."""
 
+DONE = "They were brought together;"
+"""Words of the note by which an alignment tells that it did so."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Displaced:
@@ -43,10 +45,11 @@ class Displaced:
 
 
 def brought_together(
-    found: Alignment, photos: Sequence[Photo], priors: Sequence[Prior]
+    found: Alignment, names: Sequence[str], priors: Sequence[Prior]
 ) -> Displaced | None:
-    """The priors with the positions of displaced parts (in order of capture) brought together, the
-    middle of all staying, by their deviations; None where no part is displaced.
+    """The priors with the positions of displaced parts brought together, the middle of all staying,
+    by their deviations; None where no part is displaced. Photos are in order of capture, under
+    their `names`.
     """
     own = [i for i in found.held if np.isfinite(priors[i].map_C[:2]).all()]
     if found.frame.crs is None or len(own) < 2 * FEWEST:
@@ -64,13 +67,20 @@ def brought_together(
     for i, d in zip(own, shift[part], strict=True):
         there = priors[i].map_C - np.array([d.real, d.imag, 0.0])
         moved[i] = replace(priors[i], map_C=there)
-    first = [photos[own[k]].name for k in np.flatnonzero(np.diff(part)) + 1]
+    first = [names[own[k]] for k in np.flatnonzero(np.diff(part)) + 1]
     note = (
         f"Positions from {' and from '.join(first)} on are displaced against those before by up to"
-        f" {apart:.1f} m: another flight, or a correction that was lost. They were brought"
-        " together; the map's place is as uncertain as that."
+        f" {apart:.1f} m: another flight, or a correction that was lost. {DONE} the map's place is"
+        " as uncertain as that."
     )
     return Displaced(priors=tuple(moved), note=note)
+
+
+def as_taken(found: Alignment, names: Sequence[str], priors: Sequence[Prior]) -> tuple[Prior, ...]:
+    """The priors as an alignment took them: brought together where it says so."""
+    told = any(DONE in note for note in found.notes)
+    together = brought_together(found, names, priors) if told else None
+    return tuple(priors) if together is None else together.priors
 
 
 def _parts(placed: Complex, told: Complex) -> Parts:

@@ -396,6 +396,10 @@ def command(
         lines=lines,
     )
     if thermal is None:
+        if thermal_route != "auto":
+            raise UsageError(
+                f"--thermal-route {thermal_route!r} needs --thermal, a folder of photos"
+            )
         events = iter_mosaic(
             photos, output, settings, overwrite=overwrite, rerun_from=rerun_from, add=add
         )

@@ -11,7 +11,6 @@ from pathlib import Path, PurePosixPath
 from skyquilt.errors import NoPhotosError, UsageError
 from skyquilt.model.photo import Photo, RejectedPhoto, Survey
 from skyquilt.outside import MOST_MP, plain, walk
-from skyquilt.photos.bands import band_note
 from skyquilt.photos.cameras_json import apply_cameras, read_cameras_json
 from skyquilt.photos.clips import is_timed, read_clips
 from skyquilt.photos.implausible_positions import (
@@ -20,10 +19,10 @@ from skyquilt.photos.implausible_positions import (
     without_outliers,
     without_stuck,
 )
+from skyquilt.photos.left_out import band_note, without_reduced
 from skyquilt.photos.metadata import NO_HEMISPHERE
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.recoded import UNNAMED, recoded
-from skyquilt.photos.reduced_copies import without_reduced
 from skyquilt.photos.side_files import apply_positions
 from skyquilt.photos.side_rows import sentence_of
 from skyquilt.video.read import CLIP_ENDINGS, side_files

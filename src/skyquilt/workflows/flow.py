@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from skyquilt.alignment.crowded_positions import believed
-from skyquilt.alignment.displaced_parts import brought_together
+from skyquilt.alignment.displaced_parts import as_taken
 from skyquilt.alignment.inputs import AlignmentInputs
 from skyquilt.alignment.late_positions import unshifted
 from skyquilt.alignment.oblique_guess import lowered
@@ -221,8 +221,7 @@ def _trusted(
     """The reported priors as the alignment took them."""
     priors = lowered(alignment, believed(alignment, frame, reported))
     priors = unshifted(alignment, priors, [p.camera_key for p in photos])
-    together = brought_together(alignment, photos, priors)
-    return tuple(priors) if together is None else together.priors
+    return as_taken(alignment, [p.name for p in photos], priors)
 
 
 def memory_notes(photos: int, memory_gb: float | None) -> list[Note]:

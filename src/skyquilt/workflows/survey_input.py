@@ -14,9 +14,9 @@ from skyquilt.model.photo import (
     RejectedPhoto,
     Survey,
 )
-from skyquilt.photos.bands import of_one_band
 from skyquilt.photos.distances import read_distances
 from skyquilt.photos.gcp import check_control, read_gcp_list
+from skyquilt.photos.left_out import of_one_band
 from skyquilt.photos.lever_arm import with_lever_arm
 from skyquilt.photos.read import ReadPhoto, read_photo
 from skyquilt.photos.sequence import sequence_of

@@ -1,0 +1,130 @@
+"""Photos that a map leaves out before anything is computed.
+
+Smaller copies of photos (previews, thumbnails, what was made to be sent) show nothing that the
+photos do not, and would make the map as coarse as they are. Multispectral cameras write a file for
+each band: a map of all of them would be a patchwork of bands, so it shows one.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Hashable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import PurePosixPath
+
+from skyquilt.errors import UsageError
+from skyquilt.model.photo import Photo, RejectedPhoto, Survey
+from skyquilt.outside import plain
+from skyquilt.photos.side_rows import sentence_of
+
+SMALLER = 0.8
+"""A copy has less than this share of the photo's width; ..."""
+SAME = 0.03
+"""... the same shape and the same angle of view, within this share."""
+PREFERRED = ("green", "red")
+"""Bands that are shown before others of as many photos: lawns, fields and roads differ in them."""
+
+
+def without_reduced(photos: Sequence[Photo]) -> tuple[tuple[Photo, ...], tuple[RejectedPhoto, ...]]:
+    """The photos without smaller copies of others, and these with their reason.
+
+    A copy states the same place and time and has the same angle of view or name; or it has the
+    same name and no metadata.
+    """
+    alike: dict[Hashable, list[Photo]] = defaultdict(list)
+    for photo in photos:
+        for key in _keys(photo):
+            alike[key].append(photo)
+    copy_of: dict[str, str] = {}
+    for group in alike.values():
+        largest = max(group, key=lambda p: (p.width, p.name))
+        for photo in group:
+            if _is_reduced(photo, largest):
+                copy_of[photo.name] = largest.name
+    kept = tuple(p for p in photos if p.name not in copy_of)
+    return kept, tuple(
+        RejectedPhoto(name=name, reason=f"it is a smaller copy of {original}")
+        for name, original in copy_of.items()
+    )
+
+
+def _keys(photo: Photo) -> Iterator[Hashable]:
+    """What a photo shares with its copies."""
+    place = photo.position
+    if photo.time is not None and place is not None:
+        yield photo.time, place.latitude_deg, place.longitude_deg, photo.band, photo.band_name
+    yield _stem(photo)
+
+
+def _stem(photo: Photo) -> str:
+    return PurePosixPath(photo.name).stem.lower()
+
+
+def _is_reduced(photo: Photo, original: Photo) -> bool:
+    """Whether a photo is a smaller copy of one that shares a key with it."""
+    ratio = photo.width / original.width
+    if ratio > SMALLER or abs(photo.height / original.height / ratio - 1) > SAME:
+        return False
+    if photo.time is None and photo.position is None:
+        told = original.time is not None or original.position is not None
+        return told and _stem(photo) == _stem(original)
+    a, b = photo.position, original.position
+    if a is None or b is None or photo.time != original.time or photo.band != original.band:
+        return False
+    if (a.latitude_deg, a.longitude_deg) != (b.latitude_deg, b.longitude_deg):
+        return False
+    same_view = abs(photo.focal.px / original.focal.px / ratio - 1) < SAME
+    return same_view or _stem(photo) == _stem(original)
+
+
+def bands_of(photos: Sequence[Photo]) -> Counter[str]:
+    """Photos of each band that files of one channel name."""
+    return Counter(p.band_name for p in photos if p.band_name and p.channels == 1)
+
+
+def of_one_band(survey: Survey, wanted: str | None) -> Survey:
+    """The survey with the files of one band, those of the others left out with a reason; files that
+    name no band stay. `wanted`: its name; None = the one of which there are most.
+
+    Raises:
+        UsageError: no file shows the band that is wanted.
+    """
+    bands = bands_of(survey.photos)
+    if wanted is not None and wanted.lower() not in bands:
+        there = f"they show {sentence_of(sorted(bands))}" if bands else "they name none"
+        raise UsageError(f"no photo shows the band '{plain(wanted, 40)}' (--band): {there}")
+    if len(bands) < 2 and wanted is None:
+        return survey
+    shown = wanted.lower() if wanted is not None else _usual(bands)
+    kept = [p for p in survey.photos if p.band_name == shown or not _of_a_band(p)]
+    out = [
+        RejectedPhoto(
+            name=p.name, reason=f"it shows the band {p.band_name}; the map shows {shown} (--band)"
+        )
+        for p in survey.photos
+        if _of_a_band(p) and p.band_name != shown
+    ]
+    return replace(
+        survey,
+        photos=tuple(kept),
+        rejected=tuple(sorted((*survey.rejected, *out), key=lambda r: r.name)),
+    )
+
+
+def band_note(photos: Sequence[Photo]) -> tuple[str, ...]:
+    """What is said where files show several bands."""
+    bands = bands_of(photos)
+    if len(bands) < 2:
+        return ()
+    listed = sentence_of([f"{name} ({n})" for name, n in sorted(bands.items())])
+    return (
+        f"Each file shows one band of a multispectral camera: {listed}. A map shows one of them,"
+        f" {_usual(bands)} unless --band names another.",
+    )
+
+
+def _of_a_band(photo: Photo) -> bool:
+    return bool(photo.band_name) and photo.channels == 1
+
+
+def _usual(bands: Counter[str]) -> str:
+    rank = {name: k for k, name in enumerate(PREFERRED)}
+    return min(bands, key=lambda name: (-bands[name], rank.get(name, len(rank)), name))
