@@ -32,6 +32,7 @@ from skyquilt.ortho.fusion import (
     with_coarse,
     without_specks,
 )
+from skyquilt.ortho.leaves import calmed
 from skyquilt.ortho.pair_matching import Array, Float, Mask, Pair, matched_points, pair_of
 
 GreyPicture = Callable[[int, int], NDArray[np.uint8]]
@@ -110,7 +111,7 @@ class Stereo:
     """The ratio that is preferred."""
     cell_px: tuple[int, int] = (4, 8)
     """Least and greatest side of a cell in map pixels."""
-    version: ClassVar[int] = 5
+    version: ClassVar[int] = 6
 
     def __call__(
         self, surface: Surface, views: Sequence[View], grid: Grid, grey: GreyPicture, keep: Keep
@@ -149,7 +150,8 @@ class Stereo:
             if far > 0:
                 z = lowered(z, known, round(far / 2 / cells.gsd), agree)
         side = 2 * round(self.whole * height / cells.gsd / 2) + 1
-        return surface_of(with_coarse(z, known, rough, cells, side), cells)
+        z = with_coarse(z, known, rough, cells, side)
+        return surface_of(calmed(z, known, cells.gsd, side), cells)
 
     def _coarse(
         self,
