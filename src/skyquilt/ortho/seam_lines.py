@@ -80,7 +80,7 @@ class SeamLines:
     """Half the width of the contested strip, as a share of the distance of the two cameras."""
     grey: float = 2.0
     """Difference in grey values that does not count."""
-    object: float = 60.0
+    object: float = 40.0
     """The same for a height of one metre or more above the surroundings, in grey values."""
     least: int = 24
     """Undisputed patches of fewer cells are contested too."""
