@@ -109,6 +109,15 @@ def worst_turn_deg(flown, alignment):
     return float(np.degrees(np.linalg.norm(turn, axis=1)).max())
 
 
+def assert_residuals_fit(alignment, photos):
+    """Tie points projected by the records lie where the residuals say."""
+    ties = alignment.ties
+    for i in photos:
+        mine = ties.photo == i
+        px = project(alignment.camera(i), alignment.poses[i].to_camera(ties.xyz[ties.point[mine]]))
+        assert px - ties.px[mine] == pytest.approx(ties.residual_px[mine], abs=1e-4)
+
+
 def relative_error(flown, alignment):
     """RMS in m of camera centres after the common shift is taken away."""
     e = np.array([p.map_C - flown.truth.C[i] for i, p in sorted(alignment.poses.items())])
@@ -195,10 +204,7 @@ def test_an_interrupted_adjustment_of_many_photos_goes_on_at_its_iteration(
 def test_tie_points_project_where_they_were_seen(plain):
     _, found = plain
     t = found.ties
-    for i in (0, 7, 17):
-        mine = t.photo == i
-        px = project(found.camera(i), found.poses[i].to_camera(t.xyz[t.point[mine]]))
-        assert px - t.px[mine] == pytest.approx(t.residual_px[mine], abs=1e-4)
+    assert_residuals_fit(found, (0, 7, 17))
     assert (np.diff(t.point) >= 0).all() and np.bincount(t.point).min() >= 2
 
 
@@ -219,11 +225,7 @@ def test_files_turned_by_half_a_turn(plain):
     assert worst_turn_deg(flown, found) < 0.6
     error, before = (np.sqrt((a.ties.residual_px**2).mean()) for a in (found, plain[1]))
     assert error == pytest.approx(before, rel=0.03)
-    for i in (7, 13):
-        t = found.ties
-        mine = t.photo == i
-        px = project(found.camera(i), found.poses[i].to_camera(t.xyz[t.point[mine]]))
-        assert px - t.px[mine] == pytest.approx(t.residual_px[mine], abs=1e-4)
+    assert_residuals_fit(found, (7, 13))
 
 
 def test_a_mirrored_camera_is_the_turned_file_s():

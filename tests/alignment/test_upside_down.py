@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 import skyquilt.alignment.upside_down as upside_down
-from skyquilt.geometry.camera import project
 from tests.alignment.blocks import LENS
-from tests.alignment.test_bundle import Flown, relative_error, worst_turn_deg
+from tests.alignment.test_bundle import Flown, assert_residuals_fit, relative_error, worst_turn_deg
 
 LINE = range(6, 12)
 ASIDE = LENS + [0, 5.5, -7.3, 0, 0, 0, 8e-4, -8e-4, 0, 0]
@@ -53,11 +52,7 @@ def test_a_turned_line_is_found(straight):
     assert relative_error(flown, found) < relative_error(*straight) + 0.1
     error, before = (np.sqrt((a.ties.residual_px**2).mean()) for a in (found, straight[1]))
     assert error == pytest.approx(before, rel=0.03)
-    for i in (7, 13):
-        ties = found.ties
-        seen = ties.photo == i
-        px = project(found.camera(i), found.poses[i].to_camera(ties.xyz[ties.point[seen]]))
-        assert px - ties.px[seen] == pytest.approx(ties.residual_px[seen], abs=1e-4)
+    assert_residuals_fit(found, (7, 13))
 
 
 def test_files_that_were_only_rewritten_stay(straight):

@@ -82,7 +82,7 @@ class Setup:
         """
         if not self.turned.any():
             return px
-        return np.where(self.turned[photo][:, None], self.size[photo] - 1 - px, px)
+        return turned_px(px, self.turned[photo], self.size[photo])
 
     def moving_as(self, photos: Sequence[Photo], C: Array) -> "Setup":
         """The same with the velocities that centres (n, 3) and capture times tell."""
@@ -161,6 +161,11 @@ class Setup:
         K = self.base.K0[self.camera[row]]
         p = ((tracks.px[:, 0] - K[:, 1]) - 1j * (tracks.px[:, 1] - K[:, 2])) / K[:, 0]
         return np.asarray(p)
+
+
+def turned_px(px: Array, mine: NDArray[np.bool_], size: Array) -> Array:
+    """Pixels (N, 2), those marked (N,) of pictures of a size (N, 2) turned by 180 degrees."""
+    return np.where(mine[:, None], size - 1 - px, px)
 
 
 def set_up(

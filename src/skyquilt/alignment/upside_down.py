@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from skyquilt.alignment.adjust import Adjusted, adjust
 from skyquilt.alignment.problem import Problem, State
-from skyquilt.alignment.setup import HALF_TURN, Setup
+from skyquilt.alignment.setup import HALF_TURN, Setup, turned_px
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.engine.kept import MADE_NOW, Keep
 from skyquilt.photos.side_rows import sentence_of
@@ -45,7 +45,8 @@ class Unturned:
     def turned_tracks(self, tracks: Tracks) -> Tracks:
         """Tracks in the sensor pixels of before, in those of this setup."""
         mine = np.isin(tracks.photo, self.setup.members[self.rows])
-        return replace(tracks, px=_turned_px(tracks.px, mine, self.setup.size[tracks.photo]))
+        px = turned_px(tracks.px, mine, self.setup.size[tracks.photo])
+        return replace(tracks, px=px.astype(tracks.px.dtype, copy=False))
 
 
 def upside_down(problem: Problem, state: State, setup: Setup, keep: Keep = MADE_NOW) -> Unturned:
@@ -125,17 +126,13 @@ def _adjusted(problem: Problem, state: State, keep: Keep = MADE_NOW) -> Adjusted
     return adjust(narrow, state, iterations=20, tolerance=3e-4, damping=1e-6, keep=keep)
 
 
-def _turned_px(px: NDArray[Any], mine: Mask, size: NDArray[Any]) -> NDArray[Any]:
-    """Pixels (N, 2), those marked of pictures of a size (N, 2) turned by 180 degrees."""
-    return np.where(mine[:, None], size - 1 - px, px).astype(px.dtype, copy=False)
-
-
 def _turned(
     problem: Problem, state: State, rows: Mask, size: NDArray[Any]
 ) -> tuple[Problem, State]:
     """The same problem and state with these rows' (n,) photos, of a size (n, 2), turned."""
     half = np.where(rows[:, None, None], HALF_TURN, np.eye(3))
-    px = _turned_px(problem.px, rows[problem.photo], size[problem.photo])
+    px = turned_px(problem.px, rows[problem.photo], size[problem.photo])
+    px = px.astype(problem.px.dtype, copy=False)
     return replace(problem, px=px, R0=half @ problem.R0), replace(state, R=half @ state.R)
 
 

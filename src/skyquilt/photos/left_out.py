@@ -77,7 +77,7 @@ def _is_reduced(photo: Photo, original: Photo) -> bool:
 
 def bands_of(photos: Sequence[Photo]) -> Counter[str]:
     """Photos of each band that files of one channel name."""
-    return Counter(p.band_name for p in photos if p.band_name and p.channels == 1)
+    return Counter(p.band_name for p in photos if _of_a_band(p))
 
 
 def of_one_band(survey: Survey, wanted: str | None) -> Survey:
