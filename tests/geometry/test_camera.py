@@ -1,5 +1,7 @@
 """Projection against OpenCV, its derivatives against differences, its inverse against itself."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from skyquilt.geometry.camera import (
+    FURTHEST,
     distort,
     monotone_radius,
     pixels,
@@ -21,7 +24,7 @@ small = st.floats(-0.01, 0.01)
 
 
 @st.composite
-def cameras(draw):
+def cameras(draw, fisheye=None):
     width, height = draw(st.integers(300, 6000)), draw(st.integers(300, 6000))
     focal = draw(st.floats(0.5, 3.0)) * max(width, height)
     return Camera(
@@ -35,6 +38,7 @@ def cameras(draw):
         k3=draw(st.floats(-0.05, 0.05)),
         p1=draw(small),
         p2=draw(small),
+        fisheye=float(draw(st.booleans()) if fisheye is None else fisheye),
     )
 
 
@@ -44,12 +48,35 @@ def points(seed, count=40, spread=0.6):
     return np.column_stack([rng.uniform(-spread, spread, (count, 2)) * z[:, None], z])
 
 
-@given(cameras(), st.integers(0, 2**31))
+@given(cameras(fisheye=False), st.integers(0, 2**31))
 def test_projection_is_opencv_s(camera, seed):
     xyz = points(seed)
     k = np.array([camera.k1, camera.k2, camera.p1, camera.p2, camera.k3])
     theirs = cv2.projectPoints(xyz, np.zeros(3), np.zeros(3), camera.matrix, k)[0][:, 0]
     assert project(camera, xyz) == pytest.approx(theirs, abs=1e-8 * camera.focal)
+
+
+@given(cameras(fisheye=True), st.integers(0, 2**31))
+def test_a_fisheye_is_opencv_s_without_tangential_terms(camera, seed):
+    camera = replace(camera, p1=0.0, p2=0.0)
+    xyz = points(seed, spread=2.5)
+    k = np.array([camera.k1, camera.k2, camera.k3, 0.0])
+    theirs = cv2.fisheye.projectPoints(xyz[None], np.zeros(3), np.zeros(3), camera.matrix, k)[0][0]
+    assert project(camera, xyz) == pytest.approx(theirs, abs=1e-8 * camera.focal)
+
+
+def test_lenses_of_both_kinds_are_projected_together():
+    pinhole = Camera(width=400, height=300, focal=350, cx=200, cy=150, k1=-0.1, p1=0.001)
+    both = (pinhole, replace(pinhole, fisheye=1.0))
+    xyz = points(3, 10)
+    k = np.repeat([c.vector for c in both], len(xyz), axis=0)
+    found = project_with_derivatives(k, np.tile(xyz, (2, 1)))
+    for n, camera in enumerate(both):
+        own = slice(n * len(xyz), (n + 1) * len(xyz))
+        alone = project_with_derivatives(k[own], xyz)
+        assert found.px[own] == pytest.approx(project(camera, xyz), abs=1e-9)
+        assert found.d_point[own] == pytest.approx(alone.d_point, abs=1e-9)
+        assert found.d_intrinsics[own] == pytest.approx(alone.d_intrinsics, abs=1e-9)
 
 
 def test_behind_the_camera_is_nowhere():
@@ -77,9 +104,10 @@ def test_derivatives_are_those_of_the_projection(camera, seed):
         assert exact.d_point[:, :, axis] == pytest.approx(
             numeric, rel=1e-6, abs=2e-6 * camera.focal / 0.5
         )
+    assert not exact.d_intrinsics[:, :, 9].any()  # the kind of lens
     for column in range(9):
         h = 1e-6 * (camera.focal if column < 3 else 1.0)
-        step = np.eye(9)[column] * h
+        step = np.eye(10)[column] * h
         numeric = (px(k + step, xyz) - px(k - step, xyz)) / (2 * h)
         scale = max(1.0, float(np.abs(numeric).max()))
         assert exact.d_intrinsics[:, :, column] == pytest.approx(numeric, abs=1e-7 * scale)
@@ -92,18 +120,34 @@ def test_undistortion_inverts_distortion(camera, seed):
     those).
     """
     rng = np.random.default_rng(seed)
-    reach = min(0.98 * monotone_radius(camera), 0.9)
+    reach = min(0.98 * monotone_radius(camera), 3.0 if camera.fisheye else 0.9)
     radius, angle = reach * np.sqrt(rng.random(60)), rng.uniform(0, 2 * np.pi, 60)
     xy = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
     jacobian = project_with_derivatives(
-        np.tile(np.r_[1, 0, 0, camera.vector[3:8], 1], (60, 1)), np.c_[xy, np.ones(60)]
+        np.tile(np.r_[1, 0, 0, camera.vector[3:8], 1, camera.fisheye], (60, 1)),
+        np.c_[xy, np.ones(60)],
     )
     assume(
         np.linalg.det(jacobian.d_point[:, :, :2]).min() > 0.02
     )  # tangential terms may fold earlier
+    if camera.fisheye:  # the same of the polynomial alone, at the angle
+        turned = xy / radius[:, None] * np.arctan(radius)[:, None]
+        flat = project_with_derivatives(
+            np.tile(np.r_[1, 0, 0, camera.vector[3:8], 1, 0], (60, 1)), np.c_[turned, np.ones(60)]
+        )
+        assume(np.linalg.det(flat.d_point[:, :, :2]).min() > 0.02)
     px = project(camera, np.c_[xy, np.ones(60)])
     assert undistort(camera, px) == pytest.approx(xy, abs=1e-9)
     assert rays(camera, px) == pytest.approx(np.c_[xy, np.ones(60)], abs=1e-9)
+
+
+def test_a_fisheye_s_picture_beyond_80_degrees_is_taken_for_its_rim():
+    camera = replace(Camera.ideal(width=4000, height=3000, focal=1100), fisheye=1.0)
+    corner = rays(camera, np.array([[0.0, 0.0], [3999.0, 2999.0]]))
+    assert np.degrees(np.arctan(np.hypot(*corner.T[:2]))) == pytest.approx(
+        np.degrees(FURTHEST), abs=1e-9
+    )
+    assert monotone_radius(camera) == pytest.approx(np.tan(FURTHEST))
 
 
 def test_any_shape_and_no_points():
@@ -122,11 +166,11 @@ def test_radius_of_the_fold_of_a_barrel(k1):
     assert min(exact, 3.0) <= found + 1e-12 <= min(exact, 3.0) + 0.005 + 1e-9
 
 
-@given(cameras())
+@given(cameras(fisheye=False))
 def test_distortion_grows_up_to_that_radius_and_hardly_beyond(camera):
     limit = monotone_radius(camera)
     r = np.linspace(0, limit - 0.006, 500)
-    k = np.r_[camera.vector[:6], 0, 0, 1]
+    k = np.r_[camera.vector[:6], 0, 0, 1, 0]
     assert (np.diff(distort(np.c_[r, 0 * r], k)[:, 0]) > 0).all()
     if limit < 3:
         step = distort(np.array([[limit, 0.0], [limit + 1e-6, 0.0]]), k)[:, 0]

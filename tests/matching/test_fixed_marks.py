@@ -141,7 +141,9 @@ def test_photos_of_different_ground_are_linked_by_their_text_unless_it_is_known(
         for pair in ((0, 1), (2, 5), (3, 7)):
             two = features[pair[0]], features[pair[1]]
             marked = marked_in(known, photos, pair, two)
-            found.append(link_pair(*pair, two, photos[0], methods, marked=marked))
+            found.append(
+                link_pair(*pair, two, (photos[pair[0]], photos[pair[1]]), methods, marked=marked)
+            )
         return sum(isinstance(k, Link) for k in found)
 
     assert linked(FixedMarks()) >= 2

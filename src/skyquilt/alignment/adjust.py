@@ -62,7 +62,7 @@ class Covariance:
 
     @property
     def camera_sigmas(self) -> Array:
-        """Standard deviations (m, 10) of the cameras' unknowns."""
+        """Standard deviations (m, 11) of the cameras' unknowns."""
         return np.asarray(np.sqrt(np.abs(np.diagonal(self.cameras))).reshape(-1, CAMERA))
 
     @property

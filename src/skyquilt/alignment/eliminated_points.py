@@ -186,7 +186,7 @@ def points_step(
     part: Problem, state: State, damping: float, photos: Array, cameras: Array
 ) -> Array:
     """The step (P, 3) of a part's points that goes with that of all photos (n, p) and of the
-    cameras (m, 10).
+    cameras (m, 11).
     """
     lin = linearise(part, state)
     weight, _ = observation_weights(part, lin.residual)

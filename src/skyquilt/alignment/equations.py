@@ -139,7 +139,7 @@ class Equations:
         self.pattern = pattern(state.C[:, :2], self.p, border, *_together(problem))
 
     def step(self, state: State, damping: float) -> tuple[Array, Array]:
-        """The Gauss-Newton step of photos (n, p) and cameras (m, 10).
+        """The Gauss-Newton step of photos (n, p) and cameras (m, 11).
 
         Raises:
             LinAlgError: it goes nowhere.

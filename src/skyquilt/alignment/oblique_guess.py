@@ -15,6 +15,7 @@ from skyquilt.alignment.determined import STATED_DEG
 from skyquilt.alignment.oblique import OBLIQUE_DEG, tilt_deg, tilts_reported
 from skyquilt.alignment.oblique_start import off_positions, slanting, turned_far
 from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
+from skyquilt.matching.lens_kind import as_pinhole
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Prior
@@ -180,7 +181,7 @@ def _rays(
 def _local(photo: Photo, px: NDArray[np.floating]) -> Array:
     """(n, 3) unit vectors in camera coordinates, the lens's distortion neglected."""
     middle = np.array([photo.width - 1, photo.height - 1]) / 2
-    local = np.column_stack([(px - middle) / photo.focal.px, np.ones(len(px))])
+    local = np.column_stack([(as_pinhole(photo, px) - middle) / photo.focal.px, np.ones(len(px))])
     return np.asarray(local / np.linalg.norm(local, axis=1, keepdims=True))
 
 

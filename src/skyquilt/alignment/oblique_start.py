@@ -17,6 +17,7 @@ from skyquilt.alignment.similarity_graph import components
 from skyquilt.alignment.start import Start, plane_link
 from skyquilt.alignment.triangulate import intersect
 from skyquilt.geometry.frames import angles_from_cam_R_map, cam_R_map_from_angles
+from skyquilt.matching.lens_kind import as_pinhole
 from skyquilt.model.features import Features, Link
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Alignment, Prior
@@ -165,6 +166,6 @@ def _meetings(
 def _rays(photo: Photo, prior: Prior, px: NDArray[np.floating]) -> Array:
     """(n, 3) unit vectors in the map frame, the lens's distortion neglected."""
     middle = np.array([photo.width - 1, photo.height - 1]) / 2
-    local = np.column_stack([(px - middle) / photo.focal.px, np.ones(len(px))])
+    local = np.column_stack([(as_pinhole(photo, px) - middle) / photo.focal.px, np.ones(len(px))])
     local /= np.linalg.norm(local, axis=1, keepdims=True)
     return local @ cam_R_map_from_angles(prior.yaw_deg, prior.pitch_deg, prior.roll_deg)

@@ -46,7 +46,7 @@ class State:
     C: Array
     """(n, 3) centres in m."""
     K: Array
-    """(m, 10) intrinsics in the order of `model.camera.PARAMETERS`, then the readout time in s."""
+    """(m, 11) intrinsics in the order of `model.camera.PARAMETERS`, then the readout time in s."""
     X: Array
     """(P, 3) points in m."""
     turn: Array
@@ -56,7 +56,7 @@ class State:
 
     def moved(self, photo_step: Array, camera_step: Array, point_step: Array) -> "State":
         """The state after a step of the solver: photos (n, 6) = rotation vector then centre, or
-        (n, 9) with the turn, cameras (m, 10), points (P, 3).
+        (n, 9) with the turn, cameras (m, 11), points (P, 3).
         """
         turns = photo_step.shape[1] == 9
         return State(
@@ -85,11 +85,11 @@ class Problem:
     camera: Index
     """(n,) camera of each photo."""
     free: NDArray[np.bool_]
-    """(m, 10) which intrinsics, and whether the readout time, are estimated."""
+    """(m, 11) which intrinsics, and whether the readout time, are estimated."""
     K0: Array
-    """(m, 10) prior of the intrinsics and the readout time."""
+    """(m, 11) prior of the intrinsics and the readout time."""
     sigma_K: Array
-    """(m, 10) deviations of that prior."""
+    """(m, 11) deviations of that prior."""
     C0: Array
     """(n, 3) measured centres; NaN where unknown."""
     sigma_C: Array
@@ -249,7 +249,7 @@ class Linearised:
     J_photo: Array
     """(N, 2, 6), or (N, 2, 9) where turns are estimated."""
     J_camera: Array
-    """(N, 2, 10), fixed intrinsics zeroed; (N, 2, 0) where all are fixed."""
+    """(N, 2, 11), fixed intrinsics zeroed; (N, 2, 0) where all are fixed."""
     J_point: Array
     """(N, 2, 3)."""
     behind: NDArray[np.bool_]

@@ -43,9 +43,9 @@ class PriorTerms:
     photo_gradient: Array
     """(n, 9)."""
     camera: Array
-    """(m, 10), zero where fixed."""
+    """(m, 11), zero where fixed."""
     camera_gradient: Array
-    """(m, 10)."""
+    """(m, 11)."""
     cost: float
     """Their robust cost."""
 

@@ -12,6 +12,7 @@ from skyquilt.alignment.problem import PART, READOUT, Problem, State
 from skyquilt.alignment.start import Start
 from skyquilt.alignment.tracks import Tracks
 from skyquilt.alignment.triangulate import intersect
+from skyquilt.geometry.camera import FURTHEST
 from skyquilt.geometry.frames import angle_difference_deg, cam_R_map_from_angles
 from skyquilt.model.camera import PARAMETERS, Camera, order_named
 from skyquilt.model.photo import Photo
@@ -31,6 +32,8 @@ it; factory calibrations of drones show 0.2 to 0.5 %.
 """
 TOGETHER = 500_000
 """Observations, about, of the parts in which those of all tracks are computed."""
+FISHEYE = PARAMETERS.index("fisheye")
+"""Column of the kind of lens among the intrinsics."""
 YAW_LIE_DEG = 20.0
 """A reported yaw further than this, in degrees, from that of the links is a gross error."""
 
@@ -157,9 +160,14 @@ class Setup:
         return intersect(tracks.point, C, ray, count, np.column_stack(near), TOLD_APART**2 * number)
 
     def _plain(self, tracks: Tracks, row: NDArray[np.int64]) -> NDArray[np.complex128]:
-        """(N,) places in the picture over the focal length, y up, distortion neglected."""
+        """(N,) places in the picture over the focal length, y up, distortion neglected but for a
+        fisheye's.
+        """
         K = self.base.K0[self.camera[row]]
         p = ((tracks.px[:, 0] - K[:, 1]) - 1j * (tracks.px[:, 1] - K[:, 2])) / K[:, 0]
+        if (fisheye := K[:, FISHEYE] > 0).any():
+            angle = np.abs(p[fisheye])
+            p[fisheye] *= np.tan(np.minimum(angle, FURTHEST)) / np.maximum(angle, 1e-9)
         return np.asarray(p)
 
 
@@ -327,11 +335,11 @@ def intrinsic_priors(
             ideal = Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
             known = ideal.vector
             lengths = [photo.focal.sigma_px, 0.01 * wide, 0.01 * wide]
-            deviation = np.array([*lengths, 0.1, 0.1, 0.05, 2e-3, 2e-3, SIGMA_ASPECT])
+            deviation = np.array([*lengths, 0.1, 0.1, 0.05, 2e-3, 2e-3, SIGMA_ASPECT, 1.0])
         K0.append(np.r_[known, photo.shutter.readout_s])
         sigma.append(np.r_[deviation, max(photo.shutter.sigma_s, 1e-9)])
     order = order_named(distortion)
-    terms = (True, True, True, *order.terms, order.aspect)
+    terms = (True, True, True, *order.terms, order.aspect, False)
     free = np.array([(*terms, photo.shutter.sigma_s > 0) for photo in photos])
     return np.array(K0), np.array(sigma), free
 
@@ -342,7 +350,8 @@ def _calibrated_sigma(camera: Camera, sigma_focal: float) -> Array:
     """
     wide = max(camera.width, camera.height)
     usual = [sigma_focal, 0.003 * wide, 0.003 * wide, 0.01, 0.01, 0.01, 1e-3, 1e-3, SIGMA_ASPECT]
-    least = [5e-4 * camera.focal, 5e-4 * wide, 5e-4 * wide, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 5e-4]
+    usual += [1.0]  # the kind of lens, which is held
+    least = [5e-4 * camera.focal, 5e-4 * wide, 5e-4 * wide, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4, 5e-4, 1.0]
     stated = np.array(camera.sigmas or usual)
     if stated[8] == 0:  # a calibration with square pixels says nothing about their shape
         stated[8] = SIGMA_ASPECT
@@ -371,7 +380,7 @@ def pose_records(setup: Setup, state: State, sigmas: Array | None = None) -> dic
 def camera_records(
     photos: Sequence[Photo], setup: Setup, state: State, deviations: Array | None
 ) -> tuple[dict[str, Camera], dict[int, str]]:
-    """Calibrations with deviations (m, 10), and the name of each photo's calibration."""
+    """Calibrations with deviations (m, 11), and the name of each photo's calibration."""
     cameras: dict[str, Camera] = {}
     for row, key in enumerate(setup.camera_keys):
         photo = next(p for p in photos if p.camera_key == key)

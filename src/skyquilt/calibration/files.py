@@ -18,7 +18,7 @@ from skyquilt.geometry.camera_formats import camera_to_opensfm
 from skyquilt.imaging.grey import to_grey8
 from skyquilt.model.board import Board, BoardView
 from skyquilt.model.calibration import Calibration, rms
-from skyquilt.model.camera import PARAMETERS, Camera
+from skyquilt.model.camera import ADJUSTABLE, PARAMETERS, Camera
 from skyquilt.raster.atomic import whole_file, write_text
 from skyquilt.version import __version__
 
@@ -150,7 +150,7 @@ def _calibration_record(found: Calibration, judged: Judged | None) -> dict[str, 
                 "sigma": found.sigma(name),
                 "free": name in found.free,
             }
-            for name in PARAMETERS
+            for name in ADJUSTABLE
         },
         "dropped": {n: {"value": v, "tolerance": t} for n, v, t in found.dropped},
         "points": sum(len(s.px) for s in found.observations),

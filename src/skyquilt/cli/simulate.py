@@ -43,6 +43,12 @@ def command(
     aspect: Annotated[
         float | None, typer.Option(help="focal length along columns over that along rows")
     ] = None,
+    fisheye: Annotated[
+        bool, typer.Option("--fisheye", help="the lens is a fisheye (equidistant)")
+    ] = False,
+    field_of_view: Annotated[
+        float | None, typer.Option(help="of the photo's diagonal, degrees")
+    ] = None,
     dewarp: Annotated[
         str | None,
         typer.Option(help="a factory calibration in the files, with these P1,P2 in place of true"),
@@ -211,7 +217,9 @@ def command(
         gust_blur=gust_blur,
     )
     readout = None if shutter_readout is None else shutter_readout / 1000
-    base = _with(base, "lens", readout=readout, aspect=aspect)
+    base = _with(base, "lens", readout=readout, aspect=aspect, fisheye=fisheye or None)
+    if field_of_view is not None:
+        base = replace(base, lens=base.lens.seeing(field_of_view))
     pushed = _pair("--wind", wind)
     if pushed is not None:
         base = _with(base, "route", wind=pushed[0], wind_from=pushed[1])

@@ -19,20 +19,29 @@ keys they do not know.
 _LEAST_FOCAL = 0.02
 _MOST = {"width": 1e6, "height": 1e6, "focal": 100.0, "focal_x": 100.0, "focal_y": 100.0}
 """Largest plausible values; lengths in units of the longer side."""
+PINHOLES = ("brown", "perspective", "simple_radial", "radial")
+FISHEYES = ("fisheye", "fisheye_opencv", "fisheye62")
+"""Projections by their names there: of `fisheye62`, the tangential terms take coordinates before
+radial distortion here, and after it there, which is the same to first order.
+"""
 _NAMES = ("focal_x", "c_x", "c_y", "k1", "k2", "k3", "p1", "p2", "aspect")
 
 
 def camera_from_opensfm(record: Mapping[str, Any]) -> Camera:
-    """A `brown`, `perspective`, `simple_radial` or `radial` camera.
+    """A camera of one of `PINHOLES` or `FISHEYES`.
 
     Raises `ValueError` for any other projection and for a broken record. Standard deviations
     are read from the key that `camera_to_opensfm` writes.
     """
     kind = str(record.get("projection_type", "perspective"))
-    if kind not in ("brown", "perspective", "simple_radial", "radial"):
+    if kind not in (*PINHOLES, *FISHEYES):
         raise ValueError(
-            f"its projection is '{kind}'; expected brown, perspective, simple_radial or radial"
+            f"its projection is '{kind}'; expected {', '.join((*PINHOLES, *FISHEYES[:-1]))}"
+            f" or {FISHEYES[-1]}"
         )
+    higher = [_number(record, k, 0.0) for k in ("k4", "k5", "k6")]
+    if any(higher):
+        raise ValueError("it has more than three radial coefficients (k4 and more are not 0)")
     width, height = int(_number(record, "width")), int(_number(record, "height"))
     if width < 1 or height < 1:
         raise ValueError(f"its size is {width}x{height} px")
@@ -52,6 +61,7 @@ def camera_from_opensfm(record: Mapping[str, Any]) -> Camera:
         p1=_number(record, "p1", 0.0),
         p2=_number(record, "p2", 0.0),
         aspect=_number(record, "focal_y", focals[0]) / focals[0] if "focal_x" in record else 1.0,
+        fisheye=1.0 if kind in FISHEYES else 0.0,
         sigmas=_deviations(record, unit),
     )
 
@@ -71,20 +81,22 @@ def _deviations(record: Mapping[str, Any], unit: int) -> tuple[float, ...] | Non
     )
     if min(found) < 0 or not all(map(math.isfinite, found)):
         raise ValueError(f"its '{DEVIATIONS}' are {dict(stated)}; expected none below zero")
-    return found
+    return (*found, 0.0)  # the kind of lens is certain
 
 
 def camera_to_opensfm(camera: Camera) -> dict[str, Any]:
-    """The camera as a `brown` record, ready for JSON; its standard deviations, if it has any, under
-    a key that other software ignores.
+    """The camera as a `brown` record, or a `fisheye62` record with the coefficients that a fisheye
+    has of these, ready for JSON; its standard deviations, if it has any, under a key that other
+    software ignores.
     """
     unit = max(camera.width, camera.height)
     stated = {}
     if camera.sigmas:
         shares = [s / unit if k < 3 else s for k, s in enumerate(camera.sigmas)]
-        stated = {DEVIATIONS: dict(zip(_NAMES, shares, strict=True))}
+        stated = {DEVIATIONS: dict(zip(_NAMES, shares, strict=False))}
+    fisheye = {"k4": 0.0, "k5": 0.0, "k6": 0.0} if camera.fisheye else {}
     return {
-        "projection_type": "brown",
+        "projection_type": "fisheye62" if camera.fisheye else "brown",
         "width": camera.width,
         "height": camera.height,
         "focal_x": camera.focal / unit,
@@ -92,6 +104,7 @@ def camera_to_opensfm(camera: Camera) -> dict[str, Any]:
         "c_x": (camera.cx - (camera.width - 1) / 2) / unit,
         "c_y": (camera.cy - (camera.height - 1) / 2) / unit,
         **{k: getattr(camera, k) for k in ("k1", "k2", "p1", "p2", "k3")},
+        **fisheye,
         **stated,
     }
 

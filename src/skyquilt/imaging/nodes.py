@@ -253,7 +253,7 @@ def _photo_pixels(
     k: NDArray[Any],
     limit: NDArray[Any] | float,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Photo columns and rows of points in camera coordinates, and which are real; `k` (..., 9),
+    """Photo columns and rows of points in camera coordinates, and which are real; `k` (..., 10),
     `limit`: the radius up to which the distortion is invertible.
     """
     across, down, depth = planes

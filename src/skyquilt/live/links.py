@@ -71,10 +71,10 @@ class LiveLinks:
 
     def _compared(self, a: int, b: int) -> Link | None:
         """The link of two photos; None where they do not match."""
-        photos = [self.members.by_id[i].photo for i in (a, b)]
+        photos = self.members.by_id[a].photo, self.members.by_id[b].photo
         two = self.features(a), self.features(b)
         marked = marked_in(self.marks.known, photos, (0, 1), two)
-        link = link_pair(a, b, two, photos[0], self.methods, marked=marked)
+        link = link_pair(a, b, two, photos, self.methods, marked=marked)
         return link if isinstance(link, Link) else None
 
     def _compare_again(self, camera: str) -> None:

@@ -15,7 +15,7 @@ from skyquilt.live.failures import concerning
 from skyquilt.live.inbox import Inbox
 from skyquilt.live.ledger import DAMAGED, Ledger
 from skyquilt.live.settings import LiveSettings
-from skyquilt.model.camera import PARAMETERS, Camera
+from skyquilt.model.camera import ADJUSTABLE, PARAMETERS, Camera
 from skyquilt.model.photo import Photo, RejectedPhoto
 from skyquilt.model.poses import MapFrame, Motion, Pose, Prior
 from skyquilt.outside import real, whole
@@ -292,7 +292,8 @@ def camera_from(body: str) -> Camera | None:
         said = json.loads(body)
         focal = real(said["focal"], 10, 1e6)
         size = [whole(said[k], 1, 10**5) for k in ("width", "height")]
-        rest = [real(said[k], -1e6, 1e6) for k in (*PARAMETERS, "readout_s")]
+        rest = [real(said[k], -1e6, 1e6) for k in (*ADJUSTABLE, "readout_s")]
+        rest.append(real(said.get("fisheye", 0.0), 0, 1))
         return None if None in (focal, *size, *rest) else Camera(**said)
     except DAMAGED:
         return None

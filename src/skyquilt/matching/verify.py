@@ -8,8 +8,15 @@ from typing import ClassVar
 import cv2
 import numpy as np
 
+from skyquilt.matching.lens_kind import TOLERANCE_PX, straight, unit_rays
+from skyquilt.matching.sphere_epipolar import agreeing
+from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link, Matches, RejectedLink, numbers
 
+FURTHER = 4.0
+"""Factor on the tolerance of the similarity for fisheyes: relief and tilt move what a pinhole shows
+at 60 degrees from the axis four times as far as what it shows in the middle.
+"""
 EPIPOLAR = {"magsac": cv2.USAC_MAGSAC, "ransac": cv2.FM_RANSAC, "lmeds": cv2.FM_LMEDS}
 """OpenCV's estimators of a fundamental matrix, by name."""
 
@@ -38,7 +45,7 @@ class Verify:
     """The same for photos that evidently show the same ground: two flying heights, or a wide lens
     and a long one.
     """
-    version: ClassVar[int] = 2
+    version: ClassVar[int] = 3
 
     def __call__(
         self,
@@ -48,9 +55,10 @@ class Verify:
         features_b: Features,
         matches: Matches,
         width: int,
+        lenses: tuple[Camera, Camera] | None = None,
     ) -> Link | RejectedLink:
         """The link of photos a and b (indices), or the reason why there is none. `width`: image
-        width of a in px.
+        width of a in px; `lenses` of the two photos where one is a fisheye.
         """
         if len(matches) < self.minimum:
             return RejectedLink(
@@ -61,6 +69,11 @@ class Verify:
         # photos may have different numbers of pixels; distances are those in b
         finer = features_a.scale / features_b.scale
         tolerance = self.similarity_share * width / finer
+        rays = None
+        if lenses is not None:
+            rays = unit_rays(lenses[0], pa), unit_rays(lenses[1], pb)
+            pa, pb = (straight(lens, px) for lens, px in zip(lenses, (pa, pb), strict=True))
+            tolerance *= FURTHER
         model, inliers = cv2.estimateAffinePartial2D(
             pa, pb, ransacReprojThreshold=tolerance, maxIters=2000, confidence=0.999, refineIters=5
         )
@@ -75,7 +88,12 @@ class Verify:
         limit = self.most_scale if len(keep) >= self.sure else self.scale
         if not 1 / limit < scale < limit:
             return RejectedLink(a=a, b=b, reason=f"implausible scale ({scale:.2f})")
-        keep = self._epipolar(pa, pb, keep, max(features_a.scale, features_b.scale))
+        coarser = max(features_a.scale, features_b.scale)
+        if lenses is None or rays is None:
+            keep = self._epipolar(pa, pb, keep, coarser)
+        else:
+            angle = TOLERANCE_PX * coarser / min(lens.focal for lens in lenses)
+            keep = keep[agreeing(rays[0][keep], rays[1][keep], angle)]
         if len(keep) < self.minimum:
             return RejectedLink(a=a, b=b, reason=f"weak inliers after epipolar check ({len(keep)})")
         # image y points down: conjugate to get the similarity with y up

@@ -5,15 +5,24 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-PARAMETERS = ("focal", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "aspect")
-"""Order of the intrinsics in every parameter vector and covariance of the project."""
-SQUARE = PARAMETERS[:-1]
+PARAMETERS = ("focal", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "aspect", "fisheye")
+"""Order of the intrinsics in every parameter vector and covariance of the project. The last one
+tells the kind of lens; it is never estimated.
+"""
+ADJUSTABLE = PARAMETERS[:-1]
+"""The intrinsics that may be estimated."""
+SQUARE = PARAMETERS[:-2]
 """The intrinsics of a camera with square pixels: what views of a board determine."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """Pinhole with Brown's distortion in OpenCV's direction (undistorted -> distorted).
+    """Pinhole or fisheye with Brown's distortion in OpenCV's direction (undistorted -> distorted).
+
+    Coordinates in the image plane (units of the focal length) are those of a pinhole everywhere. A
+    fisheye shows a ray at the angle from its axis in rad where a pinhole shows it at the tangent;
+    Brown's polynomial follows in both, so a fisheye without tangential terms is OpenCV's fisheye
+    model (Kannala and Brandt 2006) with three of its four coefficients.
 
     Pixel centres lie at integer coordinates: the image spans [-0.5, width - 0.5] x [-0.5, height -
     0.5].
@@ -41,6 +50,8 @@ class Camera:
     """Tangential coefficient, OpenCV's p2."""
     aspect: float = 1.0
     """Focal length along the columns (fy) over that along the rows."""
+    fisheye: float = 0.0
+    """1.0 for a fisheye (equidistant), 0.0 for a pinhole."""
     readout_s: float = 0.0
     """Time in s from the exposure of the first row to that of the last; 0 = all rows at once."""
     sigma_readout_s: float | None = field(default=None, compare=False)
@@ -52,7 +63,7 @@ class Camera:
 
     @property
     def vector(self) -> NDArray[np.float64]:
-        """The intrinsics as (9,), in the order of `PARAMETERS`."""
+        """The intrinsics as (10,), in the order of `PARAMETERS`."""
         return np.array([getattr(self, name) for name in PARAMETERS], dtype=np.float64)
 
     @property

@@ -4,14 +4,14 @@ import csv
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from typing import Literal
 
 import numpy as np
 
-from skyquilt.model.camera import PARAMETERS, Camera
+from skyquilt.model.camera import ADJUSTABLE, Camera
 from skyquilt.model.photo import Focal
 from skyquilt.photos import tags as tag
 from skyquilt.photos.tags import Exif, Xmp
@@ -224,6 +224,8 @@ another setting of the focus, another camera of the model.
 """
 _SIGMA_RADIAL, _SIGMA_TANGENTIAL, _SIGMA_ASPECT = 0.02, 0.004, 0.0015
 """Deviations of its distortion coefficients and of its ratio of focal lengths."""
+_FURTHEST = 1.4
+"""Angle from the axis in rad up to which a fisheye's polynomial is taken over."""
 _UNTOLD = (0.1, 0.1, 0.05, 0.002, 0.002, 0.003)
 """Deviations of k1, k2, k3, p1, p2 and the ratio where a calibration gives only lengths."""
 
@@ -241,8 +243,8 @@ class FoundCalibration:
 def read_calibration(
     *, exif: Exif, xmp: Xmp, sensor: Sensor | None, width: int, height: int, scale: float
 ) -> FoundCalibration:
-    """The first of DJI's `DewarpData` or `DewarpDataK6`, Pix4D's `Camera:Perspective*` and DJI's
-    `CalibratedFocalLength` that a lens can have.
+    """The first of DJI's `DewarpData` or `DewarpDataK6`, Pix4D's `Camera:Perspective*` or
+    `Camera:Fisheye*` and DJI's `CalibratedFocalLength` that a lens can have.
 
     `scale` is this file's px per px as captured (`lens.native_scale`): the calibration refers to
     the latter.
@@ -251,6 +253,7 @@ def read_calibration(
     readers: tuple[tuple[str, Callable[[], Camera | str | None]], ...] = (
         ("DewarpData", lambda: _dewarp(xmp, native)),
         ("Camera:Perspective...", lambda: _perspective(exif, xmp, sensor, native)),
+        ("Camera:Fisheye...", lambda: _fisheye(exif, xmp, sensor, native)),
         ("CalibratedFocalLength", lambda: _calibrated_focal(xmp, native)),
     )
     found_otherwise = (_on_sensor(exif, sensor, *native), _from_35mm(exif, *native))
@@ -348,14 +351,45 @@ def _perspective(
         px_per_mm = 1.0
     if px_per_mm is None:
         return None
-    point = xmp.numbers("Camera:PrincipalPoint")
-    centre = (
-        (point[0] * px_per_mm, point[1] * px_per_mm)
-        if len(point) == 2
-        else (size[0] / 2, size[1] / 2)
-    )
+    centre = _principal_point(xmp, px_per_mm, size)
     distortion = xmp.numbers("Camera:PerspectiveDistortion")
     return _camera(size, mm * px_per_mm, centre, distortion if len(distortion) == 5 else None)
+
+
+def _principal_point(xmp: Xmp, px_per_mm: float, size: tuple[int, int]) -> tuple[float, float]:
+    """In px from the image's corner; the middle where none is given."""
+    point = xmp.numbers("Camera:PrincipalPoint")
+    if len(point) != 2:
+        return size[0] / 2, size[1] / 2
+    return point[0] * px_per_mm, point[1] * px_per_mm
+
+
+def _fisheye(
+    exif: Exif, xmp: Xmp, sensor: Sensor | None, size: tuple[int, int]
+) -> Camera | str | None:
+    """Pix4D's fisheye: the affine matrix times a polynomial of third degree in the angle from the
+    axis over a right angle.
+    """
+    matrix, rho = (xmp.numbers(f"Camera:Fisheye{n}") for n in ("AffineMatrix", "Polynomial"))
+    if xmp.text("Camera:ModelType").lower() != "fisheye" or len(matrix) != 4:
+        return None
+    if not (matrix[0] > 0 and matrix[3] > 0 and all(math.isfinite(n) for n in (*matrix, *rho))):
+        return f"an affine matrix of {', '.join(f'{n:.4g}' for n in matrix)}"
+    px_per_mm = _px_per_mm(exif, sensor, size)
+    middle = (size[0] / 2, size[1] / 2)
+    centre = middle if px_per_mm is None else _principal_point(xmp, px_per_mm, size)
+    unit = 2 / math.pi
+    reach = min(math.hypot(*size) / 2 / (matrix[0] * unit), _FURTHEST)
+    angle = np.linspace(0, reach, 200)[1:]
+    wanted = np.polyval(list(reversed(rho or (0.0, 1.0))), angle * unit)
+    powers = np.stack([angle, angle**3, angle**5, angle**7], axis=1)
+    first, *higher = (float(n) for n in np.linalg.lstsq(powers, wanted, rcond=None)[0])
+    if not first > 0:
+        return f"a polynomial of {', '.join(f'{n:.4g}' for n in rho)}"
+    k1, k2, k3 = (n / first for n in higher)
+    focal, aspect = matrix[0] * first, matrix[3] / matrix[0]
+    found = _camera(size, focal, centre, (k1, k2, k3, 0.0, 0.0), aspect=aspect)
+    return replace(found, fisheye=1.0) if isinstance(found, Camera) else found
 
 
 def _px_per_mm(exif: Exif, sensor: Sensor | None, size: tuple[int, int]) -> float | None:
@@ -402,7 +436,8 @@ def _camera(
         _SIGMA_FOCAL * focal,
         *(_SIGMA_CENTRE * long,) * 2,
         *(_UNTOLD if distortion is None else told),
+        0.0,  # the kind of lens is certain
     )
     values = (focal, centre[0] - 0.5, centre[1] - 0.5, k1, k2, k3, p1, p2, aspect)
-    known = dict(zip(PARAMETERS, values, strict=True))
+    known = dict(zip(ADJUSTABLE, values, strict=True))
     return Camera(width=size[0], height=size[1], sigmas=sigmas, **known)

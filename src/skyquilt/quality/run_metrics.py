@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from skyquilt.model.camera import PARAMETERS
+from skyquilt.model.camera import ADJUSTABLE
 from skyquilt.model.event import MetadataConflict
 from skyquilt.model.features import Link, RejectedLink
 from skyquilt.model.photo import Photo, RejectedPhoto
@@ -93,11 +93,12 @@ def camera_figures(photos: Sequence[Photo], alignment: Alignment) -> dict[str, A
         if key in out:
             continue
         camera, focal = alignment.cameras[key], photos[i].focal
-        sigmas = camera.sigmas or (None,) * len(PARAMETERS)
+        sigmas = camera.sigmas or (None,) * len(camera.vector)
         out[key] = {
             name: {"value": _round(value, 6), "sigma": _round(sigma, 6)}
-            for name, value, sigma in zip(PARAMETERS, camera.vector, sigmas, strict=True)
+            for name, value, sigma in zip(ADJUSTABLE, camera.vector, sigmas, strict=False)
         }
+        out[key]["projection"] = "fisheye" if camera.fisheye else "perspective"
         out[key]["focal"] |= {
             "prior": _round(focal.px, 2),
             "prior_sigma": _round(focal.sigma_px, 2),

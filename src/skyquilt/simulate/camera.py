@@ -1,14 +1,20 @@
-"""The simulated camera: pinhole with Brown's distortion in OpenCV's direction."""
+"""The simulated camera: pinhole or fisheye with Brown's distortion in OpenCV's direction."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from skyquilt.errors import UsageError
 from skyquilt.simulate.grid import Doubles, Floats
 
 _NED_OF_MAP = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 _CAMERA_OF_BODY = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
 _NOSE_CAMERA_OF_BELLY = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+
+
+_FLATTEST = 1.45
+"""Angle in rad from the axis of a fisheye (83 degrees) beyond which rays are taken for ones there.
+"""
 
 
 def _turn(axis: int, degrees: float) -> Doubles:
@@ -76,6 +82,8 @@ class Lens:
     """Focal length along the columns over that along the rows."""
     readout: float = 0.0
     """Time in s from the exposure of the first row to that of the last."""
+    fisheye: bool = False
+    """Whether a ray is shown at its angle from the axis in rad, not at the tangent of the angle."""
 
     @property
     def cx(self) -> float:
@@ -89,6 +97,10 @@ class Lens:
 
     def distort(self, x: Doubles, y: Doubles) -> tuple[Doubles, Doubles]:
         """Ideal to real normalised coordinates."""
+        if self.fisheye:
+            tangent = np.hypot(x, y)
+            share = np.where(tangent > 1e-9, np.arctan(tangent) / np.maximum(tangent, 1e-9), 1.0)
+            x, y = x * share, y * share
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
         xy2 = 2 * x * y
@@ -100,10 +112,16 @@ class Lens:
     def undistort(self, x: Doubles, y: Doubles, rounds: int = 14) -> tuple[Doubles, Doubles]:
         """Real to ideal normalised coordinates, by fixed-point iteration."""
         ideal_x, ideal_y = x.copy(), y.copy()
+        flat = replace(self, fisheye=False)
         for _ in range(rounds):
-            real_x, real_y = self.distort(ideal_x, ideal_y)
+            real_x, real_y = flat.distort(ideal_x, ideal_y)
             ideal_x += x - real_x
             ideal_y += y - real_y
+        if self.fisheye:
+            angle = np.hypot(ideal_x, ideal_y)
+            stretch = np.tan(np.minimum(angle, _FLATTEST)) / np.maximum(angle, 1e-9)
+            stretch = np.where(angle > 1e-9, stretch, 1.0)
+            ideal_x, ideal_y = ideal_x * stretch, ideal_y * stretch
         return ideal_x, ideal_y
 
     def project(self, points: Doubles, rotation: Doubles, centre: Doubles) -> Doubles:
@@ -128,6 +146,29 @@ class Lens:
             xx, yy = np.meshgrid(x, y)
             out[rows, :, 0], out[rows, :, 1] = self.undistort(xx, yy)
         return out
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height of the level ground that a vertical photo shows, per height above it;
+        distortion neglected.
+        """
+        wide, tall = self.width / self.focal, self.height / self.focal
+        if self.fisheye:
+            wide, tall = (2 * float(np.tan(min(side / 2, _FLATTEST))) for side in (wide, tall))
+        return wide, tall
+
+    def seeing(self, degrees: float) -> "Lens":
+        """The lens with another focal length: the one that gives the photo's diagonal a field of
+        view, distortion neglected.
+
+        Raises:
+            UsageError: no such lens exists.
+        """
+        most = 165.0 if self.fisheye else 150.0
+        if not 5 <= degrees <= most:
+            raise UsageError(f"field of view must be 5 to {most:g} degrees, not {degrees:g}")
+        half, diagonal = np.radians(degrees) / 2, np.hypot(self.width, self.height) / 2
+        return replace(self, focal=float(diagonal / (half if self.fisheye else np.tan(half))))
 
     def turned(self) -> "Lens":
         """The lens for files whose pixels were rotated by 180 degrees."""

@@ -106,8 +106,9 @@ def plan(route: Route, lens: Lens) -> list[Waypoint]:
     """Waypoints in the order in which they are flown, centred on the map origin; times per
     drone.
     """
-    forward = (1 - route.overlap) * route.height * lens.height / lens.focal
-    sideways = (1 - route.sidelap) * route.height * lens.width / lens.focal
+    wide, tall = lens.extent
+    forward = (1 - route.overlap) * route.height * tall
+    sideways = (1 - route.sidelap) * route.height * wide
     if route.pattern == "roundtrip":
         points = _around(route.photos, forward, route.heading)
     else:

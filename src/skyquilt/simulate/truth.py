@@ -107,7 +107,7 @@ def write_truth(
 
 def _camera(lens: Lens) -> dict[str, float]:
     lengths = ("width", "height", "focal", "cx", "cy", "aspect")
-    names = (*lengths, "k1", "k2", "k3", "p1", "p2", "readout")
+    names = (*lengths, "k1", "k2", "k3", "p1", "p2", "readout", "fisheye")
     return {name: getattr(lens, name) for name in names}
 
 

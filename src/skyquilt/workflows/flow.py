@@ -37,7 +37,7 @@ from skyquilt.settings import USUAL_GB, MosaicSettings, PictureSettings
 from skyquilt.workflows.clip_frames import with_frames
 from skyquilt.workflows.finished import Earlier
 from skyquilt.workflows.keys import alignment_key, exposure_key, labels_key
-from skyquilt.workflows.links import Links, link_photos, make_room
+from skyquilt.workflows.links import Links, link_photos, make_room, with_fisheyes
 from skyquilt.workflows.methods import Methods
 from skyquilt.workflows.photo_features import (
     FeaturedPhotos,
@@ -387,6 +387,11 @@ def _links(
     if not methods.align.needs_links or len(found.photos) < 2:
         return found, Links()
     links = yield from link_photos(found, frame, reported, methods, store, workers)
+    again, said = with_fisheyes(found, links, methods)
+    if said:
+        found = again
+        links = yield from link_photos(found, frame, reported, methods, store, workers)
+        links = replace(links, lenses=said)
     return (yield from connect(found, links, reported, grey, methods, store, workers))
 
 

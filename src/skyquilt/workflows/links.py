@@ -18,6 +18,7 @@ from skyquilt.imaging.nodes import View, project_nodes
 from skyquilt.imaging.views import make_views, on_ground
 from skyquilt.matching.candidates import Pair, sequence
 from skyquilt.matching.fixed_marks import FindFixedMarks, FixedMarks
+from skyquilt.matching.lens_kind import as_fisheye, fisheyes, lenses_of
 from skyquilt.matching.matchers import Guided
 from skyquilt.model.features import Features, Link, Matches, RejectedLink, numbers
 from skyquilt.model.photo import Photo
@@ -77,6 +78,13 @@ class Links:
     """What pictures show at the same place each, and does not connect them."""
     matches: tuple[InFile, ...] = ()
     """Where the keypoints of all links lie."""
+    lenses: tuple[str, ...] = ()
+    """Notes on lenses whose kind was found by them."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know."""
+        return (*self.marks.notes, *self.lenses)
 
     def make_room(self) -> None:
         """Gives back the memory of matches that were used."""
@@ -146,12 +154,12 @@ def link_pair(
     a: int,
     b: int,
     features: tuple[Features, Features],
-    photo: Photo,
+    photos: tuple[Photo, Photo],
     methods: Methods,
     expected: NDArray[np.float64] | None = None,
     marked: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None,
 ) -> Link | RejectedLink:
-    """The link of photos a and b (numbers), or the reason why there is none. `photo` is a.
+    """The link of photos a and b (numbers), or the reason why there is none.
 
     `expected` (len(features of a), 2): positions in px of a's keypoints in b predicted from
     metadata, NaN where unknown; needed by a guided matcher only. `marked`: which keypoints of each
@@ -159,13 +167,21 @@ def link_pair(
     """
     if isinstance(methods.matcher, Guided):
         assert expected is not None, "a guided matcher needs predicted positions"
-        matches = methods.matcher.for_width(photo.width)(*features, expected)
+        matches = methods.matcher.for_width(photos[0].width)(*features, expected)
     else:
         matches = methods.matcher(*features)
-    if marked is not None:
-        ground = ~(marked[0][matches.index_a] | marked[1][matches.index_b])
-        matches = Matches(index_a=matches.index_a[ground], index_b=matches.index_b[ground])
-    return methods.verify(a, b, *features, matches, photo.width)
+    matches = _on_ground(matches, marked)
+    return methods.verify(a, b, *features, matches, photos[0].width, lenses_of(*photos))
+
+
+def _on_ground(
+    matches: Matches, marked: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None
+) -> Matches:
+    """Matches without those on marks."""
+    if marked is None:
+        return matches
+    ground = ~(marked[0][matches.index_a] | marked[1][matches.index_b])
+    return Matches(index_a=matches.index_a[ground], index_b=matches.index_b[ground])
 
 
 class _Linker:
@@ -196,14 +212,15 @@ class _Linker:
         two = self.features[a], self.features[b]
         places = None if self.expected is None else self.expected(a, b, two[0].px)
         marked = marked_in(self.marks, self.found.photos, pair, two)
-        return link_pair(a, b, two, self.found.photos[a], self.methods, places, marked)
+        photos = self.found.photos[a], self.found.photos[b]
+        return link_pair(a, b, two, photos, self.methods, places, marked)
 
     def batch(self, pairs: Sequence[Pair]) -> list[Link | RejectedLink]:
         """Links of a batch. They are stored by content: photos that join the survey later change
         the indices, but not what is stored of other photos.
         """
         photos = self.found.photos
-        names = [(photos[i].digest, photos[j].digest) for i, j in pairs]
+        names = [(seen_as(photos[i]), seen_as(photos[j])) for i, j in pairs]
         kept = self.store.get_or(
             "links",
             digest(names, self._recipe),
@@ -213,10 +230,43 @@ class _Linker:
 
     def key(self, priors: Sequence[Prior]) -> str:
         """Key of all links of the survey."""
-        photos = [(p.digest, p.width, p.height) for p in self.found.photos]
+        photos = [(seen_as(p), p.width, p.height) for p in self.found.photos]
         methods = self.methods.nearest, self.methods.retrieval, link_photos
         places = [p.map_C[:2].tolist() for p in priors]
         return digest(photos, places, self._recipe, *methods)
+
+
+def seen_as(photo: Photo) -> object:
+    """What of a photo enters its links: its content, and its lens if that is a fisheye."""
+    known = photo.calibration
+    return (photo.digest, known) if known is not None and known.fisheye else photo.digest
+
+
+def with_fisheyes(
+    found: FeaturedPhotos, links: Links, methods: Methods
+) -> tuple[FeaturedPhotos, tuple[str, ...]]:
+    """The photos, those of cameras that prove to have a fisheye with such a lens, and notes on
+    them; the same where there are none. Links must be found again for these.
+    """
+    matcher, features = methods.matcher, found.features
+    if isinstance(matcher, Guided):
+        return found, ()
+
+    def matched(a: int, b: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        two = features[a], features[b]
+        marked = marked_in(links.marks, found.photos, (a, b), two)
+        matches = _on_ground(matcher(*two), marked)
+        return two[0].px[matches.index_a], two[1].px[matches.index_b]
+
+    tried = [(k.a, k.b) for k in links.links] + [(k.a, k.b) for k in links.rejected]
+    kinds = {f.camera: f for f in fisheyes(found.photos, features, links.links, tried, matched)}
+    if not kinds:
+        return found, ()
+    photos = tuple(
+        as_fisheye(p, kinds[p.camera_key].multiple) if p.camera_key in kinds else p
+        for p in found.photos
+    )
+    return replace(found, photos=photos), tuple(f.note for f in kinds.values())
 
 
 def link_photos(

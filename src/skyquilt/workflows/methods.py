@@ -23,6 +23,7 @@ from skyquilt.imaging.nodes import View
 from skyquilt.matching.candidates import Nearest, Pair, Retrieval
 from skyquilt.matching.matchers import Guided
 from skyquilt.matching.verify import Verify
+from skyquilt.model.camera import Camera
 from skyquilt.model.features import Features, Link, Matches, RejectedLink
 from skyquilt.model.raster import Grid
 from skyquilt.model.surface import Surface
@@ -87,10 +88,11 @@ class Verifier(Protocol):
         features_b: Features,
         matches: Matches,
         width: int,
+        lenses: tuple[Camera, Camera] | None = None,
         /,
     ) -> Link | RejectedLink:
         """The link of photos a and b (numbers), or the reason why there is none; `width` of a in
-        px.
+        px; `lenses` are given where one of them is a fisheye.
         """
         ...
 

@@ -386,7 +386,7 @@ def _metrics(
             looks={**seams.looks, "tone_residual": tone},
             conflicts=conflicts(aligned.photos, aligned.priors, alignment),
             warnings=[
-                *aligned.links.marks.notes,
+                *aligned.links.notes,
                 *position_warnings(aligned.priors, alignment),
                 *tilt_warnings(aligned.priors, alignment),
             ],

@@ -22,7 +22,7 @@ from skyquilt.matching.matchers import Guided
 from skyquilt.model.features import Features, Link, RejectedLink, numbers
 from skyquilt.model.photo import Photo
 from skyquilt.model.poses import Prior
-from skyquilt.workflows.links import Links, link_pair, marked_in
+from skyquilt.workflows.links import Links, link_pair, marked_in, seen_as
 from skyquilt.workflows.methods import Countable, Methods
 from skyquilt.workflows.photo_features import PICTURE, FeaturedPhotos, GreyPictures, features_recipe
 
@@ -67,14 +67,15 @@ class CloserLook:
     def pair(self, pair: Pair) -> Link | RejectedLink:
         """The link of two photos, or the reason why there is none."""
         a, b = pair
-        names = (self.photos[a].digest, self.photos[b].digest)
+        names = seen_as(self.photos[a]), seen_as(self.photos[b])
         methods = self.methods
         recipe = (features_recipe(methods.detector), methods.matcher, methods.verify, self.marks)
 
         def compared() -> Link | RejectedLink:
             two = self(a), self(b)
             marked = marked_in(self.marks, self.photos, pair, two)
-            return link_pair(a, b, two, self.photos[a], methods, marked=marked)
+            photos = self.photos[a], self.photos[b]
+            return link_pair(a, b, two, photos, methods, marked=marked)
 
         found = self.store.get_or("links", digest(names, "closer", recipe), compared)
         return replace(found, a=a, b=b)

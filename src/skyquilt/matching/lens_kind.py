@@ -1,0 +1,220 @@
+"""The kind of a lens, found in what photos have in common: pinhole or fisheye.
+
+A pinhole shows a ray at the tangent of its angle from the axis, a fisheye at the angle itself.
+Metadata rarely tell which one a camera has. Photos of the same ground do: seen through a pinhole
+they differ by nearly a homography, and read with the wrong kind of lens they do not.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyquilt.geometry.camera import rays, undistort
+from skyquilt.geometry.transforms import fit, transfer
+from skyquilt.matching.sphere_epipolar import agreeing
+from skyquilt.model.camera import Camera
+from skyquilt.model.features import Features, Link
+from skyquilt.model.photo import Photo
+
+Px = NDArray[np.float64]
+
+WIDE_RAD = 0.7
+"""Angle of a picture's corner from the axis in rad, by the focal length and read as a fisheye's,
+from which a lens may be one: below 40 degrees the two kinds differ by no more than a lens's
+distortion.
+"""
+LOOKED_AT = 8
+"""Links of a camera that are looked at, spread over the survey."""
+FEWEST = 3
+"""Links that can tell the kind of a lens."""
+SUSPECT = 0.9
+"""Residuals as a fisheye over those as a pinhole, in the median of links, below which both are
+tried: 0.2 to 0.4 for a fisheye over level ground, 0.6 to 0.8 over relief of a seventh of the
+height, and above 1 for a pinhole.
+"""
+MORE = 1.06
+"""So many times as many matches must agree with a fisheye: 1.08 to 1.3 times as many do for
+fisheyes of 118 to 153 degrees, at most as many for pinholes, those with much distortion too
+(simulated matches, a fifth of them false).
+"""
+CERTAIN = 20
+"""And at least so many more."""
+FOCALS = (1.0, 0.8, 0.65)
+"""Multiples of the reported focal length that are tried: a guess may be far off, and 35 mm
+equivalents of fisheyes are given by the field of view as well as by the focal length.
+"""
+SIGMA_FOCAL = 0.15
+"""Relative deviation of the focal length after that."""
+TOLERANCE_PX = 2.0
+"""Of matches that agree, in px of the picture that was searched for features: lenses that are taken
+for those of a kind differ from it.
+"""
+SIGMA_RADIAL = (0.1, 0.05, 0.02)
+"""Deviations of a fisheye's k1, k2, k3: between an orthographic (k1 = -0.17), an equal-area (-0.04)
+and a stereographic projection (0.08) lie all lenses in use.
+"""
+
+
+def as_pinhole(photo: Photo, px: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Where a pinhole with the same focal length and principal point shows what a photo's fisheye
+    shows at px (n, 2); unchanged where the photo has no fisheye.
+    """
+    camera = photo.calibration
+    return px if camera is None or not camera.fisheye else straight(camera, px)
+
+
+def lens_of(photo: Photo) -> Camera:
+    """The lens as far as metadata tell it."""
+    if photo.calibration is not None:
+        return photo.calibration
+    return Camera.ideal(width=photo.width, height=photo.height, focal=photo.focal.px)
+
+
+def lenses_of(a: Photo, b: Photo) -> tuple[Camera, Camera] | None:
+    """The lenses of two photos where one is a fisheye; None for pinholes."""
+    two = lens_of(a), lens_of(b)
+    return two if any(lens.fisheye for lens in two) else None
+
+
+def straight(camera: Camera, px: NDArray[np.floating]) -> Px:
+    """Pixels (n, 2) where a pinhole with the same focal length and principal point shows them."""
+    lengths = camera.focal * np.array([1.0, camera.aspect])
+    return np.asarray(
+        undistort(camera, np.asarray(px, np.float64)) * lengths + (camera.cx, camera.cy)
+    )
+
+
+def as_fisheye(photo: Photo, multiple: float = 1.0) -> Photo:
+    """The photo as one of a fisheye whose focal length is the reported one times a factor."""
+    focal = photo.focal.px * multiple
+    wide = max(photo.width, photo.height)
+    ideal = Camera.ideal(width=photo.width, height=photo.height, focal=focal)
+    sigma = max(SIGMA_FOCAL * focal, photo.focal.sigma_px)
+    lengths = (sigma, 0.01 * wide, 0.01 * wide)
+    sigmas = (*lengths, *SIGMA_RADIAL, 2e-3, 2e-3, 3e-3, 0.0)
+    return replace(
+        photo,
+        calibration=replace(ideal, fisheye=1.0, sigmas=sigmas),
+        focal=replace(photo.focal, px=focal, sigma_px=sigma),
+    )
+
+
+def may_be_fisheye(photo: Photo) -> bool:
+    """Whether nothing tells the kind of a photo's lens, and it is wide enough for the question."""
+    corner = np.hypot(photo.width, photo.height) / 2
+    known = photo.calibration
+    bent = known is not None and bool(known.vector[3:8].any() or known.fisheye)
+    return not bent and photo.band == "visible" and corner > WIDE_RAD * photo.focal.px
+
+
+@dataclass(frozen=True, kw_only=True)
+class FoundFisheye:
+    """A camera that proved to have a fisheye."""
+
+    camera: str
+    """Its key."""
+    multiple: float
+    """Its focal length over the reported one, roughly."""
+    agreeing: tuple[int, int]
+    """Matches that agree with a fisheye, and with a pinhole."""
+
+    @property
+    def note(self) -> str:
+        """What a user should know."""
+        fisheye, pinhole = self.agreeing
+        return (
+            f"{self.camera} has a fisheye: {fisheye} matches of some pairs agree with one,"
+            f" {pinhole} with a pinhole. Its lens is adjusted as a fisheye's."
+        )
+
+
+Matched = Callable[[int, int], tuple[Px, Px]]
+"""Places (n, 2) in px of the matches of two photos (numbers), in each."""
+
+
+def fisheyes(
+    photos: Sequence[Photo],
+    features: Sequence[Features],
+    links: Sequence[Link],
+    tried: Sequence[tuple[int, int]],
+    matched: Matched,
+) -> Iterator[FoundFisheye]:
+    """Cameras with a fisheye among those whose lens nothing tells. `links`: as found with pinholes;
+    `tried`: all pairs that were compared, by which a camera is judged that has hardly a link.
+    """
+    for key in dict.fromkeys(p.camera_key for p in photos if may_be_fisheye(p)):
+        own = {i for i, p in enumerate(photos) if p.camera_key == key}
+        linked = [k for k in links if k.a in own and k.b in own]
+        if len(linked) < FEWEST:
+            inside = [pair for pair in tried if pair[0] in own and pair[1] in own]
+            pairs = [inside[n] for n in _spread(len(inside))]
+        else:
+            some = [linked[n] for n in _spread(len(linked))]
+            if not _suspect(photos[min(own)], features, some):
+                continue
+            pairs = [(k.a, k.b) for k in some]
+        scale = features[min(own)].scale
+        found = _judged(photos[min(own)], [matched(*pair) for pair in pairs], scale)
+        if found is not None:
+            yield found
+
+
+def _spread(count: int) -> list[int]:
+    where = np.linspace(0, count - 1, min(count, LOOKED_AT)).astype(int)
+    return [int(n) for n in np.unique(where)]
+
+
+def _suspect(photo: Photo, features: Sequence[Features], links: Iterable[Link]) -> bool:
+    """Whether matches of links are more nearly a homography when read as a fisheye's."""
+    ratios = []
+    for link in links:
+        a, b = features[link.a].px[link.index_a], features[link.b].px[link.index_b]
+        plain = _residual(a, b)
+        bent = [as_fisheye(photo, m).calibration for m in FOCALS]
+        best = min(_residual(straight(c, a), straight(c, b)) / _stretch(c, b) for c in bent if c)
+        ratios.append(best / max(plain, 1e-9))
+    return bool(ratios) and float(np.median(ratios)) < SUSPECT
+
+
+def _residual(a: Px, b: Px) -> float:
+    """Median distance in px of matches (n, 2) from their homography."""
+    H = fit("homography", a, b)
+    if H is None:
+        return np.inf
+    return float(np.median(np.linalg.norm(transfer(H, a) - b, axis=1)))
+
+
+def _stretch(camera: Camera, px: Px) -> float:
+    """By how much places px (n, 2) of a fisheye are drawn apart where a pinhole shows them: the
+    root of the change of areas, in the median.
+    """
+    angle = np.linalg.norm(px - (camera.cx, camera.cy), axis=1) / camera.focal
+    angle = np.clip(angle, 1e-6, 1.4)
+    return float(np.median(np.sqrt(np.tan(angle) / angle) / np.cos(angle)))
+
+
+def _judged(photo: Photo, pairs: Sequence[tuple[Px, Px]], scale: float) -> FoundFisheye | None:
+    """The fisheye with which most matches of pairs agree, if clearly more than with a pinhole of
+    any of the same focal lengths.
+    """
+
+    def count(camera: Camera) -> int:
+        tolerance = TOLERANCE_PX * scale / camera.focal
+        return sum(int(agreeing(unit_rays(camera, a), unit_rays(camera, b), tolerance).sum())
+                   for a, b in pairs)  # fmt: skip
+
+    bent = {m: as_fisheye(photo, m).calibration for m in FOCALS}
+    counts = {m: (count(c), count(replace(c, fisheye=0.0))) for m, c in bent.items() if c}
+    best = max(counts, key=lambda m: counts[m][0])
+    fisheye, pinhole = counts[best][0], max(n for _, n in counts.values())
+    if fisheye < max(MORE * pinhole, pinhole + CERTAIN):
+        return None
+    return FoundFisheye(camera=photo.camera_key, multiple=best, agreeing=(fisheye, pinhole))
+
+
+def unit_rays(camera: Camera, px: Px) -> Px:
+    """Directions (N, 3) of unit length in camera coordinates of pixels (N, 2)."""
+    found = rays(camera, px)
+    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
